@@ -1,0 +1,63 @@
+"""Search for a free parking space: Gymnasium environments, and the stack and planners to beat.
+
+Importing this package registers the environments; everything heavy is loaded when it is first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from gymnasium.envs.registration import register, registry
+
+if TYPE_CHECKING:
+    from parkenv.belief import SightingModel
+    from parkenv.errors import InputError
+    from parkenv.lot import Lane, Mouth, ParkingLot
+    from parkenv.occupancy import ArrivalWindow, OccupancyProcess
+    from parkenv.occupancy_log import OccupancyLog, RecordedOccupancy
+    from parkenv.scenario import Scenario, SearchProblem
+
+__version__ = "0.1.0"
+
+_EXPORTS = {
+    "ArrivalWindow": "parkenv.occupancy",
+    "InputError": "parkenv.errors",
+    "Lane": "parkenv.lot",
+    "Mouth": "parkenv.lot",
+    "OccupancyLog": "parkenv.occupancy_log",
+    "OccupancyProcess": "parkenv.occupancy",
+    "ParkingLot": "parkenv.lot",
+    "RecordedOccupancy": "parkenv.occupancy_log",
+    "Scenario": "parkenv.scenario",
+    "SearchProblem": "parkenv.scenario",
+    "SightingModel": "parkenv.belief",
+}
+
+__all__ = [
+    "ArrivalWindow",
+    "InputError",
+    "Lane",
+    "Mouth",
+    "OccupancyLog",
+    "OccupancyProcess",
+    "ParkingLot",
+    "RecordedOccupancy",
+    "Scenario",
+    "SearchProblem",
+    "SightingModel",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _EXPORTS:
+        return getattr(import_module(_EXPORTS[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+if "parkenv/Search-v0" not in registry:
+    register(
+        id="parkenv/Search-v0",
+        entry_point="parkenv.envs.search:SearchEnv",
+        max_episode_steps=2000,
+    )

@@ -1,0 +1,60 @@
+"""The command line: `parkenv COMMAND --help` teaches each command."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+
+import typer
+
+from parkenv.cli import compare, lot, occupancy, plan
+from parkenv.errors import InputError
+
+app = typer.Typer(
+    name="parkenv",
+    help="Search for a free parking space: worlds, planners, and comparisons between them.",
+    epilog="Start with: parkenv compare --scenario campus --out results",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+app.command("compare")(compare.compare)
+app.command("plan")(plan.plan)
+app.add_typer(lot.app, name="lot")
+app.add_typer(occupancy.app, name="occupancy")
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        from parkenv import __version__
+
+        typer.echo(f"parkenv {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _global_options(
+    version: bool = typer.Option(
+        False, "--version", help="Print the version.", callback=_show_version, is_eager=True
+    ),
+) -> None:
+    del version
+
+
+def main() -> None:
+    """Entry point: bad input is one line on standard error and exit code 2."""
+    warnings.formatwarning = lambda message, *_: f"parkenv: warning: {message}\n"
+    try:
+        app()
+    except InputError as error:
+        sys.exit(_complain(str(error)))
+    except OSError as error:
+        if error.filename is None:
+            raise
+        sys.exit(_complain(f"{error.filename}: {error.strerror}"))
+
+
+def _complain(message: str) -> int:
+    typer.echo(f"parkenv: error: {' '.join(message.split())}", err=True)
+    return 2

@@ -1,0 +1,200 @@
+"""Options that several commands share, and how their words become objects."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from parkenv.errors import InputError
+from parkenv.lot import ParkingLot
+from parkenv.occupancy import ArrivalWindow, OccupancyModel, OccupancyProcess
+from parkenv.scenario import Scenario
+
+WORLD = "The world"
+COSTS = "Costs and speeds"
+
+LotOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--lot", help="A lot file: native GeoJSON, or a Dragon Lake map (.yml).", rich_help_panel=WORLD
+    ),
+]
+OccupancyOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--occupancy",
+        help="What stands in the slots: a recorded log (.csv, .csv.gz; replayed day by day) or a process "
+        "written by `parkenv occupancy fit` (.json). A typical working week where none is given.",
+        rich_help_panel=WORLD,
+    ),
+]
+MappingOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--mapping",
+        help="CSV slot_id,log_slot_id that puts the log's slots on the lot's. Without it the log's fullest "
+        "slots go nearest to the goal.",
+        rich_help_panel=WORLD,
+    ),
+]
+GoalOption = Annotated[
+    str | None,
+    typer.Option(
+        "--goal",
+        metavar="X,Y",
+        help="Walk to this point, m, not to the lot's own goal.",
+        rich_help_panel=WORLD,
+    ),
+]
+ArrivalOption = Annotated[
+    str,
+    typer.Option(
+        "--arrival", metavar="HH:MM-HH:MM", help="Searches start between these hours.", rich_help_panel=WORLD
+    ),
+]
+DaysOption = Annotated[
+    str,
+    typer.Option(
+        "--days", help="On these days: weekdays, weekend, all, or e.g. mon,tue.", rich_help_panel=WORLD
+    ),
+]
+ViewRangeOption = Annotated[
+    float | None,
+    typer.Option("--view-range", help="How far slots are seen from the car, m.", rich_help_panel=WORLD),
+]
+FailureCostOption = Annotated[
+    str,
+    typer.Option(
+        "--failure-cost",
+        metavar="S[,S...]",
+        help="Seconds lost by a try at a taken slot.",
+        rich_help_panel=COSTS,
+    ),
+]
+WalkOption = Annotated[
+    str, typer.Option("--v-walk-kmh", metavar="V[,V...]", help="Walking speed, km/h.", rich_help_panel=COSTS)
+]
+DriveOption = Annotated[
+    str, typer.Option("--v-drive-kmh", metavar="V[,V...]", help="Driving speed, km/h.", rich_help_panel=COSTS)
+]
+SeedOption = Annotated[int, typer.Option("--seed", min=0, help="First seed; episode i uses seed + i.")]
+JobsOption = Annotated[
+    int,
+    typer.Option("--jobs", "-j", min=0, help="Worker processes; 0 takes all cores. The result is the same."),
+]
+
+
+def numbers(option: str, text: str) -> list[float]:
+    """Comma-separated numbers.
+
+    Raises:
+        InputError: something else; the message names the option.
+    """
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        raise InputError(f"{option} is {text!r}, want numbers separated by commas, e.g. 10,90") from None
+    if len(set(values)) < len(values):
+        raise InputError(f"{option} is {text!r}: a value stands twice")
+    return values
+
+
+def positive(option: str, values: list[float], *, zero: bool = False) -> list[float]:
+    """The values, checked to be finite and above 0 (or at least 0)."""
+    for value in values:
+        if not (value > 0.0 or (zero and value == 0.0)) or value == float("inf"):
+            raise InputError(f"{option} is {value:g}, want a number {'of at least' if zero else 'above'} 0")
+    return values
+
+
+def words(option: str, text: str) -> list[str]:
+    """Comma-separated words, at least one, none twice."""
+    values = [word.strip() for word in text.split(",") if word.strip()]
+    if not values:
+        raise InputError(f"{option} is {text!r}, want names separated by commas")
+    if len(set(values)) < len(values):
+        raise InputError(f"{option} is {text!r}: a name stands twice")
+    return values
+
+
+def worker_count(jobs: int) -> int:
+    """How many processes to start: all cores that this process may use where 0 is asked for."""
+    return jobs or len(
+        os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    )
+
+
+def lot_of(path: Path, goal: str | None = None) -> ParkingLot:
+    """The lot in a file, with another goal where one is given."""
+    lot = ParkingLot.from_file(path)
+    if goal is None:
+        return lot
+    point = numbers("--goal", goal)
+    if len(point) != 2:
+        raise InputError(f"--goal is {goal!r}, want X,Y in metres")
+    return dataclasses.replace(lot, goals=np.array([point]))
+
+
+def occupancy_of(path: Path, lot: ParkingLot, mapping: Path | None) -> OccupancyModel:
+    """The recorded log or the process in a file, laid on the lot's slots.
+
+    Raises:
+        InputError: the file is neither, or its record cannot be laid on the lot.
+    """
+    if path.suffix == ".json":
+        if mapping is not None:
+            raise InputError("--mapping goes with a recorded log, not with a process")
+        process = OccupancyProcess.from_file(path)
+        # A process carries no slot ids: one of the lot's size is taken to be the lot's own.
+        return process if process.n_slots == lot.n_slots else process.laid_on(lot.walk_m())
+    if not path.name.endswith((".csv", ".csv.gz")):
+        raise InputError(f"{path}: want a recorded log (.csv or .csv.gz) or a process (.json)")
+    from parkenv.occupancy_log import OccupancyLog, RecordedOccupancy, read_mapping
+
+    log = OccupancyLog.read(path)
+    placed = None if mapping is None else read_mapping(mapping, lot.slot_ids, log)
+    return RecordedOccupancy(log, lot.walk_m(), placed)
+
+
+def scenarios_of(
+    scenario: str | None,
+    lot: Path | None,
+    occupancy: Path | None,
+    mapping: Path | None,
+    goal: str | None,
+    arrival: str,
+    days: str,
+    view_range: float | None,
+) -> list[Scenario]:
+    """What the options of the world describe: packaged scenarios, or one on a lot file."""
+    if lot is None:
+        for option, value in (("--occupancy", occupancy), ("--mapping", mapping), ("--goal", goal)):
+            if value is not None:
+                raise InputError(f"{option} goes with --lot; packaged scenarios have their own")
+        made = [Scenario.named(name) for name in words("--scenario", scenario or "campus")]
+    else:
+        if scenario is not None:
+            raise InputError(
+                "--scenario and --lot exclude each other: name a packaged scenario or give a file"
+            )
+        if mapping is not None and occupancy is None:
+            raise InputError("--mapping goes with --occupancy")
+        its_lot = lot_of(lot, goal)
+        made = [
+            Scenario.on_lot(its_lot, None if occupancy is None else occupancy_of(occupancy, its_lot, mapping))
+        ]
+    changes: dict[str, Any] = {"arrival": ArrivalWindow.parse(arrival, days)}
+    if view_range is not None:
+        changes["sighting"] = dataclasses.replace(made[0].sighting, view_range=view_range)
+    return [s.replace(**changes) for s in made]
+
+
+def fingerprint(path: Path | None) -> str | None:
+    """A short hash of a file's content, so that a resumed run notices a changed file."""
+    return None if path is None else hashlib.sha256(path.read_bytes()).hexdigest()[:16]

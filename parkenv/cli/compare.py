@@ -1,0 +1,276 @@
+"""`parkenv compare`: agents against each other in the same worlds."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from parkenv import __version__
+from parkenv.cli import arguments as args
+from parkenv.cli.tables import WIDE, make_console, make_table
+from parkenv.errors import InputError
+
+Row = dict[str, Any]
+
+DEFAULT_AGENTS = "mdp,mdp-static,greedy-goal,greedy-drive,first-free,random,oracle"
+LEVELS = "0.5,0.7,0.8,0.9,0.95,0.99"
+
+
+def compare(
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            "--scenario",
+            metavar="NAME[,NAME...]",
+            help="Packaged scenarios: campus, jam, street, mini.  [default: campus]",
+            rich_help_panel=args.WORLD,
+        ),
+    ] = None,
+    lot: args.LotOption = None,
+    occupancy: args.OccupancyOption = None,
+    mapping: args.MappingOption = None,
+    goal: args.GoalOption = None,
+    arrival: args.ArrivalOption = "08:00-13:00",
+    days: args.DaysOption = "weekdays",
+    view_range: args.ViewRangeOption = None,
+    agents: Annotated[
+        str,
+        typer.Option(
+            "--agents", metavar="NAME[,NAME...]", help="Who searches. Differences are to the first."
+        ),
+    ] = DEFAULT_AGENTS,
+    episodes: Annotated[
+        int, typer.Option("--episodes", "-n", min=1, help="Searches a setting and agent.")
+    ] = 100,
+    failure_cost: args.FailureCostOption = "10",
+    v_walk_kmh: args.WalkOption = "4",
+    v_drive_kmh: args.DriveOption = "10",
+    occupancy_levels: Annotated[
+        str,
+        typer.Option(
+            "--occupancy-levels",
+            metavar="P[,P...]|none",
+            help="Also make the lot this full on average, with a third as many searches each, for the figure of "
+            "time against occupancy. A recorded world is as full as it is: its searches are binned instead.",
+        ),
+    ] = LEVELS,
+    seed: args.SeedOption = 0,
+    jobs: args.JobsOption = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            "-o",
+            help="Folder for episodes.csv, summary.json and the figures.  [default: results/compare]",
+        ),
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an unfinished run in --out.")] = False,
+    figures: Annotated[bool, typer.Option(help="Draw figures.")] = True,
+) -> None:
+    """Compare agents over failure costs and speeds, all in the same worlds.
+
+    Every agent meets the same cars at the same times: episode i of each has the same seed. The table
+    gives mean total time (drive + failed tries + walk) with its 95 % interval, the paired difference to the
+    first agent, and the regret to the clairvoyant bound.
+
+    Examples:
+    * `parkenv compare --scenario campus,jam --failure-cost 10,90 --out results`
+
+    * `parkenv compare --lot lot.geojson --occupancy log.csv.gz --agents mdp,greedy-goal,oracle -n 300`
+    """
+    from parkenv.evaluation.compare import Case, at_occupancy, run_cases, settings_of, table
+    from parkenv.evaluation.results import ResultFolder
+    from parkenv.occupancy import OccupancyProcess
+    from planners.agent import make_agent
+
+    names = args.words("--agents", agents)
+    failure = args.positive("--failure-cost", args.numbers("--failure-cost", failure_cost), zero=True)
+    walk = args.positive("--v-walk-kmh", args.numbers("--v-walk-kmh", v_walk_kmh))
+    drive = args.positive("--v-drive-kmh", args.numbers("--v-drive-kmh", v_drive_kmh))
+    levels = [] if occupancy_levels == "none" else _levels(occupancy_levels)
+    scenarios = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range)
+    for name in names:
+        make_agent(name, scenarios[0])
+
+    seeds = range(seed, seed + episodes)
+    cases = [
+        (Case(setting, name), seeds)
+        for s in scenarios
+        for setting in settings_of(s, failure, walk, drive)
+        for name in names
+    ]
+    fewer = seeds[: max(1, episodes // 3)]
+    sweep = [
+        (Case(setting, name, level), fewer)
+        for s in scenarios
+        if isinstance(s.occupancy, OccupancyProcess)
+        for level in levels
+        for setting in settings_of(at_occupancy(s, level), failure, walk[:1], drive[:1])
+        for name in names
+    ]
+    settings = {
+        "version": __version__,
+        "scenarios": [s.name for s in scenarios],
+        "lot": args.fingerprint(lot),
+        "occupancy": args.fingerprint(occupancy),
+        "mapping": args.fingerprint(mapping),
+        "goal": goal,
+        "arrival": arrival,
+        "days": days,
+        "view_range": view_range,
+    }
+    out = out or Path("results/compare")
+    folder = ResultFolder(out, settings, resume=resume)
+    console = make_console()
+    interrupted = _run(console, cases + sweep, folder, args.worker_count(jobs), run_cases)
+
+    rows, sweep_rows = table(cases, folder), table(sweep, folder)
+    summary = {
+        "command": ["parkenv", *sys.argv[1:]],
+        "version": __version__,
+        "seed": seed,
+        "complete": not interrupted,
+        "rows": rows,
+        "occupancy_rows": sweep_rows,
+    }
+    order = [case.key(s) for case, its_seeds in cases + sweep for s in its_seeds]
+    folder.finish(order, summary, complete=not interrupted)
+    for printed in _tables(rows, console.width):
+        console.print(printed)
+    if interrupted:
+        console.print(f"Interrupted. What was finished is in {out}; the same command with --resume goes on.")
+        raise typer.Exit(130)
+    if figures:
+        with console.status("Drawing figures"):
+            _draw(out, rows, sweep_rows, cases, folder, seed)
+    console.print(f"Episodes, summary and figures are in {out}")
+
+
+def _levels(text: str) -> list[float]:
+    levels = args.numbers("--occupancy-levels", text)
+    for level in levels:
+        if not 0.0 < level < 1.0:
+            raise InputError(f"--occupancy-levels has {level:g}, want fractions between 0 and 1, or none")
+    return sorted(levels)
+
+
+def _run(console: Console, cases: list[Any], folder: Any, jobs: int, run_cases: Any) -> bool:
+    """Run with a progress bar; whether Ctrl-C ended it."""
+    progress = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("searches"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+    )
+    with progress:
+        bar = progress.add_task("Searching", total=sum(len(seeds) for _, seeds in cases))
+        try:
+            run_cases(cases, folder, jobs=jobs, on_progress=lambda n: progress.advance(bar, n))
+        except KeyboardInterrupt:
+            return True
+    return False
+
+
+Column = tuple[str, Callable[[Row], str]]
+
+_DETAILS: tuple[Column, ...] = (
+    ("drive", lambda r: _seconds(r["drive_s"])),
+    ("failed", lambda r: _seconds(r["failed_s"])),
+    ("walk", lambda r: _seconds(r["walk_s"])),
+    ("gave up", lambda r: _seconds(r["gave_up_s"])),
+    ("parked", lambda r: f"{r['parked_fraction']:.0%}"),
+    ("re-plans", lambda r: f"{r['replans']:.1f}"),
+    ("ms/decision", lambda r: f"{r['decision_ms']:.2f}" if "decision_ms" in r else ""),
+    ("p99", lambda r: f"{r['decision_ms_p99']:.2f}" if "decision_ms" in r else ""),
+)
+
+
+def _tables(rows: list[Row], width: int) -> list[Table]:
+    """The results of each setting, in one table or in two where the terminal is narrow."""
+    settings: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        key = (row["scenario"], row["failure_cost_s"], row["v_walk_kmh"], row["v_drive_kmh"])
+        settings.setdefault(key, []).append(row)
+    tables = []
+    for (name, failure, walk, drive), its_rows in settings.items():
+        first = its_rows[0]["agent"]
+        results: tuple[Column, ...] = (
+            ("total s [95 %]", lambda r: _interval(r["total_s"], r["total_s_ci95"])),
+            (f"minus {first} [95 %]", lambda r, a=first: _difference(r, a)),  # type: ignore[misc]
+            ("regret s", lambda r: _seconds(r["regret_s"])),
+        )
+        title = (
+            f"{name}: failure cost {failure:g} s, walk {walk:g} km/h, drive {drive:g} km/h, "
+            f"{its_rows[0]['episodes']} searches"
+        )
+        for columns in [results + _DETAILS] if width >= WIDE else [results, _DETAILS]:
+            headings = ("agent", *(heading for heading, _ in columns))
+            table = make_table(title if columns is not _DETAILS else None, headings)
+            for row in its_rows:
+                table.add_row(row["agent"], *(text(row) for _, text in columns))
+            tables.append(table)
+    return tables
+
+
+def _difference(row: Row, first_agent: str) -> str:
+    if row["agent"] == first_agent:
+        return ""
+    return _interval(row["difference_s"], row["difference_s_ci95"], signed=True)
+
+
+def _interval(mean: float, ends: list[float], *, signed: bool = False) -> str:
+    if ends[0] != ends[0]:
+        return _seconds(mean, signed)
+    return f"{_seconds(mean, signed)} [{_seconds(ends[0], signed)}, {_seconds(ends[1], signed)}]"
+
+
+def _seconds(value: float, signed: bool = False) -> str:
+    # Adding zero turns the -0.0 of a rounded difference into 0.0.
+    return f"{round(value, 1) + 0.0:{'+' if signed else ''}{'.0f' if abs(value) >= 1000 else '.1f'}}"
+
+
+PICTURED = ("greedy-goal", "first-free", "oracle")
+"""Agents whose paths are drawn beside the first agent's."""
+
+
+def _draw(
+    out: Path, rows: list[Any], sweep_rows: list[Any], cases: list[Any], folder: Any, seed: int
+) -> None:
+    from parkenv.evaluation.compare import against_occupancy
+    from parkenv.evaluation.search_pictures import save_searches
+    from parkenv.evaluation.time_figures import save_time_against_occupancy, save_time_split
+
+    for name in dict.fromkeys(row["scenario"] for row in rows):
+        save_time_split([r for r in rows if r["scenario"] == name], out / f"time_split_{name}.png")
+        swept = [{**r, "occupancy": r["occupancy_level"]} for r in sweep_rows if r["scenario"] == name]
+        if not swept:
+            recorded = [e for e in folder.episodes.values() if e["scenario"] == name]
+            swept = against_occupancy(recorded, (0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001))
+        if swept:
+            save_time_against_occupancy(swept, out / f"time_against_occupancy_{name}.png")
+        settings: dict[tuple[Any, ...], list[Any]] = {}
+        for case, _ in cases:
+            if case.scenario.name == name:
+                c = case.columns
+                settings.setdefault((c["failure_cost_s"], c["v_walk_kmh"], c["v_drive_kmh"]), []).append(case)
+        for (failure, walk, drive), its_cases in settings.items():
+            drawn = [its_cases[0], *(c for c in its_cases[1:] if c.agent in PICTURED)]
+            file = out / f"searches_{name}_failure{failure:g}_walk{walk:g}_drive{drive:g}.png"
+            save_searches([case.trace(seed) for case in drawn], file)

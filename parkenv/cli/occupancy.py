@@ -1,0 +1,88 @@
+"""`parkenv occupancy`: from a recorded log to rates."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from parkenv import __version__
+from parkenv.cli.tables import make_console, make_table
+
+app = typer.Typer(help="Learn from recorded occupancy.", no_args_is_help=True)
+
+
+@app.callback()
+def _occupancy() -> None:
+    """Learn from recorded occupancy."""
+
+
+@app.command()
+def fit(
+    log: Annotated[
+        Path, typer.Argument(help="A log: datetime,camera,slot_id,weather,occupied as .csv or .csv.gz.")
+    ],
+    max_gap_h: Annotated[
+        float, typer.Option("--max-gap-h", min=0.0, help="Looks farther apart than this, h, are not linked.")
+    ] = 2.0,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for process.json, rates.png, summary.json.")
+    ] = Path("results/occupancy"),
+) -> None:
+    """Fit arrival and departure rates to a log by maximum likelihood.
+
+    Every slot is a two-state Markov chain whose rates follow the hour, apart for weekdays and weekends,
+    and a factor of its own. The log shows it at single moments only; what may have happened in between is
+    counted in. The result, process.json, is an --occupancy for `parkenv compare`: on a lot of as many slots
+    as it is, on any other lot with the fullest slots nearest to the goal.
+    """
+    from parkenv.evaluation.rates_picture import save_rates
+    from parkenv.evaluation.results import make_folder, write_summary
+    from parkenv.occupancy_fit import fit_process
+    from parkenv.occupancy_log import OccupancyLog
+
+    make_folder(out)
+    console = make_console()
+    record = OccupancyLog.read(log)
+    with console.status("Fitting rates"):
+        fitted = fit_process(record, max_gap_s=3600.0 * max_gap_h)
+    process = fitted.process
+    process.to_file(out / "process.json")
+    save_rates(process, out / "rates.png", title=log.name)
+
+    def mean_rate(profile: str, day: int, hour: int) -> float:
+        return float(getattr(process, f"{profile}_profile")[24 * day + hour] * 3600.0)
+
+    rows = []
+    table = make_table(
+        f"{log.name}: {len(fitted.slot_ids)} slots, {fitted.n_intervals} intervals",
+        ("day", "hour", "arrivals an hour", "departures an hour", "occupied"),
+    )
+    for name, day in (("weekday", 0), ("weekend", 5)):
+        for hour in range(7, 19):
+            occupied = float(np.mean(process.marginal(86400.0 * day + 3600.0 * hour)))
+            rates = mean_rate("arrival", day, hour), mean_rate("departure", day, hour)
+            rows.append(
+                {
+                    "day": name,
+                    "hour": hour,
+                    "arrival_rate_per_h": rates[0],
+                    "departure_rate_per_h": rates[1],
+                    "occupancy": occupied,
+                }
+            )
+            table.add_row(name, f"{hour:02d}", f"{rates[0]:.3f}", f"{rates[1]:.3f}", f"{occupied:.0%}")
+    summary = {
+        "command": ["parkenv", *sys.argv[1:]],
+        "version": __version__,
+        "seed": None,
+        "log_likelihood": fitted.log_likelihood,
+        "intervals": fitted.n_intervals,
+        "rows": rows,
+    }
+    write_summary(out, summary)
+    console.print(table)
+    console.print(f"Process, picture and summary are in {out}")

@@ -1,0 +1,118 @@
+"""`parkenv plan`: what the thesis's planner makes of a lot."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from parkenv import __version__
+from parkenv.cli import arguments as args
+from parkenv.cli.tables import make_console, make_table
+from parkenv.errors import InputError
+
+
+def plan(
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            "--scenario",
+            help="A packaged scenario: campus, jam, street, mini.  [default: campus]",
+            rich_help_panel=args.WORLD,
+        ),
+    ] = None,
+    lot: args.LotOption = None,
+    occupancy: args.OccupancyOption = None,
+    mapping: args.MappingOption = None,
+    goal: args.GoalOption = None,
+    arrival: args.ArrivalOption = "08:00-13:00",
+    days: args.DaysOption = "weekdays",
+    view_range: args.ViewRangeOption = None,
+    agent: Annotated[str, typer.Option("--agent", help="A planning agent: mdp or mdp-static.")] = "mdp",
+    failure_cost: args.FailureCostOption = "10",
+    v_walk_kmh: args.WalkOption = "4",
+    v_drive_kmh: args.DriveOption = "10",
+    seed: args.SeedOption = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for plan.png and summary.json.")] = Path(
+        "results/plan"
+    ),
+) -> None:
+    """Plan a search, and drive it once in each setting, as in Fig. 4.9 to 4.12 of the thesis.
+
+    The picture shows at each slot the truth (inner disc) and the forecast (outer ring), an arrow for what
+    the plan says at each vertex, the path that was driven with re-planning, and the walk.
+
+    Examples:
+    * `parkenv plan --scenario jam --failure-cost 10,90`
+
+    * `parkenv plan --scenario campus --failure-cost 90 --v-walk-kmh 4,10`
+    """
+    import numpy as np
+
+    from parkenv.evaluation.compare import Case, settings_of
+    from parkenv.evaluation.results import make_folder, write_summary
+    from parkenv.evaluation.search_pictures import save_searches
+    from planners.agent import make_agent
+    from planners.replanning import StaticAgent
+
+    failure = args.positive("--failure-cost", args.numbers("--failure-cost", failure_cost), zero=True)
+    walk = args.positive("--v-walk-kmh", args.numbers("--v-walk-kmh", v_walk_kmh))
+    drive = args.positive("--v-drive-kmh", args.numbers("--v-drive-kmh", v_drive_kmh))
+    (base,) = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range)
+    if not isinstance(make_agent(agent, base), StaticAgent):
+        raise InputError(f"--agent {agent!r} makes no plan; known: mdp, mdp-static")
+    make_folder(out)
+
+    console = make_console()
+    headings = (
+        "failure s",
+        "walk",
+        "drive km/h",
+        "expected s",
+        "took s",
+        "driven m",
+        "slot",
+        "walked m",
+        "re-plans",
+    )
+    table = make_table(f"{base.name}: plans of {agent}, seed {seed}", headings)
+    rows, traces = [], []
+    with console.status("Planning"):
+        for setting in settings_of(base, failure, walk, drive):
+            case = Case(setting, agent)
+            trace = case.trace(seed)
+            planner = make_agent(agent, setting)
+            assert isinstance(planner, StaticAgent)
+            expected = planner.expected_time(trace.forecast)[trace.path[0]]
+            slots = [
+                setting.lot.slot_ids[v] if v < setting.lot.n_slots else f"junction {v}" for v in trace.path
+            ]
+            parked = slots[-1] if trace.metrics["parked"] else ""
+            row = {
+                **case.columns,
+                "expected_s": float(expected),
+                "slot": parked,
+                **trace.metrics,
+                "path": slots,
+            }
+            row["occupancy"] = float(np.mean(trace.occupied))
+            rows.append(row)
+            traces.append(trace)
+            table.add_row(
+                f"{setting.failure_s:g}",
+                f"{row['v_walk_kmh']:g}",
+                f"{row['v_drive_kmh']:g}",
+                f"{expected:.1f}",
+                f"{row['total_s']:.1f}",
+                f"{row['driven_m']:.0f}",
+                parked,
+                f"{row['walked_m']:.0f}",
+                str(row["replans"]),
+            )
+        save_searches(traces, out / "plan.png")
+    summary = {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "rows": rows}
+    write_summary(out, summary)
+    console.print(table)
+    console.print(f"Picture and summary are in {out}")

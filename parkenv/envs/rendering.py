@@ -1,0 +1,623 @@
+"""Pictures of a search, from above: frames for videos and windows, and text for terminals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Self
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.lot import ParkingLot
+from parkenv.occupancy import DAY_NAMES, DAY_S
+from parkenv.scenario import Scenario
+
+if TYPE_CHECKING:
+    from parkenv.envs.search import SearchState
+
+FloatArray = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Color = tuple[int, int, int]
+
+WIDTH, HEIGHT = 640, 480
+HUD = 34
+"""Height, px, of the line of text below the map."""
+HUD_MARGIN = 14
+KEY_WIDTH = 172
+"""Place, px, that the key to the colours takes at the right of that line."""
+MARGIN = 8
+"""Ground, px, left around the lot."""
+SMALLEST_SLOT = 4.0
+"""Width, px, below which the map no longer shows the whole lot but a window that moves with the car."""
+WINDOW_SLOT = 9.0
+"""Width, px, of a slot in such a window."""
+LARGEST_SCALE = 22.0
+"""px/m; a handful of slots need not fill the picture."""
+SUPERSAMPLING = 4
+
+BELIEF_ANCHORS: tuple[Color, ...] = (
+    (0, 128, 115),
+    (106, 190, 170),
+    (245, 238, 215),
+    (240, 150, 95),
+    (192, 50, 25),
+)
+"""Colours of P(taken) = 0, 1/4, 1/2, 3/4, 1: greenish to red, told apart with any colour vision."""
+
+GROUND: Color = (226, 228, 221)
+ASPHALT: Color = (112, 116, 122)
+BUILDING: Color = (190, 186, 178)
+WALL: Color = (122, 116, 108)
+PARKED_CAR: Color = (46, 52, 60)
+GLASS: Color = (128, 140, 152)
+CAR: Color = (255, 208, 0)
+INK: Color = (24, 27, 31)
+WALK: Color = (24, 82, 186)
+GAVE_UP: Color = (255, 140, 90)
+WHITE: Color = (255, 255, 255)
+
+_LANE_WIDTH = 5.5  # m
+_LINE_WIDTH = 0.14  # m, paint between slots
+_APRON = 0.6  # m, by which asphalt is longer and wider than the slot on it
+_ASPHALT_GAP = 2.0  # m, what is narrower between asphalt is asphalt
+_EDGE = 3.0  # m, around the lot's features
+_PALENESS = 0.62
+_SUBPIXEL_BITS = 4
+_FONT = cv2.FontFace("sans")
+
+TEXT_WIDTH, TEXT_ROWS = 78, 17
+"""Cells of the map in text: with its lines above and below it fits a terminal of 80 by 24."""
+TEXT_CELL_LEAST, TEXT_CELL = 1.25, 3.5
+"""Width, m, of a cell; wider ones would lump slots together, so larger lots show a window around the car."""
+
+
+def _belief_scale() -> Image:
+    """Colours, (2, 256, 3), of P(taken) = i/255: pale for slots not seen yet, full for those seen."""
+    anchors = np.array(BELIEF_ANCHORS, dtype=np.float64)
+    at = np.linspace(0.0, len(anchors) - 1.0, 256)
+    full = np.stack([np.interp(at, np.arange(len(anchors)), channel) for channel in anchors.T], axis=1)
+    pale = full + _PALENESS * (np.array(GROUND) - full)
+    return np.round(np.stack([pale, full])).astype(np.uint8)
+
+
+_BELIEF_SCALE = _belief_scale()
+
+
+def belief_colors(p_occupied: NDArray[np.floating], seen: NDArray[np.bool_]) -> Image:
+    """Colours, (n, 3) uint8 RGB, of slots that are taken with these probabilities, (n,)."""
+    colors: Image = _BELIEF_SCALE[seen.astype(np.intp), np.round(255.0 * p_occupied).astype(np.intp)]
+    return colors
+
+
+def clock(time: float) -> str:
+    """Weekday and time of day.
+
+    Args:
+        time: s since Monday 00:00.
+
+    Example:
+        >>> clock(86400.0 + 34867.0)
+        'Tue 09:41:07'
+    """
+    day, second = divmod(int(time), int(DAY_S))
+    return f"{DAY_NAMES[day % 7].title()} {second // 3600:02d}:{second // 60 % 60:02d}:{second % 60:02d}"
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """How the lot is laid on a picture: `pixels = xy @ turn * scale + shift`.
+
+    Attributes:
+        turn: (2, 2), north up, or north to the right.
+        scale: px/m.
+        shift: (2,) px.
+    """
+
+    turn: FloatArray
+    scale: float
+    shift: FloatArray
+
+    @classmethod
+    def fit(cls, xy: FloatArray, size: tuple[float, float], largest_scale: float = np.inf) -> Self:
+        """Show all points, (k, 2) m, in the middle of a picture of this width and height, px.
+
+        North is up unless the points then come out a good deal smaller than with north to the right.
+        """
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        extent = np.maximum(high - low, 1e-6)
+        upright, turned = (float(np.min(np.array(size) / e)) for e in (extent, extent[::-1]))
+        scale = turned if turned > 1.2 * upright else upright
+        return cls.around((low + high) / 2, size, min(scale, largest_scale), turned=scale > upright)
+
+    @classmethod
+    def around(
+        cls, center: FloatArray, size: tuple[float, float], scale: float, *, turned: bool = False
+    ) -> Self:
+        """Show the surroundings of a point, (2,) m, which comes to lie in the middle."""
+        turn = np.array([[0.0, 1.0], [1.0, 0.0]] if turned else [[1.0, 0.0], [0.0, -1.0]])
+        return cls(turn, scale, np.array(size) / 2 - center @ turn * scale)
+
+    def __call__(self, xy: FloatArray) -> FloatArray:
+        """Pixels, (..., 2), x right and y down, of points, (..., 2) m."""
+        pixels: FloatArray = xy @ self.turn * self.scale + self.shift
+        return pixels
+
+
+@dataclass(frozen=True, eq=False)
+class _Ground:
+    """What stays the same from frame to frame, and where the slots' colours go.
+
+    Attributes:
+        view: where it lies.
+        image: (HEIGHT, WIDTH, 3) uint8, the picture without slots.
+        slots: (m,) int64, the slots in the picture.
+        pixel: (k,) int64, index of each pixel that shows a slot, in the flattened picture.
+        slot: (k,) int64, which of `slots` it shows.
+        cover: (k,) float32, share of the pixel that is slot; the rest is paint.
+        car: (k, 3) float32, colour of a parked car there, times
+        car_cover: (k,) float32, the share of the pixel that it takes.
+    """
+
+    view: View
+    image: Image
+    slots: NDArray[np.int64]
+    pixel: NDArray[np.int64]
+    slot: NDArray[np.int64]
+    cover: NDArray[np.float32]
+    car: NDArray[np.float32]
+    car_cover: NDArray[np.float32]
+
+
+@njit(cache=True)
+def _paint_slots(
+    flat: Image,
+    pixel: NDArray[np.int64],
+    slot: NDArray[np.int64],
+    cover: NDArray[np.float32],
+    car: NDArray[np.float32],
+    car_cover: NDArray[np.float32],
+    colors: Image,
+    taken: NDArray[np.bool_],
+) -> None:
+    for i in range(len(pixel)):
+        s, p = slot[i], pixel[i]
+        for c in range(3):
+            value = flat[p, c] + cover[i] * (np.float32(colors[s, c]) - flat[p, c])
+            if taken[s]:
+                value = value * (np.float32(1.0) - car_cover[i]) + car[i, c]
+            flat[p, c] = np.uint8(value + np.float32(0.5))
+
+
+class SearchRenderer:
+    """Draws the searches of one scenario.
+
+    Ground, slots and cars are laid out once with high resolution; a frame then only mixes colours, so its
+    cost does not grow with the number of slots. A lot whose slots would come out less than
+    `SMALLEST_SLOT` px wide is shown through a window around the car, which moves on in half its size.
+
+    Args:
+        scenario: where the searches take place.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        self._ground: _Ground | None = None
+        self._window_at: tuple[int, int] | None = None
+        self._window: Any = None
+        self._size = (float(WIDTH), float(HEIGHT - HUD))
+        lot = scenario.lot
+        room = (self._size[0] - 2 * MARGIN, self._size[1] - 2 * MARGIN)
+        fitted = View.fit(_corners(lot), room, LARGEST_SCALE)
+        self._slot_width = float(np.median(np.minimum(lot.slot_width, lot.slot_length)))
+        self._whole: View | None = None
+        if fitted.scale * self._slot_width >= SMALLEST_SLOT:
+            self._whole = View(fitted.turn, fitted.scale, fitted.shift + MARGIN)
+
+    def frame(self, state: SearchState, occupied: NDArray[np.bool_]) -> Image:
+        """The search as it stands, (480, 640, 3) uint8 RGB.
+
+        A slot's colour is what the car believes, pale until it has seen the slot; the cars in the slots
+        are what is true, so this is a picture for spectators.
+
+        Args:
+            state: of an environment with the renderer's scenario.
+            occupied: (n_slots,) bool, the truth.
+        """
+        ground = self._ground_for(state)
+        image = ground.image.copy()
+        slots = ground.slots
+        _paint_slots(
+            image.reshape(-1, 3),
+            ground.pixel,
+            ground.slot,
+            ground.cover,
+            ground.car,
+            ground.car_cover,
+            belief_colors(state.belief.p_occupied[slots], state.belief.seen[slots]),
+            occupied[slots],
+        )
+        self._draw_trail(image, ground.view, state)
+        self._draw_goal(image, ground.view, state)
+        self._draw_car(image, ground.view, state)
+        self._draw_hud(image, state)
+        return image
+
+    def text(self, state: SearchState) -> str:
+        """The search as it stands, in at most 22 lines of 78 characters. Only what the car may know."""
+        lot, belief = self.scenario.lot, state.belief
+        starts, seen_from = self.scenario.slots_in_view
+        near = seen_from[starts[state.vertex] : starts[state.vertex + 1]]
+        looks = [f"{lot.slot_ids[s]} {'taken' if belief.p_occupied[s] > 0.5 else 'free'}" for s in near]
+        around = _fitting(looks, TEXT_WIDTH - len("in view: ")) or "no slot"
+        lines = [
+            f"{lot.name}: {self._place(state)}",
+            f"{clock(state.time)}  elapsed {state.time - state.arrival.time:.1f} s  "
+            f"failed tries {state.failed_parks}  seen {int(belief.seen.sum())}/{lot.n_slots}",
+            f"in view: {around}",
+            *self._text_map(state),
+            "seen: o free  # taken   not seen: . likely free  : open  % likely taken",
+            "<>^v car   + driven   G goal   E entry",
+        ]
+        return "\n".join(line[:TEXT_WIDTH] for line in lines)
+
+    def show(self, frame: Image, fps: float) -> None:
+        """Show a frame in a window, at most `fps` of them a second.
+
+        Raises:
+            InputError: pygame is not installed.
+        """
+        try:
+            import pygame
+        except ImportError as error:
+            raise InputError(
+                'render_mode "human" needs pygame, which is not installed: pip install "parkenv[human]"'
+            ) from error
+        if self._window is None:
+            pygame.display.init()
+            self._window = pygame.display.set_mode((WIDTH, HEIGHT)), pygame.time.Clock()
+            pygame.display.set_caption(f"parkenv: {self.scenario.name}")
+        screen, ticker = self._window
+        screen.blit(pygame.surfarray.make_surface(frame.swapaxes(0, 1)), (0, 0))
+        # Unanswered events make a desktop call the window frozen.
+        pygame.event.pump()
+        pygame.display.flip()
+        ticker.tick(fps)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            import pygame
+
+            pygame.display.quit()
+            self._window = None
+
+    def _ground_for(self, state: SearchState) -> _Ground:
+        if self._whole is not None:
+            if self._ground is None:
+                self._ground = _lay_out(self.scenario, self._whole)
+            return self._ground
+        # Where the window lies follows from where the car is alone: equal states, equal frames.
+        scale = WINDOW_SLOT / self._slot_width
+        stride = np.array(self._size) / scale / 2
+        column, row = np.round(self.scenario.lot.vertex_xy[state.vertex] / stride).astype(int)
+        if self._ground is None or self._window_at != (column, row):
+            self._window_at = column, row
+            center = np.array([column, row]) * stride
+            self._ground = _lay_out(self.scenario, View.around(center, self._size, scale))
+        return self._ground
+
+    def _pose(self, state: SearchState) -> tuple[FloatArray, float]:
+        """Where the car stands, (2,) m, and its yaw."""
+        lot, vertex = self.scenario.lot, state.vertex
+        if state.parked:
+            return lot.slot_xy[vertex], float(lot.slot_yaw[vertex])
+        ahead = lot.vertex_xy[vertex] - lot.vertex_xy[state.path[-2] if len(state.path) > 1 else vertex]
+        if not ahead.any():
+            ahead = _way_in(lot, vertex)
+        return lot.vertex_xy[vertex], float(np.arctan2(ahead[1], ahead[0]))
+
+    def _place(self, state: SearchState) -> str:
+        lot, vertex = self.scenario.lot, state.vertex
+        if state.parked:
+            return f"parked in slot {lot.slot_ids[vertex]}, {state.walk_s:.0f} s to walk"
+        if state.over:
+            return "every slot is taken, parking elsewhere"
+        return f"at slot {lot.slot_ids[vertex]}" if vertex < lot.n_slots else f"at junction {vertex}"
+
+    def _text_map(self, state: SearchState) -> list[str]:
+        lot, belief = self.scenario.lot, state.belief
+        size = (TEXT_WIDTH - 1.0, 2.0 * TEXT_ROWS - 1.0)  # a character is twice as high as wide
+        view = View.fit(_corners(lot), size, 1 / TEXT_CELL_LEAST)
+        if view.scale < 1 / TEXT_CELL:
+            view = View.around(lot.vertex_xy[state.vertex], size, 1 / TEXT_CELL)
+        rows = np.full((TEXT_ROWS, TEXT_WIDTH), " ")
+
+        def put(xy: FloatArray, glyphs: NDArray[np.str_]) -> None:
+            column, row = np.floor(view(xy) / [1.0, 2.0]).astype(int).T
+            here = (column >= 0) & (column < TEXT_WIDTH) & (row >= 0) & (row < TEXT_ROWS)
+            rows[row[here], column[here]] = glyphs[here]
+
+        # Where slots share a cell, the one most likely free is written last.
+        order = np.argsort(-belief.p_occupied, kind="stable")
+        likely = np.searchsorted([1 / 3, 2 / 3], belief.p_occupied)
+        glyphs = np.where(belief.seen, np.array(list("oo#"))[likely], np.array(list(".:%"))[likely])
+        put(lot.vertex_xy[state.path], np.full(len(state.path), "+"))
+        put(lot.slot_xy[order], glyphs[order])
+        put(lot.entries, np.full(len(lot.entries), "E"))
+        put(lot.goals[[self.scenario.goal]], np.array(["G"]))
+        xy, yaw = self._pose(state)
+        heading = np.array([np.cos(yaw), np.sin(yaw)]) @ view.turn
+        quarter = round(float(np.arctan2(heading[1], heading[0])) / (np.pi / 2)) % 4
+        put(xy[None], np.array([">v<^"[quarter]]))
+        return ["".join(row).rstrip() for row in rows]
+
+    def _draw_trail(self, image: Image, view: View, state: SearchState) -> None:
+        xy = self.scenario.lot.vertex_xy[state.path]
+        if state.parked:
+            xy = np.vstack([xy, self.scenario.lot.slot_xy[state.vertex]])
+        points = _fixed(view(xy))
+        ages = np.linspace(0, len(points) - 1, min(len(points), 25)).astype(int)
+        thickness = min(max(2, round(0.5 * view.scale)), 5)
+        for i, (first, last) in enumerate(pairwise(ages)):
+            fresh = 0.35 + 0.65 * (i + 1) / (len(ages) - 1)
+            color = _mixed(ASPHALT, CAR, fresh)
+            cv2.polylines(
+                image, [points[first : last + 1]], False, color, thickness, cv2.LINE_AA, _SUBPIXEL_BITS
+            )
+
+    def _draw_goal(self, image: Image, view: View, state: SearchState) -> None:
+        lot = self.scenario.lot
+        goal = view(lot.goals[self.scenario.goal])
+        if state.parked:
+            _dashes(image, view(lot.slot_xy[state.vertex]), goal, WALK)
+        low, high = np.full(2, 14.0), np.array(self._size) - 14.0
+        if (goal >= low).all() and (goal <= high).all():
+            _disc(image, goal, 11.0, WHITE)
+            _disc(image, goal, 9.5, WALK)
+            _label(image, "G", goal, WHITE, 13, 700)
+            return
+        middle = np.array(self._size) / 2
+        away = goal - middle
+        edge = middle + away * np.min((high - low) / 2 / np.maximum(np.abs(away), 1e-9))
+        yaw = float(np.arctan2(away[1], away[0]))
+        tip = np.array([[10.0, 0.0], [-8.0, 7.0], [-8.0, -7.0]]) @ _rotation(yaw)
+        _polygon(image, edge + 1.35 * tip, WHITE)
+        _polygon(image, edge + tip, WALK)
+        away_m = float(np.hypot(*(lot.goals[self.scenario.goal] - lot.vertex_xy[state.vertex])))
+        text = f"goal {away_m:.0f} m"
+        ahead = away / np.hypot(*away)
+        room = np.abs(ahead) @ [_text_width(text, 13, 700) / 2, 6.0] + 16.0
+        _label(image, text, edge - room * ahead, WALK, 13, 700, halo=True)
+
+    def _draw_car(self, image: Image, view: View, state: SearchState) -> None:
+        xy, yaw = self._pose(state)
+        at = view(xy)
+        if not state.parked:
+            center = _fixed(at)
+            radius = round(self.scenario.sighting.view_range * view.scale * 2**_SUBPIXEL_BITS)
+            cv2.circle(image, tuple(center), radius, WHITE, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+        heading = np.array([np.cos(yaw), np.sin(yaw)]) @ view.turn
+        turn = _rotation(float(np.arctan2(heading[1], heading[0])))
+        # A car that is not to be lost from sight may come out larger than life.
+        length = max(4.4 * view.scale, 17.0)
+        for part, color, swell in (
+            (_BODY, INK, 3.0),
+            (_BODY, CAR, 0.0),
+            (_WINDSCREEN, INK, 0.0),
+            (_REAR, INK, 0.0),
+        ):
+            _polygon(image, at + part * (np.array([length, 0.44 * length]) + swell) @ turn, color)
+
+    def _draw_hud(self, image: Image, state: SearchState) -> None:
+        parts = [
+            clock(state.time),
+            f"{state.time - state.arrival.time + state.walk_s + state.gave_up_s:.0f} s",
+            f"{state.failed_parks} failed",
+        ]
+        x, baseline = HUD_MARGIN, HEIGHT - HUD // 2 + 5
+        for part in parts:
+            x = _write(image, part, (x, baseline), WHITE, 15, 500) + 18
+        if state.parked:
+            place = f"parked in {self.scenario.lot.slot_ids[state.vertex]}"
+            for verdict in (f"{place}, {state.walk_s:.0f} s to walk", place, "parked"):
+                if x + _text_width(verdict, 15, 600) <= WIDTH - KEY_WIDTH:
+                    _write(image, verdict, (x, baseline), CAR, 15, 600)
+                    break
+        elif state.over:
+            _write(image, "lot is full", (x, baseline), GAVE_UP, 15, 600)
+
+
+def _fitting(words: list[str], width: int) -> str:
+    """As many words as fit, and how many more there are."""
+    for n in range(len(words), 0, -1):
+        text = ", ".join(words[:n]) + (f", +{len(words) - n}" if n < len(words) else "")
+        if len(text) <= width:
+            return text
+    return f"{len(words)} slots" if words else ""
+
+
+def _corners(lot: ParkingLot) -> FloatArray:
+    low_x, low_y, high_x, high_y = lot.bounds()
+    return np.array([[low_x - _EDGE, low_y - _EDGE], [high_x + _EDGE, high_y + _EDGE]])
+
+
+def _way_in(lot: ParkingLot, vertex: int) -> FloatArray:
+    """Unit vector, (2,), along the edge out of a vertex that leads most toward the slots."""
+    ahead = lot.vertex_xy[lot.neighbors[vertex][lot.neighbors[vertex] >= 0]] - lot.vertex_xy[vertex]
+    if not len(ahead):
+        return np.array([1.0, 0.0])
+    ahead /= np.hypot(ahead[:, 0], ahead[:, 1])[:, None]
+    best: FloatArray = ahead[np.argmax(ahead @ (lot.slot_xy.mean(axis=0) - lot.vertex_xy[vertex]))]
+    return best
+
+
+def _lay_out(scenario: Scenario, view: View) -> _Ground:
+    """Draw all that stays, at `SUPERSAMPLING` times the size, and average it down."""
+    lot = scenario.lot
+    fine = View(view.turn, view.scale * SUPERSAMPLING, view.shift * SUPERSAMPLING)
+    shape = ((HEIGHT - HUD) * SUPERSAMPLING, WIDTH * SUPERSAMPLING)
+    at = view(lot.slot_xy)
+    reach = view.scale * float(np.hypot(lot.slot_length, lot.slot_width).max()) / 2
+    inside = (at > -reach).all(axis=1) & (at < np.array([WIDTH, HEIGHT - HUD]) + reach).all(axis=1)
+    slots = np.flatnonzero(inside)
+    along = np.stack([np.cos(lot.slot_yaw), np.sin(lot.slot_yaw)], axis=1)[slots, None]
+    left = np.stack([-along[..., 1], along[..., 0]], axis=-1)
+    length, width = lot.slot_length[slots, None, None], lot.slot_width[slots, None, None]
+
+    def placed(part: FloatArray, long: FloatArray, wide: FloatArray) -> NDArray[np.int32]:
+        """A part of unit size, (k, 2), at every slot, (m, k, 2) fixed-point pixels."""
+        xy = lot.slot_xy[slots, None] + part[:, :1] * long * along + part[:, 1:] * wide * left
+        return _fixed(fine(xy))
+
+    image = np.full((*shape, 3), GROUND, dtype=np.uint8)
+    for wall in lot.walls:
+        if len(wall) > 3 and np.array_equal(wall[0], wall[-1]):
+            cv2.fillPoly(image, [_fixed(fine(wall))], BUILDING, cv2.LINE_8, _SUBPIXEL_BITS)
+    asphalt = np.zeros(shape, dtype=np.uint8)
+    lane_width = max(1, round(_LANE_WIDTH * fine.scale))
+    for lane in lot.lanes:
+        cv2.polylines(asphalt, [_fixed(fine(lane.points))], False, 1, lane_width, 8, _SUBPIXEL_BITS)
+    mouths = _fixed(fine(lot.vertex_xy[slots]))[:, None]
+    for corners in np.concatenate([placed(_BOX, length + _APRON, width + _APRON), mouths], axis=1):
+        cv2.fillConvexPoly(asphalt, cv2.convexHull(corners), 1, 8, _SUBPIXEL_BITS)
+    gap = max(1, round(_ASPHALT_GAP * fine.scale))
+    # Closing fills whatever is narrow, also between asphalt and the picture's edge: keep that away.
+    asphalt = cv2.copyMakeBorder(asphalt, gap, gap, gap, gap, cv2.BORDER_REPLICATE)
+    asphalt = cv2.morphologyEx(asphalt, cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8))
+    image[asphalt[gap:-gap, gap:-gap] > 0] = ASPHALT
+    for wall in lot.walls:
+        thickness = max(SUPERSAMPLING, round(0.3 * fine.scale))
+        cv2.polylines(image, [_fixed(fine(wall))], False, WALL, thickness, 8, _SUBPIXEL_BITS)
+    for xy, vertex in zip(lot.entries, lot.entry_vertices, strict=True):
+        way = _way_in(lot, int(vertex)) @ view.turn
+        arrow = SUPERSAMPLING * _ENTRY_MARK @ _rotation(float(np.arctan2(way[1], way[0])))
+        _polygon(image, fine(xy) + arrow, WHITE)
+
+    label = np.full(shape, -1, dtype=np.int32)
+    cars = np.zeros((*shape, 3), dtype=np.uint8)
+    has_car = np.zeros(shape, dtype=np.uint8)
+    line = max(_LINE_WIDTH, 0.8 / view.scale)
+    boxes = placed(_BOX, length - line, width - line)
+    long, wide = np.minimum(0.8 * length, 4.4), np.minimum(0.62 * width, 1.75)
+    bodies = placed(_BODY, long, wide)
+    glass = np.stack([placed(_WINDSCREEN, long, wide), placed(_REAR, long, wide)])
+    for i in range(len(slots)):
+        cv2.fillConvexPoly(image, boxes[i], WHITE, 8, _SUBPIXEL_BITS)
+        cv2.fillConvexPoly(label, boxes[i], i, 8, _SUBPIXEL_BITS)
+        cv2.fillConvexPoly(cars, bodies[i], PARKED_CAR, 8, _SUBPIXEL_BITS)
+        cv2.fillConvexPoly(has_car, bodies[i], 1, 8, _SUBPIXEL_BITS)
+        for pane in glass[:, i]:
+            cv2.fillConvexPoly(cars, pane, GLASS, 8, _SUBPIXEL_BITS)
+
+    blocks = _blocks(label)
+    owner = blocks.max(axis=-1)
+    pixel = np.flatnonzero(owner >= 0)
+    owner = owner.ravel()[pixel]
+    blocks = blocks.reshape(len(blocks) * WIDTH, -1)[pixel]
+    mine = blocks == owner[:, None]
+    cars_here = _blocks(has_car).reshape(-1, SUPERSAMPLING**2)[pixel]
+    colors = np.stack([_blocks(cars[..., c]).reshape(-1, SUPERSAMPLING**2)[pixel] for c in range(3)], axis=-1)
+    small = cv2.resize(image, (WIDTH, HEIGHT - HUD), interpolation=cv2.INTER_AREA)
+    return _Ground(
+        view=view,
+        image=_furnished(np.vstack([small, np.full((HUD, WIDTH, 3), INK, np.uint8)]), view),
+        slots=slots,
+        pixel=pixel,
+        slot=owner.astype(np.int64),
+        cover=mine.mean(axis=1, dtype=np.float32),
+        car=(colors * cars_here[..., None]).mean(axis=1, dtype=np.float32),
+        car_cover=cars_here.mean(axis=1, dtype=np.float32),
+    )
+
+
+def _blocks(fine: NDArray[Any]) -> NDArray[Any]:
+    """The fine pixels of each pixel, (rows, columns, SUPERSAMPLING ** 2)."""
+    rows, columns = fine.shape[0] // SUPERSAMPLING, fine.shape[1] // SUPERSAMPLING
+    split = fine.reshape(rows, SUPERSAMPLING, columns, SUPERSAMPLING)
+    return split.swapaxes(1, 2).reshape(rows, columns, SUPERSAMPLING**2)
+
+
+def _furnished(image: Image, view: View) -> Image:
+    """Add what belongs to the picture, not to the lot: the colours' key and the north."""
+    top = HEIGHT - HUD // 2 - 6
+    right = WIDTH - HUD_MARGIN
+    _label(image, "taken", np.array([right - 18.0, top + 6.0]), WHITE, 13, 400)
+    bar = np.linspace(0, 255, 72).astype(int)
+    image[top : top + 6, right - 116 : right - 44] = _BELIEF_SCALE[0, bar]
+    image[top + 6 : top + 12, right - 116 : right - 44] = _BELIEF_SCALE[1, bar]
+    _label(image, "free", np.array([right - 132.0, top + 6.0]), WHITE, 13, 400)
+    north = np.array([0.0, 1.0]) @ view.turn
+    at = np.array([float(WIDTH - 22), 24.0])
+    turn = _rotation(float(np.arctan2(north[1], north[0])))
+    _polygon(image, at + np.array([[11.0, 0.0], [-3.0, 5.0], [-1.0, 0.0], [-3.0, -5.0]]) @ turn, INK)
+    _label(image, "N", at - 12.0 * north, INK, 12, 600)
+    return image
+
+
+_BOX = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+_ENTRY_MARK = np.array([[9.0, 0.0], [-6.0, 8.0], [-2.0, 0.0], [-6.0, -8.0]])
+_CORNER = np.linspace(0, 2 * np.pi, 28, endpoint=False)
+_BODY = 0.5 * np.stack([np.sign(f) * np.abs(f) ** 0.4 for f in (np.cos(_CORNER), np.sin(_CORNER))], axis=1)
+"""Outline of a car of unit length and width, nose to +x."""
+_WINDSCREEN = np.array([[0.24, -0.40], [0.24, 0.40], [0.10, 0.32], [0.10, -0.32]])
+_REAR = np.array([[-0.36, -0.36], [-0.36, 0.36], [-0.26, 0.30], [-0.26, -0.30]])
+
+
+def _rotation(yaw: float) -> FloatArray:
+    """Matrix that turns row vectors by `yaw` in the picture's axes."""
+    return np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+
+
+def _fixed(pixels: FloatArray) -> NDArray[np.int32]:
+    """Pixels as OpenCV's fixed-point numbers; its pixel centres are whole numbers."""
+    fixed: NDArray[np.int32] = np.round((pixels - 0.5) * 2**_SUBPIXEL_BITS).astype(np.int32)
+    return fixed
+
+
+def _mixed(start: Color, end: Color, share: float) -> Color:
+    red, green, blue = (round(a + share * (b - a)) for a, b in zip(start, end, strict=True))
+    return red, green, blue
+
+
+def _polygon(image: Image, pixels: FloatArray, color: Color) -> None:
+    cv2.fillPoly(image, [_fixed(pixels)], color, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _disc(image: Image, at: FloatArray, radius: float, color: Color) -> None:
+    x, y = _fixed(at).tolist()
+    cv2.circle(image, (x, y), round(radius * 2**_SUBPIXEL_BITS), color, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _dashes(image: Image, start: FloatArray, end: FloatArray, color: Color) -> None:
+    n = max(1, round(float(np.hypot(*(end - start))) / 9.0))
+    ends = start + np.linspace(0, 1, 2 * n)[:, None] * (end - start)
+    for dash in _fixed(ends).reshape(n, 2, 2):
+        cv2.polylines(image, [dash], False, color, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def _write(image: Image, text: str, at: tuple[int, int], color: Color, size: int, weight: int) -> int:
+    """Write from a point of the baseline on; where the text ends, px."""
+    (right, _), _ = cv2.putText(image, text, at, color, _FONT, size, weight)
+    return int(right)
+
+
+def _text_width(text: str, size: int, weight: int) -> int:
+    _, _, width, _ = cv2.getTextSize((WIDTH, HEIGHT), text, (0, 0), _FONT, size, weight)
+    return int(width)
+
+
+def _label(
+    image: Image, text: str, at: FloatArray, color: Color, size: int, weight: int, *, halo: bool = False
+) -> None:
+    """Write a text with its middle at a point, kept inside the picture."""
+    width = _text_width(text, size, weight)
+    left = int(np.clip(round(at[0] - width / 2), 2, WIDTH - width - 2))
+    base = round(at[1] + 0.36 * size)
+    if halo:
+        for dx, dy in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+            cv2.putText(image, text, (left + dx, base + dy), WHITE, _FONT, size, weight)
+    cv2.putText(image, text, (left, base), color, _FONT, size, weight)

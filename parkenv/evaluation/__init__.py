@@ -1,0 +1,1 @@
+"""Agents compared: episodes, statistics, result folders and pictures."""

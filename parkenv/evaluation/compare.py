@@ -1,0 +1,190 @@
+"""Agents against each other in the same worlds: the runs, in parallel, and their summary."""
+
+from __future__ import annotations
+
+import itertools
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+
+from parkenv.errors import InputError
+from parkenv.evaluation.episodes import EpisodeRunner, SearchTrace
+from parkenv.evaluation.results import ResultFolder, Row, episode_key
+from parkenv.evaluation.statistics import mean_interval, summarize
+from parkenv.occupancy import ArrivalWindow, OccupancyProcess
+from parkenv.scenario import KMH, Scenario
+from planners.agent import make_agent
+
+BLOCK = 10
+"""Episodes a task: few enough to lose little to a crash, enough to make up for starting one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One scenario with the costs and speeds of one setting, met by one agent.
+
+    Attributes:
+        scenario: with the setting's costs and speeds.
+        agent: the agent's name.
+        occupancy_level: the mean occupancy that the world was set to; None where it was left as it is.
+    """
+
+    scenario: Scenario
+    agent: str
+    occupancy_level: float | None = None
+
+    @property
+    def columns(self) -> Row:
+        """What names this case in the tables."""
+        return {
+            "scenario": self.scenario.name,
+            "occupancy_level": self.occupancy_level,
+            "agent": self.agent,
+            "failure_cost_s": float(self.scenario.failure_s),
+            "v_walk_kmh": round(self.scenario.v_walk / KMH, 6),
+            "v_drive_kmh": round(self.scenario.v_drive / KMH, 6),
+        }
+
+    def key(self, seed: int) -> tuple[Any, ...]:
+        """The key of one of its episodes in a `ResultFolder`."""
+        return episode_key({**self.columns, "seed": seed})
+
+    def run(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row]]:
+        """Search once for each seed: rows of `episodes.csv` and of `timings.csv`."""
+        runner = EpisodeRunner(self.scenario, self.agent, make_agent(self.agent, self.scenario))
+        rows, timings = [], []
+        for seed in seeds:
+            episode = runner.run(seed)
+            rows.append({**self.columns, **episode.row})
+            microseconds = " ".join(str(round(1e6 * s)) for s in episode.decision_s)
+            timings.append({**self.columns, "seed": seed, "decisions_us": microseconds})
+        return rows, timings
+
+    def trace(self, seed: int) -> SearchTrace:
+        """One search, for a picture."""
+        return EpisodeRunner(self.scenario, self.agent, make_agent(self.agent, self.scenario)).run(seed).trace
+
+
+def settings_of(
+    scenario: Scenario,
+    failure_s: Sequence[float],
+    v_walk_kmh: Sequence[float],
+    v_drive_kmh: Sequence[float],
+) -> list[Scenario]:
+    """The scenario in every combination of failure cost, s, and speeds, km/h."""
+    return [
+        scenario.replace(failure_s=failure, v_walk=walk * KMH, v_drive=drive * KMH)
+        for failure, walk, drive in itertools.product(failure_s, v_walk_kmh, v_drive_kmh)
+    ]
+
+
+def at_occupancy(scenario: Scenario, level: float) -> Scenario:
+    """The scenario at the middle of its arrival window, made so full on average.
+
+    Raises:
+        InputError: its world is a record, which is as full as it is.
+    """
+    window = scenario.arrival
+    middle = (window.start_s + window.end_s) / 2
+    moment = ArrivalWindow(window.weekdays, middle, middle)
+
+    def adjusted(model: Any) -> Any:
+        if model is None:
+            return None
+        if not isinstance(model, OccupancyProcess):
+            raise InputError(f"scenario {scenario.name!r}: a recorded world cannot be made {level:.0%} full")
+        return model.at_mean_occupancy(level, window.weekdays[0] * 86400.0 + middle)
+
+    return scenario.replace(
+        arrival=moment, occupancy=adjusted(scenario.occupancy), prior=adjusted(scenario.prior)
+    )
+
+
+def run_cases(
+    cases: Sequence[tuple[Case, range]],
+    folder: ResultFolder,
+    *,
+    jobs: int = 1,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> None:
+    """Run what the folder does not hold yet.
+
+    Args:
+        cases: each with the seeds of its episodes.
+        folder: where finished episodes go.
+        jobs: worker processes. The result does not depend on it.
+        on_progress: told how many episodes have just been finished.
+
+    Raises:
+        KeyboardInterrupt: as it comes; what was finished is in the folder.
+    """
+    tasks = [
+        (case, block)
+        for case, seeds in cases
+        for block in _blocks([s for s in seeds if case.key(s) not in folder.episodes])
+    ]
+    done = sum(len(seeds) for _, seeds in cases) - sum(len(block) for _, block in tasks)
+    on_progress(done)
+    with Parallel(
+        n_jobs=jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs"
+    ) as parallel:
+        for rows, timings in parallel(delayed(case.run)(block) for case, block in tasks):
+            folder.add(rows, timings)
+            on_progress(len(rows))
+
+
+def _blocks(seeds: Sequence[int]) -> Iterator[Sequence[int]]:
+    for i in range(0, len(seeds), BLOCK):
+        yield seeds[i : i + BLOCK]
+
+
+def table(cases: Sequence[tuple[Case, range]], folder: ResultFolder) -> list[Row]:
+    """A row for every case that has finished episodes, in order; differences are to the first agent's."""
+    rows = []
+    first: dict[tuple[Any, ...], list[Row]] = {}
+    for case, seeds in cases:
+        keys = [key for s in seeds if (key := case.key(s)) in folder.episodes]
+        if not keys:
+            continue
+        episodes = [folder.episodes[key] for key in keys]
+        columns = case.columns
+        setting = tuple(v for k, v in columns.items() if k != "agent")
+        decision_s = list(itertools.chain.from_iterable(folder.decision_s(key) for key in keys))
+        rows.append(summarize(columns, episodes, first.get(setting), decision_s))
+        first.setdefault(setting, episodes)
+    return rows
+
+
+def against_occupancy(rows: Sequence[Row], edges: Sequence[float]) -> list[Row]:
+    """Total time against how full the lot was at the arrival, from episodes as they came.
+
+    Args:
+        rows: episodes.
+        edges: ends of the bins of occupancy, ascending.
+
+    Returns:
+        Rows with agent, failure_cost_s, occupancy (the bin's mean), total_s, total_s_ci95, episodes.
+    """
+    bins: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
+    for row in rows:
+        place = int(np.searchsorted(edges, row["occupancy"], side="right")) - 1
+        if 0 <= place < len(edges) - 1:
+            bins[row["agent"], row["failure_cost_s"], place].append(row)
+    result = []
+    for (agent, failure, _), inside in sorted(bins.items(), key=lambda item: item[0][1:]):
+        mean, low, high = mean_interval([r["total_s"] for r in inside])
+        result.append(
+            {
+                "agent": agent,
+                "failure_cost_s": failure,
+                "occupancy": float(np.mean([r["occupancy"] for r in inside])),
+                "episodes": len(inside),
+                "total_s": mean,
+                "total_s_ci95": [low, high],
+            }
+        )
+    return result

@@ -1,0 +1,209 @@
+"""The folder of a comparison: what is finished stays finished, whatever happens to the process.
+
+`settings.json` says what was asked for, `episodes.csv` gains a line for every finished search,
+`timings.csv` one with the wall time of its decisions, and `summary.json` is written at the end.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from parkenv.errors import InputError
+from parkenv.whole_files import written_whole
+
+SETTING_COLUMNS = ("scenario", "occupancy_level", "agent", "failure_cost_s", "v_walk_kmh", "v_drive_kmh")
+EPISODE_COLUMNS = (
+    *SETTING_COLUMNS,
+    "seed",
+    "day",
+    "arrival_s",
+    "occupancy",
+    "slot",
+    "parked",
+    "truncated",
+    "total_s",
+    "drive_s",
+    "failed_s",
+    "walk_s",
+    "gave_up_s",
+    "bound_s",
+    "driven_m",
+    "walked_m",
+    "failed_parks",
+    "slots_passed",
+    "replans",
+    "steps",
+)
+TIMING_COLUMNS = (*SETTING_COLUMNS, "seed", "decisions_us")
+
+_TEXT = {"scenario", "agent", "day", "slot", "decisions_us"}
+_WHOLE = {"seed", "failed_parks", "slots_passed", "replans", "steps"}
+_BOOL = {"parked", "truncated"}
+
+SUMMARY = "summary.json"
+SUMMARY_PARTIAL = "summary.partial.json"
+
+Row = dict[str, Any]
+Key = tuple[Any, ...]
+
+
+def write_summary(folder: Path, summary: Mapping[str, Any], name: str = SUMMARY) -> None:
+    """Write a command's summary as strict JSON; numbers that do not exist become null."""
+    _write_text(folder / name, json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder for results and make sure that it can be written, before any work is done.
+
+    Raises:
+        InputError: it cannot be made or written.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / f".probe.{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"--out {path}: cannot be written ({error.strerror})") from error
+
+
+def episode_key(row: Mapping[str, Any]) -> Key:
+    """What makes an episode this one: its setting, agent and seed."""
+    return (*(row[c] for c in SETTING_COLUMNS), row["seed"])
+
+
+class ResultFolder:
+    """Collects episodes as they finish.
+
+    Args:
+        path: the folder; made where it does not exist.
+        settings: what was asked for; anything that changes the outcome of an episode.
+        resume: go on from the episodes that an earlier run with the same settings left.
+
+    Attributes:
+        episodes: finished episodes by key.
+
+    Raises:
+        InputError: the folder cannot be written; it holds an unfinished run and `resume` is not set; or
+            `resume` is set and the settings differ.
+    """
+
+    def __init__(self, path: Path, settings: Mapping[str, Any], *, resume: bool = False) -> None:
+        make_folder(path)
+        self.path = path
+        self.episodes: dict[Key, Row] = {}
+        self._timings: dict[Key, Row] = {}
+        settings_file = path / "settings.json"
+        if resume:
+            self._check_settings(settings_file, settings)
+            self.episodes = {episode_key(r): r for r in _read(path / "episodes.csv", EPISODE_COLUMNS)}
+            self._timings = {episode_key(r): r for r in _read(path / "timings.csv", TIMING_COLUMNS)}
+        elif (path / "episodes.csv").exists() and not (path / SUMMARY).exists():
+            raise InputError(
+                f"--out {path}: holds an unfinished comparison; add --resume to go on with it, or name another folder"
+            )
+        (path / SUMMARY).unlink(missing_ok=True)
+        _write_text(settings_file, json.dumps(dict(settings), indent=2) + "\n")
+        # Rewritten from what could be read: a line that a crash tore is gone, and its episode runs again.
+        _write_text(path / "episodes.csv", _csv_text(EPISODE_COLUMNS, self.episodes.values(), header=True))
+        _write_text(path / "timings.csv", _csv_text(TIMING_COLUMNS, self._timings.values(), header=True))
+
+    def add(self, rows: Sequence[Row], timings: Sequence[Row]) -> None:
+        """Append finished episodes; on the disk when this returns."""
+        # Timings first: an episode whose line is there is finished, and is not run again for its timing.
+        _append(self.path / "timings.csv", _csv_text(TIMING_COLUMNS, timings))
+        _append(self.path / "episodes.csv", _csv_text(EPISODE_COLUMNS, rows))
+        self._timings |= {episode_key(r): r for r in timings}
+        self.episodes |= {episode_key(r): r for r in rows}
+
+    def decision_s(self, key: Key) -> list[float]:
+        """Wall time of the decisions of an episode, s; empty where a crash lost them."""
+        row = self._timings.get(key)
+        return [int(us) * 1e-6 for us in row["decisions_us"].split()] if row else []
+
+    def finish(self, order: Iterable[Key], summary: Mapping[str, Any], *, complete: bool = True) -> None:
+        """Put the episodes in order and write the summary.
+
+        The order is the one asked for, not the one in which they finished, so that the file is the same
+        for any number of jobs. The summary of an incomplete run is called `summary.partial.json`.
+        """
+        wanted = [key for key in order if key in self.episodes]
+        rows = [self.episodes[key] for key in wanted]
+        timings = [self._timings[key] for key in wanted if key in self._timings]
+        _write_text(self.path / "episodes.csv", _csv_text(EPISODE_COLUMNS, rows, header=True))
+        _write_text(self.path / "timings.csv", _csv_text(TIMING_COLUMNS, timings, header=True))
+        (self.path / SUMMARY_PARTIAL).unlink(missing_ok=True)
+        write_summary(self.path, summary, SUMMARY if complete else SUMMARY_PARTIAL)
+
+    def _check_settings(self, file: Path, settings: Mapping[str, Any]) -> None:
+        if not file.exists():
+            raise InputError(f"--resume: {file.parent} holds no comparison to go on with")
+        before = json.loads(file.read_text(encoding="utf-8"))
+        now = json.loads(json.dumps(dict(settings)))
+        for name in sorted(before.keys() | now.keys()):
+            if before.get(name) != now.get(name):
+                raise InputError(
+                    f"--resume: {name} was {before.get(name)!r} in {file.parent}, now it is {now.get(name)!r}; "
+                    "use the same settings, or another folder"
+                )
+
+
+def _write_text(path: Path, text: str) -> None:
+    with written_whole(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
+def _csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]], *, header: bool = False) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    if header:
+        writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def _append(path: Path, text: str) -> None:
+    with path.open("a", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _read(path: Path, columns: Sequence[str]) -> list[Row]:
+    """The whole lines of a file that `_append` wrote."""
+    if not path.exists():
+        return []
+    whole, _, _ = path.read_text(encoding="utf-8").rpartition("\n")
+    rows = []
+    for raw in csv.DictReader(whole.splitlines()):
+        if tuple(raw) != tuple(columns) or None in raw.values():
+            raise InputError(f"{path}: not written by this version of parkenv; use another folder")
+        rows.append({name: _parse(name, value) for name, value in raw.items()})
+    return rows
+
+
+def _parse(name: str, value: str) -> Any:
+    if name in _TEXT:
+        return value
+    if name in _BOOL:
+        return value == "True"
+    if name in _WHOLE:
+        return int(value)
+    return float(value) if value else None
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no NaN: an interval that does not exist is null."""
+    if isinstance(value, Mapping):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and value != value:
+        return None
+    return value

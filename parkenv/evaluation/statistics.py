@@ -1,0 +1,107 @@
+"""Means with intervals, and the table that a comparison comes down to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+RESAMPLES = 9999
+
+
+def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float, float]:
+    """Mean and bootstrap interval (bias-corrected and accelerated) of a sample.
+
+    Args:
+        values: (n,) numbers.
+        confidence: coverage of the interval.
+
+    Returns:
+        Mean, lower and upper end. The ends equal the mean where all values are the same, and are NaN
+        where there are fewer than two. The resampling has a fixed seed: equal samples, equal intervals.
+
+    Example:
+        >>> mean_interval([1.0, 1.0, 1.0])
+        (1.0, 1.0, 1.0)
+    """
+    sample = np.asarray(values, dtype=np.float64)
+    if len(sample) == 0:
+        return np.nan, np.nan, np.nan
+    mean = float(sample.mean())
+    if len(sample) < 2:
+        return mean, np.nan, np.nan
+    if np.ptp(sample) == 0.0:
+        return mean, mean, mean
+    interval = stats.bootstrap(
+        (sample,),
+        np.mean,
+        confidence_level=confidence,
+        n_resamples=RESAMPLES,
+        batch=max(1, 4_000_000 // len(sample)),
+        rng=np.random.default_rng(0),
+    ).confidence_interval
+    return mean, float(interval.low), float(interval.high)
+
+
+MEANS = (
+    "drive_s",
+    "failed_s",
+    "walk_s",
+    "gave_up_s",
+    "failed_parks",
+    "replans",
+    "driven_m",
+    "walked_m",
+    "slots_passed",
+    "occupancy",
+    "bound_s",
+)
+"""Columns of an episode that the table gives as plain means."""
+
+
+def summarize(
+    columns: Mapping[str, Any],
+    episodes: Sequence[Mapping[str, Any]],
+    first: Sequence[Mapping[str, Any]] | None = None,
+    decision_s: ArrayLike = (),
+) -> dict[str, Any]:
+    """One row of the table: what an agent achieved in one setting.
+
+    Args:
+        columns: what names the row: scenario, agent, costs and speeds.
+        episodes: rows of `episodes.csv`.
+        first: the rows of the agent to compare with, for the paired difference; those with the same seed
+            are paired. None for that agent itself.
+        decision_s: (k,) wall time of single decisions, s.
+    """
+    total = _column(episodes, "total_s")
+    mean, low, high = mean_interval(total)
+    row: dict[str, Any] = {
+        **columns,
+        "episodes": len(episodes),
+        "parked_fraction": float(_column(episodes, "parked").mean()),
+        "total_s": mean,
+        "total_s_ci95": [low, high],
+        "difference_s": 0.0,
+        "difference_s_ci95": [0.0, 0.0],
+    }
+    if first is not None:
+        theirs = {e["seed"]: e["total_s"] for e in first}
+        paired = [e["total_s"] - theirs[e["seed"]] for e in episodes if e["seed"] in theirs]
+        mean, low, high = mean_interval(paired)
+        row |= {"difference_s": mean, "difference_s_ci95": [low, high]}
+    row |= {name: float(_column(episodes, name).mean()) for name in MEANS}
+    mean, low, high = mean_interval(total - _column(episodes, "bound_s"))
+    row |= {"regret_s": mean, "regret_s_ci95": [low, high]}
+    milliseconds = 1e3 * np.asarray(decision_s, dtype=np.float64)
+    if len(milliseconds):
+        row["decision_ms"] = float(np.median(milliseconds))
+        row["decision_ms_p99"] = float(np.quantile(milliseconds, 0.99))
+    return row
+
+
+def _column(episodes: Sequence[Mapping[str, Any]], name: str) -> NDArray[np.float64]:
+    return np.array([e[name] for e in episodes], dtype=np.float64)

@@ -1,0 +1,76 @@
+"""Random numbers that are a pure function of (key, stream, slot, index).
+
+Nothing is stored between draws, so a world does not depend on who looks, at which slot, or in which order.
+The mixing function is the finaliser of SplitMix64 (Steele, Lea, Flood, "Fast splittable pseudorandom number
+generators", OOPSLA 2014), applied once for each of stream, slot and index.
+"""
+
+import math
+import operator
+
+import numpy as np
+from numba import njit
+
+from parkenv.errors import InputError
+
+# What the numbers are for; two purposes must not share a stream.
+ARRIVAL_STREAM = 0
+OCCUPANCY_STREAM = 1
+ENTRY_STREAM = 2
+SIGHTING_STREAM = 3
+
+_WORD_BITS = 64
+_WORD = (1 << _WORD_BITS) - 1
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
+_MIX_1 = np.uint64(0xBF58476D1CE4E5B9)
+_MIX_2 = np.uint64(0x94D049BB133111EB)
+_SHIFT_30 = np.uint64(30)
+_SHIFT_27 = np.uint64(27)
+_SHIFT_31 = np.uint64(31)
+_SHIFT_12 = np.uint64(12)
+
+
+@njit(cache=True)
+def _mix64(word: np.uint64) -> np.uint64:
+    z = np.uint64(word)
+    z = (z ^ (z >> _SHIFT_30)) * _MIX_1
+    z = (z ^ (z >> _SHIFT_27)) * _MIX_2
+    return z ^ (z >> _SHIFT_31)
+
+
+@njit(cache=True)
+def keyed_uniform(key: np.uint64, stream: int, slot: int, index: int) -> float:
+    """Uniform float64 in the open interval (0, 1), callable from Python and from compiled code.
+
+    `key` comes from `world_key`; `stream`, `slot` and `index` are non-negative integers below 2**63.
+    """
+    # Every operand is cast by hand: uint64 with int64 would be promoted to float64.
+    h = _mix64(np.uint64(key) + _GOLDEN * np.uint64(stream))
+    h = _mix64(h + _GOLDEN * np.uint64(slot))
+    h = _mix64(h + _GOLDEN * np.uint64(index))
+    # 52 bits and a half: neither 0 nor 1 can come out.
+    return (float(h >> _SHIFT_12) + 0.5) * 2.0**-52
+
+
+@njit(cache=True)
+def keyed_exponential(key: np.uint64, stream: int, slot: int, index: int) -> float:
+    """Exponential float64 with mean 1, always positive and finite; arguments as in `keyed_uniform`."""
+    return -math.log(keyed_uniform(key, stream, slot, index))
+
+
+def world_key(seed: int, episode: int) -> np.uint64:
+    """Mix a seed and an episode number, non-negative integers of any size, into the key of one world.
+
+    >>> len({world_key(0, 1), world_key(0, 1), world_key(1, 0)})
+    2
+    """
+    state = 0
+    for name, given in (("seed", seed), ("episode", episode)):
+        number = operator.index(given)
+        if number < 0:
+            raise InputError(f"{name}: got {number}, wanted an integer >= 0")
+        n_words = max(1, -(-number.bit_length() // _WORD_BITS))
+        # The number of words goes in first, so that no two (seed, episode) pairs spell the same words.
+        for word in (n_words, *((number >> (_WORD_BITS * i)) & _WORD for i in range(n_words))):
+            state = int(_mix64(np.uint64((state + int(_GOLDEN) + word) & _WORD)))
+    return np.uint64(state)

@@ -1,0 +1,436 @@
+"""The drive graph of a lot: where a car can stop, and which stop leads to which.
+
+Every slot has one vertex, the point on the lane before its mouth; lane ends and crossings are the
+further vertices. A two-way lane carries one directed chain of slot vertices a side, kept to the right
+of the centre line, so a car passes the slots on its right in order, turns round at the lane's ends,
+and may swing across to the slots opposite. A one-way lane carries a single chain that serves both of
+its sides. Everything is array work, so that a million slots take seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from parkenv.errors import InputError
+
+LANE_OFFSET = 1.5
+"""Distance, m, of a slot's vertex from the centre line of a two-way lane, to the right of travel."""
+SLOT_REACH = 8.0
+"""Farthest, m, that a slot's mouth may lie from the centre line of the lane that serves it."""
+ENTRY_REACH = 15.0
+"""Farthest, m, that an entry may lie from a lane."""
+VERTEX_SPACING = 1.0
+"""Least distance, m, between two slot vertices on one chain, so that every move takes time."""
+SWING_REACH = 3.0
+"""Farthest, m along the lane, that a car swings across to a slot on the other side."""
+NODE_TOLERANCE = 1e-3
+"""Lane points closer than this, m, are one junction."""
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class GraphProblem:
+    """Why a drive graph cannot be made: kind of feature, its index among its kind, the reason, and where."""
+
+    kind: str
+    index: int
+    message: str
+    xy: tuple[float, float]  # m
+
+
+class GraphError(InputError):
+    """A lot whose lanes, slots and entries do not fit together; `problems` lists all of them."""
+
+    def __init__(self, problems: Sequence[GraphProblem]) -> None:
+        self.problems = tuple(problems)
+        first = self.problems[0]
+        more = f" (and {len(self.problems) - 1} more)" if len(self.problems) > 1 else ""
+        super().__init__(f"{first.kind} {first.index}: {first.message}{more}")
+
+
+@dataclass(frozen=True, eq=False)
+class DriveGraph:
+    """Vertices 0..n_slots-1 belong to the slots in order; the rest are junctions and lane ends.
+
+    Attributes:
+        vertex_xy: (n_vertices, 2) float64, m, lot frame.
+        vertex_yaw: (n_vertices,) float64, rad: the direction of travel at a slot's vertex, 0 elsewhere.
+        neighbors: (n_vertices, 4) int32, columns up, down, left, right; -1 where there is no edge.
+        edge_length: (n_vertices, 4) float64, m; 0 where there is no edge.
+        entry_vertices: (n_entries,) int64.
+    """
+
+    vertex_xy: FloatArray
+    vertex_yaw: FloatArray
+    neighbors: NDArray[np.int32]
+    edge_length: FloatArray
+    entry_vertices: IntArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Centrelines:
+    """All lanes in one row of points; `station` is a running length that never decreases along it.
+
+    A segment is the stretch of one lane between two neighbouring nodes, a leg a straight piece.
+    """
+
+    xy: FloatArray  # (n_points, 2)
+    station: FloatArray  # (n_points,)
+    leg_start: IntArray  # (n_legs,) index of the point where the leg starts
+    leg_tangent: FloatArray  # (n_legs, 2) unit vectors
+    leg_segment: IntArray  # (n_legs,)
+    segment_nodes: IntArray  # (n_segments, 2) node at the start and at the end
+    segment_stations: FloatArray  # (n_segments, 2)
+    segment_oneway: NDArray[np.bool_]  # (n_segments,)
+    node_xy: FloatArray  # (n_nodes, 2)
+
+    def legs_at(self, station: FloatArray) -> IntArray:
+        """The leg on which each station lies."""
+        leg = np.searchsorted(self.station[self.leg_start], station, side="right") - 1
+        return np.clip(leg, 0, len(self.leg_start) - 1)
+
+    def points_at(self, station: FloatArray, leg: IntArray) -> FloatArray:
+        start = self.leg_start[leg]
+        return self.xy[start] + (station - self.station[start])[:, None] * self.leg_tangent[leg]
+
+
+def build_drive_graph(
+    lanes: Sequence[tuple[FloatArray, bool]],
+    mouth_xy: FloatArray,
+    entry_xy: FloatArray,
+) -> DriveGraph:
+    """Tie slots and entries to lanes, and link what can be driven.
+
+    Args:
+        lanes: pairs of a centre line, (k, 2) m, and whether it is one-way in the order of its points.
+            Lanes meet where they share a point.
+        mouth_xy: (n_slots, 2) m, the middle of the side by which each slot is entered.
+        entry_xy: (n_entries, 2) m.
+
+    Raises:
+        GraphError: a slot or an entry that no lane serves, or a junction of more than four lanes.
+    """
+    lanes, entry_point = _with_entry_points(lanes, entry_xy)
+    lines = _centrelines(lanes)
+    n_slots = len(mouth_xy)
+
+    station, leg, left = _attach_slots(lines, mouth_xy)
+    segment = lines.leg_segment[leg]
+    # Chain 2k runs along segment k and serves its right side, 2k+1 runs against it and serves the left;
+    # a one-way segment has the first only.
+    against = left & ~lines.segment_oneway[segment]
+    chain = 2 * segment + against
+    order = np.lexsort((station * np.where(against, -1.0, 1.0), chain))
+    station = _spread(lines, station, segment, chain, order)
+
+    leg = lines.legs_at(station)
+    tangent = lines.leg_tangent[leg] * np.where(against, -1.0, 1.0)[:, None]
+    right = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
+    offset = np.where(lines.segment_oneway[segment], 0.0, LANE_OFFSET)
+    slot_vertex_xy = lines.points_at(station, leg) + offset[:, None] * right
+
+    edges = _chain_edges(lines, station, tangent, chain, order, n_slots)
+    edges += _swing_edges(lines, station, tangent, segment, against)
+    source, target, length, bearing = (np.concatenate(part) for part in zip(*edges, strict=True))
+    neighbors, edge_length = _four_columns(
+        n_slots + len(lines.node_xy), n_slots, lines.node_xy, source, target, length, bearing
+    )
+    vertex_yaw = np.zeros(n_slots + len(lines.node_xy))
+    vertex_yaw[:n_slots] = np.arctan2(tangent[:, 1], tangent[:, 0])
+    return DriveGraph(
+        vertex_xy=np.concatenate([slot_vertex_xy, lines.node_xy]),
+        vertex_yaw=vertex_yaw,
+        neighbors=neighbors,
+        edge_length=edge_length,
+        entry_vertices=n_slots + np.asarray(cKDTree(lines.node_xy).query(entry_point)[1], dtype=np.int64),
+    )
+
+
+def _with_entry_points(
+    lanes: Sequence[tuple[FloatArray, bool]], entry_xy: FloatArray
+) -> tuple[list[tuple[FloatArray, bool]], FloatArray]:
+    """Give the lane nearest to each entry a point there (twice, so that it becomes a node)."""
+    lanes = list(lanes)
+    points = np.empty((len(entry_xy), 2))
+    problems = []
+    for i, xy in enumerate(entry_xy):
+        lines = linestrings([centre for centre, _ in lanes])
+        spot = shapely.Point(xy)
+        distance = np.asarray(shapely.distance(lines, spot))
+        k = int(np.argmin(distance))
+        if distance[k] > ENTRY_REACH:
+            reason = f"is {distance[k]:.1f} m from the nearest lane, want at most {ENTRY_REACH:g} m"
+            problems.append(GraphProblem("entry", i, reason, (float(xy[0]), float(xy[1]))))
+            continue
+        centre, oneway = lanes[k]
+        along = shapely.line_locate_point(lines[k], spot)
+        station = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(centre, axis=0).T))])
+        nearest = int(np.argmin(np.abs(station - along)))
+        if abs(station[nearest] - along) > NODE_TOLERANCE:
+            nearest = int(np.searchsorted(station, along))
+            on_lane = shapely.get_coordinates(shapely.line_interpolate_point(lines[k], along))
+            centre = np.insert(centre, nearest, on_lane, axis=0)
+        points[i] = centre[nearest]
+        if 0 < nearest < len(centre) - 1:
+            # Two lanes that meet at the entry make it a node.
+            lanes[k : k + 1] = [(centre[: nearest + 1], oneway), (centre[nearest:], oneway)]
+    if problems:
+        raise GraphError(problems)
+    return lanes, points
+
+
+def linestrings(parts: Sequence[FloatArray]) -> NDArray[np.object_]:
+    """Shapely lines, (len(parts),), through (k, 2) points each."""
+    which = np.repeat(np.arange(len(parts)), [len(points) for points in parts])
+    return np.atleast_1d(np.asarray(shapely.linestrings(np.concatenate(parts), indices=which)))
+
+
+def places(xy: FloatArray) -> IntArray:
+    """Number the places, (n,): points closer than `NODE_TOLERANCE` are at the same one."""
+    near = cKDTree(xy).query_pairs(NODE_TOLERANCE, output_type="ndarray")
+    graph = coo_array((np.ones(len(near), dtype=bool), (near[:, 0], near[:, 1])), shape=(len(xy), len(xy)))
+    _, place = connected_components(graph, directed=False)
+    return np.asarray(place, dtype=np.int64)
+
+
+def _centrelines(lanes: Sequence[tuple[FloatArray, bool]]) -> _Centrelines:
+    xy = np.concatenate([centre for centre, _ in lanes])
+    count = np.array([len(centre) for centre, _ in lanes])
+    oneway = np.array([oneway for _, oneway in lanes])
+    lane = np.repeat(np.arange(len(lanes)), count)
+    last = np.cumsum(count) - 1
+    is_end = np.zeros(len(xy), dtype=bool)
+    is_end[last] = True
+    is_end[last - count + 1] = True
+
+    place = places(xy)
+    is_node = is_end | (np.bincount(place)[place] > 1)
+    cut = np.flatnonzero(is_node)
+    loops = (lane[cut[:-1]] == lane[cut[1:]]) & (place[cut[:-1]] == place[cut[1:]]) & (np.diff(cut) > 1)
+    # A lane that comes back to where it left would be an edge to itself: stop once on the way round.
+    is_node[(cut[:-1][loops] + cut[1:][loops]) // 2] = True
+    cut = np.flatnonzero(is_node)
+
+    same_lane = lane[:-1] == lane[1:]
+    leg_start = np.flatnonzero(same_lane)
+    step = xy[leg_start + 1] - xy[leg_start]
+    leg_length = np.hypot(*step.T)
+    run = np.zeros(len(xy))
+    run[leg_start + 1] = leg_length
+    station = np.cumsum(run)
+
+    in_segment = lane[cut[:-1]] == lane[cut[1:]]
+    first, end = cut[:-1][in_segment], cut[1:][in_segment]
+    _, node = np.unique(place[cut], return_inverse=True)
+    node_of_point = np.full(len(xy), -1)
+    node_of_point[cut] = node
+    node_xy = np.empty((node.max() + 1, 2))
+    node_xy[node[::-1]] = xy[cut[::-1]]  # where points differ by less than the tolerance the first one counts
+    return _Centrelines(
+        xy=xy,
+        station=station,
+        leg_start=leg_start,
+        leg_tangent=step / leg_length[:, None],
+        leg_segment=np.searchsorted(first, leg_start, side="right") - 1,
+        segment_nodes=np.stack([node_of_point[first], node_of_point[end]], axis=1),
+        segment_stations=np.stack([station[first], station[end]], axis=1),
+        segment_oneway=oneway[lane[first]],
+        node_xy=node_xy,
+    )
+
+
+def _attach_slots(
+    lines: _Centrelines, mouth_xy: FloatArray
+) -> tuple[FloatArray, IntArray, NDArray[np.bool_]]:
+    """Station, leg and side (True: left of the lane's direction) of the lane point nearest each mouth."""
+    start = lines.leg_start
+    ends = np.stack([lines.xy[start], lines.xy[start + 1]], axis=1)
+    tree = shapely.STRtree(np.asarray(shapely.linestrings(ends)))
+    (found, leg), distance = tree.query_nearest(
+        shapely.points(mouth_xy), all_matches=False, return_distance=True
+    )
+    problems = [
+        GraphProblem(
+            "slot",
+            int(i),
+            f"is on no lane: the nearest is {d:.1f} m from its mouth, want at most {SLOT_REACH:g} m",
+            (float(mouth_xy[i, 0]), float(mouth_xy[i, 1])),
+        )
+        for i, d in zip(found, distance, strict=True)
+        if d > SLOT_REACH
+    ]
+    if problems:
+        raise GraphError(problems)
+    leg = leg[np.argsort(found)].astype(np.int64)
+    away = mouth_xy - lines.xy[start[leg]]
+    tangent = lines.leg_tangent[leg]
+    leg_length = lines.station[start[leg] + 1] - lines.station[start[leg]]
+    along = np.clip((away * tangent).sum(axis=1), 0.0, leg_length)
+    left = tangent[:, 0] * away[:, 1] - tangent[:, 1] * away[:, 0] > 0.0
+    return lines.station[start[leg]] + along, leg, left
+
+
+def _spread(
+    lines: _Centrelines, station: FloatArray, segment: IntArray, chain: IntArray, order: IntArray
+) -> FloatArray:
+    """Move vertices along their lane as little as keeps them apart from each other and from its nodes."""
+    if not len(order):
+        return station
+    sign = np.where(chain % 2 == 1, -1.0, 1.0)
+    low, high = np.sort(lines.segment_stations[segment] * sign[:, None], axis=1).T
+    sorted_chain = chain[order]
+    starts = np.flatnonzero(np.r_[True, sorted_chain[1:] != sorted_chain[:-1]])
+    size = np.diff(np.r_[starts, len(order)])
+    rank = np.arange(len(order)) - np.repeat(starts, size)
+    size = np.repeat(size, size)
+    low, high, wanted = low[order], high[order], (station * sign)[order]
+    gap = np.minimum(VERTEX_SPACING, (high - low) / (size + 1))
+    # With k gaps taken off, "each at least a gap after the one before" is a running maximum per chain.
+    shift = np.cumsum(np.r_[0.0, np.where(sorted_chain[1:] != sorted_chain[:-1], 1.0, 0.0)])
+    stride = float(np.max(high - low)) + 1.0
+    free = np.clip(wanted - low, gap, high - low - gap)
+    pushed = np.maximum.accumulate(free - rank * gap + shift * stride * 2) - shift * stride * 2 + rank * gap
+    room = high - low - (size - rank) * gap
+    spread = np.empty_like(station)
+    spread[order] = (low + np.minimum(pushed, room)) * sign[order]
+    return spread
+
+
+Edges = tuple[IntArray, IntArray, FloatArray, FloatArray]
+
+
+def _chain_edges(
+    lines: _Centrelines,
+    station: FloatArray,
+    tangent: FloatArray,
+    chain: IntArray,
+    order: IntArray,
+    n_slots: int,
+) -> list[Edges]:
+    """From node to slot to slot to node along every chain: sources, targets, lengths and bearings."""
+    n_segments = len(lines.segment_oneway)
+    drivable = np.ones(2 * n_segments, dtype=bool)
+    drivable[1::2] = ~lines.segment_oneway
+    chains = np.flatnonzero(drivable)
+    segment, against = chains // 2, chains % 2 == 1
+    first_node = np.where(against, lines.segment_nodes[segment, 1], lines.segment_nodes[segment, 0])
+    last_node = np.where(against, lines.segment_nodes[segment, 0], lines.segment_nodes[segment, 1])
+    first_at = np.where(against, lines.segment_stations[segment, 1], lines.segment_stations[segment, 0])
+    last_at = np.where(against, lines.segment_stations[segment, 0], lines.segment_stations[segment, 1])
+    # The first leg of a segment starts where the segment does, its last leg ends there.
+    first_leg = np.searchsorted(lines.leg_segment, segment, side="left")
+    last_leg = np.searchsorted(lines.leg_segment, segment, side="right") - 1
+    leaving = lines.leg_tangent[np.where(against, last_leg, first_leg)]
+    leaving = leaving * np.where(against, -1.0, 1.0)[:, None]
+
+    # One row of stops: each chain's first node, its slots in order, its last node.
+    stop_chain = np.concatenate([chains, chain[order], chains])
+    stop_rank = np.concatenate([np.zeros(len(chains)), np.ones(len(order)), np.full(len(chains), 2.0)])
+    stop_vertex = np.concatenate([n_slots + first_node, order, n_slots + last_node])
+    stop_station = np.concatenate([first_at, station[order], last_at])
+    stop_direction = np.concatenate([leaving, tangent[order], leaving])
+    row = np.lexsort((np.arange(len(stop_chain)), stop_rank, stop_chain))
+    linked = stop_chain[row][:-1] == stop_chain[row][1:]
+    here, there = row[:-1][linked], row[1:][linked]
+    direction = stop_direction[here]
+    return [
+        (
+            stop_vertex[here],
+            stop_vertex[there],
+            np.abs(stop_station[there] - stop_station[here]),
+            np.arctan2(direction[:, 1], direction[:, 0]),
+        )
+    ]
+
+
+def _swing_edges(
+    lines: _Centrelines,
+    station: FloatArray,
+    tangent: FloatArray,
+    segment: IntArray,
+    against: NDArray[np.bool_],
+) -> list[Edges]:
+    """From a slot's vertex across a two-way lane to the nearest one of the other side."""
+    edges = []
+    two_way = ~lines.segment_oneway[segment]
+    for side in (False, True):
+        here = np.flatnonzero(two_way & (against == side))
+        there = np.flatnonzero(two_way & (against != side))
+        if not len(here) or not len(there):
+            continue
+        there = there[np.argsort(station[there], kind="stable")]
+        after = np.searchsorted(station[there], station[here])
+        before = np.clip(after - 1, 0, len(there) - 1)
+        after = np.clip(after, 0, len(there) - 1)
+        ahead, behind = (np.abs(station[there[i]] - station[here]) for i in (after, before))
+        mate = np.where(ahead < behind, there[after], there[before])
+        along = np.abs(station[mate] - station[here])
+        linked = (along <= SWING_REACH) & (segment[mate] == segment[here])
+        here, mate, along = here[linked], mate[linked], along[linked]
+        # Across means to the left of the direction of travel.
+        bearing = np.arctan2(tangent[here, 0], -tangent[here, 1])
+        edges.append((here, mate, np.hypot(2 * LANE_OFFSET, along), bearing))
+    return edges
+
+
+_COLUMN_BEARINGS = np.array([np.pi / 2, -np.pi / 2, np.pi, 0.0])
+_CHUNK = 65536
+
+
+def _four_columns(
+    n_vertices: int,
+    n_slots: int,
+    node_xy: FloatArray,
+    source: IntArray,
+    target: IntArray,
+    length: FloatArray,
+    bearing: FloatArray,
+) -> tuple[NDArray[np.int32], FloatArray]:
+    """Assign every vertex's edges to up, down, left, right so that the bearings fit best in sum.
+
+    The assignment problem has at most 4! solutions, so all of them are tried, for many vertices at once.
+    """
+    order = np.argsort(source, kind="stable")
+    source, target, length, bearing = source[order], target[order], length[order], bearing[order]
+    degree = np.bincount(source, minlength=n_vertices)
+    crowded = np.flatnonzero(degree > 4)
+    if len(crowded):
+        spots = node_xy[crowded - n_slots].tolist()
+        raise GraphError(
+            [
+                GraphProblem(
+                    "junction",
+                    int(v - n_slots),
+                    f"at ({x:.1f}, {y:.1f}) m has {degree[v]} lanes that lead away; "
+                    "up, down, left and right leave room for 4",
+                    (x, y),
+                )
+                for v, (x, y) in zip(crowded, spots, strict=True)
+            ]
+        )
+    rank = np.arange(len(source)) - np.repeat(np.cumsum(degree) - degree, degree)
+    misfit = np.zeros((n_vertices, 4, 4))  # vertex, edge, column; an edge that is not there fits everywhere
+    misfit[source, rank] = 1.0 - np.cos(bearing[:, None] - _COLUMN_BEARINGS)
+    choices = np.array(list(permutations(range(4))))
+    column = np.empty((n_vertices, 4), dtype=np.int64)
+    for i in range(0, n_vertices, _CHUNK):
+        total = np.zeros((len(misfit[i : i + _CHUNK]), len(choices)))
+        for edge in range(4):
+            total += misfit[i : i + _CHUNK, edge][:, choices[:, edge]]
+        column[i : i + _CHUNK] = choices[np.argmin(total, axis=1)]
+    neighbors = np.full((n_vertices, 4), -1, dtype=np.int32)
+    edge_length = np.zeros((n_vertices, 4))
+    neighbors[source, column[source, rank]] = target
+    edge_length[source, column[source, rank]] = length
+    return neighbors, edge_length

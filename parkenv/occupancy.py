@@ -1,0 +1,554 @@
+"""Which slots are taken when: the contracts of a world, and a process that generates worlds.
+
+Times are seconds since Monday 00:00 of the scenario's week; rates are 1/s.
+"""
+
+import json
+import math
+import os
+import re
+from collections import OrderedDict
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+
+from parkenv.errors import InputError
+from parkenv.keyed_random import ARRIVAL_STREAM, OCCUPANCY_STREAM, keyed_exponential, keyed_uniform
+from parkenv.whole_files import written_whole
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+HOUR_S = 3600.0
+DAY_S = 86_400.0
+WEEK_S = 604_800.0
+WEEK_HOURS = 168
+DAY_NAMES = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+DAY_GROUPS = {"weekdays": (0, 1, 2, 3, 4), "weekend": (5, 6), "all": (0, 1, 2, 3, 4, 5, 6)}
+
+# No forecast is certain: a planner must be able to recover from a wrong one.
+MIN_PROBABILITY = 0.001
+MAX_PROBABILITY = 0.999
+
+MAX_RATE = 1e3
+_CACHE_BYTES = 1 << 26
+_NEVER_WEEKS = 1e9
+_FORGOTTEN = 1e-17
+_FORMAT = "parkenv-occupancy-process"
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class ArrivalWindow:
+    """When searches begin: on which weekdays, and between which times of day.
+
+    Args:
+        weekdays: Monday = 0 ... Sunday = 6, none twice.
+        start_s: first second of the day, in [0, 86400).
+        end_s: end of the window (not in it), in [start_s, 86400]; equal to start_s means that very moment.
+    """
+
+    weekdays: tuple[int, ...] = (0, 1, 2, 3, 4)
+    start_s: float = 8 * HOUR_S
+    end_s: float = 13 * HOUR_S
+
+    def __post_init__(self) -> None:
+        days = tuple(self.weekdays)
+        if not days or len(set(days)) != len(days) or not set(days) <= set(range(7)):
+            raise InputError(
+                f"ArrivalWindow.weekdays: got {days}, wanted different numbers from 0 (Mon) to 6 (Sun)"
+            )
+        if not 0 <= self.start_s < DAY_S:
+            raise InputError(f"ArrivalWindow.start_s: got {self.start_s}, wanted seconds in [0, 86400)")
+        if not self.start_s <= self.end_s <= DAY_S:
+            raise InputError(
+                f"ArrivalWindow.end_s: got {self.end_s}, wanted seconds in [start_s={self.start_s}, 86400]"
+            )
+        object.__setattr__(self, "weekdays", days)
+
+    @classmethod
+    def parse(cls, hours: str, days: str = "weekdays") -> Self:
+        """Read a window as a user types it.
+
+        >>> ArrivalWindow.parse("08:00-09:30", days="mon,sat")
+        ArrivalWindow(weekdays=(0, 5), start_s=28800.0, end_s=34200.0)
+
+        Args:
+            hours: `HH:MM-HH:MM`, with 24:00 allowed as the end.
+            days: `weekdays`, `weekend`, `all`, or names as in `mon,tue`.
+        """
+        match = re.fullmatch(r"\s*(\d{1,2}):([0-5]\d)\s*-\s*(\d{1,2}):([0-5]\d)\s*", hours)
+        if match is None:
+            raise InputError(f"arrival hours: got {hours!r}, wanted HH:MM-HH:MM, for example 08:00-13:00")
+        start_h, start_min, end_h, end_min = map(int, match.groups())
+        names = [name.strip() for name in days.lower().split(",")]
+        if days.lower() in DAY_GROUPS:
+            weekdays: tuple[int, ...] = DAY_GROUPS[days.lower()]
+        elif set(names) <= set(DAY_NAMES):
+            weekdays = tuple(DAY_NAMES.index(name) for name in names)
+        else:
+            wanted = f"{', '.join(DAY_GROUPS)}, or some of {','.join(DAY_NAMES)}"
+            raise InputError(f"arrival days: got {days!r}, wanted {wanted}")
+        return cls(weekdays, start_h * HOUR_S + start_min * 60.0, end_h * HOUR_S + end_min * 60.0)
+
+    def draw_second(self, key: np.uint64) -> float:
+        """Second of the day, uniform in the window; the world's key decides."""
+        return self.start_s + float(keyed_uniform(key, ARRIVAL_STREAM, 0, 1)) * (self.end_s - self.start_s)
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """The moment at which a search begins.
+
+    Args:
+        time: s since Monday 00:00.
+        day: ISO date of the recorded day that the world replays; empty where nothing is replayed.
+    """
+
+    time: float
+    day: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """What is known of a lot before anything has been seen.
+
+    Args:
+        p_occupied: (n,) float64, probability at the arrival.
+        relaxation_rate: (n,) float64, 1/s, arrival rate plus departure rate: how fast a sighting goes stale.
+    """
+
+    p_occupied: FloatArray
+    relaxation_rate: FloatArray
+
+
+class World(Protocol):
+    """The hidden truth of one episode; any slots, any times from the arrival on, in any order."""
+
+    def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
+        """(k,) bool: is each of the slots (k,) taken at `time`?"""
+
+    def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
+        """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
+
+
+class OccupancyModel(Protocol):
+    """Draws arrivals and worlds, and says what can be known beforehand."""
+
+    @property
+    def n_slots(self) -> int:
+        """Number of slots."""
+
+    def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
+        """The arrival of the episode with this key."""
+
+    def world(self, key: np.uint64, arrival: Arrival) -> World:
+        """The world of the episode with this key."""
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        """What is known at the arrival; it never peeks at the world."""
+
+
+@njit(cache=True)
+def _hour_of_week(time: float) -> tuple[float, int, float]:
+    """Week, hour of the week and second of the hour."""
+    week = np.floor(time / WEEK_S)
+    second = time - week * WEEK_S
+    hour = min(int(second // HOUR_S), WEEK_HOURS - 1)
+    return week, hour, second - hour * HOUR_S
+
+
+@njit(cache=True)
+def _time_after(profile: FloatArray, table: FloatArray, since: float, hazard: float) -> float:
+    """When the hazard that a unit slot has gathered since `since` reaches `hazard`; table[-1] must be > 0."""
+    week, hour, second = _hour_of_week(since)
+    target = table[hour] + profile[hour] * second + hazard
+    more_weeks = np.floor(target / table[WEEK_HOURS])
+    if not more_weeks < _NEVER_WEEKS:
+        return np.inf
+    rest = target - more_weeks * table[WEEK_HOURS]
+    # table[hour] < rest <= table[hour + 1], hence a positive rate, but for rounding at the ends.
+    hour = min(max(np.searchsorted(table, rest) - 1, 0), WEEK_HOURS - 1)
+    second = min((rest - table[hour]) / profile[hour], HOUR_S) if profile[hour] > 0.0 else 0.0
+    end: float = max((week + more_weeks) * WEEK_S + hour * HOUR_S + second, since)
+    return end
+
+
+@njit(cache=True)
+def _marginal(arrival_factor: float, departure_factor: float, profiles: FloatArray, time: float) -> float:
+    """P(occupied) at `time` in the periodic regime of p' = λ(t)(1−p) − μ(t)p.
+
+    The affine map over the week that ends at `time` is gathered backwards, latest piece first, so it can
+    stop as soon as the past is forgotten. A slot that never changes has no regime; it gets 0.5.
+    """
+    _, now, second = _hour_of_week(time)
+    p, gain, gathered = 0.0, 1.0, 0.0
+    for back in range(WEEK_HOURS + 1):
+        duration = HOUR_S
+        if back == 0:
+            duration = second
+        elif back == WEEK_HOURS:
+            duration = HOUR_S - second
+        hour = (now - back) % WEEK_HOURS
+        arrival = arrival_factor * profiles[0, hour]
+        rate = arrival + departure_factor * profiles[1, hour]
+        if rate > 0.0:
+            moved = -math.expm1(-rate * duration)
+            p += gain * (arrival / rate) * moved
+            gain *= 1.0 - moved
+            gathered += rate * duration
+            if gain < _FORGOTTEN:
+                return float(p)
+    return float(p / -math.expm1(-gathered)) if gathered > 0.0 else 0.5
+
+
+@njit(cache=True)
+def _marginals(factors: FloatArray, profiles: FloatArray, time: float) -> FloatArray:
+    p = np.empty(factors.shape[1])
+    for slot in range(p.size):
+        p[slot] = _marginal(factors[0, slot], factors[1, slot], profiles, time)
+    return p
+
+
+@njit(cache=True)
+def _holding_end(
+    key: np.uint64,
+    slot: int,
+    flip: int,
+    state: int,
+    since: float,
+    factors: FloatArray,
+    profiles: FloatArray,
+    tables: FloatArray,
+) -> float:
+    factor = factors[state, slot]
+    if factor * tables[state, WEEK_HOURS] <= 0.0:
+        return np.inf
+    hazard = keyed_exponential(key, OCCUPANCY_STREAM, slot, flip) / factor
+    end: float = _time_after(profiles[state], tables[state], since, hazard)
+    return end
+
+
+@njit(cache=True)
+def seek(
+    slot: int,
+    time: float,
+    key: np.uint64,
+    arrival: float,
+    factors: FloatArray,
+    profiles: FloatArray,
+    tables: FloatArray,
+    span: FloatArray,
+    flips: IntArray,
+    states: NDArray[np.uint8],
+) -> None:
+    """Move one slot's cursor to the stretch of constant state that holds `time` (compiled; for batches too).
+
+    Args:
+        slot: index of the slot.
+        time: s, at or after `arrival`.
+        key: the world's key.
+        arrival: s, when the world begins.
+        factors: (2, n) float64, arrival and departure factors.
+        profiles: (2, 168) float64, 1/s.
+        tables: (2, 169) float64, cumulative hazards of the profiles.
+        span: (n, 2) float64, s, changed in place: begin and end of the stretch.
+        flips: (n,) int64, changed in place: stretches begun so far, 0 = cursor not set.
+        states: (n,) uint8, changed in place: 1 = occupied. Rows of factors, profiles and tables are the
+            rates of leaving state 0 and state 1.
+    """
+    if flips[slot] == 0 or time < span[slot, 0]:
+        p = _marginal(factors[0, slot], factors[1, slot], profiles, arrival)
+        states[slot] = 1 if keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < p else 0
+        flips[slot] = 1
+        span[slot, 0] = arrival
+        span[slot, 1] = _holding_end(key, slot, 1, states[slot], arrival, factors, profiles, tables)
+    while time >= span[slot, 1]:
+        states[slot] = 1 - states[slot]
+        flips[slot] += 1
+        span[slot, 0] = span[slot, 1]
+        span[slot, 1] = _holding_end(
+            key, slot, flips[slot], states[slot], span[slot, 0], factors, profiles, tables
+        )
+
+
+@njit(cache=True)
+def _look(
+    slots: IntArray,
+    time: float,
+    key: np.uint64,
+    arrival: float,
+    factors: FloatArray,
+    profiles: FloatArray,
+    tables: FloatArray,
+    span: FloatArray,
+    flips: IntArray,
+    states: NDArray[np.uint8],
+) -> BoolArray:
+    occupied = np.empty(slots.size, np.bool_)
+    for i, slot in enumerate(slots):
+        if not 0 <= slot < flips.size:
+            raise IndexError("slot index out of range")
+        seek(slot, time, key, arrival, factors, profiles, tables, span, flips, states)
+        occupied[i] = states[slot] == 1
+    return occupied
+
+
+class ProcessWorld:
+    """One episode of an `OccupancyProcess`: a pure function of (process, key, arrival).
+
+    Lazy: only slots that are looked at cost anything. A slot keeps a cursor on its latest stretch; a query
+    before the cursor starts that slot again, so answers never depend on the order of the queries.
+    """
+
+    def __init__(self, process: "OccupancyProcess", key: np.uint64, arrival: Arrival) -> None:
+        if not math.isfinite(arrival.time):
+            raise InputError(f"Arrival.time: got {arrival.time}, wanted finite seconds")
+        n = process.n_slots
+        # np.zeros takes memory from the system untouched, so a million slots that nobody sees cost nothing.
+        self._span = np.zeros((n, 2))
+        self._flips = np.zeros(n, np.int64)
+        self._states = np.zeros(n, np.uint8)
+        self.process = process
+        self.key = np.uint64(key)
+        self.arrival = arrival
+
+    def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
+        """(k,) bool: is each of the slots (k,) taken at `time`, which is at or after the arrival?"""
+        return self._look(np.asarray(slots, np.int64), time)
+
+    def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
+        """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
+        slots = np.asarray(slots, np.int64)
+        return np.where(self._look(slots, time), self._span[slots, 1], time)
+
+    def _look(self, slots: IntArray, time: float) -> BoolArray:
+        arrival = self.arrival.time
+        if not arrival <= time < math.inf:
+            raise InputError(f"time: got {time}, wanted finite seconds at or after the arrival at {arrival}")
+        process = self.process
+        occupied: BoolArray = _look(
+            slots,
+            float(time),
+            self.key,
+            float(arrival),
+            process.factors,
+            process.profiles,
+            process.tables,
+            self._span,
+            self._flips,
+            self._states,
+        )
+        return occupied
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyProcess:
+    """Every slot an independent two-state Markov chain in continuous time, with rates that repeat weekly.
+
+    A free slot s is taken at the rate `arrival_factor[s] * arrival_profile[h]`, a taken one is left at the
+    rate `departure_factor[s] * departure_profile[h]`; h is the hour of the week, 0 = Monday 00:00 to 01:00.
+
+    Args:
+        arrival_factor: (n,) float64, no unit, >= 0.
+        arrival_profile: (168,) float64, 1/s, >= 0.
+        departure_factor: (n,) float64, no unit, >= 0.
+        departure_profile: (168,) float64, 1/s, >= 0.
+
+    Attributes:
+        factors: (2, n) float64, read-only, the two factors stacked; row = the state that is left.
+        profiles: (2, 168) float64, 1/s, read-only, likewise.
+        tables: (2, 169) float64, read-only, the profiles' hazard gathered since Monday 00:00, at full hours.
+
+    Raises:
+        InputError: a wrong shape, a value that is negative or not finite, or a rate above 1000/s.
+    """
+
+    arrival_factor: FloatArray
+    arrival_profile: FloatArray
+    departure_factor: FloatArray
+    departure_profile: FloatArray
+    factors: FloatArray = field(init=False, repr=False)
+    profiles: FloatArray = field(init=False, repr=False)
+    tables: FloatArray = field(init=False, repr=False)
+    _hour_marginals: OrderedDict[int, FloatArray] = field(init=False, repr=False, default_factory=OrderedDict)
+
+    def __post_init__(self) -> None:
+        arrival = _checked("arrival_factor", self.arrival_factor)
+        factors = np.stack([arrival, _checked("departure_factor", self.departure_factor, arrival.size)])
+        names = ("arrival_profile", "departure_profile")
+        profiles = np.stack([_checked(name, getattr(self, name), WEEK_HOURS) for name in names])
+        fastest = float((factors.max(axis=1) * profiles.max(axis=1)).max())
+        if not fastest <= MAX_RATE:
+            raise InputError(
+                f"OccupancyProcess: got a rate of {fastest:g}/s, wanted factor * profile <= {MAX_RATE:g}"
+            )
+        tables = np.pad(np.cumsum(profiles * HOUR_S, axis=1), ((0, 0), (1, 0)))
+        for name, array in (("factors", factors), ("profiles", profiles), ("tables", tables)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        for name, row in zip(_FIELDS, (factors[0], profiles[0], factors[1], profiles[1]), strict=True):
+            object.__setattr__(self, name, row)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return OccupancyProcess, tuple(getattr(self, name) for name in _FIELDS)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "OccupancyProcess":
+        return self  # immutable: copies of a world share it
+
+    @classmethod
+    def from_demand(cls, attraction: ArrayLike, demand: ArrayLike, mean_stay_s: float = 2 * HOUR_S) -> Self:
+        """Process whose equilibrium occupancy has the logit `attraction[s] + demand[h]`.
+
+        Args:
+            attraction: (n,) float64, logit, how much a slot is liked.
+            demand: (168,) float64, logit, by hour of the week.
+            mean_stay_s: s, mean time that a car stays, the same for all slots and hours.
+        """
+        if not 0 < mean_stay_s < math.inf:
+            raise InputError(f"mean_stay_s: got {mean_stay_s}, wanted seconds > 0")
+        attraction, demand = np.asarray(attraction, float), np.asarray(demand, float)
+        for name, logits in (("attraction", attraction), ("demand", demand)):
+            # Past this even the exponential leaves the floating-point range.
+            if not np.all(np.abs(logits) <= 300):
+                raise InputError(f"{name}: wanted finite logits between -300 and 300")
+        return cls(
+            np.exp(attraction),
+            np.exp(demand) / mean_stay_s,
+            np.ones(attraction.shape),
+            np.full(WEEK_HOURS, 1 / mean_stay_s),
+        )
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> Self:
+        """Read what `to_file` wrote; InputError names the file and what is wrong with it."""
+        try:
+            content = json.loads(Path(path).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise InputError(
+                f"{path}: {error.strerror or error}, wanted an occupancy process file"
+            ) from error
+        except ValueError as error:
+            raise InputError(f"{path}: not JSON ({error}), wanted an occupancy process file") from error
+        if not isinstance(content, dict) or content.get("format") != _FORMAT:
+            raise InputError(f'{path}: wanted a JSON object with "format": "{_FORMAT}"')
+        if content.get("version") != _VERSION:
+            raise InputError(f"{path}: version: got {content.get('version')!r}, wanted {_VERSION}")
+        wanted = {"format", "version", *_FIELDS}
+        if content.keys() != wanted:
+            odd = ", ".join(sorted(content.keys() ^ wanted))
+            raise InputError(f"{path}: missing or unknown fields: {odd}; wanted {', '.join(sorted(wanted))}")
+        try:
+            return cls(*(content[name] for name in _FIELDS))
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+
+    def to_file(self, path: str | os.PathLike[str]) -> None:
+        """Write as JSON; a file that is there stays whole until the new one is complete."""
+        rates = {name: getattr(self, name).tolist() for name in _FIELDS}
+        text = json.dumps({"format": _FORMAT, "version": _VERSION} | rates)
+        with written_whole(path) as part:
+            part.write_text(text, encoding="utf-8")
+
+    @property
+    def n_slots(self) -> int:
+        """Number of slots."""
+        return int(self.factors.shape[1])
+
+    def take(self, slots: ArrayLike) -> "OccupancyProcess":
+        """Process of a lot whose slot i has the rates of our slot `slots[i]`; (n,) int64."""
+        arrival, departure = self.factors[:, np.asarray(slots, np.int64)]
+        return OccupancyProcess(arrival, self.arrival_profile, departure, self.departure_profile)
+
+    def laid_on(self, walk_m: ArrayLike) -> "OccupancyProcess":
+        """Process of a lot of any size, from ours by rank: the fullest slots go nearest to the goal.
+
+        Args:
+            walk_m: (n,) float64, m, walking distance from each slot of that lot to its goal. The slot of
+                rank r among them gets the rates of our slot of rank r * n_slots // n by mean occupancy over
+                the week.
+        """
+        walk = np.asarray(walk_m, float)
+        mean = np.mean([self.marginal(hour * HOUR_S) for hour in range(WEEK_HOURS)], axis=0)
+        slots = np.empty(walk.size, np.int64)
+        ranks = np.arange(walk.size) * self.n_slots // walk.size
+        slots[np.argsort(walk, kind="stable")] = np.argsort(-mean, kind="stable")[ranks]
+        return self.take(slots)
+
+    def at_mean_occupancy(self, target: float, time: float) -> "OccupancyProcess":
+        """Process with all arrival rates scaled alike, so that the lot's mean marginal at `time` is `target`.
+
+        Scaling the arrival rates shifts every slot's attraction by the same logit.
+        """
+        if not 0 < target < 1:
+            raise InputError(f"target mean occupancy: got {target}, wanted a number between 0 and 1")
+
+        def scaled(shift: float) -> OccupancyProcess:
+            arrival, departure = self.factors * [[math.exp(shift)], [1.0]]
+            return OccupancyProcess(arrival, self.arrival_profile, departure, self.departure_profile)
+
+        def excess(shift: float) -> float:
+            return float(scaled(shift).marginal(time).mean()) - target
+
+        fastest = float(self.arrival_factor.max() * self.arrival_profile.max())
+        low, high = -100.0, math.log(0.99 * MAX_RATE / fastest) if fastest > 0 else 0.0
+        if not excess(low) < 0 < excess(high):
+            raise InputError(
+                f"target mean occupancy: {target} cannot be reached by scaling the arrival rates"
+            )
+        return scaled(brentq(excess, low, high, xtol=1e-10))
+
+    def marginal(self, time: float) -> FloatArray:
+        """(n,) float64: P(occupied) at `time`, when nothing has been seen."""
+        _, hour, second = _hour_of_week(time)
+        start = self._hour_marginals.get(hour)
+        if start is None:
+            # Bounded by bytes: a small lot keeps the whole week, a million slots a few hours.
+            if len(self._hour_marginals) >= max(1, _CACHE_BYTES // (8 * self.n_slots)):
+                self._hour_marginals.popitem(last=False)
+            start = self._hour_marginals[hour] = _marginals(self.factors, self.profiles, hour * HOUR_S)
+        arrival, departure = self.factors * self.profiles[:, hour, None]
+        rate = arrival + departure
+        equilibrium = np.divide(arrival, rate, out=np.zeros_like(rate), where=rate > 0)
+        marginal: FloatArray = equilibrium + (start - equilibrium) * np.exp(-rate * second)
+        return marginal
+
+    def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
+        """Weekday and time of day, both uniform in the window."""
+        index = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(window.weekdays))
+        return Arrival(window.weekdays[index] * DAY_S + window.draw_second(key))
+
+    def world(self, key: np.uint64, arrival: Arrival) -> ProcessWorld:
+        """The world of the episode with this key; it begins in a state drawn from the marginal."""
+        return ProcessWorld(self, key, arrival)
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        """The marginal at the arrival, clipped to [0.001, 0.999], and the rates of that hour."""
+        _, hour, _ = _hour_of_week(arrival.time)
+        rates = self.factors * self.profiles[:, hour, None]
+        return Forecast(
+            np.clip(self.marginal(arrival.time), MIN_PROBABILITY, MAX_PROBABILITY), rates[0] + rates[1]
+        )
+
+
+_FIELDS = tuple(f.name for f in fields(OccupancyProcess) if f.init)
+
+
+def _checked(name: str, values: Any, size: int | None = None) -> FloatArray:
+    try:
+        array = np.array(values, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"OccupancyProcess.{name}: {error}, wanted numbers") from error
+    if array.ndim != 1 or not array.size or array.size != (size or array.size):
+        raise InputError(
+            f"OccupancyProcess.{name}: got shape {array.shape}, wanted ({size or 'n'},), not empty"
+        )
+    for i in np.flatnonzero(~((array >= 0) & np.isfinite(array))):
+        raise InputError(f"OccupancyProcess.{name}[{i}]: got {array[i]}, wanted a finite number >= 0")
+    return array

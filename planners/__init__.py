@@ -1,0 +1,21 @@
+"""Planners and strategies: from what is known of a lot to an action.
+
+They know the lot and a belief, never what stands in the slots; the oracle alone is shown that.
+"""
+
+from planners.agent import AGENT_NAMES, Agent, SearchAgent, make_agent
+from planners.mdp import CirclingWarning, ParkingMDP
+from planners.policy_iteration import Solution, policy_iteration
+from planners.value_iteration import value_iteration
+
+__all__ = [
+    "AGENT_NAMES",
+    "Agent",
+    "CirclingWarning",
+    "ParkingMDP",
+    "SearchAgent",
+    "Solution",
+    "make_agent",
+    "policy_iteration",
+    "value_iteration",
+]

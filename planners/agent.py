@@ -1,0 +1,125 @@
+"""What an agent is, and how to make one by name."""
+
+from __future__ import annotations
+
+import inspect
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.scenario import Scenario, SearchProblem
+
+Observation = Mapping[str, Any]
+Memory = TypeVar("Memory")
+
+
+class Agent(Protocol):
+    """Whatever decides: planners, strategies and stable-baselines3's models alike."""
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[Any, Any]:
+        """Choose an action for an observation; hand the returned state back at the next call."""
+        ...
+
+
+class SearchAgent(ABC, Generic[Memory]):
+    """Base of the agents for `parkenv/Search-v0`: one decision at a time, batches handled here.
+
+    An agent object holds what it knows of the problem and never changes; what it remembers of an episode
+    travels in `state`, so one object may serve many episodes at once.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, problem: SearchProblem) -> None:
+        self.problem = problem
+
+    @abstractmethod
+    def begin(self, observation: Observation) -> Memory:
+        """What to remember when an episode starts with this observation."""
+
+    @abstractmethod
+    def decide(self, observation: Observation, memory: Memory) -> int:
+        """The action for this observation; `memory` may be written to."""
+
+    def predict(
+        self,
+        observation: Observation,
+        state: Sequence[Memory] | Memory | None = None,
+        episode_start: NDArray[np.bool_] | Sequence[bool] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.int64], Sequence[Memory] | Memory]:
+        """stable-baselines3's interface: single observations, or batches of them with a leading axis.
+
+        Args:
+            observation: from `parkenv/Search-v0` or a vector of them.
+            state: what the last call returned; None at the start.
+            episode_start: for each environment, whether its episode has just begun. With None, it has
+                where there is no state.
+            deterministic: accepted for the interface; these agents make no distinction.
+
+        Returns:
+            The action, () or (n_envs,) int64, and the state to hand back.
+        """
+        del deterministic
+        if np.ndim(observation["vertex"]) == 0:
+            starts = state is None or (episode_start is not None and bool(np.any(episode_start)))
+            memory: Memory = self.begin(observation) if starts else state  # type: ignore[assignment]
+            return np.asarray(self.decide(observation, memory), dtype=np.int64), memory
+        n = len(observation["vertex"])
+        memories: list[Any] = [None] * n if state is None else list(state)  # type: ignore[arg-type]
+        actions = np.empty(n, dtype=np.int64)
+        for i in range(n):
+            single = {key: values[i] for key, values in observation.items()}
+            if memories[i] is None or (episode_start is not None and episode_start[i]):
+                memories[i] = self.begin(single)
+            actions[i] = self.decide(single, memories[i])
+        return actions, memories
+
+
+# Modules are named, not imported: a strategy needs no sparse solver, and nobody pays for torch unasked.
+_AGENTS: dict[str, tuple[str, str]] = {
+    "mdp": ("planners.replanning", "ReplanningAgent"),
+    "mdp-static": ("planners.replanning", "StaticAgent"),
+    "greedy-goal": ("planners.greedy", "GreedyGoalAgent"),
+    "greedy-drive": ("planners.greedy", "GreedyDriveAgent"),
+    "first-free": ("planners.greedy", "FirstFreeAgent"),
+    "random": ("planners.greedy", "RandomAgent"),
+    "oracle": ("planners.oracle", "OracleAgent"),
+}
+
+AGENT_NAMES = tuple(_AGENTS)
+
+
+def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) -> SearchAgent[Any]:
+    """Make an agent that knows the scenario's public part: lot, goal, speeds and costs.
+
+    Args:
+        name: one of `AGENT_NAMES`.
+        scenario: the scenario; what stands in its slots is kept from the agent.
+        options: the agent's own, such as `failure_s=5.0` of "mdp".
+
+    Raises:
+        InputError: an unknown name or option; the message lists the known ones.
+    """
+    try:
+        module, class_name = _AGENTS[name]
+    except KeyError:
+        raise InputError(f"unknown agent {name!r}; known: {', '.join(_AGENTS)}") from None
+    agent: Callable[..., SearchAgent[Any]] = getattr(import_module(module), class_name)
+    known = [p for p in inspect.signature(agent).parameters if p != "problem"]
+    for option in options:
+        if option not in known:
+            raise InputError(f"agent {name!r} has no option {option!r}; known: {', '.join(known) or 'none'}")
+    problem = scenario.public() if isinstance(scenario, Scenario) else scenario
+    return agent(problem, **options)

@@ -1,0 +1,194 @@
+"""The strategies that people use: no map of how often slots are taken, just eyes and habits.
+
+They tell from the belief what they have seen: a slot below its forecast was seen free, above it taken,
+at its forecast not at all. "Free-looking" means not seen taken.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.lot import PARK
+from parkenv.scenario import SearchProblem
+from planners.agent import Observation, SearchAgent
+from planners.routes import DriveRoutes
+
+
+@dataclass
+class Eyes:
+    """What a strategy remembers.
+
+    Attributes:
+        forecast: (n_slots,) float32, the belief before anything was seen.
+        target: the slot that it is driving to, or -1.
+    """
+
+    forecast: NDArray[np.float32]
+    target: int = -1
+
+
+class TargetAgent(SearchAgent[Eyes]):
+    """Drives to one slot after the other, parks where its target is free, and drops it once seen taken."""
+
+    def __init__(self, problem: SearchProblem) -> None:
+        super().__init__(problem)
+        self.routes = DriveRoutes(problem)
+
+    def begin(self, observation: Observation) -> Eyes:
+        """Remember the forecast, so that later sightings stand out.
+
+        The slots in view of the entry are seen already; a look that is certain shows as 0 or 1, which no
+        forecast is, and any other forecast is good enough to compare with.
+        """
+        p = np.array(observation["p_occupied"])
+        return Eyes(forecast=np.where((p == 0.0) | (p == 1.0), np.float32(0.5), p))
+
+    def decide(self, observation: Observation, memory: Eyes) -> int:
+        """Keep to the target while it is free-looking, else choose another; park on arrival."""
+        vertex = int(observation["vertex"])
+        p = observation["p_occupied"]
+        candidates = p <= memory.forecast
+        seen_free = p < memory.forecast
+        previous = memory.target
+        if previous < 0 or not candidates[previous] or self.changes_mind(seen_free, previous):
+            seconds = self.routes.seconds_from(vertex)[: len(p)]
+            within_reach = candidates & np.isfinite(seconds)
+            if not within_reach.any():
+                # Everything has been seen taken: what was seen longest ago may be free by now.
+                within_reach = np.isfinite(seconds)
+                memory.target = int(np.where(within_reach, p, np.inf).argmin())
+            else:
+                memory.target = self.choose(within_reach, seen_free, seconds, previous)
+        if memory.target == vertex:
+            return PARK
+        return self.routes.move_toward(vertex, memory.target)
+
+    @abstractmethod
+    def choose(
+        self,
+        candidates: NDArray[np.bool_],
+        seen_free: NDArray[np.bool_],
+        seconds: NDArray[np.float64],
+        previous: int,
+    ) -> int:
+        """The slot to drive to.
+
+        Args:
+            candidates: (n_slots,) free-looking and within reach; at least one.
+            seen_free: (n_slots,) seen free.
+            seconds: (n_slots,) s, drive time to each slot.
+            previous: the slot that it was driving to, or -1 at the start.
+        """
+
+    def changes_mind(self, seen_free: NDArray[np.bool_], target: int) -> bool:
+        """Whether what is seen makes the agent leave a target that still looks free."""
+        del seen_free, target
+        return False
+
+
+class GreedyGoalAgent(TargetAgent):
+    """`greedy-goal`: heads for the free-looking slot nearest to the goal, then for the next one."""
+
+    name: ClassVar[str] = "greedy-goal"
+
+    def choose(
+        self,
+        candidates: NDArray[np.bool_],
+        seen_free: NDArray[np.bool_],
+        seconds: NDArray[np.float64],
+        previous: int,
+    ) -> int:
+        """The shortest walk; among equals the shortest drive."""
+        del seen_free, previous
+        slots = np.flatnonzero(candidates)
+        return int(slots[np.lexsort((seconds[slots], self.problem.walk_s[slots]))[0]])
+
+
+class GreedyDriveAgent(TargetAgent):
+    """`greedy-drive`: heads for the nearest free-looking slot, however far it is from the goal."""
+
+    name: ClassVar[str] = "greedy-drive"
+
+    def choose(
+        self,
+        candidates: NDArray[np.bool_],
+        seen_free: NDArray[np.bool_],
+        seconds: NDArray[np.float64],
+        previous: int,
+    ) -> int:
+        """The shortest drive; among equals the shortest walk."""
+        del seen_free, previous
+        slots = np.flatnonzero(candidates)
+        return int(slots[np.lexsort((self.problem.walk_s[slots], seconds[slots]))[0]])
+
+
+class FirstFreeAgent(TargetAgent):
+    """`first-free`: drives toward the goal and takes the first free slot once it is near enough.
+
+    If it gets to where the slot nearest to the goal is and has found nothing, it looks on from there:
+    always at the nearest slot not yet seen, and takes whatever is free.
+
+    Args:
+        problem: lot, goal, speeds and costs.
+        within_m: walk from which on a free slot is good enough, m; the lot's median walk where None.
+    """
+
+    name: ClassVar[str] = "first-free"
+
+    def __init__(self, problem: SearchProblem, within_m: float | None = None) -> None:
+        super().__init__(problem)
+        walk_m = problem.walk_s * problem.v_walk
+        if within_m is not None and not within_m >= walk_m.min():
+            raise InputError(
+                f"within_m is {within_m}, want at least {walk_m.min():.1f}, the shortest walk of the lot"
+            )
+        self._near = walk_m <= (np.median(walk_m) if within_m is None else within_m)
+
+    def choose(
+        self,
+        candidates: NDArray[np.bool_],
+        seen_free: NDArray[np.bool_],
+        seconds: NDArray[np.float64],
+        previous: int,
+    ) -> int:
+        """A free slot in sight that is near enough; at first the one at the goal; then the next ones."""
+        good = candidates & seen_free & self._near
+        if good.any():
+            return int(np.where(good, seconds, np.inf).argmin())
+        if previous < 0:
+            return int(np.where(candidates, self.problem.walk_s, np.inf).argmin())
+        return int(np.where(candidates, seconds, np.inf).argmin())
+
+    def changes_mind(self, seen_free: NDArray[np.bool_], target: int) -> bool:
+        """At the first near slot seen free it stops driving on."""
+        return bool((seen_free & self._near).any()) and not seen_free[target]
+
+
+class RandomAgent(SearchAgent[np.random.Generator]):
+    """`random`: any action that the graph has here, all equally likely.
+
+    Args:
+        problem: lot, goal, speeds and costs.
+        seed: together with the moment of arrival it fixes the whole episode.
+    """
+
+    name: ClassVar[str] = "random"
+
+    def __init__(self, problem: SearchProblem, seed: int = 0) -> None:
+        super().__init__(problem)
+        self.seed = seed
+
+    def begin(self, observation: Observation) -> np.random.Generator:
+        """A generator that depends on the seed and the moment of arrival alone."""
+        moment = int(np.float32(observation["time"][0]).view(np.uint32))
+        return np.random.default_rng([self.seed, moment, int(observation["vertex"])])
+
+    def decide(self, observation: Observation, memory: np.random.Generator) -> int:
+        """One of the actions that the mask allows."""
+        return int(memory.choice(np.flatnonzero(observation["action_mask"])))

@@ -1,0 +1,1 @@
+"""What a side camera and a laser would measure; knows geometry and nothing of parking."""

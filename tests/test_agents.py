@@ -1,0 +1,277 @@
+"""Agents: the interface, what the strategies do, the oracle's bound, and the thesis's findings."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightingModel
+from parkenv.evaluation.compare import Case, settings_of
+from parkenv.evaluation.episodes import EpisodeRunner
+from parkenv.scenario import SCENARIO_NAMES, SearchProblem
+from planners import AGENT_NAMES, make_agent
+
+SEEDS = range(12)
+
+
+def episodes(scenario, agent, seeds=SEEDS):
+    return Case(scenario, agent).run(seeds)[0]
+
+
+def mean(rows, column):
+    return float(np.mean([row[column] for row in rows]))
+
+
+def frozen_world(lot, taken, **changes):
+    """Slots that are taken, or free, for ever, under a forecast that says 50 % of each."""
+    occupancy = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
+    prior = OccupancyProcess.from_demand(np.zeros(lot.n_slots), np.zeros(168), 1e9)
+    return Scenario(name="frozen", lot=lot, occupancy=occupancy, prior=prior, **changes)
+
+
+# --- the interface ---------------------------------------------------------------------------------
+
+
+def test_unknown_names_and_options_are_refused_with_the_known_ones():
+    scenario = Scenario.named("mini")
+    with pytest.raises(InputError, match="unknown agent 'mpd'; known: mdp, mdp-static, greedy-goal"):
+        make_agent("mpd", scenario)
+    with pytest.raises(InputError, match="no option 'cost'; known: failure_s, gamma"):
+        make_agent("mdp", scenario, cost=3)
+    with pytest.raises(InputError, match="within_m"):
+        make_agent("first-free", scenario, within_m=0.0)
+
+
+@pytest.mark.parametrize("name", AGENT_NAMES)
+def test_agents_get_the_public_part_of_a_scenario_only(name):
+    agent = make_agent(name, Scenario.named("campus"))
+    assert type(agent.problem) is SearchProblem
+    assert not hasattr(agent.problem, "occupancy")
+
+
+@pytest.mark.parametrize("name", [n for n in AGENT_NAMES if n != "oracle"])
+def test_a_batch_of_observations_gives_the_actions_of_the_single_ones(name):
+    scenario = Scenario.named("campus")
+    agent = make_agent(name, scenario)
+    envs = [gym.make("parkenv/Search-v0", scenario=scenario) for _ in range(3)]
+    observations = [env.reset(seed=i)[0] for i, env in enumerate(envs)]
+    singles, batch, start = [None] * 3, None, np.ones(3, dtype=bool)
+    for _ in range(15):
+        stacked = {key: np.stack([o[key] for o in observations]) for key in observations[0]}
+        actions, batch = agent.predict(stacked, batch, start)
+        start[:] = False
+        for i, env in enumerate(envs):
+            action, singles[i] = agent.predict(observations[i], singles[i])
+            assert action == actions[i]
+            observations[i] = env.step(action)[0] if not env.unwrapped.state.over else observations[i]
+
+
+def test_stable_baselines_evaluates_a_planner():
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    scenario = Scenario.named("mini")
+    venv = make_vec_env(lambda: gym.make("parkenv/Search-v0", scenario=scenario), n_envs=2, seed=0)
+    reward, _ = evaluate_policy(make_agent("mdp", scenario), venv, n_eval_episodes=6)
+    assert -120.0 < reward < 0.0
+
+
+def test_one_agent_may_serve_many_episodes_at_once():
+    scenario = Scenario.named("campus")
+    shared = make_agent("mdp", scenario)
+    runner = EpisodeRunner(scenario, "mdp", shared)
+    first = [runner.run(seed).row for seed in (0, 1, 0)]
+    assert first[0] == first[2]
+
+
+def test_random_agent_repeats_itself_under_a_seed():
+    scenario = Scenario.named("mini")
+    run = EpisodeRunner(scenario, "random", make_agent("random", scenario, seed=1)).run
+    other = EpisodeRunner(scenario, "random", make_agent("random", scenario, seed=2)).run
+    assert [run(s).row for s in SEEDS] == [run(s).row for s in SEEDS]
+    assert [run(s).row for s in SEEDS] != [other(s).row for s in SEEDS]
+
+
+# --- strategies ------------------------------------------------------------------------------------
+
+
+def parked_slot(scenario, agent, **options):
+    runner = EpisodeRunner(scenario, agent, make_agent(agent, scenario, **options))
+    return scenario.lot.slot_ids.index(runner.run(0).row["slot"])
+
+
+def test_strategies_park_where_their_names_say():
+    lot = ParkingLot.grid(2, 30)
+    walk, rng = lot.walk_m(), np.random.default_rng(5)
+    taken = rng.random(lot.n_slots) < 0.6
+    scenario = frozen_world(lot, taken)
+    free = np.flatnonzero(~taken)
+    assert parked_slot(scenario, "greedy-goal") == free[walk[free].argmin()]
+    from planners.routes import DriveRoutes
+
+    seconds = DriveRoutes(scenario).seconds_from(int(lot.entry_vertices[0]))[: lot.n_slots]
+    assert parked_slot(scenario, "greedy-drive") == free[seconds[free].argmin()]
+    threshold = 40.0
+    near_and_free = free[walk[free] <= threshold]
+    assert walk[parked_slot(scenario, "first-free", within_m=threshold)] <= threshold
+    assert parked_slot(scenario, "first-free", within_m=threshold) in near_and_free
+    assert (
+        seconds[parked_slot(scenario, "first-free", within_m=threshold)]
+        <= seconds[near_and_free].min() + 10.0
+    )
+    assert parked_slot(scenario, "first-free", within_m=1e3) == parked_slot(scenario, "greedy-drive")
+
+
+def test_strategies_find_the_only_free_slot():
+    lot = ParkingLot.grid(4, 12)
+    taken = np.ones(lot.n_slots, dtype=bool)
+    taken[29] = False
+    scenario = frozen_world(lot, taken)
+    for agent in ("greedy-goal", "greedy-drive", "first-free", "mdp", "oracle"):
+        assert parked_slot(scenario, agent) == 29, agent
+
+
+@pytest.mark.parametrize("agent", ["mdp", "greedy-goal", "greedy-drive", "first-free", "random"])
+def test_a_full_lot_is_given_up_once_it_is_proven_full(agent):
+    lot = ParkingLot.grid(2, 5)
+    scenario = frozen_world(lot, np.ones(lot.n_slots, dtype=bool), give_up_s=500.0)
+    row = EpisodeRunner(scenario, agent, make_agent(agent, scenario)).run(0).row
+    assert not row["parked"]
+    assert not row["truncated"]
+    assert row["gave_up_s"] == 500.0
+    assert row["bound_s"] == 500.0
+
+
+def test_a_search_cut_off_is_charged_like_one_that_gave_up():
+    lot = ParkingLot.grid(2, 5)
+    scenario = frozen_world(lot, np.ones(lot.n_slots, dtype=bool), failure_s=1.0, give_up_s=500.0)
+    scenario = scenario.replace(sighting=SightingModel(view_range=0.0))
+    row = EpisodeRunner(scenario, "mdp-static", make_agent("mdp-static", scenario)).run(0).row
+    assert row["truncated"]
+    assert row["total_s"] == pytest.approx(row["drive_s"] + row["failed_s"] + 500.0)
+    assert row["steps"] == 2000
+
+
+# --- the planner -----------------------------------------------------------------------------------
+
+
+def test_the_planner_plans_again_only_when_a_probability_changes():
+    """Where the forecast is what is seen, nothing changes but that slots become certain."""
+    lot = ParkingLot.grid(2, 20)
+    scenario = frozen_world(lot, np.arange(lot.n_slots) % 2 == 0, sighting=SightingModel(view_range=0.0))
+    agent = make_agent("mdp", scenario)
+    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    observation, _ = env.reset(seed=0)
+    _, memory = agent.predict(observation)
+    assert memory.replans == 0
+    agent.predict(observation, memory)
+    assert memory.replans == 0
+    changed = dict(observation, p_occupied=observation["p_occupied"].copy())
+    changed["p_occupied"][3] = 1.0
+    agent.predict(changed, memory)
+    assert memory.replans == 1
+    nearly = dict(changed, p_occupied=changed["p_occupied"].copy())
+    nearly["p_occupied"][3] = 0.997
+    agent.predict(nearly, memory)
+    assert memory.replans == 1, "a sighting that has aged a little is not news"
+
+
+def test_the_static_planner_keeps_trying_its_taken_slot():
+    lot = ParkingLot.grid(2, 8)
+    scenario = frozen_world(lot, np.ones(lot.n_slots, dtype=bool), sighting=SightingModel(view_range=0.0))
+    row = EpisodeRunner(scenario, "mdp-static", make_agent("mdp-static", scenario)).run(0).row
+    assert row["failed_parks"] > 100
+    assert row["replans"] == 0
+
+
+def test_the_planner_never_tries_a_slot_that_it_sees_taken():
+    for name in SCENARIO_NAMES:
+        rows = episodes(Scenario.named(name), "mdp")
+        assert mean(rows, "failed_parks") == 0.0
+        assert mean(rows, "replans") > 0.0
+
+
+# --- the oracle ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", SCENARIO_NAMES)
+def test_nobody_beats_the_bound_and_the_oracle_reaches_it(name):
+    scenario = Scenario.named(
+        name, sighting=SightingModel(view_range=6.0, hit_rate=0.95, false_alarm_rate=0.05)
+    )
+    for agent in AGENT_NAMES:
+        for row in episodes(scenario, agent, range(8)):
+            assert row["total_s"] >= row["bound_s"] - 1e-6, (agent, row["seed"])
+            if agent == "oracle" and row["gave_up_s"] == 0.0:
+                assert row["total_s"] <= row["bound_s"] + scenario.wait_s
+
+
+def test_the_oracle_waits_for_a_slot_that_is_about_to_come_free():
+    scenario = Scenario.named("mini", entry=0)
+    busy = scenario.replace(occupancy=scenario.occupancy.at_mean_occupancy(0.97, 10 * 3600.0))
+    rows = episodes(busy, "oracle", range(60))
+    parked = [r for r in rows if r["parked"]]
+    waited = [r for r in parked if r["drive_s"] > r["driven_m"] / busy.v_drive + 0.5]
+    assert waited, "in a nearly full lot it must wait in some episode"
+    for row in parked:
+        assert row["bound_s"] - 1e-6 <= row["total_s"] <= row["bound_s"] + 5 * busy.wait_s
+
+
+def test_the_oracle_must_be_shown_the_future():
+    scenario = Scenario.named("mini")
+    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    with pytest.raises(RuntimeError, match="reveal"):
+        make_agent("oracle", scenario).predict(env.reset(seed=0)[0])
+
+
+def test_agents_meet_the_same_worlds():
+    """Same arrival, same fullness, same bound for every agent under one seed."""
+    scenario = Scenario.named("street")
+    for seed in range(4):
+        met = {
+            (row["arrival_s"], row["occupancy"], row["bound_s"])
+            for agent in AGENT_NAMES
+            for row in episodes(scenario, agent, [seed])
+        }
+        assert len(met) == 1
+
+
+# --- the thesis's findings (T §4.3) -----------------------------------------------------------------
+
+
+def setting(name, failure_s, v_walk_kmh, v_drive_kmh):
+    return settings_of(Scenario.named(name), [failure_s], [v_walk_kmh], [v_drive_kmh])[0]
+
+
+def test_on_campus_it_drives_in_and_weighs_distance_against_occupancy():
+    """Fig. 4.9: nearer to the goal than the first free slot, but not the best slot at any price."""
+    scenario = setting("campus", 10.0, 4.0, 10.0)
+    planner, nearest, best = (
+        episodes(scenario, a, range(40)) for a in ("mdp", "greedy-drive", "greedy-goal")
+    )
+    assert mean(planner, "driven_m") > 1.5 * mean(nearest, "driven_m")
+    assert mean(best, "walked_m") < mean(planner, "walked_m") < 0.8 * mean(nearest, "walked_m")
+    assert mean(planner, "total_s") < min(mean(nearest, "total_s"), mean(best, "total_s"))
+    # The rows on the way in are emptier than those at the goal: it passes free slots, and stops in time.
+    forecast = scenario.forecast(scenario.occupancy.draw_arrival(scenario.arrival, np.uint64(0))).p_occupied
+    near = scenario.lot.walk_m() < np.median(scenario.lot.walk_m())
+    assert forecast[near].mean() > forecast[~near].mean() + 0.2
+
+
+def test_on_jam_a_low_failure_cost_is_over_confident_and_a_high_one_is_not():
+    """Fig. 4.12 against 4.10: long paths and many re-plans at 10 s; at 90 s short ones, parked farther off."""
+    bold = episodes(setting("jam", 10.0, 4.0, 10.0), "mdp", range(30))
+    careful = episodes(setting("jam", 90.0, 4.0, 10.0), "mdp", range(30))
+    assert mean(careful, "driven_m") < 0.6 * mean(bold, "driven_m")
+    assert mean(careful, "replans") < 0.6 * mean(bold, "replans")
+    assert mean(careful, "walked_m") > mean(bold, "walked_m") + 5.0
+    assert mean(bold, "replans") > 20.0
+
+
+@pytest.mark.parametrize("name", ["campus", "jam"])
+def test_who_walks_as_fast_as_they_drive_parks_by_the_entry(name):
+    """Fig. 4.11b."""
+    scenario = setting(name, 10.0, 10.0, 10.0)
+    planner, nearest = (episodes(scenario, a, range(20)) for a in ("mdp", "greedy-drive"))
+    assert mean(planner, "driven_m") <= 1.1 * mean(nearest, "driven_m")
+    slow_walk = episodes(setting(name, 10.0, 4.0, 10.0), "mdp", range(20))
+    assert mean(planner, "walked_m") > mean(slow_walk, "walked_m") + 10.0

@@ -1,0 +1,315 @@
+"""`parkenv compare` and its neighbours from the outside: results, resuming, faults."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from parkenv import InputError, ParkingLot
+from parkenv.evaluation.results import EPISODE_COLUMNS, ResultFolder
+from parkenv.evaluation.statistics import mean_interval, summarize
+
+PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
+DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def parkenv(*arguments, **options):
+    return subprocess.run(
+        [*PARKENV, *map(str, arguments)], capture_output=True, text=True, timeout=300, check=False, **options
+    )
+
+
+def small(out, *more, agents="mdp,greedy-goal,oracle", episodes=12):
+    return (
+        "compare", "--scenario", "mini", "--agents", agents, "-n", episodes, "--occupancy-levels", "none",
+        "--no-figures", "--out", out, *more,
+    )  # fmt: skip
+
+
+def rows_without_times(out):
+    rows = json.loads((out / "summary.json").read_text())["rows"]
+    return [{k: v for k, v in row.items() if not k.startswith("decision_ms")} for row in rows]
+
+
+def episodes_of(out):
+    with (out / "episodes.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_summary_is_what_the_episodes_say_and_jobs_do_not_matter(tmp_path):
+    one, two = tmp_path / "one", tmp_path / "two"
+    for out, jobs in ((one, 1), (two, 2)):
+        done = parkenv(
+            *small(out, "--jobs", jobs, "--failure-cost", "10,90", "--v-walk-kmh", "4,10", episodes=25)
+        )
+        assert done.returncode == 0, done.stderr
+    assert (one / "episodes.csv").read_bytes() == (two / "episodes.csv").read_bytes()
+    assert rows_without_times(one) == rows_without_times(two)
+
+    episodes, rows = episodes_of(one), rows_without_times(one)
+    assert len(episodes) == 25 * 3 * 2 * 2
+    assert len(rows) == 3 * 2 * 2
+    for row in rows:
+        mine = [
+            e
+            for e in episodes
+            if e["agent"] == row["agent"]
+            and float(e["failure_cost_s"]) == row["failure_cost_s"]
+            and float(e["v_walk_kmh"]) == row["v_walk_kmh"]
+        ]
+        total = np.array([float(e["total_s"]) for e in mine])
+        assert row["total_s"] == pytest.approx(total.mean())
+        low, high = row["total_s_ci95"]
+        assert low < row["total_s"] < high
+        assert row["total_s"] == pytest.approx(
+            row["drive_s"] + row["failed_s"] + row["walk_s"] + row["gave_up_s"]
+        )
+        assert row["regret_s"] >= -1e-9
+        assert row["episodes"] == 25
+    first, second = rows[0], rows[1]
+    assert second["difference_s"] == pytest.approx(second["total_s"] - first["total_s"])
+    summary = json.loads((one / "summary.json").read_text())
+    assert summary["command"][1] == "compare"
+    assert {"version", "seed", "rows"} <= summary.keys()
+
+
+def test_a_killed_run_leaves_what_was_done_and_resumes(tmp_path):
+    out, whole = tmp_path / "killed", tmp_path / "whole"
+    arguments = small(out, "--jobs", "2", agents="greedy-goal,mdp", episodes=400)
+    process = subprocess.Popen(
+        [*PARKENV, *map(str, arguments)],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if (out / "episodes.csv").exists() and len((out / "episodes.csv").read_text().splitlines()) > 60:
+            break
+        time.sleep(0.02)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    survived = episodes_of(out)
+    assert 60 <= len(survived) < 800
+    assert not (out / "summary.json").exists()
+
+    refused = parkenv(*arguments)
+    assert refused.returncode == 2
+    assert "add --resume" in refused.stderr
+    assert len(episodes_of(out)) == len(survived), "nothing written over"
+
+    # A line that the kill tore is dropped, and its episode run again.
+    with (out / "episodes.csv").open("a") as file:
+        file.write("mini,,mdp,10.0,4.0")
+    assert parkenv(*arguments, "--resume").returncode == 0
+    assert parkenv(*small(whole, agents="greedy-goal,mdp", episodes=400)).returncode == 0
+    assert (out / "episodes.csv").read_bytes() == (whole / "episodes.csv").read_bytes()
+    assert rows_without_times(out) == rows_without_times(whole)
+
+    other = parkenv(*small(out, "--resume", "--days", "weekend"))
+    assert other.returncode == 2
+    assert "days was 'weekdays'" in other.stderr
+
+
+def test_interrupting_writes_what_is_done(tmp_path):
+    out = tmp_path / "interrupted"
+    process = subprocess.Popen(
+        [*PARKENV, *map(str, small(out, "--jobs", "1", agents="mdp", episodes=5000))],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline:
+        if (out / "episodes.csv").exists() and len((out / "episodes.csv").read_text().splitlines()) > 20:
+            break
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert "--resume goes on" in " ".join(output.split())
+    summary = json.loads((out / "summary.partial.json").read_text())
+    assert summary["complete"] is False
+    assert summary["rows"][0]["episodes"] == len(episodes_of(out)) >= 20
+
+
+def test_figures_and_occupancy_levels(tmp_path):
+    done = parkenv(
+        "compare", "--scenario", "mini", "--agents", "greedy-goal,oracle", "-n", 12,
+        "--occupancy-levels", "0.5,0.9", "--out", tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    pictures = sorted(p.name for p in tmp_path.glob("*.png"))
+    assert pictures == [
+        "searches_mini_failure10_walk4_drive10.png",
+        "time_against_occupancy_mini.png",
+        "time_split_mini.png",
+    ]
+    swept = json.loads((tmp_path / "summary.json").read_text())["occupancy_rows"]
+    assert [r["occupancy_level"] for r in swept] == [0.5, 0.5, 0.9, 0.9]
+    assert swept[1]["total_s"] < swept[3]["total_s"], "a fuller lot takes longer"
+
+
+def test_plan_writes_a_path_and_a_picture(tmp_path):
+    done = parkenv("plan", "--scenario", "jam", "--failure-cost", "10,90", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "plan.png").stat().st_size > 10_000
+    bold, careful = json.loads((tmp_path / "summary.json").read_text())["rows"]
+    assert len(bold["path"]) > len(careful["path"]) > 2
+    assert bold["path"][-1] == bold["slot"]
+
+
+# --- statistics ------------------------------------------------------------------------------------
+
+
+def test_intervals_cover_the_mean_as_often_as_they_say():
+    rng = np.random.default_rng(0)
+    covered = 0
+    for _ in range(100):
+        _, low, high = mean_interval(rng.normal(5.0, 2.0, 60))
+        covered += low <= 5.0 <= high
+    assert stats.binomtest(covered, 100, 0.95).pvalue > 0.01
+
+
+def test_degenerate_samples_have_sane_intervals():
+    assert mean_interval([3.0, 3.0]) == (3.0, 3.0, 3.0)
+    mean, low, high = mean_interval([4.0])
+    assert mean == 4.0
+    assert np.isnan(low)
+    assert np.isnan(high)
+
+
+def test_differences_are_paired_by_seed():
+    def episode(seed, total):
+        zero = dict.fromkeys(("drive_s", "failed_s", "walk_s", "gave_up_s", "failed_parks", "replans"), 0.0)
+        more = dict.fromkeys(("driven_m", "walked_m", "slots_passed", "occupancy", "bound_s"), 0.0)
+        return {"seed": seed, "total_s": total, "parked": True, **zero, **more}
+
+    first = [episode(s, 100.0 * s) for s in range(20)]
+    other = [episode(s, 100.0 * s + 1.0) for s in range(19, 5, -1)]
+    row = summarize({}, other, first)
+    assert row["difference_s"] == pytest.approx(1.0)
+    assert row["difference_s_ci95"] == pytest.approx([1.0, 1.0])
+
+
+# --- faults ----------------------------------------------------------------------------------------
+
+LOG = "datetime,camera,slot_id,weather,occupied\n"
+
+
+@pytest.fixture
+def lot_file(tmp_path):
+    path = tmp_path / "lot.geojson"
+    ParkingLot.packaged("mini").to_file(path)
+    return path
+
+
+def assert_one_line_and_exit_2(done, *wanted):
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
+    for text in wanted:
+        assert text in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        (["--agents", "mdp,gredy"], ["unknown agent 'gredy'", "known: mdp, mdp-static, greedy-goal"]),
+        (["--v-walk-kmh=-4"], ["--v-walk-kmh is -4", "above 0"]),
+        (["--v-drive-kmh", "0"], ["--v-drive-kmh is 0"]),
+        (["--v-drive-kmh", "fast"], ["--v-drive-kmh", "'fast'"]),
+        (["--failure-cost=-1"], ["--failure-cost is -1"]),
+        (["--failure-cost", "nan"], ["--failure-cost is nan"]),
+        (["--scenario", "moon"], ["unknown scenario 'moon'", "campus"]),
+        (["--lot", "nowhere.geojson"], ["nowhere.geojson"]),
+        (["--occupancy", "log.csv"], ["--occupancy goes with --lot"]),
+        (["--occupancy-levels", "1.5"], ["--occupancy-levels has 1.5"]),
+        (["--arrival", "late"], ["late"]),
+        (["--days", "someday"], ["someday"]),
+        (["--resume"], ["holds no comparison"]),
+    ],
+)
+def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):
+    out = tmp_path / "out"
+    assert_one_line_and_exit_2(parkenv("compare", *arguments, "--out", out), *wanted)
+    assert not (out / "episodes.csv").exists()
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        (
+            "datetime,camera,slot_id,weather,occupied,mood\n2015-11-12 07:09,1,a,sunny,0,glad\n",
+            ["mood", "occupied"],
+        ),
+        (LOG + "2015-11-12 09:09,1,a,sunny,0\n2015-11-12 08:09,1,a,sunny,1\n", ["line 3"]),
+        (LOG + "2015-11-12 09:09,1,a,sunny,2\n", ["line 2", "2"]),
+        (LOG, ["log.csv"]),
+    ],
+)
+def test_bad_logs_are_one_clear_line(tmp_path, lot_file, text, wanted):
+    log = tmp_path / "log.csv"
+    log.write_text(text)
+    out = tmp_path / "out"
+    done = parkenv("compare", "--lot", lot_file, "--occupancy", log, "--out", out)
+    assert_one_line_and_exit_2(done, "log.csv", *wanted)
+    assert not (out / "episodes.csv").exists()
+
+
+def test_bad_lot_files_are_one_clear_line(tmp_path, lot_file):
+    good = lot_file.read_text()
+    for name, text, wanted in (
+        ("torn", good[: len(good) // 2], "not JSON"),
+        ("nan", good.replace('"coordinates": [', '"coordinates": [NaN, ', 1), "NaN"),
+    ):
+        bad = tmp_path / f"{name}.geojson"
+        bad.write_text(text)
+        out = tmp_path / "out"
+        done = parkenv("compare", "--lot", bad, "--out", out)
+        assert_one_line_and_exit_2(done, bad.name)
+        assert wanted.lower() in done.stderr.lower()
+        assert not out.exists()
+
+
+def test_an_output_folder_that_cannot_be_written_is_refused_before_any_work(tmp_path):
+    blocker = tmp_path / "file"
+    blocker.write_text("mine")
+    for command in (small(blocker / "out"), ("plan", "--out", blocker / "out")):
+        assert_one_line_and_exit_2(parkenv(*command), "--out", "cannot be written")
+    assert blocker.read_text() == "mine"
+
+
+def test_a_finished_folder_may_be_used_again_and_a_foreign_one_is_refused(tmp_path):
+    for _ in range(2):
+        assert parkenv(*small(tmp_path, agents="greedy-goal")).returncode == 0
+    (tmp_path / "episodes.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match="not written by this version"):
+        ResultFolder(tmp_path, json.loads((tmp_path / "settings.json").read_text()), resume=True)
+
+
+def test_columns_are_stable():
+    assert EPISODE_COLUMNS[:7] == (
+        "scenario",
+        "occupancy_level",
+        "agent",
+        "failure_cost_s",
+        "v_walk_kmh",
+        "v_drive_kmh",
+        "seed",
+    )
+
+
+def test_help_names_every_command():
+    done = parkenv("--help")
+    for command in ("compare", "plan", "lot", "occupancy"):
+        assert command in done.stdout
+    for command in ("compare", "plan"):
+        assert "--failure-cost" in parkenv(command, "--help").stdout

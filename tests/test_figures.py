@@ -1,0 +1,238 @@
+import cv2
+import numpy as np
+import pytest
+from matplotlib.collections import EllipseCollection
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from parkenv.errors import InputError
+from parkenv.evaluation import time_figures
+from parkenv.evaluation.episodes import EpisodeRunner, SearchTrace
+from parkenv.evaluation.rates_picture import save_rates
+from parkenv.evaluation.search_pictures import BELIEF_MAP, draw_search, save_searches
+from parkenv.evaluation.time_figures import AGENT_COLORS, save_time_against_occupancy, save_time_split
+from parkenv.lot import ParkingLot
+from parkenv.occupancy import OccupancyProcess
+from parkenv.scenario import Scenario
+from planners.agent import AGENT_NAMES, make_agent
+
+
+def row(agent="mdp", drive=30.0, failed=5.0, walk=60.0, gave_up=0.0, **more):
+    total = drive + failed + walk + gave_up
+    return {
+        "scenario": "campus",
+        "agent": agent,
+        "failure_cost_s": 10.0,
+        "v_walk_kmh": 4.0,
+        "v_drive_kmh": 10.0,
+        "episodes": 20,
+        "total_s": total,
+        "total_s_ci95": [0.9 * total, 1.1 * total],
+        "drive_s": drive,
+        "failed_s": failed,
+        "walk_s": walk,
+        "gave_up_s": gave_up,
+        "bound_s": 50.0,
+    } | more
+
+
+def trace(name="mdp", scenario=None, seed=0):
+    scenario = scenario or Scenario.named("mini")
+    return EpisodeRunner(scenario, name, make_agent(name, scenario)).run(seed).trace
+
+
+def picture(path):
+    """The image in a file, which must be a PNG."""
+    assert path.read_bytes().startswith(b"\x89PNG")
+    image = cv2.imread(str(path))
+    assert image is not None
+    assert image.std() > 5
+    return image
+
+
+def axes():
+    return Figure(figsize=(6, 4)).add_axes((0.2, 0.2, 0.6, 0.6))
+
+
+@pytest.mark.parametrize("panels", [1, 2, 4, 7])
+def test_time_split_has_a_panel_for_each_setting(tmp_path, panels, monkeypatch):
+    titles = []
+    monkeypatch.setattr(time_figures, "_draw_split", lambda ax, rows, limit: titles.append(len(rows)))
+    rows = [row(name, failure_cost_s=float(c)) for c in range(panels) for name in ("mdp", "random", "oracle")]
+    save_time_split(rows, tmp_path / "split.png")
+    assert titles == [3] * panels
+    monkeypatch.undo()
+    save_time_split(rows, tmp_path / "split.png")
+    height, width = picture(tmp_path / "split.png").shape[:2]
+    assert 900 <= width <= 2000
+    assert 200 <= height <= 2000
+
+
+def test_bars_stack_the_terms_and_an_agent_off_the_scale_is_cut():
+    rows = [row("mdp"), row("greedy-goal", drive=80.0, failed=0.0), row("mdp-static", failed=5000.0)]
+    limit = time_figures._limit(rows)
+    assert 140.0 < limit < 200.0
+    ax = axes()
+    time_figures._draw_split(ax, rows, limit)
+    drive, failed, walk, gave_up = ([bar.get_width() for bar in bars] for bars in ax.containers)
+    assert drive == [30.0, 80.0, 30.0]
+    assert failed == pytest.approx([5.0, 0.0, limit - 30.0])
+    assert walk == [60.0, 60.0, 0.0]
+    assert gave_up == [0.0, 0.0, 0.0]
+    assert [text.get_text() for text in ax.texts] == ["95 s", "140 s", "5,090 s"]
+    assert [text.get_weight() for text in ax.texts] == ["bold", "normal", "normal"]
+    assert [label.get_text() for label in ax.get_yticklabels()] == ["mdp", "greedy-goal", "mdp-static"]
+    assert ax.get_xlim() == (0, limit)
+
+
+def test_nothing_is_cut_where_agents_are_alike():
+    assert time_figures._limit([row("mdp"), row("oracle", drive=90.0)]) > 155.0
+
+
+@pytest.mark.parametrize("interval", [[None, None], [float("nan"), float("nan")]])
+def test_a_single_search_has_no_interval(tmp_path, interval):
+    alone = row(total_s_ci95=interval, episodes=1)
+    assert time_figures._interval(alone) == (95.0, 95.0)
+    save_time_split([alone], tmp_path / "split.png")
+    save_time_against_occupancy([alone | {"occupancy": 0.9}], tmp_path / "occupancy.png")
+    picture(tmp_path / "split.png")
+    picture(tmp_path / "occupancy.png")
+
+
+def test_rows_without_a_bound_are_drawn(tmp_path):
+    rows = [row()]
+    del rows[0]["bound_s"]
+    save_time_split(rows, tmp_path / "split.png")
+    picture(tmp_path / "split.png")
+
+
+def test_lines_against_occupancy_are_labelled_where_they_end(tmp_path):
+    levels = (0.5, 0.8, 0.95)
+    rows = [row(name, drive=d * o, occupancy=o) for name, d in (("mdp", 30), ("oracle", 20)) for o in levels]
+    rows += [row("random", failed=f, occupancy=o) for f, o in zip((5.0, 80.0, 9000.0), levels, strict=True)]
+    limit = time_figures._limit(rows)
+    ax = axes()
+    time_figures._draw_lines(ax, rows, limit)
+    assert sorted(text.get_text() for text in ax.texts) == ["mdp", "oracle", "random ↑ 9,090 s"]
+    heights = sorted(text.xyann[1] for text in ax.texts)
+    assert np.diff(heights).min() > 0.06 - 1e-9
+    assert ax.get_ylim() == (0, limit)
+    assert limit < 200
+    assert [to_hex(line.get_color()) for line in ax.lines] == [
+        AGENT_COLORS[a] for a in ("mdp", "oracle", "random")
+    ]
+    save_time_against_occupancy(
+        [r | {"failure_cost_s": c} for r in rows for c in (10.0, 90.0)], tmp_path / "occupancy.png"
+    )
+    height, width = picture(tmp_path / "occupancy.png").shape[:2]
+    assert width == 1500
+    assert 400 < height < 800
+
+
+@pytest.mark.parametrize(
+    ("places", "want"),
+    [
+        ([0.5], [0.5]),
+        ([0.2, 0.5], [0.2, 0.5]),
+        ([0.5, 0.5], [0.5, 0.6]),
+        ([0.2, 1.0, 1.0], [0.2, 0.9, 1.0]),
+    ],
+)
+def test_labels_are_spread(places, want):
+    assert time_figures._spread(places, 0.1) == pytest.approx(want)
+
+
+def test_every_agent_has_a_colour_of_its_own():
+    assert set(AGENT_NAMES) <= set(AGENT_COLORS)
+    assert len(set(AGENT_COLORS.values())) == len(AGENT_COLORS)
+
+
+def test_discs_show_the_truth_and_rings_the_forecast():
+    searched = trace()
+    ax = axes()
+    draw_search(searched, ax)
+    ring, disc = (c for c in ax.collections if isinstance(c, EllipseCollection))
+    assert np.allclose(ring.get_facecolors(), BELIEF_MAP(searched.forecast))
+    assert np.allclose(disc.get_facecolors(), BELIEF_MAP(searched.occupied.astype(float)))
+    assert (ring.get_widths() > disc.get_widths()).all()
+    title = ax.get_title(loc="left")
+    assert title.startswith("mdp: failure cost 10 s")
+    assert f"total {searched.metrics['total_s']:.0f} s" in title.replace("\n", " ")
+
+
+def test_the_path_is_numbered_and_the_policy_drawn_where_there_is_one():
+    marks = {}
+    for name in ("mdp", "greedy-goal"):
+        ax = axes()
+        draw_search(trace(name), ax)
+        # Every P twice: with an outline below.
+        marks[name] = sum(len(line.get_xdata()) for line in ax.lines if "P" in str(line.get_marker())) / 2
+        assert [text.get_text() for text in ax.texts][-2:] == ["1", "2"]
+    assert marks["mdp"] == np.sum(trace().policy == 4) > 0
+    assert marks["greedy-goal"] == 0
+
+
+def test_a_search_that_gave_up_or_never_moved_is_drawn(tmp_path):
+    scenario = Scenario.named("mini")
+    n = scenario.lot.n_slots
+    entry = int(scenario.lot.entry_vertices[0])
+    metrics = {
+        "total_s": 1800.0,
+        "drive_s": 0.0,
+        "failed_s": 0.0,
+        "walk_s": 0.0,
+        "gave_up_s": 1800.0,
+        "parked": False,
+    }
+    still = SearchTrace(scenario, "random", [entry], np.ones(n, bool), np.full(n, 0.9), None, metrics)
+    save_searches([still], tmp_path / "search.png")
+    picture(tmp_path / "search.png")
+    ax = axes()
+    draw_search(still, ax)
+    assert "1800 gave up" in ax.get_title(loc="left").replace("\n", " ")
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 4])
+def test_searches_of_any_number_are_laid_out(tmp_path, n):
+    save_searches(
+        [trace(name) for name in ("mdp", "greedy-goal", "first-free", "oracle")[:n]], tmp_path / "s.png"
+    )
+    height, width = picture(tmp_path / "s.png").shape[:2]
+    assert 1000 <= width <= 2400
+    assert 600 <= height <= 2600
+
+
+@pytest.mark.parametrize("lot", [ParkingLot.grid(12, 3), ParkingLot.grid(2, 40)], ids=["high", "wide"])
+def test_titles_fit_lots_of_any_shape(lot):
+    searched = trace("first-free", Scenario.on_lot(lot))
+    figure = Figure(figsize=(3, 8) if lot.n_slots == 36 else (9, 3))
+    ax = figure.add_axes((0, 0, 1, 0.8))
+    draw_search(searched, ax)
+    figure.draw_without_rendering()
+    title = ax.get_tightbbox()
+    assert title.x1 <= figure.bbox.x1 + 1
+
+
+def test_rates_are_drawn(tmp_path):
+    process = OccupancyProcess.from_demand(np.zeros(3), np.sin(np.arange(168) / 4))
+    save_rates(process, tmp_path / "rates.png")
+    picture(tmp_path / "rates.png")
+
+
+@pytest.mark.parametrize("save", [save_time_split, save_time_against_occupancy, save_searches])
+def test_nothing_to_draw_is_refused(tmp_path, save):
+    with pytest.raises(InputError, match="no "):
+        save([], tmp_path / "x.png")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_place_that_cannot_be_written_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"missing/x\.png: cannot be written"):
+        save_time_split([row()], tmp_path / "missing" / "x.png")
+
+
+def test_figures_come_out_the_same_and_leave_nothing_beside(tmp_path):
+    for name in ("a.png", "b.png"):
+        save_time_split([row(), row("oracle")], tmp_path / name)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "b.png"]

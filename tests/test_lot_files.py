@@ -1,0 +1,641 @@
+import copy
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from parkenv.errors import InputError
+from parkenv.lot import Lane, Mouth, ParkingLot
+from parkenv.lot_check import check_lot
+from parkenv.lot_files import PACKAGED_LOTS
+from parkenv.lots.build import LOTS, build
+
+DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"
+finite = st.floats(-1e6, 1e6)
+points = st.tuples(finite, finite)
+
+
+def feature(kind, shape, coordinates, **properties):
+    geometry = {"type": shape, "coordinates": coordinates}
+    return {"type": "Feature", "properties": {"kind": kind, **properties}, "geometry": geometry}
+
+
+def box(x0, y0, x1, y1):
+    return [[[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]]
+
+
+def document():
+    """A sound lot of two slots: features 0 and 1; 2 is the lane, 3 the entry, 4 the goal, 5 a wall."""
+    return {
+        "type": "FeatureCollection",
+        "name": "two",
+        "parkenv": {"format": "lot", "version": 1},
+        "frame": "local",
+        "features": [
+            feature("slot", "Polygon", box(10, 3, 12.5, 8), id="a"),
+            feature("slot", "Polygon", box(20, 3, 22.5, 8), id="b"),
+            feature("lane", "LineString", [[0, 0], [40, 0]], oneway=False),
+            feature("entry", "Point", [0, 0]),
+            feature("goal", "Point", [45, 0]),
+            feature("wall", "LineString", [[0, 12], [40, 12]]),
+        ],
+    }
+
+
+def written(tmp_path, content) -> Path:
+    path = tmp_path / "lot.geojson"
+    path.write_text(content if isinstance(content, str) else json.dumps(content), encoding="utf-8")
+    return path
+
+
+def read(tmp_path, content) -> ParkingLot:
+    return ParkingLot.from_file(written(tmp_path, content))
+
+
+def with_exact(slot, **changes):
+    shape = {"center": [11.25, 5.5], "yaw": np.pi / 2, "length": 5.0, "width": 2.5, "mouth": "rear"}
+    slot["properties"].update({**shape, **changes})
+
+
+# ---- round trip ----
+
+
+@pytest.mark.parametrize("name", PACKAGED_LOTS)
+def test_packaged_lots_are_what_their_script_makes(name, tmp_path):
+    lot = ParkingLot.packaged(name)
+    assert lot == LOTS[name]()
+    build(tmp_path)
+    committed = Path(__file__).parents[1] / "parkenv" / "lots" / f"{name}.geojson"
+    assert (tmp_path / committed.name).read_text() == committed.read_text()
+    assert check_lot(committed) == []
+
+
+def test_unknown_packaged_lot_lists_the_known_ones():
+    with pytest.raises(InputError, match="no packaged lot 'camp', want one of campus, jam, street, mini"):
+        ParkingLot.packaged("camp")
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@given(
+    rows=st.integers(1, 5),
+    columns=st.integers(1, 5),
+    pitch=st.floats(2.0, 4.0),
+    aisle=st.floats(3.0, 9.0),
+    turn=st.floats(-4.0, 4.0),
+    shift=points,
+    name=st.text(),
+    goal=points,
+    walls=st.lists(st.lists(points, min_size=2, max_size=5), max_size=3),
+)
+def test_written_lots_are_read_back_to_the_bit(
+    tmp_path, rows, columns, pitch, aisle, turn, shift, name, goal, walls
+):
+    grid = ParkingLot.grid(rows, columns, name=name, pitch=pitch, aisle=aisle)
+    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+
+    def moved(xy):
+        return xy @ matrix.T + shift
+
+    lot = replace(
+        grid,
+        slot_xy=moved(grid.slot_xy),
+        slot_yaw=grid.slot_yaw + turn,
+        lanes=tuple(
+            Lane(moved(lane.points), oneway)
+            for lane, oneway in zip(grid.lanes, [True] + [False] * 9, strict=False)
+        ),
+        entries=moved(grid.entries),
+        goals=[goal],
+        walls=tuple(map(np.array, walls)),
+    )
+    path = tmp_path / "lot.geojson"
+    lot.to_file(path)
+    again = ParkingLot.from_file(path)
+    assert again == lot
+    assert again.slot_xy.tobytes() == lot.slot_xy.tobytes()
+    assert again.edge_length.tobytes() == lot.edge_length.tobytes()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_cities_are_read_back_to_the_bit(tmp_path, seed):
+    lot = ParkingLot.city(200, seed)
+    lot.to_file(tmp_path / "city.json")
+    assert ParkingLot.from_file(tmp_path / "city.json") == lot
+    assert check_lot(tmp_path / "city.json") == []
+
+
+def test_closed_walls_are_polygons_in_the_file(tmp_path):
+    lot = ParkingLot.packaged("mini")
+    lot.to_file(tmp_path / "mini.geojson")
+    features = json.loads((tmp_path / "mini.geojson").read_text())["features"]
+    shapes = [f["geometry"]["type"] for f in features if f["properties"]["kind"] == "wall"]
+    assert shapes == ["LineString", "Polygon"]
+
+
+def test_a_lot_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "lot.geojson"
+    path.write_text("before")
+
+    def full_disk(self, *arguments, **options):
+        with self.open("w") as file:
+            file.write("half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full_disk)
+    with pytest.raises(InputError, match="cannot be written: No space left on device"):
+        ParkingLot.packaged("mini").to_file(path)
+    monkeypatch.undo()
+    assert path.read_text() == "before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_lot_is_not_written_where_it_could_not_be_read(tmp_path):
+    with pytest.raises(InputError, match=r"written as \.geojson or \.json"):
+        ParkingLot.packaged("mini").to_file(tmp_path / "lot.yml")
+    with pytest.raises(InputError, match="cannot be written"):
+        ParkingLot.packaged("mini").to_file(tmp_path / "nowhere" / "lot.geojson")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---- files of others ----
+
+
+def test_slots_are_understood_from_their_outlines(tmp_path):
+    doc = document()
+    doc["features"][1] = feature("slot", "Polygon", box(20, -5, 26, -2.9), id="kerb")
+    lot = read(tmp_path, doc)
+    assert lot.name == "two"
+    np.testing.assert_allclose(lot.slot_xy, [[11.25, 5.5], [23.0, -3.95]])
+    np.testing.assert_allclose(lot.slot_length, [5.0, 6.0])
+    np.testing.assert_allclose(lot.slot_width, [2.5, 2.1])
+    np.testing.assert_allclose(lot.slot_yaw, [np.pi / 2, 0.0], atol=1e-12)
+    assert lot.slot_mouth.tolist() == [Mouth.REAR, Mouth.LEFT]
+    assert check_lot(tmp_path / "lot.geojson") == []
+
+
+@pytest.mark.parametrize(
+    ("y", "oneway", "mouth", "yaw"),
+    [
+        (-3.95, False, Mouth.LEFT, 0.0),
+        (3.95, False, Mouth.LEFT, np.pi),
+        (-3.95, True, Mouth.LEFT, 0.0),
+        (3.95, True, Mouth.RIGHT, 0.0),
+    ],
+)
+def test_kerbside_cars_stand_as_traffic_runs(tmp_path, y, oneway, mouth, yaw):
+    doc = document()
+    doc["features"][0] = feature("slot", "Polygon", box(10, y - 1.05, 16, y + 1.05), id="kerb")
+    doc["features"][2]["properties"]["oneway"] = oneway
+    lot = read(tmp_path, doc)
+    assert lot.slot_mouth[0] == mouth
+    assert np.cos(lot.slot_yaw[0] - yaw) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", PACKAGED_LOTS)
+def test_outlines_alone_tell_the_same_lots(tmp_path, name):
+    doc = json.loads((Path(__file__).parents[1] / "parkenv" / "lots" / f"{name}.geojson").read_text())
+    for f in doc["features"]:
+        if f["properties"]["kind"] == "slot":
+            f["properties"] = {"kind": "slot", "id": f["properties"]["id"]}
+    lot, known = read(tmp_path, doc), ParkingLot.packaged(name)
+    np.testing.assert_array_equal(lot.slot_mouth, known.slot_mouth)
+    np.testing.assert_allclose(lot.slot_xy, known.slot_xy, atol=2e-3)
+    np.testing.assert_allclose(lot.slot_length, known.slot_length, atol=4e-3)
+    np.testing.assert_allclose(lot.slot_width, known.slot_width, atol=4e-3)
+    assert np.cos(lot.slot_yaw - known.slot_yaw).min() > 0.9999
+
+
+def test_longitude_and_latitude_become_metres(tmp_path):
+    from pyproj import Geod
+
+    geod = Geod(ellps="WGS84")
+    known = ParkingLot.packaged("jam")
+    path = tmp_path / "jam.geojson"
+    known.to_file(path)
+    doc = json.loads(path.read_text())
+    del doc["frame"], doc["parkenv"]
+
+    def to_globe(xy):
+        if isinstance(xy[0], list):
+            return [to_globe(part) for part in xy]
+        x, y = xy
+        lon, lat, _ = geod.fwd(7.8342, 48.0131, np.degrees(np.arctan2(x, y)), np.hypot(x, y))
+        return [lon, lat, 270.0]
+
+    for f in doc["features"]:
+        f["geometry"]["coordinates"] = to_globe(f["geometry"]["coordinates"])
+    lot = read(tmp_path, doc)
+    assert lot.slot_ids == known.slot_ids
+    offset = (lot.slot_xy - known.slot_xy).mean(axis=0)
+    np.testing.assert_allclose(lot.slot_xy - offset, known.slot_xy, atol=0.01)
+    np.testing.assert_allclose(lot.goals - offset, known.goals, atol=0.01)
+    np.testing.assert_allclose(lot.slot_length, known.slot_length, atol=0.01)
+    np.testing.assert_array_equal(lot.slot_mouth, known.slot_mouth)
+    np.testing.assert_array_equal(lot.neighbors, known.neighbors)
+
+
+def test_a_lot_on_the_date_line_stays_in_one_piece(tmp_path):
+    doc = document()
+    del doc["frame"]
+
+    def to_globe(xy):
+        if isinstance(xy[0], list):
+            return [to_globe(part) for part in xy]
+        lon = 180.0 + (xy[0] - 20.0) / 111_319.5
+        return [lon - 360.0 if lon > 180.0 else lon, xy[1] / 110_574.0]
+
+    for f in doc["features"]:
+        f["geometry"]["coordinates"] = to_globe(f["geometry"]["coordinates"])
+    lot = read(tmp_path, doc)
+    assert lot.slot_xy[1, 0] - lot.slot_xy[0, 0] == pytest.approx(10.0, abs=0.01)
+
+
+def test_a_polygon_may_lie_a_centimetre_off_its_properties(tmp_path):
+    doc = document()
+    with_exact(doc["features"][0], center=[11.255, 5.5])
+    assert read(tmp_path, doc).slot_xy[0, 0] == 11.255
+
+
+def test_ids_may_stand_elsewhere_or_nowhere(tmp_path):
+    doc = document()
+    del doc["features"][0]["properties"]["id"]
+    doc["features"][0]["id"] = 17
+    del doc["features"][1]["properties"]["id"]
+    assert read(tmp_path, doc).slot_ids == ("17", "1")
+
+
+# ---- the Dragon Lake map ----
+
+needs_dragon_lake = pytest.mark.skipif(
+    not DRAGON_LAKE.exists(),
+    reason="the Dragon Lake map, data/dlp/parking_map.yml, is not beside this checkout",
+)
+
+
+@needs_dragon_lake
+def test_dragon_lake_is_a_drivable_lot():
+    lot = ParkingLot.from_file(DRAGON_LAKE)
+    assert lot.n_slots == 364
+    assert lot.slot_ids[0] == "A-0-0"
+    assert {"A-0-41", "B-1-24", "I-0-20"} < set(lot.slot_ids)
+    assert connected_components(lot.drive_matrix(), connection="strong")[0] == 1
+    np.testing.assert_allclose(lot.entries, [[14.38, 76.21]])
+    np.testing.assert_allclose(lot.vertex_xy[lot.entry_vertices], lot.entries)
+    np.testing.assert_allclose(lot.goals, [[80.0, -4.0]])
+    assert check_lot(DRAGON_LAKE) == []
+
+
+@needs_dragon_lake
+def test_dragon_lake_is_not_driven_through_parked_rows():
+    lot = ParkingLot.from_file(DRAGON_LAKE)
+    source, column = np.nonzero(lot.neighbors >= 0)
+    ways = np.stack([lot.vertex_xy[source], lot.vertex_xy[lot.neighbors[source, column]]], axis=1)
+    slots = shapely.polygons(lot.slot_corners())
+    crossed = shapely.STRtree(slots).query(shapely.linestrings(ways), predicate="intersects")
+    assert crossed.shape == (2, 0)
+
+    # Two slots back to back in the middle of area B: the way leads round by C1 or C2.
+    upper, lower = lot.slot_ids.index("B-0-12"), lot.slot_ids.index("B-1-12")
+    assert np.hypot(*(lot.slot_xy[upper] - lot.slot_xy[lower])) < 6.0
+    to_c1 = lot.slot_xy[upper, 0] - 3.07
+    assert dijkstra(lot.drive_matrix(), indices=upper)[lower] > 2 * to_c1 + 10.0
+
+
+@needs_dragon_lake
+def test_dragon_lake_rows_open_to_their_own_aisles():
+    lot = ParkingLot.from_file(DRAGON_LAKE)
+    vertex_y = dict(zip(lot.slot_ids, lot.vertex_xy[:364, 1], strict=True))
+    for slot, aisle in (
+        ("A-0-3", 64.95),
+        ("B-0-3", 64.95),
+        ("B-1-3", 46.82),
+        ("D-0-3", 46.82),
+        ("I-0-3", 9.99),
+    ):
+        assert vertex_y[slot] == pytest.approx(aisle, abs=1.6)
+    # Columns count from the west in every row.
+    x = dict(zip(lot.slot_ids, lot.slot_xy[:, 0], strict=True))
+    assert x["B-0-0"] == pytest.approx(x["B-1-0"])
+    assert x["B-0-0"] < x["B-0-1"]
+
+
+@needs_dragon_lake
+def test_dragon_lake_goes_through_the_native_format(tmp_path):
+    lot = ParkingLot.from_file(DRAGON_LAKE)
+    lot.to_file(tmp_path / "dlp.geojson")
+    assert ParkingLot.from_file(tmp_path / "dlp.geojson") == lot
+    assert check_lot(tmp_path / "dlp.geojson") == []
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: [1", "not YAML: .*line 1"),
+        ("- 1", "no WAYPOINTS.R1L.bounds, want 2 points"),
+        ("WAYPOINTS: {R1L: {bounds: [[1, 2], [3, .nan]]}}", "WAYPOINTS.R1L.bounds is"),
+    ],
+)
+def test_a_map_that_is_none_is_refused(tmp_path, text, message):
+    path = tmp_path / "map.yml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        ParkingLot.from_file(path)
+    assert "\n" not in str(caught.value)
+    (problem,) = check_lot(path)
+    assert problem.severity == "error"
+    assert str(path) not in problem.message
+
+
+# ---- faults ----
+
+
+def broken(change):
+    doc = document()
+    change(doc)
+    return doc
+
+
+def set_feature(index, *arguments, **properties):
+    def change(doc):
+        doc["features"][index] = feature(*arguments, **properties)
+
+    return change
+
+
+def exact(**changes):
+    return lambda doc: with_exact(doc["features"][0], **changes)
+
+
+FAULTS = [
+    # change, feature, message
+    (lambda d: d.update(type="Feature"), None, "type is 'Feature', want a GeoJSON 'FeatureCollection'"),
+    (lambda d: d.update(features={}), None, "features is {}, want a list of features"),
+    (lambda d: d["parkenv"].update(version=2), None, "parkenv.version is 2, want 1: made by a newer parkenv"),
+    (lambda d: d["parkenv"].update(version="1"), None, "parkenv.version is '1', want 1"),
+    (
+        lambda d: d.update(parkenv={"format": "map", "version": 1}),
+        None,
+        'want {"format": "lot", "version": 1}',
+    ),
+    (lambda d: d.update(frame="utm"), None, "frame is 'utm', want 'local'"),
+    (lambda d: d.update(name=3), None, "name is 3, want a text"),
+    (lambda d: d["features"].__setitem__(5, "wall"), 5, "want a GeoJSON object of type 'Feature'"),
+    (
+        lambda d: d["features"][0].update(properties=None),
+        0,
+        "kind is None, want one of slot, lane, entry, goal",
+    ),
+    (set_feature(0, "tree", "Point", [0, 0]), 0, "kind is 'tree', want one of slot, lane, entry, goal, wall"),
+    (set_feature(2, "lane", "Polygon", box(0, 0, 1, 1)), 2, "lane: geometry is 'Polygon', want LineString"),
+    (set_feature(5, "wall", "Point", [0, 0]), 5, "wall: geometry is 'Point', want LineString or Polygon"),
+    (lambda d: d["features"][3].update(geometry=None), 3, "entry: geometry is None, want Point"),
+    (
+        set_feature(3, "entry", "Point", [0, float("nan")]),
+        3,
+        "entry: position [0, nan], want two finite numbers",
+    ),
+    (
+        set_feature(4, "goal", "Point", [float("inf"), 0]),
+        4,
+        "goal: position [inf, 0], want two finite numbers",
+    ),
+    (set_feature(4, "goal", "Point", ["45", 0]), 4, "goal: position ['45', 0], want two finite numbers"),
+    (set_feature(4, "goal", "Point", [True, 0]), 4, "goal: position [True, 0], want two finite numbers"),
+    (set_feature(4, "goal", "Point", [10**400, 0]), 4, "want two finite numbers"),
+    (set_feature(4, "goal", "Point", 7), 4, "goal: position 7, want two finite numbers"),
+    (set_feature(2, "lane", "LineString", [[0, 0]]), 2, "want at least 2 positions"),
+    (set_feature(2, "lane", "LineString", [[0, 0], [0, 0]]), 2, "are the same place"),
+    (
+        set_feature(2, "lane", "LineString", [[0, 0], [40, 0]], oneway="no"),
+        2,
+        "oneway is 'no', want true or false",
+    ),
+    (set_feature(0, "slot", "Polygon", []), 0, "slot: coordinates are [], want a list of rings"),
+    (set_feature(0, "slot", "Polygon", 2 * box(10, 3, 12, 8)), 0, "slot: the polygon has 2 rings, want 1"),
+    (set_feature(0, "slot", "Polygon", [box(10, 3, 12, 8)[0][:4]]), 0, "slot: the polygon's ring is open"),
+    (
+        set_feature(0, "slot", "Polygon", [[[10, 3], [12, 8], [12, 3], [10, 8], [10, 3]]], id="a"),
+        0,
+        "slot 'a': the polygon is not a simple one: Self-intersection",
+    ),
+    (
+        set_feature(0, "slot", "Polygon", [[[9, 3], [9, 8], [9, 5], [9, 3]]], id="a"),
+        0,
+        "'a': the polygon is flat",
+    ),
+    (set_feature(0, "slot", "Polygon", box(10, 3, 10.01, 8), id="a"), 0, "'a': the polygon is 0.010 m wide"),
+    (
+        set_feature(0, "slot", "Polygon", box(10, 3, 12.5, 8), id="b"),
+        1,
+        "slot: id 'b' stands already at feature 0",
+    ),
+    (set_feature(0, "slot", "Polygon", box(10, 3, 12.5, 8), id=[1]), 0, "slot: id is [1], want a text"),
+    (
+        exact(center=[11.3, 5.5]),
+        0,
+        "slot 'a': the polygon lies 0.05 m from what center, yaw, length and width say",
+    ),
+    (exact(width=float("nan")), 0, "slot 'a': width is nan, want at least 0.1 m"),
+    (exact(length=-5.0), 0, "slot 'a': length is -5.0, want at least 0.1 m"),
+    (exact(yaw="north"), 0, "slot 'a': yaw is 'north', want a finite number"),
+    (exact(center=[1.0]), 0, "slot 'a': center is [1.0], want two finite numbers"),
+    (exact(mouth="front"), 0, "slot 'a': mouth is 'front', want one of rear, left, right"),
+    (
+        lambda d: d["features"][0]["properties"].update(yaw=0.0),
+        0,
+        "slot 'a': no center, want all of center, yaw",
+    ),
+    (
+        set_feature(1, "slot", "Polygon", box(20, 30, 22.5, 35), id="b"),
+        1,
+        "slot 'b' is on no lane: the nearest is 30.0",
+    ),
+    (
+        set_feature(3, "entry", "Point", [0, 20]),
+        3,
+        "entry is 20.0 m from the nearest lane, want at most 15 m",
+    ),
+    (
+        lambda d: d["features"].extend(
+            feature("lane", "LineString", [[40, 0], [40 + dx, dy]])
+            for dx, dy in ((9, 9), (9, 0), (9, -9), (0, -9))
+        ),
+        2,
+        "lane: the junction at (40.0, 0.0) m has 5 lanes that lead away",
+    ),
+    (lambda d: d.update(features=d["features"][2:]), None, "no slot: an empty lot"),
+    (lambda d: d["features"].pop(2), None, "no lane: an empty lot"),
+    (lambda d: d["features"].pop(3), None, "no entry: an empty lot"),
+    (lambda d: d["features"].pop(4), None, "no goal: an empty lot"),
+]
+
+
+@pytest.mark.parametrize(("change", "number", "message"), FAULTS, ids=map(str, range(len(FAULTS))))
+def test_faults_are_named(tmp_path, change, number, message):
+    path = written(tmp_path, broken(change))
+    errors = [problem for problem in check_lot(path) if problem.severity == "error"]
+    assert [problem.feature for problem in errors] == [number]
+    assert message in errors[0].message
+    with pytest.raises(InputError) as caught:
+        ParkingLot.from_file(path)
+    where = "" if number is None else f"feature {number}: "
+    assert str(caught.value) == f"{path}: {where}{errors[0].message}"
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "not JSON: line 1, column 1"),
+        ('{"type": "FeatureCollection",\n "features": [', "not JSON: line 2, column 15"),
+        ("[1, 2]", "type is 'list', want a GeoJSON 'FeatureCollection'"),
+        ("[" * 100_000, "not JSON"),
+        ("9" * 5000, "not JSON"),
+    ],
+)
+def test_files_that_are_no_geojson_are_refused(tmp_path, text, message):
+    path = written(tmp_path, text)
+    with pytest.raises(InputError, match=message):
+        ParkingLot.from_file(path)
+    (problem,) = check_lot(path)
+    assert problem.feature is None
+
+
+def test_every_cut_of_a_file_is_refused(tmp_path):
+    whole = json.dumps(document())
+    for length in range(0, len(whole), 37):
+        with pytest.raises(InputError, match="not JSON: line 1, column"):
+            read(tmp_path, whole[:length])
+
+
+def test_files_that_are_not_there_or_no_text_are_refused(tmp_path):
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        ParkingLot.from_file(tmp_path / "lot.geojson")
+    with pytest.raises(InputError, match=r"unknown kind of file '\.osm'"):
+        ParkingLot.from_file(tmp_path / "lot.osm")
+    (tmp_path / "lot.json").write_bytes(b'{"name": "\xff"}')
+    with pytest.raises(InputError, match="not UTF-8 text"):
+        ParkingLot.from_file(tmp_path / "lot.json")
+
+
+def test_metres_without_a_frame_are_refused(tmp_path):
+    doc = document()
+    del doc["frame"]
+    doc["features"][4]["geometry"]["coordinates"] = [450.0, 0.0]
+    (problem,) = check_lot(written(tmp_path, doc))
+    assert problem.feature == 4
+    assert 'needs the member "frame": "local"' in problem.message
+
+
+def test_all_faults_are_listed_at_once(tmp_path):
+    doc = document()
+    doc["features"][0]["properties"]["kind"] = "slott"
+    doc["features"][1]["geometry"]["coordinates"] = box(20, 60, 22.5, 65)
+    doc["features"][3]["geometry"]["coordinates"] = [0, 99]
+    doc["features"][4]["geometry"]["coordinates"] = [None, 0]
+    doc["features"].append(feature("lane", "LineString", [[20, -30], [20, 30]]))
+    path = written(tmp_path, doc)
+    problems = check_lot(path)
+    assert [(p.severity, p.feature) for p in problems] == [
+        ("error", 0),
+        ("error", 4),
+        ("error", 3),
+        ("error", 1),
+        ("warning", 6),
+    ]
+    assert str(problems[0]).startswith("error: feature 0: kind is 'slott'")
+    with pytest.raises(
+        InputError, match=r"feature 0: kind .* \(and 3 more; `parkenv lot check .* lists all\)"
+    ):
+        ParkingLot.from_file(path)
+
+
+WARNINGS = [
+    (set_feature(4, "goal", "Point", [200, 0]), 4, "goal: the nearest lane is 160 m away"),
+    (
+        set_feature(1, "slot", "Polygon", box(11, 3, 13.5, 8), id="b"),
+        1,
+        "slot 'b' overlaps slot 'a' of feature",
+    ),
+    (
+        lambda d: d["features"].append(feature("lane", "LineString", [[30, -9], [30, 9]])),
+        6,
+        "lane crosses the lane of feature 2 at (30.0, 0.0) m without a common point",
+    ),
+    (
+        lambda d: d["features"].append(feature("lane", "LineString", [[30, 0], [30, 9]])),
+        6,
+        "lane crosses the lane of feature 2 at (30.0, 0.0) m without a common point",
+    ),
+    (
+        lambda d: d["features"].append(feature("lane", "LineString", [[40.4, 0], [60, 0]])),
+        6,
+        "lane ends 0.40 m from the lane of feature 2 without a common point",
+    ),
+    (exact(yaw=-np.pi / 2), 0, "slot 'a': its mouth faces away from its lane"),
+]
+
+
+@pytest.mark.parametrize(("change", "number", "message"), WARNINGS, ids=map(str, range(len(WARNINGS))))
+def test_slips_of_the_pen_are_warned_of_and_read(tmp_path, change, number, message):
+    path = written(tmp_path, broken(change))
+    problems = check_lot(path)
+    assert {p.severity for p in problems} == {"warning"}
+    assert any(p.feature == number and message in p.message for p in problems), problems
+    assert ParkingLot.from_file(path).n_slots == 2
+
+
+def test_slots_that_cannot_be_reached_or_left_are_warned_of(tmp_path):
+    doc = document()
+    # A one-way lane away from the entry: its slot is a trap. One towards the entry: no way leads there.
+    doc["features"] += [
+        feature("lane", "LineString", [[40, 0], [80, 0]], oneway=True),
+        feature("slot", "Polygon", box(60, 3, 62.5, 8), id="trap"),
+        feature("lane", "LineString", [[-40, 0], [0, 0]], oneway=True),
+        feature("slot", "Polygon", box(-20, 3, -17.5, 8), id="upstream"),
+    ]
+    problems = check_lot(written(tmp_path, doc))
+    assert [(p.feature, p.message) for p in problems] == [
+        (9, "slot 'upstream': no way leads there from an entry"),
+        (7, "slot 'trap': no way leads on to another slot"),
+    ]
+
+
+def test_lanes_that_share_a_point_are_not_warned_of(tmp_path):
+    doc = document()
+    doc["features"][2] = feature("lane", "LineString", [[0, 0], [30, 0], [40, 0]])
+    doc["features"].append(feature("lane", "LineString", [[30, -9], [30, 0], [30, 9]]))
+    doc["features"].append(feature("lane", "LineString", [[45, 15], [30, 9]]))
+    assert check_lot(written(tmp_path, doc)) == []
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=150)
+@given(data=st.data())
+def test_no_content_makes_the_checker_raise(tmp_path, data):
+    doc = copy.deepcopy(document())
+    odd = st.sampled_from(
+        [None, True, 0, -1, 1e308, float("nan"), "x", "slot", [], {}, [[]], [0, 0], [[0, 0]]]
+    )
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = doc
+        while True:
+            keys = list(at) if isinstance(at, dict) else range(len(at))
+            key = data.draw(st.sampled_from(keys))
+            if isinstance(at[key], dict | list) and at[key] and data.draw(st.integers(0, 4)):
+                at = at[key]
+                continue
+            at[key] = copy.deepcopy(data.draw(odd))
+            break
+    path = written(tmp_path, doc)
+    errors = [p for p in check_lot(path) if p.severity == "error"]
+    if errors:
+        with pytest.raises(InputError):
+            ParkingLot.from_file(path)
+    else:
+        ParkingLot.from_file(path)

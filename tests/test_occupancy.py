@@ -1,0 +1,372 @@
+import copy
+import json
+import math
+import pickle
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from parkenv.errors import InputError
+from parkenv.keyed_random import keyed_exponential, keyed_uniform, world_key
+from parkenv.occupancy import HOUR_S, WEEK_S, Arrival, ArrivalWindow, OccupancyProcess
+
+NINE = Arrival(9 * HOUR_S)
+KEY = world_key(7, 0)
+
+
+def constant_process(n, arrival, departure):
+    return OccupancyProcess(np.ones(n), np.full(168, arrival), np.ones(n), np.full(168, departure))
+
+
+def busy_process(n=20):
+    rng = np.random.default_rng(0)
+    return OccupancyProcess.from_demand(rng.normal(0, 2, n), rng.normal(0, 2, 168), mean_stay_s=1800)
+
+
+def uniforms(key, streams, slots, indices):
+    return np.array([keyed_uniform(key, a, b, c) for a, b, c in zip(streams, slots, indices, strict=True)])
+
+
+# Keyed random numbers
+
+
+def test_keyed_uniforms_are_uniform_and_their_neighbours_independent():
+    n = 40_000
+    zero, run = np.zeros(n, int), np.arange(n)
+    base = uniforms(KEY, zero, zero, run)
+    assert base.min() > 0
+    assert base.max() < 1
+    assert base.mean() == pytest.approx(1 / 2, abs=4 / math.sqrt(12 * n))
+    assert base.var() == pytest.approx(1 / 12, abs=4 * math.sqrt(1 / 180 / n))
+    assert np.histogram(base, 16, (0, 1))[0] == pytest.approx(n / 16, abs=5 * math.sqrt(n / 16))
+    others = {
+        "next index": uniforms(KEY, zero, zero, run + 1),
+        "next slot": uniforms(KEY, zero, zero + 1, run),
+        "next stream": uniforms(KEY, zero + 1, zero, run),
+        "slot and index swapped": uniforms(KEY, zero, run, zero),
+        "next episode": uniforms(world_key(7, 1), zero, zero, run),
+    }
+    for name, other in others.items():
+        assert abs(np.corrcoef(base, other)[0, 1]) < 4 / math.sqrt(n), name
+
+
+def test_keyed_uniform_takes_any_integer_type():
+    one = keyed_uniform(KEY, 1, 2, 3)
+    assert keyed_uniform(int(KEY), np.int64(1), np.int32(2), np.uint8(3)) == one
+    assert keyed_exponential(KEY, 1, 2, 3) == -math.log(one)
+
+
+@given(seed=st.integers(0, 2**200), episode=st.integers(0, 2**70))
+def test_world_keys_accept_big_seeds_and_tell_them_apart(seed, episode):
+    keys = {int(world_key(seed + i, episode + j)) for i in range(2) for j in range(2)}
+    assert len(keys) == 4
+    assert world_key(seed, episode) == world_key(seed, episode)
+
+
+def test_world_key_refuses_negative_seeds():
+    with pytest.raises(InputError, match=r"seed: got -1, wanted an integer >= 0"):
+        world_key(-1, 0)
+
+
+# Closed forms
+
+
+def test_a_constant_chain_rests_at_its_equilibrium():
+    process = constant_process(3, 2e-4, 1e-4)
+    assert process.marginal(12345.0) == pytest.approx(2 / 3)
+    assert process.forecast(NINE).relaxation_rate == pytest.approx(3e-4)
+
+
+def test_the_marginal_relaxes_exponentially_after_the_rates_have_changed():
+    arrival = np.full(168, 1e-4)
+    arrival[100:] = 0.0
+    process = OccupancyProcess(np.ones(1), arrival, np.ones(1), np.full(168, 1e-4))
+    p0, p1 = process.marginal(100 * HOUR_S)[0], process.marginal(103.5 * HOUR_S)[0]
+    assert p1 == pytest.approx(p0 * math.exp(-1e-4 * 3.5 * HOUR_S), rel=1e-12)
+
+
+def test_the_marginal_solves_its_differential_equation_and_repeats_weekly():
+    process = busy_process()
+    for time in (1.0, 3.5 * HOUR_S, 100.3 * HOUR_S):
+        arrival, departure = process.factors * process.profiles[:, int(time // HOUR_S), None]
+        p, step = process.marginal(time), 0.01
+        slope = (process.marginal(time + step) - process.marginal(time - step)) / (2 * step)
+        assert slope == pytest.approx(arrival * (1 - p) - departure * p, rel=1e-4, abs=1e-10)
+        assert process.marginal(time + WEEK_S) == pytest.approx(p, abs=1e-12)
+
+
+def test_a_slow_chain_needs_the_whole_week_for_its_marginal():
+    # Nothing is forgotten in a week, so the time average of the rates decides.
+    arrival = np.zeros(168)
+    arrival[:42] = 4e-12
+    process = OccupancyProcess(np.ones(1), arrival, np.ones(1), np.full(168, 3e-12))
+    assert process.marginal(50 * HOUR_S)[0] == pytest.approx(1 / 4, abs=1e-5)
+
+
+def test_worlds_are_occupied_as_often_as_the_marginal_says_at_any_time():
+    n = 20_000
+    profile = 1e-4 * (1 + np.sin(np.arange(168)))
+    process = OccupancyProcess(np.ones(n), profile, np.ones(n), np.full(168, 1e-4))
+    world = process.world(KEY, NINE)
+    for time in (9 * HOUR_S, 12.3 * HOUR_S, WEEK_S + 9 * HOUR_S, 2.5 * WEEK_S):
+        p = process.marginal(time)[0]
+        assert world.occupied(np.arange(n), time).mean() == pytest.approx(
+            p, abs=4 * math.sqrt(p * (1 - p) / n)
+        )
+
+
+def test_holding_times_have_the_mean_one_over_the_rate():
+    n = 20_000
+    world = constant_process(n, 1e-3, 1 / 7200).world(KEY, NINE)
+    slots = np.flatnonzero(world.occupied(np.arange(n), NINE.time))
+    stays = world.next_free(slots, NINE.time) - NINE.time
+    assert stays.mean() == pytest.approx(7200, abs=4 * 7200 / math.sqrt(slots.size))
+    assert stays.std() == pytest.approx(7200, rel=0.05)
+
+
+def test_holding_times_skip_the_hours_in_which_nobody_leaves():
+    departure = np.zeros(168)
+    departure[17] = 1e-2
+    process = OccupancyProcess(np.full(500, 1.0), np.full(168, 1e-2), np.ones(500), departure)
+    world = process.world(KEY, NINE)
+    taken = np.flatnonzero(world.occupied(np.arange(500), NINE.time))
+    freed = world.next_free(taken, NINE.time)
+    assert np.all((freed % WEEK_S >= 17 * HOUR_S) & (freed % WEEK_S <= 18 * HOUR_S))
+
+
+def test_without_rates_a_state_lasts_for_ever():
+    never_left = constant_process(50, 1e-3, 0.0).world(KEY, NINE)
+    assert never_left.occupied(np.arange(50), 100 * WEEK_S).all()
+    assert np.all(never_left.next_free(np.arange(50), NINE.time) == np.inf)
+    frozen = constant_process(50, 0.0, 0.0)
+    assert np.all(frozen.marginal(0.0) == 0.5)
+    world = frozen.world(KEY, NINE)
+    first = world.occupied(np.arange(50), NINE.time)
+    assert np.array_equal(world.occupied(np.arange(50), 100 * WEEK_S), first)
+    assert np.array_equal(world.next_free(np.arange(50), NINE.time), np.where(first, np.inf, NINE.time))
+
+
+# Same key, same world, whoever looks
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    queries=st.lists(
+        st.tuples(st.lists(st.integers(0, 19), min_size=1, max_size=6), st.floats(0, 2e5)),
+        min_size=1,
+        max_size=12,
+    ),
+    data=st.data(),
+)
+def test_answers_do_not_depend_on_the_order_of_looks(queries, data):
+    process = busy_process()
+    world = process.world(KEY, NINE)
+
+    def answers(world, query):
+        slots, after = query
+        time = NINE.time + after
+        return world.occupied(slots, time).tolist(), world.next_free(slots, time).tolist()
+
+    expected = [answers(process.world(KEY, NINE), query) for query in queries]
+    for i in data.draw(st.permutations(range(len(queries)))):
+        assert answers(world, queries[i]) == expected[i]
+    for twin in (copy.deepcopy(world), pickle.loads(pickle.dumps(world))):
+        assert [answers(twin, query) for query in queries] == expected
+
+
+@settings(deadline=None, max_examples=60)
+@given(after=st.floats(0, 2e5), key=st.integers(0, 2**64 - 1))
+def test_a_slot_is_free_from_next_free_on_and_not_before(after, key):
+    world, slots, time = busy_process().world(np.uint64(key), NINE), np.arange(20), NINE.time + after
+    free_at = world.next_free(slots, time)
+    assert np.all(free_at >= time)
+    assert np.array_equal(free_at == time, ~world.occupied(slots, time))
+    for slot, at in zip(slots, free_at, strict=True):
+        assert not world.occupied([slot], at)[0]
+        assert at == time or world.occupied([slot], (time + at) / 2)[0]
+
+
+def test_two_processes_make_the_same_world():
+    code = (
+        "import numpy as np; from parkenv.keyed_random import world_key;"
+        "from parkenv.occupancy import Arrival, OccupancyProcess;"
+        "p = OccupancyProcess.from_demand(np.linspace(-2, 2, 9), np.zeros(168));"
+        "print(p.world(world_key(3, 4), Arrival(0.0)).next_free(np.arange(9), 5e4).tolist())"
+    )
+    outputs = {
+        subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout for _ in range(2)
+    }
+    assert len(outputs) == 1
+    process = OccupancyProcess.from_demand(np.linspace(-2, 2, 9), np.zeros(168))
+    here = process.world(world_key(3, 4), Arrival(0.0)).next_free(np.arange(9), 5e4)
+    assert json.loads(outputs.pop()) == here.tolist()
+
+
+def test_a_copy_of_a_world_goes_its_own_way():
+    world = busy_process().world(KEY, NINE)
+    twin = copy.deepcopy(world)
+    twin.occupied(np.arange(20), 3 * WEEK_S)
+    assert twin.process is world.process
+    assert not world._flips.any()
+
+
+def test_a_million_slots_cost_nothing_until_seen():
+    process = constant_process(1_000_000, 1e-4, 1e-4)
+    world = process.world(KEY, NINE)
+    assert world.occupied([5, 999_999], NINE.time).shape == (2,)
+    assert world._flips.sum() == 2
+
+
+# Forecast, constructors, files
+
+
+def test_forecast_is_the_clipped_marginal():
+    process = OccupancyProcess([1.0, 0.0, 1.0], np.full(168, 1e-4), [1.0, 1.0, 0.0], np.full(168, 1e-4))
+    assert process.forecast(NINE).p_occupied == pytest.approx([0.5, 0.001, 0.999])
+
+
+def test_from_demand_has_the_demanded_equilibrium():
+    process = OccupancyProcess.from_demand([-1.0, 0.0, 2.0], np.full(168, 0.5), mean_stay_s=3600)
+    assert process.marginal(5e5) == pytest.approx(1 / (1 + np.exp(-np.array([-0.5, 0.5, 2.5]))))
+    assert process.departure_profile == pytest.approx(1 / 3600)
+
+
+@pytest.mark.parametrize("target", [0.02, 0.5, 0.97])
+def test_at_mean_occupancy_hits_its_target_and_keeps_the_order_of_slots(target):
+    process = busy_process()
+    shifted = process.at_mean_occupancy(target, NINE.time)
+    assert shifted.marginal(NINE.time).mean() == pytest.approx(target, abs=1e-6)
+    assert shifted.arrival_factor / process.arrival_factor == pytest.approx(
+        shifted.arrival_factor[0] / process.arrival_factor[0]
+    )
+
+
+def test_take_lays_slots_on_another_lot():
+    process = busy_process()
+    assert np.array_equal(process.take([3, 3, 0]).marginal(0.0), process.marginal(0.0)[[3, 3, 0]])
+
+
+def test_a_file_gives_the_same_process_back(tmp_path):
+    path = tmp_path / "process.json"
+    process = busy_process()
+    process.to_file(path)
+    assert np.array_equal(OccupancyProcess.from_file(path).factors, process.factors)
+    assert np.array_equal(OccupancyProcess.from_file(path).profiles, process.profiles)
+    assert [p.name for p in tmp_path.iterdir()] == ["process.json"]
+
+
+def change(**fields):
+    return lambda content: content | fields
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (change(format="other"), '"format": "parkenv-occupancy-process"'),
+        (change(version=2), "version: got 2, wanted 1"),
+        (change(colour="red"), "missing or unknown fields: colour"),
+        (
+            lambda c: {k: v for k, v in c.items() if k != "arrival_factor"},
+            "missing or unknown fields: arrival_factor",
+        ),
+        (change(arrival_profile=[1e-4]), r"arrival_profile: got shape \(1,\), wanted \(168,\)"),
+        (
+            change(arrival_factor=[1.0] * 19 + [-1.0]),
+            r"arrival_factor\[19\]: got -1.0, wanted a finite number >= 0",
+        ),
+        (change(departure_factor=[1.0, math.nan] * 10), r"departure_factor\[1\]: got nan"),
+        (change(arrival_factor=[[1.0], 2.0]), "arrival_factor: .*wanted numbers"),
+        (change(arrival_factor=[]), r"arrival_factor: got shape \(0,\)"),
+        (change(arrival_factor=[1e12] * 20), "wanted factor .* profile <= 1000"),
+        (lambda c: [], "wanted a JSON object"),
+    ],
+)
+def test_a_bad_file_is_refused_by_name(tmp_path, spoil, message):
+    path = tmp_path / "process.json"
+    busy_process().to_file(path)
+    path.write_text(json.dumps(spoil(json.loads(path.read_text()))))
+    with pytest.raises(InputError, match=rf"process\.json: .*{message}"):
+        OccupancyProcess.from_file(path)
+
+
+def test_torn_missing_and_unwritable_files_are_refused(tmp_path):
+    path = tmp_path / "process.json"
+    busy_process().to_file(path)
+    path.write_text(path.read_text()[:-40])
+    with pytest.raises(InputError, match="not JSON"):
+        OccupancyProcess.from_file(path)
+    with pytest.raises(InputError, match=r"none\.json: No such file"):
+        OccupancyProcess.from_file(tmp_path / "none.json")
+    with pytest.raises(InputError, match="cannot be written"):
+        busy_process().to_file(tmp_path / "none" / "process.json")
+
+
+# Arrivals and their window
+
+
+def test_arrivals_are_uniform_over_the_window():
+    window, process = ArrivalWindow.parse("08:00-09:30", days="mon,sat"), busy_process()
+    times = np.array([process.draw_arrival(window, world_key(1, e)).time for e in range(4000)])
+    days, seconds = np.divmod(times, 86_400)
+    assert set(days) == {0.0, 5.0}
+    assert (days == 0).mean() == pytest.approx(0.5, abs=0.04)
+    assert seconds.min() >= 8 * HOUR_S
+    assert seconds.max() < 9.5 * HOUR_S
+    assert seconds.mean() == pytest.approx(8.75 * HOUR_S, abs=120)
+    assert abs(np.corrcoef(days, seconds)[0, 1]) < 0.07
+
+
+def test_window_parse():
+    assert ArrivalWindow.parse("08:00-13:00") == ArrivalWindow()
+    assert ArrivalWindow.parse("0:00-24:00", "all") == ArrivalWindow(tuple(range(7)), 0.0, 86_400.0)
+    assert ArrivalWindow.parse("10:00-10:00", "weekend").draw_second(KEY) == 10 * HOUR_S
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ArrivalWindow.parse("8-13"), "arrival hours: got '8-13', wanted HH:MM-HH:MM"),
+        (lambda: ArrivalWindow.parse("13:00-08:00"), "end_s: got 28800.0"),
+        (lambda: ArrivalWindow.parse("25:00-26:00"), "start_s: got 90000.0"),
+        (lambda: ArrivalWindow.parse("08:00-09:00", "monday"), "arrival days: got 'monday', wanted weekdays"),
+        (lambda: ArrivalWindow.parse("08:00-09:00", "mon,mon"), "weekdays: got"),
+        (lambda: ArrivalWindow(weekdays=()), "weekdays: got"),
+        (lambda: ArrivalWindow(start_s=math.nan), "start_s: got nan"),
+        (lambda: busy_process().at_mean_occupancy(1.0, 0.0), "got 1.0, wanted a number between 0 and 1"),
+        (
+            lambda: constant_process(2, 0.0, 1e-4).at_mean_occupancy(0.5, 0.0),
+            "cannot be reached by scaling the arrival rates",
+        ),
+        (lambda: OccupancyProcess.from_demand([1.0], np.zeros(168), -1.0), "mean_stay_s: got -1.0"),
+        (lambda: OccupancyProcess.from_demand([math.nan], np.zeros(168)), "attraction: wanted finite logits"),
+        (
+            lambda: busy_process().world(KEY, NINE).occupied([0], 0.0),
+            "time: got 0.0, wanted finite seconds at or after",
+        ),
+        (lambda: busy_process().world(KEY, NINE).occupied([0], math.inf), "time: got inf"),
+        (lambda: busy_process().world(KEY, Arrival(math.nan)), "Arrival.time: got nan"),
+    ],
+)
+def test_bad_input_is_refused_in_words(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+@pytest.mark.parametrize("slot", [-1, 20])
+def test_a_slot_that_is_not_there_is_an_index_error(slot):
+    with pytest.raises(IndexError, match="slot index out of range"):
+        busy_process().world(KEY, NINE).occupied([slot], NINE.time)
+
+
+def test_a_process_is_laid_on_another_lot_fullest_nearest():
+    process = OccupancyProcess.from_demand(np.array([-1.0, 2.0, 0.5]), np.zeros(168))
+    walk = np.array([90.0, 10.0, 50.0, 70.0, 20.0, 30.0])
+    laid = process.laid_on(walk)
+    fullness = laid.marginal(0.0)
+    assert laid.n_slots == 6
+    assert (np.diff(fullness[np.argsort(walk)]) <= 1e-12).all()
+    np.testing.assert_allclose(np.unique(fullness), np.unique(process.marginal(0.0)))

@@ -1,0 +1,210 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import check_grad
+
+from parkenv.errors import InputError
+from parkenv.keyed_random import world_key
+from parkenv.occupancy import DAY_S, HOUR_S, Arrival, OccupancyProcess
+from parkenv.occupancy_fit import fit_constant_rates, fit_process, log_likelihood
+from parkenv.occupancy_log import OccupancyLog
+
+REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
+FIRST_MONDAY = np.datetime64("2024-01-01")
+
+
+def simulated_log(process, n_weeks, every_s, start_h=7, end_h=19, seed=0):
+    """What a camera notes that looks at all slots at the same times of every day."""
+    n = process.n_slots
+    world = process.world(world_key(seed, 0), Arrival(0.0))
+    seconds = np.arange(start_h * HOUR_S, end_h * HOUR_S, every_s)
+    times = (np.arange(7 * n_weeks)[:, None] * DAY_S + seconds).ravel()
+    states = np.array([world.occupied(np.arange(n), time) for time in times])
+    return OccupancyLog(
+        tuple(f"s{i}" for i in range(n)),
+        tuple(str(FIRST_MONDAY + i) for i in range(7 * n_weeks)),
+        np.tile(np.arange(n), times.size),
+        np.repeat((times // DAY_S).astype(int), n),
+        np.repeat(times % DAY_S, n),
+        states.ravel(),
+    )
+
+
+def constant_process(n, arrival, departure):
+    return OccupancyProcess(np.ones(n), np.full(168, arrival), np.ones(n), np.full(168, departure))
+
+
+def naive_rates(looks):
+    """Flips over the time spent in the state that they leave."""
+    dt = looks.end - looks.start
+    flipped = looks.before != looks.after
+    return [np.sum(flipped & (looks.before == x)) / dt[looks.before == x].sum() for x in (False, True)]
+
+
+@pytest.mark.parametrize("every_s", [300.0, 1800.0])
+def test_constant_rates_are_recovered_however_coarse_the_looks(every_s):
+    arrival, departure = 1 / 1500, 1 / 3000
+    looks = simulated_log(constant_process(60, arrival, departure), 2, every_s).intervals()
+    fitted = fit_constant_rates(looks.end - looks.start, looks.before, looks.after)
+    assert fitted == pytest.approx((arrival, departure), rel=0.06)
+
+
+def test_counting_flips_of_coarse_looks_misses_half_of_them():
+    truth = np.array([1 / 1500, 1 / 3000])
+    looks = simulated_log(constant_process(60, *truth), 2, 1800.0).intervals()
+    fitted = np.array(fit_constant_rates(looks.end - looks.start, looks.before, looks.after))
+    assert np.all(np.array(naive_rates(looks)) < 0.65 * truth)
+    assert np.all(np.abs(fitted - truth) < 0.06 * truth)
+
+
+def test_constant_rates_solve_the_closed_form_for_equal_gaps():
+    # With one gap the fit is saturated: both transition probabilities are matched exactly.
+    start, end = np.repeat([0, 0, 1, 1], [70, 30, 40, 60]), np.repeat([0, 1, 0, 1], [70, 30, 40, 60])
+    arrival, departure = fit_constant_rates(np.full(200, 600.0), start, end)
+    total = -np.log(1 - 0.3 - 0.4) / 600
+    assert arrival == pytest.approx(total * 3 / 7, rel=1e-4)
+    assert departure == pytest.approx(total * 4 / 7, rel=1e-4)
+
+
+def test_what_never_happens_gets_the_lowest_rate():
+    arrival, departure = fit_constant_rates([600.0] * 3, [0, 0, 1], [0, 1, 1])
+    assert arrival > 1e-5
+    assert departure == pytest.approx(1e-9, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("dt", "start", "message"),
+    [
+        ([], [], r"looks: got shapes \(0,\)"),
+        ([1.0, 2.0], [1], "looks: got shapes"),
+        ([0.0], [1], "looks: dt: wanted finite seconds > 0"),
+    ],
+)
+def test_bad_looks_are_refused(dt, start, message):
+    with pytest.raises(InputError, match=message):
+        fit_constant_rates(dt, start, start)
+
+
+def random_intervals(k, n):
+    rng = np.random.default_rng(3)
+    start = rng.uniform(0, 20, k) * HOUR_S
+    end = start + rng.uniform(60, 3.5 * HOUR_S, k)
+    theta = np.concatenate([rng.normal(-8.5, 1, 96), rng.normal(0, 1, 2 * n)])
+    states = rng.random((2, k)) < 0.5
+    return theta, (rng.integers(0, n, k), 24 * rng.integers(0, 2, k), start, end, *states)
+
+
+def test_the_gradient_agrees_with_finite_differences():
+    theta, data = random_intervals(200, 4)
+    _, gradient = log_likelihood(theta, *data)
+    error = check_grad(lambda t: log_likelihood(t, *data)[0], lambda t: log_likelihood(t, *data)[1], theta)
+    assert error < 1e-5 * np.linalg.norm(gradient)
+
+
+def test_intervals_are_split_exactly_at_full_hours():
+    # The forward equation, integrated in small steps, gives the same likelihood.
+    theta, (slot, first_bin, start, end, before, after) = random_intervals(5, 2)
+    rates, value = np.exp(theta), 0.0
+    for k in range(5):
+        p, steps = float(before[k]), 200_000
+        dt = (end[k] - start[k]) / steps
+        bins = first_bin[k] + ((start[k] + (np.arange(steps) + 0.5) * dt) // HOUR_S).astype(int)
+        arrival = rates[bins] * rates[96 + slot[k]]
+        departure = rates[48 + bins] * rates[98 + slot[k]]
+        for a, d in zip(arrival, departure, strict=True):
+            p += (a * (1 - p) - d * p) * dt
+        value += np.log(p if after[k] else 1 - p)
+    assert log_likelihood(theta, slot, first_bin, start, end, before, after)[0] == pytest.approx(
+        value, abs=1e-3
+    )
+
+
+@pytest.fixture(scope="module")
+def hourly():
+    """A process with a morning rush, quiet weekends and uneven slots; its fit from looks every half hour."""
+    rng = np.random.default_rng(5)
+    hour = np.arange(24)
+    weekday = 1e-4 * np.exp(2 * np.exp(-(((hour - 9) / 2) ** 2)))
+    profile = np.concatenate([np.tile(weekday, 5), np.tile(0.3 * weekday, 2)])
+    factors = np.exp(rng.normal(0, 0.7, (2, 40)))
+    factors /= np.exp(np.log(factors).mean(axis=1, keepdims=True))
+    truth = OccupancyProcess(factors[0], profile, factors[1], np.full(168, 1.5e-4))
+    return truth, fit_process(simulated_log(truth, 12, 1800.0))
+
+
+@pytest.mark.parametrize("side", ["arrival", "departure"])
+@pytest.mark.parametrize("part", ["profile", "factor"])
+def test_profiles_and_factors_are_recovered_within_their_standard_errors(hourly, side, part):
+    truth, fit = hourly
+    name = f"{side}_{part}"
+    error = getattr(fit, f"{name}_se")
+    seen = np.isfinite(error)
+    off = (np.log(getattr(fit.process, name)) - np.log(getattr(truth, name)))[seen] / error[seen]
+    assert seen.sum() == (7 * 12 if part == "profile" else 40)
+    assert np.abs(off).max() < 4
+    assert 0.6 < np.sqrt(np.mean(off**2)) < 1.4
+    assert error[seen].max() < 0.6
+
+
+def test_factors_have_the_geometric_mean_one(hourly):
+    _, fit = hourly
+    assert np.log(fit.process.factors).mean(axis=1) == pytest.approx([0, 0], abs=1e-9)
+    assert fit.slot_ids[:2] == ("s0", "s1")
+    assert fit.n_intervals == 40 * 84 * 23
+
+
+def test_the_fitted_process_forecasts_the_morning_although_nights_were_not_seen(hourly):
+    truth, fit = hourly
+    assert np.isnan(fit.arrival_profile_se[:7]).all()
+    for day in (2, 5):
+        time = day * DAY_S + 7.1 * HOUR_S
+        assert fit.process.marginal(time).mean() == pytest.approx(truth.marginal(time).mean(), abs=0.04)
+
+
+def test_unobserved_hours_take_the_nearest_and_an_unobserved_class_the_other():
+    log = simulated_log(constant_process(20, 2e-4, 2e-4), 1, 600.0)
+    seen = (log.day < 5) & ((log.second < 9.9 * HOUR_S) | (log.second >= 13 * HOUR_S))
+    fit = fit_process(
+        OccupancyLog(
+            log.slot_ids, log.days, log.slot[seen], log.day[seen], log.second[seen], log.occupied[seen]
+        )
+    )
+    profile = fit.process.arrival_profile
+    # The gap from 9:50 to 13:00 is too long to count.
+    assert profile[10] == profile[11] == profile[9]
+    assert profile[12] == profile[13]
+    assert np.array_equal(profile[:24], profile[-24:])
+    assert np.isnan(fit.arrival_profile_se[[6, 10, 12, 130]]).all()
+
+
+def test_a_slot_that_never_changed_gets_a_finite_rate():
+    log = simulated_log(constant_process(10, 2e-4, 2e-4), 1, 600.0)
+    log = OccupancyLog(
+        log.slot_ids, log.days, log.slot, log.day, log.second, np.where(log.slot == 3, True, log.occupied)
+    )
+    process = fit_process(log).process
+    assert 1e-4 < process.departure_factor[3] < 0.2
+
+
+def test_nothing_to_fit_is_refused():
+    log = OccupancyLog(("a",), ("2024-01-01",), [0, 0], [0, 0], [0.0, 9000.0], [0, 1])
+    with pytest.raises(InputError, match="no two looks at a slot on one day within 7200 s"):
+        fit_process(log)
+    with pytest.raises(InputError, match=r"prior_sd: got 0\.0"):
+        fit_process(log, prior_sd=0.0)
+
+
+def test_the_real_logs_process_follows_the_day_and_survives_its_file(tmp_path):
+    if not REAL_LOG.exists():
+        pytest.skip("the CNRPark-EXT log is not in shared/data")
+    log = OccupancyLog.read(REAL_LOG)
+    fit = fit_process(log)
+    for kind, day in (("weekday", 2), ("weekend", 5)):
+        recorded = np.array([np.nanmean(log.mean_occupancy(kind, (h, h + 1))) for h in range(7, 17)])
+        fitted = np.array(
+            [fit.process.marginal(day * DAY_S + (h + 0.5) * HOUR_S).mean() for h in range(7, 17)]
+        )
+        assert np.abs(recorded - fitted).mean() < 0.05
+    fit.process.to_file(tmp_path / "cnr.json")
+    assert np.array_equal(OccupancyProcess.from_file(tmp_path / "cnr.json").factors, fit.process.factors)

@@ -1,0 +1,400 @@
+import copy
+import gzip
+import math
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from parkenv.errors import InputError
+from parkenv.keyed_random import world_key
+from parkenv.occupancy import DAY_S, HOUR_S, Arrival, ArrivalWindow
+from parkenv.occupancy_log import OccupancyLog, RecordedOccupancy, day_class, read_mapping
+
+REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
+HEADER = "datetime,camera,slot_id,weather,occupied\n"
+MONDAYS = ("2024-01-01", "2024-01-08", "2024-01-15", "2024-01-22", "2024-01-29")
+SATURDAYS = ("2024-01-06", "2024-01-13")
+
+
+def write(tmp_path, text, name="log.csv"):
+    path = tmp_path / name
+    path.write_bytes(gzip.compress(text.encode()) if name.endswith(".gz") else text.encode())
+    return path
+
+
+def random_log(n_slots=4, days=(*MONDAYS, *SATURDAYS), seed=0, change_days=()):
+    """Looks every half hour from 7 to 19; slot s is taken with the probability (s + 1) / (n + 1)."""
+    rng = np.random.default_rng(seed)
+    days = tuple(sorted(days))
+    slot, day, step = (
+        a.ravel() for a in np.meshgrid(range(n_slots), range(len(days)), range(24), indexing="ij")
+    )
+    occupied = rng.random(slot.size) < (slot + 1) / (n_slots + 1)
+    changed = np.isin(day, [days.index(d) for d in change_days])
+    ids = tuple(f"s{i}" for i in range(n_slots))
+    return OccupancyLog(ids, days, slot, day, 7 * HOUR_S + 1800.0 * step, occupied ^ changed)
+
+
+def at(day, hour):
+    return Arrival((5 if day_class(day) == "weekend" else 0) * DAY_S + hour * HOUR_S, day)
+
+
+# Reading
+
+
+@pytest.mark.parametrize("name", ["log.csv", "log.csv.gz"])
+def test_a_log_is_read(tmp_path, name):
+    text = HEADER + (
+        "2024-01-01 07:00,1,b,sunny,1\n2024-01-01 07:00,1,a,sunny,0\n\n2024-01-01T07:30:30,2,a,,1\n"
+        "2024-01-06 08:00,1,a,rainy,0\n"
+    )
+    log = OccupancyLog.read(write(tmp_path, text, name))
+    assert log.slot_ids == ("b", "a")
+    assert log.days == ("2024-01-01", "2024-01-06")
+    assert [day_class(day) for day in log.days] == ["weekday", "weekend"]
+    assert log.slot.tolist() == [0, 1, 1, 1]
+    assert log.day.tolist() == [0, 0, 0, 1]
+    assert log.second.tolist() == [25_200.0, 25_200.0, 27_030.0, 28_800.0]
+    assert log.occupied.tolist() == [True, False, True, False]
+    assert log.recorded.tolist() == [[True, False], [True, True]]
+
+
+def test_camera_and_weather_may_be_absent_and_the_later_of_two_cameras_stands(tmp_path):
+    text = "slot_id,occupied,datetime\na,1,2024-01-01 07:00\na,0,2024-01-01 07:00\na,0,2024-01-01 08:00\n"
+    log = OccupancyLog.read(write(tmp_path, text))
+    assert log.occupied.tolist() == [False, False]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "empty, wanted a header"),
+        (HEADER, "no looks"),
+        (
+            "datetime,slot_id,occupied,colour\n",
+            "column 'colour' is unknown, wanted some of datetime, camera,",
+        ),
+        ("datetime,slot_id\n", "column 'occupied' is missing"),
+        ("datetime,slot_id,slot_id,occupied\n", "column 'slot_id' stands there twice"),
+        (HEADER + "2024-01-01 07:00,1,a,sunny,2\n", "line 2: occupied: got '2', wanted 0 or 1"),
+        (HEADER + "yesterday,1,a,sunny,1\n", "line 2: datetime: got 'yesterday', wanted local date and time"),
+        (HEADER + "2024-01-01,1,a,sunny,1\n", "line 2: datetime: got '2024-01-01'"),
+        (HEADER + "2024-01-01 07:00+01:00,1,a,sunny,1\n", r"line 2: datetime: got '2024-01-01 07:00\+01:00'"),
+        (HEADER + "2024-01-01 07:00,1,,sunny,1\n", "line 2: slot_id: empty"),
+        (HEADER + "2024-01-01 07:00,1,a\n", "line 2: got 3 fields, wanted 5"),
+        (
+            HEADER
+            + "2024-01-01 07:05,1,a,sunny,1\n2024-01-01 07:00,1,b,sunny,1\n2024-01-01 07:04,1,a,sunny,1\n",
+            "line 4: datetime: 2024-01-01 07:04 of slot a is before",
+        ),
+        (HEADER + "\0\udcff", "not CSV text in UTF-8"),
+    ],
+)
+def test_a_bad_log_is_refused_by_line(tmp_path, text, message):
+    path = tmp_path / "log.csv"
+    path.write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(InputError, match=rf"log\.csv: {message}"):
+        OccupancyLog.read(path)
+
+
+def test_torn_missing_and_falsely_named_files_are_refused(tmp_path):
+    text = HEADER + "".join(f"2024-01-01 07:{i:02d},1,a,sunny,{i % 2}\n" for i in range(60))
+    torn = tmp_path / "torn.csv.gz"
+    torn.write_bytes(gzip.compress(text.encode())[:-30])
+    with pytest.raises(InputError, match=r"torn\.csv\.gz: not a whole gzip file"):
+        OccupancyLog.read(torn)
+    plain = tmp_path / "plain.csv.gz"
+    plain.write_text(text)
+    with pytest.raises(InputError, match=r"plain\.csv\.gz: not a whole gzip file"):
+        OccupancyLog.read(plain)
+    with pytest.raises(InputError, match=r"none\.csv: No such file"):
+        OccupancyLog.read(tmp_path / "none.csv")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"slot": [4]}, "slot: wanted indices from 0 to 0"),
+        ({"second": [86_400.0]}, "second: wanted seconds of the day"),
+        ({"second": [1.0, 2.0]}, "of one length"),
+        ({"days": ("1 May",)}, "days: wanted different ISO dates"),
+        ({"max_gap_s": 0.0}, "max_gap_s: got 0.0"),
+        ({"slot": []}, "no looks"),
+    ],
+)
+def test_a_bad_log_object_is_refused(fields, message):
+    good = {
+        "slot_ids": ("a",),
+        "days": MONDAYS[:1],
+        "slot": [0],
+        "day": [0],
+        "second": [1.0],
+        "occupied": [True],
+    }
+    with pytest.raises(InputError, match=message):
+        OccupancyLog(**(good | fields))
+
+
+# The replay
+
+
+def replay_of(seconds, states, max_gap_s=7200.0):
+    n = len(seconds)
+    # The other Monday is there to forecast from.
+    log = OccupancyLog(
+        ("a",),
+        MONDAYS[:2],
+        np.zeros(n + 2, int),
+        np.array([0] * n + [1] * 2),
+        np.array([*seconds, 0.0, 60.0]),
+        np.array([*states, 0, 1], bool),
+        max_gap_s,
+    )
+    return RecordedOccupancy(log, np.zeros(1)).world(0, at(MONDAYS[0], 0))
+
+
+def test_the_last_known_state_holds_and_in_a_long_gap_the_nearest_one():
+    world = replay_of([7 * HOUR_S, 8 * HOUR_S, 12 * HOUR_S], [1, 0, 1])
+    assert [bool(world.occupied([0], h * HOUR_S)[0]) for h in (0, 6.9, 7, 7.9, 8, 9.9, 10, 12, 23, 40)] == (
+        [True, True, True, True, False, False, True, True, True, True]
+    )
+    assert world.next_free([0], 7.5 * HOUR_S) == 8 * HOUR_S
+    assert world.next_free([0], 9 * HOUR_S) == 9 * HOUR_S
+    assert world.next_free([0], 11 * HOUR_S) == math.inf
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    looks=st.dictionaries(st.integers(0, 86_399), st.booleans(), min_size=1, max_size=8),
+    time=st.floats(0, 9e4),
+)
+def test_the_replay_agrees_with_its_rule(looks, time):
+    seconds = sorted(looks)
+    world = replay_of(seconds, [looks[s] for s in seconds])
+
+    def rule(time):
+        before = [s for s in seconds if s <= time] or seconds[:1]
+        after = [s for s in seconds if s > time]
+        held = before[-1]
+        if after and before[0] <= time and after[0] - held > 7200 and after[0] - time <= time - held:
+            held = after[0]
+        return looks[held]
+
+    assert world.occupied([0], time)[0] == rule(time)
+    free_at = world.next_free([0], time)[0]
+    assert (free_at == time) == (not rule(time))
+    if free_at < math.inf:
+        assert not world.occupied([0], free_at)[0]
+    else:
+        assert world.occupied([0], 2 * DAY_S)[0]
+
+
+def test_mean_occupancy_weighs_time_between_the_first_and_the_last_look():
+    log = OccupancyLog(
+        ("a", "b"),
+        MONDAYS[:1],
+        [0, 0, 0, 1],
+        [0] * 4,
+        [7 * HOUR_S, 7.5 * HOUR_S, 9 * HOUR_S, 0.0],
+        [1, 0, 1, 1],
+    )
+    assert log.mean_occupancy("weekday") == pytest.approx([0.25, math.nan], nan_ok=True)
+    assert log.mean_occupancy("weekday", (7, 8))[0] == pytest.approx(0.5)
+    assert np.isnan(log.mean_occupancy("weekend")).all()
+    with pytest.raises(InputError, match="class of day: got 'sunday'"):
+        log.mean_occupancy("sunday")
+
+
+# A log on a lot
+
+
+def test_the_fullest_log_slots_stand_nearest_to_the_goal():
+    log = random_log(n_slots=8)
+    walk = np.array([30.0, 10.0, 20.0, 40.0])
+    arrival = at(MONDAYS[0], 9)
+    fullest_first = np.argsort(-log.mean_occupancy("weekday", days=np.array(log.days) != MONDAYS[0]))
+    world = RecordedOccupancy(log, walk).world(0, arrival)
+    day = log.days.index(MONDAYS[0])
+    for lot_slot, rank in ((1, 0), (2, 2), (0, 4), (3, 6)):
+        looks = (log.slot == fullest_first[rank]) & (log.day == day)
+        times = log.second[looks][log.second[looks] >= arrival.time]
+        replayed = [world.occupied([lot_slot], time)[0] for time in times]
+        assert replayed == log.occupied[looks & (log.second >= arrival.time)].tolist()
+
+
+def test_no_two_slots_of_a_larger_lot_share_a_record():
+    log = random_log(n_slots=4)
+    model = RecordedOccupancy(log, np.arange(13.0))
+    for day in MONDAYS:
+        layout = model._layout(at(day, 9))
+        assert len(set(layout.record.tolist())) == 13
+        assert np.bincount(layout.log_slot).tolist().count(3) == 3
+        assert len(layout.held_out) == 4
+
+
+def test_a_day_on_which_a_slot_was_not_seen_is_passed_over():
+    log = random_log(n_slots=2, days=MONDAYS)
+    seen = ~((log.slot == 1) & (log.day == 0))
+    log = OccupancyLog(
+        log.slot_ids, log.days, log.slot[seen], log.day[seen], log.second[seen], log.occupied[seen]
+    )
+    layout = RecordedOccupancy(log, np.zeros(2))._layout(at(MONDAYS[0], 9))
+    assert sorted(layout.record.tolist()) == [0, 1 * 2 + 1]
+    assert layout.held_out == {0, 1}
+
+
+@pytest.mark.parametrize("n", [2, 4, 11])
+@pytest.mark.parametrize("day", [MONDAYS[0], MONDAYS[3]])
+def test_the_forecast_knows_nothing_of_the_days_that_are_replayed(n, day):
+    walk, arrival = np.arange(float(n)), at(day, 9.2)
+    model = RecordedOccupancy(random_log(), walk)
+    held_out = [model.log.days[d] for d in model._layout(arrival).held_out]
+    assert day in held_out
+    before = model.forecast(arrival)
+    changed = RecordedOccupancy(random_log(change_days=held_out), walk)
+    after = changed.forecast(arrival)
+    assert np.array_equal(before.p_occupied, after.p_occupied)
+    assert np.array_equal(before.relaxation_rate, after.relaxation_rate)
+    # The worlds themselves are exactly each other's opposite.
+    slots = np.arange(n)
+    assert np.array_equal(
+        model.world(0, arrival).occupied(slots, arrival.time),
+        ~changed.world(0, arrival).occupied(slots, arrival.time),
+    )
+    other = next(d for d in MONDAYS if d not in held_out)
+    elsewhere = RecordedOccupancy(random_log(change_days=[other]), walk).forecast(arrival)
+    assert not np.array_equal(before.p_occupied, elsewhere.p_occupied)
+
+
+def test_the_forecast_is_the_shrunk_mean_of_the_hour_around_the_arrival():
+    # From 7 to 9 slot a is taken on every day, slot b on none; after 9 it is the other way round.
+    looks = [
+        (s, d, h * HOUR_S, (h < 9) == (s == 0)) for d in range(4) for s in range(2) for h in range(7, 12)
+    ]
+    log = OccupancyLog(("a", "b"), MONDAYS[:4], *(np.array(column) for column in zip(*looks, strict=True)))
+    model = RecordedOccupancy(log, np.zeros(2), mapping=np.array([0, 1]))
+    assert model.forecast(at(MONDAYS[0], 8.0)).p_occupied == pytest.approx([3.5 / 4, 0.5 / 4])
+    assert model.forecast(at(MONDAYS[0], 9.0)).p_occupied == pytest.approx([0.5, 0.5])
+    assert model.forecast(at(MONDAYS[0], 9.25)).p_occupied == pytest.approx([0.25 * 0.75 + 0.125, 0.6875])
+
+
+def test_arrivals_are_recorded_days_of_the_window():
+    model = RecordedOccupancy(random_log(), np.arange(4.0))
+    window = ArrivalWindow.parse("08:00-13:00", "mon")
+    arrivals = [model.draw_arrival(window, world_key(0, e)) for e in range(1000)]
+    days, counts = np.unique([arrival.day for arrival in arrivals], return_counts=True)
+    assert tuple(days) == MONDAYS
+    assert counts == pytest.approx(200, abs=60)
+    assert all(8 * HOUR_S <= arrival.time < 13 * HOUR_S for arrival in arrivals)
+    saturday = model.draw_arrival(ArrivalWindow.parse("08:00-13:00", "weekend"), world_key(0, 0))
+    assert saturday.day in SATURDAYS
+    assert saturday.time // DAY_S == 5
+
+
+def test_copies_of_a_world_answer_alike():
+    model = RecordedOccupancy(random_log(), np.arange(9.0))
+    arrival, slots = at(MONDAYS[1], 9), np.arange(9)
+    world = model.world(0, arrival)
+    for twin in (
+        copy.deepcopy(world),
+        pickle.loads(pickle.dumps(world)),
+        pickle.loads(pickle.dumps(model)).world(0, arrival),
+    ):
+        assert np.array_equal(twin.next_free(slots, 10 * HOUR_S), world.next_free(slots, 10 * HOUR_S))
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda m: m.draw_arrival(ArrivalWindow.parse("08:00-09:00", "tue,sun"), 0),
+            "no recorded day is one of tue,sun",
+        ),
+        (lambda m: m.world(0, Arrival(0.0)), "Arrival.day: got '', wanted a recorded day"),
+        (lambda m: m.world(0, Arrival(DAY_S, MONDAYS[0])), "Arrival.time: got 86400.0"),
+        (lambda m: m.world(0, at(MONDAYS[0], 9)).occupied([0], 8 * HOUR_S), "time: got 28800.0"),
+        (lambda m: RecordedOccupancy(m.log, [math.nan]), "walk_m: got shape"),
+        (lambda m: RecordedOccupancy(m.log, [1.0], mapping=[9]), "mapping: wanted"),
+        (
+            lambda m: RecordedOccupancy(m.log, np.zeros(8)).forecast(at(SATURDAYS[0], 9)),
+            "replays all 2 recorded weekend",
+        ),
+        (
+            lambda m: RecordedOccupancy(m.log, np.zeros(80)).forecast(at(MONDAYS[0], 9)),
+            "would serve 20 slots of the lot",
+        ),
+    ],
+)
+def test_what_a_log_cannot_serve_is_refused_in_words(make, message):
+    with pytest.raises(InputError, match=message):
+        make(RecordedOccupancy(random_log(), np.arange(4.0)))
+
+
+def test_a_slot_that_is_not_there_is_an_index_error():
+    world = RecordedOccupancy(random_log(), np.arange(4.0)).world(0, at(MONDAYS[0], 9))
+    with pytest.raises(IndexError, match="slot index out of range"):
+        world.occupied([4], 9 * HOUR_S)
+
+
+# Mapping files
+
+
+def test_a_mapping_is_read_and_used(tmp_path):
+    log = random_log()
+    path = write(tmp_path, "log_slot_id,slot_id\ns3,B\ns0,A\ns3,C\n", "mapping.csv")
+    mapping = read_mapping(path, ["A", "B", "C"], log)
+    assert mapping.tolist() == [0, 3, 3]
+    layout = RecordedOccupancy(log, np.array([3.0, 2.0, 1.0]), mapping)._layout(at(MONDAYS[0], 9))
+    monday, next_monday = (log.days.index(day) * 4 for day in MONDAYS[:2])
+    assert layout.record.tolist() == [monday, next_monday + 3, monday + 3]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("slot_id,log_slot_id\nZ,s0\n", "line 2: slot_id: got 'Z', wanted a slot of the lot"),
+        ("slot_id,log_slot_id\nA,s9\n", "line 2: log_slot_id: got 's9', wanted a slot of occupancy log"),
+        ("slot_id,log_slot_id\nA,s0\nA,s1\n", "line 3: slot_id: 'A' a second time"),
+        ("slot_id,log_slot_id\nA,s0\n", "slot_id: 1 slots of the lot have no line, the first is 'B'"),
+        ("slot_id,log\nA,s0\n", "column 'log' is unknown"),
+    ],
+)
+def test_a_bad_mapping_is_refused(tmp_path, text, message):
+    with pytest.raises(InputError, match=rf"mapping\.csv: {message}"):
+        read_mapping(write(tmp_path, text, "mapping.csv"), ["A", "B"], random_log())
+
+
+# The real log
+
+
+@pytest.fixture(scope="module")
+def real_log():
+    if not REAL_LOG.exists():
+        pytest.skip("the CNRPark-EXT log is not in shared/data")
+    return OccupancyLog.read(REAL_LOG)
+
+
+def test_the_real_log_shows_the_morning_fill_up(real_log):
+    assert len(real_log.slot_ids) == 164
+    assert len(real_log.days) == 15
+    assert real_log.recorded.all()
+    by_hour = [np.nanmean(real_log.mean_occupancy("weekday", (hour, hour + 1))) for hour in range(7, 12)]
+    assert by_hour[0] < 0.12
+    assert by_hour[-1] > 0.95
+    assert np.nanmean(real_log.mean_occupancy("weekend")) < 0.07
+
+
+def test_forecasts_of_the_real_log_beat_the_lots_mean(real_log):
+    model = RecordedOccupancy(real_log, np.random.default_rng(0).uniform(10, 200, 200))
+    scores = []
+    for episode in range(60):
+        arrival = model.draw_arrival(ArrivalWindow(), world_key(0, episode))
+        p = model.forecast(arrival).p_occupied
+        truth = model.world(0, arrival).occupied(np.arange(200), arrival.time)
+        scores.append([np.mean((p - truth) ** 2), np.mean((p.mean() - truth) ** 2)])
+    ours, lot_mean = np.mean(scores, axis=0)
+    assert ours < 0.9 * lot_mean

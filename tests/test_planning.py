@@ -1,0 +1,163 @@
+"""The MDP and its solvers: closed forms, agreement, and bad input."""
+
+import warnings
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from parkenv import InputError, ParkingLot, Scenario
+from parkenv.lot import PARK
+from planners import CirclingWarning, ParkingMDP, policy_iteration, value_iteration
+
+
+def line(p_free, walk_s, hop_s=1.0, failure_s=10.0, gamma=0.999):
+    """Slots on a line; "right" leads to the next one, "left" back."""
+    n = len(p_free)
+    neighbors = np.full((n, 4), -1)
+    neighbors[:-1, 3] = np.arange(1, n)
+    neighbors[1:, 2] = np.arange(n - 1)
+    return ParkingMDP(
+        neighbors, np.where(neighbors >= 0, hop_s, 0.0), p_free, walk_s, failure_s, wait_s=1.0, gamma=gamma
+    )
+
+
+def retry_value(mdp):
+    """Trying at one slot until it works has a closed value: a geometric series."""
+    p = mdp.p_free
+    return (p * mdp.park_reward - (1 - p) * mdp.failure_s) / (1 - mdp.gamma * (1 - p))
+
+
+@pytest.mark.parametrize("solve", [policy_iteration, value_iteration])
+def test_one_slot_is_a_geometric_series(solve):
+    mdp = ParkingMDP([[-1] * 4], np.zeros((1, 4)), [0.25], [30.0], failure_s=10.0, wait_s=100.0, gamma=0.99)
+    # Three failures on average, each but the first one decision later.
+    expected = -(0.75 * 10.0) / (1 - 0.99 * 0.75)
+    solution = solve(mdp)
+    assert solution.values[0] == pytest.approx(expected, abs=1e-9)
+    assert solution.policy[0] == PARK
+
+
+@pytest.mark.parametrize("solve", [policy_iteration, value_iteration])
+@pytest.mark.parametrize("gamma", [0.9, 0.99, 0.999])
+def test_parking_along_a_line_is_the_best_stop(solve, gamma):
+    """The textbook case: the value is the best over slots of driving there and trying until it works."""
+    rng = np.random.default_rng(3)
+    n = 30
+    mdp = line(rng.uniform(0.05, 0.95, n), 40.0 - np.arange(n), gamma=gamma)
+    park = retry_value(mdp)
+    discount = gamma ** np.arange(n)
+    drive = (1 - discount) / (1 - gamma)  # hops of one second, discounted
+    hops = np.abs(np.arange(n)[:, None] - np.arange(n))
+    expected = (discount[hops] * park - drive[hops]).max(axis=1)
+    solution = solve(mdp)
+    np.testing.assert_allclose(solution.values, expected, atol=1e-9)
+    best = (discount[hops] * park - drive[hops]).argmax(axis=1)
+    assert [a == PARK for a in solution.policy] == [best[i] == i for i in range(n)]
+
+
+graphs = st.integers(0, 2**32 - 1)
+
+
+@given(seed=graphs, gamma=st.sampled_from([0.9, 0.99, 0.995]), failure=st.sampled_from([0.0, 5.0, 90.0]))
+@settings(max_examples=60, deadline=None)
+def test_policy_iteration_agrees_with_value_iteration(seed, gamma, failure):
+    """Random directed graphs, dead ends and slots that are surely free or surely taken among them."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 25))
+    neighbors = np.where(rng.random((n, 4)) < 0.6, rng.integers(0, n, (n, 4)), -1)
+    p_free = rng.choice([0.0, 1.0, *rng.random(4)], n)
+    mdp = ParkingMDP(
+        neighbors,
+        rng.uniform(0.5, 20.0, (n, 4)),
+        p_free,
+        rng.uniform(0, 200, n),
+        failure,
+        wait_s=1.0,
+        gamma=gamma,
+    )
+    by_policy, by_value = policy_iteration(mdp), value_iteration(mdp, tolerance=1e-10)
+    scale = 1.0 + np.abs(by_policy.values).max()
+    np.testing.assert_allclose(by_policy.values, by_value.values, atol=1e-9 * scale, rtol=0)
+    # The policy earns what the values promise, and no action promises more.
+    q = mdp.action_values(by_policy.values)
+    np.testing.assert_allclose(q.max(axis=1), by_policy.values, atol=1e-9 * scale, rtol=0)
+    np.testing.assert_allclose(q[np.arange(n), by_policy.policy], by_policy.values, atol=1e-9 * scale, rtol=0)
+
+
+@given(seed=graphs)
+@settings(max_examples=20, deadline=None)
+def test_solvers_agree_on_random_lots(seed):
+    rng = np.random.default_rng(seed)
+    lot = ParkingLot.grid(int(rng.integers(1, 5)), int(rng.integers(2, 9)))
+    scenario = Scenario.on_lot(lot, failure_s=float(rng.uniform(0, 90)))
+    mdp = ParkingMDP.from_belief(scenario, rng.uniform(0.0, 0.99, lot.n_slots), gamma=0.999)
+    np.testing.assert_allclose(
+        policy_iteration(mdp).values, value_iteration(mdp, tolerance=1e-10).values, atol=1e-9 * 1e3, rtol=0
+    )
+
+
+def test_a_warm_start_ends_at_the_same_optimum_sooner():
+    scenario = Scenario.named("campus")
+    belief = np.random.default_rng(0).uniform(0.5, 0.99, scenario.lot.n_slots)
+    first = policy_iteration(ParkingMDP.from_belief(scenario, belief))
+    belief[5] = 1.0
+    mdp = ParkingMDP.from_belief(scenario, belief)
+    cold, warm = policy_iteration(mdp), policy_iteration(mdp, first.policy)
+    np.testing.assert_allclose(warm.values, cold.values, atol=1e-7)
+    assert warm.iterations < cold.iterations
+
+
+def test_without_discount_values_are_expected_times():
+    mdp = line(np.full(4, 0.5), np.array([40.0, 30.0, 20.0, 10.0]), gamma=1.0, hop_s=2.0)
+    values = value_iteration(mdp).values
+    # Drive three hops, then fail once on average, then walk 10 s.
+    assert mdp.expected_time(values)[0] == pytest.approx(3 * 2.0 + 10.0 + 10.0, abs=1e-6)
+
+
+def test_an_unavailable_move_costs_its_wait_and_stays():
+    mdp = line([0.0, 0.0], [5.0, 5.0], gamma=0.9)
+    assert mdp.rewards()[0, 2] == -1.0
+    assert mdp.successors()[0, 2] == 0
+
+
+def test_a_low_discount_is_warned_of():
+    lot = ParkingLot.grid(2, 40)
+    scenario = Scenario.on_lot(lot, failure_s=90.0)
+    mdp = ParkingMDP.from_belief(scenario, np.full(lot.n_slots, 0.99), gamma=0.99)
+    with pytest.warns(CirclingWarning, match=r"gamma 0\.99 is too low"):
+        mdp.check_discount(policy_iteration(mdp).values)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        good = ParkingMDP.from_belief(scenario, np.full(lot.n_slots, 0.5))
+        good.check_discount(policy_iteration(good).values)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"p_free": [0.5, 1.5]}, "p_free"),
+        ({"p_free": [0.5]}, "shape"),
+        ({"gamma": 0.0}, "gamma"),
+        ({"gamma": 1.1}, "gamma"),
+        ({"failure_s": -1.0}, "failure_s"),
+        ({"neighbors": [[-1, -1, -1, 7], [-1] * 4]}, "neighbors"),
+        ({"walk_s": [np.nan, 1.0]}, "walk_s"),
+    ],
+)
+def test_a_wrong_process_is_refused(changes, message):
+    good = {
+        "neighbors": [[-1, -1, -1, 1], [-1, -1, 0, -1]],
+        "move_s": np.ones((2, 4)),
+        "p_free": [0.5, 0.5],
+        "walk_s": [1.0, 2.0],
+        "failure_s": 1.0,
+    }
+    with pytest.raises(InputError, match=message):
+        ParkingMDP(**(good | changes))
+
+
+def test_policy_iteration_refuses_gamma_one():
+    with pytest.raises(InputError, match="gamma below 1"):
+        policy_iteration(line([0.5], [1.0], gamma=1.0))

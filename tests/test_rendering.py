@@ -1,0 +1,235 @@
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import parkenv  # noqa: F401  (registers the environments)
+from parkenv.envs import rendering
+from parkenv.envs.rendering import SearchRenderer, belief_colors, clock
+from parkenv.errors import InputError
+from parkenv.lot import PARK, Lane, ParkingLot
+from parkenv.occupancy import OccupancyProcess
+from parkenv.scenario import Scenario
+
+
+def row_lot(goal=(40.0, 0.0), vertical=False):
+    """Ten slots of 2.5 m by 5 m north of a lane; or east of it, where it runs north."""
+    x = 5.0 + 2.5 * np.arange(10)
+    xy, yaw, lane = np.stack([x, np.full(10, 5.5)], axis=1), np.pi / 2, [[0.0, 0.0], [35.0, 0.0]]
+    if vertical:
+        xy, yaw, lane, goal = xy[:, ::-1], 0.0, [p[::-1] for p in lane], goal[::-1]
+    return ParkingLot(
+        "row",
+        tuple(f"A{i}" for i in range(10)),
+        xy,
+        np.full(10, yaw),
+        np.full(10, 5.0),
+        np.full(10, 2.5),
+        np.zeros(10),
+        (Lane(np.array(lane)),),
+        np.array([[0.0, 0.0]]),
+        np.array([goal]),
+    )
+
+
+def start(lot, **fields):
+    env = gym.make("parkenv/Search-v0", scenario=Scenario.on_lot(lot, **fields), render_mode="rgb_array")
+    env.reset(seed=1)
+    return env
+
+
+def middle_of_slot(renderer, state, slot, along=0.0):
+    """Pixel (row, column) of a point of a slot, `along` m from its centre toward its nose."""
+    lot = renderer.scenario.lot
+    yaw = lot.slot_yaw[slot]
+    point = lot.slot_xy[slot] + along * np.array([np.cos(yaw), np.sin(yaw)])
+    column, row = np.floor(renderer._ground_for(state).view(point)).astype(int)
+    return row, column
+
+
+def test_frames_are_what_gymnasium_asks_for_and_do_not_depend_on_history():
+    env = start(row_lot())
+    first = env.render()
+    assert first.shape == (480, 640, 3)
+    assert first.dtype == np.uint8
+    state = env.unwrapped.state
+    occupied = state.world.occupied(np.arange(10), state.time)
+    env.step(3)
+    moved = env.render()
+    again = SearchRenderer(env.unwrapped.scenario)
+    assert np.array_equal(again.frame(state, occupied), moved)
+    assert (first != moved).any(axis=2).sum() > 200
+    first[:] = 0
+    assert env.render().any()
+
+
+def test_slots_have_the_colour_of_the_belief_and_cars_stand_where_the_truth_is_taken():
+    env = start(row_lot())
+    state = env.unwrapped.state
+    renderer = SearchRenderer(env.unwrapped.scenario)
+    state.belief.p_occupied[:] = np.linspace(0, 1, 10)
+    state.belief.seen[:] = np.arange(10) >= 5
+    occupied = np.arange(10) % 2 == 1
+    frame = renderer.frame(state, occupied)
+    colors = belief_colors(state.belief.p_occupied, state.belief.seen)
+    for slot in range(10):
+        edge = frame[middle_of_slot(renderer, state, slot, along=2.3)]
+        assert np.abs(edge.astype(int) - colors[slot]).max() <= 2
+        center = frame[middle_of_slot(renderer, state, slot)]
+        assert (
+            np.abs(center.astype(int) - (rendering.PARKED_CAR if occupied[slot] else colors[slot])).max() <= 2
+        )
+
+
+def test_what_was_not_seen_is_paler():
+    p = np.array([0.0, 0.3, 0.8, 1.0])
+    pale, full = (belief_colors(p, np.full(4, seen)).astype(float) for seen in (False, True))
+    ground = np.array(rendering.GROUND)
+    assert (np.abs(pale - ground).sum(axis=1) < np.abs(full - ground).sum(axis=1)).all()
+    assert full[0, 1] > full[0, 0]  # free is greenish,
+    assert full[3, 0] > full[3, 1]  # taken is reddish
+
+
+def test_a_lot_higher_than_wide_is_turned_and_drawn_as_large():
+    flat, high = (SearchRenderer(Scenario.on_lot(row_lot(vertical=v))) for v in (False, True))
+    assert high._whole.scale == pytest.approx(flat._whole.scale)
+    north = high._whole(np.array([0.0, 30.0])) - high._whole(np.array([0.0, 0.0]))
+    assert north[0] > 0
+    assert north[1] == pytest.approx(0)
+
+
+def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
+    scenario = Scenario.on_lot(ParkingLot.city(4000, seed=2))
+    renderer = SearchRenderer(scenario)
+    assert renderer._whole is None
+    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    env.reset(seed=0)
+    state = env.unwrapped.state
+    nothing = np.zeros(4000, dtype=bool)
+    frames = {}
+    for vertex in (0, 2000, 3999, 0):
+        state.vertex, state.path = vertex, [vertex]
+        frame = renderer.frame(state, nothing)
+        column, row = renderer._ground.view(scenario.lot.vertex_xy[vertex])
+        assert 0.2 * 640 < column < 0.8 * 640
+        assert 0.2 * 446 < row < 0.8 * 446
+        assert (frame == rendering.CAR).all(axis=2).any()
+        assert np.array_equal(frames.setdefault(vertex, frame), frame)
+        assert len(renderer._ground.slots) < 1000
+
+
+def test_a_goal_out_of_the_window_is_pointed_at():
+    scenario = Scenario.on_lot(ParkingLot.city(4000, seed=2))
+    env = gym.make("parkenv/Search-v0", scenario=scenario, render_mode="rgb_array")
+    env.reset(seed=0)
+    away = scenario.lot.goals[0] - scenario.lot.vertex_xy[env.unwrapped.state.vertex]
+    rows, columns = np.nonzero((env.render()[:446] == rendering.WALK).all(axis=2))
+    assert len(rows) > 20
+    if abs(away[0]) > abs(away[1]):
+        assert np.sign(columns.mean() - 320) == np.sign(away[0])
+    else:
+        assert np.sign(rows.mean() - 223) == -np.sign(away[1])
+
+
+def test_the_end_of_a_search_shows_the_walk():
+    env = start(row_lot())
+    unwrapped = env.unwrapped
+    while unwrapped.state.vertex >= 10:
+        out = unwrapped.scenario.lot.neighbors[unwrapped.state.vertex]
+        env.step(int(np.argmax(out >= 0)))
+    before = env.render()
+    free = not unwrapped.state.world.occupied(np.array([unwrapped.state.vertex]), unwrapped.state.time)[0]
+    env.step(PARK)
+    after = env.render()
+    assert unwrapped.state.parked == free
+
+    def walk_pixels(frame):
+        return int((frame == rendering.WALK).all(axis=2).sum())
+
+    assert (walk_pixels(after) > walk_pixels(before) + 100) == free
+
+
+def test_a_full_lot_ends_at_a_junction_too():
+    lot = row_lot()
+    full = OccupancyProcess(np.full(10, 100.0), np.full(168, 9.0), np.ones(10), np.full(168, 1e-9))
+    env = start(lot, occupancy=full)
+    over = False
+    while not over:
+        out = np.flatnonzero(env.unwrapped.action_masks()[:PARK])
+        onward = lot.vertex_xy[lot.neighbors[env.unwrapped.state.vertex, out], 0]
+        _, _, over, _, _ = env.step(int(out[np.argmax(onward)]))
+    state = env.unwrapped.state
+    state.vertex = 10
+    assert (env.render()[446:] == rendering.GAVE_UP).all(axis=2).any()
+    assert "every slot is taken" in SearchRenderer(env.unwrapped.scenario).text(state)
+
+
+def test_text_tells_place_time_and_surroundings():
+    env = start(row_lot())
+    state = env.unwrapped.state
+    renderer = SearchRenderer(env.unwrapped.scenario)
+    state.vertex, state.path, state.time = 3, [3], 86400 + 9 * 3600 + 41 * 60 + 7
+    state.belief.p_occupied[2:5] = [0.0, 1.0, 0.0]
+    text = renderer.text(state)
+    lines = text.splitlines()
+    assert "at slot A3" in lines[0]
+    assert "Tue 09:41:07" in lines[1]
+    assert "A2 free, A3 taken, A4 free" in lines[2]
+    assert len(lines) <= 22
+    assert max(map(len, lines)) <= 78
+    marks = "".join(lines[3:-2])
+    assert marks.count("G") == marks.count("E") == 1
+    assert sum(marks.count(m) for m in "<>^v") == 1
+    assert sum(marks.count(m) for m in "o#.:%") == 10
+
+
+def test_text_of_a_large_lot_fits_the_terminal_too():
+    env = gym.make(
+        "parkenv/Search-v0", scenario=Scenario.on_lot(ParkingLot.city(4000, seed=2)), render_mode="ansi"
+    )
+    env.reset(seed=0)
+    lines = env.render().splitlines()
+    assert len(lines) <= 22
+    assert max(map(len, lines)) <= 78
+
+
+@pytest.mark.parametrize(
+    ("time", "text"), [(0.0, "Mon 00:00:00"), (604_799.9, "Sun 23:59:59"), (604_800.0, "Mon 00:00:00")]
+)
+def test_clock(time, text):
+    assert clock(time) == text
+
+
+def test_frames_of_an_episode_can_be_collected():
+    env = gym.wrappers.RenderCollection(
+        gym.make("parkenv/Search-v0", scenario="mini", render_mode="rgb_array")
+    )
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(3)
+    frames = env.render()
+    assert len(frames) == 4
+    assert {f.shape for f in frames} == {(480, 640, 3)}
+    env.close()
+
+
+def test_window(monkeypatch):
+    import pygame
+
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    renderer = SearchRenderer(Scenario.on_lot(row_lot()))
+    frame = np.zeros((480, 640, 3), dtype=np.uint8)
+    frame[100, 200] = 1, 2, 3
+    renderer.show(frame, 1000)
+    assert pygame.display.get_surface().get_at((200, 100))[:3] == (1, 2, 3)
+    renderer.close()
+    renderer.close()
+    assert not pygame.display.get_init()
+
+
+def test_a_window_without_pygame_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    renderer = SearchRenderer(Scenario.on_lot(row_lot()))
+    with pytest.raises(InputError, match=r'pip install "parkenv\[human\]"'):
+        renderer.show(np.zeros((480, 640, 3), dtype=np.uint8), 8)

@@ -1,0 +1,343 @@
+"""`parkenv/Search-v0`: contract, determinism, rewards, ends, sight."""
+
+import copy
+import hashlib
+import pickle
+import subprocess
+import sys
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import parkenv
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightingModel
+from parkenv.belief import SlotBelief
+from parkenv.envs.wrappers import ThesisReward
+from parkenv.lot import PARK
+from parkenv.occupancy import Forecast
+from parkenv.scenario import SCENARIO_NAMES
+
+ENV_IDS = [name for name in gym.registry if name.startswith("parkenv/")]
+
+
+def always(lot, occupied):
+    """A world in which slot s is taken for ever where `occupied[s]`, free for ever elsewhere."""
+    return OccupancyProcess.from_demand(np.where(occupied, 25.0, -25.0), np.zeros(168), 1e9)
+
+
+def random_episode(env, seed, steps=300):
+    """Act at random; everything that was observed."""
+    rng = np.random.default_rng(seed)
+    observation, _ = env.reset(seed=seed)
+    seen = [observation]
+    for _ in range(steps):
+        observation, reward, terminated, truncated, info = env.step(
+            rng.choice(np.flatnonzero(observation["action_mask"]))
+        )
+        seen.append((observation, reward, terminated, truncated, info))
+        if terminated or truncated:
+            break
+    return seen
+
+
+def digest(env, seed):
+    return hashlib.sha256(repr(random_episode(env, seed)).encode()).hexdigest()
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+@pytest.mark.parametrize("scenario", SCENARIO_NAMES)
+def test_every_id_passes_the_checker_without_a_warning(env_id, scenario):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        env = gym.make(env_id, scenario=scenario, render_mode="rgb_array")
+        # The spec of a Dict space holds no unbounded action; time alone is unbounded above, as it should be.
+        warnings.filterwarnings("ignore", message=".*infinity.*")
+        check_env(env.unwrapped)
+        env.close()
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_stable_baselines_accepts_it(env_id):
+    from stable_baselines3.common.env_checker import check_env as check_sb3
+
+    check_sb3(gym.make(env_id, scenario="mini").unwrapped)
+
+
+@pytest.mark.parametrize("env_id", ENV_IDS)
+def test_importing_twice_does_no_harm_and_specs_have_a_limit(env_id):
+    import importlib
+
+    importlib.reload(parkenv)
+    assert gym.spec(env_id).max_episode_steps == 2000
+
+
+@pytest.mark.parametrize("scenario", SCENARIO_NAMES)
+def test_equal_seeds_give_equal_episodes(scenario):
+    one, two = (gym.make("parkenv/Search-v0", scenario=scenario) for _ in range(2))
+    for seed in (0, 1, 2**40):
+        assert digest(one, seed) == digest(two, seed)
+    assert digest(one, 0) != digest(one, 1)
+
+
+def test_equal_seeds_give_equal_episodes_in_another_process():
+    program = (
+        "import sys; sys.path.insert(0, 'tests'); import gymnasium as gym, parkenv;"
+        "from test_search_env import digest; print(digest(gym.make('parkenv/Search-v0', scenario='street'), 5))"
+    )
+    theirs = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout
+    assert theirs.strip() == digest(gym.make("parkenv/Search-v0", scenario="street"), 5)
+
+
+def test_resets_without_a_seed_go_through_other_worlds_of_the_same_seed():
+    env = gym.make("parkenv/Search-v0", scenario="mini")
+    runs = []
+    for _ in range(2):
+        env.reset(seed=4)
+        runs.append([float(env.reset()[0]["time"][0]) for _ in range(3)])
+    assert runs[0] == runs[1]
+    assert len(set(runs[0])) == 3
+
+
+@given(seed=st.integers(0, 1000))
+@settings(max_examples=20, deadline=None)
+def test_the_world_does_not_depend_on_who_drives(seed):
+    """Two cars that behave differently meet the same slot states at the same times."""
+    scenario = Scenario.named("street")
+    worlds = []
+    for policy in (0, 1):
+        env = gym.make("parkenv/Search-v0", scenario=scenario)
+        env.reset(seed=seed)
+        rng = np.random.default_rng(policy)
+        for _ in range(20 * policy):
+            env.step(int(rng.integers(0, PARK)))
+        state = env.unwrapped.state
+        times = state.arrival.time + np.array([0.0, 60.0, 600.0, 3600.0])
+        worlds.append([state.world.occupied(np.arange(scenario.lot.n_slots), t) for t in times])
+    np.testing.assert_array_equal(worlds[0], worlds[1])
+
+
+@pytest.mark.parametrize("scenario", SCENARIO_NAMES)
+def test_reward_terms_add_up_and_the_return_is_minus_the_total_time(scenario):
+    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    for seed in range(5):
+        steps = random_episode(env, seed, steps=2000)[1:]
+        for _, reward, _, _, info in steps:
+            assert reward == pytest.approx(sum(info["reward_terms"].values()))
+        info = steps[-1][-1]
+        assert -sum(s[1] for s in steps) == pytest.approx(info["total_s"])
+        assert info["total_s"] == pytest.approx(
+            info["drive_s"] + info["failed_s"] + info["walk_s"] + info["gave_up_s"]
+        )
+
+
+def test_the_thesis_reward_differs_by_r_max_on_success():
+    env = ThesisReward(gym.make("parkenv/Search-v0", scenario="mini"))
+    observation, _ = env.reset(seed=1)
+    rng = np.random.default_rng(0)
+    done = False
+    while not done:
+        observation, reward, terminated, truncated, info = env.step(
+            rng.choice(np.flatnonzero(observation["action_mask"]))
+        )
+        done = terminated or truncated
+        assert reward == pytest.approx(sum(info["reward_terms"].values()))
+        assert info["reward_terms"]["r_max"] == (env.r_max if info["parked"] else 0.0)
+    scenario = env.unwrapped.scenario
+    # eq. 3.24: the slot farthest from the goal earns nothing, nearer ones the walk that they save.
+    assert env.r_max == pytest.approx(scenario.lot.walk_m().max() / scenario.v_walk)
+
+
+def two_slots(taken):
+    lot = ParkingLot.grid(1, 2, aisle=6.0)
+    return Scenario(name="two", lot=lot, occupancy=always(lot, np.array(taken)), failure_s=7.0, wait_s=2.0)
+
+
+def test_moves_tries_and_parking_cost_what_they_should():
+    scenario = two_slots([True, False])
+    env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+    observation, _ = env.reset(seed=0)
+    lot = scenario.lot
+    missing = int(np.flatnonzero(observation["action_mask"] == 0)[0])
+    observation, reward, *_ = env.step(missing)
+    assert reward == -2.0, "a move that the graph does not have costs the wait"
+    while observation["vertex"] != 0:
+        column = int(np.flatnonzero(lot.neighbors[observation["vertex"]] >= 0)[0])
+        length = lot.edge_length[observation["vertex"], column]
+        observation, reward, *_ = env.step(column)
+        assert reward == pytest.approx(-length / scenario.v_drive)
+    observation, reward, terminated, _, info = env.step(PARK)
+    assert (reward, terminated, info["failed_parks"]) == (-7.0, False, 1)
+    assert observation["p_occupied"][0] == 1.0
+    while observation["vertex"] != 1:
+        column = int(np.flatnonzero(lot.neighbors[observation["vertex"]] >= 0)[-1])
+        observation, *_ = env.step(column)
+    observation, reward, terminated, _, info = env.step(PARK)
+    assert terminated
+    assert info["parked"]
+    assert reward == pytest.approx(-lot.walk_m()[1] / scenario.v_walk)
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(0)
+
+
+def test_a_lot_proven_full_ends_the_search_with_the_cost_of_going_elsewhere():
+    scenario = two_slots([True, True]).replace(give_up_s=300.0, sighting=SightingModel(view_range=0.0))
+    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    observation, _ = env.reset(seed=0)
+    seen_before_the_end = set()
+    for _ in range(20):
+        column = int(np.flatnonzero(scenario.lot.neighbors[observation["vertex"]] >= 0)[-1])
+        observation, _, terminated, truncated, info = env.step(column)
+        if terminated:
+            break
+        seen_before_the_end.add(int(observation["vertex"]))
+    assert terminated
+    assert not truncated
+    assert info["reward_terms"]["gave_up"] == -300.0
+    assert not info["parked"]
+    assert len(seen_before_the_end & {0, 1}) == 1, "it ends as soon as the second of two slots is seen taken"
+
+
+def test_the_time_limit_truncates_and_does_not_terminate():
+    env = gym.make("parkenv/Search-v0", scenario="mini", max_episode_steps=3)
+    env.reset(seed=0)
+    for step in range(3):
+        _, _, terminated, truncated, info = env.step(2)
+        assert not terminated
+        assert truncated == (step == 2)
+    assert info["reward_terms"]["gave_up"] == 0.0
+    assert "total_s" in info
+
+
+def test_the_mask_tells_what_the_graph_has():
+    env = gym.make("parkenv/Search-v0", scenario="mini").unwrapped
+    observation, _ = env.reset(seed=0)
+    lot = env.scenario.lot
+    for _ in range(30):
+        vertex = observation["vertex"]
+        np.testing.assert_array_equal(observation["action_mask"][:PARK], lot.neighbors[vertex] >= 0)
+        assert observation["action_mask"][PARK] == (vertex < lot.n_slots)
+        np.testing.assert_array_equal(env.action_masks(), observation["action_mask"] == 1)
+        observation, *_ = env.step(int(np.flatnonzero(observation["action_mask"][:PARK])[-1]))
+
+
+def test_state_deepcopy_and_pickle_bring_an_episode_back():
+    env = gym.make("parkenv/Search-v0", scenario="campus").unwrapped
+    env.reset(seed=3)
+    actions = np.random.default_rng(0).integers(0, 4, 60)
+    for a in actions[:20]:
+        env.step(a)
+    saved, twin, thawed = env.get_state(), copy.deepcopy(env), pickle.loads(pickle.dumps(env))
+
+    def rest(e):
+        return repr([e.step(a) for a in actions[20:]])
+
+    expected = rest(env)
+    env.set_state(saved)
+    assert rest(env) == expected
+    assert rest(twin) == expected
+    assert rest(thawed) == expected
+    with pytest.raises(InputError, match="slots"):
+        gym.make("parkenv/Search-v0", scenario="mini").unwrapped.set_state(saved)
+
+
+def test_observations_are_not_live_buffers():
+    env = gym.make("parkenv/Search-v0", scenario="campus").unwrapped
+    before, _ = env.reset(seed=0)
+    kept = copy.deepcopy(before)
+    for _ in range(10):
+        env.step(3)
+    for key, value in kept.items():
+        np.testing.assert_array_equal(before[key], value)
+
+
+def test_only_slots_in_view_are_learnt_of():
+    """The belief of a slot that was never in view stays at its forecast, whatever stands there."""
+    scenario = Scenario.named("campus", sighting=SightingModel(view_range=6.0))
+    env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+    observation, _ = env.reset(seed=0)
+    lot, forecast = scenario.lot, env.state.belief.prior
+    in_view = np.zeros(lot.n_slots, dtype=bool)
+    for _ in range(40):
+        away = np.hypot(*(lot.vertex_xy[: lot.n_slots] - lot.vertex_xy[observation["vertex"]]).T)
+        in_view |= away <= 6.0
+        observation, *_ = env.step(int(np.flatnonzero(observation["action_mask"][:PARK])[-1]))
+    np.testing.assert_array_equal(observation["p_occupied"][~in_view], forecast.astype(np.float32)[~in_view])
+    assert in_view.any()
+
+
+def test_a_sighting_is_bayes_rule_and_relaxes_exponentially():
+    forecast = Forecast(p_occupied=np.array([0.6, 0.6]), relaxation_rate=np.array([1 / 600, 1 / 600]))
+    belief = SlotBelief(forecast, time=100.0)
+    belief.update(np.array([0]), np.array([True]), SightingModel(hit_rate=0.9, false_alarm_rate=0.2))
+    seen = 0.9 * 0.6 / (0.9 * 0.6 + 0.2 * 0.4)
+    assert belief.p_occupied[0] == pytest.approx(seen)
+    belief.relax(100.0 + 300.0)
+    assert belief.p_occupied[0] == pytest.approx(0.6 + (seen - 0.6) * np.exp(-0.5))
+    assert belief.p_occupied[1] == 0.6
+
+
+def test_noisy_sight_errs_as_often_as_stated():
+    lot = ParkingLot.grid(4, 25)
+    taken = np.arange(lot.n_slots) % 2 == 0
+    scenario = Scenario(
+        name="noisy",
+        lot=lot,
+        occupancy=always(lot, taken),
+        sighting=SightingModel(view_range=1e3, hit_rate=0.8, false_alarm_rate=0.3),
+    )
+    env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+    looks_taken = np.zeros(lot.n_slots)
+    seeds = 100
+    for seed in range(seeds):
+        env.reset(seed=seed)
+        looks_taken += env.state.belief.p_occupied > env.state.belief.prior
+    per_seed = looks_taken / seeds
+    assert per_seed[taken].mean() == pytest.approx(0.8, abs=0.02)
+    assert per_seed[~taken].mean() == pytest.approx(0.3, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"v_walk": -1.0}, "v_walk is -1.0"),
+        ({"v_drive": 0.0}, "v_drive"),
+        ({"v_drive": float("nan")}, "v_drive"),
+        ({"failure_s": -2.0}, "failure_s"),
+        ({"failure_s": "10"}, "failure_s"),
+        ({"failure_cost": 3.0}, "no field 'failure_cost'; known: .*failure_s"),
+        ({"goal": 9}, "goal is 9"),
+        ({"entry": -1}, "entry"),
+        ({"sighting": 3}, "SightingModel"),
+        ({"scenario": "moon"}, "unknown scenario 'moon'; known: campus"),
+        ({"scenario": 3}, "want a Scenario"),
+        ({"render_mode": "hologram"}, "render_mode"),
+    ],
+)
+def test_wrong_options_are_refused_by_name(changes, message):
+    from parkenv.envs.search import SearchEnv
+
+    with pytest.raises(InputError, match=message):
+        SearchEnv(**({"scenario": "mini"} | changes))
+
+
+def test_wrong_use_is_refused():
+    env = gym.make("parkenv/Search-v0", scenario="mini").unwrapped
+    with pytest.raises(gym.error.ResetNeeded):
+        env.step(0)
+    with pytest.raises(InputError, match="no options"):
+        env.reset(options={"speed": 3})
+    env.reset(seed=0)
+    with pytest.raises(InputError, match="action is 7"):
+        env.step(7)
+    with pytest.raises(InputError, match="slots"):
+        Scenario(name="x", lot=ParkingLot.grid(1, 3), occupancy=always(None, np.array([True])))
+    for wrong in ({"hit_rate": 1.2}, {"view_range": -1.0}, {"hit_rate": 0.2, "false_alarm_rate": 0.3}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            SightingModel(**wrong)
