@@ -11,6 +11,21 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from parkenv.envs.drawing import (
+    SUBPIXEL_BITS,
+    Color,
+    FloatArray,
+    Image,
+    draw_dashes,
+    fill_disc,
+    fill_polygon,
+    fixed_point,
+    mixed_color,
+    rotation,
+    text_width,
+    write_label,
+    write_text,
+)
 from parkenv.errors import InputError
 from parkenv.lot import ParkingLot
 from parkenv.occupancy import DAY_NAMES, DAY_S
@@ -18,10 +33,6 @@ from parkenv.scenario import Scenario
 
 if TYPE_CHECKING:
     from parkenv.envs.search import SearchState
-
-FloatArray = NDArray[np.float64]
-Image = NDArray[np.uint8]
-Color = tuple[int, int, int]
 
 WIDTH, HEIGHT = 640, 480
 HUD = 34
@@ -66,8 +77,6 @@ _APRON = 0.6  # m, by which asphalt is longer and wider than the slot on it
 _ASPHALT_GAP = 2.0  # m, what is narrower between asphalt is asphalt
 _EDGE = 3.0  # m, around the lot's features
 _PALENESS = 0.62
-_SUBPIXEL_BITS = 4
-_FONT = cv2.FontFace("sans")
 
 TEXT_WIDTH, TEXT_ROWS = 78, 17
 """Cells of the map in text: with its lines above and below it fits a terminal of 80 by 24."""
@@ -359,49 +368,49 @@ class SearchRenderer:
         xy = self.scenario.lot.vertex_xy[state.path]
         if state.parked:
             xy = np.vstack([xy, self.scenario.lot.slot_xy[state.vertex]])
-        points = _fixed(view(xy))
+        points = fixed_point(view(xy))
         ages = np.linspace(0, len(points) - 1, min(len(points), 25)).astype(int)
         thickness = min(max(2, round(0.5 * view.scale)), 5)
         for i, (first, last) in enumerate(pairwise(ages)):
             fresh = 0.35 + 0.65 * (i + 1) / (len(ages) - 1)
-            color = _mixed(ASPHALT, CAR, fresh)
+            color = mixed_color(ASPHALT, CAR, fresh)
             cv2.polylines(
-                image, [points[first : last + 1]], False, color, thickness, cv2.LINE_AA, _SUBPIXEL_BITS
+                image, [points[first : last + 1]], False, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS
             )
 
     def _draw_goal(self, image: Image, view: View, state: SearchState) -> None:
         lot = self.scenario.lot
         goal = view(lot.goals[self.scenario.goal])
         if state.parked:
-            _dashes(image, view(lot.slot_xy[state.vertex]), goal, WALK)
+            draw_dashes(image, view(lot.slot_xy[state.vertex]), goal, WALK)
         low, high = np.full(2, 14.0), np.array(self._size) - 14.0
         if (goal >= low).all() and (goal <= high).all():
-            _disc(image, goal, 11.0, WHITE)
-            _disc(image, goal, 9.5, WALK)
-            _label(image, "G", goal, WHITE, 13, 700)
+            fill_disc(image, goal, 11.0, WHITE)
+            fill_disc(image, goal, 9.5, WALK)
+            write_label(image, "G", goal, WHITE, 13, 700)
             return
         middle = np.array(self._size) / 2
         away = goal - middle
         edge = middle + away * np.min((high - low) / 2 / np.maximum(np.abs(away), 1e-9))
         yaw = float(np.arctan2(away[1], away[0]))
-        tip = np.array([[10.0, 0.0], [-8.0, 7.0], [-8.0, -7.0]]) @ _rotation(yaw)
-        _polygon(image, edge + 1.35 * tip, WHITE)
-        _polygon(image, edge + tip, WALK)
+        tip = np.array([[10.0, 0.0], [-8.0, 7.0], [-8.0, -7.0]]) @ rotation(yaw)
+        fill_polygon(image, edge + 1.35 * tip, WHITE)
+        fill_polygon(image, edge + tip, WALK)
         away_m = float(np.hypot(*(lot.goals[self.scenario.goal] - lot.vertex_xy[state.vertex])))
         text = f"goal {away_m:.0f} m"
         ahead = away / np.hypot(*away)
-        room = np.abs(ahead) @ [_text_width(text, 13, 700) / 2, 6.0] + 16.0
-        _label(image, text, edge - room * ahead, WALK, 13, 700, halo=True)
+        room = np.abs(ahead) @ [text_width(text, 13, 700) / 2, 6.0] + 16.0
+        write_label(image, text, edge - room * ahead, WALK, 13, 700, halo=True)
 
     def _draw_car(self, image: Image, view: View, state: SearchState) -> None:
         xy, yaw = self._pose(state)
         at = view(xy)
         if not state.parked:
-            center = _fixed(at)
-            radius = round(self.scenario.sighting.view_range * view.scale * 2**_SUBPIXEL_BITS)
-            cv2.circle(image, tuple(center), radius, WHITE, 1, cv2.LINE_AA, _SUBPIXEL_BITS)
+            center = fixed_point(at)
+            radius = round(self.scenario.sighting.view_range * view.scale * 2**SUBPIXEL_BITS)
+            cv2.circle(image, tuple(center), radius, WHITE, 1, cv2.LINE_AA, SUBPIXEL_BITS)
         heading = np.array([np.cos(yaw), np.sin(yaw)]) @ view.turn
-        turn = _rotation(float(np.arctan2(heading[1], heading[0])))
+        turn = rotation(float(np.arctan2(heading[1], heading[0])))
         # A car that is not to be lost from sight may come out larger than life.
         length = max(4.4 * view.scale, 17.0)
         for part, color, swell in (
@@ -410,7 +419,7 @@ class SearchRenderer:
             (_WINDSCREEN, INK, 0.0),
             (_REAR, INK, 0.0),
         ):
-            _polygon(image, at + part * (np.array([length, 0.44 * length]) + swell) @ turn, color)
+            fill_polygon(image, at + part * (np.array([length, 0.44 * length]) + swell) @ turn, color)
 
     def _draw_hud(self, image: Image, state: SearchState) -> None:
         parts = [
@@ -420,15 +429,15 @@ class SearchRenderer:
         ]
         x, baseline = HUD_MARGIN, HEIGHT - HUD // 2 + 5
         for part in parts:
-            x = _write(image, part, (x, baseline), WHITE, 15, 500) + 18
+            x = write_text(image, part, (x, baseline), WHITE, 15, 500) + 18
         if state.parked:
             place = f"parked in {self.scenario.lot.slot_ids[state.vertex]}"
             for verdict in (f"{place}, {state.walk_s:.0f} s to walk", place, "parked"):
-                if x + _text_width(verdict, 15, 600) <= WIDTH - KEY_WIDTH:
-                    _write(image, verdict, (x, baseline), CAR, 15, 600)
+                if x + text_width(verdict, 15, 600) <= WIDTH - KEY_WIDTH:
+                    write_text(image, verdict, (x, baseline), CAR, 15, 600)
                     break
         elif state.over:
-            _write(image, "lot is full", (x, baseline), GAVE_UP, 15, 600)
+            write_text(image, "lot is full", (x, baseline), GAVE_UP, 15, 600)
 
 
 def _fitting(words: list[str], width: int) -> str:
@@ -471,19 +480,19 @@ def _lay_out(scenario: Scenario, view: View) -> _Ground:
     def placed(part: FloatArray, long: FloatArray, wide: FloatArray) -> NDArray[np.int32]:
         """A part of unit size, (k, 2), at every slot, (m, k, 2) fixed-point pixels."""
         xy = lot.slot_xy[slots, None] + part[:, :1] * long * along + part[:, 1:] * wide * left
-        return _fixed(fine(xy))
+        return fixed_point(fine(xy))
 
     image = np.full((*shape, 3), GROUND, dtype=np.uint8)
     for wall in lot.walls:
         if len(wall) > 3 and np.array_equal(wall[0], wall[-1]):
-            cv2.fillPoly(image, [_fixed(fine(wall))], BUILDING, cv2.LINE_8, _SUBPIXEL_BITS)
+            cv2.fillPoly(image, [fixed_point(fine(wall))], BUILDING, cv2.LINE_8, SUBPIXEL_BITS)
     asphalt = np.zeros(shape, dtype=np.uint8)
     lane_width = max(1, round(_LANE_WIDTH * fine.scale))
     for lane in lot.lanes:
-        cv2.polylines(asphalt, [_fixed(fine(lane.points))], False, 1, lane_width, 8, _SUBPIXEL_BITS)
-    mouths = _fixed(fine(lot.vertex_xy[slots]))[:, None]
+        cv2.polylines(asphalt, [fixed_point(fine(lane.points))], False, 1, lane_width, 8, SUBPIXEL_BITS)
+    mouths = fixed_point(fine(lot.vertex_xy[slots]))[:, None]
     for corners in np.concatenate([placed(_BOX, length + _APRON, width + _APRON), mouths], axis=1):
-        cv2.fillConvexPoly(asphalt, cv2.convexHull(corners), 1, 8, _SUBPIXEL_BITS)
+        cv2.fillConvexPoly(asphalt, cv2.convexHull(corners), 1, 8, SUBPIXEL_BITS)
     gap = max(1, round(_ASPHALT_GAP * fine.scale))
     # Closing fills whatever is narrow, also between asphalt and the picture's edge: keep that away.
     asphalt = cv2.copyMakeBorder(asphalt, gap, gap, gap, gap, cv2.BORDER_REPLICATE)
@@ -491,11 +500,11 @@ def _lay_out(scenario: Scenario, view: View) -> _Ground:
     image[asphalt[gap:-gap, gap:-gap] > 0] = ASPHALT
     for wall in lot.walls:
         thickness = max(SUPERSAMPLING, round(0.3 * fine.scale))
-        cv2.polylines(image, [_fixed(fine(wall))], False, WALL, thickness, 8, _SUBPIXEL_BITS)
+        cv2.polylines(image, [fixed_point(fine(wall))], False, WALL, thickness, 8, SUBPIXEL_BITS)
     for xy, vertex in zip(lot.entries, lot.entry_vertices, strict=True):
         way = _way_in(lot, int(vertex)) @ view.turn
-        arrow = SUPERSAMPLING * _ENTRY_MARK @ _rotation(float(np.arctan2(way[1], way[0])))
-        _polygon(image, fine(xy) + arrow, WHITE)
+        arrow = SUPERSAMPLING * _ENTRY_MARK @ rotation(float(np.arctan2(way[1], way[0])))
+        fill_polygon(image, fine(xy) + arrow, WHITE)
 
     label = np.full(shape, -1, dtype=np.int32)
     cars = np.zeros((*shape, 3), dtype=np.uint8)
@@ -506,12 +515,12 @@ def _lay_out(scenario: Scenario, view: View) -> _Ground:
     bodies = placed(_BODY, long, wide)
     glass = np.stack([placed(_WINDSCREEN, long, wide), placed(_REAR, long, wide)])
     for i in range(len(slots)):
-        cv2.fillConvexPoly(image, boxes[i], WHITE, 8, _SUBPIXEL_BITS)
-        cv2.fillConvexPoly(label, boxes[i], i, 8, _SUBPIXEL_BITS)
-        cv2.fillConvexPoly(cars, bodies[i], PARKED_CAR, 8, _SUBPIXEL_BITS)
-        cv2.fillConvexPoly(has_car, bodies[i], 1, 8, _SUBPIXEL_BITS)
+        cv2.fillConvexPoly(image, boxes[i], WHITE, 8, SUBPIXEL_BITS)
+        cv2.fillConvexPoly(label, boxes[i], i, 8, SUBPIXEL_BITS)
+        cv2.fillConvexPoly(cars, bodies[i], PARKED_CAR, 8, SUBPIXEL_BITS)
+        cv2.fillConvexPoly(has_car, bodies[i], 1, 8, SUBPIXEL_BITS)
         for pane in glass[:, i]:
-            cv2.fillConvexPoly(cars, pane, GLASS, 8, _SUBPIXEL_BITS)
+            cv2.fillConvexPoly(cars, pane, GLASS, 8, SUBPIXEL_BITS)
 
     blocks = _blocks(label)
     owner = blocks.max(axis=-1)
@@ -545,16 +554,16 @@ def _furnished(image: Image, view: View) -> Image:
     """Add what belongs to the picture, not to the lot: the colours' key and the north."""
     top = HEIGHT - HUD // 2 - 6
     right = WIDTH - HUD_MARGIN
-    _label(image, "taken", np.array([right - 18.0, top + 6.0]), WHITE, 13, 400)
+    write_label(image, "taken", np.array([right - 18.0, top + 6.0]), WHITE, 13, 400)
     bar = np.linspace(0, 255, 72).astype(int)
     image[top : top + 6, right - 116 : right - 44] = _BELIEF_SCALE[0, bar]
     image[top + 6 : top + 12, right - 116 : right - 44] = _BELIEF_SCALE[1, bar]
-    _label(image, "free", np.array([right - 132.0, top + 6.0]), WHITE, 13, 400)
+    write_label(image, "free", np.array([right - 132.0, top + 6.0]), WHITE, 13, 400)
     north = np.array([0.0, 1.0]) @ view.turn
     at = np.array([float(WIDTH - 22), 24.0])
-    turn = _rotation(float(np.arctan2(north[1], north[0])))
-    _polygon(image, at + np.array([[11.0, 0.0], [-3.0, 5.0], [-1.0, 0.0], [-3.0, -5.0]]) @ turn, INK)
-    _label(image, "N", at - 12.0 * north, INK, 12, 600)
+    turn = rotation(float(np.arctan2(north[1], north[0])))
+    fill_polygon(image, at + np.array([[11.0, 0.0], [-3.0, 5.0], [-1.0, 0.0], [-3.0, -5.0]]) @ turn, INK)
+    write_label(image, "N", at - 12.0 * north, INK, 12, 600)
     return image
 
 
@@ -565,59 +574,3 @@ _BODY = 0.5 * np.stack([np.sign(f) * np.abs(f) ** 0.4 for f in (np.cos(_CORNER),
 """Outline of a car of unit length and width, nose to +x."""
 _WINDSCREEN = np.array([[0.24, -0.40], [0.24, 0.40], [0.10, 0.32], [0.10, -0.32]])
 _REAR = np.array([[-0.36, -0.36], [-0.36, 0.36], [-0.26, 0.30], [-0.26, -0.30]])
-
-
-def _rotation(yaw: float) -> FloatArray:
-    """Matrix that turns row vectors by `yaw` in the picture's axes."""
-    return np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-
-
-def _fixed(pixels: FloatArray) -> NDArray[np.int32]:
-    """Pixels as OpenCV's fixed-point numbers; its pixel centres are whole numbers."""
-    fixed: NDArray[np.int32] = np.round((pixels - 0.5) * 2**_SUBPIXEL_BITS).astype(np.int32)
-    return fixed
-
-
-def _mixed(start: Color, end: Color, share: float) -> Color:
-    red, green, blue = (round(a + share * (b - a)) for a, b in zip(start, end, strict=True))
-    return red, green, blue
-
-
-def _polygon(image: Image, pixels: FloatArray, color: Color) -> None:
-    cv2.fillPoly(image, [_fixed(pixels)], color, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def _disc(image: Image, at: FloatArray, radius: float, color: Color) -> None:
-    x, y = _fixed(at).tolist()
-    cv2.circle(image, (x, y), round(radius * 2**_SUBPIXEL_BITS), color, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def _dashes(image: Image, start: FloatArray, end: FloatArray, color: Color) -> None:
-    n = max(1, round(float(np.hypot(*(end - start))) / 9.0))
-    ends = start + np.linspace(0, 1, 2 * n)[:, None] * (end - start)
-    for dash in _fixed(ends).reshape(n, 2, 2):
-        cv2.polylines(image, [dash], False, color, 2, cv2.LINE_AA, _SUBPIXEL_BITS)
-
-
-def _write(image: Image, text: str, at: tuple[int, int], color: Color, size: int, weight: int) -> int:
-    """Write from a point of the baseline on; where the text ends, px."""
-    (right, _), _ = cv2.putText(image, text, at, color, _FONT, size, weight)
-    return int(right)
-
-
-def _text_width(text: str, size: int, weight: int) -> int:
-    _, _, width, _ = cv2.getTextSize((WIDTH, HEIGHT), text, (0, 0), _FONT, size, weight)
-    return int(width)
-
-
-def _label(
-    image: Image, text: str, at: FloatArray, color: Color, size: int, weight: int, *, halo: bool = False
-) -> None:
-    """Write a text with its middle at a point, kept inside the picture."""
-    width = _text_width(text, size, weight)
-    left = int(np.clip(round(at[0] - width / 2), 2, WIDTH - width - 2))
-    base = round(at[1] + 0.36 * size)
-    if halo:
-        for dx, dy in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
-            cv2.putText(image, text, (left + dx, base + dy), WHITE, _FONT, size, weight)
-    cv2.putText(image, text, (left, base), color, _FONT, size, weight)
