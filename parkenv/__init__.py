@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from parkenv.errors import InputError
     from parkenv.lot import Lane, Mouth, ParkingLot
     from parkenv.occupancy import ArrivalWindow, OccupancyProcess
-    from parkenv.occupancy_log import OccupancyLog, RecordedOccupancy
+    from parkenv.occupancy_log import OccupancyLog
+    from parkenv.recorded_occupancy import RecordedOccupancy
     from parkenv.scenario import Scenario, SearchProblem
 
 __version__ = "0.1.0"
@@ -28,7 +29,7 @@ _EXPORTS = {
     "OccupancyLog": "parkenv.occupancy_log",
     "OccupancyProcess": "parkenv.occupancy",
     "ParkingLot": "parkenv.lot",
-    "RecordedOccupancy": "parkenv.occupancy_log",
+    "RecordedOccupancy": "parkenv.recorded_occupancy",
     "Scenario": "parkenv.scenario",
     "SearchProblem": "parkenv.scenario",
     "SightingModel": "parkenv.belief",

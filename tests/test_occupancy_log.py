@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from parkenv.errors import InputError
 from parkenv.keyed_random import world_key
 from parkenv.occupancy import DAY_S, HOUR_S, Arrival, ArrivalWindow
-from parkenv.occupancy_log import OccupancyLog, RecordedOccupancy, day_class, read_mapping
+from parkenv.occupancy_log import OccupancyLog, day_class
+from parkenv.recorded_occupancy import RecordedOccupancy, read_mapping
 
 REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
 HEADER = "datetime,camera,slot_id,weather,occupied\n"

@@ -155,7 +155,8 @@ def occupancy_of(path: Path, lot: ParkingLot, mapping: Path | None) -> Occupancy
         return process if process.n_slots == lot.n_slots else process.laid_on(lot.walk_m())
     if not path.name.endswith((".csv", ".csv.gz")):
         raise InputError(f"{path}: want a recorded log (.csv or .csv.gz) or a process (.json)")
-    from parkenv.occupancy_log import OccupancyLog, RecordedOccupancy, read_mapping
+    from parkenv.occupancy_log import OccupancyLog
+    from parkenv.recorded_occupancy import RecordedOccupancy, read_mapping
 
     log = OccupancyLog.read(path)
     placed = None if mapping is None else read_mapping(mapping, lot.slot_ids, log)

@@ -37,7 +37,7 @@ class SearchState:
     belief: SlotBelief
     vertex: int
     time: float
-    passed: NDArray[np.bool_]
+    passed: set[int]
     path: list[int]
     drive_s: float = 0.0
     failed_s: float = 0.0
@@ -60,7 +60,7 @@ class SearchState:
             "driven_m": self.driven_m,
             "walked_m": self.walked_m,
             "failed_parks": self.failed_parks,
-            "slots_passed": int(self.passed.sum()),
+            "slots_passed": len(self.passed),
             "parked": self.parked,
         }
 
@@ -218,7 +218,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             belief=SlotBelief(scenario.forecast(arrival), arrival.time),
             vertex=vertex,
             time=arrival.time,
-            passed=np.zeros(scenario.lot.n_slots, dtype=np.bool_),
+            passed=set(),
             path=[vertex],
         )
         self._look(self._state)
@@ -304,7 +304,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         """See the slots in view of the car, as well as the sighting model lets it."""
         vertex, sighting = state.vertex, self.scenario.sighting
         if vertex < self.scenario.lot.n_slots:
-            state.passed[vertex] = True
+            state.passed.add(vertex)
         slots = self._view_slots[self._view_starts[vertex] : self._view_starts[vertex + 1]]
         state.belief.relax(state.time)
         if not len(slots):
