@@ -55,7 +55,7 @@ def compare(
     ] = DEFAULT_AGENTS,
     episodes: Annotated[
         int, typer.Option("--episodes", "-n", min=1, help="Searches a setting and agent.")
-    ] = 100,
+    ] = 200,
     failure_cost: args.FailureCostOption = "10",
     v_walk_kmh: args.WalkOption = "4",
     v_drive_kmh: args.DriveOption = "10",
