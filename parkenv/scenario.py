@@ -65,12 +65,12 @@ class SearchProblem:
     @cached_property
     def walk_s(self) -> FloatArray:
         """Walk from each slot to the goal, (n_slots,) s (eq. 3.25)."""
-        return self.lot.walk_m(self.goal) / self.v_walk
+        return _read_only(self.lot.walk_m(self.goal) / self.v_walk)
 
     @cached_property
     def move_s(self) -> FloatArray:
         """Drive time of each edge, (n_vertices, 4) s; 0 where there is none (eq. 3.22)."""
-        return self.lot.edge_length / self.v_drive
+        return _read_only(self.lot.edge_length / self.v_drive)
 
     @cached_property
     def slots_in_view(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -84,7 +84,7 @@ class SearchProblem:
         viewer, slot = viewer[slot < self.lot.n_slots], slot[slot < self.lot.n_slots]
         order = np.lexsort((slot, viewer))
         starts = np.searchsorted(viewer[order], np.arange(self.lot.n_vertices + 1))
-        return starts.astype(np.int64), slot[order].astype(np.int64)
+        return _read_only(starts.astype(np.int64)), _read_only(slot[order].astype(np.int64))
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed, checked again.
@@ -235,6 +235,11 @@ _NAMED: dict[str, Callable[[], dict[str, Any]]] = {
 }
 
 SCENARIO_NAMES = tuple(_NAMED)
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    array.flags.writeable = False
+    return array
 
 
 def _require_number(name: str, value: Any, *, above: float | None = None, least: float | None = None) -> None:

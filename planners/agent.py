@@ -42,7 +42,8 @@ class SearchAgent(ABC, Generic[Memory]):
     name: ClassVar[str]
 
     def __init__(self, problem: SearchProblem) -> None:
-        self.problem = problem
+        # Handed a whole scenario, an agent keeps the part that it may know.
+        self.problem = problem.public() if isinstance(problem, Scenario) else problem
 
     @abstractmethod
     def begin(self, observation: Observation) -> Memory:
@@ -121,5 +122,4 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
     for option in options:
         if option not in known:
             raise InputError(f"agent {name!r} has no option {option!r}; known: {', '.join(known) or 'none'}")
-    problem = scenario.public() if isinstance(scenario, Scenario) else scenario
-    return agent(problem, **options)
+    return agent(scenario, **options)

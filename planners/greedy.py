@@ -41,13 +41,8 @@ class TargetAgent(SearchAgent[Eyes]):
         self.routes = DriveRoutes(problem)
 
     def begin(self, observation: Observation) -> Eyes:
-        """Remember the forecast, so that later sightings stand out.
-
-        The slots in view of the entry are seen already; a look that is certain shows as 0 or 1, which no
-        forecast is, and any other forecast is good enough to compare with.
-        """
-        p = np.array(observation["p_occupied"])
-        return Eyes(forecast=np.where((p == 0.0) | (p == 1.0), np.float32(0.5), p))
+        """Remember the first observation, which is the forecast, so that later sightings stand out."""
+        return Eyes(forecast=np.array(observation["p_occupied"]))
 
     def decide(self, observation: Observation, memory: Eyes) -> int:
         """Keep to the target while it is free-looking, else choose another; park on arrival."""

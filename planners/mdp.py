@@ -162,19 +162,21 @@ class ParkingMDP:
     def check_discount(self, values: FloatArray) -> None:
         """Warn where discounting breaks the equivalence with time (eq. 3.28).
 
-        Driving in circles for ever costs at least min(d_min, Δt)/(1 - γ); as long as every state does
-        better than that, no circle can be optimal.
+        Driving in circles for ever costs at least min(d_min, Δt)/(1 - γ), trying at a taken slot for ever
+        `failure_s`/(1 - γ); as long as every state does better than both, neither can be optimal.
         """
         if self.gamma == 1.0:
             return
         edges = self.move_s[self.neighbors >= 0]
         shortest = min(float(edges.min()) if len(edges) else np.inf, self.wait_s)
+        if (self.p_free < 1.0).any():
+            shortest = min(shortest, self.failure_s)
         bound = shortest / (1.0 - self.gamma)
         worst = float(-values.min())
         if worst >= bound:
             warnings.warn(
-                f"gamma {self.gamma} is too low for this lot: circling for ever costs {bound:.0f} s discounted, the "
-                f"worst state {worst:.0f} s; raise gamma above {1.0 - shortest / max(worst, shortest):.6f}",
+                f"gamma {self.gamma} is too low for this lot and a failure cost of {self.failure_s:g} s: circling, or "
+                f"trying in vain for ever, costs {bound:.0f} s discounted, the worst state {worst:.0f} s",
                 CirclingWarning,
                 stacklevel=2,
             )

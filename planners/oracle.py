@@ -123,7 +123,7 @@ class OracleAgent(SearchAgent[Foresight]):
         wait_s = self.problem.wait_s
         choice = best_slot(self.problem, self.routes, self._future, vertex, self._time, wait_s)
         give_up_s = self.problem.give_up_s
-        if choice.total_s > give_up_s and choice.total_s > give_up_s + self._tour_s(vertex):
+        if choice.total_s > give_up_s and self._tour_s(vertex, choice.total_s - give_up_s) < np.inf:
             return Foresight(-1, 0, np.ones(self.problem.lot.n_slots, dtype=np.bool_))
         waits = round(choice.wait_s / wait_s)
         return Foresight(choice.slot, waits + self._hidden_waits(vertex, choice.slot, waits) if waits else 0)
@@ -183,16 +183,17 @@ class OracleAgent(SearchAgent[Foresight]):
         nearest = int(seconds.argmin())
         return nearest if np.isfinite(seconds[nearest]) else None
 
-    def _tour_s(self, vertex: int) -> float:
-        """How long it takes to see every slot, s; inf where some are out of reach."""
+    def _tour_s(self, vertex: int, at_most: float) -> float:
+        """How long it takes to see every slot, s; inf where that is over `at_most`, or some are out of reach."""
         unseen = np.ones(self.problem.lot.n_slots, dtype=np.bool_)
         unseen[self._in_view(vertex)] = False
         total = 0.0
         while unseen.any():
-            target = self._next_on_tour(vertex, unseen)
-            if target is None:
+            seconds = np.where(unseen, self.routes.seconds_from(vertex)[: len(unseen)], np.inf)
+            target = int(seconds.argmin())
+            total += float(seconds[target])
+            if not total < at_most:
                 return np.inf
-            total += float(self.routes.seconds_from(vertex)[target])
             # What is seen in passing is left out: an upper bound is good enough.
             vertex = target
             unseen[self._in_view(vertex)] = False

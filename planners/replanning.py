@@ -55,8 +55,7 @@ class StaticAgent(SearchAgent[Plan]):
         """The optimal policy for a belief, (n_slots,), found from `policy` on where one is given."""
         mdp = ParkingMDP.from_belief(self.problem, p_occupied, failure_s=self.failure_s, gamma=self.gamma)
         solution = policy_iteration(mdp, policy)
-        if policy is None:
-            mdp.check_discount(solution.values)
+        mdp.check_discount(solution.values)
         return solution
 
     def expected_time(self, p_occupied: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -76,6 +75,9 @@ class StaticAgent(SearchAgent[Plan]):
 
 class ReplanningAgent(StaticAgent):
     """`mdp`: the thesis's planner. It plans again after every sighting that changes a probability.
+
+    A change counts from `RELEVANT_CHANGE` on, or where a look makes a slot certain; ageing that adds up to as
+    much counts, too.
 
     It goes on until it has parked or the environment declares the lot proven full. Where nothing that it
     can reach may be free, the model's best is to wait, and so does the agent.

@@ -233,6 +233,10 @@ def assert_one_line_and_exit_2(done, *wanted):
         (["--occupancy", "log.csv"], ["--occupancy goes with --lot"]),
         (["--occupancy-levels", "1.5"], ["--occupancy-levels has 1.5"]),
         (["--arrival", "late"], ["late"]),
+        (["--arrival", "22:00-02:00"], ["--arrival 22:00-02:00", "within one day"]),
+        (["-n", "0"], ["--episodes", "--help"]),
+        (["--speed", "3"], ["--speed"]),
+        (["--v-drive-kmh", "1e-300"], ["--v-drive-kmh is 1e-300"]),
         (["--days", "someday"], ["someday"]),
         (["--resume"], ["holds no comparison"]),
     ],
@@ -288,11 +292,49 @@ def test_an_output_folder_that_cannot_be_written_is_refused_before_any_work(tmp_
 
 
 def test_a_finished_folder_may_be_used_again_and_a_foreign_one_is_refused(tmp_path):
-    for _ in range(2):
-        assert parkenv(*small(tmp_path, agents="greedy-goal")).returncode == 0
+    assert parkenv(*small(tmp_path, agents="greedy-goal")).returncode == 0
+    again = parkenv(*small(tmp_path, agents="greedy-goal"))
+    assert_one_line_and_exit_2(again, "holds a finished comparison", "--overwrite")
+    assert parkenv(*small(tmp_path, "--overwrite", agents="greedy-goal")).returncode == 0
+    more = parkenv(*small(tmp_path, "--resume", agents="greedy-drive", episodes=5))
+    assert more.returncode == 0
+    kept = [row["agent"] for row in episodes_of(tmp_path)]
+    assert kept == ["greedy-drive"] * 5 + ["greedy-goal"] * 12, "what was there stays"
     (tmp_path / "episodes.csv").write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match="not written by this version"):
         ResultFolder(tmp_path, json.loads((tmp_path / "settings.json").read_text()), resume=True)
+
+
+def test_a_log_too_short_to_forecast_from_is_found_before_anything_is_replaced(tmp_path, lot_file):
+    out = tmp_path / "out"
+    assert parkenv(*small(out, agents="greedy-goal")).returncode == 0
+    before = (out / "episodes.csv").read_bytes()
+    log = tmp_path / "log.csv"
+    looks = [f"2015-11-12 {h:02d}:09,1,s{i},sunny,{i % 2}" for h in range(7, 14) for i in range(10)]
+    log.write_text(LOG + "\n".join(looks) + "\n")
+    done = parkenv(
+        "compare",
+        "--lot",
+        lot_file,
+        "--occupancy",
+        log,
+        "--agents",
+        "mdp",
+        "-n",
+        3,
+        "--overwrite",
+        "--out",
+        out,
+    )
+    assert_one_line_and_exit_2(done, "log.csv", "at least one more to forecast from")
+    assert (out / "episodes.csv").read_bytes() == before
+    assert (out / "summary.json").exists()
+
+
+def test_a_goal_may_lie_anywhere_and_plan_draws_one_scenario(tmp_path, lot_file):
+    done = parkenv("plan", "--lot", lot_file, "--goal", "5,5", "--out", tmp_path / "plan")
+    assert done.returncode == 0, done.stderr
+    assert_one_line_and_exit_2(parkenv("plan", "--scenario", "campus,jam"), "want one")
 
 
 def test_columns_are_stable():

@@ -134,6 +134,13 @@ def test_a_low_discount_is_warned_of():
         good.check_discount(policy_iteration(good).values)
 
 
+def test_a_failure_cost_at_which_trying_in_vain_looks_best_is_warned_of():
+    scenario = Scenario.named("jam", failure_s=0.0)
+    mdp = ParkingMDP.from_belief(scenario, np.ones(scenario.lot.n_slots))
+    with pytest.warns(CirclingWarning, match="failure cost of 0 s"):
+        mdp.check_discount(policy_iteration(mdp).values)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

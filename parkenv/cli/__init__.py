@@ -7,8 +7,9 @@ import warnings
 
 import typer
 
-from parkenv.cli import compare, lot, occupancy, plan
+from parkenv.cli import compare, lot, occupancy, plan, sensors
 from parkenv.errors import InputError
+from sim_sensors.errors import SensorError
 
 app = typer.Typer(
     name="parkenv",
@@ -23,6 +24,7 @@ app.command("compare")(compare.compare)
 app.command("plan")(plan.plan)
 app.add_typer(lot.app, name="lot")
 app.add_typer(occupancy.app, name="occupancy")
+app.add_typer(sensors.app, name="sensors")
 
 
 def _show_version(wanted: bool) -> None:
@@ -46,13 +48,20 @@ def main() -> None:
     """Entry point: bad input is one line on standard error and exit code 2."""
     warnings.formatwarning = lambda message, *_: f"parkenv: warning: {message}\n"
     try:
-        app()
-    except InputError as error:
+        code = app(standalone_mode=False)
+    except (InputError, SensorError) as error:
         sys.exit(_complain(str(error)))
+    except typer.TyperException as error:
+        message = error.format_message().rstrip(".")
+        # Without a command the help has been printed, and there is nothing to add.
+        sys.exit(_complain(f"{message}. See parkenv --help, and --help of each command") if message else 2)
+    except typer.Abort:
+        sys.exit(130)
     except OSError as error:
         if error.filename is None:
             raise
         sys.exit(_complain(f"{error.filename}: {error.strerror}"))
+    sys.exit(code if isinstance(code, int) else 0)
 
 
 def _complain(message: str) -> int:

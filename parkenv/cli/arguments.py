@@ -105,11 +105,29 @@ def numbers(option: str, text: str) -> list[float]:
     return values
 
 
-def positive(option: str, values: list[float], *, zero: bool = False) -> list[float]:
-    """The values, checked to be finite and above 0 (or at least 0)."""
+def speeds(option: str, text: str) -> list[float]:
+    """Comma-separated speeds, km/h, that a person or a car may have.
+
+    Raises:
+        InputError: something else; the message names the option.
+    """
+    values = numbers(option, text)
     for value in values:
-        if not (value > 0.0 or (zero and value == 0.0)) or value == float("inf"):
-            raise InputError(f"{option} is {value:g}, want a number {'of at least' if zero else 'above'} 0")
+        if not 0.1 <= value <= 300.0:
+            raise InputError(f"{option} is {value:g}, want a speed above 0: 0.1 to 300 km/h")
+    return values
+
+
+def costs(option: str, text: str) -> list[float]:
+    """Comma-separated costs, s, of at least 0 and at most a day.
+
+    Raises:
+        InputError: something else; the message names the option.
+    """
+    values = numbers(option, text)
+    for value in values:
+        if not 0.0 <= value <= 86400.0:
+            raise InputError(f"{option} is {value:g}, want seconds from 0 to 86400")
     return values
 
 
@@ -135,9 +153,12 @@ def lot_of(path: Path, goal: str | None = None) -> ParkingLot:
     lot = ParkingLot.from_file(path)
     if goal is None:
         return lot
-    point = numbers("--goal", goal)
+    try:
+        point = [float(word) for word in goal.split(",")]
+    except ValueError:
+        point = []
     if len(point) != 2:
-        raise InputError(f"--goal is {goal!r}, want X,Y in metres")
+        raise InputError(f"--goal is {goal!r}, want X,Y in metres, e.g. 80,-4")
     return dataclasses.replace(lot, goals=np.array([point]))
 
 
@@ -190,7 +211,13 @@ def scenarios_of(
         made = [
             Scenario.on_lot(its_lot, None if occupancy is None else occupancy_of(occupancy, its_lot, mapping))
         ]
-    changes: dict[str, Any] = {"arrival": ArrivalWindow.parse(arrival, days)}
+    try:
+        window = ArrivalWindow.parse(arrival, days)
+    except InputError as error:
+        raise InputError(
+            f"--arrival {arrival} --days {days}: {error}; a window lies within one day"
+        ) from error
+    changes: dict[str, Any] = {"arrival": window}
     if view_range is not None:
         changes["sighting"] = dataclasses.replace(made[0].sighting, view_range=view_range)
     return [s.replace(**changes) for s in made]

@@ -78,7 +78,10 @@ def compare(
             help="Folder for episodes.csv, summary.json and the figures.  [default: results/compare]",
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with an unfinished run in --out.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the run in --out: add what is missing.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results in --out.")] = False,
     figures: Annotated[bool, typer.Option(help="Draw figures.")] = True,
 ) -> None:
     """Compare agents over failure costs and speeds, all in the same worlds.
@@ -92,15 +95,15 @@ def compare(
 
     * `parkenv compare --lot lot.geojson --occupancy log.csv.gz --agents mdp,greedy-goal,oracle -n 300`
     """
-    from parkenv.evaluation.compare import Case, at_occupancy, run_cases, settings_of, table
+    from parkenv.evaluation.compare import Case, at_occupancy, check_worlds, run_cases, settings_of, table
     from parkenv.evaluation.results import ResultFolder
     from parkenv.occupancy import OccupancyProcess
     from planners.agent import make_agent
 
     names = args.words("--agents", agents)
-    failure = args.positive("--failure-cost", args.numbers("--failure-cost", failure_cost), zero=True)
-    walk = args.positive("--v-walk-kmh", args.numbers("--v-walk-kmh", v_walk_kmh))
-    drive = args.positive("--v-drive-kmh", args.numbers("--v-drive-kmh", v_drive_kmh))
+    failure = args.costs("--failure-cost", failure_cost)
+    walk = args.speeds("--v-walk-kmh", v_walk_kmh)
+    drive = args.speeds("--v-drive-kmh", v_drive_kmh)
     levels = [] if occupancy_levels == "none" else _levels(occupancy_levels)
     scenarios = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range)
     for name in names:
@@ -134,7 +137,9 @@ def compare(
         "view_range": view_range,
     }
     out = out or Path("results/compare")
-    folder = ResultFolder(out, settings, resume=resume)
+    for s in scenarios:
+        check_worlds(s, seeds)
+    folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)
     console = make_console()
     interrupted = _run(console, cases + sweep, folder, args.worker_count(jobs), run_cases)
 
@@ -218,7 +223,7 @@ def _tables(rows: list[Row], width: int) -> list[Table]:
         )
         title = (
             f"{name}: failure cost {failure:g} s, walk {walk:g} km/h, drive {drive:g} km/h, "
-            f"{its_rows[0]['episodes']} searches"
+            f"{max(r['episodes'] for r in its_rows)} searches"
         )
         for columns in [results + _DETAILS] if width >= WIDE else [results, _DETAILS]:
             headings = ("agent", *(heading for heading, _ in columns))
@@ -261,7 +266,15 @@ def _draw(
         save_time_split([r for r in rows if r["scenario"] == name], out / f"time_split_{name}.png")
         swept = [{**r, "occupancy": r["occupancy_level"]} for r in sweep_rows if r["scenario"] == name]
         if not swept:
-            recorded = [e for e in folder.episodes.values() if e["scenario"] == name]
+            # As the sweep: at the first of the speeds, whatever else was asked for.
+            shown = [(c, seeds) for c, seeds in cases if c.scenario.name == name]
+            speeds = shown[0][0].scenario.v_walk, shown[0][0].scenario.v_drive
+            recorded = [
+                folder.episodes[c.key(s)]
+                for c, seeds in shown
+                for s in seeds
+                if (c.scenario.v_walk, c.scenario.v_drive) == speeds
+            ]
             swept = against_occupancy(recorded, (0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001))
         if swept:
             save_time_against_occupancy(swept, out / f"time_against_occupancy_{name}.png")

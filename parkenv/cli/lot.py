@@ -60,13 +60,16 @@ def check(
     problems = check_lot(file)
     for problem in problems:
         place = "" if problem.feature is None else f"feature {problem.feature}: "
-        color = "red" if problem.severity == "error" else "yellow"
-        console.print(f"[{color}]{problem.severity}[/]: {place}{problem.message}")
+        console.print(
+            f"{problem.severity}: {place}{problem.message}",
+            style="red" if problem.severity == "error" else "yellow",
+            markup=False,
+        )
     errors = sum(p.severity == "error" for p in problems)
     if not problems:
-        console.print(f"{file}: nothing wrong")
+        console.print(f"{file}: nothing wrong", markup=False)
     else:
-        console.print(f"{file}: {errors} errors, {len(problems) - errors} warnings")
+        console.print(f"{file}: {errors} errors, {len(problems) - errors} warnings", markup=False)
     if errors:
         raise typer.Exit(2)
 

@@ -57,10 +57,12 @@ def plan(
     from planners.agent import make_agent
     from planners.replanning import StaticAgent
 
-    failure = args.positive("--failure-cost", args.numbers("--failure-cost", failure_cost), zero=True)
-    walk = args.positive("--v-walk-kmh", args.numbers("--v-walk-kmh", v_walk_kmh))
-    drive = args.positive("--v-drive-kmh", args.numbers("--v-drive-kmh", v_drive_kmh))
-    (base,) = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range)
+    failure = args.costs("--failure-cost", failure_cost)
+    walk = args.speeds("--v-walk-kmh", v_walk_kmh)
+    drive = args.speeds("--v-drive-kmh", v_drive_kmh)
+    base, *others = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range)
+    if others:
+        raise InputError(f"--scenario is {scenario!r}, want one: plan draws one scenario at a time")
     if not isinstance(make_agent(agent, base), StaticAgent):
         raise InputError(f"--agent {agent!r} makes no plan; known: mdp, mdp-static")
     make_folder(out)

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 _CERTAIN = SightingModel()
 _ALWAYS = np.ones(1, dtype=np.bool_)
 
+LATEST = 1e8
+"""Bound, s, of the observed times: Gymnasium wants one, and three years are more than any search takes."""
 REWARD_TERMS = ("drive", "failed", "walk", "gave_up")
 
 
@@ -89,7 +91,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     | Key | Space | Meaning |
     |-----|-------|---------|
     | `vertex` | `Discrete(n_vertices)` | where the car is; vertex i < n_slots lies before slot i |
-    | `time` | `Box(0, inf, (2,), float32)` | s since Monday 00:00; s since the search began |
+    | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
     | `p_occupied` | `Box(0, 1, (n_slots,), float32)` | belief that each slot is taken |
     | `action_mask` | `Box(0, 1, (5,), int8)` | which actions the graph has here |
 
@@ -101,7 +103,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     `failed` (tries at taken slots), `walk` and `gave_up`; they add up to the reward.
 
     ## Starting state
-    At the scenario's entry, at a time drawn from its arrival window. The slots around are seen at once.
+    At the scenario's entry, at a time drawn from its arrival window. The first observation is the forecast
+    alone; slots are seen from the first step on, from wherever a step ends.
     With `reset(seed=s)` arrival, entry and every slot's comings and goings are the same whatever the agent
     does; later `reset()` calls go through further worlds of the same seed.
 
@@ -111,7 +114,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     - Truncated: after the step limit of the spec, 2000 (`max_episode_steps` of `gymnasium.make`).
 
     At the end `info` holds drive_s, failed_s, walk_s, gave_up_s, total_s, driven_m, walked_m, failed_parks,
-    slots_passed (slots whose vertex was driven to) and parked.
+    slots_passed (slots whose vertex was driven to) and parked. A wrapper's time limit is not part of
+    `get_state`: it goes on counting.
 
     ## Arguments
     - `scenario`: a `Scenario`, or the name of a packaged one: campus, jam, street, mini.
@@ -156,7 +160,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self.observation_space = spaces.Dict(
             {
                 "vertex": spaces.Discrete(lot.n_vertices),
-                "time": spaces.Box(0.0, np.inf, (2,), np.float32),
+                "time": spaces.Box(0.0, LATEST, (2,), np.float32),
                 "p_occupied": spaces.Box(0.0, 1.0, (lot.n_slots,), np.float32),
                 "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
             }
@@ -221,7 +225,6 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             passed=set(),
             path=[vertex],
         )
-        self._look(self._state)
         if self.render_mode == "human":
             self.render()
         return self._observation(self._state), {}
@@ -231,15 +234,14 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         state, lot = self.state, self.scenario.lot
         if state.over:
             raise gym.error.ResetNeeded("the search is over: call reset()")
-        if not 0 <= action <= PARK:
-            raise InputError(f"action is {action!r}, want 0 to {PARK} ({', '.join(ACTIONS)})")
+        chosen = _action_number(action)
         drive = failed = walk = gave_up = 0.0
-        if not self._masks[state.vertex, action]:
+        if not self._masks[state.vertex, chosen]:
             drive = self.scenario.wait_s
-        elif action < PARK:
-            drive = float(self.scenario.move_s[state.vertex, action])
-            state.driven_m += float(lot.edge_length[state.vertex, action])
-            state.vertex = int(lot.neighbors[state.vertex, action])
+        elif chosen < PARK:
+            drive = float(self.scenario.move_s[state.vertex, chosen])
+            state.driven_m += float(lot.edge_length[state.vertex, chosen])
+            state.vertex = int(lot.neighbors[state.vertex, chosen])
             state.path.append(state.vertex)
         elif state.world.occupied(np.array([state.vertex]), state.time)[0]:
             failed = self.scenario.failure_s
@@ -324,3 +326,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             "p_occupied": state.belief.p_occupied.astype(np.float32),
             "action_mask": self._masks[state.vertex].copy(),
         }
+
+
+def _action_number(action: Any) -> int:
+    """The action as an int; arrays of one element will do, as models return them."""
+    number = np.asarray(action)
+    if number.size != 1 or not np.issubdtype(number.dtype, np.integer) or not 0 <= number.item() <= PARK:
+        raise InputError(f"action is {action!r}, want a whole number from 0 to {PARK} ({', '.join(ACTIONS)})")
+    return int(number.item())

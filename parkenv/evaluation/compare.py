@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from parkenv.errors import InputError
 from parkenv.evaluation.episodes import EpisodeRunner, SearchTrace
 from parkenv.evaluation.results import ResultFolder, Row, episode_key
 from parkenv.evaluation.statistics import mean_interval, summarize
+from parkenv.keyed_random import world_key
 from parkenv.occupancy import ArrivalWindow, OccupancyProcess
 from parkenv.scenario import KMH, Scenario
 from planners.agent import make_agent
@@ -64,6 +66,13 @@ class Case:
             timings.append({**self.columns, "seed": seed, "decisions_us": microseconds})
         return rows, timings
 
+    def run_reporting(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row], list[str]]:
+        """As `run`, and what it warned of: a worker's own warnings would not reach the user in order."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("default")
+            rows, timings = self.run(seeds)
+        return rows, timings, [f"{self.agent} in {self.scenario.name}: {w.message}" for w in caught]
+
     def trace(self, seed: int) -> SearchTrace:
         """One search, for a picture."""
         return EpisodeRunner(self.scenario, self.agent, make_agent(self.agent, self.scenario)).run(seed).trace
@@ -83,21 +92,23 @@ def settings_of(
 
 
 def at_occupancy(scenario: Scenario, level: float) -> Scenario:
-    """The scenario at the middle of its arrival window, made so full on average.
+    """The scenario at the middle of the first day of its arrival window, made so full on average.
 
     Raises:
         InputError: its world is a record, which is as full as it is.
     """
     window = scenario.arrival
     middle = (window.start_s + window.end_s) / 2
-    moment = ArrivalWindow(window.weekdays, middle, middle)
+    # Days differ in how full they are, so that one level can be right for one of them only.
+    day = window.weekdays[0]
+    moment = ArrivalWindow((day,), middle, middle)
 
     def adjusted(model: Any) -> Any:
         if model is None:
             return None
         if not isinstance(model, OccupancyProcess):
             raise InputError(f"scenario {scenario.name!r}: a recorded world cannot be made {level:.0%} full")
-        return model.at_mean_occupancy(level, window.weekdays[0] * 86400.0 + middle)
+        return model.at_mean_occupancy(level, day * 86400.0 + middle)
 
     return scenario.replace(
         arrival=moment, occupancy=adjusted(scenario.occupancy), prior=adjusted(scenario.prior)
@@ -132,9 +143,31 @@ def run_cases(
     with Parallel(
         n_jobs=jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs"
     ) as parallel:
-        for rows, timings in parallel(delayed(case.run)(block) for case, block in tasks):
+        told = set()
+        for rows, timings, messages in parallel(delayed(case.run_reporting)(block) for case, block in tasks):
             folder.add(rows, timings)
             on_progress(len(rows))
+            for message in messages:
+                # Once an agent and scenario: figures in the text differ from episode to episode.
+                if (topic := message.partition(":")[0]) not in told:
+                    told.add(topic)
+                    warnings.warn(message, stacklevel=2)
+
+
+def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
+    """Make sure that the scenario has a world and a forecast for every search, before anything is written.
+
+    Raises:
+        InputError: such as a log that has no other day to forecast from.
+    """
+    days = set()
+    for seed in seeds:
+        key = world_key(seed, 0)
+        arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
+        if arrival.day not in days:
+            days.add(arrival.day)
+            scenario.forecast(arrival)
+            scenario.occupancy.world(key, arrival)
 
 
 def _blocks(seeds: Sequence[int]) -> Iterator[Sequence[int]]:

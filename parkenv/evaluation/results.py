@@ -48,6 +48,8 @@ _BOOL = {"parked", "truncated"}
 
 SUMMARY = "summary.json"
 SUMMARY_PARTIAL = "summary.partial.json"
+PICTURES = ("time_split_", "time_against_occupancy_", "searches_")
+"""What the names of a comparison's figures begin with."""
 
 Row = dict[str, Any]
 Key = tuple[Any, ...]
@@ -85,16 +87,19 @@ class ResultFolder:
         path: the folder; made where it does not exist.
         settings: what was asked for; anything that changes the outcome of an episode.
         resume: go on from the episodes that an earlier run with the same settings left.
+        overwrite: replace what another run left.
 
     Attributes:
         episodes: finished episodes by key.
 
     Raises:
-        InputError: the folder cannot be written; it holds an unfinished run and `resume` is not set; or
-            `resume` is set and the settings differ.
+        InputError: the folder cannot be written; it holds another run and neither `resume` nor `overwrite` is
+            set; or `resume` is set and the settings differ.
     """
 
-    def __init__(self, path: Path, settings: Mapping[str, Any], *, resume: bool = False) -> None:
+    def __init__(
+        self, path: Path, settings: Mapping[str, Any], *, resume: bool = False, overwrite: bool = False
+    ) -> None:
         make_folder(path)
         self.path = path
         self.episodes: dict[Key, Row] = {}
@@ -104,10 +109,15 @@ class ResultFolder:
             self._check_settings(settings_file, settings)
             self.episodes = {episode_key(r): r for r in _read(path / "episodes.csv", EPISODE_COLUMNS)}
             self._timings = {episode_key(r): r for r in _read(path / "timings.csv", TIMING_COLUMNS)}
-        elif (path / "episodes.csv").exists() and not (path / SUMMARY).exists():
+        elif (path / "episodes.csv").exists() and not overwrite:
+            state = "a finished" if (path / SUMMARY).exists() else "an unfinished"
             raise InputError(
-                f"--out {path}: holds an unfinished comparison; add --resume to go on with it, or name another folder"
+                f"--out {path}: holds {state} comparison; add --resume to go on with it, --overwrite to replace it, "
+                "or name another folder"
             )
+        for picture in path.glob("*.png"):
+            if picture.name.startswith(PICTURES):
+                picture.unlink()
         (path / SUMMARY).unlink(missing_ok=True)
         _write_text(settings_file, json.dumps(dict(settings), indent=2) + "\n")
         # Rewritten from what could be read: a line that a crash tore is gone, and its episode runs again.
@@ -131,9 +141,11 @@ class ResultFolder:
         """Put the episodes in order and write the summary.
 
         The order is the one asked for, not the one in which they finished, so that the file is the same
-        for any number of jobs. The summary of an incomplete run is called `summary.partial.json`.
+        for any number of jobs. Episodes that were not asked for, but are there from a run that this one
+        resumed, come after. The summary of an incomplete run is called `summary.partial.json`.
         """
-        wanted = [key for key in order if key in self.episodes]
+        wanted = dict.fromkeys(key for key in order if key in self.episodes)
+        wanted |= dict.fromkeys(self.episodes)
         rows = [self.episodes[key] for key in wanted]
         timings = [self._timings[key] for key in wanted if key in self._timings]
         _write_text(self.path / "episodes.csv", _csv_text(EPISODE_COLUMNS, rows, header=True))

@@ -1,0 +1,112 @@
+"""`parkenv sensors`: look through the simulated sensors."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import track
+
+from parkenv.cli import arguments as args
+from parkenv.cli.tables import make_console
+from parkenv.errors import InputError
+
+app = typer.Typer(help="Look through the simulated sensors.", no_args_is_help=True)
+
+
+@app.callback()
+def _sensors() -> None:
+    """Look through the simulated sensors."""
+
+
+@app.command()
+def preview(
+    scenario: Annotated[
+        str, typer.Option("--scenario", help="A packaged scenario: campus, jam, street, mini.")
+    ] = "campus",
+    weather: Annotated[
+        str,
+        typer.Option(
+            "--weather", help="sunny, overcast, low_sun, dusk, rain; or all, or several with commas."
+        ),
+    ] = "all",
+    seed: args.SeedOption = 0,
+    drive: Annotated[float, typer.Option("--drive", min=0.0, help="Metres of the video; 0 for none.")] = 20.0,
+    every: Annotated[float, typer.Option("--every", min=0.05, help="Metres between its frames.")] = 0.5,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures and drive.gif.")] = Path(
+        "results/sensors"
+    ),
+) -> None:
+    """Draw what the sensors see on the way from the entry to the slot nearest to the goal.
+
+    A picture for each weather: the side camera's frame with the true boxes, its depth, the stereo pair's
+    disparity, and the laser's scan from above. And a short video of the side camera driving past.
+
+    Examples:
+    * `parkenv sensors preview`
+
+    * `parkenv sensors preview --scenario street --weather dusk --drive 40`
+    """
+    import numpy as np
+
+    from parkenv.evaluation.results import make_folder
+    from parkenv.evaluation.sensor_pictures import save_animation, save_sensor_preview, with_boxes
+    from parkenv.keyed_random import world_key
+    from parkenv.lot_scene import slot_lot
+    from parkenv.scenario import Scenario
+    from planners.routes import DriveRoutes
+    from sim_sensors.camera import camera_pose
+    from sim_sensors.ground_truth import vehicle_boxes
+    from sim_sensors.rig import SensorRig, poses_along
+    from sim_sensors.weather import PRESETS, Weather
+
+    names = list(PRESETS) if weather == "all" else args.words("--weather", weather)
+    for name in names:
+        if name not in PRESETS:
+            raise InputError(f"--weather has {name!r}, want all or some of {', '.join(PRESETS)}")
+    its = Scenario.named(scenario)
+    make_folder(out)
+    console = make_console()
+
+    key = world_key(seed, 0)
+    arrival = its.occupancy.draw_arrival(its.arrival, key)
+    occupied = its.occupancy.world(key, arrival).occupied(np.arange(its.lot.n_slots), arrival.time)
+    scene = slot_lot(its.lot).scene(occupied, int(key) % 2**31)
+
+    routes, vertex = DriveRoutes(its), int(its.lot.entry_vertices[0])
+    target = int(its.lot.walk_m().argmin())
+    path = [vertex]
+    while vertex != target:
+        vertex = int(its.lot.neighbors[vertex, routes.move_toward(vertex, target)])
+        path.append(vertex)
+    poses = poses_along(its.lot.vertex_xy[path], every)
+    middle = len(poses) // 2
+
+    ((_, stereo, stereo_mount),) = SensorRig.stereo().stereo_cameras
+    rig = dataclasses.replace(SensorRig.thesis(), stereo_cameras=(("pair", stereo, stereo_mount),))
+    name, camera, mount = rig.cameras[0]
+    x, y, yaw = mount.in_world(poses[middle])
+    eye = camera_pose(x, y, mount.z, yaw, mount.pitch)
+    console.print(
+        "The first picture after an installation waits for the renderer to be compiled, about 20 s."
+    )
+    for preset in track(names, "Taking pictures", console=console, disable=not console.is_terminal):
+        light = Weather.draw(preset, seed)
+        capture = rig.capture(scene, poses[middle], light, seed)
+        boxes = vehicle_boxes(camera, scene, eye, capture.images[name])
+        title = f"{its.name}, {preset.replace('_', ' ')}"
+        save_sensor_preview(its.lot, rig, capture, boxes, title, out / f"sensors_{its.name}_{preset}.png")
+    n = int(drive / every)
+    if n:
+        frames = []
+        past = poses[max(0, middle - n // 2) :][:n]
+        light = Weather.draw(names[0], seed)
+        for k, pose in enumerate(track(past, "Driving", console=console, disable=not console.is_terminal)):
+            x, y, yaw = mount.in_world(pose)
+            eye = camera_pose(x, y, mount.z, yaw, mount.pitch)
+            frame = camera.render(scene, eye, light, seed + k)
+            frames.append(with_boxes(frame.image, vehicle_boxes(camera, scene, eye, frame)))
+        save_animation(frames, out / "drive.gif")
+    console.print(f"Pictures are in {out}")

@@ -1,0 +1,395 @@
+"""What a horizontal scan plane meets: convex footprints and walls, sorted into cells so that a look is local."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim_sensors.errors import SensorError
+
+Float64Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+NO_RETURN = -1
+WALL = -2
+NOWHERE = -1
+
+LANES = 16  # obstacles that one pass of vector code prepares
+QUAD, OCTAGON = 4, 8
+FAR = 1e9
+
+CELL_M = 16.0
+LARGEST_IN_A_CELL_M = 8.0  # what reaches further from its centre is looked at in every scan
+SPARE_PLACES = 32
+SHORTEST_EDGE_M = 1e-6
+STRAIGHT_RAD = 1e-9
+
+
+class Cells(NamedTuple):
+    """Obstacles as compiled code walks them, sixteen at a time; a wall is a polygon of two corners.
+
+    Places `0:cell_start[-1]` are sorted by cell, row after row, so that neighbouring cells of a row are one run
+    of places. The places after them hold what is too large for a cell or has left its own, and spares. Unused
+    places lie `FAR` away.
+
+    Attributes:
+        corners: (n_places / LANES · k · 2 · LANES,) float32, m, counter-clockwise, relative to the centre: for
+            each block of LANES places the x and the y of corner 0, of corner 1, ... A polygon of fewer than k
+            corners repeats its last.
+        x, y: (n_places,) float64, m, world frame: the centre. Only differences to it are taken in float32, so
+            a lot may lie anywhere.
+        radius: (n_places,) float32, m, of the circle that encloses the obstacle.
+        label: (n_places,) int32, the footprint's id, or `WALL`.
+        cell_start: (n_rows · n_columns + 1,) int64.
+        frame: (6,) float64: x and y of the first cell's corner and the cell size (m), rows, columns; places in use.
+        k: corners kept of each.
+    """
+
+    corners: NDArray[np.float32]
+    x: Float64Array
+    y: Float64Array
+    radius: NDArray[np.float32]
+    label: NDArray[np.int32]
+    cell_start: IntArray
+    frame: Float64Array
+    k: int
+
+
+class CellTable:
+    """Convex polygons of at most k corners, sorted into cells, of which single ones may change.
+
+    Args:
+        k: most corners of one.
+        corners: (n, k_max, 2) float64, m, world frame, counter-clockwise.
+        n_corners: (n,) int64; those with none or with more than k are left out.
+        labels: (n,) int64.
+    """
+
+    def __init__(self, k: int, corners: Float64Array, n_corners: IntArray, labels: IntArray) -> None:
+        stands = np.flatnonzero((n_corners > 0) & (n_corners <= k))
+        circle = _enclosing_circles(corners[stands], n_corners[stands])
+        fits = circle[:, 2] <= LARGEST_IN_A_CELL_M
+        frame = _frame(circle[fits])
+        n_cells = int(frame[3] * frame[4])
+        cell = np.full(len(stands), n_cells)
+        cell[fits] = _cell_of(circle[fits], frame)
+        order = np.argsort(cell, kind="stable")
+        self._used = len(order)
+        self._place = np.full(len(n_corners), NOWHERE)
+        self._place[stands[order]] = np.arange(self._used)
+        spare = SPARE_PLACES + int(np.sqrt(self._used))
+        n_blocks = -(-(self._used + spare) // LANES) if self._used else 0
+        self.cells = Cells(
+            np.zeros(n_blocks * k * 2 * LANES, np.float32),
+            np.full(n_blocks * LANES, FAR),
+            np.full(n_blocks * LANES, FAR),
+            np.zeros(n_blocks * LANES, np.float32),
+            np.full(n_blocks * LANES, NO_RETURN, np.int32),
+            np.searchsorted(cell[order], np.arange(n_cells + 1)),
+            np.append(frame, self._used),
+            k,
+        )
+        chosen = stands[order]
+        self._write(np.arange(self._used), circle[order], corners[chosen], n_corners[chosen], labels[chosen])
+
+    def copy(self) -> CellTable:
+        """A table of its own, whose changes leave this one as it is."""
+        twin = object.__new__(CellTable)
+        twin._used, twin._place = self._used, self._place.copy()
+        cells = self.cells
+        twin.cells = cells._replace(
+            corners=cells.corners.copy(),
+            x=cells.x.copy(),
+            y=cells.y.copy(),
+            radius=cells.radius.copy(),
+            label=cells.label.copy(),
+            frame=cells.frame.copy(),
+        )
+        return twin
+
+    def remove(self, index: int) -> None:
+        """Take a polygon away; nothing happens where there is none."""
+        place = self._place[index]
+        if place != NOWHERE:
+            self.cells.x[place] = self.cells.y[place] = FAR
+
+    def put(self, index: int, corners: Float64Array, label: int) -> bool:
+        """Let polygon `index` be another; False, and nothing done, if there is no place left and a new sort is due.
+
+        Args:
+            index: which.
+            corners: (3 to k, 2) float64, m, world frame, counter-clockwise.
+            label: its label.
+        """
+        count = np.array([len(corners)])
+        circle = _enclosing_circles(corners[None], count)
+        place, start = int(self._place[index]), self.cells.cell_start
+        if place == NOWHERE or not (place >= start[-1] or self._in_cell_of(place, circle)):
+            if self._used == len(self.cells.x):
+                return False
+            self.remove(index)
+            place = self._place[index] = self._used
+            self._used += 1
+            self.cells.frame[5] = self._used
+        self._write(np.array([place]), circle, corners[None], count, np.array([label]))
+        return True
+
+    def _in_cell_of(self, place: int, circle: Float64Array) -> bool:
+        cell, start = int(_cell_of(circle, self.cells.frame)[0]), self.cells.cell_start
+        return (
+            cell >= 0 and circle[0, 2] <= LARGEST_IN_A_CELL_M and bool(start[cell] <= place < start[cell + 1])
+        )
+
+    def _write(
+        self,
+        place: IntArray,
+        circle: Float64Array,
+        corners: Float64Array,
+        n_corners: IntArray,
+        label: IntArray,
+    ) -> None:
+        cells = self.cells
+        cells.x[place], cells.y[place], cells.radius[place] = circle[:, 0], circle[:, 1], circle[:, 2]
+        cells.label[place] = label
+        last = np.minimum(np.arange(cells.k), n_corners[:, None] - 1)
+        local = np.take_along_axis(corners, last[..., None], 1) - circle[:, None, :2]
+        blocks = cells.corners.reshape(-1, cells.k, 2, LANES)
+        blocks[place // LANES, :, :, place % LANES] = local
+
+
+class ScanPlane:
+    """Everything that a horizontal laser plane (knee height, 0.5 m) meets: footprints and walls.
+
+    Footprints are convex polygons (a post is a polygon of eight or more corners), walls are line segments of
+    no thickness, seen from both sides. They may overlap. Preparing takes a sort over all of them; afterwards
+    changing one footprint touches that one alone, and a scan visits the cells within its range alone.
+
+    Args:
+        footprints: (n, k_max, 2) float, m, world frame: corners in order, of either orientation. Kept
+            counter-clockwise, without corners on a straight edge.
+        n_corners: (n,) int, how many corners of each are used: 3 to k_max, or 0 for an empty place that
+            `replace` may fill later. None: all of them.
+        walls: (m, 2, 2) float, m, world frame: the two ends of each.
+        ids: (n,) int, 0 or more, what a scan reports as hit; several footprints may share one. None: 0 to n-1.
+
+    Raises:
+        SensorError: a shape that does not fit, a value that is not finite, a footprint that is concave, crosses
+            itself or has no area, or a wall of no length.
+
+    Examples:
+        >>> plane = ScanPlane([[[1, -1], [2, -1], [2, 1], [1, 1]]], walls=[[[5, -9], [5, 9]]])
+        >>> plane.n_footprints, plane.n_walls
+        (1, 1)
+    """
+
+    def __init__(
+        self,
+        footprints: ArrayLike,
+        n_corners: ArrayLike | None = None,
+        walls: ArrayLike | None = None,
+        ids: ArrayLike | None = None,
+    ) -> None:
+        corners = _as_floats("footprints", footprints, (None, None, 2))
+        n, k_max = corners.shape[:2]
+        count = np.full(n, k_max) if n_corners is None else _as_ints("n_corners", n_corners, n)
+        wall = _as_floats("walls", np.empty((0, 2, 2)) if walls is None else walls, (None, 2, 2))
+        self.ids = np.arange(n) if ids is None else _as_ints("ids", ids, n)
+        if n and self.ids.min() < 0:
+            raise SensorError(f"ids: wanted 0 or more, got {self.ids.min()}")
+        length = np.hypot(*(wall[:, 1] - wall[:, 0]).T)
+        if (length < SHORTEST_EDGE_M).any():
+            i = int(np.argmax(length < SHORTEST_EDGE_M))
+            raise SensorError(f"walls[{i}]: wanted two ends apart, got {wall[i].tolist()}")
+        self.n_footprints, self.n_walls, self.k_max = n, len(wall), max(k_max, QUAD)
+        self._wall = wall
+        self._corners = np.zeros((n, self.k_max, 2))
+        self._corners[:, :k_max], self._n_corners = _normalised("footprints", corners, count)
+        self._sort()
+
+    @property
+    def cells(self) -> tuple[Cells, Cells]:
+        """What compiled code walks: obstacles of up to four corners, and the others. To be read only."""
+        return self._quads.cells, self._others.cells
+
+    @property
+    def footprints(self) -> tuple[Float64Array, IntArray]:
+        """As kept: (n, k_max, 2) float64, m, world frame, counter-clockwise, zero-padded; and (n,) int64 corners."""
+        return self._corners.copy(), self._n_corners.copy()
+
+    @property
+    def walls(self) -> Float64Array:
+        """(m, 2, 2) float64, m, world frame."""
+        return self._wall.copy()
+
+    def replace(self, index: int, corners: ArrayLike | None) -> None:
+        """Put another footprint in the place of one, or none; its id stays.
+
+        Takes microseconds, except that after every few dozen moves from one cell to another all are sorted again.
+
+        Args:
+            index: which footprint, 0 to n_footprints - 1.
+            corners: (k, 2) float, m, world frame, 3 to k_max corners of either orientation; None to clear it.
+
+        Raises:
+            SensorError: no such footprint, or corners that the class would refuse.
+        """
+        if not 0 <= index < self.n_footprints:
+            raise SensorError(f"index: wanted 0 to {self.n_footprints - 1}, got {index}")
+        new = _as_floats("corners", np.empty((0, 2)) if corners is None else corners, (None, 2))
+        if len(new) > self.k_max:
+            raise SensorError(f"corners: wanted at most {self.k_max}, got {len(new)}")
+        shape, count = _normalised("corners", new[None], np.array([len(new)]))
+        self._corners[index] = 0.0
+        self._corners[index, : len(new)], self._n_corners[index] = shape[0], count[0]
+        table, other = (self._quads, self._others) if count[0] <= QUAD else (self._others, self._quads)
+        other.remove(index)
+        if count[0] == 0:
+            table.remove(index)
+        elif not table.put(index, shape[0, : count[0]], int(self.ids[index])):
+            self._sort()
+
+    def with_footprint(self, index: int, corners: ArrayLike | None) -> ScanPlane:
+        """A copy in which one footprint is another; see `replace`."""
+        twin = object.__new__(ScanPlane)
+        twin.__dict__.update(self.__dict__)
+        twin._corners, twin._n_corners = self._corners.copy(), self._n_corners.copy()
+        twin._quads, twin._others = self._quads.copy(), self._others.copy()
+        twin.replace(index, corners)
+        return twin
+
+    def _sort(self) -> None:
+        pieces = _short_pieces(self._wall)
+        corners = np.zeros((self.n_footprints + len(pieces), self.k_max, 2))
+        corners[: self.n_footprints], corners[self.n_footprints :, :2] = self._corners, pieces
+        n_corners = np.concatenate([self._n_corners, np.full(len(pieces), 2)])
+        labels = np.concatenate([self.ids, np.full(len(pieces), WALL)])
+        self._quads = CellTable(QUAD, corners, n_corners, labels)
+        larger = np.where(n_corners > QUAD, n_corners, 0)
+        self._others = CellTable(max(OCTAGON, self.k_max), corners, larger, labels)
+
+
+def _short_pieces(walls: Float64Array) -> Float64Array:
+    """(n, 2, 2) float64: walls cut so that every piece fits into a cell."""
+    start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
+    n = np.ceil(np.hypot(along[:, 0], along[:, 1]) / (2 * LARGEST_IN_A_CELL_M)).astype(np.int64)
+    wall = np.repeat(np.arange(len(walls)), n)
+    number = np.arange(len(wall)) - np.repeat(np.cumsum(n) - n, n)
+    ends = (number[:, None] + [0, 1]) / n[wall, None]
+    return np.asarray(start[wall, None] + ends[..., None] * along[wall, None])
+
+
+def _frame(circle: Float64Array) -> Float64Array:
+    """The frame of cells over all centres; see `Cells.frame`."""
+    low, high = (circle[:, :2].min(0), circle[:, :2].max(0)) if len(circle) else (np.zeros(2), np.zeros(2))
+    extent = high - low
+    # Where little stands on much ground, larger cells keep their number in proportion to the obstacles.
+    size = max(CELL_M, float(np.sqrt(np.prod(extent) / (64 + 4 * len(circle)))), float(extent.max()) / 4096)
+    columns, rows = np.floor(extent / size) + 1
+    return np.array([*low, size, rows, columns])
+
+
+def _cell_of(circle: Float64Array, frame: Float64Array) -> IntArray:
+    """(n,) int64: the cell of each centre, -1 outside all."""
+    x, y, size, rows, columns = frame[:5]
+    column, row = np.floor((circle[:, 0] - x) / size), np.floor((circle[:, 1] - y) / size)
+    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    return np.where(inside, row * columns + column, -1).astype(np.int64)
+
+
+def _as_floats(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float64Array:
+    """`value` as finite float64 of a shape; None stands for any length.
+
+    Raises:
+        SensorError: another shape, or a value that is not a finite number.
+    """
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SensorError(f"{name}: wanted numbers, got {value!r}") from error
+    if array.size == 0 and array.ndim < len(shape):
+        array = array.reshape([length or 0 for length in shape])
+    if array.ndim != len(shape) or any(
+        w is not None and w != g for w, g in zip(shape, array.shape, strict=True)
+    ):
+        wanted = ", ".join("any" if length is None else str(length) for length in shape)
+        raise SensorError(f"{name}: wanted shape ({wanted}), got {array.shape}")
+    if not np.isfinite(array).all():
+        row = np.argwhere(~np.isfinite(array))[0]
+        raise SensorError(f"{name}{row.tolist()}: wanted a finite number, got {array[tuple(row)]}")
+    return array
+
+
+def _as_ints(name: str, value: ArrayLike, n: int) -> IntArray:
+    array = np.asarray(value)
+    if array.shape != (n,) or (n and not np.issubdtype(array.dtype, np.integer)):
+        raise SensorError(f"{name}: wanted ({n},) integers, got {array.shape} of {array.dtype}")
+    return array.astype(np.int64)
+
+
+def _cross(a: Float64Array, b: Float64Array) -> Float64Array:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def _enclosing_circles(corners: Float64Array, n_corners: IntArray) -> Float64Array:
+    """(n, 3) float64: x, y and radius of a circle around each polygon."""
+    used = np.arange(corners.shape[1]) < n_corners[:, None]
+    centre = (corners * used[..., None]).sum(1) / n_corners[:, None]
+    reach = np.hypot(*np.moveaxis(corners - centre[:, None], -1, 0))
+    return np.column_stack([centre, np.where(used, reach, 0.0).max(1, initial=0.0)])
+
+
+def _normalised(name: str, corners: Float64Array, n_corners: IntArray) -> tuple[Float64Array, IntArray]:
+    """Footprints counter-clockwise, without corners on a straight edge.
+
+    Args:
+        name: what the caller calls them.
+        corners: (n, k_max, 2) float64, m.
+        n_corners: (n,) int64.
+
+    Returns:
+        (n, k_max, 2) float64 and (n,) int64.
+
+    Raises:
+        SensorError: a number of corners out of range, coinciding corners, no area, a concave or crossed outline.
+    """
+    k_max = corners.shape[1]
+    wrong = (n_corners < 3) & (n_corners != 0) | (n_corners > k_max)
+    if wrong.any():
+        i = int(np.argmax(wrong))
+        raise SensorError(f"n_corners[{i}]: wanted 3 to {k_max}, or 0 for none, got {n_corners[i]}")
+    kept, count = np.zeros_like(corners), n_corners.copy()
+    for k in np.unique(n_corners[n_corners > 0]):
+        group = np.flatnonzero(n_corners == k)
+        outline = corners[group, :k]
+        relative = outline - outline[:, :1]
+        clockwise = _cross(relative, np.roll(relative, -1, 1)).sum(1) < 0
+        outline[clockwise] = outline[clockwise, ::-1]
+        edge = np.roll(outline, -1, 1) - outline
+        before = np.roll(edge, 1, 1)
+        _refuse(
+            name,
+            "corners that lie apart",
+            group,
+            outline,
+            np.hypot(edge[..., 0], edge[..., 1]) < SHORTEST_EDGE_M,
+        )
+        turn = np.arctan2(_cross(before, edge), (before * edge).sum(-1))
+        # A convex outline turns left at every corner, and once around in all; one of no area turns back.
+        flat = np.abs(np.abs(turn) - np.pi) < STRAIGHT_RAD
+        _refuse(name, "an area above zero", group, outline, flat)
+        crossed = np.abs(turn.sum(1, keepdims=True) - 2 * np.pi) > 1e-3
+        _refuse(name, "a convex outline", group, outline, (turn < -STRAIGHT_RAD) | crossed)
+        corner = turn > STRAIGHT_RAD
+        count[group] = corner.sum(1)
+        first = np.argsort(~corner, axis=1, kind="stable")
+        kept[group, :k] = np.take_along_axis(outline, first[..., None], 1)
+    kept[np.arange(k_max) >= count[:, None]] = 0.0
+    return kept, count
+
+
+def _refuse(name: str, wanted: str, group: IntArray, outline: Float64Array, wrong: NDArray[np.bool_]) -> None:
+    if wrong.any():
+        i = int(np.argmax(wrong.any(1)))
+        raise SensorError(f"{name}[{group[i]}]: wanted {wanted}, got {outline[i].round(4).tolist()}")

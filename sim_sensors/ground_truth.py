@@ -1,0 +1,154 @@
+"""The truth about the vehicles in a frame: where each one is, how much of it is seen, and from which side."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from sim_sensors.camera import Drawable, Frame, PinholeCamera, checked_pose
+from sim_sensors.projection import project
+from sim_sensors.rasterizer import edge_slope, sorted_by_row
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+
+END_LIMIT = math.radians(30.0)
+SIDE_LIMIT = math.radians(60.0)
+
+
+class View(IntEnum):
+    """From where a vehicle is seen, by the angle in the ground plane between its axis and the line of sight."""
+
+    END = 0  # front or rear: below 30°
+    OBLIQUE = 1
+    SIDE = 2  # 60° or more
+
+
+@dataclass(frozen=True, eq=False)
+class VehicleBoxes:
+    """Every vehicle that would show in the image if it stood alone, nearest first.
+
+    Attributes:
+        ids: (n,) int32, as in the instances.
+        box: (n, 4) int32, px: left, top, right, bottom (right and bottom exclusive) of the whole vehicle as far
+            as the image reaches, hidden parts included.
+        visible_box: (n, 4) int32, the same of the pixels that are seen; zeros where none is.
+        visible_fraction: (n,) float64, pixels seen over pixels that it would have alone, both within the image.
+        view: (n,) int8, a `View` each.
+        distance: (n,) float64, m, from the camera to the vehicle's origin, in the ground plane.
+    """
+
+    ids: IntArray
+    box: IntArray
+    visible_box: IntArray
+    visible_fraction: FloatArray
+    view: NDArray[np.int8]
+    distance: FloatArray
+
+
+def vehicle_boxes(camera: PinholeCamera, scene: Drawable, pose: FloatArray, frame: Frame) -> VehicleBoxes:
+    """Boxes of the vehicles (instances with an id above 0) in a frame that the camera took.
+
+    Each vehicle is drawn once more without depth test, in one image that remembers who was last at a pixel; so the
+    cost is that of the rasteriser alone.
+
+    Args:
+        camera: that took the frame.
+        scene: that it looked at.
+        pose: from where, (4, 4).
+        frame: its ids are counted.
+    """
+    pose = checked_pose(scene, pose)
+    size = (camera.width, camera.height)
+    triangles = project(scene.pool, scene.instances, pose, camera.intrinsics, size, camera.coarse_beyond)
+    alone, box = _extents_alone(triangles.corners, triangles.instance, len(scene.instances.ids), *size)
+    greatest = int(scene.instances.ids.max(initial=0))
+    seen, visible_box = _extents_seen(frame.ids, greatest + 1)
+    offset = scene.instances.pose[:, :2] - pose[:2, 3]
+    distance = np.hypot(offset[:, 0], offset[:, 1])
+    shown = np.flatnonzero((alone > 0) & (scene.instances.ids > 0))
+    shown = shown[np.argsort(distance[shown], kind="stable")]
+    ids = scene.instances.ids[shown]
+    return VehicleBoxes(
+        ids,
+        box[shown],
+        visible_box[ids],
+        np.minimum(seen[ids] / alone[shown], 1.0),
+        _views(offset[shown], scene.instances.pose[shown, 3]),
+        distance[shown],
+    )
+
+
+def _views(offset: FloatArray, yaw: FloatArray) -> NDArray[np.int8]:
+    angle = np.abs(np.arctan2(offset[:, 1], offset[:, 0]) - yaw) % np.pi
+    angle = np.minimum(angle, np.pi - angle)
+    view = np.full(len(angle), View.OBLIQUE, dtype=np.int8)
+    view[angle < END_LIMIT] = View.END
+    view[angle >= SIDE_LIMIT] = View.SIDE
+    return view
+
+
+@njit(cache=True)
+def _extents_alone(
+    corners: NDArray[np.float32], instance: IntArray, n: int, width: int, height: int
+) -> tuple[NDArray[np.int64], IntArray]:
+    """Pixels and box of each instance without the others; its triangles come one after the other."""
+    last = np.full((height, width), -1, dtype=np.int32)
+    count = np.zeros(n, dtype=np.int64)
+    box = _empty_boxes(n, width, height)
+    for t in range(corners.shape[0]):
+        q = instance[t]
+        ax, ay, bx, by, cx, cy = sorted_by_row(corners[t])
+        slope_ac = edge_slope(ax, ay, cx, cy)
+        slope_ab = edge_slope(ax, ay, bx, by)
+        slope_bc = edge_slope(bx, by, cx, cy)
+        for y in range(max(0, math.ceil(ay - 0.5)), min(height, math.ceil(cy - 0.5))):
+            py = y + 0.5
+            long = ax + (py - ay) * slope_ac
+            short = ax + (py - ay) * slope_ab if py < by else bx + (py - by) * slope_bc
+            first = math.ceil(max(min(long, short), 0.0) - 0.5)
+            end = math.ceil(min(max(long, short), float(width)) - 0.5)
+            if first >= end:
+                continue
+            box[q, 0] = min(box[q, 0], first)
+            box[q, 1] = min(box[q, 1], y)
+            box[q, 2] = max(box[q, 2], end)
+            box[q, 3] = max(box[q, 3], y + 1)
+            for x in range(first, end):
+                if last[y, x] != q:
+                    last[y, x] = q
+                    count[q] += 1
+    return count, box
+
+
+@njit(cache=True)
+def _extents_seen(ids: IntArray, n: int) -> tuple[NDArray[np.int64], IntArray]:
+    height, width = ids.shape
+    count = np.zeros(n, dtype=np.int64)
+    box = _empty_boxes(n, width, height)
+    for y in range(height):
+        for x in range(width):
+            q = ids[y, x]
+            if q > 0:
+                count[q] += 1
+                box[q, 0] = min(box[q, 0], x)
+                box[q, 1] = min(box[q, 1], y)
+                box[q, 2] = max(box[q, 2], x + 1)
+                box[q, 3] = max(box[q, 3], y + 1)
+    for q in range(n):
+        if count[q] == 0:
+            box[q] = 0
+    return count, box
+
+
+@njit(cache=True)
+def _empty_boxes(n: int, width: int, height: int) -> IntArray:
+    box = np.zeros((n, 4), dtype=np.int32)
+    box[:, 0] = width
+    box[:, 1] = height
+    return box

@@ -1,0 +1,222 @@
+"""Which sensor sits where on the car, and what all of them deliver at once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim_sensors.camera import Drawable, Frame, PinholeCamera, StereoCamera, StereoFrame, camera_pose
+from sim_sensors.errors import SensorError
+from sim_sensors.footprints import ScanPlane
+from sim_sensors.laser import LaserScanner
+from sim_sensors.weather import Weather
+
+FloatArray = NDArray[np.float64]
+
+RIGHT, LEFT = -math.pi / 2, math.pi / 2
+
+
+class Sensed(Drawable, Protocol):
+    """What a rig can be driven through: what a camera draws, and what a laser meets."""
+
+    @property
+    def scan_plane(self) -> ScanPlane:
+        """Footprints and walls at knee height."""
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Where a sensor sits: vehicle frame, x forward, y left, z up from the ground, origin below its middle.
+
+    Args:
+        x, y, z: m.
+        yaw: rad, where it looks, counter-clockwise from forward.
+        pitch: rad, above 0 looks up.
+
+    Raises:
+        SensorError: a number that is not finite, or a sensor on or below the ground.
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 1.0
+    yaw: float = 0.0
+    pitch: float = 0.0
+
+    def __post_init__(self) -> None:
+        values = (self.x, self.y, self.z, self.yaw, self.pitch)
+        if not all(math.isfinite(v) for v in values):
+            raise SensorError(f"mount is {values}, want finite numbers")
+        if self.z <= 0.0:
+            raise SensorError(f"mount z is {self.z} m, want above the ground")
+
+    def in_world(self, vehicle: FloatArray) -> tuple[float, float, float]:
+        """Position, m, and yaw, rad, in the world frame on a vehicle at x, y, yaw."""
+        x, y, yaw = vehicle
+        cosine, sine = math.cos(yaw), math.sin(yaw)
+        return x + cosine * self.x - sine * self.y, y + sine * self.x + cosine * self.y, yaw + self.yaw
+
+
+@dataclass(frozen=True)
+class Capture:
+    """What a rig measured at one pose.
+
+    Attributes:
+        pose: (3,) float64, x, y in m and yaw in rad of the vehicle, world frame.
+        images: by the camera's name; the frames hold depth and ids as well, which are the truth.
+        pairs: by the stereo camera's name.
+        scans: by the laser's name, (n_beams,) float32, m, `inf` for no return.
+    """
+
+    pose: FloatArray
+    images: dict[str, Frame]
+    pairs: dict[str, StereoFrame]
+    scans: dict[str, NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class SensorRig:
+    """Sensors on a car; the calibration as data.
+
+    Args:
+        cameras: name, camera and mount of each; the optical axis is the mount's forward.
+        stereo_cameras: the same of stereo cameras; the mount is the left camera's.
+        lasers: the same of laser scanners; angle 0 is the mount's forward.
+
+    Raises:
+        SensorError: no sensor at all, or a name that stands twice.
+
+    Example:
+        >>> rig = SensorRig.thesis()
+        >>> [name for name, _, _ in rig.cameras], [name for name, _, _ in rig.lasers]
+        (['right'], ['laser'])
+    """
+
+    cameras: tuple[tuple[str, PinholeCamera, Mount], ...] = ()
+    stereo_cameras: tuple[tuple[str, StereoCamera, Mount], ...] = ()
+    lasers: tuple[tuple[str, LaserScanner, Mount], ...] = ()
+
+    def __post_init__(self) -> None:
+        names = [name for name, _, _ in (*self.cameras, *self.stereo_cameras, *self.lasers)]
+        if not names:
+            raise SensorError("the rig has no sensor, want at least one camera, stereo camera or laser")
+        for name in names:
+            if names.count(name) > 1:
+                raise SensorError(f"sensor name {name!r} stands twice, want different ones")
+
+    @classmethod
+    def thesis(cls) -> SensorRig:
+        """The thesis's robot (T §4.1, Fig. 4.3): a camera to the right above a 270° laser, on one vertical axis."""
+        return cls(
+            cameras=(("right", PinholeCamera(), Mount(z=1.1, yaw=RIGHT)),),
+            lasers=(("laser", LaserScanner(), Mount(z=0.5)),),
+        )
+
+    @classmethod
+    def stereo(cls) -> SensorRig:
+        """A stereo pair to the right and no laser."""
+        return cls(stereo_cameras=(("right", StereoCamera(), Mount(z=1.1, yaw=RIGHT)),))
+
+    @classmethod
+    def both_sides(cls) -> SensorRig:
+        """The thesis's rig with a second camera, to the left."""
+        return cls(
+            cameras=(
+                ("right", PinholeCamera(), Mount(z=1.1, yaw=RIGHT)),
+                ("left", PinholeCamera(), Mount(z=1.1, yaw=LEFT)),
+            ),
+            lasers=(("laser", LaserScanner(), Mount(z=0.5)),),
+        )
+
+    def capture(
+        self,
+        scene: Sensed,
+        pose: ArrayLike,
+        weather: Weather | None = None,
+        seed: int = 0,
+        *,
+        noise: bool = True,
+    ) -> Capture:
+        """Measure with every sensor at one pose; equal arguments give equal results.
+
+        Args:
+            scene: what is around. The vehicle that carries the rig is not part of it.
+            pose: (3,) x, y in m and yaw in rad of the vehicle, world frame.
+            weather: the light; a sunny day where None.
+            seed: of all sensors' noise.
+            noise: whether the laser's ranges are noisy; images always are.
+
+        Raises:
+            SensorError: a pose that is not three finite numbers; what the sensors raise.
+        """
+        vehicle = np.asarray(pose, dtype=np.float64)
+        if vehicle.shape != (3,) or not np.isfinite(vehicle).all():
+            raise SensorError(f"vehicle pose is {vehicle.tolist()}, want finite x, y and yaw")
+        images, pairs, scans = {}, {}, {}
+        for i, (name, camera, mount) in enumerate(self.cameras):
+            x, y, yaw = mount.in_world(vehicle)
+            eye = camera_pose(x, y, mount.z, yaw, mount.pitch)
+            images[name] = camera.render(scene, eye, weather, _seed_of(seed, 0, i))
+        for i, (name, stereo, mount) in enumerate(self.stereo_cameras):
+            x, y, yaw = mount.in_world(vehicle)
+            eye = camera_pose(x, y, mount.z, yaw, mount.pitch)
+            pairs[name] = stereo.render_stereo(scene, eye, weather, _seed_of(seed, 1, i))
+        for i, (name, laser, mount) in enumerate(self.lasers):
+            rng = np.random.default_rng([seed, 2, i]) if noise else None
+            scans[name] = laser.scan(scene.scan_plane, mount.in_world(vehicle), rng)
+        return Capture(vehicle, images, pairs, scans)
+
+    def drive(
+        self,
+        scene: Sensed,
+        path: ArrayLike,
+        every: float,
+        weather: Weather | None = None,
+        seed: int = 0,
+    ) -> Iterator[Capture]:
+        """Captures along a path; see `poses_along`. The k-th one is seeded with `seed + k`."""
+        for k, pose in enumerate(poses_along(path, every)):
+            yield self.capture(scene, pose, weather, seed + k)
+
+
+def poses_along(path: ArrayLike, every: float) -> FloatArray:
+    """Vehicle poses every so many metres along a polyline, heading as it does, both ends included.
+
+    Args:
+        path: (k, 2) m, at least two different points.
+        every: m between poses; the last step may be shorter.
+
+    Returns:
+        (n, 3) float64, x, y, yaw.
+
+    Raises:
+        SensorError: a path of another shape, not finite or of no length, or a distance that is not positive.
+    """
+    points = np.asarray(path, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2 or not np.isfinite(points).all():
+        raise SensorError(f"path has shape {points.shape}, want (at least 2, 2) finite numbers")
+    if not (math.isfinite(every) and every > 0.0):
+        raise SensorError(f"every is {every} m, want a finite distance above 0")
+    step = np.diff(points, axis=0)
+    length = np.hypot(step[:, 0], step[:, 1])
+    points = points[np.r_[True, length > 0.0]]
+    step, length = step[length > 0.0], length[length > 0.0]
+    if not len(length):
+        raise SensorError("path has no length, want two different points")
+    station = np.r_[0.0, np.cumsum(length)]
+    at = np.arange(0.0, station[-1], every)
+    # A last step much shorter than the others would be rounding, not driving.
+    at = np.r_[at[at < station[-1] - 1e-6 * every], station[-1]]
+    leg = np.clip(np.searchsorted(station, at, side="right") - 1, 0, len(length) - 1)
+    share = (at - station[leg]) / length[leg]
+    xy = points[leg] + share[:, None] * step[leg]
+    return np.column_stack([xy, np.arctan2(step[leg, 1], step[leg, 0])])
+
+
+def _seed_of(*words: int) -> int:
+    return int(np.random.SeedSequence(words).generate_state(1)[0])

@@ -1,0 +1,433 @@
+"""A scene: vehicles among surroundings, as the sensors need it; changing one vehicle leaves the rest as it is."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from sim_sensors.errors import SensorError
+from sim_sensors.footprints import ScanPlane
+from sim_sensors.mesh import Ground, Instances, Mesh, MeshPool
+from sim_sensors.surroundings import Surroundings, floats
+from sim_sensors.vehicles import COARSE, DETAILED, FOOTPRINT_CORNERS, VehicleModel
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+NO_VEHICLE = -1
+
+
+class OverlapWarning(UserWarning):
+    """Two vehicles of a scene stand in the same place."""
+
+
+class Footprints(NamedTuple):
+    """What a horizontal plane at knee height meets, as `footprints.ScanPlane` takes it.
+
+    Attributes:
+        corners: (n, k, 2) float64, m, world frame, counter-clockwise: a row for every vehicle place, then the posts,
+            trunks and people.
+        n_corners: (n,) int64, how many corners are used; 0 for an empty place.
+        ids: (n,) int64, as in `Instances.ids`: place + 1 for a vehicle, 0 for all else.
+        walls: (m, 2, 2) float64, m, world frame: ends of line segments.
+    """
+
+    corners: FloatArray
+    n_corners: IntArray
+    ids: IntArray
+    walls: FloatArray
+
+
+class Fleet:
+    """The meshes of a scene: its surroundings, and every vehicle model with its coarse version.
+
+    Shared by all scenes that differ only in which of these vehicles stand where.
+
+    Args:
+        models: the vehicle models.
+        surroundings: what else stands about.
+    """
+
+    def __init__(self, models: Sequence[VehicleModel], surroundings: Surroundings) -> None:
+        self.models = tuple(models)
+        self.surroundings = surroundings
+
+    def with_model(self, model: VehicleModel) -> Fleet:
+        """One more model, after the others; the meshes made so far are taken over."""
+        larger = Fleet((*self.models, model), self.surroundings)
+        if "pool" in self.__dict__:
+            pair = [model.mesh(DETAILED), model.mesh(COARSE)]
+            larger.__dict__["pool"] = _joined(self.pool, pair)
+        return larger
+
+    @cached_property
+    def _scenery(self) -> tuple[list[Mesh], list[int]]:
+        """Distinct meshes of the surroundings, and which of them each thing has."""
+        meshes: list[Mesh] = []
+        place: dict[int, int] = {}
+        index = []
+        for thing in self.surroundings.standing:
+            if id(thing.mesh) not in place:
+                place[id(thing.mesh)] = len(meshes)
+                meshes.append(thing.mesh)
+            index.append(place[id(thing.mesh)])
+        return meshes, index
+
+    @cached_property
+    def pool(self) -> MeshPool:
+        """Meshes of the surroundings first, then the detailed and the coarse mesh of model after model."""
+        meshes = list(self._scenery[0])
+        for model in self.models:
+            meshes += [model.mesh(DETAILED), model.mesh(COARSE)]
+        return _joined(None, meshes, scenery=len(self._scenery[0]))
+
+    def mesh_of(self, model: IntArray) -> NDArray[np.int32]:
+        """Index in the pool of the detailed mesh of each model."""
+        return (len(self._scenery[0]) + 2 * model).astype(np.int32)
+
+    @cached_property
+    def scenery_instances(self) -> Instances:
+        """Everything but the vehicles."""
+        things = self.surroundings.standing
+        pose = np.zeros((len(things), 4))
+        if things:
+            pose[:, [0, 1, 3]] = [thing.pose for thing in things]
+        return Instances(
+            np.array(self._scenery[1], dtype=np.int32), pose, np.zeros(len(things), dtype=np.int32)
+        )
+
+    @cached_property
+    def sizes(self) -> FloatArray:
+        """(n_models, 3) float64, m: length, width, height."""
+        return np.array([m.size for m in self.models]).reshape(-1, 3)
+
+    @cached_property
+    def outlines(self) -> tuple[FloatArray, IntArray]:
+        """(n_models, k, 2) float64 footprints, vehicle frame, and (n_models,) int64 how many corners they have."""
+        return _padded([m.footprint() for m in self.models])
+
+    @cached_property
+    def posts(self) -> tuple[FloatArray, IntArray]:
+        """The footprints of the surroundings, world frame, as in `outlines`."""
+        return _padded(
+            [_moved(t.footprint, t.pose) for t in self.surroundings.standing if t.footprint is not None]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Vehicles in numbered places, and what stands around them. World frame, SI units.
+
+    A place may be empty; its number and so the ids of the other vehicles stay when a vehicle leaves. Make one with
+    `from_arrays`, or from a parking lot with `slot_scenes.scene_of_slots`.
+
+    Args:
+        vehicle_pose: (n, 3) float64: x, y in m, yaw in rad, of each place.
+        vehicle_model: (n,) int64, index into `fleet.models`, `NO_VEHICLE` where the place is empty.
+        fleet: the meshes.
+
+    Raises:
+        SensorError: a wrong shape, a pose that is not finite, a model that the fleet does not have.
+
+    Warns:
+        OverlapWarning: two vehicles' rectangles overlap.
+
+    Examples:
+        >>> scene = Scene.from_arrays([[0, 0, 0], [0, 3, 0.02]], seeds=[1, 2], bodies=["van", None])
+        >>> scene.n_vehicles, scene.without_vehicle(0).instances.ids.tolist()
+        (2, [2])
+    """
+
+    vehicle_pose: FloatArray
+    vehicle_model: IntArray
+    fleet: Fleet
+
+    def __post_init__(self) -> None:
+        pose = floats("vehicle_pose", self.vehicle_pose, 3)
+        model = np.array(self.vehicle_model, dtype=np.int64)
+        if model.shape != (len(pose),):
+            raise SensorError(f"vehicle_model: wanted shape ({len(pose)},), got {model.shape}")
+        if len(model) and not (model.min() >= NO_VEHICLE and model.max() < len(self.fleet.models)):
+            raise SensorError(
+                f"vehicle_model: wanted -1 to {len(self.fleet.models) - 1}, got {model.tolist()}"
+            )
+        self._set(pose, model, self.fleet)
+        pairs = overlapping(pose[self.present], self.fleet.sizes[model[self.present]])
+        if len(pairs):
+            first, second = self.present[pairs[0]]
+            warnings.warn(
+                f"vehicles {first} and {second} overlap ({len(pairs)} such pairs)",
+                OverlapWarning,
+                stacklevel=3,
+            )
+
+    def _set(self, pose: FloatArray, model: IntArray, fleet: Fleet) -> None:
+        for array in (pose, model):
+            array.setflags(write=False)
+        for name, value in (("vehicle_pose", pose), ("vehicle_model", model), ("fleet", fleet)):
+            object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        poses: ArrayLike,
+        seeds: ArrayLike,
+        bodies: Sequence[str | None] | None = None,
+        paints: Sequence[tuple[int, int, int] | None] | None = None,
+        surroundings: Surroundings | None = None,
+    ) -> Scene:
+        """A scene of given vehicles.
+
+        Args:
+            poses: (n, 3): x, y in m, yaw in rad.
+            seeds: (n,) int, of each vehicle's model.
+            bodies: (n,) names from `vehicle_classes.BODIES`; None for a body drawn by the seed.
+            paints: (n,) sRGB triples; None for a paint drawn by the seed.
+            surroundings: None for an open plain.
+
+        Raises:
+            SensorError: as the class, and for lengths that differ.
+        """
+        pose = floats("poses", poses, 3)
+        seed = np.asarray(seeds)
+        if seed.shape != (len(pose),) or (len(pose) and not np.issubdtype(seed.dtype, np.integer)):
+            raise SensorError(f"seeds: wanted ({len(pose)},) integers, got {seed.shape} of {seed.dtype}")
+        models: dict[VehicleModel, int] = {}
+        index = []
+        for name, column in (("bodies", bodies), ("paints", paints)):
+            if column is not None and len(column) != len(pose):
+                raise SensorError(f"{name}: wanted {len(pose)} entries, got {len(column)}")
+        for i, number in enumerate(seed.tolist()):
+            model = VehicleModel.from_seed(None if bodies is None else bodies[i], number)
+            paint = None if paints is None else paints[i]
+            if paint is not None:
+                model = model.painted(paint)
+            index.append(models.setdefault(model, len(models)))
+        fleet = Fleet(tuple(models), surroundings or Surroundings())
+        return cls(pose, np.array(index, dtype=np.int64), fleet)
+
+    @property
+    def n_vehicles(self) -> int:
+        """How many places there are, empty ones counted."""
+        return len(self.vehicle_pose)
+
+    @cached_property
+    def present(self) -> IntArray:
+        """The places where a vehicle stands, ascending."""
+        return np.flatnonzero(self.vehicle_model != NO_VEHICLE)
+
+    @property
+    def vehicle_boxes(self) -> FloatArray:
+        """(n, 3) float64, m: length, width, height of each vehicle, its mirrors left out; 0 for an empty place."""
+        boxes = np.zeros((self.n_vehicles, 3))
+        boxes[self.present] = self.fleet.sizes[self.vehicle_model[self.present]]
+        return boxes
+
+    @property
+    def pool(self) -> MeshPool:
+        """The meshes; the same object for all scenes made from one by changing vehicles."""
+        return self.fleet.pool
+
+    @property
+    def ground(self) -> Ground:
+        """The plane below."""
+        return self.fleet.surroundings.ground
+
+    @cached_property
+    def instances(self) -> Instances:
+        """Where every mesh stands, detailed; `pool.coarse` names the coarse ones."""
+        scenery = self.fleet.scenery_instances
+        pose = np.zeros((len(self.present), 4))
+        pose[:, [0, 1, 3]] = self.vehicle_pose[self.present]
+        mesh = self.fleet.mesh_of(self.vehicle_model[self.present])
+        return Instances(
+            np.concatenate([scenery.mesh, mesh]),
+            np.concatenate([scenery.pose, pose]),
+            np.concatenate([scenery.ids, (self.present + 1).astype(np.int32)]),
+        )
+
+    @cached_property
+    def coarse_instances(self) -> Instances:
+        """As `instances`, every vehicle by its coarse mesh."""
+        coarse = self.pool.coarse
+        assert coarse is not None
+        return Instances(coarse[self.instances.mesh], self.instances.pose, self.instances.ids)
+
+    def footprints(self) -> Footprints:
+        """What a laser at knee height meets: a convex polygon for each vehicle and post, and wall segments."""
+        outline, count = self.fleet.outlines
+        posts, post_count = self.fleet.posts
+        corners = np.zeros((self.n_vehicles + len(posts), FOOTPRINT_CORNERS, 2))
+        n_corners = np.zeros(len(corners), dtype=np.int64)
+        n_corners[self.present] = count[self.vehicle_model[self.present]]
+        n_corners[self.n_vehicles :] = post_count
+        corners[self.present] = _placed(
+            outline[self.vehicle_model[self.present]], self.vehicle_pose[self.present]
+        )
+        corners[self.n_vehicles :] = posts
+        corners[np.arange(FOOTPRINT_CORNERS) >= n_corners[:, None]] = 0.0
+        ids = np.concatenate([np.arange(self.n_vehicles) + 1, np.zeros(len(posts), dtype=np.int64)])
+        return Footprints(corners, n_corners, ids, self.fleet.surroundings.wall_segments)
+
+    @cached_property
+    def scan_plane(self) -> ScanPlane:
+        """`footprints` as the laser scans them; the ids are those of `instances`."""
+        corners, n_corners, ids, walls = self.footprints()
+        return ScanPlane(corners, n_corners, walls, ids)
+
+    def footprint(self, i: int) -> FloatArray:
+        """(k, 2) float64, m, world frame: the footprint of the vehicle in place i; (0, 2) if it is empty."""
+        self._check_place(i)
+        if self.vehicle_model[i] == NO_VEHICLE:
+            return np.empty((0, 2))
+        outline, count = self.fleet.outlines
+        model = self.vehicle_model[i]
+        return np.asarray(
+            _placed(outline[model : model + 1, : count[model]], self.vehicle_pose[i : i + 1])[0]
+        )
+
+    def with_vehicle(
+        self, i: int, *, pose: ArrayLike | None = None, model: VehicleModel | None = None
+    ) -> Scene:
+        """A scene in which place i has another vehicle, or the same one elsewhere; all else is shared.
+
+        Args:
+            i: the place.
+            pose: (3,): x, y in m, yaw in rad; None: where it is.
+            model: None: the one that it has. One that the fleet lacks is added to a copy of its meshes.
+
+        Raises:
+            SensorError: no such place, a pose that is not finite, or no model for an empty place.
+
+        Warns:
+            OverlapWarning: it overlaps another vehicle.
+        """
+        self._check_place(i)
+        fleet, number = self.fleet, int(self.vehicle_model[i])
+        if model is not None:
+            if model not in fleet.models:
+                fleet = fleet.with_model(model)
+            number = fleet.models.index(model)
+        if number == NO_VEHICLE:
+            raise SensorError(f"model: place {i} is empty, wanted a model for it")
+        return self._changed(i, self.vehicle_pose[i] if pose is None else pose, number, fleet)
+
+    def without_vehicle(self, i: int) -> Scene:
+        """A scene in which place i is empty; all else is shared."""
+        self._check_place(i)
+        return self._changed(i, self.vehicle_pose[i], NO_VEHICLE, self.fleet)
+
+    def _check_place(self, i: int) -> None:
+        if not 0 <= i < self.n_vehicles:
+            raise SensorError(f"place: wanted 0 to {self.n_vehicles - 1}, got {i}")
+
+    def _changed(self, i: int, pose: ArrayLike, number: int, fleet: Fleet) -> Scene:
+        new_pose, new_model = self.vehicle_pose.copy(), self.vehicle_model.copy()
+        new_pose[i] = floats("pose", np.asarray(pose, dtype=np.float64)[None], 3)[0]
+        new_model[i] = number
+        scene = object.__new__(Scene)
+        scene._set(new_pose, new_model, fleet)
+        if number != NO_VEHICLE:
+            others = scene.present[scene.present != i]
+            away = np.hypot(*(new_pose[others, :2] - new_pose[i, :2]).T)
+            sizes = fleet.sizes[new_model]
+            reach = 0.5 * (np.hypot(sizes[others, 0], sizes[others, 1]) + np.hypot(sizes[i, 0], sizes[i, 1]))
+            near = others[away < reach]
+            hit = [j for j in near if _rectangles_meet(new_pose[[i, j]], sizes[[i, j]])]
+            if hit:
+                warnings.warn(f"vehicles {i} and {hit[0]} overlap", OverlapWarning, stacklevel=3)
+        return scene
+
+
+def overlapping(pose: FloatArray, size: FloatArray) -> IntArray:
+    """Pairs of vehicles whose rectangles overlap.
+
+    Args:
+        pose: (n, 3) x, y in m, yaw in rad.
+        size: (n, 3) m, length, width, height.
+
+    Returns:
+        (k, 2) int64, first < second, ascending.
+    """
+    if len(pose) < 2:
+        return np.empty((0, 2), dtype=np.int64)
+    reach = float(np.hypot(size[:, 0], size[:, 1]).max())
+    pairs = np.sort(cKDTree(pose[:, :2]).query_pairs(reach, output_type="ndarray"), axis=1)
+    hits = [p for p in pairs.tolist() if _rectangles_meet(pose[p], size[p])]
+    return np.array(sorted(hits), dtype=np.int64).reshape(-1, 2)
+
+
+def _rectangles_meet(pose: FloatArray, size: FloatArray) -> bool:
+    """Whether two rectangles, (2, 3) poses and sizes, overlap: no side of either separates them."""
+    axis = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)
+    axes = np.concatenate([axis, np.stack([-axis[:, 1], axis[:, 0]], axis=-1)])
+    across = np.stack([-axis[:, 1], axis[:, 0]], axis=-1)
+    reach = sum(
+        0.5 * size[k, 0] * np.abs(axes @ axis[k]) + 0.5 * size[k, 1] * np.abs(axes @ across[k])
+        for k in (0, 1)
+    )
+    return bool((np.abs(axes @ (pose[1, :2] - pose[0, :2])) < reach).all())
+
+
+def _moved(outline: FloatArray, pose: tuple[float, float, float]) -> FloatArray:
+    return np.asarray(_placed(outline[None], np.array([pose]))[0])
+
+
+def _placed(outline: FloatArray, pose: FloatArray) -> FloatArray:
+    """(n, k, 2) outlines turned and shifted by (n, 3) poses."""
+    c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
+    x = c * outline[..., 0] - s * outline[..., 1] + pose[:, 0, None]
+    y = s * outline[..., 0] + c * outline[..., 1] + pose[:, 1, None]
+    return np.stack([x, y], axis=-1)
+
+
+def _padded(outlines: Sequence[FloatArray]) -> tuple[FloatArray, IntArray]:
+    corners = np.zeros((len(outlines), FOOTPRINT_CORNERS, 2))
+    for row, outline in zip(corners, outlines, strict=True):
+        row[: len(outline)] = outline
+    return corners, np.array([len(o) for o in outlines], dtype=np.int64)
+
+
+def _joined(pool: MeshPool | None, meshes: Sequence[Mesh], scenery: int = 0) -> MeshPool:
+    """A pool with meshes appended: first `scenery` that have no coarse version, then detailed and coarse in turn."""
+    start = 0 if pool is None else len(pool.radius)
+    parts: list[Mesh | MeshPool] = [*([] if pool is None else [pool]), *meshes]
+    if not parts:
+        parts = [_NOTHING]
+    vertices = np.array([len(m.vertices) for m in meshes], dtype=np.int64)
+    triangles = np.array([len(m.triangles) for m in meshes], dtype=np.int64)
+    before = (
+        (np.zeros(1, np.int64), np.zeros(1, np.int64))
+        if pool is None
+        else (pool.vertex_start, pool.triangle_start)
+    )
+    radius = [float(np.sqrt((m.vertices.astype(np.float64) ** 2).sum(axis=1).max())) for m in meshes]
+    coarse = np.arange(start, start + len(meshes), dtype=np.int32)
+    coarse[scenery::2] += 1
+    return MeshPool(
+        np.concatenate([p.vertices for p in parts]),
+        np.concatenate([p.normals for p in parts]),
+        np.concatenate([p.triangles for p in parts]),
+        np.concatenate([p.material for p in parts]),
+        np.concatenate([p.color for p in parts]),
+        np.concatenate([before[0], before[0][-1] + np.cumsum(vertices)]),
+        np.concatenate([before[1], before[1][-1] + np.cumsum(triangles)]),
+        np.concatenate([np.empty(0) if pool is None else pool.radius, radius]).astype(np.float32),
+        coarse if pool is None or pool.coarse is None else np.concatenate([pool.coarse, coarse]),
+    )
+
+
+_NOTHING = Mesh(
+    np.empty((0, 3), np.float32),
+    np.empty((0, 3), np.float32),
+    np.empty((0, 3), np.int32),
+    np.empty(0, np.uint8),
+    np.empty((0, 3), np.uint8),
+)

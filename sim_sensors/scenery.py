@@ -1,0 +1,393 @@
+"""What stands about besides vehicles: buildings, walls, kerbs, trees, lamp posts, people."""
+
+from __future__ import annotations
+
+import itertools
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim_sensors.errors import SensorError
+from sim_sensors.mesh import Material, Mesh
+from sim_sensors.surfaces import ShapeBuilder
+
+FloatArray = NDArray[np.float64]
+
+TRUNK_M = 0.16
+"""Radius of a tree's trunk at knee height, for a tree of 7 m."""
+LAMP_POST_M = 0.08
+"""Radius of a lamp post at knee height."""
+KERB_M = (0.14, 0.12)
+"""Width and height of a kerb."""
+
+_STOREY = 3.0
+_BAY = 2.7
+_REVEAL = 0.14  # m, from the wall to the window
+_STEP = 0.76  # m, at a walking pace
+
+
+class _Part(IntEnum):
+    WALL = 0
+    PLINTH = 1
+    FRAME = 2
+    GLASS = 3
+    ROOM = 4
+    DOOR = 5
+    ROOF = 6
+    BARK = 7
+    LEAVES = 8
+    LEAVES_DARK = 9
+    POST = 10
+    LANTERN = 11
+    STONE = 12
+    COPING = 13
+    SKIN = 14
+    HAIR = 15
+    COAT = 16
+    TROUSERS = 17
+    SHOES = 18
+
+
+_MATERIAL = np.array(
+    [
+        Material.STONE,
+        Material.STONE,
+        Material.TRIM,
+        Material.GLASS,
+        Material.INTERIOR,
+        Material.TRIM,
+        Material.STONE,
+        Material.BARK,
+        Material.FOLIAGE,
+        Material.FOLIAGE,
+        Material.POST,
+        Material.LAMP,
+        Material.STONE,
+        Material.STONE,
+        Material.CLOTH,
+        Material.CLOTH,
+        Material.CLOTH,
+        Material.CLOTH,
+        Material.CLOTH,
+    ],
+    dtype=np.uint8,
+)
+
+
+def _made(build: ShapeBuilder, colors: dict[_Part, ArrayLike]) -> Mesh:
+    palette = np.zeros((len(_Part), 3), dtype=np.uint8)
+    for part, rgb in colors.items():
+        palette[part] = np.clip(np.round(np.asarray(rgb, dtype=np.float64)), 0, 255)
+    return build.build().dyed(_MATERIAL, palette)
+
+
+def building_mesh(outline: ArrayLike, height: float, seed: int) -> Mesh:
+    """A block with storeys of windows set back into its walls, doors, a plinth and a cornice.
+
+    Args:
+        outline: (k, 2) m, a simple polygon, counter-clockwise.
+        height: m, at least 2.4.
+        seed: of colours and of which bays have doors.
+
+    Returns:
+        The mesh in the outline's own frame; seen from inside, and from above, it is not finished.
+    """
+    corner = np.asarray(outline, dtype=np.float64)
+    rng = np.random.default_rng([seed, 11])
+    build = ShapeBuilder()
+    tones = np.array([[196, 186, 168], [172, 118, 92], [206, 204, 198], [150, 146, 140], [188, 164, 120]])
+    wall = tones[rng.integers(len(tones))] + rng.uniform(-12, 12)
+    for a, b in zip(corner, np.roll(corner, -1, axis=0), strict=True):
+        _add_facade(build, a, b, height, rng)
+    for i, j, k in _ears(corner):
+        top = np.column_stack([corner[[i, j, k]], np.full(3, height)])
+        build.fan(top, _Part.ROOF)
+    frame = (232, 231, 226) if rng.random() < 0.6 else (70, 72, 76)
+    return _made(
+        build,
+        {
+            _Part.WALL: wall,
+            _Part.PLINTH: 0.62 * wall,
+            _Part.FRAME: frame,
+            _Part.GLASS: (30, 36, 38),
+            _Part.ROOM: (58, 54, 50),
+            _Part.DOOR: rng.uniform(30, 110, 3),
+            _Part.ROOF: (92, 88, 86),
+        },
+    )
+
+
+class _Facade(NamedTuple):
+    """One side of a building, its outside to the right of the way along it."""
+
+    start: FloatArray
+    along: FloatArray
+    length: float
+
+    def place(self, u: FloatArray, z: FloatArray, depth: FloatArray) -> FloatArray:
+        """Points at u along the wall, z up and `depth` out of it, m."""
+        out = np.array([self.along[1], -self.along[0]])
+        base = self.start + u[..., None] * self.along + depth[..., None] * out
+        return np.concatenate([base, z[..., None]], axis=-1)
+
+    def add_slab(
+        self, build: ShapeBuilder, box: tuple[float, float, float, float], depth: float, part: _Part
+    ) -> None:
+        """A flat panel from u, u, z, z; if it stands out, with its upper and lower side."""
+        u0, u1, z0, z1 = box
+        u = np.array([u0, u1, u1, u0])
+        build.fan(self.place(u, np.array([z0, z0, z1, z1]), np.full(4, depth)), part)
+        if depth > 0.0:
+            out = np.array([depth, depth, 0.0, 0.0])
+            build.fan(self.place(u, np.full(4, z1), out), part)
+            build.fan(self.place(u, np.full(4, z0), out), part, flip=True)
+
+
+def _add_facade(
+    build: ShapeBuilder, start: FloatArray, end: FloatArray, height: float, rng: np.random.Generator
+) -> None:
+    length = float(np.hypot(*(end - start)))
+    facade = _Facade(start, (end - start) / length, length)
+    bays, storeys = int((length - 0.8) / _BAY), max(1, round((height - 0.5) / _STOREY))
+    tall, pitch = (height - 0.5) / storeys, length / max(bays, 1)
+    centers = (np.arange(bays) + 0.5) * pitch
+    wide, low, high = 0.27 * pitch, 0.32 * tall, 0.84 * tall
+    sills = np.arange(storeys) * tall + 0.3
+    # Every window edge twice: once on the wall, once at the bottom of the reveal.
+    sides = np.repeat(np.sort(np.concatenate([centers - wide, centers + wide])), 2)
+    levels = np.repeat(np.sort(np.concatenate([sills + low, sills + high])), 2)
+    u, u_deep = np.array([0.0, *sides, length]), np.zeros(len(sides) + 2, dtype=bool)
+    z, z_deep = np.array([0.0, 0.3, *levels, height]), np.zeros(len(levels) + 3, dtype=bool)
+    u_deep[1:-1] = np.tile([False, True, True, False], bays)
+    z_deep[2:-1] = np.tile([False, True, True, False], storeys)
+    deep = u_deep[:, None] & z_deep[None, :]
+    finish = np.full((len(u) - 1, len(z) - 1), int(_Part.WALL))
+    finish[:, 0] = _Part.PLINTH
+    finish[deep[:-1, :-1] & deep[1:, 1:]] = _Part.ROOM
+    across, up = np.meshgrid(u, z, indexing="ij")
+    build.grid(facade.place(across, up, np.where(deep, -_REVEAL, 0.0)), finish, smooth=False)
+    doors = set(rng.choice(bays, size=max(1, bays // 7), replace=False).tolist()) if bays else set()
+    for bay, center in enumerate(centers.tolist()):
+        for storey, sill in enumerate(sills.tolist()):
+            if storey == 0 and bay in doors:
+                facade.add_slab(build, (center - 0.55, center + 0.55, 0.0, 2.15), 0.02, _Part.DOOR)
+            else:
+                _add_window(build, facade, (center - wide, center + wide, sill + low, sill + high))
+    facade.add_slab(build, (-0.12, length + 0.12, height - 0.28, height), 0.14, _Part.PLINTH)
+
+
+def _add_window(build: ShapeBuilder, facade: _Facade, box: tuple[float, float, float, float]) -> None:
+    left, right, low, high = box
+    middle = 0.5 * (left + right)
+    facade.add_slab(build, box, -0.6 * _REVEAL, _Part.GLASS)
+    facade.add_slab(build, (middle - 0.03, middle + 0.03, low, high), -0.5 * _REVEAL, _Part.FRAME)
+    facade.add_slab(build, (left - 0.06, right + 0.06, low - 0.07, low), 0.05, _Part.FRAME)
+
+
+def _ears(corner: FloatArray) -> list[tuple[int, int, int]]:
+    """Triangles of a simple counter-clockwise polygon."""
+    left = list(range(len(corner)))
+    triangles = []
+    while len(left) > 3:
+        for at in range(len(left)):
+            i, j, k = left[at - 1], left[at], left[(at + 1) % len(left)]
+            if _turn(corner[i], corner[j], corner[k]) <= 0:
+                continue
+            others = [m for m in left if m not in (i, j, k)]
+            if not any(_within(corner[m], corner[i], corner[j], corner[k]) for m in others):
+                triangles.append((i, j, k))
+                left.pop(at)
+                break
+        else:
+            raise SensorError(f"outline: wanted a simple polygon, got {corner.tolist()}")
+    return [*triangles, (left[0], left[1], left[2])]
+
+
+def _turn(a: FloatArray, b: FloatArray, c: FloatArray) -> float:
+    return float((b[0] - a[0]) * (c[1] - b[1]) - (b[1] - a[1]) * (c[0] - b[0]))
+
+
+def _within(p: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray) -> bool:
+    return _turn(a, b, p) >= 0 and _turn(b, c, p) >= 0 and _turn(c, a, p) >= 0
+
+
+def wall_mesh(start: ArrayLike, end: ArrayLike, height: float, thickness: float, seed: int) -> Mesh:
+    """A free-standing wall with a coping, its middle line from start to end, (2,) m each."""
+    a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
+    tone = np.array([150.0, 142.0, 130.0]) + np.random.default_rng([seed, 12]).uniform(-20, 20)
+    build = ShapeBuilder()
+    _add_bar(build, a, b, (0.0, height - 0.07), thickness, _Part.STONE)
+    _add_bar(build, a, b, (height - 0.07, height), thickness + 0.08, _Part.COPING)
+    return _made(build, {_Part.STONE: tone, _Part.COPING: 1.12 * tone})
+
+
+def kerb_mesh(line: ArrayLike) -> Mesh:
+    """Kerb stones along a polyline, (k, 2) m."""
+    point = np.asarray(line, dtype=np.float64)
+    build = ShapeBuilder()
+    for a, b in itertools.pairwise(point):
+        _add_bar(build, a, b, (0.0, KERB_M[1]), KERB_M[0], _Part.STONE)
+    return _made(build, {_Part.STONE: (158, 156, 150)})
+
+
+def _add_bar(
+    build: ShapeBuilder, a: FloatArray, b: FloatArray, levels: tuple[float, float], width: float, part: _Part
+) -> None:
+    along = (b - a) / np.hypot(*(b - a))
+    side = 0.5 * width * np.array([-along[1], along[0]])
+    ring = np.array([a - side, b - side, b + side, a + side])
+    low, high = (np.column_stack([ring, np.full(4, z)]) for z in levels)
+    after = [1, 2, 3, 0]
+    build.quads(np.stack([low, low[after], high[after], high], axis=1), part)
+    build.quads(np.stack([high, low[::-1]]) if levels[0] > 0 else high[None], part)
+
+
+def tree_mesh(height: float, seed: int) -> Mesh:
+    """A broad-leaved tree about the z axis, its height in m."""
+    rng = np.random.default_rng([seed, 13])
+    build = ShapeBuilder()
+    scale = height / 7.0
+    bole = 0.36 * height
+    lean = rng.uniform(-0.12, 0.12, 2)
+    profile = np.array([[1.6, 0.0], [1.15, 0.15], [1.0, 0.5], [0.8, bole], [0.35, 0.72 * height]])
+    profile[:, 0] *= TRUNK_M * scale
+    build.turned(profile, _Part.BARK, 8)
+    for _ in range(int(rng.integers(11, 15))):
+        angle, out = rng.uniform(0, 2 * np.pi), rng.uniform(0.02, 0.23) * height
+        z = rng.uniform(0.50, 0.82) * height
+        center = np.array([out * np.cos(angle), out * np.sin(angle), z])
+        center[:2] += lean * z
+        radius = rng.uniform(0.11, 0.155) * height * (1.25 - 0.6 * abs(z / height - 0.62))
+        part = _Part.LEAVES if rng.random() < 0.6 else _Part.LEAVES_DARK
+        _add_ball(build, center, radius * np.array([1.0, 1.0, 0.85]), part, rng, 0.24)
+    green = np.array([74.0, 88.0, 50.0]) + rng.uniform(-16, 16, 3)
+    return _made(build, {_Part.BARK: (84, 70, 56), _Part.LEAVES: green, _Part.LEAVES_DARK: 0.72 * green})
+
+
+def _add_ball(
+    build: ShapeBuilder,
+    center: FloatArray,
+    radius: FloatArray,
+    part: _Part,
+    rng: np.random.Generator | None = None,
+    rough: float = 0.0,
+) -> None:
+    """An ellipsoid of 8 × 5 facets, its surface roughened."""
+    across, up = np.linspace(0, 2 * np.pi, 9), np.linspace(-np.pi / 2, np.pi / 2, 6)
+    reach = np.ones((9, 6))
+    if rng is not None:
+        reach += rough * rng.uniform(-1, 1, (9, 6))
+        reach[:, [0, -1]] = 1.0
+    reach[-1] = reach[0]
+    unit = np.stack(
+        [
+            np.cos(across)[:, None] * np.cos(up),
+            np.sin(across)[:, None] * np.cos(up),
+            np.broadcast_to(np.sin(up), (9, 6)),
+        ],
+        axis=-1,
+    )
+    unit[-1] = unit[0]
+    build.grid(center + unit * reach[..., None] * radius, part)
+
+
+def lamp_post_mesh(height: float = 5.5) -> Mesh:
+    """A lamp post at the origin, its lantern out along x; height in m."""
+    build = ShapeBuilder()
+    foot, neck = LAMP_POST_M, 0.55 * LAMP_POST_M
+    build.turned(
+        [[1.3 * foot, 0.0], [1.3 * foot, 0.35], [foot, 0.42], [neck, height], [0.0, height]], _Part.POST, 8
+    )
+    build.box((0.42, 0.0, height - 0.05), (0.9, 0.06, 0.06), _Part.POST)
+    build.box((0.85, 0.0, height - 0.06), (0.55, 0.20, 0.10), _Part.POST, taper=(0.8, 0.6), faces="xXyYZ")
+    build.box((0.85, 0.0, height - 0.115), (0.46, 0.16, 0.02), _Part.LANTERN, faces="xXyYz")
+    return _made(build, {_Part.POST: (96, 100, 102), _Part.LANTERN: (232, 230, 220)})
+
+
+def pedestrian_mesh(phase: float, seed: int) -> Mesh:
+    """A walking person at the origin who looks along x.
+
+    Args:
+        phase: of the stride, in turns; 0 and 0.5 are the widest steps.
+        seed: of height and clothes.
+    """
+    rng = np.random.default_rng([seed, 14])
+    scale = rng.uniform(1.58, 1.88) / 1.75
+    build = ShapeBuilder()
+    swing = np.cos(2 * np.pi * phase)
+    hip, shoulder = 0.92, 1.44
+    for side in (1.0, -1.0):
+        foot = np.array([0.5 * _STEP * swing * side, 0.10 * side, 0.06 + 0.03 * (1 - abs(swing))])
+        knee = np.array([0.5 * foot[0] + 0.09, 0.10 * side, 0.50])
+        joint = np.array([0.0, 0.09 * side, hip])
+        _add_limb(build, joint, knee, (0.085, 0.065), _Part.TROUSERS)
+        _add_limb(build, knee, foot, (0.065, 0.045), _Part.TROUSERS)
+        build.box(foot + np.array([0.06, 0.0, -0.02]), (0.27, 0.09, 0.08), _Part.SHOES, taper=(0.8, 0.9))
+        elbow = np.array([-0.16 * swing * side - 0.03, 0.25 * side, 1.14])
+        hand = np.array([-0.30 * swing * side + 0.10, 0.25 * side, 0.90])
+        _add_limb(build, np.array([0.0, 0.20 * side, shoulder]), elbow, (0.06, 0.05), _Part.COAT)
+        _add_limb(build, elbow, hand, (0.05, 0.04), _Part.COAT)
+        _add_ball(build, hand, np.array([0.05, 0.035, 0.055]), _Part.SKIN)
+    section = [
+        (0.10, 0.145, 0.86),
+        (0.115, 0.165, 1.00),
+        (0.12, 0.19, 1.28),
+        (0.10, 0.20, 1.42),
+        (0.055, 0.06, 1.50),
+    ]
+    turn = np.linspace(0, 2 * np.pi, 11)
+    turn[-1] = 0.0
+    torso = [
+        [[rx * np.cos(t), ry * np.sin(t), z] for rx, ry, z in [(0.0, 0.0, 0.86), *section]] for t in turn
+    ]
+    build.grid(torso, _Part.COAT)
+    _add_limb(build, np.array([0.0, 0.0, 1.46]), np.array([0.02, 0.0, 1.58]), (0.055, 0.05), _Part.SKIN)
+    _add_ball(build, np.array([0.02, 0.0, 1.64]), np.array([0.098, 0.078, 0.118]), _Part.SKIN)
+    _add_ball(build, np.array([0.0, 0.0, 1.67]), np.array([0.10, 0.084, 0.105]), _Part.HAIR)
+    coat, trousers = rng.uniform(20, 190, 3), rng.uniform(20, 90) + rng.uniform(0, 20, 3)
+    skin = np.array([206.0, 160.0, 132.0]) * rng.uniform(0.5, 1.05)
+    mesh = _made(
+        build,
+        {
+            _Part.SKIN: skin,
+            _Part.HAIR: rng.uniform(20, 120) * np.array([1.0, 0.85, 0.7]),
+            _Part.COAT: coat,
+            _Part.TROUSERS: trousers,
+            _Part.SHOES: (34, 32, 30),
+        },
+    )
+    return Mesh((mesh.vertices * np.float32(scale)), mesh.normals, mesh.triangles, mesh.material, mesh.color)
+
+
+def _add_limb(
+    build: ShapeBuilder, a: FloatArray, b: FloatArray, radius: tuple[float, float], part: _Part
+) -> None:
+    """A tapered rod of seven sides from a to b, closed at both ends."""
+    axis = (b - a) / np.linalg.norm(b - a)
+    side = np.cross(axis, [0.0, 1.0, 0.0])
+    side /= np.linalg.norm(side)
+    other = np.cross(axis, side)
+    turn = np.linspace(0, 2 * np.pi, 8)[:, None, None]
+    ring = np.cos(turn) * side + np.sin(turn) * other
+    ring[-1] = ring[0]
+    points = np.concatenate([a + 0 * ring, a + radius[0] * ring, b + radius[1] * ring, b + 0 * ring], axis=1)
+    build.grid(points, part)
+
+
+def pedestrian_footprint(phase: float) -> FloatArray:
+    """(6, 2) float64, m: hull of both legs at knee height, person's frame, counter-clockwise."""
+    stride = abs(np.cos(2 * np.pi * phase))
+    front, back = 0.19 + 0.19 * stride, -0.02 - 0.18 * stride  # a knee is bent forward
+    middle = 0.5 * (front + back)
+    return np.array(
+        [[front, -0.15], [front, 0.15], [middle, 0.18], [back, 0.15], [back, -0.15], [middle, -0.18]]
+    )
+
+
+def round_footprint(radius: float) -> FloatArray:
+    """(8, 2) float64, m: a post as an octagon of the same area, counter-clockwise."""
+    turn = np.arange(8) * np.pi / 4
+    corner = radius * np.sqrt(np.pi / (2 * np.sqrt(2)))
+    return np.asarray(corner * np.column_stack([np.cos(turn), np.sin(turn)]))

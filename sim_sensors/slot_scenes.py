@@ -1,0 +1,287 @@
+"""A parking lot's slots and their occupancy as a scene: who parks where, and how crookedly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim_sensors.errors import SensorError
+from sim_sensors.scene import NO_VEHICLE, Fleet, Scene
+from sim_sensors.surroundings import Surroundings, floats
+from sim_sensors.vehicles import VehicleModel
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LINE_M = 0.10
+"""Width of painted slot lines."""
+LIBRARY_MODELS = 100
+"""How many vehicle models a lot's cars are drawn from."""
+PAVED_MARGIN_M = 7.0
+
+
+@dataclass(frozen=True)
+class ParkingManners:
+    """How cars stand in their slots.
+
+    Every car's offsets are normal with these deviations, cut at three; the offset to the side is also cut so that the
+    car's rectangle stays within its slot where it can. A model is chosen only for slots that it fits.
+
+    Args:
+        lateral_m: deviation to the side of the slot's middle line, m.
+        along_m: deviation along it, m.
+        yaw_rad: deviation of the heading, rad.
+        nose_out: share of cars that stand against the slot's yaw, backed in; kerbside slots have none.
+        door_room_m: how much wider than a car its slot must be.
+        overhang_m: how much longer than its slot a car may be; in a kerbside slot it must be as much shorter.
+    """
+
+    lateral_m: float = 0.12
+    along_m: float = 0.20
+    yaw_rad: float = float(np.radians(1.5))
+    nose_out: float = 0.25
+    door_room_m: float = 0.40
+    overhang_m: float = 0.20
+
+    def __post_init__(self) -> None:
+        for name in ("lateral_m", "along_m", "yaw_rad", "door_room_m", "overhang_m"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise SensorError(f"{name}: wanted a finite number of 0 or more, got {value}")
+        if not 0.0 <= self.nose_out <= 1.0:
+            raise SensorError(f"nose_out: wanted a share from 0 to 1, got {self.nose_out}")
+
+
+@lru_cache(maxsize=4)
+def vehicle_library(n_models: int = LIBRARY_MODELS) -> tuple[VehicleModel, ...]:
+    """The models of seeds 0 to n - 1, bodies, sizes and paints by how common they are."""
+    return tuple(VehicleModel.from_seed(None, seed) for seed in range(n_models))
+
+
+@dataclass(frozen=True, eq=False)
+class SlotLot:
+    """Slots, and which car every arrival at each of them would be.
+
+    The car in a slot and how it stands are drawn from (seed, slot, arrival) alone: neither other slots nor the order
+    of arrivals matter.
+
+    Args:
+        slot_xy: (n, 2) m, centres.
+        slot_yaw: (n,) rad, heading of a car that stands nose-in.
+        slot_length: (n,) or () m, along the yaw.
+        slot_width: (n,) or () m.
+        kerbside: (n,) or () bool, slots that lie along the lane.
+        surroundings: ground and scenery; None: asphalt under and around the slots, and their painted lines.
+        manners: how cars stand.
+        n_models: how many vehicle models there are.
+        seed: 0 or more.
+
+    Raises:
+        SensorError: a wrong shape or value, or a slot that no model fits.
+    """
+
+    slot_xy: ArrayLike
+    slot_yaw: ArrayLike
+    slot_length: ArrayLike
+    slot_width: ArrayLike
+    kerbside: ArrayLike = False
+    surroundings: Surroundings | None = None
+    manners: ParkingManners = field(default_factory=ParkingManners)
+    n_models: int = LIBRARY_MODELS
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        xy = floats("slot_xy", self.slot_xy, 2)
+        n = len(xy)
+        object.__setattr__(self, "slot_xy", xy)
+        for name in ("slot_yaw", "slot_length", "slot_width"):
+            value = np.asarray(getattr(self, name), dtype=np.float64)
+            if value.shape not in ((), (n,)):
+                raise SensorError(f"{name}: wanted shape ({n},), got {value.shape}")
+            column = floats(name, np.broadcast_to(value, (n,)).reshape(-1, 1), 1)[:, 0]
+            if name != "slot_yaw" and (column <= 0).any():
+                raise SensorError(f"{name}: wanted lengths above 0 m, got {column.min()}")
+            object.__setattr__(self, name, column)
+        if np.asarray(self.kerbside).shape not in ((), (n,)):
+            raise SensorError(f"kerbside: wanted shape ({n},), got {np.asarray(self.kerbside).shape}")
+        object.__setattr__(self, "kerbside", np.broadcast_to(np.asarray(self.kerbside, dtype=bool), (n,)))
+        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
+            raise SensorError(f"seed: wanted an integer, 0 or more, got {self.seed!r}")
+        if self.n_models < 1:
+            raise SensorError(f"n_models: wanted 1 or more, got {self.n_models}")
+        if self.surroundings is None:
+            object.__setattr__(self, "surroundings", slot_surroundings(self))
+        lonely = [i for i in range(n) if not len(self.fitting[i])]
+        if lonely:
+            length, width = self._column("slot_length")[lonely[0]], self._column("slot_width")[lonely[0]]
+            raise SensorError(
+                f"slot {lonely[0]}: no vehicle fits {length} m × {width} m, wanted a larger slot"
+            )
+
+    def _column(self, name: str) -> FloatArray:
+        return np.asarray(getattr(self, name))
+
+    @cached_property
+    def fleet(self) -> Fleet:
+        """All models, with the surroundings."""
+        assert self.surroundings is not None
+        return Fleet(vehicle_library(self.n_models), self.surroundings)
+
+    @cached_property
+    def fitting(self) -> list[IntArray]:
+        """For each slot the models that fit it."""
+        size = np.array([m.size for m in vehicle_library(self.n_models)])
+        spare = np.where(self._column("kerbside"), -self.manners.overhang_m, self.manners.overhang_m)
+        length, width = (
+            self._column("slot_length") + spare,
+            self._column("slot_width") - self.manners.door_room_m,
+        )
+        known: dict[tuple[float, float], IntArray] = {}
+        out = []
+        for key in zip(length.tolist(), width.tolist(), strict=True):
+            if key not in known:
+                known[key] = np.flatnonzero((size[:, 0] <= key[0]) & (size[:, 1] <= key[1]))
+            out.append(known[key])
+        return out
+
+    def arrival(self, slot: int, number: int) -> tuple[FloatArray, int]:
+        """The car of one arrival.
+
+        Args:
+            slot: its index.
+            number: 0 or more: the how manieth car since the start.
+
+        Returns:
+            (3,) float64, x, y in m and yaw in rad; index of its model in the fleet.
+        """
+        manners = self.manners
+        rng = np.random.default_rng([self.seed, slot, number])
+        chosen = int(self.fitting[slot][rng.integers(len(self.fitting[slot]))])
+        side, along, turn = np.clip(rng.normal(0.0, 1.0, 3), -3.0, 3.0)
+        backed_in = bool(rng.random() < manners.nose_out) and not self._column("kerbside")[slot]
+        length, width, _ = self.fleet.models[chosen].size
+        turn *= manners.yaw_rad
+        needed = width * np.cos(turn) + length * abs(np.sin(turn))
+        room = max(0.5 * (self._column("slot_width")[slot] - needed), 0.0)
+        side = float(np.clip(side * manners.lateral_m, -room, room))
+        ahead = max(0.5 * (self._column("slot_length")[slot] - length), 0.0) + 0.5 * manners.overhang_m
+        along = float(np.clip(along * manners.along_m, -ahead, ahead))
+        yaw = float(self._column("slot_yaw")[slot])
+        heading = np.array([np.cos(yaw), np.sin(yaw)])
+        xy = self._column("slot_xy")[slot] + along * heading + side * np.array([-heading[1], heading[0]])
+        return np.array([*xy, yaw + turn + (np.pi if backed_in else 0.0)]), chosen
+
+    def scene(self, occupied: ArrayLike, arrivals: ArrayLike = 0) -> Scene:
+        """The lot under an occupancy; place i of the scene is slot i.
+
+        Args:
+            occupied: (n,) bool.
+            arrivals: (n,) or () int, 0 or more: which arrival stands in each slot.
+        """
+        n = len(self._column("slot_xy"))
+        taken = np.asarray(occupied)
+        if taken.shape != (n,) or taken.dtype != bool:
+            raise SensorError(f"occupied: wanted ({n},) bool, got {taken.shape} of {taken.dtype}")
+        number = np.asarray(arrivals)
+        if (
+            number.shape not in ((), (n,))
+            or not np.issubdtype(number.dtype, np.integer)
+            or (number < 0).any()
+        ):
+            raise SensorError(f"arrivals: wanted ({n},) integers of 0 or more, got {arrivals!r}")
+        number = np.broadcast_to(number, (n,))
+        pose = np.column_stack([self._column("slot_xy"), self._column("slot_yaw")])
+        model = np.full(n, NO_VEHICLE, dtype=np.int64)
+        for slot in np.flatnonzero(taken).tolist():
+            pose[slot], model[slot] = self.arrival(slot, int(number[slot]))
+        return Scene(pose, model, self.fleet)
+
+    def filled(self, scene: Scene, slot: int, arrival: int) -> Scene:
+        """A scene of this lot after one arrival at a slot; use `Scene.without_vehicle` for a departure."""
+        pose, model = self.arrival(slot, arrival)
+        return scene.with_vehicle(slot, pose=pose, model=self.fleet.models[model])
+
+
+def slot_surroundings(lot: SlotLot, lanes: Sequence[ArrayLike] = (), **more: object) -> Surroundings:
+    """Asphalt under slots and lanes, and the slots' painted lines: both sides, of kerbside ones the ends too.
+
+    Args:
+        lot: the slots.
+        lanes: polylines, (k, 2) m; the asphalt reaches `PAVED_MARGIN_M` beyond them and the slots.
+        more: other fields of `Surroundings`.
+    """
+    plain = Surroundings(**more)  # type: ignore[arg-type]
+    ends = slot_lines(lot)
+    everything = [ends[:, :2], ends[:, 2:4], *(floats("lanes", lane, 2) for lane in lanes)]
+    point = np.concatenate(everything)
+    paved = list(plain.paved)
+    if len(point) and not paved:
+        low, high = point.min(axis=0) - PAVED_MARGIN_M, point.max(axis=0) + PAVED_MARGIN_M
+        paved = [np.array([low, [high[0], low[1]], high, [low[0], high[1]]])]
+    markings = np.concatenate([ends, np.asarray(plain.markings)])
+    return replace(plain, paved=paved, markings=markings)
+
+
+def slot_lines(lot: SlotLot) -> FloatArray:
+    """(k, 5) float64: ends and width, m, of the lines of all slots; a line between two slots comes once."""
+    xy, yaw = np.asarray(lot.slot_xy), np.asarray(lot.slot_yaw)
+    half = 0.5 * np.column_stack([np.asarray(lot.slot_length), np.asarray(lot.slot_width)])
+    heading = np.column_stack([np.cos(yaw), np.sin(yaw)])
+    left = np.column_stack([-heading[:, 1], heading[:, 0]])
+    ahead, aside = half[:, :1] * heading, half[:, 1:] * left
+    corner = {(i, j): xy + i * ahead + j * aside for i in (-1, 1) for j in (-1, 1)}
+    kerb = np.asarray(lot.kerbside)
+    lines = [np.hstack([corner[-1, j], corner[1, j]]) for j in (-1, 1)]
+    lines += [np.hstack([corner[i, -1], corner[i, 1]])[kerb] for i in (-1, 1)]
+    table = np.concatenate(lines)
+    middle = np.round((table[:, :2] + table[:, 2:]) / 2 / 0.15)
+    once = np.sort(np.unique(middle, axis=0, return_index=True)[1])
+    return np.column_stack([table[once], np.full(len(once), LINE_M)])
+
+
+def scene_of_slots(
+    slot_xy: ArrayLike,
+    slot_yaw: ArrayLike,
+    slot_length: ArrayLike,
+    slot_width: ArrayLike,
+    occupied: ArrayLike,
+    *,
+    kerbside: ArrayLike = False,
+    arrivals: ArrayLike = 0,
+    lanes: Sequence[ArrayLike] = (),
+    seed: int = 0,
+    manners: ParkingManners | None = None,
+    **surroundings: object,
+) -> Scene:
+    """A lot and its occupancy as a scene, in one call.
+
+    Args:
+        slot_xy: (n, 2) m, centres.
+        slot_yaw: (n,) rad, heading of a car that stands nose-in.
+        slot_length: (n,) or () m, along the yaw.
+        slot_width: (n,) or () m.
+        occupied: (n,) bool.
+        kerbside: (n,) or () bool, slots that lie along the lane.
+        arrivals: (n,) or () int, 0 or more: which arrival stands in each slot.
+        lanes: polylines, (k, 2) m, that are paved.
+        seed: 0 or more.
+        manners: how cars stand.
+        surroundings: fields of `Surroundings`: walls, buildings, trees and so on.
+
+    Raises:
+        SensorError: as `SlotLot` and `Surroundings`.
+
+    Examples:
+        >>> scene = scene_of_slots([[0, 0], [2.5, 0]], [1.57, 1.57], 5.0, 2.5, np.array([True, False]))
+        >>> scene.present.tolist(), len(scene.ground.markings)
+        ([0], 3)
+    """
+    lot = SlotLot(
+        slot_xy, slot_yaw, slot_length, slot_width, kerbside, None, manners or ParkingManners(), seed=seed
+    )
+    around = slot_surroundings(lot, lanes, **{"seed": seed, **surroundings})
+    return replace(lot, surroundings=around).scene(occupied, arrivals)

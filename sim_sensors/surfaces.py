@@ -1,0 +1,281 @@
+"""Triangles from a few kinds of surface: bent grids, strips between curves, boxes, turned profiles, prisms.
+
+Every triangle carries a *finish*, a small number; which material and colour that is, is looked up when the
+mesh is made. So one shape gives cars of many paints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from sim_sensors.mesh import Mesh
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+CREASE = np.cos(np.radians(42.0))  # faces of two surfaces that meet at less than this angle look like one
+WELD_M = 1e-5
+
+_BOX_FACES = {
+    "x": (0, 4, 7, 3),
+    "X": (1, 2, 6, 5),
+    "y": (0, 1, 5, 4),
+    "Y": (3, 7, 6, 2),
+    "z": (0, 3, 2, 1),
+    "Z": (4, 5, 6, 7),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """A mesh whose triangles have finishes instead of colours.
+
+    Attributes:
+        vertices: (v, 3) float32, m.
+        normals: (v, 3) float32, unit, outward.
+        triangles: (t, 3) int32, counter-clockwise seen from outside.
+        finish: (t,) uint8, row of the palette.
+    """
+
+    vertices: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+    finish: NDArray[np.uint8]
+
+    def dyed(self, material: NDArray[np.uint8], color: NDArray[np.uint8]) -> Mesh:
+        """The mesh under a palette.
+
+        Args:
+            material: (n_finishes,) uint8.
+            color: (n_finishes, 3) uint8, sRGB.
+        """
+        return Mesh(self.vertices, self.normals, self.triangles, material[self.finish], color[self.finish])
+
+
+class ShapeBuilder:
+    """Collects surfaces and welds them into a `Shape`."""
+
+    def __init__(self) -> None:
+        self._points: list[FloatArray] = []
+        self._triangles: list[IntArray] = []
+        self._finish: list[IntArray] = []
+        self._smooth: list[bool] = []
+
+    def grid(self, points: ArrayLike, finish: ArrayLike, *, flip: bool = False, smooth: bool = True) -> None:
+        """Add a bent sheet of quads.
+
+        Args:
+            points: (a, b, 3) m. The outside is where ∂/∂a × ∂/∂b points.
+            finish: () or (a - 1, b - 1) int.
+            flip: turns the outside to the other side.
+            smooth: rounds the sheet and its seams with other smooth sheets by common normals; facets otherwise.
+        """
+        corner = np.asarray(points, dtype=np.float64)
+        rows, columns = corner.shape[:2]
+        index = np.arange(rows * columns).reshape(rows, columns)
+        quads = np.stack([index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]], axis=-1).reshape(
+            -1, 4
+        )
+        if flip:
+            quads = quads[:, ::-1]
+        flat = corner.reshape(-1, 3)
+        # The shorter diagonal follows curved sheets better.
+        first = np.sum((flat[quads[:, 0]] - flat[quads[:, 2]]) ** 2, axis=1)
+        second = np.sum((flat[quads[:, 1]] - flat[quads[:, 3]]) ** 2, axis=1)
+        quads = np.where((first <= second + 1e-12)[:, None], quads, np.roll(quads, -1, axis=1))
+        triangles = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+        per_quad = np.broadcast_to(np.asarray(finish), (rows - 1, columns - 1)).reshape(-1)
+        self._add(flat, triangles, np.repeat(per_quad, 2), smooth)
+
+    def fan(self, points: ArrayLike, finish: int, *, flip: bool = False) -> None:
+        """Add a flat convex polygon, (k, 3) m, counter-clockwise seen from outside."""
+        corner = np.asarray(points, dtype=np.float64)
+        if flip:
+            corner = corner[::-1]
+        k = np.arange(1, len(corner) - 1)
+        triangles = np.column_stack([np.zeros_like(k), k, k + 1])
+        self._add(corner, triangles, np.full(len(triangles), finish), smooth=False)
+
+    def quads(self, points: ArrayLike, finish: int) -> None:
+        """Add flat quads of one finish, (n, 4, 3) m, each counter-clockwise seen from outside."""
+        corner = np.asarray(points, dtype=np.float64)
+        start: IntArray = 4 * np.arange(len(corner), dtype=np.int64)[:, None]
+        triangles = (start + np.array([0, 1, 2, 0, 2, 3])).reshape(-1, 3)
+        self._add(corner.reshape(-1, 3), triangles, np.full(len(triangles), int(finish)), smooth=False)
+
+    def box(
+        self,
+        center: ArrayLike,
+        size: ArrayLike,
+        finish: int,
+        *,
+        taper: tuple[float, float] = (1.0, 1.0),
+        lean: float = 0.0,
+        faces: str = "xXyYzZ",
+    ) -> None:
+        """Add a box.
+
+        Args:
+            center: (3,) m.
+            size: (3,) m along x, y, z.
+            finish: of all faces.
+            taper: scale of the top along x and y.
+            lean: m, by which the top is shifted along x.
+            faces: which to keep, lower case for the low side of an axis.
+        """
+        x, y, z = np.asarray(size, dtype=np.float64) / 2
+        bottom = np.array([[-x, -y, -z], [x, -y, -z], [x, y, -z], [-x, y, -z]])
+        top = bottom * [taper[0], taper[1], -1.0] + np.array([lean, 0.0, 0.0])
+        corner = np.vstack([bottom, top]) + np.asarray(center, dtype=np.float64)
+        self.quads(corner[[_BOX_FACES[face] for face in faces]], finish)
+
+    def turned(
+        self, profile: ArrayLike, finish: ArrayLike, segments: int, *, smooth: bool = True, phase: float = 0.0
+    ) -> None:
+        """Add a profile turned about the z axis.
+
+        Args:
+            profile: (k, 2) radius and height, m; the outside lies to the right of its direction.
+            finish: () or (k - 1,) int, of each band.
+            segments: around.
+            smooth: see `grid`.
+            phase: rad, of the first corner.
+        """
+        radius, height = np.asarray(profile, dtype=np.float64).T
+        angle = phase + np.linspace(0.0, 2 * np.pi, segments + 1)
+        angle[-1] = angle[0]
+        ring = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        points = np.empty((segments + 1, len(radius), 3))
+        points[..., :2] = ring[:, None] * radius[None, :, None]
+        points[..., 2] = height
+        self.grid(points, np.broadcast_to(np.asarray(finish), (segments, len(radius) - 1)), smooth=smooth)
+
+    def chords(
+        self,
+        edge: FloatArray,
+        across: ArrayLike,
+        crown: ArrayLike,
+        finish: ArrayLike,
+        *,
+        flip: bool = False,
+        smooth: bool = True,
+    ) -> None:
+        """Span a sheet between a curve on the left (y ≥ 0) and its mirror image on the right, facing up.
+
+        Args:
+            edge: (n, 3) m, from rear to front.
+            across: (k,) fractions of the half width, 1 on the left edge to -1 on the right.
+            crown: () or (n,) m, how much higher the middle is.
+            finish: () or (n - 1, k - 1) int.
+            flip: makes the sheet face down.
+            smooth: see `grid`.
+        """
+        a = np.asarray(across, dtype=np.float64)
+        points = np.repeat(edge[:, None], len(a), axis=1)
+        points[..., 1] *= a
+        points[..., 2] += np.broadcast_to(np.asarray(crown), len(edge))[:, None] * (1.0 - a**2)
+        self.grid(points, finish, flip=not flip, smooth=smooth)
+
+    def put(
+        self, shape: Shape, *, offset: ArrayLike = (0.0, 0.0, 0.0), turn: FloatArray | None = None
+    ) -> None:
+        """Add a finished shape, turned by a (3, 3) rotation (or reflection), then shifted; it keeps its facets."""
+        matrix = np.eye(3) if turn is None else turn
+        triangles = shape.triangles.astype(np.int64)
+        if np.linalg.det(matrix) < 0:
+            triangles = triangles[:, ::-1]
+        points = shape.vertices.astype(np.float64) @ matrix.T + np.asarray(offset, dtype=np.float64)
+        self._add(points, triangles, shape.finish.astype(np.int64), smooth=True)
+
+    def _add(self, points: FloatArray, triangles: IntArray, finish: IntArray, smooth: bool) -> None:
+        self._points.append(points)
+        self._triangles.append(triangles)
+        self._finish.append(finish)
+        self._smooth.append(smooth)
+
+    def build(self) -> Shape:
+        """Weld equal points, drop triangles of no area, and give every vertex its normal.
+
+        A face's corner takes the mean normal, weighted by area, of the smooth faces about the point that make
+        less than the crease angle with it; faceted ones keep the face's own.
+        """
+        counts = np.cumsum([0, *(len(p) for p in self._points)])
+        points = np.concatenate(self._points)
+        triangles = np.concatenate([t + start for t, start in zip(self._triangles, counts, strict=False)])
+        finish = np.concatenate(self._finish)
+        smooth = np.repeat(self._smooth, [len(t) for t in self._triangles])
+        spot = _spots(points)
+        corner = spot[triangles]
+        doubled = np.cross(
+            points[triangles[:, 1]] - points[triangles[:, 0]],
+            points[triangles[:, 2]] - points[triangles[:, 0]],
+        )
+        area = np.sqrt(np.sum(doubled**2, axis=1))
+        distinct = (corner != np.roll(corner, 1, axis=1)).all(axis=1)
+        kept = distinct & (area > 1e-9)
+        triangles, finish, smooth = triangles[kept], finish[kept], smooth[kept]
+        doubled, area, corner = doubled[kept], area[kept], corner[kept]
+        face = doubled / area[:, None]
+        normal = _corner_normals(corner, face, area, smooth)
+        rows = points[triangles.ravel()]
+        packed = np.round(np.hstack([spot[triangles.ravel()][:, None] * 1.0, normal * 2048.0]))
+        _, first, inverse = np.unique(_as_keys(packed), return_index=True, return_inverse=True)
+        return Shape(
+            np.ascontiguousarray(rows[first], dtype=np.float32),
+            np.ascontiguousarray(normal[first], dtype=np.float32),
+            inverse.reshape(-1, 3).astype(np.int32),
+            finish.astype(np.uint8),
+        )
+
+
+def _as_keys(rows: FloatArray) -> IntArray:
+    """One integer for each row of up to four small integers."""
+    columns = rows.astype(np.int64) + 4096
+    keys = columns[:, 0]
+    for column in columns[:, 1:].T:
+        keys = keys * 8192 + column
+    return np.asarray(keys)
+
+
+def _spots(points: FloatArray) -> IntArray:
+    """(n,) int64: points at the same place have the same number."""
+    cell = np.round(points / WELD_M).astype(np.int64)
+    keys = (cell[:, 0] * 73856093) ^ (cell[:, 1] * 19349663 << 8) ^ (cell[:, 2] * 83492791 << 16)
+    return np.asarray(np.unique(keys, return_inverse=True)[1])
+
+
+@njit(cache=True)
+def _corner_normals(
+    corner: IntArray, face: FloatArray, area: FloatArray, smooth: NDArray[np.bool_]
+) -> FloatArray:
+    """(3 t, 3) float64: the unit normal at each corner of each triangle."""
+    spot = corner.ravel()
+    order = np.argsort(spot, kind="mergesort")
+    normal = np.empty((len(spot), 3))
+    begin = 0
+    while begin < len(order):
+        end = begin + 1
+        while end < len(order) and spot[order[end]] == spot[order[begin]]:
+            end += 1
+        for i in range(begin, end):
+            own = order[i] // 3
+            x, y, z = 0.0, 0.0, 0.0
+            for j in range(begin, end):
+                other = order[j] // 3
+                alike = (
+                    face[own, 0] * face[other, 0]
+                    + face[own, 1] * face[other, 1]
+                    + face[own, 2] * face[other, 2]
+                )
+                if own == other or (smooth[own] and smooth[other] and alike > CREASE):
+                    x += area[other] * face[other, 0]
+                    y += area[other] * face[other, 1]
+                    z += area[other] * face[other, 2]
+            length = np.sqrt(x * x + y * y + z * z)
+            normal[order[i], 0], normal[order[i], 1], normal[order[i], 2] = x / length, y / length, z / length
+        begin = end
+    return normal

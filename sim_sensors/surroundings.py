@@ -1,0 +1,204 @@
+"""What of a scene does not drive away: the ground and all that stands on it, given as plain arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sim_sensors.errors import SensorError
+from sim_sensors.mesh import Ground, Mesh
+from sim_sensors.scenery import (
+    LAMP_POST_M,
+    TRUNK_M,
+    building_mesh,
+    kerb_mesh,
+    lamp_post_mesh,
+    pedestrian_footprint,
+    pedestrian_mesh,
+    round_footprint,
+    tree_mesh,
+    wall_mesh,
+)
+
+FloatArray = NDArray[np.float64]
+
+TREE_KINDS = 8
+GAITS = 8
+LOW_WALL_M = 0.5  # the laser passes over what is lower
+WALL_THICKNESS_M = 0.24
+
+
+class Standing(NamedTuple):
+    """One thing on the ground: its mesh, x, y, yaw, and its outline at knee height in its own frame, if it has one."""
+
+    mesh: Mesh
+    pose: tuple[float, float, float]
+    footprint: FloatArray | None = None
+
+
+def floats(name: str, value: ArrayLike, columns: int) -> FloatArray:
+    """`value` as a finite, read-only (n, columns) float64 array; an empty one may have any shape.
+
+    Raises:
+        SensorError: another shape, or a value that is not finite.
+    """
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SensorError(f"{name}: wanted (n, {columns}) numbers, got {value!r}") from error
+    if array.size == 0:
+        array = array.reshape(0, columns)
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise SensorError(f"{name}: wanted shape (n, {columns}), got {array.shape}")
+    if not np.isfinite(array).all():
+        row, column = np.argwhere(~np.isfinite(array))[0]
+        raise SensorError(f"{name}[{row}, {column}]: wanted a finite number, got {array[row, column]}")
+    array.setflags(write=False)
+    return array
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Ground, buildings, walls, kerbs, trees, lamp posts and people; world frame, SI units.
+
+    Args:
+        paved: polygons, (k, 2) m, of asphalt.
+        markings: (n, 5) m: both ends of painted lines, and their width.
+        buildings: outlines, (k, 2) m, simple polygons.
+        building_heights: (n_buildings,) m; None: 9 m each.
+        walls: (n, 5) m: both ends of free-standing walls, and their height.
+        kerbs: polylines, (k, 2) m.
+        trees: (n, 3) m: x, y, height.
+        lamp_posts: (n, 3): x, y in m, yaw of the arm in rad.
+        pedestrians: (n, 4): x, y in m, yaw in rad, phase of the stride in turns.
+        seed: 0 or more, of textures, trees, clothes, windows.
+
+    Raises:
+        SensorError: a wrong shape, a value that is not finite, a height or width not above zero, a wall of no length.
+    """
+
+    paved: Sequence[ArrayLike] = ()
+    markings: ArrayLike = ()
+    buildings: Sequence[ArrayLike] = ()
+    building_heights: ArrayLike | None = None
+    walls: ArrayLike = ()
+    kerbs: Sequence[ArrayLike] = ()
+    trees: ArrayLike = ()
+    lamp_posts: ArrayLike = ()
+    pedestrians: ArrayLike = ()
+    seed: int = 0
+    _outlines: tuple[FloatArray, ...] = field(init=False, repr=False, default=())
+
+    def __post_init__(self) -> None:
+        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
+            raise SensorError(f"seed: wanted an integer, 0 or more, got {self.seed!r}")
+        tables = {"markings": 5, "walls": 5, "trees": 3, "lamp_posts": 3, "pedestrians": 4}
+        for name, columns in tables.items():
+            object.__setattr__(self, name, floats(name, getattr(self, name), columns))
+        for name, least in (("paved", 3), ("buildings", 3), ("kerbs", 2)):
+            rows = tuple(floats(f"{name}[{i}]", row, 2) for i, row in enumerate(getattr(self, name)))
+            short = [i for i, row in enumerate(rows) if len(row) < least]
+            if short:
+                raise SensorError(
+                    f"{name}[{short[0]}]: wanted {least} or more points, got {len(rows[short[0]])}"
+                )
+            object.__setattr__(self, name, rows)
+        heights = (
+            np.full(len(self.buildings), 9.0) if self.building_heights is None else self.building_heights
+        )
+        heights = floats("building_heights", np.reshape(heights, (-1, 1)), 1)[:, 0]
+        if len(heights) != len(self.buildings):
+            raise SensorError(f"building_heights: wanted {len(self.buildings)} heights, got {len(heights)}")
+        object.__setattr__(self, "building_heights", heights)
+        least_values = (("building_heights", heights, 2.4), ("trees", self._table("trees")[:, 2], 1.5))
+        for name, column, low in least_values:
+            if (column < low).any():
+                raise SensorError(f"{name}: wanted heights of {low} m or more, got {column.min()}")
+        for name in ("markings", "walls"):
+            table = self._table(name)
+            what = "width" if name == "markings" else "height"
+            if (table[:, 4] <= 0).any():
+                raise SensorError(f"{name}: wanted a {what} above 0 m, got {table[:, 4].min()}")
+            length = np.hypot(*(table[:, 2:4] - table[:, :2]).T)
+            if (length < 1e-6).any():
+                raise SensorError(
+                    f"{name}[{int(np.argmin(length))}]: wanted two ends apart, got a length of 0 m"
+                )
+        object.__setattr__(
+            self, "_outlines", tuple(_counter_clockwise(np.asarray(b)) for b in self.buildings)
+        )
+
+    def _table(self, name: str) -> FloatArray:
+        return np.asarray(getattr(self, name))
+
+    @cached_property
+    def ground(self) -> Ground:
+        """For the camera."""
+        return Ground(tuple(np.asarray(p) for p in self.paved), self._table("markings"), self.seed)
+
+    @cached_property
+    def standing(self) -> tuple[Standing, ...]:
+        """Everything that stands on the ground; equal things share their mesh."""
+        things: list[Standing] = []
+        for i, (outline, height) in enumerate(
+            zip(self._outlines, self._table("building_heights"), strict=True)
+        ):
+            center = outline.mean(axis=0)
+            mesh = building_mesh(outline - center, float(height), self.seed + i)
+            things.append(Standing(mesh, (center[0], center[1], 0.0)))
+        for i, (x0, y0, x1, y1, height) in enumerate(self._table("walls").tolist()):
+            # Corners of walls overlap; were they of one height, their tops would flicker.
+            mesh = wall_mesh(
+                [0, 0], [x1 - x0, y1 - y0], height + 0.002 * (i % 4), WALL_THICKNESS_M, self.seed
+            )
+            things.append(Standing(mesh, (x0, y0, 0.0)))
+        for line in self.kerbs:
+            start = np.asarray(line)[0]
+            things.append(Standing(kerb_mesh(np.asarray(line) - start), (start[0], start[1], 0.0)))
+        trees = self._table("trees")
+        kinds: dict[tuple[float, int], Mesh] = {}
+        for i, (x, y, height) in enumerate(trees.tolist()):
+            key = (round(height * 2) / 2, i % TREE_KINDS)
+            if key not in kinds:
+                kinds[key] = tree_mesh(key[0], self.seed * TREE_KINDS + key[1])
+            trunk = round_footprint(TRUNK_M * key[0] / 7.0)
+            things.append(Standing(kinds[key], (x, y, 2.4 * i), trunk))
+        post = lamp_post_mesh() if len(self._table("lamp_posts")) else None
+        for x, y, yaw in self._table("lamp_posts").tolist():
+            assert post is not None
+            things.append(Standing(post, (x, y, yaw), round_footprint(LAMP_POST_M)))
+        for i, (x, y, yaw, phase) in enumerate(self._table("pedestrians").tolist()):
+            gait = round(phase * GAITS) % GAITS / GAITS
+            person = pedestrian_mesh(gait, self.seed * 4096 + i)
+            things.append(Standing(person, (x, y, yaw), pedestrian_footprint(gait)))
+        return tuple(things)
+
+    @cached_property
+    def wall_segments(self) -> FloatArray:
+        """(m, 2, 2) float64, m: what a laser at knee height meets of buildings and walls, as line segments.
+
+        A free-standing wall is met on both faces and at both ends.
+        """
+        sides = [np.stack([a, np.roll(a, -1, axis=0)], axis=1) for a in self._outlines]
+        for x0, y0, x1, y1, height in self._table("walls").tolist():
+            if height <= LOW_WALL_M:
+                continue
+            a, b = np.array([x0, y0]), np.array([x1, y1])
+            along = (b - a) / np.hypot(*(b - a))
+            side = 0.5 * WALL_THICKNESS_M * np.array([-along[1], along[0]])
+            ring = np.array([a - side, b - side, b + side, a + side])
+            sides.append(np.stack([ring, np.roll(ring, -1, axis=0)], axis=1))
+        return np.concatenate(sides) if sides else np.empty((0, 2, 2))
+
+
+def _counter_clockwise(outline: FloatArray) -> FloatArray:
+    x, y = outline.T
+    area = float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
+    if abs(area) < 1e-3:
+        raise SensorError(f"buildings: wanted an outline with an area, got {outline.tolist()}")
+    return outline if area > 0 else outline[::-1].copy()

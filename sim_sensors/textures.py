@@ -1,0 +1,110 @@
+"""Noise that tiles, and image pyramids that compiled code samples with distance filtering."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Float32Array = NDArray[np.float32]
+
+# Everything that fastmath offers except the promise that no infinity occurs: the sky's depth is one.
+FAST = {"reassoc", "nsz", "arcp", "contract", "afn"}
+# For functions that are called for every pixel or triangle and allocate nothing: numba's reference counts on
+# the arrays they are handed would cost ten times what they compute.
+LEAF = {"fastmath": FAST, "_nrt": False, "forceinline": True}
+
+
+class Tile(NamedTuple):
+    """A square grey texture that repeats, with its coarser levels.
+
+    Attributes:
+        levels: (total,) float32, 0 to 1, level after level, each row-major and half as wide as the last.
+        start: (n_levels,) int64, where each level begins.
+        size: texels along a side of the finest level, a power of two.
+    """
+
+    levels: Float32Array
+    start: NDArray[np.int64]
+    size: int
+
+
+def fractal_noise(size: int, generator: np.random.Generator, slope: float) -> NDArray[np.float64]:
+    """Tileable noise whose amplitude falls as frequency^-slope; (size, size), mean 0, deviation 1."""
+    frequency = np.fft.fftfreq(size)
+    radius = np.hypot(frequency[:, None], frequency[None, :])
+    radius[0, 0] = 1.0
+    white = np.fft.fft2(generator.standard_normal((size, size)))
+    noise = np.fft.ifft2(white * radius**-slope).real
+    scaled: NDArray[np.float64] = (noise - noise.mean()) / noise.std()
+    return scaled
+
+
+def make_tile(image: NDArray[np.float64]) -> Tile:
+    """Pack a square image, a power of two wide and in [0, 1], with its pyramid down to 4 texels."""
+    level = np.ascontiguousarray(image, dtype=np.float32)
+    levels = [level]
+    while level.shape[0] > 4:
+        half = level.shape[0] // 2
+        level = level.reshape(half, 2, half, 2).mean(axis=(1, 3))
+        levels.append(level)
+    start = np.cumsum([0] + [part.size for part in levels[:-1]]).astype(np.int64)
+    return Tile(np.concatenate([part.ravel() for part in levels]), start, image.shape[0])
+
+
+@lru_cache(maxsize=1)
+def grain_tile() -> Tile:
+    """Stones in asphalt: white noise over a little fractal noise. The same in every scene."""
+    generator = np.random.default_rng(41)
+    image = 0.5 + 0.13 * fractal_noise(512, generator, 0.35) + 0.07 * fractal_noise(512, generator, 0.9)
+    return make_tile(np.clip(image, 0.0, 1.0))
+
+
+@lru_cache(maxsize=1)
+def cloud_tile() -> Tile:
+    """Soft blotches: dirt, plaster, leaves, clouds. The same in every scene."""
+    image = 0.5 + 0.2 * fractal_noise(512, np.random.default_rng(42), 1.35)
+    return make_tile(np.clip(image, 0.0, 1.0))
+
+
+@njit(**LEAF)
+def sample_tile(tile: Tile, u: float, v: float, level: int) -> float:
+    """Bilinear value at (u, v), in periods of the tile, of one level of its pyramid."""
+    level = min(max(level, 0), tile.start.shape[0] - 1)
+    n = tile.size >> level
+    x = u * n - 0.5
+    y = v * n - 0.5
+    column = int(np.floor(x))
+    row = int(np.floor(y))
+    a = x - column
+    b = y - row
+    mask = n - 1
+    top = tile.start[level] + (row & mask) * n
+    bottom = tile.start[level] + ((row + 1) & mask) * n
+    left = column & mask
+    right = (column + 1) & mask
+    above = tile.levels[top + left] * (1 - a) + tile.levels[top + right] * a
+    below = tile.levels[bottom + left] * (1 - a) + tile.levels[bottom + right] * a
+    return float(above * (1 - b) + below * b)
+
+
+@njit(**LEAF)
+def hash_unit(x: int, y: int) -> float:
+    """A number in [0, 1) that looks random and is always the same for the same two integers."""
+    h = (np.int64(x) * 374761393 + np.int64(y) * 668265263) & 0x7FFFFFFF
+    h = ((h ^ (h >> 13)) * 1274126177) & 0x7FFFFFFF
+    return (h ^ (h >> 16)) / 2147483648.0
+
+
+@njit(**LEAF)
+def pixel_level(texels: float) -> int:
+    """Level of a 512-texel tile whose texels are as large as a pixel that spans `texels` periods."""
+    level = 0
+    spans = texels * 512.0
+    while spans > 1.4 and level < 7:
+        spans *= 0.5
+        level += 1
+    return level

@@ -1,0 +1,132 @@
+"""The light of a day: sun, sky, haze and rain, by preset and seed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_sensors.errors import SensorError
+
+Color = tuple[float, float, float]
+
+PRESETS = ("sunny", "overcast", "low_sun", "dusk", "rain")
+
+
+@dataclass(frozen=True)
+class Weather:
+    """What lights a scene. Light is relative: a white wall under an open overcast sky has radiance 1.
+
+    Args:
+        preset: the name it was drawn under.
+        sun_azimuth: rad, world frame, counter-clockwise from x, of the direction to the sun.
+        sun_elevation: rad above the horizon.
+        sun: radiance of a white surface that faces the sun, linear RGB; black when hidden.
+        sky: radiance of a white surface under the whole sky, linear RGB.
+        zenith, horizon: radiance of the clear sky there, linear RGB.
+        clouds: fraction of the sky that clouds cover.
+        haze: 1/m, how fast things fade into the horizon's colour.
+        wetness: 0 dry to 1 puddles.
+        rain: 0 none to 1 streaks in the air.
+        lit_windows: fraction of the windows with light behind them.
+        seed: of clouds, skyline and puddles.
+
+    Raises:
+        SensorError: a value that is not finite, or out of range.
+    """
+
+    preset: str = "sunny"
+    sun_azimuth: float = -1.0
+    sun_elevation: float = 0.8
+    sun: Color = (2.6, 2.5, 2.25)
+    sky: Color = (0.75, 0.85, 1.0)
+    zenith: Color = (0.22, 0.38, 0.78)
+    horizon: Color = (0.72, 0.82, 0.95)
+    clouds: float = 0.3
+    haze: float = 0.0008
+    wetness: float = 0.0
+    rain: float = 0.0
+    lit_windows: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("sun_azimuth", "sun_elevation", "haze"):
+            value = getattr(self, name)
+            if not math.isfinite(value) or (name != "sun_azimuth" and value < 0.0):
+                raise SensorError(f"{name} is {value}, want a finite number of at least 0")
+        for name in ("clouds", "wetness", "rain", "lit_windows"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise SensorError(f"{name} is {getattr(self, name)}, want a fraction from 0 to 1")
+        for name in ("sun", "sky", "zenith", "horizon"):
+            value = getattr(self, name)
+            if len(value) != 3 or not all(math.isfinite(part) and part >= 0.0 for part in value):
+                raise SensorError(f"{name} is {value}, want three finite numbers of at least 0")
+
+    @property
+    def sun_direction(self) -> Color:
+        """Unit vector to the sun, world frame."""
+        flat = math.cos(self.sun_elevation)
+        return (
+            flat * math.cos(self.sun_azimuth),
+            flat * math.sin(self.sun_azimuth),
+            math.sin(self.sun_elevation),
+        )
+
+    @classmethod
+    def draw(cls, preset: str, seed: int) -> Weather:
+        """Weather of one preset, its parameters drawn by the seed.
+
+        Args:
+            preset: one of `PRESETS`.
+            seed: any integer of at least 0; equal seeds give equal weather.
+
+        Raises:
+            SensorError: an unknown preset or a negative seed.
+        """
+        if preset not in PRESETS:
+            raise SensorError(f"weather preset is {preset!r}, want one of {', '.join(PRESETS)}")
+        if seed < 0:
+            raise SensorError(f"weather seed is {seed}, want at least 0")
+        uniform = np.random.default_rng([seed, PRESETS.index(preset)]).uniform
+        azimuth = float(uniform(-math.pi, math.pi))
+
+        def scaled(color: Color, low: float, high: float) -> Color:
+            factor = float(uniform(low, high))
+            return (color[0] * factor, color[1] * factor, color[2] * factor)
+
+        if preset == "sunny":
+            return cls(
+                preset, azimuth, float(uniform(0.6, 1.1)), scaled((1.0, 0.96, 0.87), 2.3, 3.0),
+                scaled((0.76, 0.86, 1.0), 0.7, 0.95), scaled((0.22, 0.38, 0.78), 0.8, 1.1),
+                scaled((0.72, 0.82, 0.95), 0.9, 1.1), float(uniform(0.05, 0.55)), float(uniform(0.0004, 0.0015)),
+                seed=seed,
+            )  # fmt: skip
+        if preset == "overcast":
+            veiled = float(uniform(0.0, 0.12))
+            return cls(
+                preset, azimuth, float(uniform(0.5, 1.0)), (veiled, veiled, veiled),
+                scaled((0.94, 0.98, 1.04), 0.8, 1.05), scaled((0.98, 1.0, 1.04), 0.85, 1.05),
+                scaled((0.78, 0.8, 0.84), 0.8, 1.0), float(uniform(0.85, 1.0)), float(uniform(0.001, 0.004)),
+                seed=seed,
+            )  # fmt: skip
+        if preset == "low_sun":
+            return cls(
+                preset, azimuth, float(uniform(0.12, 0.3)), scaled((1.0, 0.74, 0.46), 1.5, 2.2),
+                scaled((0.72, 0.8, 1.0), 0.4, 0.55), scaled((0.25, 0.36, 0.62), 0.6, 0.9),
+                scaled((1.0, 0.8, 0.58), 0.8, 1.1), float(uniform(0.1, 0.6)), float(uniform(0.001, 0.004)),
+                seed=seed,
+            )  # fmt: skip
+        if preset == "dusk":
+            return cls(
+                preset, azimuth, 0.05, (0.0, 0.0, 0.0),
+                scaled((0.8, 0.88, 1.1), 0.03, 0.08), scaled((0.03, 0.045, 0.085), 0.8, 1.2),
+                scaled((0.16, 0.12, 0.1), 0.6, 1.0), float(uniform(0.1, 0.7)), float(uniform(0.001, 0.003)),
+                lit_windows=float(uniform(0.15, 0.5)), seed=seed,
+            )  # fmt: skip
+        return cls(
+            preset, azimuth, float(uniform(0.5, 1.0)), (0.0, 0.0, 0.0),
+            scaled((0.9, 0.97, 1.05), 0.35, 0.6), scaled((0.9, 0.95, 1.0), 0.35, 0.55),
+            scaled((0.8, 0.83, 0.87), 0.4, 0.55), 1.0, float(uniform(0.005, 0.012)),
+            wetness=float(uniform(0.6, 1.0)), rain=float(uniform(0.3, 1.0)), seed=seed,
+        )  # fmt: skip

@@ -1,0 +1,256 @@
+"""Pictures: deterministic, well exposed, with true depth, ids and boxes; stereo; what is refused."""
+
+import math
+from dataclasses import replace
+
+import cv2
+import numba
+import numpy as np
+import pytest
+from bench.bench_camera import parked_cars
+from toy_scene import ToyScene, box_mesh, random_boxes, toy_scene
+
+from sim_sensors.camera import PinholeCamera, StereoCamera, camera_pose
+from sim_sensors.errors import SensorError
+from sim_sensors.ground_truth import View, vehicle_boxes
+from sim_sensors.image_sensor import ImageSensor
+from sim_sensors.light_maps import light_maps, open_sky, sunlit
+from sim_sensors.mesh import Instances, Material
+from sim_sensors.weather import PRESETS, Weather
+
+CAMERA = PinholeCamera.from_field_of_view(320, 240)
+POSE = camera_pose(0.0, 0.0, 1.4, 0.4, -0.05)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return random_boxes(5, count=50)
+
+
+@pytest.fixture(scope="module")
+def row():
+    """Five cars in a row 6 m to the right of a lane along x, seen from the side, the third also from behind one."""
+    body, pane = box_mesh(4.3, 1.8, 1.0), box_mesh(1.6, 1.6, 0.5, Material.GLASS)
+    placed, ids = [], []
+    for i, x in enumerate((-11.0, -5.5, 0.0, 5.5, 11.0)):
+        placed += [(0, x, -6.0, 0.2, 0.0), (1, x, -6.0, 1.2, 0.0)]
+        ids += [i + 1, i + 1]
+    return toy_scene([body, pane], placed, ids)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_weather_is_deterministic_and_well_exposed(scene, preset):
+    weather = Weather.draw(preset, 3)
+    assert weather == Weather.draw(preset, 3)
+    assert weather != Weather.draw(preset, 4)
+    frame, again = (CAMERA.render(scene, POSE, weather, 7) for _ in range(2))
+    assert frame.image.shape == (240, 320, 3)
+    assert frame.image.dtype == np.uint8
+    assert np.array_equal(frame.image, again.image)
+    assert np.array_equal(frame.depth, again.depth)
+    assert 60 < frame.image.mean() < 170
+    assert frame.image.std() > 15
+    assert np.mean(frame.image == 255) < 0.2
+
+
+def test_noise_follows_the_seed_and_geometry_does_not(scene):
+    one, other = CAMERA.render(scene, POSE, seed=1), CAMERA.render(scene, POSE, seed=2)
+    difference = one.image.astype(int) - other.image.astype(int)
+    assert 0.3 < difference.std() < 8.0
+    assert abs(difference.mean()) < 0.2
+    assert np.array_equal(one.depth, other.depth)
+    assert np.array_equal(one.ids, other.ids)
+
+
+def test_same_bytes_on_any_number_of_threads(scene):
+    weather = Weather.draw("rain", 1)
+    before = numba.get_num_threads()
+    try:
+        frames = []
+        for threads in sorted({1, before}):
+            numba.set_num_threads(threads)
+            frames.append(CAMERA.render(scene, POSE, weather, 3))
+    finally:
+        numba.set_num_threads(before)
+    assert np.array_equal(frames[0].image, frames[-1].image)
+    assert np.array_equal(frames[0].ids, frames[-1].ids)
+
+
+def test_depth_is_of_what_is_opaque_and_ids_of_what_is_first(row):
+    frame = CAMERA.render(row, camera_pose(0.0, 0.0, 1.4, -math.pi / 2))
+    through = np.isfinite(frame.glass_depth)
+    assert through.any()
+    # The pane's near side is 5.2 m away; behind it are the ground and the sky, no car.
+    assert frame.glass_depth[through].min() == pytest.approx(5.2, abs=1e-3)
+    assert (frame.depth[through] > frame.glass_depth[through]).all()
+    assert (frame.ids[through] > 0).all()
+    assert np.isinf(frame.depth[:60]).all()
+    assert (frame.ids[:60] == 0).all()
+    body = (frame.ids == 3) & ~through
+    assert np.median(frame.depth[body]) == pytest.approx(5.1, abs=0.05)
+
+
+def test_supersampling_changes_the_picture_and_not_the_truth(scene):
+    plain, fine = CAMERA.render(scene, POSE), replace(CAMERA, supersampling=2).render(scene, POSE)
+    assert np.array_equal(plain.depth, fine.depth)
+    assert np.array_equal(plain.ids, fine.ids)
+    difference = np.abs(plain.image.astype(int) - fine.image.astype(int))
+    assert 0.5 < difference.mean() < 8.0
+
+
+def test_shadows_lie_away_from_the_sun():
+    scene = toy_scene([box_mesh(4.0, 2.0, 1.5)], [(0, 0.0, 0.0, 0.0, 0.0)], [1])
+    weather = Weather(sun_azimuth=0.0, sun_elevation=math.radians(45.0))
+    maps = light_maps(scene.pool, scene.instances, weather, 0.0, 0.0)
+    # Sun from +x at 45°: the box (±2 m, 1.5 m high) throws its shadow to x = -3.5 m.
+    assert sunlit(maps, -3.3, 0.0, 0.0, 0.05) == 0.0
+    assert sunlit(maps, -3.7, 0.0, 0.0, 0.05) == 1.0
+    assert sunlit(maps, 2.3, 0.0, 0.0, 0.05) == 1.0
+    assert sunlit(maps, 0.0, 0.0, 1.6, 0.05) == 1.0
+    assert open_sky(maps, 0.0, 0.0) < 0.1
+    assert open_sky(maps, 5.0, 0.0) > 0.99
+
+
+def test_shadows_follow_new_instances(row):
+    weather = Weather.draw("sunny", 0)
+    pose = camera_pose(0.0, 0.0, 1.4, -math.pi / 2)
+    full = CAMERA.render(row, pose, weather)
+    kept = [0, 1, 2, 3, 6, 7, 8, 9]
+    gone = Instances(row.instances.mesh[kept], row.instances.pose[kept], row.instances.ids[kept])
+    emptied = CAMERA.render(ToyScene(row.pool, gone, row.ground), pose, weather)
+    assert not (emptied.ids == 3).any()
+    assert not np.array_equal(full.image, emptied.image)
+
+
+def test_boxes_of_vehicles(row):
+    pose = camera_pose(0.0, 0.0, 1.4, -math.pi / 2)
+    camera = PinholeCamera()
+    frame = camera.render(row, pose)
+    boxes = vehicle_boxes(camera, row, pose, frame)
+    # Body and pane are two instances of one vehicle here.
+    middle = boxes.ids == 3
+    assert middle.any()
+    left, top, right, bottom = boxes.visible_box[middle][0]
+    assert (right - left) == pytest.approx(4.3 * 520.0 / 5.1, abs=1.5)
+    assert left == pytest.approx(320.0 - 2.15 * 520.0 / 5.1, abs=1.5)
+    assert bottom == pytest.approx(240.0 + 1.2 * 520.0 / 5.1, abs=1.5)
+    assert top < 240.0
+    assert (boxes.view[middle] == View.SIDE).all()
+    np.testing.assert_allclose(boxes.distance[middle], 6.0)
+    assert boxes.distance[0] == boxes.distance.min()
+
+
+def test_hidden_vehicles_have_small_visible_fractions():
+    body = box_mesh(4.0, 1.8, 1.5)
+    placed = [(0, 6.0, 0.0, 0.0, math.pi / 2), (0, 12.0, 0.0, 0.0, math.pi / 2), (0, 12.0, 6.0, 0.0, 0.5)]
+    scene = toy_scene([body], placed, [4, 9, 2])
+    camera, pose = PinholeCamera(), camera_pose(0.0, 0.0, 1.2, 0.0)
+    boxes = vehicle_boxes(camera, scene, pose, camera.render(scene, pose))
+    assert boxes.ids.tolist() == [4, 9, 2]
+    assert boxes.visible_fraction[0] == 1.0
+    assert boxes.visible_fraction[1] < 0.1
+    assert boxes.visible_fraction[2] > 0.8
+    assert boxes.view.tolist() == [View.SIDE, View.SIDE, View.END]
+
+
+def test_a_stereo_pair_agrees_with_its_depth():
+    scene = random_boxes(3, count=60)
+    stereo = StereoCamera()
+    pair = stereo.render_stereo(scene, camera_pose(0.0, 0.0, 1.4, 0.9, -0.04), Weather.draw("sunny", 2), 1)
+    left, right = (cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY) for frame in (pair.left, pair.right))
+    matcher = cv2.StereoSGBM.create(0, 64, 5, 200, 800, 1, 0, 8, 80, 2, cv2.StereoSGBM_MODE_SGBM_3WAY)
+    disparity = matcher.compute(left, right).astype(np.float32) / 16.0
+    ground = (pair.left.ids == 0) & (pair.left.depth < 7.0) & (disparity > 0)
+    assert ground.sum() > 5000
+    depth = stereo.camera.fx * stereo.baseline / disparity[ground]
+    assert np.median(np.abs(depth - pair.left.depth[ground])) < 0.15
+
+
+def test_stereo_measures_bodies_and_misses_windows():
+    # T §3.3: through the windows a stereo camera sees what is behind, and the car seems farther than it is.
+    scene, stereo = parked_cars(), StereoCamera(PinholeCamera.from_field_of_view())
+    matcher = cv2.StereoSGBM.create(0, 64, 5, 200, 800, 1, 0, 8, 80, 2, cv2.StereoSGBM_MODE_SGBM_3WAY)
+    near, far, windows = [], [], []
+    for i in range(4):
+        pose = camera_pose(-20.0 + 9.0 * i, 0.3, 1.35, -math.pi / 2, -0.04)
+        pair = stereo.render_stereo(scene, pose, Weather.draw("sunny", i), i)
+        left, right = (cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY) for frame in (pair.left, pair.right))
+        disparity = matcher.compute(left, right).astype(np.float32) / 16.0
+        depth = stereo.camera.fx * stereo.baseline / np.maximum(disparity, 1e-3)
+        truth, pane = pair.left.depth, pair.left.glass_depth
+        matched = (disparity > 0) & (pair.left.ids > 0)
+        body = matched & np.isinf(pane)
+        near.append(np.abs(depth - truth)[body & (truth > 5.0) & (truth < 7.0)])
+        far.append(np.abs(depth - truth)[body & (truth > 7.0) & (truth < 10.0)])
+        windows.append((depth - pane)[matched & (pane > 5.0) & (pane < 7.0)])
+    assert np.median(np.concatenate(near)) < 0.2
+    assert np.median(np.concatenate(far)) < 0.4
+    assert np.median(np.concatenate(windows)) > 0.4
+
+
+def test_a_right_camera_stands_to_the_right():
+    right = StereoCamera(baseline=0.12).right_pose(camera_pose(1.0, 2.0, 1.5, math.pi / 2))
+    np.testing.assert_allclose(right[:3, 3], [1.12, 2.0, 1.5], atol=1e-12)
+
+
+def test_camera_frame_is_right_down_forward():
+    pose = camera_pose(0.0, 0.0, 1.0, 0.0)
+    np.testing.assert_allclose(pose[:3, :3].T, [[0, -1, 0], [0, 0, -1], [1, 0, 0]], atol=1e-12)
+    assert camera_pose(0.0, 0.0, 1.0, 0.0, pitch=0.2)[2, 2] > 0.0
+    # Head to the right shoulder: the camera's right axis points down.
+    assert camera_pose(0.0, 0.0, 1.0, 0.0, roll=0.2)[2, 0] < 0.0
+
+
+def test_exposure_holds_its_limits():
+    sensor = ImageSensor(least_gain=0.5, greatest_gain=2.0)
+    assert sensor.gain(np.full((64, 64, 3), 1e-4, dtype=np.float32)) == 2.0
+    assert sensor.gain(np.full((64, 64, 3), 50.0, dtype=np.float32)) == 0.5
+    flat = np.full((64, 64, 3), 0.19, dtype=np.float32)
+    assert sensor.gain(flat) == pytest.approx(1.0)
+    quiet = ImageSensor(shot_noise=0.0, read_noise=0.0, vignetting=0.0)
+    # 0.19 linear is 0.473 under the sRGB curve.
+    assert np.unique(quiet.expose(flat, 0, 1.0)).tolist() == [121]
+
+
+def test_noise_has_the_stated_deviation():
+    sensor = ImageSensor(vignetting=0.0, blur=0.0)
+    image = sensor.expose(np.full((200, 200, 3), 0.19, dtype=np.float32), 5, 1.0).astype(float)
+    slope = 255.0 * 1.055 / 2.4 * 0.19 ** (1.0 / 2.4 - 1.0)
+    expected = math.hypot(slope * math.sqrt(0.01**2 * 0.19 + 0.0008**2), math.sqrt(1.0 / 12.0))
+    assert image.std() == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"width": 0}, "image size is 0×480"),
+        ({"fx": -1.0}, "fx is -1.0"),
+        ({"cy": math.nan}, "cy is nan"),
+        ({"supersampling": 3}, "supersampling is 3"),
+        ({"coarse_beyond": math.nan}, "coarse_beyond is nan"),
+    ],
+)
+def test_bad_cameras_are_refused(arguments, message):
+    with pytest.raises(SensorError, match=message):
+        PinholeCamera(**arguments)
+
+
+def test_other_bad_input_is_refused(scene, row):
+    with pytest.raises(SensorError, match="field of view is 4"):
+        PinholeCamera.from_field_of_view(horizontal=4.0)
+    with pytest.raises(SensorError, match="baseline is 0"):
+        StereoCamera(baseline=0.0)
+    with pytest.raises(SensorError, match="blur is 2"):
+        ImageSensor(blur=2.0)
+    with pytest.raises(SensorError, match="want one of sunny"):
+        Weather.draw("snow", 0)
+    with pytest.raises(SensorError, match="want finite"):
+        camera_pose(math.nan, 0.0, 1.0, 0.0)
+    with pytest.raises(SensorError, match=r"shape \(3, 4\)"):
+        CAMERA.render(scene, POSE[:3])
+    with pytest.raises(SensorError, match="want a rotation"):
+        CAMERA.render(scene, 2.0 * POSE)
+    with pytest.raises(SensorError, match="above the ground"):
+        CAMERA.render(scene, camera_pose(0.0, 0.0, -0.1, 0.0))
+    with pytest.raises(SensorError, match="inside vehicle 3"):
+        CAMERA.render(row, camera_pose(0.3, -6.1, 0.8, 0.0))

@@ -1,0 +1,340 @@
+"""The laser: against its definition, against pymunk, at the edges of its domain, and its noise."""
+
+import math
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pymunk
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sim_sensors import laser_reference
+from sim_sensors.errors import SensorError
+from sim_sensors.footprints import NO_RETURN, WALL, ScanPlane
+from sim_sensors.laser import LaserScanner
+
+LASER = LaserScanner()
+WIDE = LaserScanner(n_beams=1440, start=1.0)
+SQUARE = np.array([[1, -1], [2, -1], [2, 1], [1, 1]], float)
+TOLERANCE_M = 2e-3
+# A beam is at an edge if turning it this little changes its true range by more than the tolerance.
+TURN = 2e-6
+
+
+def regular_polygon(k, x=0.0, y=0.0, radius=1.0, turned=0.0, stretch=1.0):
+    angle = turned + 2 * np.pi * np.arange(k) / k
+    return np.column_stack([x + radius * stretch * np.cos(angle), y + radius * np.sin(angle)])
+
+
+def stack(polygons, k_max=12):
+    corners = np.zeros((len(polygons), k_max, 2))
+    for i, polygon in enumerate(polygons):
+        corners[i, : len(polygon)] = polygon
+    return corners, np.array([len(p) for p in polygons], dtype=int)
+
+
+def random_plane(rng, n, n_walls, extent):
+    """Cars, posts and odd polygons of both orientations, and walls of every length, strewn about."""
+    polygons = []
+    for _ in range(n):
+        k = int(rng.choice([3, 4, 4, 4, 5, 8, 12]))
+        outline = regular_polygon(
+            k, 0, 0, rng.choice([0.05, 1.0, 2.5, 6.0]), rng.uniform(0, 7), rng.uniform(0.3, 1)
+        )
+        turn = rng.uniform(0, 7)
+        outline = outline @ [[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]
+        polygons.append((outline + rng.uniform(-extent, extent, 2))[:: rng.choice([-1, 1])])
+    corners, n_corners = stack(polygons)
+    middle = rng.uniform(-extent, extent, (n_walls, 1, 2))
+    walls = middle + rng.normal(0, rng.choice([0.5, 5, 40], (n_walls, 1, 1)), (n_walls, 2, 2))
+    return ScanPlane(corners, n_corners, walls)
+
+
+def compare(scanner, plane, pose, exclude=None):
+    """Number of beams at an edge; all others agree with the definition."""
+    ranges, ids = scanner.scan_with_ids(plane, pose, exclude=exclude)
+    wanted = [
+        laser_reference.scan(scanner, plane, (*pose[:2], pose[2] + turn), exclude=exclude)
+        for turn in (-TURN, 0.0, TURN)
+    ]
+    true = np.array([np.minimum(r, 2 * scanner.max_range) for r, _ in wanted])
+    edge = (np.ptp(true, 0) > TOLERANCE_M) | (np.abs(true[1] - scanner.max_range) < TOLERANCE_M)
+    error = np.abs(np.minimum(ranges, 2 * scanner.max_range) - true[1])
+    assert error[~edge].max(initial=0) <= TOLERANCE_M
+    # Where two things touch, either may be named; inside two footprints, either of them.
+    same = (ids == wanted[1][1]) | (true[1] == 0)
+    assert (same | edge).mean() > 0.99
+    assert not (np.isfinite(ranges) ^ (ids != NO_RETURN)).any()
+    return int(edge.sum())
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    n=st.integers(0, 60),
+    n_walls=st.integers(0, 8),
+    extent=st.sampled_from([5.0, 25.0, 120.0]),
+    yaw=st.floats(-10, 10),
+    scanner=st.sampled_from([LASER, WIDE, LaserScanner(n_beams=1), LaserScanner(n_beams=37, step=0.1)]),
+)
+def test_scans_are_what_the_definition_says(seed, n, n_walls, extent, yaw, scanner):
+    plane = random_plane(np.random.default_rng(seed), n, n_walls, extent)
+    compare(scanner, plane, (0.0, 0.0, yaw))
+
+
+def test_few_beams_are_at_edges_in_a_large_sample():
+    rng = np.random.default_rng(1)
+    edges = beams = 0
+    for _ in range(40):
+        plane = random_plane(rng, int(rng.integers(20, 300)), int(rng.integers(0, 20)), 60.0)
+        for pose in rng.uniform((-50, -50, -4), (50, 50, 4), (5, 3)):
+            edges += compare(LASER, plane, pose)
+            beams += LASER.n_beams
+    assert edges < 1e-3 * beams  # 49 of 216,200
+
+
+def test_a_lot_far_from_the_origin_is_seen_as_exactly():
+    rng = np.random.default_rng(2)
+    near = random_plane(rng, 80, 6, 30.0)
+    corners, n_corners = near.footprints
+    shift = np.array([413_000.25, 5_320_000.5])
+    far = ScanPlane(corners + shift, n_corners, near.walls + shift)
+    assert compare(LASER, far, (*shift, 0.3)) < 10
+
+
+def test_pymunk_sees_the_same():
+    rng = np.random.default_rng(3)
+    plane = random_plane(rng, 120, 8, 40.0)
+    space = static_space(plane)
+    wrong = 0
+    for pose in rng.uniform((-30, -30, -4), (30, 30, 4), (10, 3)):
+        ranges = LASER.scan(plane, pose)
+        if not ranges.any():
+            continue
+        seen = pymunk_scan(space, LASER, pose)
+        wrong += int((np.abs(np.minimum(ranges, 99) - np.minimum(seen, 99)) > TOLERANCE_M).sum())
+    assert wrong <= 10  # beams at edges
+
+
+def static_space(plane):
+    space = pymunk.Space()
+    corners, n_corners = plane.footprints
+    for polygon, k in zip(corners, n_corners, strict=True):
+        space.add(pymunk.Poly(space.static_body, polygon[:k].tolist()))
+    for a, b in plane.walls.tolist():
+        space.add(pymunk.Segment(space.static_body, a, b, 0.0))
+    return space
+
+
+def pymunk_scan(space, scanner, pose):
+    x, y, yaw = map(float, pose)
+    ranges = np.full(scanner.n_beams, np.inf)
+    for i, angle in enumerate((yaw + scanner.angles).tolist()):
+        end = (x + scanner.max_range * math.cos(angle), y + scanner.max_range * math.sin(angle))
+        hit = space.segment_query_first((x, y), end, 0.0, pymunk.ShapeFilter())
+        if hit is not None:
+            ranges[i] = hit.alpha * scanner.max_range
+    return ranges
+
+
+@pytest.mark.parametrize("yaw", np.linspace(-math.pi, math.pi, 17))
+def test_what_lies_across_the_blind_sector_is_seen_at_both_ends(yaw):
+    around = ScanPlane([SQUARE * [1, 40]])  # spans more than the blind sector when behind
+    for scanner in (LASER, WIDE, replace(WIDE, start=-7.0)):
+        assert compare(scanner, around, (0.0, 0.0, yaw)) < 8
+
+
+@pytest.mark.parametrize("distance", [1e-4, 0.01, 0.3, 29.99, 31.0])
+def test_a_wall_close_by_and_one_at_the_range_s_end(distance):
+    for yaw in (0.0, 0.4, math.pi / 2, 3.0):
+        compare(
+            LASER, ScanPlane(np.empty((0, 4, 2)), walls=[[[distance, -60], [distance, 60]]]), (0.0, 0.0, yaw)
+        )
+
+
+def test_no_beam_slips_through_the_joints_of_a_closed_room():
+    outline = regular_polygon(900, radius=9.0)
+    walls = np.stack([outline, np.roll(outline, -1, 0)], 1)
+    plane = ScanPlane(np.empty((0, 4, 2)), walls=walls)
+    poses = np.random.default_rng(0).uniform((-6, -6, -4), (6, 6, 4), (400, 3))
+    assert np.isfinite(LASER.scan_batch(plane, poses)).all()
+
+
+def test_a_face_seen_end_on_is_not_seen():
+    wall = ScanPlane(np.empty((0, 4, 2)), walls=[[[1, 0], [3, 0]]])
+    ranges = LASER.scan(wall, (0, 0, 0))
+    assert np.isinf(np.delete(ranges, 540)).all()
+    assert compare(LASER, ScanPlane([SQUARE]), (0.0, 1.0, 0.0)) <= 4
+
+
+def test_a_sliver_seen_end_on_does_not_cover_the_lens():
+    rng = np.random.default_rng(6)
+    for x, thickness in zip(rng.uniform(1, 29, 200), 10 ** rng.uniform(-5.9, -3, 200), strict=True):
+        sliver = ScanPlane([[[x, 0], [x + 4, 0], [x + 4, thickness], [x, thickness]]])
+        assert LASER.scan(sliver, (0, rng.choice([0.0, thickness]), 0)).all()
+
+
+def test_nothing_there():
+    for plane in (ScanPlane(np.empty((0, 4, 2))), ScanPlane([SQUARE], [0]), ScanPlane([SQUARE + 1000])):
+        ranges, ids = LASER.scan_with_ids(plane, (0, 0, 0), np.random.default_rng(0))
+        assert np.isinf(ranges).all()
+        assert (ids == NO_RETURN).all()
+        assert LASER.scan_batch(plane, np.empty((0, 3))).shape == (0, 1081)
+
+
+def test_ids_name_what_was_hit_and_an_excluded_one_is_looked_through():
+    plane = ScanPlane([SQUARE, SQUARE + np.array([3, 0])], ids=[7, 9], walls=[[[8, -60], [8, 60]]])
+    ahead = LaserScanner(n_beams=3, start=-1.2, step=1.2)
+    ranges, ids = ahead.scan_with_ids(plane, (0, 0, 0))
+    assert (ids.tolist(), ranges[1]) == ([WALL, 7, WALL], 1.0)
+    assert ahead.scan_with_ids(plane, (0, 0, 0), exclude=7)[1].tolist() == [WALL, 9, WALL]
+    batch, ids = ahead.scan_batch_with_ids(plane, np.zeros((3, 3)), exclude=[7, -1, 9])
+    assert ids[:, 1].tolist() == [9, 7, 7]
+    assert batch[:, 1].tolist() == [4.0, 1.0, 1.0]
+
+
+def test_inside_a_footprint_the_lens_is_covered_unless_it_is_one_s_own():
+    plane = ScanPlane(*stack([regular_polygon(8), SQUARE + np.array([3, 0])]), ids=[4, 5])
+    ranges, ids = LASER.scan_with_ids(plane, (0.2, 0.1, 0))
+    assert not ranges.any()
+    assert (ids == 4).all()
+    assert compare(LASER, plane, (0.2, 0.1, 0.0), exclude=4) < 4
+    # In the circle around a slim footprint, but not in the footprint.
+    compare(LASER, ScanPlane([SQUARE * [0.1, 9]]), (0.05, 0.5, 0.0))
+
+
+def test_changing_one_footprint_is_as_building_anew():
+    rng = np.random.default_rng(5)
+    plane = random_plane(rng, 150, 5, 60.0)
+    corners, n_corners = plane.footprints
+    for step in range(400):
+        i = int(rng.integers(150))
+        k = int(rng.choice([0, 3, 4, 8, 12]))
+        new = (
+            regular_polygon(k, *rng.uniform(-70, 70, 2), rng.choice([1.0, 2.0, 12.0]))
+            if k
+            else np.empty((0, 2))
+        )
+        corners[i] = 0
+        corners[i, :k], n_corners[i] = new, k
+        if step % 2:
+            plane.replace(i, new if k else None)
+        else:
+            before = LASER.scan(plane, (0, 0, 0))
+            plane, old = plane.with_footprint(i, new if k else None), plane
+            np.testing.assert_array_equal(LASER.scan(old, (0, 0, 0)), before)
+        if step % 20 == 19:
+            anew = ScanPlane(corners, n_corners, plane.walls)
+            poses = rng.uniform((-60, -60, -4), (60, 60, 4), (5, 3))
+            np.testing.assert_allclose(
+                LASER.scan_batch(plane, poses), LASER.scan_batch(anew, poses), atol=1e-4
+            )
+
+
+def test_orientation_and_corners_on_a_straight_edge_do_not_matter():
+    with_midpoints = np.insert(SQUARE, [1, 2], [[1.5, -1], [2, 0]], axis=0)
+    pose = (-1.0, 0.3, 0.2)
+    wanted = LASER.scan(ScanPlane([SQUARE]), pose)
+    np.testing.assert_allclose(LASER.scan(ScanPlane([SQUARE[::-1]]), pose), wanted, atol=1e-6)
+    np.testing.assert_allclose(LASER.scan(ScanPlane([with_midpoints]), pose), wanted, atol=1e-6)
+
+
+def test_thousands_of_footprints():
+    x, y = np.meshgrid(np.arange(100) * 2.5, np.arange(50) * 8.0)
+    rectangles = np.column_stack([x.ravel(), y.ravel()])[:, None] + [
+        [-0.9, -2.2],
+        [0.9, -2.2],
+        [0.9, 2.2],
+        [-0.9, 2.2],
+    ]
+    plane = ScanPlane(rectangles)
+    assert compare(LASER, plane, (120.3, 204.0, 0.1)) < 10
+
+
+def test_noise_has_the_spread_and_the_losses_that_were_asked_for():
+    plane = ScanPlane(np.empty((0, 4, 2)), walls=[[[5, -90], [5, 90]]])
+    scanner = LaserScanner(n_beams=201, start=-0.5, step=0.005, noise_sd=0.03, dropout=0.1)
+    poses = np.zeros((2000, 3))
+    noisy = scanner.scan_batch(plane, poses, np.random.default_rng(0)).astype(float)
+    error = noisy - scanner.scan(plane, (0, 0, 0))
+    kept = np.isfinite(noisy)
+    assert 1 - kept.mean() == pytest.approx(0.1, abs=2e-3)
+    assert error[kept].mean() == pytest.approx(0, abs=3e-4)
+    assert error[kept].std() == pytest.approx(0.03, rel=0.01)
+    assert np.mean(np.abs(error[kept]) < 0.03) == pytest.approx(0.6827, abs=4e-3)
+    # Neighbouring beams and successive scans are independent.
+    filled = np.where(kept, error, 0.0)
+    assert abs(np.corrcoef(filled[:, :-1].ravel(), filled[:, 1:].ravel())[0, 1]) < 0.01
+    assert abs(np.corrcoef(filled[:-1].ravel(), filled[1:].ravel())[0, 1]) < 0.01
+
+
+def test_noisy_ranges_stay_between_zero_and_the_maximum():
+    plane = ScanPlane([SQUARE], walls=[[[-29.9, -90], [-29.9, 90]]])
+    noisy = replace(WIDE, noise_sd=5.0, dropout=0.0).scan_batch(
+        plane, np.zeros((50, 3)), np.random.default_rng(0)
+    )
+    finite = noisy[np.isfinite(noisy)]
+    assert finite.min() == 0.0
+    assert finite.max() == 30.0
+    assert np.isinf(replace(LASER, dropout=1.0).scan(plane, (0, 0, 0), np.random.default_rng(0))).all()
+
+
+def test_equal_seeds_give_equal_scans_on_any_number_of_threads():
+    rng = np.random.default_rng(8)
+    plane = random_plane(rng, 100, 4, 40.0)
+    poses = rng.uniform((-30, -30, -4), (30, 30, 4), (64, 3))
+    alone = LASER.scan_batch(plane, poses, np.random.default_rng(3))
+    with ThreadPoolExecutor(4) as pool:
+        for scans in pool.map(lambda _: LASER.scan_batch(plane, poses, np.random.default_rng(3)), range(8)):
+            np.testing.assert_array_equal(scans, alone)
+    np.testing.assert_array_equal(LASER.scan(plane, poses[5]), LASER.scan_batch(plane, poses)[5])
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ScanPlane([SQUARE * np.nan]), r"footprints\[0, 0, 0\]: wanted a finite number, got nan"),
+        (lambda: ScanPlane([SQUARE * [0, 1]]), r"footprints\[0\]: wanted "),
+        (lambda: ScanPlane([SQUARE, SQUARE * [1, 0]]), r"footprints\[1\]: wanted "),
+        (lambda: ScanPlane([[[0, 0], [1, 1], [2, 2]]]), r"footprints\[0\]: wanted an area above zero"),
+        (lambda: ScanPlane([[[0, 0], [4, 0], [1, 1], [0, 4]]]), r"footprints\[0\]: wanted a convex outline"),
+        (
+            lambda: ScanPlane([regular_polygon(5)[[0, 2, 4, 1, 3]]]),
+            r"footprints\[0\]: wanted a convex outline",
+        ),
+        (lambda: ScanPlane([SQUARE], [2]), r"n_corners\[0\]: wanted 3 to 4"),
+        (lambda: ScanPlane([SQUARE], [4, 4]), r"n_corners: wanted \(1,\) integers"),
+        (lambda: ScanPlane([SQUARE], ids=[-3]), "ids: wanted 0 or more, got -3"),
+        (lambda: ScanPlane([SQUARE], walls=[[[1, 1], [1, 1]]]), r"walls\[0\]: wanted two ends apart"),
+        (lambda: ScanPlane(SQUARE), r"footprints: wanted shape \(any, any, 2\), got \(4, 2\)"),
+        (lambda: ScanPlane([["a"]]), "footprints: wanted numbers"),
+        (lambda: ScanPlane([SQUARE]).replace(1, SQUARE), "index: wanted 0 to 0, got 1"),
+        (lambda: ScanPlane([SQUARE]).replace(0, regular_polygon(9)), "corners: wanted at most 4, got 9"),
+        (lambda: LASER.scan(ScanPlane([SQUARE]), (0, math.nan, 0)), "pose: wanted finite x, y and yaw"),
+        (lambda: LASER.scan(ScanPlane([SQUARE]), (0, 0)), r"pose: wanted shape \(3,\), got \(2,\)"),
+        (
+            lambda: LASER.scan_batch(ScanPlane([SQUARE]), (0, 0, 0)),
+            r"poses: wanted shape \(b, 3\), got \(3,\)",
+        ),
+        (lambda: LASER.scan_batch(ScanPlane([SQUARE]), [(0, 0, math.inf)]), "poses: wanted finite"),
+        (lambda: LASER.scan(ScanPlane([SQUARE]), (0, 0, 0), exclude=1.5), "exclude: wanted an id"),
+        (lambda: LaserScanner(n_beams=0), "n_beams: wanted an integer of 1 or more, got 0"),
+        (lambda: LaserScanner(step=0.1), "step: wanted above 0 and 1081 beams within one turn"),
+        (lambda: LaserScanner(start=math.nan), "start: wanted a finite number, got nan"),
+        (lambda: LaserScanner(max_range=-1.0), "max_range: wanted above 0 m, got -1.0"),
+        (lambda: LaserScanner(noise_sd=-0.1), "noise_sd: wanted 0 m or more, got -0.1"),
+        (lambda: LaserScanner(dropout=1.1), "dropout: wanted 0 to 1, got 1.1"),
+    ],
+)
+def test_bad_input_is_named(make, message):
+    with pytest.raises(SensorError, match=message):
+        make()
+
+
+def test_a_refused_change_changes_nothing():
+    plane = ScanPlane([SQUARE])
+    with pytest.raises(SensorError, match="wanted a convex outline"):
+        plane.replace(0, [[0, 0], [4, 0], [1, 1], [0, 4]])
+    np.testing.assert_array_equal(plane.footprints[0][0], SQUARE)

@@ -1,0 +1,175 @@
+"""The z-buffer against an independent ray caster, near clipping, watertight edges, any thread count."""
+
+import math
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from toy_scene import box_mesh, random_boxes, ray_depth, toy_scene
+
+from sim_sensors.camera import PinholeCamera, camera_pose
+from sim_sensors.mesh import Material
+from sim_sensors.projection import NEAR, project
+from sim_sensors.rasterizer import FAR, interleaved
+
+
+def plain_camera(width=160, height=120, horizontal=1.1):
+    return PinholeCamera.from_field_of_view(width, height, horizontal)
+
+
+def depth_of(scene, camera, pose):
+    _, seen = camera.visibility(scene, pose)
+    with np.errstate(divide="ignore"):
+        return 1.0 / seen.inverse_depth
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_depth_agrees_with_a_ray_caster(seed):
+    scene = random_boxes(seed)
+    camera = plain_camera()
+    generator = np.random.default_rng(seed)
+    pose = camera_pose(0.0, 0.0, 1.4, *generator.uniform((-3.0, -0.3, -0.4), (3.0, 0.2, 0.4)))
+    ours, theirs = depth_of(scene, camera, pose), ray_depth(scene, camera, pose)
+    assert np.array_equal(np.isinf(ours), np.isinf(theirs))
+    seen = np.isfinite(theirs)
+    error = np.abs(ours[seen] - theirs[seen])
+    assert np.median(error) < 1e-3
+    assert np.mean(error > 0.01) < 0.002
+
+
+def test_depth_agrees_with_embree():
+    trimesh = pytest.importorskip("trimesh")
+    embree = pytest.importorskip("trimesh.ray.ray_pyembree")
+    scene = random_boxes(11, count=60)
+    camera = PinholeCamera()
+    pose = camera_pose(0.0, 0.0, 1.4, 0.7, -0.05, 0.1)
+    corners = scene.soup()
+    mesh = trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+    rays = camera_rays(camera) @ pose[:3, :3].T
+    origin = np.broadcast_to(pose[:3, 3], rays.shape)
+    hit, ray = embree.RayMeshIntersector(mesh).intersects_id(origin, rays, multiple_hits=False)[:2]
+    a, b, c = corners[hit].transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    depth = np.full(len(rays), np.inf)
+    depth[ray] = ((a - origin[ray]) * normal).sum(1) / (rays[ray] * normal).sum(1)
+    with np.errstate(divide="ignore"):
+        ground = np.where(rays[:, 2] < 0.0, -1.4 / rays[:, 2], np.inf)
+    ground[ground > FAR] = np.inf
+    theirs = np.minimum(depth, ground).reshape(camera.height, camera.width)
+    ours = depth_of(scene, camera, pose)
+    seen = np.isfinite(theirs) & np.isfinite(ours)
+    error = np.abs(ours[seen] - theirs[seen])
+    assert np.median(error) < 1e-3
+    assert np.mean(error > 0.01) < 0.002
+    assert np.mean(np.isfinite(theirs) != np.isfinite(ours)) < 0.002
+
+
+def camera_rays(camera):
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], axis=-1)
+    return rays.reshape(-1, 3)
+
+
+def test_a_wall_beside_and_behind_the_camera_is_clipped_not_dropped():
+    # One 40 m quad of two triangles passes 0.3 m to the right of the camera, from far behind to far ahead.
+    scene = toy_scene([box_mesh(40.0, 0.2, 3.0, Material.STONE)], [(0, 0.0, -0.4, 0.0, 0.0)], [0])
+    camera, pose = plain_camera(), camera_pose(0.0, 0.0, 1.2, 0.0)
+    ours, theirs = depth_of(scene, camera, pose), ray_depth(scene, camera, pose)
+    # At the right edge the wall is 0.3 m / tan(half the field of view) away.
+    assert ours[60, -1] == pytest.approx(0.3 / ((159.5 - camera.cx) / camera.fx), rel=1e-4)
+    same = np.isfinite(theirs)
+    assert np.abs(ours[same] - theirs[same]).max() < 1e-2
+
+
+def test_what_is_nearer_than_the_near_plane_is_not_drawn():
+    scene = toy_scene([box_mesh(0.02, 4.0, 4.0, Material.STONE)], [(0, 0.03, 0.0, 0.0, 0.0)], [0])
+    ours = depth_of(scene, plain_camera(), camera_pose(0.0, 0.0, 1.2, 0.0))
+    assert NEAR > 0.04
+    assert not (ours < NEAR).any()
+
+
+@given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-3.0, 3.0))
+@settings(max_examples=25, deadline=None)
+def test_no_gap_where_triangles_meet(x, z, roll):
+    # A finely split wall fills the view: every pixel must be on it.
+    scene = toy_scene(
+        [box_mesh(0.5, 90.0, 60.0, Material.STONE, splits=23)], [(0, 8.0, 0.0, -20.0, 0.0)], [0]
+    )
+    camera = plain_camera(horizontal=0.9)
+    _, seen = camera.visibility(scene, camera_pose(x, 0.0, 8.0 + z, 0.0, 0.0, roll))
+    assert (seen.triangle >= 0).all()
+
+
+def test_ground_depth_to_the_horizon():
+    scene = toy_scene([box_mesh(1.0, 1.0, 1.0)], [(0, -50.0, 0.0, 0.0, 0.0)], [1])
+    camera = plain_camera()
+    depth = depth_of(scene, camera, camera_pose(0.0, 0.0, 1.5, 0.3))
+    below = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
+    expected = np.where(below > 0.0, 1.5 / np.maximum(below, 1e-12), np.inf)
+    expected[expected > FAR] = np.inf
+    np.testing.assert_allclose(depth, np.broadcast_to(expected[:, None], depth.shape), rtol=1e-6)
+
+
+def test_glass_is_found_apart_from_what_is_behind():
+    pane = box_mesh(0.01, 2.0, 2.0, Material.GLASS)
+    wall = box_mesh(0.5, 9.0, 9.0, Material.STONE)
+    scene = toy_scene([pane, wall], [(0, 3.0, 0.0, 0.2, 0.0), (1, 6.25, 0.0, 0.0, 0.0)], [1, 0])
+    camera = plain_camera()
+    _, seen = camera.visibility(scene, camera_pose(0.0, 0.0, 1.2, 0.0))
+    assert 1.0 / seen.inverse_depth[60, 80] == pytest.approx(6.0, abs=1e-4)
+    assert 1.0 / seen.pane_inverse_depth[60, 80] == pytest.approx(2.995, abs=1e-4)
+    assert seen.n_panes[60, 80] == 2
+    assert seen.pane[60, 0] == -1
+
+
+def test_glass_behind_a_wall_is_not_seen():
+    pane = box_mesh(0.01, 2.0, 2.0, Material.GLASS)
+    wall = box_mesh(0.5, 9.0, 9.0, Material.STONE)
+    scene = toy_scene([pane, wall], [(0, 8.0, 0.0, 0.2, 0.0), (1, 6.25, 0.0, 0.0, 0.0)], [1, 0])
+    _, seen = plain_camera().visibility(scene, camera_pose(0.0, 0.0, 1.2, 0.0))
+    assert (seen.pane == -1).all()
+
+
+def test_same_result_on_any_number_of_threads():
+    scene, camera = random_boxes(2, count=80), plain_camera(320, 240)
+    pose = camera_pose(0.0, 0.0, 1.4, 0.5)
+    before = numba.get_num_threads()
+    results = []
+    try:
+        for threads in sorted({1, before}):
+            numba.set_num_threads(threads)
+            results.append(camera.visibility(scene, pose)[1])
+    finally:
+        numba.set_num_threads(before)
+    for one, other in zip(results[0], results[-1], strict=True):
+        assert np.array_equal(one, other)
+
+
+def test_far_instances_are_drawn_coarse():
+    fine, coarse = box_mesh(4.0, 2.0, 1.5, splits=8), box_mesh(4.0, 2.0, 1.5)
+    scene = toy_scene(
+        [fine, coarse], [(0, 6.0, 0.0, 0.0, 0.0), (0, 40.0, 3.0, 0.0, 0.0)], [1, 2], coarse=[1, 1]
+    )
+    camera, pose = plain_camera(640, 480), camera_pose(0.0, 0.0, 1.4, 0.0)
+    size = (camera.width, camera.height)
+    near_fine = project(scene.pool, scene.instances, pose, camera.intrinsics, size, 20.0)
+    all_fine = project(scene.pool, scene.instances, pose, camera.intrinsics, size, math.inf)
+    assert (near_fine.instance == 1).sum() < (all_fine.instance == 1).sum()
+    assert (near_fine.instance == 0).sum() == (all_fine.instance == 0).sum()
+
+
+def test_what_is_out_of_view_is_culled():
+    scene = toy_scene(
+        [box_mesh(4.0, 2.0, 1.5)], [(0, -10.0, 0.0, 0.0, 0.0), (0, 0.0, 30.0, 0.0, 0.0)], [1, 2]
+    )
+    camera = plain_camera()
+    size = (camera.width, camera.height)
+    triangles = project(scene.pool, scene.instances, camera_pose(0.0, 0.0, 1.4, 0.0), camera.intrinsics, size)
+    assert len(triangles.corners) == 0
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 8, 30, 31])
+def test_interleaving_is_a_permutation(n):
+    assert sorted(interleaved(n)) == list(range(n))

@@ -1,0 +1,339 @@
+"""Scenes: plain arrays and lots in, meshes and footprints out; changing one vehicle leaves the rest alone."""
+
+import time
+import warnings
+
+import numpy as np
+import pytest
+from shapely.geometry import LineString, Polygon
+
+from sim_sensors.errors import SensorError
+from sim_sensors.footprints import ScanPlane
+from sim_sensors.mesh import Material
+from sim_sensors.scene import OverlapWarning, Scene, overlapping
+from sim_sensors.scenery import (
+    building_mesh,
+    kerb_mesh,
+    lamp_post_mesh,
+    pedestrian_footprint,
+    pedestrian_mesh,
+    tree_mesh,
+    wall_mesh,
+)
+from sim_sensors.slot_scenes import ParkingManners, SlotLot, scene_of_slots, vehicle_library
+from sim_sensors.surroundings import Surroundings
+from sim_sensors.vehicles import VehicleModel
+
+AROUND = {
+    "buildings": [[[-5, 20], [40, 20], [40, 30], [-5, 30]]],
+    "walls": [[-6, -4, -6, 9, 1.6], [0, -5, 9, -5, 0.4]],
+    "kerbs": [[[0, 15], [20, 15], [25, 17]]],
+    "trees": [[3, 17, 7], [9, 17, 8]],
+    "lamp_posts": [[6, 17, -1.57]],
+    "pedestrians": [[4, 5, 0.3, 0.1]],
+}
+
+
+def rows_of_slots(n=20):
+    x = 2.5 * np.arange(n)
+    xy = np.concatenate([np.column_stack([x, 0 * x]), np.column_stack([x, 0 * x + 11])])
+    return xy, np.repeat([-np.pi / 2, np.pi / 2], n)
+
+
+def lot(n=20, **options):
+    xy, yaw = rows_of_slots(n)
+    return SlotLot(xy, yaw, 5.0, 2.5, **options)
+
+
+# --- from plain arrays -------------------------------------------------------------------------------
+
+
+def test_a_scene_holds_what_it_was_given():
+    scene = Scene.from_arrays(
+        [[0, 0, 0], [4, 0, 1.5], [9, 0, 0]],
+        [1, 2, 1],
+        ["suv", None, "suv"],
+        [(200, 0, 0), None, None],
+        Surroundings(**AROUND, paved=[[[0, 0], [9, 0], [9, 9]]], markings=[[0, 0, 0, 5, 0.1]]),
+    )
+    first, third = (scene.fleet.models[scene.vehicle_model[i]] for i in (0, 2))
+    assert first.paint == (200, 0, 0)
+    assert first.painted(third.paint) == third == VehicleModel.from_seed("suv", 1)
+    np.testing.assert_array_equal(scene.vehicle_boxes[0], first.size)
+    ids = scene.instances.ids
+    assert ids[-3:].tolist() == [1, 2, 3]
+    assert not ids[:-3].any()
+    assert len(ids) == 3 + 1 + 2 + 1 + 2 + 1 + 1
+    assert scene.ground.markings.shape == (1, 5)
+    assert len(scene.ground.paved) == 1
+
+
+def test_the_pool_holds_every_mesh_and_its_coarse_one():
+    scene = Scene.from_arrays([[0, 0, 0], [4, 0, 1.5]], [1, 2], surroundings=Surroundings(**AROUND))
+    pool = scene.pool
+    n = len(pool.radius)
+    assert len(pool.vertex_start) == len(pool.triangle_start) == n + 1
+    assert pool.vertex_start[-1] == len(pool.vertices) == len(pool.normals)
+    assert pool.triangle_start[-1] == len(pool.triangles) == len(pool.material) == len(pool.color)
+    for m in range(n):
+        part = pool.triangles[pool.triangle_start[m] : pool.triangle_start[m + 1]]
+        size = pool.vertex_start[m + 1] - pool.vertex_start[m]
+        assert part.min() == 0
+        assert part.max() == size - 1
+    count = np.diff(pool.triangle_start)
+    vehicles = scene.instances.mesh[scene.instances.ids > 0]
+    assert (count[pool.coarse[vehicles]] * 4 < count[vehicles]).all()
+    assert np.array_equal(pool.coarse[pool.coarse], pool.coarse)
+    assert np.array_equal(scene.coarse_instances.pose, scene.instances.pose)
+    model = scene.fleet.models[1]
+    m = vehicles[1]
+    np.testing.assert_array_equal(
+        pool.vertices[pool.vertex_start[m] : pool.vertex_start[m + 1]], model.mesh().vertices
+    )
+
+
+def test_footprints_are_where_the_vehicles_stand():
+    scene = Scene.from_arrays([[10, 5, 0.7], [20, 0, 0]], [1, 2], surroundings=Surroundings(**AROUND))
+    prints = scene.footprints()
+    assert prints.ids[:2].tolist() == [1, 2]
+    assert not prints.ids[2:].any()
+    assert len(prints.ids) == 2 + 2 + 1 + 1
+    model = scene.fleet.models[0]
+    shape = Polygon(prints.corners[0, : prints.n_corners[0]])
+    assert shape.exterior.is_ccw
+    assert shape.area == pytest.approx(Polygon(model.footprint()).area)
+    heading = np.array([np.cos(0.7), np.sin(0.7)])
+    front = np.array([10, 5]) + heading * model.footprint()[:, 0].max()
+    assert shape.distance(LineString([[10, 5], front]).interpolate(1.0, normalized=True)) < 0.05
+    np.testing.assert_array_equal(prints.corners[0, : prints.n_corners[0]], scene.footprint(0))
+    # The low wall is passed over, the high one is met on four sides, the building on four.
+    assert len(prints.walls) == 4 + 4
+    plane = ScanPlane(prints.corners, prints.n_corners, prints.walls, prints.ids)
+    assert plane.n_footprints == 6
+
+
+def test_an_empty_scene_is_a_scene():
+    scene = Scene.from_arrays(np.empty((0, 3)), np.empty(0, int))
+    assert scene.n_vehicles == 0
+    assert len(scene.pool.vertices) == 0
+    assert scene.footprints().corners.shape[0] == 0
+    assert len(scene.instances.ids) == 0
+
+
+# --- changing one vehicle ----------------------------------------------------------------------------
+
+
+def test_changing_one_slot_leaves_every_other_array_as_it_was():
+    parking = lot(seed=5)
+    scene = parking.scene(np.ones(40, bool))
+    pool, before, prints = scene.pool, scene.instances, scene.footprints()
+    gone = scene.without_vehicle(7)
+    back = parking.filled(gone, 7, 0)
+    other = parking.filled(gone, 7, 1)
+    for changed in (gone, back, other):
+        assert changed.pool is pool
+        assert changed.ground is scene.ground
+        keep = changed.instances.ids != 8
+        kept = before.ids != 8
+        for name in ("mesh", "pose", "ids"):
+            np.testing.assert_array_equal(getattr(changed.instances, name)[keep], getattr(before, name)[kept])
+        rest = np.arange(len(prints.ids)) != 7
+        np.testing.assert_array_equal(changed.footprints().corners[rest], prints.corners[rest])
+    assert gone.footprints().n_corners[7] == 0
+    assert gone.footprint(7).shape == (0, 2)
+    np.testing.assert_array_equal(back.instances.pose, before.pose)
+    assert not np.array_equal(other.vehicle_pose[7], scene.vehicle_pose[7])
+    assert scene.vehicle_model[7] >= 0
+
+
+def test_the_car_in_a_slot_depends_on_seed_slot_and_arrival_alone():
+    parking = lot(seed=5)
+    rng = np.random.default_rng(0)
+    full = parking.scene(np.ones(40, bool))
+    occupied = rng.random(40) < 0.5
+    some = parking.scene(occupied)
+    np.testing.assert_array_equal(some.vehicle_pose[occupied], full.vehicle_pose[occupied])
+    np.testing.assert_array_equal(some.vehicle_model[occupied], full.vehicle_model[occupied])
+    assert (some.vehicle_model[~occupied] == -1).all()
+    again = parking.scene(np.ones(40, bool), np.where(np.arange(40) == 3, 1, 0))
+    assert np.flatnonzero((again.vehicle_pose != full.vehicle_pose).any(axis=1)).tolist() == [3]
+    assert not np.array_equal(lot(seed=6).scene(np.ones(40, bool)).vehicle_pose, full.vehicle_pose)
+
+
+def test_a_model_that_the_fleet_lacks_is_added_behind_the_others():
+    scene = Scene.from_arrays([[0, 0, 0], [9, 0, 0]], [1, 2])
+    pool = scene.pool
+    new = VehicleModel.from_seed("pickup", 77)
+    changed = scene.with_vehicle(1, model=new, pose=(12, 3, 1.0))
+    assert changed.fleet.models[:2] == scene.fleet.models
+    assert changed.vehicle_pose[1].tolist() == [12, 3, 1]
+    np.testing.assert_array_equal(changed.pool.vertices[: len(pool.vertices)], pool.vertices)
+    whole = Scene(
+        changed.vehicle_pose, changed.vehicle_model, type(scene.fleet)(changed.fleet.models, Surroundings())
+    )
+    for name in ("vertices", "triangles", "color", "vertex_start", "triangle_start", "radius", "coarse"):
+        np.testing.assert_array_equal(getattr(changed.pool, name), getattr(whole.pool, name))
+
+
+def test_a_lot_of_200_cars_is_quick_and_a_change_quicker():
+    parking = lot(100, seed=1)
+    scene = parking.scene(np.ones(200, bool))
+    assert scene.pool is not None
+    start = time.perf_counter()
+    for k in range(20):
+        changed = parking.filled(scene.without_vehicle(k), k, 3)
+        assert len(changed.instances.ids) == 200
+    assert (time.perf_counter() - start) / 20 < 0.01  # 1 ms where nothing else runs
+
+
+# --- lots --------------------------------------------------------------------------------------------
+
+
+def test_cars_park_as_the_manners_say():
+    xy = 50.0 * np.column_stack([np.arange(1500), np.zeros(1500)])
+    parking = SlotLot(xy, np.zeros(1500), 5.2, 3.4, seed=2)
+    scene = parking.scene(np.ones(1500, bool))
+    offset = scene.vehicle_pose[:, :2] - xy
+    turn = np.mod(scene.vehicle_pose[:, 2] + np.pi / 2, np.pi) - np.pi / 2
+    assert offset[:, 1].std() == pytest.approx(0.12, rel=0.1)
+    assert offset[:, 0].std() == pytest.approx(0.20, rel=0.15)
+    assert turn.std() == pytest.approx(np.radians(1.5), rel=0.1)
+    assert np.mean(np.abs(scene.vehicle_pose[:, 2]) > 1) == pytest.approx(0.25, abs=0.04)
+
+
+def test_only_models_that_fit_are_chosen_and_none_overlap():
+    for width, length in ((2.3, 5.0), (2.5, 4.6), (2.7, 6.0)):
+        x = width * np.arange(150)
+        xy = np.column_stack([x, 0 * x])
+        parking = SlotLot(xy, np.full(150, np.pi / 2), length, width, seed=4)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", OverlapWarning)
+            boxes = parking.scene(np.ones(150, bool)).vehicle_boxes
+        assert boxes[:, 0].max() <= length + 0.2
+        assert boxes[:, 1].max() <= width - 0.4
+
+
+def test_kerbside_cars_stand_one_way_with_room_between():
+    xy = np.column_stack([6.0 * np.arange(80), np.zeros(80)])
+    scene = SlotLot(xy, np.zeros(80), 6.0, 2.2, True, seed=1).scene(np.ones(80, bool))
+    assert np.abs(scene.vehicle_pose[:, 2]).max() < 0.1
+    assert scene.vehicle_boxes[:, 0].max() <= 5.8
+
+
+def test_a_lot_becomes_a_scene_in_one_call():
+    xy, yaw = rows_of_slots(4)
+    occupied = np.array([1, 0, 1, 1, 0, 0, 1, 0], bool)
+    scene = scene_of_slots(xy, yaw, 5.0, 2.5, occupied, lanes=[[[-5, 5.5], [30, 5.5]]], seed=3, **AROUND)
+    assert scene.present.tolist() == np.flatnonzero(occupied).tolist()
+    assert len(scene.ground.markings) == 10  # five lines a row: a shared line is painted once
+    paved = Polygon(scene.ground.paved[0])
+    assert paved.contains(LineString([[-5, 5.5], [30, 5.5]]))
+    assert len(scene.footprints().walls) == 8
+
+
+# --- scenery -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        building_mesh([[0, 0], [20, 0], [20, 12], [10, 12], [10, 8], [0, 8]], 9.0, 1),
+        wall_mesh([0, 0], [5, 1], 2.0, 0.24, 1),
+        kerb_mesh([[0, 0], [5, 0], [9, 4]]),
+        tree_mesh(7.0, 3),
+        lamp_post_mesh(),
+        pedestrian_mesh(0.0, 1),
+        pedestrian_mesh(0.25, 2),
+    ],
+    ids=["building", "wall", "kerb", "tree", "lamp post", "striding", "passing"],
+)
+def test_scenery_is_turned_the_right_way_round(mesh):
+    np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
+    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(float), 1, 0)
+    face = np.cross(b - a, c - a)
+    assert (np.sum(face * mesh.normals[mesh.triangles[:, 0]], axis=1) > 0).all()
+    assert np.sum(a * face) > 0  # volume
+    assert mesh.vertices[:, 2].min() > -0.02
+
+
+def test_facades_have_depth():
+    mesh = building_mesh([[0, 0], [30, 0], [30, 10], [0, 10]], 9.0, 1)
+    front = mesh.vertices[np.abs(mesh.vertices[:, 1]) < 0.3]
+    assert len(np.unique(np.round(front[:, 1], 2))) >= 4
+    assert np.sum(mesh.material == Material.GLASS) > 40
+
+
+def test_people_have_their_legs_inside_their_footprint():
+    for phase in (0.0, 0.25, 0.6):
+        mesh = pedestrian_mesh(phase, 4)
+        knee = mesh.vertices[(mesh.vertices[:, 2] > 0.45) & (mesh.vertices[:, 2] < 0.55), :2]
+        shape = Polygon(pedestrian_footprint(phase)).buffer(0.03)
+        assert all(shape.contains(LineString([p, p + 1e-6])) for p in knee)
+
+
+# --- bad input ---------------------------------------------------------------------------------------
+
+
+def test_overlapping_cars_are_allowed_and_warned_of():
+    with pytest.warns(OverlapWarning, match="vehicles 0 and 2 overlap"):
+        scene = Scene.from_arrays([[0, 0, 0], [20, 0, 0], [1, 1, 0.3]], [1, 2, 3])
+    assert scene.n_vehicles == 3
+    apart = scene.with_vehicle(2, pose=(40, 0, 0))
+    with pytest.warns(OverlapWarning, match="vehicles 2 and 1 overlap"):
+        apart.with_vehicle(2, pose=(20, 1, 0))
+
+
+def test_overlap_is_told_apart_from_closeness():
+    size = np.array([[4.0, 1.8, 1.5]] * 2)
+    for yaw, gap, meets in ((0.0, 1.81, False), (0.0, 1.79, True), (0.5, 1.9, True)):
+        pose = np.array([[0, 0, 0], [0, gap, yaw]])
+        assert (len(overlapping(pose, size)) == 1) == meets
+
+
+@pytest.mark.parametrize(
+    ("call", "match"),
+    [
+        (lambda: Scene.from_arrays([[0, np.nan, 0]], [1]), r"poses\[0, 1\]: wanted a finite number"),
+        (lambda: Scene.from_arrays([[0, 0]], [1]), r"poses: wanted shape \(n, 3\)"),
+        (lambda: Scene.from_arrays([[0, 0, 0]], [1, 2]), "seeds"),
+        (lambda: Scene.from_arrays([[0, 0, 0]], [1.5]), "seeds"),
+        (lambda: Scene.from_arrays([[0, 0, 0]], [1], ["tank"]), "body"),
+        (lambda: Scene.from_arrays([[0, 0, 0]], [1], ["van", "van"]), "bodies"),
+        (lambda: Scene.from_arrays([[0, 0, 0]], [1]).with_vehicle(1), "place: wanted 0 to 0, got 1"),
+        (lambda: Scene.from_arrays([[0, 0, 0]], [1]).with_vehicle(0, pose=(0, 0, np.inf)), "pose"),
+        (
+            lambda: Scene.from_arrays([[0, 0, 0]], [1]).without_vehicle(0).with_vehicle(0),
+            "model: place 0 is empty",
+        ),
+        (lambda: Scene.from_arrays([[0, 0, 0]], [1]).with_vehicle(0, pose=(0, 0)), "pose"),
+        (lambda: lot().scene(np.ones(3, bool)), r"occupied: wanted \(40,\) bool"),
+        (lambda: lot().scene(np.ones(40)), "occupied"),
+        (lambda: lot().scene(np.ones(40, bool), -1), "arrivals"),
+        (lambda: SlotLot([[0, 0]], [0], 0.0, 2.5), "slot_length: wanted lengths above 0"),
+        (lambda: SlotLot([[0, 0]], [0], 5.0, 1.2), "slot 0: no vehicle fits"),
+        (lambda: SlotLot([[0, 0]], [0, 1], 5.0, 2.5), "slot_yaw"),
+        (lambda: SlotLot([[0, 0]], [0], 5.0, 2.5, seed=-1), "seed"),
+        (lambda: ParkingManners(nose_out=1.5), "nose_out"),
+        (lambda: ParkingManners(lateral_m=-1), "lateral_m"),
+        (lambda: Surroundings(walls=[[0, 0, 0, 0, 1]]), r"walls\[0\]: wanted two ends apart"),
+        (lambda: Surroundings(walls=[[0, 0, 3, 0, 0]]), "walls: wanted a height above 0"),
+        (lambda: Surroundings(trees=[[0, 0]]), "trees: wanted shape"),
+        (lambda: Surroundings(trees=[[0, 0, 0.2]]), "trees: wanted heights"),
+        (lambda: Surroundings(buildings=[[[0, 0], [1, 0]]]), "buildings"),
+        (
+            lambda: Surroundings(buildings=[[[0, 0], [1, 0], [2, 0]]]),
+            "buildings: wanted an outline with an area",
+        ),
+        (lambda: Surroundings(building_heights=[4]), "building_heights"),
+        (lambda: Surroundings(seed=-2), "seed"),
+    ],
+)
+def test_bad_input_is_refused_with_one_clear_line(call, match):
+    with pytest.raises(SensorError, match=match) as caught:
+        call()
+    assert "\n" not in str(caught.value)
+
+
+def test_the_library_has_every_body_but_rare_ones():
+    bodies = {m.body for m in vehicle_library()}
+    assert bodies >= {"hatchback", "sedan", "estate", "suv", "van"}

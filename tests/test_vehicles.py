@@ -1,0 +1,265 @@
+"""Vehicle models: sizes by class, meshes that are closed and rightly turned round, footprints that match them."""
+
+import hashlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from shapely.geometry import MultiPoint, Polygon
+
+from sim_sensors.errors import SensorError
+from sim_sensors.mesh import Material
+from sim_sensors.surfaces import ShapeBuilder
+from sim_sensors.vehicle_classes import BODIES, BODY_SHARE, PAINTS, SIZE_CLASSES
+from sim_sensors.vehicles import COARSE, DETAILED, FOOTPRINT_CORNERS, KNEE_M, VehicleModel
+
+SEEDS = range(6)
+MIRRORS_M = 0.30  # both, beyond the body's sides
+
+
+def corners(mesh):
+    return mesh.vertices[mesh.triangles].astype(np.float64)
+
+
+def section(mesh, height):
+    """Where the edges of all triangles cross a height, (n, 2)."""
+    ends = corners(mesh)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2, 3)
+    z = ends[..., 2] - height
+    ends, z = ends[z[:, 0] * z[:, 1] < 0], z[z[:, 0] * z[:, 1] < 0]
+    share = z[:, 0] / (z[:, 0] - z[:, 1])
+    return (ends[:, 0] + share[:, None] * (ends[:, 1] - ends[:, 0]))[:, :2]
+
+
+def first_hits(mesh, origin, direction):
+    """For each ray the first triangle that it meets, -1 for none (Möller and Trumbore, 1997)."""
+    a, b, c = np.moveaxis(corners(mesh), 1, 0)
+    nearest, found = np.full(len(origin), np.inf), np.full(len(origin), -1)
+    for i, (o, d) in enumerate(zip(origin, direction, strict=True)):
+        p = np.cross(d, c - a)
+        volume = np.sum((b - a) * p, axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u = np.sum((o - a) * p, axis=1) / volume
+            q = np.cross(o - a, b - a)
+            v, t = (q @ d) / volume, np.sum((c - a) * q, axis=1) / volume
+        t = np.where((u >= 0) & (v >= 0) & (u + v <= 1) & (t > 1e-6), t, np.inf)
+        nearest[i], found[i] = t.min(), t.argmin() if np.isfinite(t.min()) else -1
+    return found
+
+
+def digest(model):
+    data = hashlib.sha256()
+    for level in (DETAILED, COARSE):
+        mesh = model.mesh(level)
+        for array in (mesh.vertices, mesh.normals, mesh.triangles, mesh.material, mesh.color):
+            data.update(np.ascontiguousarray(array).tobytes())
+    data.update(model.footprint().tobytes())
+    return data.hexdigest()
+
+
+# --- sizes and paints --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_sizes_stay_within_their_class_and_fill_it(body):
+    models = [VehicleModel.from_seed(body, seed) for seed in range(500)]
+    classes = {c.segment: c for c in SIZE_CLASSES[body]}
+    for model in models:
+        limits = classes[model.segment][2:]
+        assert all(low <= size <= high for size, (low, high) in zip(model.size, limits, strict=True))
+    assert {m.segment for m in models} == set(classes)
+    assert np.std([m.length for m in models]) > 0.03
+
+
+def test_bodies_and_paints_are_as_common_as_stated():
+    models = [VehicleModel.from_seed(None, seed) for seed in range(4000)]
+    share = [sum(m.body == body for m in models) / len(models) for body in BODIES]
+    np.testing.assert_allclose(share, BODY_SHARE, atol=0.03)
+    spread = np.array([max(m.paint) - min(m.paint) for m in models])
+    neutral = sum(p.share for p in PAINTS if p.name in ("white", "black", "grey", "silver"))
+    assert np.mean(spread < 25) == pytest.approx(neutral, abs=0.05)
+    assert sum(p.share for p in PAINTS) == pytest.approx(1.0)
+    assert all(sum(c.share for c in group) == pytest.approx(1.0) for group in SIZE_CLASSES.values())
+
+
+@pytest.mark.parametrize("body", BODIES)
+@pytest.mark.parametrize("level", [DETAILED, COARSE])
+def test_the_mesh_is_as_large_as_the_model_says(body, level):
+    for seed in SEEDS:
+        model = VehicleModel.from_seed(body, seed)
+        mesh = model.mesh(level)
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        assert high[0] - low[0] == pytest.approx(model.length, abs=0.02)
+        assert 0.0 <= low[2] < 0.02
+        roof = high[2] - model.height
+        assert -0.01 < roof < 0.06  # rails stand higher
+        body_only = mesh.vertices[mesh.vertices[:, 2] < 0.75, 1]
+        assert np.ptp(body_only) == pytest.approx(model.width, abs=0.03)
+        assert np.ptp(mesh.vertices[:, 1]) < model.width + MIRRORS_M
+
+
+# --- meshes ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("body", BODIES)
+@pytest.mark.parametrize("level", [DETAILED, COARSE])
+def test_normals_are_unit_and_on_the_triangles_outer_side(body, level):
+    for seed in SEEDS:
+        mesh = VehicleModel.from_seed(body, seed).mesh(level)
+        np.testing.assert_allclose(np.linalg.norm(mesh.normals, axis=1), 1.0, atol=1e-5)
+        a, b, c = np.moveaxis(corners(mesh), 1, 0)
+        face = np.cross(b - a, c - a)
+        area = np.linalg.norm(face, axis=1)
+        assert area.min() > 0
+        assert np.array_equal(np.unique(mesh.triangles), np.arange(len(mesh.vertices)))
+        for k in range(3):
+            agree = np.sum(face * mesh.normals[mesh.triangles[:, k]], axis=1) / area
+            assert agree.min() > 0.3
+
+
+@pytest.mark.parametrize("body", BODIES)
+@pytest.mark.parametrize("level", [DETAILED, COARSE])
+def test_no_gap_shows_a_surface_from_behind(body, level):
+    """Rays from all around at a car first meet the outside of something, never an inside through a hole."""
+    rng = np.random.default_rng(8)
+    model = VehicleModel.from_seed(body, 2)
+    mesh = model.mesh(level)
+    around, up = rng.uniform(0, 2 * np.pi, 600), rng.uniform(0.0, 0.9, 600)
+    origin = 12.0 * np.column_stack([np.cos(around) * np.cos(up), np.sin(around) * np.cos(up), np.sin(up)])
+    origin[:, 2] += 0.5
+    target = rng.uniform(-0.5, 0.5, (600, 3)) * [model.length, model.width, 0.8 * model.height]
+    direction = target + np.array([0, 0, 0.55 * model.height]) - origin
+    found = first_hits(mesh, origin, direction)
+    a, b, c = np.moveaxis(corners(mesh)[found], 1, 0)
+    outside = np.sum(np.cross(b - a, c - a) * direction, axis=1) < 0
+    behind = (found >= 0) & ~outside
+    # Thin sheets that are meant to be seen from both sides, and slits narrower than a seam.
+    assert np.mean(behind) <= 0.005, model
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_one_looks_through_the_glass_onto_an_interior(body):
+    mesh = VehicleModel.from_seed(body, 4).mesh()
+    opaque = mesh.material != Material.GLASS
+    assert 20 < np.sum(~opaque) < 400
+    seen = type(mesh)(
+        mesh.vertices, mesh.normals, mesh.triangles[opaque], mesh.material[opaque], mesh.color[opaque]
+    )
+    rng = np.random.default_rng(3)
+    panes = corners(mesh)[~opaque]
+    normal = np.cross(panes[:, 1] - panes[:, 0], panes[:, 2] - panes[:, 0])
+    side = panes[np.abs(normal[:, 1]) > 0.8 * np.linalg.norm(normal, axis=1)].mean(axis=1)
+    target = side[rng.integers(len(side), size=120)]
+    origin = target + np.column_stack([rng.uniform(-2, 2, 120), np.sign(target[:, 1]) * 6, np.full(120, 0.7)])
+    hit = first_hits(seen, origin, target - origin)
+    kinds = seen.material[hit[hit >= 0]]
+    assert np.mean(kinds == Material.INTERIOR) > 0.35
+    assert np.mean(hit < 0) > 0.02  # and out through the other side
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_levels_of_detail_have_their_size_and_one_outline(body):
+    model = VehicleModel.from_seed(body, 5)
+    fine, coarse = model.mesh(DETAILED), model.mesh(COARSE)
+    assert 1500 < len(fine.triangles) < 4200
+    assert len(coarse.triangles) < 650
+    sides = [MultiPoint(m.vertices[:, [0, 2]]).convex_hull for m in (fine, coarse)]
+    assert sides[0].symmetric_difference(sides[1]).area < 0.05 * sides[0].area
+
+
+# --- footprints --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_footprints_are_convex_and_agree_with_the_mesh(body):
+    for seed in range(20):
+        model = VehicleModel.from_seed(body, seed)
+        footprint = model.footprint()
+        assert footprint.shape[1] == 2
+        assert 8 <= len(footprint) <= FOOTPRINT_CORNERS
+        edge = np.roll(footprint, -1, axis=0) - footprint
+        after = np.roll(edge, -1, axis=0)
+        assert (edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0] > 0).all()
+        hull = MultiPoint(section(model.mesh(), KNEE_M)).convex_hull
+        assert Polygon(footprint).hausdorff_distance(hull) < 0.02
+
+
+# --- sameness ----------------------------------------------------------------------------------------
+
+
+def test_the_same_seed_gives_the_same_mesh_in_another_process():
+    program = (
+        "import sys; sys.path.insert(0, 'tests'); from test_vehicles import digest, VehicleModel;"
+        "print(*(digest(VehicleModel.from_seed(body, 11)) for body in ('suv', 'hatchback')))"
+    )
+    other = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout.split()
+    assert other == [digest(VehicleModel.from_seed(body, 11)) for body in ("suv", "hatchback")]
+
+
+def test_seeds_give_different_cars_and_paint_changes_nothing_but_colour():
+    assert len({digest(VehicleModel.from_seed("sedan", seed)) for seed in range(12)}) == 12
+    model = VehicleModel.from_seed("van", 3)
+    red, plain = model.painted((200, 10, 10)).mesh(), model.mesh()
+    assert red.vertices is plain.vertices
+    assert red.triangles is plain.triangles
+    assert not np.array_equal(red.color, plain.color)
+    glass = red.material == Material.GLASS
+    assert np.array_equal(red.color[glass], plain.color[glass])
+
+
+# --- bad input ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"body": "tank"}, "body: wanted one of hatchback"),
+        ({"size": (0.0, 1.8, 1.5)}, "size: wanted a length of 3.2 to 6.0 m, got 0.0"),
+        ({"size": (4.2, float("nan"), 1.5)}, "size: wanted a width"),
+        ({"paint": (10, 20, 300)}, "paint"),
+        ({"seed": -1}, "seed: wanted an integer"),
+        ({"seed": 1.5}, "seed: wanted an integer"),
+    ],
+)
+def test_bad_models_are_refused(change, match):
+    good = {"body": "suv", "segment": "JC", "size": (4.5, 1.85, 1.65), "paint": (9, 9, 9), "seed": 1}
+    VehicleModel(**good).footprint()
+    with pytest.raises(SensorError, match=match):
+        VehicleModel(**{**good, **change})
+
+
+def test_bad_requests_are_refused():
+    with pytest.raises(SensorError, match="body"):
+        VehicleModel.from_seed("tank", 1)
+    with pytest.raises(SensorError, match="seed"):
+        VehicleModel.from_seed("suv", -3)
+    with pytest.raises(SensorError, match="level"):
+        VehicleModel.from_seed("suv", 1).mesh(2)
+
+
+# --- surfaces ----------------------------------------------------------------------------------------
+
+
+def test_turned_and_boxed_solids_are_closed_and_have_their_volume():
+    build = ShapeBuilder()
+    build.turned([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.0, 2.0]], 0, 64)
+    build.box((5.0, 0.0, 0.5), (2.0, 1.0, 1.0), 1)
+    shape = build.build()
+    a, b, c = np.moveaxis(shape.vertices[shape.triangles].astype(float), 1, 0)
+    assert np.sum(a * np.cross(b, c)) / 6 == pytest.approx(2 * np.pi + 2.0, rel=0.01)
+    spot = np.unique(np.round(shape.vertices, 4), axis=0, return_inverse=True)[1].ravel()[shape.triangles]
+    edges = np.sort(spot[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
+
+
+def test_creases_stay_sharp_and_bends_are_smooth():
+    build = ShapeBuilder()
+    build.turned([[1.0, 0.0], [1.0, 2.0]], 0, 32)
+    smooth = build.build()
+    radial = smooth.vertices[:, :2] / np.linalg.norm(smooth.vertices[:, :2], axis=1, keepdims=True)
+    np.testing.assert_allclose(np.sum(radial * smooth.normals[:, :2], axis=1), 1.0, atol=1e-3)
+    build = ShapeBuilder()
+    build.box((0, 0, 0), (1, 1, 1), 0)
+    assert np.allclose(np.sort(np.abs(build.build().normals), axis=1), [0, 0, 1])
