@@ -106,28 +106,20 @@ def numbers(option: str, text: str) -> list[float]:
 
 
 def speeds(option: str, text: str) -> list[float]:
-    """Comma-separated speeds, km/h, that a person or a car may have.
-
-    Raises:
-        InputError: something else; the message names the option.
-    """
-    values = numbers(option, text)
-    for value in values:
-        if not 0.1 <= value <= 300.0:
-            raise InputError(f"{option} is {value:g}, want a speed above 0: 0.1 to 300 km/h")
-    return values
+    """Comma-separated speeds, km/h, that a person or a car may have."""
+    return _between(option, text, 0.1, 300.0, "a speed above 0: 0.1 to 300 km/h")
 
 
 def costs(option: str, text: str) -> list[float]:
-    """Comma-separated costs, s, of at least 0 and at most a day.
+    """Comma-separated costs, s, of at most a day."""
+    return _between(option, text, 0.0, 86400.0, "seconds from 0 to 86400")
 
-    Raises:
-        InputError: something else; the message names the option.
-    """
+
+def _between(option: str, text: str, least: float, most: float, wanted: str) -> list[float]:
     values = numbers(option, text)
     for value in values:
-        if not 0.0 <= value <= 86400.0:
-            raise InputError(f"{option} is {value:g}, want seconds from 0 to 86400")
+        if not least <= value <= most:
+            raise InputError(f"{option} is {value:g}, want {wanted}")
     return values
 
 
