@@ -328,6 +328,11 @@ def corner_points(xy: FloatArray, yaw: FloatArray, length: FloatArray, width: Fl
     return np.stack([xy + a * along + b * left for a, b in signs], axis=1)
 
 
+def is_building(wall: FloatArray) -> bool:
+    """Whether a wall, (k, 2), ends where it starts and so is a building's outline."""
+    return len(wall) >= 4 and np.array_equal(wall[0], wall[-1])
+
+
 def _frozen(values: ArrayLike, name: str) -> FloatArray:
     try:
         array = np.array(values, dtype=np.float64)

@@ -26,7 +26,7 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.lot import SLOT_SIDE, Lane, Mouth, ParkingLot, corner_points, mouth_points
+from parkenv.lot import SLOT_SIDE, Lane, Mouth, ParkingLot, corner_points, is_building, mouth_points
 from parkenv.lot_generators import Slots, bay_row
 from parkenv.lot_graph import GraphError, build_drive_graph, linestrings
 from parkenv.slot_polygons import slots_from_polygons
@@ -108,7 +108,7 @@ def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
         for xy in points.tolist():
             yield feature("Point", xy, kind=kind)
     for wall in lot.walls:
-        if len(wall) >= 4 and np.array_equal(wall[0], wall[-1]):
+        if is_building(wall):
             yield feature("Polygon", [wall.tolist()], kind="wall")
         else:
             yield feature("LineString", wall.tolist(), kind="wall")

@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 
-import numpy as np
-
-from parkenv.lot import Mouth, ParkingLot
+from parkenv.lot import Mouth, ParkingLot, is_building
 from sim_sensors.slot_scenes import SlotLot, slot_surroundings
 
 WALL_HEIGHT = 1.8
@@ -24,12 +22,11 @@ def slot_lot(lot: ParkingLot, seed: int = 0) -> SlotLot:
         lot: the lot.
         seed: of the cars' models and of everything's texture.
     """
-    closed = [len(wall) >= 4 and np.array_equal(wall[0], wall[-1]) for wall in lot.walls]
-    buildings = [wall[:-1] for wall, shut in zip(lot.walls, closed, strict=True) if shut]
+    buildings = [wall[:-1] for wall in lot.walls if is_building(wall)]
     legs = [
         [*start, *end, WALL_HEIGHT]
-        for wall, shut in zip(lot.walls, closed, strict=True)
-        if not shut
+        for wall in lot.walls
+        if not is_building(wall)
         for start, end in pairwise(wall)
     ]
     slots = SlotLot(

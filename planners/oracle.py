@@ -136,8 +136,8 @@ class OracleAgent(SearchAgent[Foresight]):
         wait = int(missing[0]) if len(missing) else 0
         if memory.unseen is not None:
             memory.unseen[self._in_view(vertex)] = False
-            target = self._next_on_tour(vertex, memory.unseen)
-            return wait if target is None else self.routes.move_toward(vertex, target)
+            target, seconds = self._nearest_unseen(vertex, memory.unseen)
+            return self.routes.move_toward(vertex, target) if np.isfinite(seconds) else wait
         if memory.waits > 0 and len(missing):
             memory.waits -= 1
             return wait
@@ -157,10 +157,9 @@ class OracleAgent(SearchAgent[Foresight]):
         shown[self._in_view(vertex)] = True
         driven = 0.0
         in_view_after = 0.0 if shown[slot] else np.inf
-        while vertex != slot:
-            move = self.routes.move_toward(vertex, slot)
+        for move, following in self.routes.way(vertex, slot):
             driven += float(self.problem.move_s[vertex, move])
-            vertex = int(self.problem.lot.neighbors[vertex, move])
+            vertex = following
             shown[self._in_view(vertex)] = True
             if shown[slot]:
                 in_view_after = min(in_view_after, driven)
@@ -178,10 +177,11 @@ class OracleAgent(SearchAgent[Foresight]):
         starts, slots = self.problem.slots_in_view
         return slots[starts[vertex] : starts[vertex + 1]]
 
-    def _next_on_tour(self, vertex: int, unseen: NDArray[np.bool_]) -> int | None:
+    def _nearest_unseen(self, vertex: int, unseen: NDArray[np.bool_]) -> tuple[int, float]:
+        """The next slot of a tour and the drive to it, s; inf where none is within reach."""
         seconds = np.where(unseen, self.routes.seconds_from(vertex)[: len(unseen)], np.inf)
         nearest = int(seconds.argmin())
-        return nearest if np.isfinite(seconds[nearest]) else None
+        return nearest, float(seconds[nearest])
 
     def _tour_s(self, vertex: int, at_most: float) -> float:
         """How long it takes to see every slot, s; inf where that is over `at_most`, or some are out of reach."""
@@ -189,9 +189,8 @@ class OracleAgent(SearchAgent[Foresight]):
         unseen[self._in_view(vertex)] = False
         total = 0.0
         while unseen.any():
-            seconds = np.where(unseen, self.routes.seconds_from(vertex)[: len(unseen)], np.inf)
-            target = int(seconds.argmin())
-            total += float(seconds[target])
+            target, seconds = self._nearest_unseen(vertex, unseen)
+            total += seconds
             if not total < at_most:
                 return np.inf
             # What is seen in passing is left out: an upper bound is good enough.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -43,6 +44,17 @@ class DriveRoutes:
         if move < 0:
             raise InputError(f"no way leads on from vertex {vertex} to vertex {target}")
         return move
+
+    def way(self, vertex: int, target: int) -> Iterator[tuple[int, int]]:
+        """A shortest way, hop by hop: the move and the vertex that it leads to; nothing where the car is there.
+
+        Raises:
+            InputError: no way leads to the target.
+        """
+        while vertex != target:
+            move = self.move_toward(vertex, target)
+            vertex = int(self._neighbors[vertex, move])
+            yield move, vertex
 
     def _moves_to(self, target: int) -> NDArray[np.int8]:
         """(n_vertices,) the first move toward the target from everywhere, -1 where there is none."""

@@ -61,6 +61,11 @@ class Mount:
         cosine, sine = math.cos(yaw), math.sin(yaw)
         return x + cosine * self.x - sine * self.y, y + sine * self.x + cosine * self.y, yaw + self.yaw
 
+    def camera_pose(self, vehicle: FloatArray) -> FloatArray:
+        """Camera-to-world matrix, (4, 4), of a camera here on a vehicle at x, y, yaw."""
+        x, y, yaw = self.in_world(vehicle)
+        return camera_pose(x, y, self.z, yaw, self.pitch)
+
 
 @dataclass(frozen=True)
 class Capture:
@@ -159,12 +164,9 @@ class SensorRig:
             raise SensorError(f"vehicle pose is {vehicle.tolist()}, want finite x, y and yaw")
         images, pairs, scans = {}, {}, {}
         for i, (name, camera, mount) in enumerate(self.cameras):
-            x, y, yaw = mount.in_world(vehicle)
-            eye = camera_pose(x, y, mount.z, yaw, mount.pitch)
-            images[name] = camera.render(scene, eye, weather, _seed_of(seed, 0, i))
+            images[name] = camera.render(scene, mount.camera_pose(vehicle), weather, _seed_of(seed, 0, i))
         for i, (name, stereo, mount) in enumerate(self.stereo_cameras):
-            x, y, yaw = mount.in_world(vehicle)
-            eye = camera_pose(x, y, mount.z, yaw, mount.pitch)
+            eye = mount.camera_pose(vehicle)
             pairs[name] = stereo.render_stereo(scene, eye, weather, _seed_of(seed, 1, i))
         for i, (name, laser, mount) in enumerate(self.lasers):
             rng = np.random.default_rng([seed, 2, i]) if noise else None

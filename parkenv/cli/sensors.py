@@ -57,7 +57,6 @@ def preview(
     from parkenv.lot_scene import slot_lot
     from parkenv.scenario import Scenario
     from planners.routes import DriveRoutes
-    from sim_sensors.camera import camera_pose
     from sim_sensors.ground_truth import vehicle_boxes
     from sim_sensors.rig import SensorRig, poses_along
     from sim_sensors.weather import PRESETS, Weather
@@ -75,20 +74,15 @@ def preview(
     occupied = its.occupancy.world(key, arrival).occupied(np.arange(its.lot.n_slots), arrival.time)
     scene = slot_lot(its.lot).scene(occupied, int(key) % 2**31)
 
-    routes, vertex = DriveRoutes(its), int(its.lot.entry_vertices[0])
-    target = int(its.lot.walk_m().argmin())
-    path = [vertex]
-    while vertex != target:
-        vertex = int(its.lot.neighbors[vertex, routes.move_toward(vertex, target)])
-        path.append(vertex)
+    entry, target = int(its.lot.entry_vertices[0]), int(its.lot.walk_m().argmin())
+    path = [entry, *(vertex for _, vertex in DriveRoutes(its).way(entry, target))]
     poses = poses_along(its.lot.vertex_xy[path], every)
     middle = len(poses) // 2
 
     ((_, stereo, stereo_mount),) = SensorRig.stereo().stereo_cameras
     rig = dataclasses.replace(SensorRig.thesis(), stereo_cameras=(("pair", stereo, stereo_mount),))
     name, camera, mount = rig.cameras[0]
-    x, y, yaw = mount.in_world(poses[middle])
-    eye = camera_pose(x, y, mount.z, yaw, mount.pitch)
+    eye = mount.camera_pose(poses[middle])
     console.print(
         "The first picture after an installation waits for the renderer to be compiled, about 20 s."
     )
@@ -104,8 +98,7 @@ def preview(
         past = poses[max(0, middle - n // 2) :][:n]
         light = Weather.draw(names[0], seed)
         for k, pose in enumerate(track(past, "Driving", console=console, disable=not console.is_terminal)):
-            x, y, yaw = mount.in_world(pose)
-            eye = camera_pose(x, y, mount.z, yaw, mount.pitch)
+            eye = mount.camera_pose(pose)
             frame = camera.render(scene, eye, light, seed + k)
             frames.append(with_boxes(frame.image, vehicle_boxes(camera, scene, eye, frame)))
         save_animation(frames, out / "drive.gif")

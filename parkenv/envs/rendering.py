@@ -27,7 +27,7 @@ from parkenv.envs.drawing import (
     write_text,
 )
 from parkenv.errors import InputError
-from parkenv.lot import ParkingLot
+from parkenv.lot import ParkingLot, is_building
 from parkenv.occupancy import DAY_NAMES, DAY_S
 from parkenv.scenario import Scenario
 
@@ -484,7 +484,7 @@ def _lay_out(scenario: Scenario, view: View) -> _Ground:
 
     image = np.full((*shape, 3), GROUND, dtype=np.uint8)
     for wall in lot.walls:
-        if len(wall) > 3 and np.array_equal(wall[0], wall[-1]):
+        if is_building(wall):
             cv2.fillPoly(image, [fixed_point(fine(wall))], BUILDING, cv2.LINE_8, SUBPIXEL_BITS)
     asphalt = np.zeros(shape, dtype=np.uint8)
     lane_width = max(1, round(_LANE_WIDTH * fine.scale))

@@ -15,7 +15,7 @@ from matplotlib.typing import ColorType
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.lot import ParkingLot, mouth_heading
+from parkenv.lot import ParkingLot, is_building, mouth_heading
 from parkenv.lot_generators import ONE_WAY_HALF_WIDTH, TWO_WAY_HALF_WIDTH
 from parkenv.lot_graph import linestrings
 from parkenv.whole_files import written_whole
@@ -74,7 +74,7 @@ def draw_lot(
     outline = corners[np.arange(lot.n_slots)[:, None], (first[:, None] + np.arange(4)) % 4]
     ax.add_collection(LineCollection(list(outline), colors=PAINT, linewidths=paint_width, zorder=1.1))
     for wall in lot.walls:
-        if np.array_equal(wall[0], wall[-1]):
+        if is_building(wall):
             ax.add_patch(Polygon(wall, facecolor=BUILDING, edgecolor=WALL, linewidth=0.8, zorder=0.8))
         else:
             ax.plot(*wall.T, color=WALL, linewidth=1.6, solid_capstyle="butt", zorder=0.8)
