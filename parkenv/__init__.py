@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from parkenv.occupancy_log import OccupancyLog
     from parkenv.recorded_occupancy import RecordedOccupancy
     from parkenv.scenario import Scenario, SearchProblem
+    from parkenv.traffic import Traffic
 
 __version__ = "0.1.0"
 
@@ -33,6 +34,7 @@ _EXPORTS = {
     "Scenario": "parkenv.scenario",
     "SearchProblem": "parkenv.scenario",
     "SightingModel": "parkenv.belief",
+    "Traffic": "parkenv.traffic",
 }
 
 __all__ = [
@@ -47,6 +49,7 @@ __all__ = [
     "Scenario",
     "SearchProblem",
     "SightingModel",
+    "Traffic",
 ]
 
 
@@ -56,9 +59,9 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-if "parkenv/Search-v0" not in registry:
-    register(
-        id="parkenv/Search-v0",
-        entry_point="parkenv.envs.search:SearchEnv",
-        max_episode_steps=2000,
-    )
+for _name, _entry_point in {
+    "parkenv/Search-v0": "parkenv.envs.search:SearchEnv",
+    "parkenv/SearchSensors-v0": "parkenv.envs.sensors:SearchSensorsEnv",
+}.items():
+    if _name not in registry:
+        register(id=_name, entry_point=_entry_point, max_episode_steps=2000)

@@ -137,6 +137,9 @@ class World(Protocol):
     def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
         """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
 
+    def stretch(self, slots: ArrayLike, time: float) -> IntArray:
+        """(k,) int64: the number of the stretch of constant state that each slot is in; it tells cars apart."""
+
 
 class OccupancyModel(Protocol):
     """Draws arrivals and worlds, and says what can be known beforehand."""
@@ -327,6 +330,13 @@ class ProcessWorld:
         """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
         slots = np.asarray(slots, np.int64)
         return np.where(self._look(slots, time), self._span[slots, 1], time)
+
+    def stretch(self, slots: ArrayLike, time: float) -> IntArray:
+        """(k,) int64: how many stretches of constant state each slot has begun since the arrival."""
+        slots = np.asarray(slots, np.int64)
+        self._look(slots, time)
+        begun: IntArray = self._flips[slots]
+        return begun
 
     def _look(self, slots: IntArray, time: float) -> BoolArray:
         arrival = self.arrival.time

@@ -99,6 +99,22 @@ def _replay(
     return answer
 
 
+@njit(cache=True)
+def _changes(
+    slots: IntArray, second: float, first: IntArray, stop: IntArray, from_s: FloatArray, taken: BoolArray
+) -> IntArray:
+    """How often each slot's state has changed from its first record to `second`."""
+    count = np.zeros(slots.size, np.int64)
+    for i, slot in enumerate(slots):
+        if not 0 <= slot < first.size:
+            raise IndexError("slot index out of range")
+        look = first[slot] + 1
+        while look < stop[slot] and from_s[look] <= second:
+            count[i] += taken[look] != taken[look - 1]
+            look += 1
+    return count
+
+
 class RecordedWorld:
     """One recorded day, replayed; past the end of the day its last state holds."""
 
@@ -116,12 +132,23 @@ class RecordedWorld:
         """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
         return np.maximum(self._look(slots, time, free=True) + self._midnight, time)
 
-    def _look(self, slots: ArrayLike, time: float, free: bool) -> FloatArray:
+    def stretch(self, slots: ArrayLike, time: float) -> IntArray:
+        """(k,) int64: how often the state of each slot has changed since the day's first record of it."""
+        second = self._second(time)
+        looks = (self._first, self._stop, self.log.from_s, self.log.occupied)
+        count: IntArray = _changes(np.asarray(slots, np.int64), second, *looks)
+        return count
+
+    def _second(self, time: float) -> float:
+        """Second of the recorded day."""
         if not self.arrival.time <= time < math.inf:
             raise InputError(
                 f"time: got {time}, wanted finite seconds from the arrival at {self.arrival.time} on"
             )
-        second = float(time) - self._midnight
+        return float(time) - self._midnight
+
+    def _look(self, slots: ArrayLike, time: float, free: bool) -> FloatArray:
+        second = self._second(time)
         looks = (self._first, self._stop, self.log.from_s, self.log.occupied)
         answer: FloatArray = _replay(np.asarray(slots, np.int64), second, free, *looks)
         return answer

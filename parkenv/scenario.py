@@ -17,6 +17,7 @@ from parkenv.belief import SightingModel
 from parkenv.errors import InputError
 from parkenv.lot import ParkingLot
 from parkenv.occupancy import Arrival, ArrivalWindow, Forecast, OccupancyModel, OccupancyProcess
+from parkenv.traffic import Traffic
 
 FloatArray = NDArray[np.float64]
 
@@ -110,6 +111,7 @@ class Scenario(SearchProblem):
             from the world is a map that is out of date.
         arrival: when searches start.
         entry: index into `lot.entries`; None draws one for each search.
+        traffic: what else moves in the lot, for those who look through sensors.
     """
 
     name: str
@@ -117,11 +119,14 @@ class Scenario(SearchProblem):
     prior: OccupancyModel | None = None
     arrival: ArrivalWindow = field(default_factory=ArrivalWindow)
     entry: int | None = None
+    traffic: Traffic = field(default_factory=Traffic)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.entry is not None:
             _require_index("entry", self.entry, len(self.lot.entries))
+        if not isinstance(self.traffic, Traffic):
+            raise InputError(f"traffic is a {type(self.traffic).__name__}, want a Traffic")
         for name in ("occupancy", "prior"):
             model = getattr(self, name)
             if model is not None and model.n_slots != self.lot.n_slots:

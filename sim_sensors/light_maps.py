@@ -52,22 +52,35 @@ _CACHE: WeakKeyDictionary[Instances, OrderedDict[_Key, LightMaps]] = WeakKeyDict
 
 
 def light_maps(pool: MeshPool, instances: Instances, weather: Weather, x: float, y: float) -> LightMaps:
-    """Maps of the surroundings of (x, y), m; kept while the instances live, as they do not change."""
+    """Maps of the surroundings of (x, y), m. Those of what stands still are kept while it lives."""
+    still = instances if instances.still is None else instances.still
     column, row = round(x / _STEP), round(y / _STEP)
-    kept = _CACHE.setdefault(instances, OrderedDict())
+    x, y = column * _STEP, row * _STEP
+    kept = _CACHE.setdefault(still, OrderedDict())
     key = (weather, column, row)
     if key not in kept:
-        kept[key] = _draw(pool, instances, weather, column * _STEP, row * _STEP)
+        kept[key] = _draw(pool, still, weather, x, y)
         if len(kept) > _KEPT:
             kept.popitem(last=False)
     kept.move_to_end(key)
-    return kept[key]
+    moving = _near(pool, instances, x, y)
+    moving = moving[moving >= len(still.mesh)]
+    return _with_moving(kept[key], pool, instances, moving, x, y) if len(moving) else kept[key]
+
+
+def _near(pool: MeshPool, instances: Instances, x: float, y: float) -> NDArray[np.int32]:
+    """Which instances may throw a shadow into the window about (x, y)."""
+    away = np.hypot(instances.pose[:, 0] - x, instances.pose[:, 1] - y)
+    return np.flatnonzero(away < 0.75 * _WINDOW + pool.radius[instances.mesh]).astype(np.int32)
 
 
 def _draw(pool: MeshPool, instances: Instances, weather: Weather, x: float, y: float) -> LightMaps:
-    away = np.hypot(instances.pose[:, 0] - x, instances.pose[:, 1] - y)
-    near = np.flatnonzero(away < 0.75 * _WINDOW + pool.radius[instances.mesh]).astype(np.int32)
-    shadow, to_shadow = _shadow_map(pool, instances, near, weather, x, y)
+    near = _near(pool, instances, x, y)
+    to_shadow = _toward_the_sun(weather, x, y)
+    if max(weather.sun) > 0.0:
+        shadow = _shadow_map(pool, instances, near, to_shadow)
+    else:
+        shadow = np.zeros((2, 2), dtype=np.float32)
     return LightMaps(
         shadow,
         to_shadow,
@@ -78,10 +91,19 @@ def _draw(pool: MeshPool, instances: Instances, weather: Weather, x: float, y: f
     )
 
 
-def _shadow_map(
-    pool: MeshPool, instances: Instances, near: NDArray[np.int32], weather: Weather, x: float, y: float
-) -> tuple[Float32Array, FloatArray]:
-    """The scene from the sun: the camera's own rasteriser, with height toward the sun for inverse depth."""
+def _with_moving(
+    maps: LightMaps, pool: MeshPool, instances: Instances, moving: NDArray[np.int32], x: float, y: float
+) -> LightMaps:
+    """The maps of what stands still, and over them what moves."""
+    shadow = maps.shadow
+    if len(shadow) == _SHADOW_TEXELS:
+        shadow = np.maximum(shadow, _shadow_map(pool, instances, moving, maps.to_shadow))
+    contact = np.maximum(maps.contact, _contact_map(pool, instances, moving, x, y))
+    return maps._replace(shadow=shadow, contact=contact)
+
+
+def _toward_the_sun(weather: Weather, x: float, y: float) -> FloatArray:
+    """World point (x, y, z, 1) to column and row of the shadow map about (x, y), and height toward the sun."""
     sun = np.array(weather.sun_direction)
     across = np.cross([0.0, 0.0, 1.0], sun)
     across /= np.linalg.norm(across)
@@ -94,15 +116,21 @@ def _shadow_map(
     to_shadow[2, :3] = sun
     center = np.array([x, y, 0.0])
     to_shadow[:, 3] = [n / 2, n / 2, 500.0] - to_shadow[:, :3] @ center
-    if max(weather.sun) <= 0.0:
-        return np.zeros((2, 2), dtype=np.float32), to_shadow
+    return to_shadow
+
+
+def _shadow_map(
+    pool: MeshPool, instances: Instances, drawn: NDArray[np.int32], to_shadow: FloatArray
+) -> Float32Array:
+    """The scene from the sun: the camera's own rasteriser, with height toward the sun for inverse depth."""
+    n = _SHADOW_TEXELS
     triangles = _seen_from_the_sun(
         pool.vertices,
         pool.triangles,
         pool.material,
         pool.vertex_start,
         pool.triangle_start,
-        near,
+        drawn,
         instances.mesh if pool.coarse is None else pool.coarse[instances.mesh],
         instances.pose,
         to_shadow,
@@ -110,7 +138,7 @@ def _shadow_map(
         n,
     )
     seen = rasterize(ScreenTriangles(*triangles), (n, n), np.zeros(3), 0.0, panes=False)
-    return seen.inverse_depth, to_shadow
+    return seen.inverse_depth
 
 
 @njit(cache=True)

@@ -82,11 +82,14 @@ class Instances:
         mesh: (n,) int32, index into the pool.
         pose: (n, 4) float64, x, y, z in m and yaw in rad, world frame.
         ids: (n,) int32, what the camera writes into its instance image: 0 for scenery, above for vehicles.
+        still: the first of these instances, where the others move: shadows of what stands still are kept for as
+            long as this object lives. None: nothing moves.
     """
 
     mesh: NDArray[np.int32]
     pose: NDArray[np.float64]
     ids: NDArray[np.int32]
+    still: Instances | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,10 @@ from sim_sensors.weather import Weather
 FloatArray = NDArray[np.float64]
 
 RIGHT, LEFT = -math.pi / 2, math.pi / 2
+EYE_M = 1.3
+"""Height, m, of the rigs' cameras."""
+WIDE = PinholeCamera.from_field_of_view(horizontal=math.pi / 2)
+"""The rigs' camera: a car drives past the noses of others at a distance of 1.5 m, and is to see them whole."""
 
 
 class Sensed(Drawable, Protocol):
@@ -118,22 +122,22 @@ class SensorRig:
     def thesis(cls) -> SensorRig:
         """The thesis's robot (T §4.1, Fig. 4.3): a camera to the right above a 270° laser, on one vertical axis."""
         return cls(
-            cameras=(("right", PinholeCamera(), Mount(z=1.1, yaw=RIGHT)),),
+            cameras=(("right", WIDE, Mount(z=EYE_M, yaw=RIGHT)),),
             lasers=(("laser", LaserScanner(), Mount(z=0.5)),),
         )
 
     @classmethod
     def stereo(cls) -> SensorRig:
         """A stereo pair to the right and no laser."""
-        return cls(stereo_cameras=(("right", StereoCamera(), Mount(z=1.1, yaw=RIGHT)),))
+        return cls(stereo_cameras=(("right", StereoCamera(WIDE), Mount(z=EYE_M, yaw=RIGHT)),))
 
     @classmethod
     def both_sides(cls) -> SensorRig:
         """The thesis's rig with a second camera, to the left."""
         return cls(
             cameras=(
-                ("right", PinholeCamera(), Mount(z=1.1, yaw=RIGHT)),
-                ("left", PinholeCamera(), Mount(z=1.1, yaw=LEFT)),
+                ("right", WIDE, Mount(z=EYE_M, yaw=RIGHT)),
+                ("left", WIDE, Mount(z=EYE_M, yaw=LEFT)),
             ),
             lasers=(("laser", LaserScanner(), Mount(z=0.5)),),
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -15,6 +15,8 @@ from scipy.spatial import cKDTree
 from sim_sensors.errors import SensorError
 from sim_sensors.footprints import ScanPlane
 from sim_sensors.mesh import Ground, Instances, Mesh, MeshPool
+from sim_sensors.movers import LOOKS, Movers, people_meshes
+from sim_sensors.scenery import GAITS, pedestrian_footprint
 from sim_sensors.surroundings import Surroundings, floats
 from sim_sensors.vehicles import COARSE, DETAILED, FOOTPRINT_CORNERS, VehicleModel
 
@@ -33,9 +35,9 @@ class Footprints(NamedTuple):
 
     Attributes:
         corners: (n, k, 2) float64, m, world frame, counter-clockwise: a row for every vehicle place, then the posts,
-            trunks and people.
+            trunks and people of the surroundings, then what moves.
         n_corners: (n,) int64, how many corners are used; 0 for an empty place.
-        ids: (n,) int64, as in `Instances.ids`: place + 1 for a vehicle, 0 for all else.
+        ids: (n,) int64, as in `Instances.ids`: place + 1 for a vehicle, more for one that moves, 0 for all else.
         walls: (m, 2, 2) float64, m, world frame: ends of line segments.
     """
 
@@ -82,15 +84,20 @@ class Fleet:
 
     @cached_property
     def pool(self) -> MeshPool:
-        """Meshes of the surroundings first, then the detailed and the coarse mesh of model after model."""
-        meshes = list(self._scenery[0])
+        """Meshes of the surroundings, people who walk, then the detailed and the coarse mesh of model after model."""
+        meshes = [*self._scenery[0], *people_meshes()]
+        before = len(meshes)
         for model in self.models:
             meshes += [model.mesh(DETAILED), model.mesh(COARSE)]
-        return _joined(None, meshes, scenery=len(self._scenery[0]))
+        return _joined(None, meshes, scenery=before)
 
     def mesh_of(self, model: IntArray) -> NDArray[np.int32]:
         """Index in the pool of the detailed mesh of each model."""
-        return (len(self._scenery[0]) + 2 * model).astype(np.int32)
+        return (len(self._scenery[0]) + LOOKS * GAITS + 2 * model).astype(np.int32)
+
+    def mesh_of_walkers(self, movers: Movers) -> NDArray[np.int32]:
+        """Index in the pool of the mesh of everyone who walks."""
+        return (len(self._scenery[0]) + GAITS * movers.walker_look + movers.gait).astype(np.int32)
 
     @cached_property
     def scenery_instances(self) -> Instances:
@@ -148,6 +155,7 @@ class Scene:
     vehicle_pose: FloatArray
     vehicle_model: IntArray
     fleet: Fleet
+    movers: Movers | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         pose = floats("vehicle_pose", self.vehicle_pose, 3)
@@ -168,10 +176,11 @@ class Scene:
                 stacklevel=3,
             )
 
-    def _set(self, pose: FloatArray, model: IntArray, fleet: Fleet) -> None:
+    def _set(self, pose: FloatArray, model: IntArray, fleet: Fleet, movers: Movers | None = None) -> None:
         for array in (pose, model):
             array.setflags(write=False)
-        for name, value in (("vehicle_pose", pose), ("vehicle_model", model), ("fleet", fleet)):
+        named = {"vehicle_pose": pose, "vehicle_model": model, "fleet": fleet, "movers": movers}
+        for name, value in named.items():
             object.__setattr__(self, name, value)
 
     @classmethod
@@ -243,6 +252,29 @@ class Scene:
     @cached_property
     def instances(self) -> Instances:
         """Where every mesh stands, detailed; `pool.coarse` names the coarse ones."""
+        still, movers = self.still_instances, self.movers
+        if movers is None:
+            return still
+        pose = np.zeros((movers.n_vehicles + movers.n_walkers, 4))
+        pose[:, [0, 1, 3]] = np.concatenate([movers.vehicle_pose, movers.walker_pose])
+        mesh = [self.fleet.mesh_of(movers.vehicle_model), self.fleet.mesh_of_walkers(movers)]
+        return Instances(
+            np.concatenate([still.mesh, *mesh]),
+            np.concatenate([still.pose, pose]),
+            np.concatenate([still.ids, self._mover_ids.astype(np.int32)]),
+            still,
+        )
+
+    @property
+    def _mover_ids(self) -> IntArray:
+        assert self.movers is not None
+        ids = np.zeros(self.movers.n_vehicles + self.movers.n_walkers, dtype=np.int64)
+        ids[: self.movers.n_vehicles] = self.n_vehicles + 1 + np.arange(self.movers.n_vehicles)
+        return ids
+
+    @cached_property
+    def still_instances(self) -> Instances:
+        """Where everything stands that does not move."""
         scenery = self.fleet.scenery_instances
         pose = np.zeros((len(self.present), 4))
         pose[:, [0, 1, 3]] = self.vehicle_pose[self.present]
@@ -274,7 +306,21 @@ class Scene:
         corners[self.n_vehicles :] = posts
         corners[np.arange(FOOTPRINT_CORNERS) >= n_corners[:, None]] = 0.0
         ids = np.concatenate([np.arange(self.n_vehicles) + 1, np.zeros(len(posts), dtype=np.int64)])
+        if self.movers is not None:
+            moving, how_many = self._mover_footprints(self.movers)
+            corners = np.concatenate([corners, moving])
+            n_corners = np.concatenate([n_corners, how_many])
+            ids = np.concatenate([ids, self._mover_ids])
         return Footprints(corners, n_corners, ids, self.fleet.surroundings.wall_segments)
+
+    def _mover_footprints(self, movers: Movers) -> tuple[FloatArray, IntArray]:
+        outline, count = self.fleet.outlines
+        people, people_count = _padded([pedestrian_footprint(g / GAITS) for g in range(GAITS)])
+        shape = np.concatenate([outline[movers.vehicle_model], people[movers.gait]])
+        how_many = np.concatenate([count[movers.vehicle_model], people_count[movers.gait]])
+        moving = _placed(shape, np.concatenate([movers.vehicle_pose, movers.walker_pose]))
+        moving[np.arange(FOOTPRINT_CORNERS) >= how_many[:, None]] = 0.0
+        return moving, how_many
 
     @cached_property
     def scan_plane(self) -> ScanPlane:
@@ -324,6 +370,24 @@ class Scene:
         self._check_place(i)
         return self._changed(i, self.vehicle_pose[i], NO_VEHICLE, self.fleet)
 
+    def with_movers(self, movers: Movers | None) -> Scene:
+        """The same scene at a moment when other vehicles drive and people walk through it; all else is shared.
+
+        Args:
+            movers: None: nobody. The k-th vehicle has the id `n_vehicles` + 1 + k, people have 0.
+
+        Raises:
+            SensorError: a model that the fleet does not have.
+        """
+        if movers is not None and movers.vehicle_model.max(initial=0) >= len(self.fleet.models):
+            raise SensorError(
+                f"vehicle_model: wanted 0 to {len(self.fleet.models) - 1}, got {movers.vehicle_model.tolist()}"
+            )
+        scene = object.__new__(Scene)
+        scene._set(self.vehicle_pose, self.vehicle_model, self.fleet, movers)
+        scene.__dict__["still_instances"] = self.still_instances
+        return scene
+
     def _check_place(self, i: int) -> None:
         if not 0 <= i < self.n_vehicles:
             raise SensorError(f"place: wanted 0 to {self.n_vehicles - 1}, got {i}")
@@ -333,7 +397,7 @@ class Scene:
         new_pose[i] = floats("pose", np.asarray(pose, dtype=np.float64)[None], 3)[0]
         new_model[i] = number
         scene = object.__new__(Scene)
-        scene._set(new_pose, new_model, fleet)
+        scene._set(new_pose, new_model, fleet, self.movers)
         if number != NO_VEHICLE:
             others = scene.present[scene.present != i]
             away = np.hypot(*(new_pose[others, :2] - new_pose[i, :2]).T)

@@ -306,6 +306,10 @@ def lamp_post_mesh(height: float = 5.5) -> Mesh:
     return _made(build, {_Part.POST: (96, 100, 102), _Part.LANTERN: (232, 230, 220)})
 
 
+GAITS = 8
+"""How many pictures of a stride there are, where meshes are shared."""
+
+
 def pedestrian_mesh(phase: float, seed: int) -> Mesh:
     """A walking person at the origin who looks along x.
 

@@ -22,14 +22,16 @@ LINE_M = 0.10
 LIBRARY_MODELS = 100
 """How many vehicle models a lot's cars are drawn from."""
 PAVED_MARGIN_M = 7.0
+NOSE_GAP_M = 0.05
+"""What is left at least between a car and the inner end of its slot; another row may begin there."""
 
 
 @dataclass(frozen=True)
 class ParkingManners:
     """How cars stand in their slots.
 
-    Every car's offsets are normal with these deviations, cut at three; the offset to the side is also cut so that the
-    car's rectangle stays within its slot where it can. A model is chosen only for slots that it fits.
+    Every car's offsets are normal with these deviations, cut at three and cut again so that the car's rectangle stays
+    within its slot; one that is too long for it stands out at the mouth. A model is chosen only for slots that it fits.
 
     Args:
         lateral_m: deviation to the side of the slot's middle line, m.
@@ -165,11 +167,12 @@ class SlotLot:
         backed_in = bool(rng.random() < manners.nose_out) and not self._column("kerbside")[slot]
         length, width, _ = self.fleet.models[chosen].size
         turn *= manners.yaw_rad
-        needed = width * np.cos(turn) + length * abs(np.sin(turn))
-        room = max(0.5 * (self._column("slot_width")[slot] - needed), 0.0)
+        broad = width * np.cos(turn) + length * abs(np.sin(turn))
+        long = length * np.cos(turn) + width * abs(np.sin(turn))
+        room = max(0.5 * (self._column("slot_width")[slot] - broad), 0.0)
         side = float(np.clip(side * manners.lateral_m, -room, room))
-        ahead = max(0.5 * (self._column("slot_length")[slot] - length), 0.0) + 0.5 * manners.overhang_m
-        along = float(np.clip(along * manners.along_m, -ahead, ahead))
+        ahead = 0.5 * (self._column("slot_length")[slot] - long) - NOSE_GAP_M
+        along = float(np.clip(along * manners.along_m, -abs(ahead), ahead))
         yaw = float(self._column("slot_yaw")[slot])
         heading = np.array([np.cos(yaw), np.sin(yaw)])
         xy = self._column("slot_xy")[slot] + along * heading + side * np.array([-heading[1], heading[0]])

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Ground, Mesh
 from sim_sensors.scenery import (
+    GAITS,
     LAMP_POST_M,
     TRUNK_M,
     building_mesh,
@@ -28,7 +29,6 @@ from sim_sensors.scenery import (
 FloatArray = NDArray[np.float64]
 
 TREE_KINDS = 8
-GAITS = 8
 LOW_WALL_M = 0.5  # the laser passes over what is lower
 WALL_THICKNESS_M = 0.24
 

@@ -115,7 +115,7 @@ def test_footprints_are_where_the_vehicles_stand():
 def test_an_empty_scene_is_a_scene():
     scene = Scene.from_arrays(np.empty((0, 3)), np.empty(0, int))
     assert scene.n_vehicles == 0
-    assert len(scene.pool.vertices) == 0
+    assert len(scene.instances.mesh) == 0
     assert scene.footprints().corners.shape[0] == 0
     assert len(scene.instances.ids) == 0
 
@@ -191,7 +191,7 @@ def test_a_lot_of_200_cars_is_quick_and_a_change_quicker():
 
 def test_cars_park_as_the_manners_say():
     xy = 50.0 * np.column_stack([np.arange(1500), np.zeros(1500)])
-    parking = SlotLot(xy, np.zeros(1500), 5.2, 3.4, seed=2)
+    parking = SlotLot(xy, np.zeros(1500), 6.5, 3.4, seed=2)
     scene = parking.scene(np.ones(1500, bool))
     offset = scene.vehicle_pose[:, :2] - xy
     turn = np.mod(scene.vehicle_pose[:, 2] + np.pi / 2, np.pi) - np.pi / 2

@@ -59,6 +59,7 @@ def test_every_id_passes_the_checker_without_a_warning(env_id, scenario):
         env.close()
 
 
+@pytest.mark.filterwarnings("ignore:Your observation (image|scan|pose).* has an unconventional shape")
 @pytest.mark.parametrize("env_id", ENV_IDS)
 def test_stable_baselines_accepts_it(env_id):
     from stable_baselines3.common.env_checker import check_env as check_sb3

@@ -35,14 +35,17 @@ def preview(
     seed: args.SeedOption = 0,
     drive: Annotated[float, typer.Option("--drive", min=0.0, help="Metres of the video; 0 for none.")] = 20.0,
     every: Annotated[float, typer.Option("--every", min=0.05, help="Metres between its frames.")] = 0.5,
+    cars: Annotated[int, typer.Option("--cars", min=0, help="Other cars that drive about.")] = 3,
+    pedestrians: Annotated[int, typer.Option("--pedestrians", min=0, help="People who walk about.")] = 5,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures and drive.gif.")] = Path(
         "results/sensors"
     ),
 ) -> None:
     """Draw what the sensors see on the way from the entry to the slot nearest to the goal.
 
-    A picture for each weather: the side camera's frame with the true boxes, its depth, the stereo pair's
-    disparity, and the laser's scan from above. And a short video of the side camera driving past.
+    A picture for each weather, from where most cars stand beside the way: the side camera's frame with the true
+    boxes, its depth, the stereo pair's disparity, and the laser's scan from above. And a short video of the
+    side camera driving past.
 
     Examples:
     * `parkenv sensors preview`
@@ -50,12 +53,14 @@ def preview(
     * `parkenv sensors preview --scenario street --weather dusk --drive 40`
     """
     import numpy as np
+    from scipy.spatial import cKDTree
 
     from parkenv.evaluation.results import make_folder
     from parkenv.evaluation.sensor_pictures import save_animation, save_sensor_preview, with_boxes
     from parkenv.keyed_random import world_key
-    from parkenv.lot_scene import slot_lot
+    from parkenv.lot_scene import LotScenes, slot_lot
     from parkenv.scenario import Scenario
+    from parkenv.traffic import Traffic
     from planners.routes import DriveRoutes
     from sim_sensors.ground_truth import vehicle_boxes
     from sim_sensors.rig import SensorRig, poses_along
@@ -65,19 +70,21 @@ def preview(
     for name in names:
         if name not in PRESETS:
             raise InputError(f"--weather has {name!r}, want all or some of {', '.join(PRESETS)}")
-    its = Scenario.named(scenario)
+    its = Scenario.named(scenario, traffic=Traffic(cars, pedestrians))
     make_folder(out)
     console = make_console()
 
     key = world_key(seed, 0)
     arrival = its.occupancy.draw_arrival(its.arrival, key)
-    occupied = its.occupancy.world(key, arrival).occupied(np.arange(its.lot.n_slots), arrival.time)
-    scene = slot_lot(its.lot).scene(occupied, int(key) % 2**31)
+    scenes = LotScenes(slot_lot(its.lot), its, key, its.occupancy.world(key, arrival))
 
     entry, target = int(its.lot.entry_vertices[0]), int(its.lot.walk_m().argmin())
     path = [entry, *(vertex for _, vertex in DriveRoutes(its).way(entry, target))]
     poses = poses_along(its.lot.vertex_xy[path], every)
-    middle = len(poses) // 2
+    parked = scenes.at(arrival.time)
+    beside = poses[:, :2] + 4.0 * np.column_stack([np.sin(poses[:, 2]), -np.cos(poses[:, 2])])
+    standing = cKDTree(parked.vehicle_pose[parked.present, :2])
+    middle = int(standing.query_ball_point(beside, 6.0, return_length=True).argmax())
 
     ((_, stereo, stereo_mount),) = SensorRig.stereo().stereo_cameras
     rig = dataclasses.replace(SensorRig.thesis(), stereo_cameras=(("pair", stereo, stereo_mount),))
@@ -88,6 +95,7 @@ def preview(
     )
     for preset in track(names, "Taking pictures", console=console, disable=not console.is_terminal):
         light = Weather.draw(preset, seed)
+        scene = scenes.at(arrival.time, poses[middle])
         capture = rig.capture(scene, poses[middle], light, seed)
         boxes = vehicle_boxes(camera, scene, eye, capture.images[name])
         title = f"{its.name}, {preset.replace('_', ' ')}"
@@ -99,6 +107,7 @@ def preview(
         light = Weather.draw(names[0], seed)
         for k, pose in enumerate(track(past, "Driving", console=console, disable=not console.is_terminal)):
             eye = mount.camera_pose(pose)
+            scene = scenes.at(arrival.time + k * every / its.v_drive, pose)
             frame = camera.render(scene, eye, light, seed + k)
             frames.append(with_boxes(frame.image, vehicle_boxes(camera, scene, eye, frame)))
         save_animation(frames, out / "drive.gif")

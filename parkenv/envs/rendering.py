@@ -287,7 +287,7 @@ class SearchRenderer:
             ) from error
         if self._window is None:
             pygame.display.init()
-            self._window = pygame.display.set_mode((WIDTH, HEIGHT)), pygame.time.Clock()
+            self._window = pygame.display.set_mode(frame.shape[1::-1]), pygame.time.Clock()
             pygame.display.set_caption(f"parkenv: {self.scenario.name}")
         screen, ticker = self._window
         screen.blit(pygame.surfarray.make_surface(frame.swapaxes(0, 1)), (0, 0))

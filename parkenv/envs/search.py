@@ -143,6 +143,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         "render_modes": ["human", "rgb_array", "ansi"],
         "render_fps": 8,
     }
+    observation_space: spaces.Dict
 
     def __init__(
         self, scenario: str | Scenario = "campus", render_mode: str | None = None, **changes: Any
@@ -289,12 +290,17 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         state = self.state
         if self.render_mode == "ansi":
             return self._renderer.text(state)
-        everything = np.arange(self.scenario.lot.n_slots)
-        frame = self._renderer.frame(state, state.world.occupied(everything, state.time))
+        frame = self._frame(state)
         if self.render_mode == "human":
             self._renderer.show(frame, self.metadata["render_fps"])
             return None
         return frame
+
+    def _frame(self, state: SearchState) -> NDArray[np.uint8]:
+        """The lot from above."""
+        assert self._renderer is not None
+        everything = np.arange(self.scenario.lot.n_slots)
+        return self._renderer.frame(state, state.world.occupied(everything, state.time))
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -9,10 +9,12 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
+from parkenv.envs.drawing import write_text
 from parkenv.evaluation.lot_picture import draw_lot
 from parkenv.evaluation.picture_files import STYLE, save_picture
 from parkenv.lot import ParkingLot
@@ -39,9 +41,9 @@ def with_boxes(image: Image, boxes: VehicleBoxes) -> Image:
         view = View(boxes.view[i])
         cv2.rectangle(drawn, (left, top), (right - 1, bottom - 1), BOX_COLORS[view], 2, cv2.LINE_AA)
         label = f"{view.name.lower()} {boxes.distance[i]:.0f} m {boxes.visible_fraction[i]:.0%}"
-        cv2.putText(
-            drawn, label, (left + 4, max(top - 5, 12)), BOX_COLORS[view], cv2.FontFace("sans"), 13, 600
-        )
+        end = write_text(drawn, label, (left + 4, top + 15), BOX_COLORS[view], 13, 600)
+        cv2.rectangle(drawn, (left, top), (end + 4, top + 20), BOX_COLORS[view], cv2.FILLED)
+        write_text(drawn, label, (left + 4, top + 15), (16, 16, 16), 13, 600)
     return drawn
 
 
@@ -98,13 +100,15 @@ def save_sensor_preview(
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10.6, 8.4))
         figure.suptitle(title, x=0.02, ha="left", weight="bold")
-        places = ((0.02, 0.5), (0.5, 0.5), (0.02, 0.02), (0.5, 0.02))
+        places = ((0.02, 0.5), (0.02, 0.02), (0.5, 0.02), (0.5, 0.5))
         axes = [figure.add_axes((x, y, 0.46, 0.43)) for x, y in places]
         axes[0].imshow(with_boxes(frame.image, boxes))
         axes[0].set_title("camera; true boxes, view, distance, visible share")
-        shown = axes[1].imshow(frame.depth, cmap="viridis_r", vmin=NEAREST, vmax=FARTHEST)
+        shown = axes[1].imshow(frame.depth, cmap="viridis_r", norm=LogNorm(NEAREST, FARTHEST))
         axes[1].set_title("depth of the first opaque surface, m")
-        figure.colorbar(shown, ax=axes[1], fraction=0.034, pad=0.01)
+        metres = figure.colorbar(shown, ax=axes[1], fraction=0.034, pad=0.01)
+        metres.set_ticks([2, 5, 10, 20, 30], labels=["2", "5", "10", "20", "30"], minor=False)
+        metres.ax.minorticks_off()
         shown = axes[2].imshow(disparity(capture.pairs[name], stereo), cmap="magma")
         axes[2].set_title("disparity by semi-global matching, px")
         figure.colorbar(shown, ax=axes[2], fraction=0.034, pad=0.01)

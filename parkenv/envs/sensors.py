@@ -1,0 +1,162 @@
+"""`parkenv/SearchSensors-v0`: the search through raw sensors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from parkenv.envs.lookout import Lookout, Moment
+from parkenv.envs.search import LATEST, SearchEnv, SearchState
+from parkenv.scenario import Scenario
+from sim_sensors.rig import SensorRig
+
+FARTHEST = 1e7
+"""Bound, m, of the observed positions: Gymnasium wants one, and no lot is as large."""
+
+
+class SearchSensorsEnv(SearchEnv):
+    """`parkenv/Search-v0` for those who bring their own eyes: images, scans and poses instead of a belief.
+
+    ## Description
+    World, decisions, rewards and ends are those of `parkenv/Search-v0`; equal seeds give equal worlds. What the
+    car sees is measured by simulated sensors on the way: up to `captures` times on every edge, evenly, the last
+    time where it stops. The vehicle stands on its vertex (x, y) and looks along the lane; between two vertices
+    it looks where it drives. One capture is made where the search starts, and one after waiting or a failed try.
+
+    Where nothing has been forecast, an agent can read the forecast in `parkenv/Search-v0`'s first observation.
+
+    ## Action space
+    `Discrete(5)`: up, down, left, right, park, as in `parkenv/Search-v0`.
+
+    ## Observation space
+    A `Dict`; K = `captures`, newest last; rows from `count` on are 0.
+
+    | Key | Space | Meaning |
+    |-----|-------|---------|
+    | `vertex` | `Discrete(n_vertices)` | where the car is; vertex i < n_slots lies before slot i |
+    | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
+    | `action_mask` | `Box(0, 1, (5,), int8)` | which actions the graph has here |
+    | `count` | `Discrete(K + 1)` | how many captures the last step made; 0 once parked |
+    | `pose` | `Box(-1e7, 1e7, (K, 3), float32)` | x, y in m, yaw in rad of the vehicle, lot frame |
+    | `captured_at` | `Box(0, 1e8, (K,), float32)` | s since the search began |
+    | `image.<camera>` | `Box(0, 255, (K, h, w, 3), uint8)` | RGB, a key for each camera of the rig |
+    | `image.<pair>` | `Box(0, 255, (K, 2, h, w, 3), uint8)` | left and right, for each stereo camera |
+    | `scan.<laser>` | `Box(0, max_range, (K, n_beams), float32)` | m; `max_range` where nothing was met |
+
+    Beam n looks along -3π/4 + n·0.25° from forward, counter-clockwise, in the laser's frame. Where sensors sit
+    and how they are built is `env.unwrapped.rig`. The thesis's rig has `image.right` and `scan.laser`.
+
+    ## Rewards
+    As in `parkenv/Search-v0`.
+
+    ## Starting state
+    As in `parkenv/Search-v0`. The weather is drawn for each search unless it is given.
+
+    ## Episode end
+    As in `parkenv/Search-v0`; the lot is proven full by that environment's perfect looks.
+
+    ## Arguments
+    - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v0`. `traffic=Traffic(cars=4,
+      pedestrians=6)` lets others drive and walk through the pictures.
+    - `rig`: thesis, stereo, both_sides, or a `sim_sensors.rig.SensorRig`.
+    - `weather`: sunny, overcast, low_sun, dusk or rain; None draws one.
+    - `captures`: how many there are at most on an edge.
+    - `every`: m; on short edges captures are at least so far apart.
+
+    ```python
+    >>> import gymnasium as gym
+    >>> import parkenv
+    >>> env = gym.make("parkenv/SearchSensors-v0", scenario="mini", captures=2)
+    >>> observation, info = env.reset(seed=0)
+    >>> observation["image.right"].shape, observation["scan.laser"].shape, int(observation["count"])
+    ((2, 480, 640, 3), (2, 1081), 1)
+
+    ```
+
+    ## Version history
+    - v0: first version.
+    """
+
+    def __init__(
+        self,
+        scenario: str | Scenario = "campus",
+        render_mode: str | None = None,
+        rig: str | SensorRig = "thesis",
+        weather: str | None = None,
+        captures: int = 4,
+        every: float = 1.0,
+        **changes: Any,
+    ) -> None:
+        super().__init__(scenario, render_mode, **changes)
+        self._lookout = Lookout(self.scenario, rig, weather, captures, every)
+        self._before: tuple[int, float] | None = None
+        self._moments: list[Moment] = []
+        k = self._lookout.captures
+        seen: dict[str, spaces.Space[Any]] = {
+            name: space for name, space in self.observation_space.items() if name != "p_occupied"
+        }
+        seen["count"] = spaces.Discrete(k + 1)
+        seen["pose"] = spaces.Box(-FARTHEST, FARTHEST, (k, 3), np.float32)
+        seen["captured_at"] = spaces.Box(0.0, LATEST, (k,), np.float32)
+        for name, camera, _ in self.rig.cameras:
+            seen[f"image.{name}"] = spaces.Box(0, 255, (k, camera.height, camera.width, 3), np.uint8)
+        for name, stereo, _ in self.rig.stereo_cameras:
+            size = (stereo.camera.height, stereo.camera.width)
+            seen[f"image.{name}"] = spaces.Box(0, 255, (k, 2, *size, 3), np.uint8)
+        for name, laser, _ in self.rig.lasers:
+            seen[f"scan.{name}"] = spaces.Box(0.0, laser.max_range, (k, laser.n_beams), np.float32)
+        self.observation_space = spaces.Dict(seen)
+
+    @property
+    def rig(self) -> SensorRig:
+        """The sensors, where they sit, and how they are built."""
+        return self._lookout.rig
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start a search; see the class."""
+        self._before = None
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Drive along an edge, or try to park; see the class."""
+        self._before = (self.state.vertex, self.state.time)
+        return super().step(action)
+
+    def _observation(self, state: SearchState) -> dict[str, Any]:
+        self._moments = [] if state.parked else self._lookout.look(state, self._before)
+        observation = super()._observation(state)
+        del observation["p_occupied"]
+        for name, space in self.observation_space.items():
+            if name not in observation:
+                observation[name] = np.zeros(space.shape, space.dtype)
+        observation["count"] = np.int64(len(self._moments))
+        for i, (time, capture) in enumerate(self._moments):
+            observation["pose"][i] = capture.pose
+            observation["captured_at"][i] = time - state.arrival.time
+            for name, frame in capture.images.items():
+                observation[f"image.{name}"][i] = frame.image
+            for name, pair in capture.pairs.items():
+                observation[f"image.{name}"][i] = pair.left.image, pair.right.image
+            for name, laser, _ in self.rig.lasers:
+                observation[f"scan.{name}"][i] = np.minimum(capture.scans[name], laser.max_range)
+        return observation
+
+    def _frame(self, state: SearchState) -> NDArray[np.uint8]:
+        """The lot from above, and beside it the newest pictures."""
+        view = super()._frame(state)
+        pictures = []
+        for _, capture in self._moments[-1:]:
+            pictures += [frame.image for frame in capture.images.values()]
+            pictures += [pair.left.image for pair in capture.pairs.values()]
+        height = view.shape[0]
+        # Every frame of a video must be as wide as the first, whatever is there to be seen.
+        while len(pictures) < len(self.rig.cameras) + len(self.rig.stereo_cameras):
+            pictures.append(np.zeros_like(view))
+        beside = [cv2.resize(p, (round(p.shape[1] * height / p.shape[0]), height)) for p in pictures]
+        return np.concatenate([view, *beside], axis=1)

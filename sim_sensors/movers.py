@@ -1,0 +1,80 @@
+"""What moves through a scene: vehicles that drive and people who walk, at one moment."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_sensors.errors import SensorError
+from sim_sensors.mesh import Mesh
+from sim_sensors.scenery import GAITS, pedestrian_mesh
+from sim_sensors.surroundings import floats
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+LOOKS = 12
+"""How many different people there are."""
+
+
+@dataclass(frozen=True, eq=False)
+class Movers:
+    """Vehicles that drive and people who walk, at one moment; world frame.
+
+    Args:
+        vehicle_pose: (m, 3): x, y in m, yaw in rad.
+        vehicle_model: (m,) int, index into the scene's `fleet.models`.
+        walker_pose: (p, 3): x, y in m, yaw in rad.
+        walker_stride: (p,) turns, phase of the stride.
+        walker_look: (p,) int, 0 to `LOOKS` - 1: who it is.
+
+    Raises:
+        SensorError: a wrong shape, a value that is not finite, an index below 0 or no such person.
+    """
+
+    vehicle_pose: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    vehicle_model: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+    walker_pose: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    walker_stride: FloatArray = field(default_factory=lambda: np.empty(0))
+    walker_look: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        for name, rows in (("vehicle_pose", "vehicle_model"), ("walker_pose", "walker_look")):
+            pose = floats(name, getattr(self, name), 3)
+            object.__setattr__(self, name, pose)
+            numbers = np.array(getattr(self, rows), dtype=np.int64)
+            if numbers.shape != (len(pose),) or numbers.min(initial=0) < 0:
+                raise SensorError(
+                    f"{rows}: wanted ({len(pose)},) integers of 0 or more, got {numbers.tolist()}"
+                )
+            object.__setattr__(self, rows, numbers)
+        stride = floats("walker_stride", np.reshape(self.walker_stride, (-1, 1)), 1)[:, 0]
+        if len(stride) != self.n_walkers:
+            raise SensorError(f"walker_stride: wanted {self.n_walkers} phases, got {len(stride)}")
+        object.__setattr__(self, "walker_stride", stride)
+        if self.walker_look.max(initial=0) >= LOOKS:
+            raise SensorError(f"walker_look: wanted 0 to {LOOKS - 1}, got {self.walker_look.tolist()}")
+
+    @property
+    def n_vehicles(self) -> int:
+        """How many vehicles drive."""
+        return len(self.vehicle_pose)
+
+    @property
+    def n_walkers(self) -> int:
+        """How many people walk."""
+        return len(self.walker_pose)
+
+    @property
+    def gait(self) -> IntArray:
+        """(p,) int64: which of the `GAITS` pictures of a stride each walker shows."""
+        return np.round(self.walker_stride * GAITS).astype(np.int64) % GAITS
+
+
+@lru_cache(maxsize=1)
+def people_meshes() -> tuple[Mesh, ...]:
+    """Every person in every gait, `GAITS` after `GAITS`."""
+    return tuple(pedestrian_mesh(gait / GAITS, look) for look in range(LOOKS) for gait in range(GAITS))

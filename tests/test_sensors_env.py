@@ -1,0 +1,325 @@
+"""`parkenv/SearchSensors-v0`: raw observations of the same searches, and what else moves in the lot."""
+
+import copy
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import data_equivalence
+
+import parkenv  # noqa: F401
+from parkenv import InputError, OccupancyProcess, Scenario, Traffic
+from parkenv.envs.lookout import Lookout
+from parkenv.lot_scene import LotScenes, slot_lot
+from parkenv.traffic import LotTraffic
+from sim_sensors.camera import PinholeCamera
+from sim_sensors.errors import SensorError
+from sim_sensors.ground_truth import vehicle_boxes
+from sim_sensors.laser import LaserScanner
+from sim_sensors.movers import Movers
+from sim_sensors.rig import LEFT, RIGHT, Mount, SensorRig
+
+SMALL = PinholeCamera.from_field_of_view(80, 60)
+SMALL_RIG = SensorRig(
+    cameras=(("right", SMALL, Mount(z=1.1, yaw=RIGHT)),), lasers=(("laser", LaserScanner(), Mount(z=0.5)),)
+)
+LASER_ONLY = SensorRig(lasers=(("laser", LaserScanner(), Mount(z=0.5)),))
+BUSY = Traffic(cars=4, pedestrians=6)
+
+
+def make(**options):
+    return gym.make("parkenv/SearchSensors-v0", **{"scenario": "mini", "rig": SMALL_RIG, **options})
+
+
+def drive(env, seed, actions):
+    first, _ = env.reset(seed=seed)
+    return [first, *(env.step(action)[0] for action in actions)]
+
+
+def test_the_same_seed_shows_the_same_pictures_to_everyone():
+    one, two = make(traffic=BUSY), make(traffic=BUSY)
+    for a, b in zip(drive(one, 3, (3, 3, 3)), drive(two, 3, (3, 3, 3)), strict=True):
+        assert data_equivalence(a, b, exact=True)
+    assert not np.array_equal(drive(one, 3, (3,))[1]["image.right"], drive(one, 4, (3,))[1]["image.right"])
+
+
+def test_the_search_is_that_of_the_search_environment():
+    sensors, plain = make(rig=LASER_ONLY), gym.make("parkenv/Search-v0", scenario="mini")
+    sensors.reset(seed=5)
+    observation, _ = plain.reset(seed=5)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        action = rng.choice(np.flatnonzero(observation["action_mask"]))
+        raw, *rest = sensors.step(action)
+        observation, *plain_rest = plain.step(action)
+        assert rest == plain_rest
+        assert raw["vertex"] == observation["vertex"]
+        assert "p_occupied" not in raw
+        if rest[1]:
+            assert (raw["count"] == 0) == rest[-1]["parked"]
+            break
+
+
+def test_captures_lie_on_the_edge_just_driven_and_end_at_the_stop():
+    env = make(scenario="campus", rig=LASER_ONLY, captures=4, every=1.0)
+    env.reset(seed=0)
+    lot = env.unwrapped.scenario.lot
+    before = env.unwrapped.state.vertex
+    counts = set()
+    for _ in range(12):
+        action = int(np.flatnonzero(lot.neighbors[before] >= 0)[-1])
+        observation, *_ = env.step(action)
+        here, n = int(observation["vertex"]), int(observation["count"])
+        start, end = lot.vertex_xy[before], lot.vertex_xy[here]
+        shares = np.arange(1, n + 1) / n
+        np.testing.assert_allclose(
+            observation["pose"][:n, :2], start + shares[:, None] * (end - start), rtol=0, atol=1e-4
+        )
+        way = np.arctan2(*(end - start)[::-1])
+        np.testing.assert_allclose(observation["pose"][: n - 1, 2], way, atol=1e-5)
+        if here < lot.n_slots:
+            assert observation["pose"][n - 1, 2] == np.float32(lot.vertex_yaw[here])
+        assert not observation["pose"][n:].any()
+        assert (np.diff(observation["captured_at"][:n]) > 0).all()
+        assert n == min(max(int(np.hypot(*(end - start))), 1), 4)
+        counts.add(n)
+        before = here
+    assert len(counts) > 1
+
+
+def test_waiting_makes_one_capture_and_time_goes_on():
+    env = make(rig=LASER_ONLY)
+    start, _ = env.reset(seed=0)
+    missing = int(np.flatnonzero(start["action_mask"] == 0)[0])
+    observation, *_ = env.step(missing)
+    assert start["count"] == observation["count"] == 1
+    np.testing.assert_array_equal(observation["pose"][0], start["pose"][0])
+    assert observation["captured_at"][0] == 1.0
+
+
+def test_a_scan_shows_max_range_where_nothing_is_met():
+    observation, _ = make(rig=LASER_ONLY).reset(seed=0)
+    scan = observation["scan.laser"][0]
+    assert (scan == 30.0).any()
+    assert (scan < 30.0).any()
+
+
+def test_state_comes_back_with_its_pictures():
+    env = make().unwrapped
+    env.reset(seed=2)
+    env.step(3)
+    saved, twin, thawed = env.get_state(), copy.deepcopy(env), pickle.loads(pickle.dumps(env))
+    after = env.step(3)[0]
+    other = make().unwrapped
+    other.reset(seed=9)
+    other.set_state(saved)
+    for again in (twin, thawed, other):
+        assert data_equivalence(again.step(3)[0], after, exact=True)
+
+
+def test_stereo_and_two_sided_rigs_have_their_own_keys():
+    pair = SensorRig.stereo()
+    assert make(rig=pair).observation_space["image.right"].shape == (4, 2, 480, 640, 3)
+    both = make(rig="both_sides").observation_space
+    assert {"image.left", "image.right", "scan.laser"} <= set(both)
+
+
+def test_frames_show_the_camera_beside_the_lot():
+    env = make(render_mode="rgb_array")
+    env.reset(seed=0)
+    assert env.render().shape == (480, 640 + 640, 3)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"rig": "lidar"}, "rig is 'lidar', want a SensorRig or one of thesis, stereo, both_sides"),
+        ({"rig": 3}, "rig is a int"),
+        ({"weather": "snow"}, "weather is 'snow'"),
+        ({"captures": 0}, "captures is 0, want a whole number of at least 1"),
+        ({"every": float("nan")}, "every is nan m"),
+        ({"traffic": 5}, "traffic is a int, want a Traffic"),
+    ],
+)
+def test_bad_arguments_are_named(options, words):
+    with pytest.raises(InputError, match=words):
+        make(**options)
+
+
+def test_negative_traffic_is_refused():
+    with pytest.raises(InputError, match=r"Traffic.cars is -1, want a whole number of at least 0"):
+        Traffic(cars=-1)
+
+
+# What stands in the lot, and what moves there
+
+
+def coming_and_going(lot):
+    """Cars that stay five minutes."""
+    return OccupancyProcess.from_demand(np.zeros(lot.n_slots), np.zeros(168), 300.0)
+
+
+def test_scenes_follow_the_world_and_do_not_depend_on_when_one_looks():
+    lot = Scenario.named("mini").lot
+    scenario = Scenario.named("mini", occupancy=coming_and_going(lot))
+    slots, key = slot_lot(lot), np.uint64(77)
+    arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
+
+    def scenes():
+        return LotScenes(slots, scenario, key, scenario.occupancy.world(key, arrival))
+
+    often, seldom = scenes(), scenes()
+    world = scenario.occupancy.world(key, arrival)
+    cars = set()
+    for minute in range(0, 60, 2):
+        time = arrival.time + 60.0 * minute
+        scene = often.at(time)
+        np.testing.assert_array_equal(
+            np.isin(np.arange(lot.n_slots), scene.present), world.occupied(np.arange(lot.n_slots), time)
+        )
+        cars |= {tuple(p) for p in scene.vehicle_pose[scene.present]}
+    late = seldom.at(time)
+    np.testing.assert_array_equal(late.vehicle_model, scene.vehicle_model)
+    np.testing.assert_array_equal(late.vehicle_pose[late.present], scene.vehicle_pose[scene.present])
+    assert len(cars) > 2 * lot.n_slots  # another car comes after one has left
+
+
+@pytest.mark.parametrize("name", ["campus", "street", "mini"])
+def test_traffic_keeps_to_its_ways(name):
+    from shapely import STRtree, box, polygons
+    from shapely.affinity import rotate, translate
+
+    scenario = Scenario.named(name)
+    traffic = LotTraffic(
+        scenario.lot, 0, Traffic(cars=6, pedestrians=0), np.uint64(3), slot_lot(scenario.lot)
+    )
+    slots = STRtree(polygons(scenario.lot.slot_corners()))
+    touching = 0
+    times = np.arange(0.0, 200.0, 2.0)
+    before = None
+    for time in times:
+        pose = traffic.at(time).vehicle_pose
+        assert len(pose) == 6
+        if before is not None:
+            assert (np.hypot(*(pose - before)[:, :2].T) < 4.0 * 2.0 + 0.5).all()
+        before = pose
+        for x, y, yaw in pose:
+            # Half the car: even people who cut a corner do not drive through parked ones.
+            car = translate(rotate(box(-2.0, -0.5, 2.0, 0.5), yaw, use_radians=True, origin=(0, 0)), x, y)
+            touching += bool(len(slots.query(car, predicate="intersects")))
+    assert touching < 0.02 * 6 * len(times)
+
+
+def test_people_walk_to_the_goal_and_back():
+    scenario = Scenario.named("mini")
+    traffic = LotTraffic(
+        scenario.lot, 0, Traffic(cars=0, pedestrians=3), np.uint64(5), slot_lot(scenario.lot)
+    )
+    poses = np.array([traffic.at(t).walker_pose for t in np.arange(0.0, 600.0, 1.0)])
+    away = np.hypot(*np.moveaxis(poses[..., :2] - scenario.lot.goals[0], -1, 0))
+    assert (away.min(axis=0) < 1.5).all()
+    assert (away.max(axis=0) > 5.0).all()
+    strides = np.array([traffic.at(t).walker_stride for t in np.arange(0.0, 2.0, 0.1)])
+    assert len(np.unique(strides)) > 20
+
+
+def test_nobody_is_in_the_searching_cars_way():
+    scenario = Scenario.named("mini")
+    traffic = LotTraffic(
+        scenario.lot, 0, Traffic(cars=3, pedestrians=4), np.uint64(1), slot_lot(scenario.lot)
+    )
+    for time in np.arange(0.0, 60.0, 3.0):
+        everyone = traffic.at(time)
+        ego = everyone.vehicle_pose[0]
+        seen = traffic.at(time, ego)
+        assert seen.n_vehicles < everyone.n_vehicles
+        assert (np.abs(seen.vehicle_pose[:, :2] - ego[:2]).max(axis=1) > 2.0).all()
+
+
+def test_movers_are_drawn_scanned_and_numbered_after_the_parked_cars():
+    lot = Scenario.named("mini").lot
+    parked = slot_lot(lot).scene(np.ones(lot.n_slots, bool))
+    x, y = lot.vertex_xy[0]
+    ahead = np.array([[x, y + 4.0, 0.3]])
+    moving = parked.with_movers(
+        Movers(ahead, np.array([2]), np.array([[x + 4.0, y, 0.0]]), np.array([0.2]), np.array([1]))
+    )
+    pose = np.array([x, y, 0.0])
+    left = Mount(z=1.1, yaw=LEFT).camera_pose(pose)
+    camera = PinholeCamera()
+    boxes = vehicle_boxes(camera, moving, left, camera.render(moving, left))
+    assert lot.n_slots + 1 in boxes.ids
+    assert lot.n_slots + 1 not in vehicle_boxes(camera, parked, left, camera.render(parked, left)).ids
+    laser = LaserScanner()
+    still, _ = laser.scan_with_ids(parked.scan_plane, pose)
+    scan, ids = laser.scan_with_ids(moving.scan_plane, pose)
+    assert (ids == lot.n_slots + 1).sum() > 20
+    assert (scan <= still).all()
+    assert scan[540] < 4.0  # someone walks straight ahead
+    assert ids[540] == 0
+
+
+def test_moving_shadows_are_those_of_a_scene_made_anew():
+    lot = Scenario.named("mini").lot
+    slots = slot_lot(lot)
+    parked = slots.scene(np.ones(lot.n_slots, bool))
+    x, y = lot.vertex_xy[0]
+    movers = Movers(np.array([[x + 3.0, y + 1.0, 0.1]]), np.array([4]))
+    eye = Mount(z=1.1, yaw=0.0).camera_pose(np.array([x - 6.0, y, 0.0]))
+    camera = PinholeCamera()
+    camera.render(parked, eye)  # its shadows are kept, and the mover's are added
+    kept = camera.render(parked.with_movers(movers), eye)
+    fresh_scene = slots.scene(np.ones(lot.n_slots, bool)).with_movers(movers)
+    fresh = camera.render(fresh_scene, eye)
+    np.testing.assert_array_equal(kept.image, fresh.image)
+    ground = (kept.ids == 0) & (kept.depth < 12.0)
+    without = camera.render(parked, eye).image.astype(int)
+    darker = (without.sum(axis=2) - kept.image.sum(axis=2, dtype=int)) > 60
+    assert (darker & ground).sum() > 300
+
+
+@pytest.mark.parametrize(
+    ("movers", "words"),
+    [
+        ({"vehicle_pose": [[0.0, np.nan, 0.0]], "vehicle_model": [0]}, r"vehicle_pose\[0, 1\]"),
+        ({"vehicle_pose": [[0.0, 0.0, 0.0]]}, "vehicle_model: wanted"),
+        ({"walker_pose": [[0.0, 0.0, 0.0]], "walker_look": [0]}, "walker_stride: wanted 1 phases"),
+        (
+            {"walker_pose": [[0.0, 0.0, 0.0]], "walker_look": [99], "walker_stride": [0.0]},
+            "walker_look: wanted 0 to 11",
+        ),
+    ],
+)
+def test_bad_movers_are_named(movers, words):
+    with pytest.raises(SensorError, match=words):
+        Movers(**movers)
+
+
+def test_a_mover_of_a_model_that_the_fleet_lacks_is_refused():
+    lot = Scenario.named("mini").lot
+    scene = slot_lot(lot).scene(np.zeros(lot.n_slots, bool))
+    with pytest.raises(SensorError, match="vehicle_model: wanted 0 to 99"):
+        scene.with_movers(Movers(np.zeros((1, 3)), np.array([100])))
+
+
+def test_lookouts_of_equal_worlds_see_the_same_whatever_was_looked_at_before():
+    scenario = Scenario.named("mini", traffic=BUSY)
+    env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+    env.reset(seed=0)
+    eager, late = (Lookout(scenario, SMALL_RIG, None, 3, 0.5) for _ in range(2))
+    for action in (3, 3, 3):
+        before = env.state.vertex, env.state.time
+        env.step(action)
+        last = eager.look(env.state, before)
+    for a, b in zip(last, late.look(env.state, before), strict=True):
+        np.testing.assert_array_equal(a.capture.images["right"].image, b.capture.images["right"].image)
+        np.testing.assert_array_equal(a.capture.scans["laser"], b.capture.scans["laser"])
+
+
+@pytest.mark.parametrize("name", ["campus", "jam", "street", "mini"])
+def test_cars_of_a_full_lot_do_not_touch(name):
+    lot = Scenario.named(name).lot
+    for arrival in (0, 7919):
+        scene = slot_lot(lot).scene(np.ones(lot.n_slots, bool), arrival)  # an overlap would warn
+        assert len(scene.present) == lot.n_slots
