@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from gymnasium.envs.registration import register, registry
 
 if TYPE_CHECKING:
-    from parkenv.belief import SightingModel
+    from parkenv.belief import SightBand, SightingModel
     from parkenv.errors import InputError
     from parkenv.lot import Lane, Mouth, ParkingLot
     from parkenv.occupancy import ArrivalWindow, OccupancyProcess
@@ -33,6 +33,7 @@ _EXPORTS = {
     "RecordedOccupancy": "parkenv.recorded_occupancy",
     "Scenario": "parkenv.scenario",
     "SearchProblem": "parkenv.scenario",
+    "SightBand": "parkenv.belief",
     "SightingModel": "parkenv.belief",
     "Traffic": "parkenv.traffic",
 }
@@ -48,6 +49,7 @@ __all__ = [
     "RecordedOccupancy",
     "Scenario",
     "SearchProblem",
+    "SightBand",
     "SightingModel",
     "Traffic",
 ]

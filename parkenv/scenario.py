@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from parkenv.belief import SightingModel
+from parkenv.belief import SightingModel, SightRates
 from parkenv.errors import InputError
 from parkenv.lot import ParkingLot
 from parkenv.occupancy import Arrival, ArrivalWindow, Forecast, OccupancyModel, OccupancyProcess
@@ -86,6 +86,21 @@ class SearchProblem:
         order = np.lexsort((slot, viewer))
         starts = np.searchsorted(viewer[order], np.arange(self.lot.n_vertices + 1))
         return _read_only(starts.astype(np.int64)), _read_only(slot[order].astype(np.int64))
+
+    @cached_property
+    def sight_rates(self) -> SightRates:
+        """How well each of `slots_in_view` is seen, row by row of it.
+
+        A slot is beside a car that stands before it or another slot if it lies to the right, within 45° of abreast.
+        """
+        starts, slots = self.slots_in_view
+        viewer = np.repeat(np.arange(self.lot.n_vertices), np.diff(starts))
+        away = self.lot.vertex_xy[slots] - self.lot.vertex_xy[viewer]
+        to_slot = self.lot.slot_xy[slots] - self.lot.vertex_xy[viewer]
+        angle = np.arctan2(to_slot[:, 1], to_slot[:, 0]) - self.lot.vertex_yaw[viewer]
+        beside = (np.sin(angle) <= -math.sqrt(0.5)) & (viewer < self.lot.n_slots)
+        rates = self.sighting.rates(np.hypot(away[:, 0], away[:, 1]), beside)
+        return SightRates(*map(_read_only, rates))
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed, checked again.

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import parkenv
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightingModel
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightBand, SightingModel
 from parkenv.belief import SlotBelief
 from parkenv.envs.wrappers import ThesisReward
 from parkenv.lot import PARK
@@ -275,7 +275,7 @@ def test_only_slots_in_view_are_learnt_of():
 def test_a_sighting_is_bayes_rule_and_relaxes_exponentially():
     forecast = Forecast(p_occupied=np.array([0.6, 0.6]), relaxation_rate=np.array([1 / 600, 1 / 600]))
     belief = SlotBelief(forecast, time=100.0)
-    belief.update(np.array([0]), np.array([True]), SightingModel(hit_rate=0.9, false_alarm_rate=0.2))
+    belief.update(np.array([0]), np.array([True]), np.array([0.9]), np.array([0.2]))
     seen = 0.9 * 0.6 / (0.9 * 0.6 + 0.2 * 0.4)
     assert belief.p_occupied[0] == pytest.approx(seen)
     belief.relax(100.0 + 300.0)
@@ -302,6 +302,55 @@ def test_noisy_sight_errs_as_often_as_stated():
     per_seed = looks_taken / seeds
     assert per_seed[taken].mean() == pytest.approx(0.8, abs=0.02)
     assert per_seed[~taken].mean() == pytest.approx(0.3, abs=0.02)
+
+
+def test_sight_differs_by_distance_and_side():
+    lot = Scenario.named("mini").lot
+    bands = (
+        SightBand(up_to=1.0, beside=True, seen_rate=1.0, hit_rate=1.0, false_alarm_rate=0.0),
+        SightBand(up_to=6.0, beside=True, seen_rate=0.5, hit_rate=0.9, false_alarm_rate=0.1),
+        SightBand(up_to=6.0, beside=False, seen_rate=0.25, hit_rate=0.8, false_alarm_rate=0.2),
+    )
+    taken = np.arange(lot.n_slots) % 2 == 0
+    scenario = Scenario(
+        name="bands", lot=lot, occupancy=always(lot, taken), sighting=SightingModel(6.0, bands=bands)
+    )
+    starts, slots = scenario.slots_in_view
+    rows = slice(starts[0], starts[1])
+    own = slots[rows] == 0
+    rates = scenario.sight_rates.of(rows)
+    np.testing.assert_array_equal(rates.hit[own], 1.0)
+    across = lot.slot_yaw[slots[rows]] != lot.slot_yaw[0]
+    assert across.any()
+    np.testing.assert_array_equal(rates.seen[across], 0.25)
+    env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+    seen, looked_taken = np.zeros(lot.n_slots), np.zeros(lot.n_slots)
+    way_to_0 = next(c for c in range(4) for v in [lot.neighbors[lot.entry_vertices[0], c]] if v >= 0)
+    seeds = 400
+    for seed in range(seeds):
+        env.reset(seed=seed)
+        env.step(way_to_0)
+        seen += env.state.belief.seen
+        looked_taken += env.state.belief.p_occupied > env.state.belief.prior
+    rows = slice(*starts[env.state.vertex : env.state.vertex + 2])
+    view, rates = slots[rows], scenario.sight_rates.of(rows)
+    np.testing.assert_allclose(seen[view] / seeds, rates.seen, atol=0.08)
+    expected = np.where(taken[view], rates.hit, rates.false_alarm)
+    np.testing.assert_allclose((looked_taken / np.maximum(seen, 1))[view], expected, atol=0.12)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"seen_rate": 1.5}, "seen_rate is 1.5"),
+        ({"up_to": -1.0}, "up_to is -1.0 m"),
+        ({"hit_rate": 0.0}, "hit_rate"),
+    ],
+)
+def test_wrong_bands_are_named(wrong, message):
+    right = {"up_to": 1.0, "beside": True, "seen_rate": 1.0, "hit_rate": 0.9, "false_alarm_rate": 0.1}
+    with pytest.raises(InputError, match=message):
+        SightBand(**right | wrong)
 
 
 @pytest.mark.parametrize(

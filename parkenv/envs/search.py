@@ -11,9 +11,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.belief import SightingModel, SlotBelief
+from parkenv.belief import SightRates, SlotBelief
 from parkenv.errors import InputError
-from parkenv.keyed_random import ENTRY_STREAM, SIGHTING_STREAM, keyed_uniform, world_key
+from parkenv.keyed_random import ENTRY_STREAM, SIGHTING_STREAM, VIEW_STREAM, keyed_uniform, world_key
 from parkenv.lot import ACTIONS, PARK
 from parkenv.occupancy import Arrival, World
 from parkenv.scenario import Scenario
@@ -21,8 +21,7 @@ from parkenv.scenario import Scenario
 if TYPE_CHECKING:
     from parkenv.envs.rendering import SearchRenderer
 
-_CERTAIN = SightingModel()
-_ALWAYS = np.ones(1, dtype=np.bool_)
+_TRIED = np.ones(1, dtype=np.bool_), np.ones(1), np.zeros(1)  # it is taken, and that is certain
 
 LATEST = 1e8
 """Bound, s, of the observed times: Gymnasium wants one, and three years are more than any search takes."""
@@ -170,6 +169,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self._masks[:, :PARK] = lot.neighbors >= 0
         self._masks[: lot.n_slots, PARK] = 1
         self._view_starts, self._view_slots = self.scenario.slots_in_view
+        self._rates = self.scenario.sight_rates
         self._state: SearchState | None = None
         self._episode = 0
         self._renderer: SearchRenderer | None = None
@@ -247,7 +247,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         elif state.world.occupied(np.array([state.vertex]), state.time)[0]:
             failed = self.scenario.failure_s
             state.failed_parks += 1
-            state.belief.update(np.array([state.vertex]), _ALWAYS, _CERTAIN)
+            state.belief.update(np.array([state.vertex]), *_TRIED)
         else:
             state.parked = True
             state.walked_m = float(lot.walk_m(self.scenario.goal)[state.vertex])
@@ -313,17 +313,18 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         vertex, sighting = state.vertex, self.scenario.sighting
         if vertex < self.scenario.lot.n_slots:
             state.passed.add(vertex)
-        slots = self._view_slots[self._view_starts[vertex] : self._view_starts[vertex + 1]]
+        rows = slice(self._view_starts[vertex], self._view_starts[vertex + 1])
+        slots, rates = self._view_slots[rows], self._rates.of(rows)
         state.belief.relax(state.time)
         if not len(slots):
             return
         looks_taken = state.world.occupied(slots, state.time)
         if not sighting.perfect:
-            # Keyed by the millisecond: whoever looks at a slot then makes the same error.
-            when = int(state.time * 1000.0)
-            chance = np.array([keyed_uniform(state.key, SIGHTING_STREAM, int(s), when) for s in slots])
-            looks_taken = chance < np.where(looks_taken, sighting.hit_rate, sighting.false_alarm_rate)
-        state.belief.update(slots, looks_taken, sighting)
+            seen = _chances(state, VIEW_STREAM, slots) < rates.seen
+            slots, looks_taken, rates = slots[seen], looks_taken[seen], SightRates(*(r[seen] for r in rates))
+            rate = np.where(looks_taken, rates.hit, rates.false_alarm)
+            looks_taken = _chances(state, SIGHTING_STREAM, slots) < rate
+        state.belief.update(slots, looks_taken, rates.hit, rates.false_alarm)
 
     def _observation(self, state: SearchState) -> dict[str, Any]:
         return {
@@ -332,6 +333,12 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             "p_occupied": state.belief.p_occupied.astype(np.float32),
             "action_mask": self._masks[state.vertex].copy(),
         }
+
+
+def _chances(state: SearchState, stream: int, slots: NDArray[np.int64]) -> NDArray[np.float64]:
+    """A uniform number for each slot, keyed by the millisecond: whoever looks at a slot then makes the same error."""
+    when = int(state.time * 1000.0)
+    return np.array([keyed_uniform(state.key, stream, int(s), when) for s in slots])
 
 
 def _action_number(action: Any) -> int:

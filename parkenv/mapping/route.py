@@ -1,0 +1,166 @@
+"""The drive that passes every slot of a lot on the side where the camera looks."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import networkx as nx
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.lot import ParkingLot
+
+FloatArray = NDArray[np.float64]
+
+_MILLIMETRES = 1000.0
+
+
+class SurveyRoute(NamedTuple):
+    """A closed drive.
+
+    Attributes:
+        vertices: (k,) int64, the stops passed, in order.
+        path: (k, 2) float64, m, lot frame.
+        against: how many slots are passed against a one-way lane, since they lie on its left.
+        length: m.
+    """
+
+    vertices: NDArray[np.int64]
+    path: FloatArray
+    against: int
+    length: float
+
+
+class _Pass(NamedTuple):
+    """One way along a lane from a junction to the next: the stops, junctions included, and its length, m."""
+
+    stops: tuple[int, ...]
+    length: float
+    against: bool = False
+
+
+def survey_route(lot: ParkingLot, entry: int = 0, *, both_sides: bool = False) -> SurveyRoute:
+    """Drive from an entry past every slot, with the slot on the right, and back.
+
+    Each side of a two-way lane is driven in its own direction. Slots on the left of a one-way lane would need a camera
+    on the left; for one on the right that lane is driven once more, against its direction, as people who map a lot
+    do at quiet hours. What must be driven is known, so this is the rural postman problem on a directed graph: the
+    cheapest ways that balance arrivals and departures at every junction are a minimum-cost flow, and then an Eulerian
+    circuit drives all (Christofides et al., "An algorithm for the rural postman problem on a directed graph", 1986).
+
+    Args:
+        lot: the lot.
+        entry: index into `lot.entries`, where the drive begins and ends.
+        both_sides: whether the car sees to the left as well.
+
+    Raises:
+        InputError: a lane to drive that cannot be reached from the entry, or from which no way leads back.
+    """
+    passes = _passes(lot)
+    needed = [p for p in passes if len(p.stops) > 2]
+    if not both_sides:
+        needed += [_Pass(p.stops[::-1], p.length, True) for p in needed if _left_slots(lot, p)]
+    start = int(lot.entry_vertices[entry])
+    ways = nx.DiGraph()
+    for p in passes:
+        a, b = p.stops[0], p.stops[-1]
+        if not ways.has_edge(a, b) or ways.edges[a, b]["length"] > p.length:
+            ways.add_edge(a, b, length=p.length, stops=p.stops)
+    drive: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
+    for p in needed:
+        drive.add_edge(p.stops[0], p.stops[-1], stops=p.stops)
+    try:
+        _join(drive, ways, start)
+        _balance(drive, ways)
+    except nx.NetworkXException as error:
+        raise InputError(
+            f"lot {lot.name!r}: no drive leads from entry {entry} past every slot and back"
+        ) from error
+    stops = [start]
+    for a, b, key in nx.eulerian_circuit(drive, start, keys=True):
+        stops.extend(drive.edges[a, b, key]["stops"][1:])
+    vertices = np.array(stops, dtype=np.int64)
+    path = lot.vertex_xy[vertices]
+    length = float(np.hypot(*np.diff(path, axis=0).T).sum())
+    against = sum(_left_slots(lot, _Pass(p.stops[::-1], 0.0)) for p in needed if p.against)
+    return SurveyRoute(vertices, path, against, length)
+
+
+def _passes(lot: ParkingLot) -> list[_Pass]:
+    """Every way from junction to junction that the lanes allow."""
+    found = []
+    for junction in range(lot.n_slots, lot.n_vertices):
+        for column in np.flatnonzero(lot.neighbors[junction] >= 0):
+            stops, length = [junction], 0.0
+            vertex: int | None = int(lot.neighbors[junction, column])
+            length += float(lot.edge_length[junction, column])
+            while vertex is not None:
+                stops.append(vertex)
+                vertex, step = _straight_on(lot, vertex)
+                length += step
+            found.append(_Pass(tuple(stops), length))
+    return found
+
+
+def _straight_on(lot: ParkingLot, vertex: int) -> tuple[int | None, float]:
+    """The next stop along a slot's lane, and how far it is; None at a junction."""
+    if vertex >= lot.n_slots:
+        return None, 0.0
+    heading = lot.vertex_yaw[vertex]
+    best, choice = -2.0, -1
+    for column in np.flatnonzero(lot.neighbors[vertex] >= 0).tolist():
+        to = lot.neighbors[vertex, column]
+        way = lot.vertex_xy[to] - lot.vertex_xy[vertex]
+        # Across a two-way lane the other side's cars drive the other way.
+        if to < lot.n_slots and np.cos(lot.vertex_yaw[to] - heading) < 0.0:
+            continue
+        ahead = float(way @ [np.cos(heading), np.sin(heading)]) / max(float(np.hypot(*way)), 1e-9)
+        if ahead > best:
+            best, choice = ahead, column
+    return int(lot.neighbors[vertex, choice]), float(lot.edge_length[vertex, choice])
+
+
+def _left_slots(lot: ParkingLot, way: _Pass) -> int:
+    """How many slots along a lane lie on the left of its direction."""
+    slots = np.array(way.stops[1:-1], dtype=np.int64)
+    yaw = lot.vertex_yaw[slots]
+    away = lot.slot_xy[slots] - lot.vertex_xy[slots]
+    return int((np.cos(yaw) * away[:, 1] - np.sin(yaw) * away[:, 0] > 0.0).sum())
+
+
+def _join(drive: nx.MultiDiGraph[Any], ways: nx.DiGraph[Any], start: int) -> None:
+    """Link what must be driven to the start, part by part, by the cheapest way there and back."""
+    drive.add_node(start)
+    while True:
+        parts = list(nx.weakly_connected_components(drive))
+        if len(parts) == 1:
+            return
+        home = next(part for part in parts if start in part)
+        out = nx.multi_source_dijkstra(ways, home, weight="length")
+        away = [v for part in parts if part is not home for v in part if v in out[0]]
+        if not away:
+            raise nx.NetworkXNoPath
+        nearest = min(away, key=lambda v: (out[0][v], v))
+        _drive_along(drive, ways, out[1][nearest])
+
+
+def _balance(drive: nx.MultiDiGraph[Any], ways: nx.DiGraph[Any]) -> None:
+    """Add the cheapest ways that make as many passes arrive as leave, everywhere."""
+    flow_graph = nx.DiGraph()
+    flow_graph.add_nodes_from(ways)
+    for v in drive:
+        flow_graph.add_node(v, demand=drive.out_degree(v) - drive.in_degree(v))
+    for a, b, length in ways.edges(data="length"):
+        # The network simplex is exact for whole numbers only.
+        flow_graph.add_edge(a, b, weight=round(length * _MILLIMETRES))
+    for a, onward in nx.min_cost_flow(flow_graph).items():
+        for b, times in onward.items():
+            for _ in range(times):
+                _drive_along(drive, ways, [a, b])
+
+
+def _drive_along(drive: nx.MultiDiGraph[Any], ways: nx.DiGraph[Any], junctions: list[int]) -> None:
+    for a, b in pairwise(junctions):
+        drive.add_edge(a, b, stops=ways.edges[a, b]["stops"])
