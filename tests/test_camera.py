@@ -7,8 +7,7 @@ import cv2
 import numba
 import numpy as np
 import pytest
-from bench.bench_camera import parked_cars
-from toy_scene import ToyScene, box_mesh, random_boxes, toy_scene
+from toy_scene import ToyScene, box_mesh, parked_cars, random_boxes, toy_scene
 
 from sim_sensors.camera import PinholeCamera, StereoCamera, camera_pose
 from sim_sensors.errors import SensorError

@@ -1,11 +1,13 @@
 """Small scenes of boxes, and a ray caster in double precision that shares nothing with the rasteriser."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from sim_sensors.mesh import Ground, Instances, Material, Mesh, MeshPool
 from sim_sensors.rasterizer import FAR
+from sim_sensors.vehicles import COARSE, DETAILED, VehicleModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,3 +127,17 @@ def ray_depth(scene, camera, pose):
             hit = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.05)
             best = np.where(hit & (t < best), t, best)
     return best.reshape(camera.height, camera.width)
+
+
+def parked_cars(rows: int = 4, columns: int = 50, models: int = 40) -> ToyScene:
+    """Cars nose-in on both sides of a lane along x, no space left free; far ones have coarse meshes."""
+    cars = [VehicleModel.from_seed(None, seed) for seed in range(models)]
+    meshes = [car.mesh(level) for level in (DETAILED, COARSE) for car in cars]
+    coarse = np.tile(np.arange(models, 2 * models), 2)
+    generator = np.random.default_rng(0)
+    placed = [
+        (generator.integers(models), (column - (columns - 1) / 2.0) * 2.55, y, 0.0, math.pi / 2)
+        for y in (-6.0, -11.2, 6.0, 11.2)[:rows]
+        for column in range(columns)
+    ]
+    return toy_scene(meshes, placed, range(1, rows * columns + 1), coarse.tolist())

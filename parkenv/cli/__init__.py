@@ -7,7 +7,7 @@ import warnings
 
 import typer
 
-from parkenv.cli import compare, lot, occupancy, plan, sensors
+from parkenv.cli import bench, compare, lot, occupancy, plan, sensors
 from parkenv.errors import InputError
 from sim_sensors.errors import SensorError
 
@@ -25,6 +25,7 @@ app.command("plan")(plan.plan)
 app.add_typer(lot.app, name="lot")
 app.add_typer(occupancy.app, name="occupancy")
 app.add_typer(sensors.app, name="sensors")
+app.command("bench")(bench.bench)
 
 
 def _show_version(wanted: bool) -> None:

@@ -1,0 +1,70 @@
+"""`parkenv bench`: the table, its rows, and that the peers do the same job."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from parkenv.cli import app
+from parkenv.errors import InputError
+from parkenv.evaluation.bench_rows import duration, rate, seconds_each
+from parkenv.evaluation.bench_sensors import (
+    GRID_CELL,
+    embree_scanner,
+    marching_scanner,
+    parked_cars,
+    pymunk_scanner,
+    walled_lot,
+)
+from sim_sensors.laser import LaserScanner
+
+
+def test_a_ratio_above_one_means_faster():
+    (row,) = rate("laser", "a", 300.0, "scans/s", other=100.0)
+    assert row == {
+        "part": "laser", "case": "a", "value": 300.0, "unit": "scans/s",
+        "peer": "other", "peer_value": 100.0, "ratio": 3.0,
+    }  # fmt: skip
+    assert duration("camera", "a", 2.0, "ms", other=8.0)[0]["ratio"] == 4.0
+    assert rate("camera", "a", 1.0, "frames/s")[0]["peer"] is None
+
+
+def test_the_stop_watch_takes_the_median():
+    calls = []
+    assert 0.0 <= seconds_each(calls.append, seconds=0.0, least=5) < 0.1
+    assert len(calls) == 6
+
+
+@pytest.mark.parametrize(
+    ("scanner", "tolerance"),
+    [(marching_scanner, 2 * GRID_CELL), (pymunk_scanner, 2e-3), (embree_scanner, 2e-3)],
+)
+def test_peers_measure_what_the_laser_measures(scanner, tolerance):
+    laser = LaserScanner()
+    plane, draw = walled_lot(np.random.default_rng(3), 30)
+    peer = scanner(plane, laser)
+    for pose in draw(3):
+        ours, theirs = (np.minimum(s, 30.0) for s in (laser.scan(plane, pose), peer(pose)))
+        assert (np.abs(ours - theirs) > tolerance).mean() < 0.05
+
+
+def test_the_measured_scene_is_full():
+    assert len(parked_cars().present) == 200
+
+
+def test_bench_writes_its_rows(tmp_path):
+    result = CliRunner().invoke(app, ["bench", "sensors", "--seconds", "0.01", "--out", str(tmp_path / "b")])
+    assert result.exit_code == 0, result.output
+    summary = json.loads((tmp_path / "b" / "summary.json").read_text())
+    keys = {"part", "case", "value", "unit", "peer", "peer_value", "ratio"}
+    assert summary["rows"]
+    assert all(set(row) == keys and row["value"] > 0 for row in summary["rows"])
+    assert {row["part"] for row in summary["rows"]} == {"laser", "camera"}
+    assert "pymunk" in result.output
+
+
+def test_an_unknown_part_is_named():
+    result = CliRunner().invoke(app, ["bench", "engine"])
+    assert isinstance(result.exception, InputError)
+    assert "no part 'engine' to measure, want some of sensors" in str(result.exception)
