@@ -126,11 +126,12 @@ class ResultFolder:
 
     def add(self, rows: Sequence[Row], timings: Sequence[Row]) -> None:
         """Append finished episodes; on the disk when this returns."""
-        # Timings first: an episode whose line is there is finished, and is not run again for its timing.
-        _append(self.path / "timings.csv", _csv_text(TIMING_COLUMNS, timings))
-        _append(self.path / "episodes.csv", _csv_text(EPISODE_COLUMNS, rows))
+        # Memory first: after an interruption `finish` writes the files anew from what is known here.
         self._timings |= {episode_key(r): r for r in timings}
         self.episodes |= {episode_key(r): r for r in rows}
+        # Then timings: an episode whose line is there is finished, and is not run again for its timing.
+        _append(self.path / "timings.csv", _csv_text(TIMING_COLUMNS, timings))
+        _append(self.path / "episodes.csv", _csv_text(EPISODE_COLUMNS, rows))
 
     def decision_s(self, key: Key) -> list[float]:
         """Wall time of the decisions of an episode, s; empty where a crash lost them."""
