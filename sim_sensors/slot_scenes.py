@@ -22,6 +22,8 @@ LINE_M = 0.10
 LIBRARY_MODELS = 100
 """How many vehicle models a lot's cars are drawn from."""
 PAVED_MARGIN_M = 7.0
+KERB_ROOM_M = 0.1
+"""How much wider than a car its slot must be along the kerb."""
 NOSE_GAP_M = 0.05
 """What is left at least between a car and the inner end of its slot; another row may begin there."""
 
@@ -38,7 +40,7 @@ class ParkingManners:
         along_m: deviation along it, m.
         yaw_rad: deviation of the heading, rad.
         nose_out: share of cars that stand against the slot's yaw, backed in; kerbside slots have none.
-        door_room_m: how much wider than a car its slot must be.
+        door_room_m: how much wider than a car its slot must be, kerbside ones excepted.
         overhang_m: how much longer than its slot a car may be; in a kerbside slot it must be as much shorter.
     """
 
@@ -138,10 +140,9 @@ class SlotLot:
         """For each slot the models that fit it."""
         size = np.array([m.size for m in vehicle_library(self.n_models)])
         spare = np.where(self._column("kerbside"), -self.manners.overhang_m, self.manners.overhang_m)
-        length, width = (
-            self._column("slot_length") + spare,
-            self._column("slot_width") - self.manners.door_room_m,
-        )
+        # Kerbside, doors open over the pavement and the street.
+        room = np.where(self._column("kerbside"), KERB_ROOM_M, self.manners.door_room_m)
+        length, width = self._column("slot_length") + spare, self._column("slot_width") - room
         known: dict[tuple[float, float], IntArray] = {}
         out = []
         for key in zip(length.tolist(), width.tolist(), strict=True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,7 +12,78 @@ from sim_sensors.errors import SensorError
 
 Color = tuple[float, float, float]
 
-PRESETS = ("sunny", "overcast", "low_sun", "dusk", "rain")
+
+class _Drawn(NamedTuple):
+    """A number between two bounds, or a colour times such a number."""
+
+    low: float
+    high: float
+    color: Color | None = None
+
+    def draw(self, generator: np.random.Generator) -> float | Color:
+        factor = float(generator.uniform(self.low, self.high))
+        if self.color is None:
+            return factor
+        red, green, blue = self.color
+        return red * factor, green * factor, blue * factor
+
+
+_BLACK: Color = (0.0, 0.0, 0.0)
+
+# Fields of `Weather` by preset, in the order in which they are drawn: another order is other weather.
+_PRESETS: dict[str, dict[str, _Drawn | float | Color]] = {
+    "sunny": {
+        "sun_elevation": _Drawn(0.6, 1.1),
+        "sun": _Drawn(2.3, 3.0, (1.0, 0.96, 0.87)),
+        "sky": _Drawn(0.7, 0.95, (0.76, 0.86, 1.0)),
+        "zenith": _Drawn(0.8, 1.1, (0.22, 0.38, 0.78)),
+        "horizon": _Drawn(0.9, 1.1, (0.72, 0.82, 0.95)),
+        "clouds": _Drawn(0.05, 0.55),
+        "haze": _Drawn(0.0004, 0.0015),
+    },
+    "overcast": {
+        "sun": _Drawn(0.0, 0.12, (1.0, 1.0, 1.0)),
+        "sun_elevation": _Drawn(0.5, 1.0),
+        "sky": _Drawn(0.8, 1.05, (0.94, 0.98, 1.04)),
+        "zenith": _Drawn(0.85, 1.05, (0.98, 1.0, 1.04)),
+        "horizon": _Drawn(0.8, 1.0, (0.78, 0.8, 0.84)),
+        "clouds": _Drawn(0.85, 1.0),
+        "haze": _Drawn(0.001, 0.004),
+    },
+    "low_sun": {
+        "sun_elevation": _Drawn(0.12, 0.3),
+        "sun": _Drawn(1.5, 2.2, (1.0, 0.74, 0.46)),
+        "sky": _Drawn(0.4, 0.55, (0.72, 0.8, 1.0)),
+        "zenith": _Drawn(0.6, 0.9, (0.25, 0.36, 0.62)),
+        "horizon": _Drawn(0.8, 1.1, (1.0, 0.8, 0.58)),
+        "clouds": _Drawn(0.1, 0.6),
+        "haze": _Drawn(0.001, 0.004),
+    },
+    "dusk": {
+        "sun_elevation": 0.05,
+        "sun": _BLACK,
+        "sky": _Drawn(0.03, 0.08, (0.8, 0.88, 1.1)),
+        "zenith": _Drawn(0.8, 1.2, (0.03, 0.045, 0.085)),
+        "horizon": _Drawn(0.6, 1.0, (0.16, 0.12, 0.1)),
+        "clouds": _Drawn(0.1, 0.7),
+        "haze": _Drawn(0.001, 0.003),
+        "lit_windows": _Drawn(0.15, 0.5),
+    },
+    "rain": {
+        "sun_elevation": _Drawn(0.5, 1.0),
+        "sun": _BLACK,
+        "sky": _Drawn(0.35, 0.6, (0.9, 0.97, 1.05)),
+        "zenith": _Drawn(0.35, 0.55, (0.9, 0.95, 1.0)),
+        "horizon": _Drawn(0.4, 0.55, (0.8, 0.83, 0.87)),
+        "clouds": 1.0,
+        "haze": _Drawn(0.005, 0.012),
+        "wetness": _Drawn(0.6, 1.0),
+        "rain": _Drawn(0.3, 1.0),
+    },
+}
+
+PRESETS = tuple(_PRESETS)
+"""Names of the kinds of weather."""
 
 
 @dataclass(frozen=True)
@@ -88,45 +160,10 @@ class Weather:
             raise SensorError(f"weather preset is {preset!r}, want one of {', '.join(PRESETS)}")
         if seed < 0:
             raise SensorError(f"weather seed is {seed}, want at least 0")
-        uniform = np.random.default_rng([seed, PRESETS.index(preset)]).uniform
-        azimuth = float(uniform(-math.pi, math.pi))
-
-        def scaled(color: Color, low: float, high: float) -> Color:
-            factor = float(uniform(low, high))
-            return (color[0] * factor, color[1] * factor, color[2] * factor)
-
-        if preset == "sunny":
-            return cls(
-                preset, azimuth, float(uniform(0.6, 1.1)), scaled((1.0, 0.96, 0.87), 2.3, 3.0),
-                scaled((0.76, 0.86, 1.0), 0.7, 0.95), scaled((0.22, 0.38, 0.78), 0.8, 1.1),
-                scaled((0.72, 0.82, 0.95), 0.9, 1.1), float(uniform(0.05, 0.55)), float(uniform(0.0004, 0.0015)),
-                seed=seed,
-            )  # fmt: skip
-        if preset == "overcast":
-            veiled = float(uniform(0.0, 0.12))
-            return cls(
-                preset, azimuth, float(uniform(0.5, 1.0)), (veiled, veiled, veiled),
-                scaled((0.94, 0.98, 1.04), 0.8, 1.05), scaled((0.98, 1.0, 1.04), 0.85, 1.05),
-                scaled((0.78, 0.8, 0.84), 0.8, 1.0), float(uniform(0.85, 1.0)), float(uniform(0.001, 0.004)),
-                seed=seed,
-            )  # fmt: skip
-        if preset == "low_sun":
-            return cls(
-                preset, azimuth, float(uniform(0.12, 0.3)), scaled((1.0, 0.74, 0.46), 1.5, 2.2),
-                scaled((0.72, 0.8, 1.0), 0.4, 0.55), scaled((0.25, 0.36, 0.62), 0.6, 0.9),
-                scaled((1.0, 0.8, 0.58), 0.8, 1.1), float(uniform(0.1, 0.6)), float(uniform(0.001, 0.004)),
-                seed=seed,
-            )  # fmt: skip
-        if preset == "dusk":
-            return cls(
-                preset, azimuth, 0.05, (0.0, 0.0, 0.0),
-                scaled((0.8, 0.88, 1.1), 0.03, 0.08), scaled((0.03, 0.045, 0.085), 0.8, 1.2),
-                scaled((0.16, 0.12, 0.1), 0.6, 1.0), float(uniform(0.1, 0.7)), float(uniform(0.001, 0.003)),
-                lit_windows=float(uniform(0.15, 0.5)), seed=seed,
-            )  # fmt: skip
-        return cls(
-            preset, azimuth, float(uniform(0.5, 1.0)), (0.0, 0.0, 0.0),
-            scaled((0.9, 0.97, 1.05), 0.35, 0.6), scaled((0.9, 0.95, 1.0), 0.35, 0.55),
-            scaled((0.8, 0.83, 0.87), 0.4, 0.55), 1.0, float(uniform(0.005, 0.012)),
-            wetness=float(uniform(0.6, 1.0)), rain=float(uniform(0.3, 1.0)), seed=seed,
-        )  # fmt: skip
+        generator = np.random.default_rng([seed, PRESETS.index(preset)])
+        azimuth = float(generator.uniform(-math.pi, math.pi))
+        fields: dict[str, Any] = {
+            name: value.draw(generator) if isinstance(value, _Drawn) else value
+            for name, value in _PRESETS[preset].items()
+        }
+        return cls(preset, azimuth, **fields, seed=seed)

@@ -8,10 +8,12 @@ from typer.testing import CliRunner
 
 from parkenv.cli import app
 from parkenv.errors import InputError
+from parkenv.evaluation import bench_sensors
 from parkenv.evaluation.bench_rows import duration, rate, seconds_each
 from parkenv.evaluation.bench_sensors import (
     GRID_CELL,
     embree_scanner,
+    laser_rows,
     marching_scanner,
     parked_cars,
     pymunk_scanner,
@@ -44,9 +46,19 @@ def test_peers_measure_what_the_laser_measures(scanner, tolerance):
     laser = LaserScanner()
     plane, draw = walled_lot(np.random.default_rng(3), 30)
     peer = scanner(plane, laser)
-    for pose in draw(3):
-        ours, theirs = (np.minimum(s, 30.0) for s in (laser.scan(plane, pose), peer(pose)))
-        assert (np.abs(ours - theirs) > tolerance).mean() < 0.05
+    poses = draw(3)
+    ours, theirs = (np.minimum(s, laser.max_range) for s in (laser.scan_batch(plane, poses), peer(poses)))
+    assert ((np.abs(ours - theirs) > tolerance).mean(axis=1) < 0.05).all()
+    np.testing.assert_array_equal(peer(poses), np.concatenate([peer(pose[None]) for pose in poses]))
+
+
+def test_a_peer_that_sees_something_else_is_not_compared(monkeypatch):
+    def blind(plane, laser):
+        return lambda poses: np.zeros((len(poses), laser.n_beams))
+
+    monkeypatch.setattr(bench_sensors, "pymunk_scanner", blind)
+    with pytest.raises(AssertionError, match="pymunk segment_query_first differs from the laser on 100%"):
+        laser_rows(seconds=0.0)
 
 
 def test_the_measured_scene_is_full():
@@ -62,6 +74,9 @@ def test_bench_writes_its_rows(tmp_path):
     assert all(set(row) == keys and row["value"] > 0 for row in summary["rows"])
     assert {row["part"] for row in summary["rows"]} == {"laser", "camera"}
     assert "pymunk" in result.output
+    assert result.output.splitlines()[0].startswith("After an installation each part first compiles")
+    stages = {"transform and raster", "of that, transform", "shading", "exposure and noise"}
+    assert {row["case"].removeprefix("stages: ") for row in summary["rows"]} > stages
 
 
 def test_an_unknown_part_is_named():

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from parkenv import __version__
-from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
 
@@ -34,13 +33,13 @@ def bench(
     seconds: Annotated[
         float, typer.Option("--seconds", min=0.01, help="How long each figure is measured.")
     ] = 0.6,
-    seed: args.SeedOption = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the lots and the noise.")] = 0,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for summary.json.")] = None,
 ) -> None:
     """Measure throughput beside other ways to do the same, in the same run.
 
     A ratio above 1 means that ours is the faster. Machines are noisy: compare ratios, and run on a quiet one.
-    Before it measures, each part compiles what it needs: some 20 s after an installation, kept from then on.
+    After an installation each part first compiles what it measures, about 20 s; that is kept from then on.
 
     Examples:
     * `parkenv bench sensors`
@@ -56,9 +55,10 @@ def bench(
     if out is not None:
         make_folder(out)
     console = make_console()
+    console.print("After an installation each part first compiles what it measures, about 20 s.")
     rows: list[BenchRow] = []
     for part in chosen:
-        with console.status(f"Measuring {part}; compiles first after an installation"):
+        with console.status(f"Measuring {part}"):
             rows += PARTS[part](seed, seconds)
     table = make_table(None, ["part", "case", "value", "unit", "peer", "peer's", "ratio"])
     before = None

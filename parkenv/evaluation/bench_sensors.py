@@ -10,26 +10,33 @@ from typing import Any
 import cv2
 import numpy as np
 import pymunk
-from numba import njit
+from numba import get_num_threads, njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from parkenv.evaluation.bench_rows import BenchRow, duration, rate, seconds_each
 from sim_sensors.camera import PinholeCamera, StereoCamera, camera_pose
 from sim_sensors.footprints import ScanPlane
+from sim_sensors.ground_texture import ground_texture
 from sim_sensors.ground_truth import vehicle_boxes
 from sim_sensors.laser import LaserScanner
-from sim_sensors.projection import ScreenTriangles
+from sim_sensors.light_maps import light_maps
+from sim_sensors.projection import ScreenTriangles, project
 from sim_sensors.scene import Scene
+from sim_sensors.shading import shade
 from sim_sensors.slot_scenes import scene_of_slots
+from sim_sensors.textures import FAST
 from sim_sensors.weather import Weather
 
 FloatArray = NDArray[np.float64]
-Scan = Callable[[FloatArray], NDArray[Any]]
+Scans = Callable[[FloatArray], NDArray[Any]]
+"""From poses, (n, 3), to ranges, (n, n_beams), m."""
 
 SLOT_WIDTH, SLOT_LENGTH, MODULE, MARGIN = 2.5, 5.0, 16.0, 6.0
 GRID_CELL = 0.05
 """Cell, m, of the grid that the beam marcher walks."""
+LIT_AHEAD = 12.0
+"""m, before the camera: about where light maps are drawn for the shading alone."""
 
 
 def sensor_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
@@ -45,6 +52,8 @@ def sensor_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
 def laser_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     """Scans a second of 1081 beams on one core, exact and noisy, in a batch and one by one.
 
+    A batch is compared with batches of the peers, one scan with one scan. Peers are always without noise.
+
     Raises:
         AssertionError: a peer does not see what the laser sees.
     """
@@ -52,7 +61,7 @@ def laser_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     laser = LaserScanner()
     plane, draw = walled_lot(rng, 200)
     poses = draw(256)
-    peers: dict[str, Scan] = {
+    peers: dict[str, Scans] = {
         "marching in a grid": marching_scanner(plane, laser),
         "pymunk segment_query_first": pymunk_scanner(plane, laser),
     }
@@ -60,56 +69,89 @@ def laser_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
         peers["Embree"] = embree_scanner(plane, laser)
     exact = np.minimum(laser.scan_batch(plane, poses[:2]), laser.max_range)
     for name, peer in peers.items():
-        seen = np.minimum([peer(pose) for pose in poses[:2]], laser.max_range)
+        seen = np.minimum(peer(poses[:2]), laser.max_range)
         off = np.abs(seen - exact) > (2 * GRID_CELL if "grid" in name else 2e-3)
         if off.mean() > 0.05:
             raise AssertionError(f"{name} differs from the laser on {off.mean():.0%} of the beams")
 
-    def singly(scan: Scan) -> float:
-        return 1.0 / seconds_each(lambda i: scan(poses[i % 32]), seconds)
+    def batch(scans: Scans, poses: FloatArray) -> float:
+        return len(poses) / seconds_each(lambda _: scans(poses), seconds)
+
+    def singly(scans: Scans) -> float:
+        return 1.0 / seconds_each(lambda i: scans(poses[i % 32 : i % 32 + 1]), seconds)
+
+    theirs = {name: batch(peer, poses[:16]) for name, peer in peers.items()}
+    exact_batch = batch(lambda poses: laser.scan_batch(plane, poses), poses)
+    rows = rate("laser", "200 cars, 256 at once", exact_batch, "scans/s", **theirs)
+    noisy_batch = batch(lambda poses: laser.scan_batch(plane, poses, rng), poses)
+    rows += rate("laser", "200 cars, 256 at once, noise", noisy_batch, "scans/s", **theirs)
 
     theirs = {name: singly(peer) for name, peer in peers.items()}
-
-    def batch(plane: ScanPlane, poses: FloatArray, rng: np.random.Generator | None = None) -> float:
-        return len(poses) / seconds_each(lambda _: laser.scan_batch(plane, poses, rng), seconds)
-
-    exact_batch = batch(plane, poses)
-    rows = rate("laser", "200 cars, 256 at once", exact_batch, "scans/s", **theirs)
-    rows += rate("laser", "200 cars, 256 at once, noise", batch(plane, poses, rng), "scans/s", **theirs)
-    one = singly(lambda pose: laser.scan(plane, pose))
+    one = singly(lambda poses: laser.scan(plane, poses[0]))
     rows += rate("laser", "200 cars, one by one", one, "scans/s", **theirs)
-    one = singly(lambda pose: laser.scan(plane, pose, rng))
-    rows += rate("laser", "200 cars, one by one, noise", one, "scans/s", **theirs)
+    noisy_one = singly(lambda poses: laser.scan(plane, poses[0], rng))
+    rows += rate("laser", "200 cars, one by one, noise", noisy_one, "scans/s", **theirs)
+
     large, draw = walled_lot(np.random.default_rng(seed), 10_000, columns=177)
-    return rows + rate(
-        "laser",
-        "10,000 cars, 256 at once",
-        batch(large, draw(256)),
-        "scans/s",
-        **{"itself at 200 cars": exact_batch},
-    )
+    large_batch = batch(lambda poses: laser.scan_batch(large, poses), draw(256))
+    smaller = {"itself at 200 cars": exact_batch}
+    return rows + rate("laser", "10,000 cars, 256 at once", large_batch, "scans/s", **smaller)
 
 
 def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
-    """Frames of 640×480 a second, on all cores. OpenCV's rasteriser draws the same triangles, already transformed."""
+    """Frames of 640×480 a second, their stages, and pairs of them, on as many cores as numba is given.
+
+    OpenCV's rasteriser, on one core, draws the depth of the same triangles, which it finds already chosen and on the
+    screen; ours is given the scene.
+    """
     scene, weather = parked_cars(seed), Weather.draw("sunny", 1)
     camera = PinholeCamera.from_field_of_view()
+    size = (camera.width, camera.height)
     poses = [camera_pose(-6.0 + 0.4 * i, 0.3, 1.35, -math.pi / 2, -0.04) for i in range(30)]
-    triangles, _ = camera.visibility(scene, poses[0])
-    case = f"200 cars, {len(triangles.corners):,} triangles"
     frame = camera.render(scene, poses[0], weather)
-    geometry = seconds_each(lambda i: camera.visibility(scene, poses[i % 30]), seconds)
+    triangles, visibility = camera.visibility(scene, poses[0])
+    ground = ground_texture(scene.ground)
+    ahead = poses[0][:2, 3] + LIT_AHEAD * poses[0][:2, 2]
+    maps = light_maps(scene.pool, scene.instances, weather, *ahead.tolist())
+
+    def pose(i: int) -> FloatArray:
+        return poses[i % len(poses)]
+
+    def transform(i: int) -> object:
+        return project(scene.pool, scene.instances, pose(i), camera.intrinsics, size, camera.coarse_beyond)
+
+    def shaded(_: int) -> NDArray[np.float32]:
+        return shade(triangles, visibility, poses[0], camera.intrinsics, weather, ground, maps)
+
+    radiance = shaded(0)
+    pair = StereoCamera(camera)
+    cores = get_num_threads()
+    case = f"200 cars, {len(triangles.corners):,} triangles, {cores} core{'s' if cores > 1 else ''}"
+
+    def each(work: Callable[[int], object]) -> float:
+        return seconds_each(work, seconds)
+
+    rows = rate(
+        "camera",
+        f"colour, depth, ids; {case}",
+        1.0 / each(lambda i: camera.render(scene, pose(i), weather, i)),
+        "frames/s",
+    )
     peers = {}
     if hasattr(cv2, "triangleRasterizeDepth"):
-        draw = opencv_rasterizer(triangles, (camera.width, camera.height))
-        peers["cv2.triangleRasterize"] = 1e3 * seconds_each(draw, seconds)
-    rows = duration("camera", f"transform, raster; {case}", 1e3 * geometry, "ms", **peers)
-    whole = seconds_each(lambda i: camera.render(scene, poses[i % 30], weather, i), seconds)
-    rows += rate("camera", f"colour, depth, ids; {case}", 1.0 / whole, "frames/s")
-    pair = StereoCamera(camera)
-    both = seconds_each(lambda i: pair.render_stereo(scene, poses[i % 30], weather, i), seconds)
+        peers["cv2.triangleRasterize"] = 1e3 * each(opencv_rasterizer(triangles, size))
+    geometry = each(lambda i: camera.visibility(scene, pose(i)))
+    rows += duration("camera", "stages: transform and raster", 1e3 * geometry, "ms", **peers)
+    stages: dict[str, Callable[[int], object]] = {
+        "stages: of that, transform": transform,
+        "stages: shading": shaded,
+        "stages: exposure and noise": lambda i: camera.sensor.expose(radiance, i, 1.0),
+    }
+    for name, stage in stages.items():
+        rows += duration("camera", name, 1e3 * each(stage), "ms")
+    both = each(lambda i: pair.render_stereo(scene, pose(i), weather, i))
     rows += rate("camera", f"stereo; {case}", 1.0 / both, "pairs/s")
-    boxes = seconds_each(lambda _: vehicle_boxes(camera, scene, poses[0], frame), seconds)
+    boxes = each(lambda _: vehicle_boxes(camera, scene, poses[0], frame))
     return rows + duration("camera", "true boxes of a frame", 1e3 * boxes, "ms")
 
 
@@ -153,7 +195,7 @@ def walled_lot(
     return plane, poses
 
 
-def pymunk_scanner(plane: ScanPlane, laser: LaserScanner) -> Scan:
+def pymunk_scanner(plane: ScanPlane, laser: LaserScanner) -> Scans:
     """A segment query a beam."""
     space = pymunk.Space()
     corners, n_corners = plane.footprints
@@ -163,21 +205,21 @@ def pymunk_scanner(plane: ScanPlane, laser: LaserScanner) -> Scan:
         space.add(pymunk.Segment(space.static_body, a, b, 0.0))
     everything, reach = pymunk.ShapeFilter(), laser.max_range
 
-    def scan(pose: FloatArray) -> FloatArray:
-        x, y, yaw = map(float, pose)
-        ranges = np.full(laser.n_beams, np.inf)
-        for i, angle in enumerate((yaw + laser.angles).tolist()):
-            end = (x + reach * math.cos(angle), y + reach * math.sin(angle))
-            hit = space.segment_query_first((x, y), end, 0.0, everything)
-            if hit is not None:
-                ranges[i] = hit.alpha * reach
+    def scans(poses: FloatArray) -> FloatArray:
+        ranges = np.full((len(poses), laser.n_beams), np.inf)
+        for row, (x, y, yaw) in zip(ranges, poses.tolist(), strict=True):
+            for i, angle in enumerate((yaw + laser.angles).tolist()):
+                end = (x + reach * math.cos(angle), y + reach * math.sin(angle))
+                hit = space.segment_query_first((x, y), end, 0.0, everything)
+                if hit is not None:
+                    row[i] = hit.alpha * reach
         return ranges
 
-    return scan
+    return scans
 
 
-def embree_scanner(plane: ScanPlane, laser: LaserScanner) -> Scan:
-    """All beams at once against upright faces, by Intel's ray tracer."""
+def embree_scanner(plane: ScanPlane, laser: LaserScanner) -> Scans:
+    """All beams of all poses at once against upright faces, by Intel's ray tracer."""
     import embreex.mesh_construction as meshes
     from embreex.rtcore_scene import EmbreeScene
 
@@ -193,23 +235,25 @@ def embree_scanner(plane: ScanPlane, laser: LaserScanner) -> Scan:
     mesh = meshes.TriangleMesh(scene, triangles.astype(np.float32))
     reach = np.float32(laser.max_range)
 
-    def scan(pose: FloatArray) -> NDArray[np.float32]:
-        angle = pose[2] + laser.angles
-        origins = np.tile(np.array([pose[0], pose[1], 0.0], dtype=np.float32), (laser.n_beams, 1))
-        beams = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1).astype(np.float32)
-        far = np.asarray(scene.run(origins, beams, query="DISTANCE"), dtype=np.float32)
+    def scans(poses: FloatArray) -> NDArray[np.float32]:
+        angles = poses[:, 2:] + laser.angles
+        origins = np.zeros((*angles.shape, 3), dtype=np.float32)
+        origins[..., :2] = poses[:, None, :2]
+        beams = np.zeros_like(origins)
+        beams[..., 0], beams[..., 1] = np.cos(angles), np.sin(angles)
+        far = scene.run(origins.reshape(-1, 3), beams.reshape(-1, 3), query="DISTANCE")
+        far = np.asarray(far, dtype=np.float32).reshape(angles.shape)
         return np.where(far < reach, far, np.float32(np.inf))
 
-    scan.__dict__["mesh"] = mesh  # the scene does not keep it alive
-    return scan
+    scans.__dict__["mesh"] = mesh  # the scene does not keep it alive
+    return scans
 
 
-@njit(cache=True)
+@njit(cache=True, fastmath=FAST)
 def _march(
-    clearance: FloatArray,
-    cell: float,
-    x: float,
-    y: float,
+    clearance: NDArray[np.float32],
+    per_cell: float,
+    poses: FloatArray,
     cosine: FloatArray,
     sine: FloatArray,
     reach: float,
@@ -217,21 +261,24 @@ def _march(
 ) -> None:
     """Step along each beam by the distance to the nearest taken cell until there is none to step."""
     rows, columns = clearance.shape
-    for i in range(len(ranges)):
-        r = 0.0
-        while r < reach:
-            row, column = int((y + r * sine[i]) / cell), int((x + r * cosine[i]) / cell)
-            if not (0 <= row < rows and 0 <= column < columns):
-                r = reach
-                break
-            step = clearance[row, column]
-            if step == 0.0:
-                break
-            r += step
-        ranges[i] = r if r < reach else np.inf
+    for k in range(len(poses)):
+        x, y = poses[k, 0], poses[k, 1]
+        for i in range(ranges.shape[1]):
+            r = 0.0
+            while r < reach:
+                row = int((y + r * sine[k, i]) * per_cell)
+                column = int((x + r * cosine[k, i]) * per_cell)
+                if not (0 <= row < rows and 0 <= column < columns):
+                    r = reach
+                    break
+                step = clearance[row, column]
+                if step == 0.0:
+                    break
+                r += step
+            ranges[k, i] = r if r < reach else np.inf
 
 
-def marching_scanner(plane: ScanPlane, laser: LaserScanner) -> Scan:
+def marching_scanner(plane: ScanPlane, laser: LaserScanner) -> Scans:
     """Ray marching in the distance transform of an occupancy grid, the method of the f1tenth simulator."""
     corners, n_corners = plane.footprints
     width, height = plane.walls.reshape(-1, 2).max(0)
@@ -245,15 +292,16 @@ def marching_scanner(plane: ScanPlane, laser: LaserScanner) -> Scan:
         away = ((np.stack([column, row], -1) + 0.5) * GRID_CELL)[:, :, None] - polygon[:k]
         edge = np.roll(polygon[:k], -1, 0) - polygon[:k]
         taken[row, column] |= (edge[:, 0] * away[..., 1] - edge[:, 1] * away[..., 0] > 0.0).all(-1)
-    clearance = np.asarray(distance_transform_edt(~taken), dtype=np.float64) * GRID_CELL
-    ranges = np.empty(laser.n_beams)
+    # Single precision halves what a look-up drags through the cache.
+    clearance = np.asarray(distance_transform_edt(~taken) * GRID_CELL, dtype=np.float32)
 
-    def scan(pose: FloatArray) -> FloatArray:
-        angle = pose[2] + laser.angles
-        _march(clearance, GRID_CELL, pose[0], pose[1], np.cos(angle), np.sin(angle), laser.max_range, ranges)
-        return ranges.copy()
+    def scans(poses: FloatArray) -> FloatArray:
+        angles = poses[:, 2:] + laser.angles
+        ranges = np.empty(angles.shape)
+        _march(clearance, 1.0 / GRID_CELL, poses, np.cos(angles), np.sin(angles), laser.max_range, ranges)
+        return ranges
 
-    return scan
+    return scans
 
 
 def opencv_rasterizer(triangles: ScreenTriangles, size: tuple[int, int]) -> Callable[[int], object]:
