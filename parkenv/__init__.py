@@ -64,6 +64,7 @@ def __getattr__(name: str) -> Any:
 for _name, _entry_point in {
     "parkenv/Search-v0": "parkenv.envs.search:SearchEnv",
     "parkenv/SearchSensors-v0": "parkenv.envs.sensors:SearchSensorsEnv",
+    "parkenv/SearchPerception-v0": "parkenv.envs.perception:SearchPerceptionEnv",
 }.items():
     if _name not in registry:
         register(id=_name, entry_point=_entry_point, max_episode_steps=2000)

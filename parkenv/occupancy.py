@@ -141,21 +141,25 @@ class World(Protocol):
         """(k,) int64: the number of the stretch of constant state that each slot is in; it tells cars apart."""
 
 
-class OccupancyModel(Protocol):
-    """Draws arrivals and worlds, and says what can be known beforehand."""
+class PriorModel(Protocol):
+    """Says what can be known beforehand."""
 
     @property
     def n_slots(self) -> int:
         """Number of slots."""
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        """What is known at the arrival; it never peeks at the world."""
+
+
+class OccupancyModel(PriorModel, Protocol):
+    """Draws arrivals and worlds, and says what can be known beforehand."""
 
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
         """The arrival of the episode with this key."""
 
     def world(self, key: np.uint64, arrival: Arrival) -> World:
         """The world of the episode with this key."""
-
-    def forecast(self, arrival: Arrival) -> Forecast:
-        """What is known at the arrival; it never peeks at the world."""
 
 
 @njit(cache=True)

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from parkenv.belief import SightingModel, SightRates
 from parkenv.errors import InputError
 from parkenv.lot import ParkingLot
-from parkenv.occupancy import Arrival, ArrivalWindow, Forecast, OccupancyModel, OccupancyProcess
+from parkenv.occupancy import Arrival, ArrivalWindow, Forecast, OccupancyModel, OccupancyProcess, PriorModel
 from parkenv.traffic import Traffic
 
 FloatArray = NDArray[np.float64]
@@ -131,7 +131,7 @@ class Scenario(SearchProblem):
 
     name: str
     occupancy: OccupancyModel
-    prior: OccupancyModel | None = None
+    prior: PriorModel | None = None
     arrival: ArrivalWindow = field(default_factory=ArrivalWindow)
     entry: int | None = None
     traffic: Traffic = field(default_factory=Traffic)

@@ -7,14 +7,14 @@ import warnings
 
 import typer
 
-from parkenv.cli import bench, compare, lot, occupancy, plan, sensors
+from parkenv.cli import bench, compare, demo, detect, lot, occupancy, plan, sensors, survey
 from parkenv.errors import InputError
 from sim_sensors.errors import SensorError
 
 app = typer.Typer(
     name="parkenv",
     help="Search for a free parking space: worlds, planners, and comparisons between them.",
-    epilog="Start with: parkenv compare --scenario campus --out results",
+    epilog="Start with: parkenv demo",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
@@ -25,6 +25,12 @@ app.command("plan")(plan.plan)
 app.add_typer(lot.app, name="lot")
 app.add_typer(occupancy.app, name="occupancy")
 app.add_typer(sensors.app, name="sensors")
+app.command("demo")(demo.demo)
+app.command("survey")(survey.survey)
+app.command("map")(survey.show_map)
+app.command("detect")(detect.detect)
+app.command("train-detector")(detect.train_detector)
+app.command("evaluate-detector")(detect.evaluate_detector)
 app.command("bench")(bench.bench)
 
 

@@ -154,7 +154,7 @@ def compare(
     }
     order = [case.key(s) for case, its_seeds in cases + sweep for s in its_seeds]
     folder.finish(order, summary, complete=not interrupted)
-    for printed in _tables(rows, console.width):
+    for printed in result_tables(rows, console.width):
         console.print(printed)
     if interrupted:
         console.print(f"Interrupted. What was finished is in {out}; the same command with --resume goes on.")
@@ -207,7 +207,7 @@ _DETAILS: tuple[Column, ...] = (
 )
 
 
-def _tables(rows: list[Row], width: int) -> list[Table]:
+def result_tables(rows: list[Row], width: int) -> list[Table]:
     """The results of each setting, in one table or in two where the terminal is narrow."""
     settings: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:

@@ -149,14 +149,18 @@ class SearchSensorsEnv(SearchEnv):
 
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
         """The lot from above, and beside it the newest pictures."""
-        view = super()._frame(state)
-        pictures = []
-        for _, capture in self._moments[-1:]:
-            pictures += [frame.image for frame in capture.images.values()]
-            pictures += [pair.left.image for pair in capture.pairs.values()]
-        height = view.shape[0]
-        # Every frame of a video must be as wide as the first, whatever is there to be seen.
-        while len(pictures) < len(self.rig.cameras) + len(self.rig.stereo_cameras):
-            pictures.append(np.zeros_like(view))
-        beside = [cv2.resize(p, (round(p.shape[1] * height / p.shape[0]), height)) for p in pictures]
-        return np.concatenate([view, *beside], axis=1)
+        return beside_the_lot(super()._frame(state), self._moments, self.rig)
+
+
+def beside_the_lot(view: NDArray[np.uint8], moments: list[Moment], rig: SensorRig) -> NDArray[np.uint8]:
+    """A frame, (h, w, 3), with the newest picture of every camera of the rig on its right."""
+    pictures = []
+    for _, capture in moments[-1:]:
+        pictures += [frame.image for frame in capture.images.values()]
+        pictures += [pair.left.image for pair in capture.pairs.values()]
+    height = view.shape[0]
+    # Every frame of a video must be as wide as the first, whatever is there to be seen.
+    while len(pictures) < len(rig.cameras) + len(rig.stereo_cameras):
+        pictures.append(np.zeros_like(view))
+    beside = [cv2.resize(p, (round(p.shape[1] * height / p.shape[0]), height)) for p in pictures]
+    return np.concatenate([view, *beside], axis=1)

@@ -33,11 +33,13 @@ class Case:
         scenario: with the setting's costs and speeds.
         agent: the agent's name.
         occupancy_level: the mean occupancy that the world was set to; None where it was left as it is.
+        env_id: the environment: how the car sees.
     """
 
     scenario: Scenario
     agent: str
     occupancy_level: float | None = None
+    env_id: str = "parkenv/Search-v0"
 
     @property
     def columns(self) -> Row:
@@ -57,7 +59,7 @@ class Case:
 
     def run(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row]]:
         """Search once for each seed: rows of `episodes.csv` and of `timings.csv`."""
-        runner = EpisodeRunner(self.scenario, self.agent, make_agent(self.agent, self.scenario))
+        runner = self._runner()
         rows, timings = [], []
         for seed in seeds:
             episode = runner.run(seed)
@@ -75,7 +77,10 @@ class Case:
 
     def trace(self, seed: int) -> SearchTrace:
         """One search, for a picture."""
-        return EpisodeRunner(self.scenario, self.agent, make_agent(self.agent, self.scenario)).run(seed).trace
+        return self._runner().run(seed).trace
+
+    def _runner(self) -> EpisodeRunner:
+        return EpisodeRunner(self.scenario, self.agent, make_agent(self.agent, self.scenario), self.env_id)
 
 
 def settings_of(
@@ -120,6 +125,7 @@ def run_cases(
     folder: ResultFolder,
     *,
     jobs: int = 1,
+    block_size: int = BLOCK,
     on_progress: Callable[[int], None] = lambda _: None,
 ) -> None:
     """Run what the folder does not hold yet.
@@ -128,6 +134,7 @@ def run_cases(
         cases: each with the seeds of its episodes.
         folder: where finished episodes go.
         jobs: worker processes. The result does not depend on it.
+        block_size: episodes a task.
         on_progress: told how many episodes have just been finished.
 
     Raises:
@@ -136,7 +143,7 @@ def run_cases(
     tasks = [
         (case, block)
         for case, seeds in cases
-        for block in _blocks([s for s in seeds if case.key(s) not in folder.episodes])
+        for block in _blocks([s for s in seeds if case.key(s) not in folder.episodes], block_size)
     ]
     done = sum(len(seeds) for _, seeds in cases) - sum(len(block) for _, block in tasks)
     on_progress(done)
@@ -170,9 +177,9 @@ def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
             scenario.occupancy.world(key, arrival)
 
 
-def _blocks(seeds: Sequence[int]) -> Iterator[Sequence[int]]:
-    for i in range(0, len(seeds), BLOCK):
-        yield seeds[i : i + BLOCK]
+def _blocks(seeds: Sequence[int], size: int) -> Iterator[Sequence[int]]:
+    for i in range(0, len(seeds), size):
+        yield seeds[i : i + size]
 
 
 def table(cases: Sequence[tuple[Case, range]], folder: ResultFolder) -> list[Row]:

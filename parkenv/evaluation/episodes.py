@@ -61,13 +61,16 @@ class EpisodeRunner:
         scenario: the scenario, with the costs and speeds of the setting.
         name: the agent's name, for the trace.
         agent: the agent.
+        env_id: `parkenv/Search-v0`, or `parkenv/SearchPerception-v0` to look through the sensors.
     """
 
-    def __init__(self, scenario: Scenario, name: str, agent: SearchAgent[Any]) -> None:
+    def __init__(
+        self, scenario: Scenario, name: str, agent: SearchAgent[Any], env_id: str = "parkenv/Search-v0"
+    ) -> None:
         self.scenario = scenario
         self.name = name
         self.agent = agent
-        self.env = gym.make("parkenv/Search-v0", scenario=scenario)
+        self.env = gym.make(env_id, scenario=scenario)
         self._routes = DriveRoutes(scenario)
 
     def run(self, seed: int) -> Episode:

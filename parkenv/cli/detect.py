@@ -1,0 +1,164 @@
+"""`parkenv detect`, `train-detector`, `evaluate-detector`: the car detector on image files."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import Progress, track
+
+from parkenv import __version__
+from parkenv.cli import arguments as args
+from parkenv.cli.tables import make_console, make_table
+from parkenv.errors import InputError
+
+_MODEL_HELP = "side, front, or an .npz that train-detector wrote"
+
+
+def detect(
+    files: Annotated[list[Path], typer.Argument(help="Image files, or folders of them.")],
+    model: Annotated[
+        list[str] | None, typer.Option("--model", help=f"{_MODEL_HELP}; may stand twice.")
+    ] = None,
+    threshold: Annotated[
+        float, typer.Option("--threshold", help="Probability from which it is a car.")
+    ] = 0.5,
+    least_height: Annotated[
+        float | None, typer.Option("--least-height", min=8.0, help="Smallest region looked for, px.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for pictures and summary.json.")
+    ] = None,
+) -> None:
+    """Find cars in image files.
+
+    Examples:
+    * `parkenv detect photo.png --out results/cars`
+
+    * `parkenv detect photos --model side --threshold 0.8`
+    """
+    import cv2
+
+    from parkenv.evaluation.results import make_folder, write_summary
+    from parkenv.evaluation.survey_pictures import draw_detections
+    from parkenv.perception.detector import Detector
+    from parkenv.perception.image_files import images_in, read_image
+    from parkenv.whole_files import written_whole
+
+    detector = Detector.load(*(model or ()), threshold=threshold, least_height=least_height)
+    chosen = [f for path in files for f in (images_in(path) if path.is_dir() else [path])]
+    if out is not None:
+        make_folder(out)
+    console = make_console()
+    rows = []
+    table = make_table(None, ["file", "left", "top", "right", "bottom", "probability", "view"])
+    for file in track(chosen, "Looking", console=console, disable=not console.is_terminal):
+        image = read_image(file)
+        found = detector.detect(image)
+        for box, p, end in zip(
+            found.boxes.tolist(), found.probability.tolist(), found.ends.tolist(), strict=True
+        ):
+            view = "end" if end else "side"
+            rows.append({"file": str(file), "box": box, "probability": p, "view": view})
+            table.add_row(str(file), *(f"{v:.0f}" for v in box), f"{p:.2f}", view)
+        if out is not None:
+            drawn = draw_detections(
+                image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), found
+            )
+            with written_whole(out / f"{file.stem}_cars.png") as beside:
+                beside.write_bytes(cv2.imencode(".png", drawn[..., ::-1])[1].tobytes())
+    console.print(table)
+    console.print(f"{len(rows)} cars in {len(chosen)} images")
+    if out is not None:
+        write_summary(
+            out, {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": None, "rows": rows}
+        )
+        console.print(f"Pictures are in {out}")
+
+
+def train_detector(
+    out: Annotated[Path, typer.Option("--out", "-o", help="The model file to write, .npz.")],
+    uiuc: Annotated[
+        Path | None,
+        typer.Option("--uiuc", help="UIUC's folder: trains on TrainImages (or TrainImages.tar.gz)."),
+    ] = None,
+    crops: Annotated[
+        Path | None,
+        typer.Option("--crops", help="A folder with positives/ and negatives/ (or vehicles/...)."),
+    ] = None,
+    front: Annotated[
+        bool, typer.Option("--front", help="A model of fronts and rears: a square window.")
+    ] = False,
+    normalization: Annotated[
+        str, typer.Option("--normalization", help="neighbors, cell (the thesis's), or blocks.")
+    ] = "neighbors",
+    penalty: Annotated[float, typer.Option("--penalty", help="C of the support vector machine.")] = 0.01,
+    rounds: Annotated[int, typer.Option("--rounds", min=0, help="How often hard negatives are mined.")] = 3,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of jitter and solver.")] = 0,
+) -> None:
+    """Train a car model on photographs: crops of cars that lie alike, and images without cars.
+
+    Examples:
+    * `parkenv train-detector --uiuc CarData --out side.npz`
+
+    * `parkenv train-detector --crops kitti --front --out front.npz`
+    """
+    from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
+    from parkenv.perception.hog import Descriptor
+    from parkenv.perception.training import TrainingSettings, train
+
+    if (uiuc is None) == (crops is None):
+        raise InputError("give either --uiuc FOLDER or --crops FOLDER")
+    if out.suffix != ".npz":
+        raise InputError(f"--out {out}: want a name that ends in .npz")
+    data = read_uiuc_training(uiuc) if uiuc is not None else read_crop_folder(Path(str(crops)))
+    console = make_console()
+    with console.status("Training") as status:
+        model = train(
+            data.positives,
+            data.negatives,
+            descriptor=Descriptor(128, 128 if front else 64, normalization),
+            ends=front,
+            settings=TrainingSettings(penalty=penalty, rounds=rounds, seed=seed),
+            trained_on=f"{len(data.positives)} crops and {len(data.negatives)} others in {uiuc or crops}",
+            progress=status.update,
+        )
+    model.save(out)
+    console.print(f"Trained on {model.trained_on}. Written: {out}")
+
+
+def evaluate_detector(
+    uiuc: Annotated[Path, typer.Option("--uiuc", help="UIUC's folder as it is published (CarData).")],
+    model: Annotated[str, typer.Option("--model", help=_MODEL_HELP)] = "side",
+    seed: args.SeedOption = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for summary.json and the curves.")] = Path(
+        "results/detector"
+    ),
+) -> None:
+    """Recall and precision of a side model on UIUC's test sets, by their own rule.
+
+    Example:
+    * `parkenv evaluate-detector --uiuc CarData --model side`
+    """
+    from parkenv.evaluation.detector_scores import save_curves, score_on_uiuc
+    from parkenv.evaluation.results import make_folder, write_summary
+    from parkenv.perception.detector import CarModel
+
+    loaded = CarModel.load(model)
+    make_folder(out)
+    console = make_console()
+    with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
+        task = progress.add_task("Looking", total=None)
+        scores = score_on_uiuc(loaded, uiuc, on_image=lambda: progress.advance(task))
+    table = make_table(None, list(scores[0].row))
+    for score in scores:
+        table.add_row(*(f"{v:.4f}" if isinstance(v, float) else str(v) for v in score.row.values()))
+    console.print(table)
+    save_curves(scores, f"model {model}", out / "recall_precision.png")
+    rows = [s.row for s in scores]
+    write_summary(
+        out, {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "rows": rows}
+    )
+    console.print(f"Written: {out / 'recall_precision.png'}, summary.json")

@@ -1,0 +1,215 @@
+"""`parkenv survey`: drive past every slot again and again; `parkenv map`: what that tells."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import Progress
+
+from parkenv import __version__
+from parkenv.cli import arguments as args
+from parkenv.cli.tables import make_console, make_table
+from parkenv.errors import InputError
+
+MAP_FILE = "map.sqlite"
+
+
+def survey(
+    scenario: Annotated[
+        str | None, typer.Option("--scenario", help="A packaged scenario: campus, jam, street, mini.")
+    ] = None,
+    lot: args.LotOption = None,
+    occupancy: args.OccupancyOption = None,
+    sessions: Annotated[
+        int, typer.Option("--sessions", "-n", min=1, help="How many drives; the thesis made 21.")
+    ] = 6,
+    rig: Annotated[
+        str, typer.Option("--rig", help="laser: a camera and a 270° laser; stereo: a stereo pair alone.")
+    ] = "laser",
+    hours: Annotated[
+        str,
+        typer.Option(
+            "--hours", metavar="HH:MM-HH:MM[,...]", help="When drives begin; one window after the other."
+        ),
+    ] = "08:00-10:00,11:00-14:00,16:00-18:00",
+    days: args.DaysOption = "weekdays",
+    weather: Annotated[
+        str | None,
+        typer.Option("--weather", help="sunny, overcast, low_sun, dusk, rain; drawn where not given."),
+    ] = None,
+    every: Annotated[float, typer.Option("--every", min=0.1, help="Metres between captures.")] = 1.25,
+    pose_noise: Annotated[
+        float, typer.Option("--pose-noise", min=0.0, help="How wrong the car is about where it is, m.")
+    ] = 0.0,
+    cars: Annotated[int, typer.Option("--cars", min=0, help="Other cars that drive about.")] = 3,
+    pedestrians: Annotated[int, typer.Option("--pedestrians", min=0, help="People who walk about.")] = 5,
+    seed: args.SeedOption = 0,
+    jobs: args.JobsOption = 0,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", help="Folder for map.sqlite, pictures, summary.json.")
+    ] = Path("results/survey"),
+) -> None:
+    """Drive past every slot with simulated sensors, find the parked cars, and keep what was seen in a map file.
+
+    The camera's pictures go through the detector, the laser (or the stereo pair) ranges what it finds, a Bayes filter
+    decides for each slot, and every drive is one session of the map. The same command goes on where it was stopped.
+
+    Examples:
+    * `parkenv survey --sessions 21`
+
+    * `parkenv survey --scenario street --rig stereo --weather rain --hours 12:00-13:00`
+    """
+    from parkenv.evaluation.results import make_folder, write_summary
+    from parkenv.evaluation.survey_pictures import save_detections, save_map, save_session
+    from parkenv.evaluation.surveys import run_survey, summarize
+    from parkenv.mapping.inference import predict
+    from parkenv.mapping.odometry import PoseNoise
+    from parkenv.mapping.store import MapStore
+    from parkenv.mapping.survey import SurveySettings
+    from parkenv.occupancy import Arrival, ArrivalWindow
+    from parkenv.traffic import Traffic
+
+    (its,) = args.scenarios_of(scenario, lot, occupancy, None, None, "08:00-13:00", days, None)
+    its = its.replace(traffic=Traffic(cars, pedestrians))
+    settings = SurveySettings(
+        rig=rig,
+        every=every,
+        weather=weather,
+        windows=tuple(ArrivalWindow.parse(h, days) for h in hours.split(",")),
+        pose_noise=PoseNoise(pose_noise, 0.02 * pose_noise),
+        seed=seed,
+    )
+    make_folder(out)
+    console = make_console()
+    with Progress(console=console, disable=not console.is_terminal) as progress:
+        task = progress.add_task("Driving (compiles first after an installation)", total=sessions)
+        run = run_survey(
+            its,
+            settings,
+            sessions,
+            out / MAP_FILE,
+            jobs=jobs or -1,
+            on_session=lambda _: progress.advance(task),
+        )
+        progress.update(task, completed=sessions)
+    row = summarize(its, settings, run, out / MAP_FILE)
+    with MapStore(out / MAP_FILE, its.lot, create=False) as store:
+        log = store.log()
+    first = settings.windows[0]
+    time = 86_400.0 * first.weekdays[0] + 0.5 * (first.start_s + first.end_s)
+    save_map(
+        its.lot, predict(log, time), its.occupancy.forecast(Arrival(time)).p_occupied,
+        f"{its.name} after {row['sessions']} sessions", out / f"map_{its.name}.png",
+    )  # fmt: skip
+    if run.shown is not None:
+        save_detections(run.shown, out / f"detections_{its.name}.png")
+        save_session(its.lot, run.shown, out / f"session_{its.name}.png")
+    table = make_table(None, ["figure", "value"])
+    for name in (
+        "car_detection_rate",
+        "detection_precision",
+        "slot_accuracy",
+        "slot_accuracy_seen",
+        "unknown_fraction",
+    ):
+        table.add_row(name, f"{row[name]:.3f}")
+    error = row["range_abs_error_m"]
+    table.add_row("range_abs_error_m", f"median {error['median']:.3f}, p95 {error['p95']:.3f}")
+    table.add_row(
+        "occupancy_mae", f"{row['occupancy_mae']:.3f} (counts alone: {row['occupancy_mae_expected']:.3f})"
+    )
+    table.add_row("seconds_per_frame", f"{row['seconds_per_frame']:.4f}")
+    console.print(table)
+    summary = {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "rows": [row]}
+    write_summary(out, summary)
+    console.print(f"Written: {out / MAP_FILE}, summary.json, sessions.csv and pictures")
+
+
+def show_map(
+    file: Annotated[Path, typer.Argument(help="A map file that parkenv survey wrote.")],
+    scenario: Annotated[
+        str | None, typer.Option("--scenario", help="The packaged scenario that was surveyed.")
+    ] = None,
+    lot: args.LotOption = None,
+    weekday: Annotated[
+        str | None, typer.Option("--weekday", help="mon to sun; over all sessions where not given.")
+    ] = None,
+    hour: Annotated[
+        float, typer.Option("--hour", min=0.0, max=24.0, help="Hour of the day, e.g. 9.5.")
+    ] = 9.0,
+    slot: Annotated[str | None, typer.Option("--slot", help="Only this slot, by its id.")] = None,
+    confidence: Annotated[float, typer.Option("--confidence", help="Of the interval, 0 to 1.")] = 0.9,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Folder for map.png, slots.csv, summary.json.")
+    ] = None,
+) -> None:
+    """Ask a map file how often slots are taken.
+
+    Examples:
+    * `parkenv map results/survey/map.sqlite --weekday tue --hour 9.5`
+
+    * `parkenv map results/survey/map.sqlite --slot A3 --out results/map`
+    """
+    import csv
+    import io
+
+    from parkenv.evaluation.results import make_folder, write_summary
+    from parkenv.evaluation.survey_pictures import save_map
+    from parkenv.mapping.inference import predict
+    from parkenv.mapping.store import MapStore
+    from parkenv.occupancy import DAY_NAMES, DAY_S, HOUR_S
+    from parkenv.whole_files import written_whole
+
+    (its,) = args.scenarios_of(scenario, lot, None, None, None, "08:00-13:00", "weekdays", None)
+    if weekday is not None and weekday not in DAY_NAMES:
+        raise InputError(f"--weekday is {weekday!r}, want one of {', '.join(DAY_NAMES)}")
+    ids = its.lot.slot_ids
+    if slot is not None and slot not in ids:
+        raise InputError(f"--slot {slot}: lot {its.name!r} has no such slot; its first is {ids[0]!r}")
+    with MapStore(file, its.lot, create=False) as store:
+        log = store.log()
+    time = None if weekday is None else DAY_NAMES.index(weekday) * DAY_S + min(hour * HOUR_S, DAY_S - 1.0)
+    found = predict(log, time, confidence=confidence)
+    rows = [
+        {
+            "slot": name,
+            "p_occupied": float(found.p_occupied[i]),
+            "low": float(found.low[i]),
+            "high": float(found.high[i]),
+            "sessions": int(found.sessions[i]),
+        }
+        for i, name in enumerate(ids)
+        if slot in (None, name)
+    ]
+    console = make_console()
+    when = "over all sessions" if weekday is None else f"{weekday} {int(hour):02d}:{int(hour % 1 * 60):02d}"
+    table = make_table(
+        f"{its.name}, {when}, {len(log.time)} sessions", ["slot", "P(taken)", f"{confidence:.0%}", "seen in"]
+    )
+    for row in sorted(rows, key=lambda r: float(str(r["p_occupied"])))[: None if slot else 12]:
+        table.add_row(
+            str(row["slot"]),
+            f"{row['p_occupied']:.2f}",
+            f"{row['low']:.2f}-{row['high']:.2f}",
+            str(row["sessions"]),
+        )
+    console.print(table)
+    if slot is None and len(rows) > 12:
+        console.print(f"The {12} most likely free of {len(rows)}; --out writes all.")
+    if out is None:
+        return
+    make_folder(out)
+    save_map(its.lot, found, None, f"{its.name}, {when}", out / "map.png")
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with written_whole(out / "slots.csv") as beside:
+        beside.write_text(text.getvalue(), encoding="utf-8")
+    write_summary(
+        out, {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": None, "rows": rows}
+    )
+    console.print(f"Written: {out / 'map.png'}, slots.csv, summary.json")

@@ -1,0 +1,212 @@
+"""Many sessions into a map file, and how good the sessions and the map are."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.mapping.inference import SessionLog, predict
+from parkenv.mapping.store import MapStore
+from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
+from parkenv.occupancy import Arrival
+from parkenv.scenario import Scenario
+from parkenv.whole_files import written_whole
+
+FloatArray = NDArray[np.float64]
+Row = dict[str, Any]
+
+SESSION_COLUMNS = (
+    "key", "weather", "time_s", "parked", "found", "detections", "right", "range_error_m", "range_error_p95_m",
+    "slot_accuracy", "slot_accuracy_seen", "unknown_fraction", "occupied_fraction", "seconds_per_frame",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyRun:
+    """A survey that is done.
+
+    Attributes:
+        rows: a row a session, in order.
+        shown: the first session, with pictures; None if all were there already.
+    """
+
+    rows: list[Row]
+    shown: SessionResult | None
+
+
+def session_row(result: SessionResult) -> Row:
+    """What `sessions.csv` says of a session."""
+    error = result.range_error
+    return dict(
+        zip(
+            SESSION_COLUMNS,
+            (
+                result.session.key, result.session.weather, result.arrival.time, result.parked, result.found,
+                result.detections, result.right,
+                float(np.median(error)) if len(error) else float("nan"),
+                float(np.quantile(error, 0.95)) if len(error) else float("nan"),
+                result.slot_accuracy, result.slot_accuracy_seen, float(1.0 - result.states.in_view.mean()),
+                float(result.truth.mean()), float(np.median(result.frame_s)),
+            ),
+            strict=True,
+        )
+    )  # fmt: skip
+
+
+def run_survey(
+    scenario: Scenario,
+    settings: SurveySettings,
+    sessions: int,
+    map_file: Path,
+    *,
+    jobs: int = 1,
+    pictures: int = 4,
+    on_session: Callable[[Row], None] = lambda _: None,
+) -> SurveyRun:
+    """Drive what the map file does not hold yet; each session is in it whole as soon as it is driven.
+
+    Args:
+        scenario: the world.
+        settings: how to drive.
+        sessions: how many.
+        map_file: made where it is not there. Beside it, `sessions.csv` keeps how good each session was.
+        jobs: worker processes; the result does not depend on it.
+        pictures: captures kept of the first session.
+        on_session: told of each session that is done.
+
+    Raises:
+        InputError: fewer than one session, or a map file that cannot be used.
+    """
+    if sessions < 1:
+        raise InputError(f"sessions is {sessions}, want at least 1")
+    survey = Survey(scenario, settings)
+    table = map_file.with_name("sessions.csv")
+    with MapStore(map_file, scenario.lot) as store:
+        # A row is written before its session: one without is of a drive that was cut off, and is driven again.
+        rows = {r["key"]: r for r in _read_rows(table) if store.has(r["key"])}
+        wanted = [survey.key_of(k) for k in range(sessions)]
+        missing = [k for k, key in enumerate(wanted) if not store.has(key) or key not in rows]
+        shown = None
+        for number, result in zip(missing, _driven(survey, missing, jobs, pictures), strict=True):
+            row = session_row(result)
+            rows[row["key"]] = row
+            _write_rows(table, list(rows.values()))
+            if not store.has(row["key"]):
+                store.add(result.session)
+            if number == 0:
+                shown = result
+            on_session(row)
+    return SurveyRun([rows[key] for key in wanted], shown)
+
+
+def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_file: Path) -> Row:
+    """The row of `summary.json`."""
+    with MapStore(map_file, scenario.lot, create=False) as store:
+        log = store.log()
+    error, expected = map_error(scenario, _test_times(settings), log)
+    parked = sum(r["parked"] for r in run.rows)
+    detections = sum(r["detections"] for r in run.rows)
+    return {
+        "scenario": scenario.name,
+        "rig": settings.rig,
+        "weather": settings.weather or "any",
+        "sessions": len(run.rows),
+        "slots": scenario.lot.n_slots,
+        "car_detection_rate": sum(r["found"] for r in run.rows) / max(parked, 1),
+        "detection_precision": sum(r["right"] for r in run.rows) / max(detections, 1),
+        "range_abs_error_m": {
+            "median": _mean(run.rows, "range_error_m"),
+            "p95": _mean(run.rows, "range_error_p95_m"),
+        },
+        "slot_accuracy": _mean(run.rows, "slot_accuracy"),
+        "slot_accuracy_seen": _mean(run.rows, "slot_accuracy_seen"),
+        "unknown_fraction": _mean(run.rows, "unknown_fraction"),
+        "occupancy_mae": error,
+        "occupancy_mae_expected": expected,
+        "seconds_per_frame": _mean(run.rows, "seconds_per_frame"),
+    }
+
+
+def map_error(scenario: Scenario, times: Sequence[float], log: SessionLog) -> tuple[float, float]:
+    """How far the map's predictions are from the true probabilities, and how far counts of as many sessions would be.
+
+    Args:
+        scenario: whose occupancy is the truth.
+        times: s since Monday 00:00, at which to ask.
+        log: the map's sessions.
+
+    Returns:
+        Mean over slots and times of |predicted - true|; the same of a mean of independent draws at that very hour.
+    """
+    errors, chances = [], []
+    for time in times:
+        true = scenario.occupancy.forecast(Arrival(time)).p_occupied
+        errors.append(np.abs(predict(log, time).p_occupied - true))
+        # Mean absolute deviation of a binomial share, by its normal limit.
+        chances.append(np.sqrt(2.0 / np.pi * true * (1.0 - true) / max(len(log.time), 1)))
+    return float(np.mean(errors)), float(np.mean(chances))
+
+
+def _driven(survey: Survey, numbers: Sequence[int], jobs: int, pictures: int) -> Iterator[SessionResult]:
+    """Sessions in order, on several processes where asked."""
+    if jobs == 1 or len(numbers) < 2:
+        for k in numbers:
+            yield survey.drive(k, pictures=pictures if k == 0 else 0)
+        return
+    work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="n_jobs")
+    yield from work(
+        delayed(_drive)(survey.scenario, survey.settings, k, pictures if k == 0 else 0) for k in numbers
+    )
+
+
+_KEPT: dict[str, Survey] = {}
+
+
+def _drive(scenario: Scenario, settings: SurveySettings, number: int, pictures: int) -> SessionResult:
+    """In a worker: the survey is made once, and kept for the next session."""
+    name = repr((scenario.name, settings))
+    if name not in _KEPT:
+        _KEPT.clear()
+        _KEPT[name] = Survey(scenario, settings)
+    return _KEPT[name].drive(number, pictures=pictures)
+
+
+def _test_times(settings: SurveySettings) -> list[float]:
+    """The middle of every window, on its first day."""
+    return [86_400.0 * w.weekdays[0] + 0.5 * (w.start_s + w.end_s) for w in settings.windows]
+
+
+def _mean(rows: Sequence[Row], column: str) -> float:
+    return float(np.nanmean([r[column] for r in rows]))
+
+
+def _read_rows(path: Path) -> list[Row]:
+    if not path.exists():
+        return []
+    rows = []
+    for raw in csv.DictReader(path.read_text(encoding="utf-8").splitlines()):
+        if tuple(raw) != SESSION_COLUMNS:
+            raise InputError(f"{path}: not written by this version of parkenv; use another folder")
+        whole = ("parked", "found", "detections", "right")
+        rows.append(
+            {k: v if k in ("key", "weather") else int(v) if k in whole else float(v) for k, v in raw.items()}
+        )
+    return rows
+
+
+def _write_rows(path: Path, rows: Sequence[Row]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, SESSION_COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with written_whole(path) as beside:
+        beside.write_text(text.getvalue(), encoding="utf-8")

@@ -1,0 +1,152 @@
+"""How often each slot is taken, from sessions at different times (T §3.3.3), and at which hour (T §6)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import beta
+
+from parkenv.errors import InputError
+from parkenv.occupancy import DAY_S, HOUR_S, MAX_PROBABILITY, MIN_PROBABILITY, Arrival, Forecast
+
+FloatArray = NDArray[np.float64]
+
+SLOT_WEIGHT, LOT_WEIGHT = 4.0, 6.0
+"""How many sessions a slot's own mean is worth against its hour, and the lot's hour against the slot."""
+RELAXATION_S = 1800.0
+"""s, how fast a sighting grows old where nothing better is known: half an hour's stay, half an hour's gap."""
+_HOUR_WIDTH = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class SessionLog:
+    """What was seen of every slot in each session.
+
+    Args:
+        time: (k,) s since Monday 00:00.
+        occupied: (k, n_slots) bool.
+        known: (k, n_slots) bool, whether the slot was in view.
+    """
+
+    time: FloatArray
+    occupied: NDArray[np.bool_]
+    known: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        if (
+            self.occupied.ndim != 2
+            or self.occupied.shape != self.known.shape
+            or len(self.time) != len(self.occupied)
+        ):
+            raise InputError(
+                f"sessions: {self.time.shape} times, {self.occupied.shape} states and {self.known.shape} views "
+                "do not go together"
+            )
+
+    @property
+    def n_slots(self) -> int:
+        """How many slots there are."""
+        return int(self.occupied.shape[1])
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a map predicts of every slot.
+
+    Attributes:
+        p_occupied: (n_slots,) float64.
+        low, high: (n_slots,) float64, bounds that hold P(occupied) with the asked probability.
+        sessions: (n_slots,) int64, in how many sessions the slot was in view.
+    """
+
+    p_occupied: FloatArray
+    low: FloatArray
+    high: FloatArray
+    sessions: NDArray[np.int64]
+
+
+def counted(log: SessionLog) -> FloatArray:
+    """The thesis's prediction, (n_slots,): N_occupied / (N_occupied + N_free) (eq. 3.10-3.12); 0.5 where never seen."""
+    seen = log.known.sum(axis=0)
+    taken = (log.occupied & log.known).sum(axis=0)
+    return np.where(seen > 0, taken / np.maximum(seen, 1), 0.5)
+
+
+def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0.9) -> Prediction:
+    """Predict every slot at a time of the week, or over all.
+
+    Counts back off from the particular to the general, each step a Beta prior worth a few sessions: the slot at this
+    hour of this kind of day, the slot at all hours shifted by how full the lot is at this hour, the lot at this hour,
+    the lot. So one session is enough for a first guess, and many make it sharp.
+
+    Args:
+        log: the sessions.
+        time: s since Monday 00:00; None: over all sessions alike.
+        confidence: of the interval.
+
+    Raises:
+        InputError: no session, or a confidence that is no probability.
+    """
+    if not len(log.time):
+        raise InputError("the map holds no session, want at least one")
+    if not 0.0 < confidence < 1.0:
+        raise InputError(f"confidence is {confidence}, want between 0 and 1")
+    taken, known = (log.occupied & log.known).astype(np.float64), log.known.astype(np.float64)
+    lot_mean = (taken.sum() + 1.0) / (known.sum() + 2.0)
+    weight = np.ones(len(log.time)) if time is None else _alike(log.time, time)
+    at_hour = (weight @ taken.sum(axis=1) + LOT_WEIGHT * lot_mean) / (weight @ known.sum(axis=1) + LOT_WEIGHT)
+    slot_mean = (taken.sum(axis=0) + SLOT_WEIGHT * lot_mean) / (known.sum(axis=0) + SLOT_WEIGHT)
+    prior = slot_mean if time is None else _expit(_logit(slot_mean) + _logit(at_hour) - _logit(lot_mean))
+    # Over all sessions the slot's own counts are in its mean already: what is left to add is the lot's prior.
+    strength = SLOT_WEIGHT
+    base = np.full(log.n_slots, lot_mean) if time is None else prior
+    a = weight @ taken + strength * base
+    b = weight @ known + strength - a
+    tail = 0.5 * (1.0 - confidence)
+    return Prediction(
+        a / (a + b),
+        np.asarray(beta.ppf(tail, a, b)),
+        np.asarray(beta.ppf(1.0 - tail, a, b)),
+        known.sum(axis=0).astype(np.int64),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class MapPrior:
+    """A map as what a search knows beforehand: stands where a `Scenario` wants a `prior`.
+
+    Args:
+        log: the sessions.
+        relaxation_s: s, how fast sightings grow old.
+    """
+
+    log: SessionLog
+    relaxation_s: float = RELAXATION_S
+
+    @property
+    def n_slots(self) -> int:
+        """Number of slots."""
+        return self.log.n_slots
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        """What the map predicts at the arrival."""
+        p = np.clip(predict(self.log, arrival.time).p_occupied, MIN_PROBABILITY, MAX_PROBABILITY)
+        return Forecast(p, np.full(self.n_slots, 1.0 / self.relaxation_s))
+
+
+def _alike(then: FloatArray, time: float) -> FloatArray:
+    """How much sessions say of another time, 0 to 1: those of the same kind of day, near the hour."""
+    same = (np.floor(then / DAY_S) % 7 >= 5) == (np.floor(time / DAY_S) % 7 >= 5)
+    apart = np.abs(then % DAY_S - time % DAY_S) / HOUR_S
+    apart = np.minimum(apart, 24.0 - apart)
+    return np.where(same, np.exp(-0.5 * (apart / _HOUR_WIDTH) ** 2), 0.0)
+
+
+def _logit(p: FloatArray | float) -> FloatArray:
+    return np.log(np.asarray(p) / (1.0 - np.asarray(p)))
+
+
+def _expit(x: FloatArray) -> FloatArray:
+    return np.asarray(1.0 / (1.0 + np.exp(-x)))

@@ -1,0 +1,251 @@
+"""The map file: sessions and what was seen in them, in SQLite; a session is there whole or not at all."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.lot import ParkingLot
+from parkenv.mapping.inference import SessionLog
+
+FloatArray = NDArray[np.float64]
+
+APPLICATION_ID = 0x7061726B  # "park"
+VERSION = 1
+_PATIENCE_S = 30.0
+
+_SCHEMA = """
+CREATE TABLE lot (name TEXT NOT NULL, digest TEXT NOT NULL, n_slots INTEGER NOT NULL);
+CREATE TABLE session (
+    id INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE, time REAL NOT NULL, rig TEXT NOT NULL, weather TEXT NOT NULL
+);
+CREATE TABLE sighting (
+    session INTEGER NOT NULL REFERENCES session(id), slot INTEGER NOT NULL, p_occupied REAL NOT NULL,
+    PRIMARY KEY (session, slot)
+) WITHOUT ROWID;
+CREATE TABLE car (
+    session INTEGER NOT NULL REFERENCES session(id), x REAL NOT NULL, y REAL NOT NULL, yaw REAL NOT NULL
+);
+CREATE INDEX car_of_session ON car(session);
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """One survey drive.
+
+    Attributes:
+        key: what tells it from all others; a survey that goes on does not drive it again.
+        time: s since Monday 00:00, when it began.
+        rig, weather: words.
+        p_occupied: (n_slots,) float64; NaN where the slot was never in view.
+        cars: (n, 3) float64, x, y in m and yaw in rad of the cars that were found.
+
+    Raises:
+        InputError: an empty key, a time or a car that is not finite, or a probability outside 0 to 1.
+    """
+
+    key: str
+    time: float
+    rig: str
+    weather: str
+    p_occupied: FloatArray
+    cars: FloatArray
+
+    def __post_init__(self) -> None:
+        if not self.key:
+            raise InputError("key of a session is empty, want a word that tells it from all others")
+        if not math.isfinite(self.time):
+            raise InputError(f"time of session {self.key!r} is {self.time}, want finite seconds")
+        seen = self.p_occupied[np.isfinite(self.p_occupied)]
+        if self.p_occupied.ndim != 1 or (seen < 0.0).any() or (seen > 1.0).any():
+            raise InputError(
+                f"p_occupied of session {self.key!r}: want (n_slots,) from 0 to 1, NaN where not seen"
+            )
+        if self.cars.ndim != 2 or self.cars.shape[1] != 3 or not np.isfinite(self.cars).all():
+            raise InputError(f"cars of session {self.key!r} have shape {self.cars.shape}, want finite (n, 3)")
+
+
+class MapStore:
+    """A map file.
+
+    Args:
+        path: the file; made where it does not exist, unless `create` is off.
+        lot: whose slots it is about.
+        create: whether to make a file that is not there.
+
+    Raises:
+        InputError: no such file; no map file, one of a newer parkenv or of another lot; or it cannot be written.
+    """
+
+    def __init__(self, path: Path, lot: ParkingLot, *, create: bool = True) -> None:
+        self.path, self._lot = path, lot
+        if not path.exists() and not create:
+            raise InputError(f"{path}: no such map file; parkenv survey makes one")
+        with self._said_plainly():
+            self._db = sqlite3.connect(path, timeout=_PATIENCE_S, isolation_level=None)
+            try:
+                self._open()
+            except BaseException:
+                self._db.close()
+                raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._db.close()
+
+    def has(self, key: str) -> bool:
+        """Whether a session is there."""
+        with self._said_plainly():
+            return self._db.execute("SELECT 1 FROM session WHERE key = ?", (key,)).fetchone() is not None
+
+    def add(self, session: Session) -> None:
+        """Write a session, in one transaction; several processes may do so at once.
+
+        Raises:
+            InputError: a session with this key is there already, a wrong number of slots, or the file cannot be
+                written.
+        """
+        if session.p_occupied.shape != (self._lot.n_slots,):
+            raise InputError(
+                f"session {session.key!r} has {session.p_occupied.shape} slots, want ({self._lot.n_slots},)"
+            )
+        seen = np.flatnonzero(np.isfinite(session.p_occupied)).tolist()
+        with self._said_plainly():
+            try:
+                with self._transaction("IMMEDIATE"):
+                    self._insert(session, seen)
+            except sqlite3.IntegrityError as error:
+                raise InputError(f"{self.path}: holds a session {session.key!r} already") from error
+
+    def sessions(self) -> list[Session]:
+        """All sessions, by key."""
+        found = []
+        with self._said_plainly(), self._transaction():
+            rows = self._db.execute("SELECT id, key, time, rig, weather FROM session ORDER BY key").fetchall()
+            for number, key, time, rig, weather in rows:
+                p = np.full(self._lot.n_slots, np.nan)
+                for slot, value in self._db.execute(
+                    "SELECT slot, p_occupied FROM sighting WHERE session = ?", (number,)
+                ):
+                    p[slot] = value
+                cars = self._db.execute("SELECT x, y, yaw FROM car WHERE session = ?", (number,)).fetchall()
+                found.append(
+                    Session(key, time, rig, weather, p, np.array(cars, dtype=np.float64).reshape(-1, 3))
+                )
+        return found
+
+    def log(self) -> SessionLog:
+        """All sessions, for predictions."""
+        sessions = self.sessions()
+        p = np.array([s.p_occupied for s in sessions]).reshape(len(sessions), self._lot.n_slots)
+        known = np.isfinite(p)
+        return SessionLog(np.array([s.time for s in sessions]), np.where(known, p, 0.0) > 0.5, known)
+
+    def _insert(self, session: Session, seen: list[int]) -> None:
+        head = (session.key, session.time, session.rig, session.weather)
+        number = self._db.execute(
+            "INSERT INTO session (key, time, rig, weather) VALUES (?, ?, ?, ?)", head
+        ).lastrowid
+        self._db.executemany(
+            "INSERT INTO sighting VALUES (?, ?, ?)",
+            ((number, slot, float(session.p_occupied[slot])) for slot in seen),
+        )
+        self._db.executemany(
+            "INSERT INTO car VALUES (?, ?, ?, ?)", ((number, *car) for car in session.cars.tolist())
+        )
+
+    def _open(self) -> None:
+        # One transaction, so that a file which somebody else is making is empty or whole.
+        with self._transaction():
+            empty = self._is_empty()
+            if not empty:
+                self._check()
+        if empty:
+            with self._transaction("IMMEDIATE"):
+                # Somebody else may have been faster.
+                if self._is_empty():
+                    self._make()
+                self._check()
+
+    def _check(self) -> None:
+        if self._pragma("application_id") != APPLICATION_ID:
+            raise InputError(f"{self.path}: is a database, but no map file of parkenv")
+        version = self._pragma("user_version")
+        if version > VERSION:
+            raise InputError(
+                f"{self.path}: was written by a newer parkenv (schema {version}, want at most {VERSION}): update it"
+            )
+        name, digest = self._db.execute("SELECT name, digest FROM lot").fetchone()
+        if digest != lot_digest(self._lot):
+            raise InputError(
+                f"{self.path}: is a map of lot {name!r}, not of {self._lot.name!r} as it is here"
+            )
+
+    def _make(self) -> None:
+        for statement in _SCHEMA.split(";"):
+            self._db.execute(statement)
+        head = (self._lot.name, lot_digest(self._lot), self._lot.n_slots)
+        self._db.execute("INSERT INTO lot VALUES (?, ?, ?)", head)
+        self._db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+        self._db.execute(f"PRAGMA user_version = {VERSION}")
+
+    def _is_empty(self) -> bool:
+        return bool(self._db.execute("SELECT count(*) FROM sqlite_master").fetchone() == (0,))
+
+    def _pragma(self, name: str) -> int:
+        return int(self._db.execute(f"PRAGMA {name}").fetchone()[0])
+
+    @contextmanager
+    def _transaction(self, kind: str = "DEFERRED") -> Iterator[None]:
+        self._db.execute(f"BEGIN {kind}")
+        try:
+            yield
+            self._db.execute("COMMIT")
+        except BaseException:
+            # Some errors, such as a full disk, have rolled back already.
+            if self._db.in_transaction:
+                self._db.execute("ROLLBACK")
+            raise
+
+    @contextmanager
+    def _said_plainly(self) -> Iterator[None]:
+        """What is wrong with the file in words."""
+        try:
+            yield
+        except sqlite3.DatabaseError as error:
+            raise InputError(f"{self.path}: {_reason(error)}") from error
+
+
+def lot_digest(lot: ParkingLot) -> str:
+    """What tells a lot's slots from those of another: equal for equal places."""
+    places = np.column_stack([lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width])
+    # Adding 0 makes one of the two zeros.
+    return hashlib.sha256((np.round(places, 3) + 0.0).tobytes()).hexdigest()[:16]
+
+
+def _reason(error: sqlite3.DatabaseError) -> str:
+    text = str(error)
+    if "not a database" in text:
+        return "is no map file (no SQLite file at all)"
+    if "readonly" in text or "unable to open" in text:
+        return "cannot be written; want a file in a folder that you may write to"
+    if "locked" in text:
+        return f"is in use by others for more than {_PATIENCE_S:g} s"
+    return f"cannot be used as a map file: {text}"

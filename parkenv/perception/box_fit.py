@@ -1,0 +1,129 @@
+"""A car fitted to the beams that end on it: the rectangle whose sides they lie on."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+
+FloatArray = NDArray[np.float64]
+
+CAR_LENGTH, CAR_WIDTH = 4.4, 1.8
+"""m; what is taken for the sides that are not seen."""
+LONG_SIDE = 2.3
+"""m; no car is as wide, so that a side of this length is a flank."""
+_SIDE_SEEN = 0.6  # m, of a side from which it counts as seen
+_NEAREST = 0.02  # m; points closer to a side than this count alike
+_CUT = 0.1  # m; an end of the run as close to a side is taken to be on it
+_STEPS = 90
+
+
+class FittedCar(NamedTuple):
+    """A car's rectangle.
+
+    Attributes:
+        x, y: m, its middle.
+        yaw: rad, along it, in [0, π): where its nose is the beams do not say.
+        length, width: m; at least a usual car's.
+        seen_length, seen_width: m, how much of a flank and of an end was met; near 0 for a side that was not seen.
+    """
+
+    x: float
+    y: float
+    yaw: float
+    length: float
+    width: float
+    seen_length: float
+    seen_width: float
+
+
+def fit_box(
+    points: FloatArray, sensor: FloatArray, *, end_on: bool, cut: tuple[bool, bool] = (False, False)
+) -> FittedCar:
+    """Fit a car to points on its sides.
+
+    The direction is the one whose sides the points are nearest to, by the closeness criterion of Zhang et al.
+    ("Efficient L-shape fitting for vehicle detection using laser scanners", IV 2017). A side longer than any car is
+    wide is a flank; where there is none, `end_on` tells front from flank. What is not seen of a side is completed to
+    a car's usual size, away from the sensor, or from where the view is cut.
+
+    Args:
+        points: (k, 2) m, k at least 1, world frame, as they lie side by side.
+        sensor: (2,) m, where they were seen from.
+        end_on: whether the car shows its front or rear rather than its flank.
+        cut: whether the car goes on unseen before the first and behind the last point.
+
+    Raises:
+        InputError: no point, or one that is not finite.
+
+    Example:
+        >>> front = np.stack([np.linspace(-0.9, 0.9, 30), np.full(30, 4.0)], axis=1)
+        >>> car = fit_box(front, np.zeros(2), end_on=True)
+        >>> round(car.x, 6), round(car.y, 6), round(math.degrees(car.yaw)), round(car.seen_width, 6)
+        (0.0, 6.2, 90, 1.8)
+    """
+    if points.ndim != 2 or points.shape[1] != 2 or not len(points) or not np.isfinite(points).all():
+        raise InputError(f"points have shape {points.shape}, want (at least 1, 2) finite numbers")
+    theta = float(_direction(np.ascontiguousarray(points, dtype=np.float64)))
+    axis = np.array([[math.cos(theta), math.sin(theta)], [-math.sin(theta), math.cos(theta)]])
+    local, seen_from = points @ axis.T, axis @ sensor
+    low, high = local.min(axis=0), local.max(axis=0)
+    extent = high - low
+    sight = np.abs(0.5 * (low + high) - seen_from)
+    lies = extent if extent.max() > LONG_SIDE else sight if end_on else -sight
+    along = int(lies.argmax())
+    size = np.full(2, CAR_WIDTH)
+    size[along] = CAR_LENGTH
+    size = np.maximum(size, extent)
+    anchor = np.zeros(
+        2
+    )  # -1: the low side is the car's own, 1: the high side, 0: neither more than the other
+    for i in (0, 1):
+        anchor[i] = -1.0 if seen_from[i] < low[i] else 1.0 if seen_from[i] > high[i] else 0.0
+        # Which of the sides are just where the view ends?
+        low_cut = any(c and local[k, i] - low[i] < _CUT for k, c in zip((0, -1), cut, strict=True))
+        high_cut = any(c and high[i] - local[k, i] < _CUT for k, c in zip((0, -1), cut, strict=True))
+        if low_cut != high_cut and extent[i] > _SIDE_SEEN:
+            anchor[i] = 1.0 if low_cut else -1.0
+    middle = 0.5 * (low + high) + anchor * 0.5 * (extent - size)
+    x, y = axis.T @ middle
+    yaw = (theta + (math.pi / 2 if along == 1 else 0.0)) % math.pi
+    return FittedCar(
+        float(x),
+        float(y),
+        yaw,
+        float(size[along]),
+        float(size[1 - along]),
+        float(extent[along]),
+        float(extent[1 - along]),
+    )
+
+
+@njit(cache=True)
+def _direction(points: FloatArray) -> float:
+    """The angle in [0, π/2) of the rectangle to whose nearer sides the points are closest."""
+    best, answer = -1.0, 0.0
+    for step in range(_STEPS):
+        theta = 0.5 * math.pi * step / _STEPS
+        c, s = math.cos(theta), math.sin(theta)
+        low1 = low2 = math.inf
+        high1 = high2 = -math.inf
+        for k in range(len(points)):
+            a = c * points[k, 0] + s * points[k, 1]
+            b = c * points[k, 1] - s * points[k, 0]
+            low1, high1 = min(low1, a), max(high1, a)
+            low2, high2 = min(low2, b), max(high2, b)
+        value = 0.0
+        for k in range(len(points)):
+            a = c * points[k, 0] + s * points[k, 1]
+            b = c * points[k, 1] - s * points[k, 0]
+            d = min(min(a - low1, high1 - a), min(b - low2, high2 - b))
+            value += 1.0 / max(d, _NEAREST)
+        if value > best:
+            best, answer = value, theta
+    return answer

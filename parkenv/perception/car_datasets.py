@@ -1,0 +1,144 @@
+"""Labelled photographs of cars: the UIUC set as it is published, and plain folders of crops."""
+
+from __future__ import annotations
+
+import re
+import tarfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.perception.detector import as_grey
+from parkenv.perception.image_files import decode_image, images_in, natural_order, read_image
+
+Image = NDArray[np.uint8]
+FloatArray = NDArray[np.float64]
+
+UIUC_SIZE = (100, 40)
+"""Width and height, px, of UIUC's training crops and of its true boxes at scale 1."""
+UIUC_TESTS = {
+    "single": ("TestImages", "trueLocations.txt"),
+    "multi": ("TestImages_Scale", "trueLocations_Scale.txt"),
+}
+_POSITIVE, _NEGATIVE = ("positives", "vehicles", "pos"), ("negatives", "non-vehicles", "neg")
+
+
+@dataclass(frozen=True, eq=False)
+class Crops:
+    """Pictures of cars, aligned alike, and pictures without any.
+
+    Attributes:
+        positives: grey, uint8, each filled by its car as the others are.
+        negatives: grey, uint8, of any size.
+    """
+
+    positives: list[Image]
+    negatives: list[Image]
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledImage:
+    """A photograph and where its cars are.
+
+    Attributes:
+        name: of the file.
+        image: (h, w) uint8.
+        boxes: (n, 4) float64 px, left, top, right, bottom.
+    """
+
+    name: str
+    image: Image
+    boxes: FloatArray
+
+
+def read_uiuc_training(folder: Path) -> Crops:
+    """UIUC's training part: `TrainImages/pos-N.pgm` and `neg-N.pgm`, in a folder or in its `.tar.gz`.
+
+    Raises:
+        InputError: neither is there, an image is missing or torn.
+    """
+    archive = folder if folder.is_file() else folder / "TrainImages.tar.gz"
+    if (folder / "TrainImages").is_dir():
+        files = images_in(folder / "TrainImages")
+        images = {f.name: as_grey(read_image(f)) for f in files}
+    elif archive.is_file():
+        images = _images_of(archive)
+    else:
+        raise InputError(f"{folder}: holds neither TrainImages/ nor TrainImages.tar.gz")
+    crops = Crops(
+        *([im for name, im in images.items() if name.startswith(kind)] for kind in ("pos-", "neg-"))
+    )
+    if not crops.positives or not crops.negatives:
+        raise InputError(
+            f"{folder}: wanted TrainImages/pos-N.pgm and neg-N.pgm, got {len(images)} other images"
+        )
+    return crops
+
+
+def read_uiuc_test(folder: Path, test_set: str) -> list[LabelledImage]:
+    """One of UIUC's test sets, with the published true locations.
+
+    Args:
+        folder: the published `CarData`.
+        test_set: `single` or `multi`.
+
+    Raises:
+        InputError: an unknown set, missing files, or a line that is not `n: (i,j) ...` or `n: (i,j,w) ...`.
+    """
+    if test_set not in UIUC_TESTS:
+        raise InputError(f"test set is {test_set!r}, want one of {', '.join(UIUC_TESTS)}")
+    images, truth = (folder / name for name in UIUC_TESTS[test_set])
+    if not truth.is_file():
+        raise InputError(f"{truth}: no such file; want the folder as UIUC publishes it")
+    labelled = []
+    for line in truth.read_text().splitlines():
+        if not line.strip():
+            continue
+        number, _, places = line.partition(":")
+        numbers = [[int(n) for n in found.split(",")] for found in re.findall(r"\(([-\d,\s]+)\)", places)]
+        if not number.strip().isdigit() or any(len(n) != (2 if test_set == "single" else 3) for n in numbers):
+            raise InputError(
+                f"{truth}: line {line!r}, want n: (i,j) ... with a width each in the multi-scale set"
+            )
+        boxes = []
+        for top, left, *width in numbers:
+            wide = float(width[0]) if width else float(UIUC_SIZE[0])
+            boxes.append([left, top, left + wide, top + wide * UIUC_SIZE[1] / UIUC_SIZE[0]])
+        file = images / f"test-{int(number)}.pgm"
+        box = np.array(boxes, dtype=np.float64).reshape(-1, 4)
+        labelled.append(LabelledImage(file.name, as_grey(read_image(file)), box))
+    return labelled
+
+
+def read_crop_folder(folder: Path) -> Crops:
+    """A folder with `positives` and `negatives` in it (or `vehicles` and `non-vehicles`), images at any depth.
+
+    Raises:
+        InputError: one of the two is missing or holds no image, or an image cannot be read.
+    """
+    parts = []
+    for names in (_POSITIVE, _NEGATIVE):
+        there = [folder / name for name in names if (folder / name).is_dir()]
+        if not there:
+            raise InputError(f"{folder}: holds no folder {names[0]}/ (or {', '.join(names[1:])})")
+        parts.append([as_grey(read_image(file)) for file in images_in(there[0])])
+    return Crops(*parts)
+
+
+def _images_of(archive: Path) -> dict[str, Image]:
+    images = {}
+    try:
+        with tarfile.open(archive) as files:
+            members = [m for m in files.getmembers() if m.isfile() and m.name.endswith(".pgm")]
+            for member in sorted(members, key=lambda m: natural_order(Path(m.name))):
+                stream = files.extractfile(member)
+                assert stream is not None
+                images[Path(member.name).name] = as_grey(
+                    decode_image(stream.read(), f"{archive}: {member.name}")
+                )
+    except (tarfile.TarError, EOFError, OSError) as error:
+        raise InputError(f"{archive}: is no archive that can be read: {error}") from error
+    return images

@@ -1,0 +1,109 @@
+"""How good a detector is: recall against precision, by UIUC's rule of what counts as found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+REACH = 0.25
+"""Semi-axes of the ellipse about a true box, as shares of its width and height (README of the UIUC set)."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecallPrecision:
+    """One point for every threshold, from the strictest.
+
+    Attributes:
+        threshold: (k,) float64.
+        recall: (k,) float64, share of the cars that are found.
+        precision: (k,) float64, share of the detections that are cars.
+    """
+
+    threshold: FloatArray
+    recall: FloatArray
+    precision: FloatArray
+
+    @property
+    def equal_error(self) -> float:
+        """Where recall and precision meet: the greatest value that both reach at one threshold."""
+        if not len(self.recall):
+            return 0.0
+        return float(np.minimum(self.recall, self.precision).max())
+
+    @property
+    def average_precision(self) -> float:
+        """Area under the curve, precision taken as the best at this recall or a higher one."""
+        if not len(self.recall):
+            return 0.0
+        best = np.maximum.accumulate(self.precision[::-1])[::-1]
+        return float(np.sum(np.diff(self.recall, prepend=0.0) * best))
+
+    def at_equal_error(self) -> tuple[float, float, float]:
+        """Threshold, recall and precision there."""
+        i = int(np.minimum(self.recall, self.precision).argmax())
+        return float(self.threshold[i]), float(self.recall[i]), float(self.precision[i])
+
+
+def recall_precision(
+    boxes: Sequence[NDArray[np.floating]],
+    scores: Sequence[NDArray[np.floating]],
+    truth: Sequence[NDArray[np.floating]],
+    *,
+    scales: bool = True,
+) -> RecallPrecision:
+    """Match detections to true boxes, best detection first, one a car.
+
+    Args:
+        boxes: of each image, (n, 4) left, top, right, bottom of what was found.
+        scores: of each image, (n,).
+        truth: of each image, (m, 4) the cars.
+        scales: whether the width counts as a third axis, as in the multi-scale set.
+    """
+    cars = sum(len(t) for t in truth)
+    hits, values = [], []
+    for found, score, true in zip(boxes, scores, truth, strict=True):
+        order = np.argsort(-np.asarray(score), kind="stable")
+        hits.append(
+            matches(
+                np.asarray(found, dtype=np.float64)[order], np.asarray(true, dtype=np.float64), scales=scales
+            )
+        )
+        values.append(np.asarray(score, dtype=np.float64)[order])
+    hit, value = np.concatenate(hits), np.concatenate(values)
+    order = np.argsort(-value, kind="stable")
+    value, right = value[order], np.cumsum(hit[order])
+    # Detections of one score are taken or left together.
+    last = (
+        np.flatnonzero(np.append(np.diff(value) != 0.0, True)) if len(value) else np.empty(0, dtype=np.int64)
+    )
+    return RecallPrecision(value[last], right[last] / max(cars, 1), right[last] / (last + 1.0))
+
+
+def matches(found: FloatArray, true: FloatArray, *, scales: bool = True) -> NDArray[np.bool_]:
+    """Which detections of an image, (n, 4), best first, find a car that no better one has found."""
+    hit = np.zeros(len(found), dtype=np.bool_)
+    if not len(true):
+        return hit
+    size = true[:, 2:] - true[:, :2]
+    taken = np.zeros(len(true), dtype=np.bool_)
+    for i, box in enumerate(found):
+        away = ((box[:2] + box[2:] - true[:, :2] - true[:, 2:]) / 2.0 / (REACH * size)) ** 2
+        off = away.sum(axis=1)
+        if scales:
+            off += ((box[2] - box[0] - size[:, 0]) / (REACH * size[:, 0])) ** 2
+        off[taken] = np.inf
+        nearest = int(off.argmin())
+        if off[nearest] <= 1.0:
+            hit[i] = taken[nearest] = True
+    return hit
+
+
+def recall_at(false_positives: float, positive: FloatArray, negative: FloatArray) -> float:
+    """Share of positive scores above the score that this share of the negative ones exceeds."""
+    limit = np.quantile(negative, 1.0 - false_positives, method="higher")
+    return float((positive > limit).mean())

@@ -1,0 +1,379 @@
+"""Histograms of oriented gradients over a whole image: the thesis's descriptor, and two ways to normalise it better.
+
+A window of the image is described by the cells in it (T §3.2.1): 8×8 pixels a cell, nine unsigned orientations, so
+1152 values for a side view of 128×64 and 2304 for a front of 128×128. Histograms are made once for an image, and every
+window on the grid of cells is a slice of them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+
+Image = NDArray[np.uint8]
+Float32Array = NDArray[np.float32]
+
+CELL = 8
+"""Pixels along each side of a cell."""
+ORIENTATIONS = 9
+"""Bins over half a turn; opposite gradients count as one."""
+NORMALIZATIONS = ("neighbors", "cell", "blocks")
+
+_NOISE = 25.0  # energy of a cell that holds nothing but the sensor's noise; what is weaker is not blown up
+_CLIP = 0.2  # no single orientation says more than this (Dalal and Triggs's L2-Hys)
+_BLOCK = 2
+
+
+@dataclass(frozen=True)
+class Descriptor:
+    """What is computed of a window.
+
+    Args:
+        width, height: px of the window, whole cells.
+        normalization: `cell`: each cell by its own energy, the thesis's count of values. `neighbors`: each cell by the
+            energies of the four blocks of 2×2 cells that it is part of, the mean of the four; as many values. `blocks`:
+            Dalal and Triggs (2005), every block of 2×2 cells on its own, 36 values each.
+
+    Raises:
+        InputError: a size that is not whole cells, or an unknown normalization.
+
+    Example:
+        >>> Descriptor(128, 64).size, Descriptor(128, 128).size, Descriptor(128, 64, "blocks").size
+        (1152, 2304, 3780)
+    """
+
+    width: int = 128
+    height: int = 64
+    normalization: str = "neighbors"
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < 2 * CELL or value % CELL:
+                raise InputError(f"{name} is {value!r} px, want a multiple of {CELL} of at least {2 * CELL}")
+        if self.normalization not in NORMALIZATIONS:
+            raise InputError(
+                f"normalization is {self.normalization!r}, want one of {', '.join(NORMALIZATIONS)}"
+            )
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Rows, values a place, columns: the shape of a window's features."""
+        rows, columns = self.height // CELL, self.width // CELL
+        if self.normalization == "blocks":
+            return rows - 1, _BLOCK * _BLOCK * ORIENTATIONS, columns - 1
+        return rows, ORIENTATIONS, columns
+
+    @property
+    def size(self) -> int:
+        """How many values describe a window."""
+        return math.prod(self.shape)
+
+    def features(self, image: Image) -> Float32Array:
+        """The features of a whole image; a window that begins on the grid of cells is a slice of `shape`.
+
+        Args:
+            image: (h, w) uint8, grey.
+
+        Returns:
+            (rows, values, columns) float32; columns come last, so that compiled loops run along them.
+        """
+        normalize = {"cell": _by_cell, "neighbors": _by_neighbors, "blocks": _by_blocks}[self.normalization]
+        features: Float32Array = normalize(cell_histograms(image))
+        return features
+
+    def describe(self, crop: Image) -> Float32Array:
+        """The values of one window, (size,) float32.
+
+        Args:
+            crop: (height, width) uint8, grey. Beyond its border the image is taken to go on as it ends.
+
+        Raises:
+            InputError: a crop of another size.
+        """
+        if crop.shape != (self.height, self.width):
+            raise InputError(f"crop is {crop.shape}, want ({self.height}, {self.width})")
+        # One cell more on each side, as a window in an image has neighbours.
+        wider = cv2.copyMakeBorder(crop, CELL, CELL, CELL, CELL, cv2.BORDER_REPLICATE)
+        rows, _, columns = self.shape
+        return np.ascontiguousarray(self.features(wider)[1 : 1 + rows, :, 1 : 1 + columns]).reshape(-1)
+
+
+def cell_histograms(image: Image) -> Float32Array:
+    """Gradient energy by orientation in every cell.
+
+    Central differences of the grey values; each pixel's gradient goes, by its magnitude and linear in distance, to the
+    two nearest orientations and the four nearest cells.
+
+    Args:
+        image: (h, w) uint8; pixels beyond the last whole cell are left out.
+
+    Returns:
+        (h // 8, 9, w // 8) float32; orientation k is centred at (k + 0.5)/9 of half a turn, counted from a gradient
+        along the columns.
+
+    Raises:
+        InputError: another shape or dtype.
+    """
+    if image.ndim != 2 or image.dtype != np.uint8:
+        raise InputError(f"image is {image.shape} of {image.dtype}, want (h, w) uint8")
+    rows, columns = image.shape[0] // CELL, image.shape[1] // CELL
+    if rows == 0 or columns == 0:
+        return np.zeros((rows, ORIENTATIONS, columns), dtype=np.float32)
+    cells: Float32Array = _histograms(
+        cv2.copyMakeBorder(image, 1, 1, 1, 1, cv2.BORDER_REPLICATE), rows, columns
+    )
+    return cells
+
+
+_FAST = {"nnan", "ninf", "nsz", "arcp", "contract", "afn"}
+_HALF = CELL // 2
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _gradients(
+    above: Image, row: Image, below: Image, magnitude: Float32Array, weighted_bin: Float32Array
+) -> None:
+    """Of each pixel the magnitude, and the magnitude times the orientation in bins, -0.5 to 8.5."""
+    one_bin = np.float32(ORIENTATIONS / math.pi)
+    for x in range(len(magnitude)):
+        gx = np.float32(np.int32(row[x + 2]) - np.int32(row[x]))
+        gy = np.float32(np.int32(below[x + 1]) - np.int32(above[x + 1]))
+        ax, ay = abs(gx), abs(gy)
+        t = min(ax, ay) / (max(ax, ay) + np.float32(1e-9))
+        s = t * t
+        # Arc tangent on [0, 1] to 1e-5 (Abramowitz and Stegun 4.4.49): a hundredth of a thousandth of a bin.
+        angle = t * (
+            np.float32(0.9998660)
+            + s
+            * (
+                np.float32(-0.3302995)
+                + s * (np.float32(0.1801410) + s * (np.float32(-0.0851330) + s * np.float32(0.0208351)))
+            )
+        )
+        angle = np.float32(0.5 * math.pi) - angle if ay > ax else angle
+        angle = np.float32(math.pi) - angle if gx * gy < np.float32(0.0) else angle
+        m = math.sqrt(gx * gx + gy * gy)
+        magnitude[x] = m
+        weighted_bin[x] = m * (angle * one_bin - np.float32(0.5))
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _share(m: np.float32, q: np.float32, k: np.float32) -> np.float32:
+    """What a gradient gives to bin k: its magnitude, less for each bin that it is away."""
+    return max(np.float32(0.0), m - abs(q - m * k))
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _bin_rows(
+    m: Float32Array, q: Float32Array, first: np.float32, upper: Float32Array, lower: Float32Array
+) -> None:
+    """Add four rows of gradients to every bin of the cells whose centres lie above and below them.
+
+    Args:
+        m: (4, w), magnitudes.
+        q: (4, w), magnitudes times bins.
+        first: weight of the first row for the cells below; it grows by 1/8 a row.
+        upper: (9, 4 + w + 4), sums for the cells above, changed in place.
+        lower: the same for those below.
+    """
+    step = np.float32(1.0 / CELL)
+    f0, f1, f2, f3 = first, first + step, first + step + step, first + step + step + step
+    m0, m1, m2, m3 = m[0], m[1], m[2], m[3]
+    q0, q1, q2, q3 = q[0], q[1], q[2], q[3]
+    for k in range(ORIENTATIONS):
+        a = upper[k]
+        b = lower[k]
+        center = np.float32(k)
+        for x in range(len(m0)):
+            v0 = _share(m0[x], q0[x], center)
+            v1 = _share(m1[x], q1[x], center)
+            v2 = _share(m2[x], q2[x], center)
+            v3 = _share(m3[x], q3[x], center)
+            down = f0 * v0 + f1 * v1 + f2 * v2 + f3 * v3
+            a[_HALF + x] += v0 + v1 + v2 + v3 - down
+            b[_HALF + x] += down
+    # Half a turn is where it began: what lies beyond the last bin's centre is near the first one's, and vice versa.
+    for k, center in ((0, np.float32(ORIENTATIONS)), (ORIENTATIONS - 1, np.float32(-1.0))):
+        a = upper[k]
+        b = lower[k]
+        for x in range(len(m0)):
+            v0 = _share(m0[x], q0[x], center)
+            v1 = _share(m1[x], q1[x], center)
+            v2 = _share(m2[x], q2[x], center)
+            v3 = _share(m3[x], q3[x], center)
+            down = f0 * v0 + f1 * v1 + f2 * v2 + f3 * v3
+            a[_HALF + x] += v0 + v1 + v2 + v3 - down
+            b[_HALF + x] += down
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _pool(sums: Float32Array, tent: Float32Array, out: Float32Array) -> None:
+    """From columns of pixels to columns of cells, each cell with a tent two cells wide."""
+    for k in range(ORIENTATIONS):
+        for c in range(out.shape[1]):
+            total = np.float32(0.0)
+            for i in range(2 * CELL):
+                total += sums[k, c * CELL + i] * tent[i]
+            out[k, c] = total
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _histograms(padded: Image, rows: int, columns: int) -> Float32Array:
+    """`cell_histograms` of an image with a border of one pixel."""
+    width = columns * CELL
+    out = np.zeros((rows, ORIENTATIONS, columns), dtype=np.float32)
+    upper = np.zeros((ORIENTATIONS, _HALF + width + _HALF), dtype=np.float32)
+    lower = np.zeros_like(upper)
+    m = np.empty((_HALF, width), dtype=np.float32)
+    q = np.empty((_HALF, width), dtype=np.float32)
+    tent = np.empty(2 * CELL, dtype=np.float32)
+    for i in range(2 * CELL):
+        tent[i] = 1.0 - abs((i + 0.5) / CELL - 1.0)
+    # Half a cell at a time: the centres of cells lie between rows 3 and 4, 11 and 12, and so on.
+    for half in range(2 * rows):
+        top = half * _HALF
+        for j in range(_HALF):
+            y = top + j
+            _gradients(padded[y], padded[y + 1], padded[y + 2], m[j], q[j])
+        if half % 2 == 1:
+            row = half // 2
+            if row > 0:
+                _pool(upper, tent, out[row - 1])
+            upper, lower = lower, upper
+            lower[:] = 0.0
+            _bin_rows(m, q, np.float32(0.5 / CELL), upper, lower)
+        else:
+            _bin_rows(m, q, np.float32((_HALF + 0.5) / CELL), upper, lower)
+    _pool(upper, tent, out[rows - 1])
+    return out
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _by_cell(cells: Float32Array) -> Float32Array:
+    rows, values, columns = cells.shape
+    out = np.empty_like(cells)
+    scale = np.empty(columns, dtype=np.float32)
+    for y in range(rows):
+        scale[:] = _NOISE * _NOISE
+        for k in range(values):
+            for x in range(columns):
+                scale[x] += cells[y, k, x] * cells[y, k, x]
+        for x in range(columns):
+            scale[x] = np.float32(1.0) / math.sqrt(scale[x])
+        for k in range(values):
+            for x in range(columns):
+                out[y, k, x] = cells[y, k, x] * scale[x]
+    return out
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _block_scales(cells: Float32Array) -> Float32Array:
+    """(rows + 1, columns + 1): one over the norm of the 2×2 cells about each corner, the border's cells doubled."""
+    rows, values, columns = cells.shape
+    energy = np.zeros((rows + 2, columns + 2), dtype=np.float32)
+    for y in range(rows):
+        for k in range(values):
+            for x in range(columns):
+                energy[y + 1, x + 1] += cells[y, k, x] * cells[y, k, x]
+    energy[0] = energy[1]
+    energy[rows + 1] = energy[rows]
+    energy[:, 0] = energy[:, 1]
+    energy[:, columns + 1] = energy[:, columns]
+    scale = np.empty((rows + 1, columns + 1), dtype=np.float32)
+    for y in range(rows + 1):
+        for x in range(columns + 1):
+            total = energy[y, x] + energy[y, x + 1] + energy[y + 1, x] + energy[y + 1, x + 1]
+            scale[y, x] = np.float32(1.0) / math.sqrt(total + np.float32(_NOISE * _NOISE))
+    return scale
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _by_neighbors(cells: Float32Array) -> Float32Array:
+    rows, values, columns = cells.shape
+    scale = _block_scales(cells)
+    out = np.empty_like(cells)
+    clip = np.float32(_CLIP)
+    quarter = np.float32(0.25)
+    for y in range(rows):
+        a = scale[y]
+        b = scale[y + 1]
+        for k in range(values):
+            for x in range(columns):
+                v = cells[y, k, x]
+                total = min(v * a[x], clip) + min(v * a[x + 1], clip)
+                out[y, k, x] = quarter * (total + min(v * b[x], clip) + min(v * b[x + 1], clip))
+    return out
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def _by_blocks(cells: Float32Array) -> Float32Array:
+    rows, values, columns = cells.shape
+    out = np.empty((max(rows - 1, 0), 4 * values, max(columns - 1, 0)), dtype=np.float32)
+    scale = _block_scales(cells)
+    clip = np.float32(_CLIP)
+    norm = np.empty(max(columns - 1, 0), dtype=np.float32)
+    for y in range(rows - 1):
+        norm[:] = 1e-6
+        for corner in range(4):
+            dy, dx = corner // 2, corner % 2
+            for k in range(values):
+                for x in range(columns - 1):
+                    v = min(cells[y + dy, k, x + dx] * scale[y + 1, x + 1], clip)
+                    out[y, corner * values + k, x] = v
+                    norm[x] += v * v
+        for x in range(columns - 1):
+            norm[x] = np.float32(1.0) / math.sqrt(norm[x])
+        for k in range(4 * values):
+            for x in range(columns - 1):
+                out[y, k, x] *= norm[x]
+    return out
+
+
+@njit(cache=True, fastmath=_FAST, error_model="numpy")
+def correlate(features: Float32Array, weights: Float32Array) -> Float32Array:
+    """The dot product of the weights with every window of the features.
+
+    Args:
+        features: (rows, values, columns) float32.
+        weights: (window rows, values, window columns) float32.
+
+    Returns:
+        (rows - window rows + 1, columns - window columns + 1) float32; empty where the window is larger.
+    """
+    height, width = weights.shape[0], weights.shape[2]
+    rows, columns = features.shape[0] - height + 1, features.shape[2] - width + 1
+    out = np.zeros((max(rows, 0), max(columns, 0)), dtype=np.float32)
+    if columns <= 0:
+        return out
+    for y in range(rows):
+        line = out[y]
+        for i in range(height):
+            for k in range(features.shape[1]):
+                source = features[y + i, k]
+                j = 0
+                # Four columns of the window at a time, so that the line is loaded and stored a quarter as often.
+                while j + 4 <= width:
+                    w0, w1 = weights[i, k, j], weights[i, k, j + 1]
+                    w2, w3 = weights[i, k, j + 2], weights[i, k, j + 3]
+                    for x in range(columns):
+                        line[x] += (
+                            w0 * source[x + j]
+                            + w1 * source[x + j + 1]
+                            + w2 * source[x + j + 2]
+                            + w3 * source[x + j + 3]
+                        )
+                    j += 4
+                while j < width:
+                    w0 = weights[i, k, j]
+                    for x in range(columns):
+                        line[x] += w0 * source[x + j]
+                    j += 1
+    return out

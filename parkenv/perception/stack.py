@@ -1,0 +1,113 @@
+"""The whole of seeing: from what a rig measured to cars in the world and what lies around (T §3.2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.perception.detector import Detections, Detector
+from parkenv.perception.ranging import CarSightings, locate
+from parkenv.perception.sweeps import Sweep, disparity, laser_sweep, stereo_sweep
+from sim_sensors.camera import PinholeCamera
+from sim_sensors.rig import Capture, Mount, SensorRig
+
+FloatArray = NDArray[np.float64]
+
+THRESHOLD = 0.25
+"""Probability from which the stack takes a window for a car: what no beam meets and no slot holds is left out later."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """What one camera of a rig saw.
+
+    Attributes:
+        name: of the camera.
+        camera, mount: how it is built, and where it sits.
+        image: (h, w, 3) uint8.
+        detections: in the image.
+        cars: the detections that stand somewhere.
+    """
+
+    name: str
+    camera: PinholeCamera
+    mount: Mount
+    image: NDArray[np.uint8]
+    detections: Detections
+    cars: CarSightings
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What the stack makes of one capture.
+
+    Attributes:
+        vehicle: (3,) x, y in m and yaw in rad: where the car took itself to be.
+        views: one for each camera.
+        sweeps: one for each laser and stereo camera.
+    """
+
+    vehicle: FloatArray
+    views: tuple[View, ...]
+    sweeps: tuple[Sweep, ...]
+
+
+class PerceptionStack:
+    """Detection and ranging with the sensors of a rig.
+
+    A laser ranges what the cameras see; a rig without one ranges with its stereo pairs.
+
+    Args:
+        rig: with at least a camera, or a stereo camera, and something to range with.
+        detector: both shipped models, at `THRESHOLD`, where None.
+
+    Raises:
+        InputError: a rig that cannot see or cannot range.
+    """
+
+    def __init__(self, rig: SensorRig, detector: Detector | None = None) -> None:
+        if not (rig.lasers or rig.stereo_cameras) or not (rig.cameras or rig.stereo_cameras):
+            raise InputError(
+                "the rig has no camera, or nothing to measure distances with; want a camera and a laser"
+            )
+        self.rig = rig
+        self.detector = detector or Detector.load(threshold=THRESHOLD)
+
+    def look(self, capture: Capture, vehicle: FloatArray | None = None) -> Look:
+        """See what was captured.
+
+        Args:
+            capture: by the stack's rig.
+            vehicle: (3,) where the car takes itself to be; where it is, if None.
+        """
+        here = capture.pose if vehicle is None else vehicle
+        lasers = {
+            name: laser_sweep(laser, mount, here, capture.scans[name])
+            for name, laser, mount in self.rig.lasers
+        }
+        views, sweeps = [], list(lasers.values())
+        for name, camera, mount in self.rig.cameras:
+            image = capture.images[name].image
+            views.append(self._view(name, camera, mount, image, next(iter(sweeps)), here))
+        for name, stereo, mount in self.rig.stereo_cameras:
+            pair = capture.pairs[name]
+            seen = stereo_sweep(stereo, mount, here, disparity(pair, stereo))
+            sweeps.append(seen)
+            ranged = next(iter(lasers.values()), seen)
+            views.append(self._view(name, stereo.camera, mount, pair.left.image, ranged, here))
+        return Look(here, tuple(views), tuple(sweeps))
+
+    def _view(
+        self,
+        name: str,
+        camera: PinholeCamera,
+        mount: Mount,
+        image: NDArray[np.uint8],
+        sweep: Sweep,
+        vehicle: FloatArray,
+    ) -> View:
+        found = self.detector.detect(image)
+        return View(name, camera, mount, image, found, locate(found, sweep, camera, mount, vehicle))

@@ -1,0 +1,281 @@
+"""Finding cars: training, files, the sliding window, and scores by UIUC's rule."""
+
+import json
+import subprocess
+import sys
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+
+from parkenv import InputError
+from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_test, read_uiuc_training
+from parkenv.perception.detection_scores import matches, recall_at, recall_precision
+from parkenv.perception.detector import CarModel, Detector, as_grey, best_boxes
+from parkenv.perception.hog import Descriptor
+from parkenv.perception.image_files import images_in, read_image
+from parkenv.perception.training import TrainingSettings, train
+
+PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
+
+
+def toy_car(rng, size=(100, 40)):
+    """Two wheels under a box: enough of a car for a linear model."""
+    image = rng.integers(90, 120, (40, 100)).astype(np.uint8)
+    shade = int(rng.integers(150, 230))
+    cv2.rectangle(image, (8, 16), (92, 32), shade, -1)
+    cv2.rectangle(image, (28, 7), (70, 18), shade - 40, -1)
+    for x in (24, 76):
+        cv2.circle(image, (x, 32), 6, 20, -1)
+    return cv2.resize(image, size)
+
+
+def clutter(rng):
+    image = rng.integers(60, 160, (12, 30)).astype(np.uint8)
+    return cv2.resize(
+        image, (150, 60), interpolation=cv2.INTER_NEAREST if rng.random() < 0.5 else cv2.INTER_CUBIC
+    )
+
+
+@pytest.fixture(scope="module")
+def crops():
+    rng = np.random.default_rng(0)
+    return [toy_car(rng) for _ in range(40)], [clutter(rng) for _ in range(60)]
+
+
+@pytest.fixture(scope="module")
+def model(crops):
+    return train(*crops, settings=TrainingSettings(rounds=2, seed=1), trained_on="toys")
+
+
+def street(rng, places):
+    image = cv2.resize(rng.integers(80, 130, (24, 40)).astype(np.uint8), (400, 240))
+    for x, y, width in places:
+        car = toy_car(rng, (width, round(0.4 * width)))
+        image[y : y + car.shape[0], x : x + width] = car
+    return image
+
+
+def test_cars_are_found_where_they_are_at_every_size(model):
+    rng = np.random.default_rng(5)
+    places = [(20, 30, 100), (200, 20, 180), (60, 120, 130)]
+    found = Detector((model,), scale_step=1.1, threshold=0.5).detect(street(rng, places))
+    truth = np.array([[x, y, x + w, y + 0.4 * w] for x, y, w in places], float)
+    hit = matches(found.regions.astype(float), truth)
+    assert hit[:3].all()
+    assert (np.diff(found.probability) <= 0).all()
+    assert not len(Detector((model,), threshold=0.5).detect(street(rng, [])))
+
+
+def test_equal_training_gives_equal_files(crops, model, tmp_path):
+    again = train(*crops, settings=TrainingSettings(rounds=2, seed=1), trained_on="toys")
+    model.save(tmp_path / "a.npz")
+    again.save(tmp_path / "b.npz")
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    other = train(*crops, settings=TrainingSettings(rounds=2, seed=2))
+    assert not np.array_equal(other.weights, model.weights)
+
+
+def test_a_model_comes_back_from_its_file(model, tmp_path):
+    model.save(tmp_path / "m.npz")
+    back = CarModel.load(tmp_path / "m.npz")
+    np.testing.assert_array_equal(back.weights, model.weights)
+    assert (back.bias, back.calibration, back.car, back.trained_on) == (
+        model.bias, model.calibration, model.car, "toys",
+    )  # fmt: skip
+
+
+def test_bad_model_files_are_told_apart(model, tmp_path):
+    (tmp_path / "text.npz").write_text("hello")
+    np.savez(tmp_path / "other.npz", weights=np.zeros(3))
+    model.save(tmp_path / "new.npz")
+    with zipfile.ZipFile(tmp_path / "new.npz") as archive:
+        weights, raw = archive.read("weights.npy"), archive.read("settings.npy")
+    start = raw.index(b'{"bias"')  # the header of the array is a dict, too
+    text = raw[start:].replace(b'"version": 1', b'"version": 9')
+    assert json.loads(text)["version"] == 9
+    with zipfile.ZipFile(tmp_path / "new.npz", "w") as archive:
+        archive.writestr("weights.npy", weights)
+        archive.writestr("settings.npy", raw[:start] + text)
+    for name, message in (
+        ("text.npz", "is no car model"),
+        ("other.npz", "is no car model"),
+        ("new.npz", "is a model of version 9, want 1"),
+        ("none.npz", "no such model; want side, front, or an .npz file"),
+    ):
+        with pytest.raises(InputError, match=message):
+            CarModel.load(tmp_path / name)
+
+
+def test_the_shipped_models_are_small_and_say_what_they_know():
+    side, front = CarModel.load("side"), CarModel.load("front")
+    assert (side.descriptor.size, front.descriptor.size) == (1152, 2304)
+    assert front.ends
+    assert not side.ends
+    assert "simulated" in side.trained_on
+
+
+def test_any_size_and_colour_is_looked_at(model):
+    detector = Detector((model,))
+    assert len(detector.detect(np.zeros((3, 5), np.uint8))) == 0
+    assert len(detector.detect(np.zeros((9, 9, 3), np.uint8))) == 0
+    detector.detect(np.zeros((1500, 2000), np.uint8))
+    for bad in (np.zeros((9, 9), np.uint16), np.zeros((9, 9, 4), np.uint8), np.zeros((0, 9), np.uint8)):
+        with pytest.raises(InputError, match="image is"):
+            detector.detect(bad)
+
+
+def test_grey_weighs_colours_as_eyes_do():
+    assert as_grey(np.full((2, 2, 3), (255, 0, 0), np.uint8))[0, 0] == pytest.approx(76, abs=1)
+
+
+def test_of_boxes_that_overlap_the_best_is_kept():
+    boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10], [20, 0, 30, 10]], np.float32)
+    assert best_boxes(boxes, np.array([0.5, 0.9, 0.1], np.float32), 0.4).tolist() == [1, 2]
+
+
+def test_recall_and_precision_of_a_known_case():
+    truth = [np.array([[0, 0, 100, 40], [200, 0, 300, 40]], float), np.array([[0, 0, 100, 40]], float)]
+    found = [
+        np.array([[2, 1, 102, 41], [3, 0, 103, 40], [0, 100, 100, 140]], float),
+        np.array([[5, 0, 105, 40]], float),
+    ]
+    curve = recall_precision(found, [np.array([0.9, 0.8, 0.1]), np.array([0.7])], truth)
+    # 0.9 right, 0.8 a second box on the same car, 0.7 right, 0.1 nothing there.
+    np.testing.assert_allclose(curve.recall, [1 / 3, 1 / 3, 2 / 3, 2 / 3])
+    np.testing.assert_allclose(curve.precision, [1, 1 / 2, 2 / 3, 1 / 2])
+    assert curve.equal_error == pytest.approx(2 / 3)
+    assert curve.average_precision == pytest.approx(1 / 3 + 1 / 3 * 2 / 3)
+
+
+def test_the_ellipse_is_a_quarter_of_the_box():
+    truth = np.array([[100, 100, 200, 140]], float)
+    for dx, dy, dw, inside in (
+        (24, 0, 0, 1),
+        (26, 0, 0, 0),
+        (0, 9.9, 0, 1),
+        (18, 8, 0, 0),
+        (0, 0, 24, 1),
+        (0, 0, 26, 0),
+    ):
+        box = np.array([[100 + dx - dw / 2, 100 + dy, 200 + dx + dw / 2, 140 + dy]], float)
+        assert matches(box, truth)[0] == bool(inside), (dx, dy, dw)
+    assert matches(np.array([[75, 100, 225, 140]], float), truth, scales=False)[0]
+
+
+def test_recall_at_a_rate_of_false_alarms():
+    assert recall_at(0.1, np.array([0.5, 2.0, 3.0]), np.arange(10) / 10.0) == pytest.approx(2 / 3)
+
+
+def write_uiuc(folder, rng):
+    (folder / "TrainImages").mkdir(parents=True)
+    for i in range(25):
+        cv2.imwrite(str(folder / f"TrainImages/pos-{i}.pgm"), toy_car(rng))
+        cv2.imwrite(str(folder / f"TrainImages/neg-{i}.pgm"), clutter(rng)[:40, :100])
+    for name, places in (("TestImages", [(30, 50, 100)]), ("TestImages_Scale", [(30, 50, 140)])):
+        (folder / name).mkdir()
+        for n in range(4):
+            cv2.imwrite(str(folder / name / f"test-{n}.pgm"), street(rng, places))
+    (folder / "trueLocations.txt").write_text("".join(f"{n}: (50,30)\n" for n in range(4)))
+    (folder / "trueLocations_Scale.txt").write_text("".join(f"{n}: (50,30,140)\n" for n in range(4)))
+
+
+def test_uiuc_is_read_as_published_trained_on_and_judged(tmp_path):
+    data = tmp_path / "CarData"
+    write_uiuc(data, np.random.default_rng(7))
+    assert len(read_uiuc_training(data).positives) == 25
+    labelled = read_uiuc_test(data, "multi")
+    np.testing.assert_array_equal(labelled[0].boxes, [[30, 50, 170, 106]])
+
+    def parkenv(*words):
+        return subprocess.run([*PARKENV, *map(str, words)], capture_output=True, text=True)
+
+    done = parkenv("train-detector", "--uiuc", data, "--out", tmp_path / "m.npz", "--rounds", 1)
+    assert done.returncode == 0, done.stderr
+    done = parkenv(
+        "evaluate-detector", "--uiuc", data, "--model", tmp_path / "m.npz", "--out", tmp_path / "scores"
+    )
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "scores" / "summary.json").read_text())["rows"]
+    assert [r["test_set"] for r in rows] == ["single", "multi"]
+    assert rows[0]["cars"] == 4
+    assert min(r["eer"] for r in rows) >= 0.75
+    assert (tmp_path / "scores" / "recall_precision.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize(
+    ("break_it", "message"),
+    [
+        (lambda f: (f / "trueLocations.txt").write_text("0: (1,2,3)\n"), "line '0: .1,2,3.', want n:"),
+        (lambda f: (f / "trueLocations.txt").unlink(), "trueLocations.txt: no such file"),
+        (lambda f: (f / "TestImages/test-0.pgm").unlink(), "test-0.pgm: No such file"),
+        (
+            lambda f: (f / "TestImages/test-0.pgm").write_bytes(
+                (f / "TestImages/test-0.pgm").read_bytes()[:900]
+            ),
+            "test-0.pgm: is no image that can be read whole",
+        ),
+    ],
+)
+def test_a_damaged_set_is_named(tmp_path, break_it, message):
+    write_uiuc(tmp_path, np.random.default_rng(7))
+    break_it(tmp_path)
+    with pytest.raises(InputError, match=message):
+        read_uiuc_test(tmp_path, "single")
+
+
+def test_images_of_all_kinds(tmp_path):
+    rng = np.random.default_rng(1)
+    color = rng.integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    cv2.imwrite(str(tmp_path / "rgb.png"), color[..., ::-1])
+    cv2.imwrite(str(tmp_path / "rgba.png"), np.dstack([color[..., ::-1], np.full((20, 30), 7, np.uint8)]))
+    cv2.imwrite(str(tmp_path / "deep.png"), color[..., 0].astype(np.uint16) * 256)
+    (tmp_path / "torn.png").write_bytes((tmp_path / "rgb.png").read_bytes()[:400])
+    np.testing.assert_array_equal(read_image(tmp_path / "rgb.png"), color)
+    np.testing.assert_array_equal(read_image(tmp_path / "rgba.png"), color)
+    for name, message in (
+        ("deep.png", "has 16 bits a channel, want 8"),
+        ("torn.png", "is no image that can be read whole"),
+        ("none.png", "No such file"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_image(tmp_path / name)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no images"):
+        images_in(tmp_path / "empty")
+    with pytest.raises(InputError, match="holds no folder positives/"):
+        read_crop_folder(tmp_path / "empty")
+
+
+def test_numbers_in_names_are_counted(tmp_path):
+    for n in (10, 9, 1):
+        cv2.imwrite(str(tmp_path / f"pos-{n}.pgm"), np.zeros((4, 4), np.uint8))
+    assert [f.stem for f in images_in(tmp_path)] == ["pos-1", "pos-9", "pos-10"]
+
+
+def test_too_little_to_train_on_is_said(crops):
+    with pytest.raises(InputError, match="3 positives and 60 negatives, want at least 20 and 1"):
+        train(crops[0][:3], crops[1])
+    with pytest.raises(InputError, match="penalty is 0"):
+        TrainingSettings(penalty=0.0)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"models": ()}, "models is empty"),
+        ({"least_height": 2.0}, "least_height is 2.0 px"),
+        ({"scale_step": 1.0}, "scale_step is 1.0"),
+        ({"threshold": 1.0}, "threshold is 1.0"),
+        ({"margin": -0.1}, "margin is -0.1"),
+    ],
+)
+def test_bad_detectors_are_named(model, settings, message):
+    with pytest.raises(InputError, match=message):
+        Detector(**{"models": (model,), **settings})
+
+
+def test_a_model_wants_weights_of_its_window():
+    with pytest.raises(InputError, match=r"weights are \(3,\), want finite \(8, 9, 16\)"):
+        CarModel(Descriptor(), np.zeros(3, np.float32), 0.0, 2.5)

@@ -1,0 +1,125 @@
+"""The descriptor: against plain numpy, by its counts, and as a correlation."""
+
+import numpy as np
+import pytest
+
+from parkenv import InputError
+from parkenv.perception.hog import CELL, ORIENTATIONS, Descriptor, cell_histograms, correlate
+
+
+def plain_histograms(image):
+    """Pixel by pixel, in double precision."""
+    padded = np.pad(image.astype(float), 1, mode="edge")
+    gx = padded[1:-1, 2:] - padded[1:-1, :-2]
+    gy = padded[2:, 1:-1] - padded[:-2, 1:-1]
+    magnitude = np.hypot(gx, gy)
+    place = np.mod(np.arctan2(gy, gx), np.pi) / np.pi * ORIENTATIONS - 0.5
+    rows, columns = image.shape[0] // CELL, image.shape[1] // CELL
+    cells = np.zeros((rows + 2, ORIENTATIONS, columns + 2))
+    for y in range(rows * CELL):
+        row = (y + 0.5) / CELL - 0.5
+        for x in range(columns * CELL):
+            column = (x + 0.5) / CELL - 0.5
+            k = int(np.floor(place[y, x]))
+            for dk, wk in ((0, 1 - (place[y, x] - k)), (1, place[y, x] - k)):
+                for dr, wr in ((0, 1 - (row - np.floor(row))), (1, row - np.floor(row))):
+                    for dc, wc in ((0, 1 - (column - np.floor(column))), (1, column - np.floor(column))):
+                        where = (
+                            int(np.floor(row)) + dr + 1,
+                            (k + dk) % ORIENTATIONS,
+                            int(np.floor(column)) + dc + 1,
+                        )
+                        cells[where] += wk * wr * wc * magnitude[y, x]
+    return cells[1:-1, :, 1:-1]
+
+
+@pytest.fixture(scope="module")
+def noise():
+    return np.random.default_rng(0).integers(0, 256, (43, 61), dtype=np.uint8)
+
+
+def test_histograms_are_those_of_plain_numpy(noise):
+    expected = plain_histograms(noise)
+    found = cell_histograms(noise)
+    assert found.shape == (5, 9, 7)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-4 * expected.max())
+
+
+def test_an_edge_is_in_the_bin_of_its_direction():
+    step = np.zeros((32, 32), np.uint8)
+    step[:, 16:] = 200  # the gradient points along the columns: angle 0, between the first and the last bin
+    cells = cell_histograms(step)[1:-1].sum(axis=(0, 2))
+    np.testing.assert_allclose(cells[[0, 8]], cells.sum() / 2, rtol=1e-4)
+    cells = cell_histograms(step.T.copy())[:, :, 1:-1].sum(axis=(0, 2))
+    assert cells.argmax() == 4  # a right angle is the middle of the nine
+
+
+def test_a_descriptor_has_the_thesis_number_of_values():
+    for shape, normalization, size in (
+        ((128, 64), "cell", 1152),
+        ((128, 128), "cell", 2304),
+        ((128, 64), "blocks", 3780),
+    ):
+        descriptor = Descriptor(*shape, normalization)
+        crop = np.random.default_rng(1).integers(0, 256, shape[::-1], dtype=np.uint8)
+        assert descriptor.describe(crop).shape == (size,) == (descriptor.size,)
+
+
+@pytest.mark.parametrize("normalization", ["cell", "neighbors", "blocks"])
+def test_brightness_and_contrast_hardly_matter(normalization):
+    rng = np.random.default_rng(2)
+    crop = np.kron(rng.integers(0, 100, (16, 32)), np.ones((4, 4))).astype(np.uint8)
+    descriptor = Descriptor(128, 64, normalization)
+    a, b = descriptor.describe(crop), descriptor.describe((2 * crop + 30).astype(np.uint8))
+    assert np.abs(a - b).max() < 0.02
+    assert np.isfinite(descriptor.describe(np.full((64, 128), 9, np.uint8))).all()
+
+
+@pytest.mark.parametrize("normalization", ["cell", "neighbors", "blocks"])
+def test_correlation_is_the_dot_product_with_every_window(normalization):
+    rng = np.random.default_rng(3)
+    image = rng.integers(0, 256, (100, 220), dtype=np.uint8)
+    descriptor = Descriptor(128, 64, normalization)
+    features = descriptor.features(image)
+    weights = rng.normal(size=descriptor.shape).astype(np.float32)
+    scores = correlate(features, weights)
+    rows, _, columns = descriptor.shape
+    assert scores.shape == (features.shape[0] - rows + 1, features.shape[2] - columns + 1)
+    for y in range(scores.shape[0]):
+        for x in range(scores.shape[1]):
+            window = features[y : y + rows, :, x : x + columns]
+            assert scores[y, x] == pytest.approx(float((window * weights).sum()), abs=1e-3)
+    assert correlate(features[:3], weights).size == 0
+
+
+def test_a_window_in_the_middle_is_the_crops_own_description():
+    rng = np.random.default_rng(4)
+    descriptor = Descriptor(128, 64)
+    image = np.pad(rng.integers(0, 256, (64, 128), dtype=np.uint8), 16, mode="edge")
+    window = descriptor.features(image)[2:10, :, 2:18]
+    alone = descriptor.describe(image[16:-16, 16:-16]).reshape(descriptor.shape)
+    # Cells at the border have neighbours beyond it, which are only guessed from the crop.
+    np.testing.assert_allclose(window[1:-1, :, 1:-1], alone[1:-1, :, 1:-1], atol=1e-5)
+    np.testing.assert_allclose(window, alone, atol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Descriptor(100, 64), "width is 100 px, want a multiple of 8"),
+        (lambda: Descriptor(128, 8), "height is 8 px"),
+        (lambda: Descriptor(128, 64, "l1"), "normalization is 'l1'"),
+        (
+            lambda: Descriptor().describe(np.zeros((64, 64), np.uint8)),
+            r"crop is \(64, 64\), want \(64, 128\)",
+        ),
+        (lambda: cell_histograms(np.zeros((8, 8), np.float32)), "float32, want"),
+    ],
+)
+def test_bad_input_is_named(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+def test_an_image_smaller_than_a_cell_has_no_cells():
+    assert cell_histograms(np.zeros((5, 90), np.uint8)).shape == (0, 9, 11)

@@ -1,0 +1,384 @@
+"""Maps: the grid, slots, inference over sessions, the map file, found slots, and poses that are off."""
+
+import math
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from parkenv import InputError, ParkingLot, Scenario
+from parkenv.lot_scene import slot_lot
+from parkenv.mapping.discovery import discover, score_discovery
+from parkenv.mapping.grid import P_FREE, P_OCCUPIED, OccupancyGrid
+from parkenv.mapping.inference import MapPrior, SessionLog, counted, predict
+from parkenv.mapping.odometry import PoseNoise
+from parkenv.mapping.slots import SlotFilter
+from parkenv.mapping.store import VERSION, MapStore, Session
+from parkenv.occupancy import Arrival
+from parkenv.perception.ranging import CarSightings
+from parkenv.perception.sweeps import laser_sweep
+from sim_sensors.laser import LaserScanner
+from sim_sensors.movers import Movers
+from sim_sensors.rig import Mount
+
+LASER, MOUNT = LaserScanner(), Mount(z=0.5)
+
+
+# The grid (T §3.3.1)
+
+
+def test_a_look_frees_cells_before_a_car_and_leaves_those_behind_it():
+    grid = OccupancyGrid((0.0, -5.0), (12.0, 5.0), 0.25)
+    grid.update((0.1, 0.1), 0.0, math.radians(30.0), np.array([[0.0, 5.0]]), 10.0, car=4.0)
+    row = int(5.1 / 0.25)
+    p = grid.probability[row]
+    assert p[int(3.0 / 0.25)] == pytest.approx(P_FREE, abs=1e-6)
+    assert p[int(7.0 / 0.25)] == pytest.approx(P_OCCUPIED, abs=1e-6)
+    assert p[int(9.6 / 0.25)] == 0.5  # the tail
+    assert not grid.seen[row, int(9.6 / 0.25)]
+    assert grid.probability[0, -1] == 0.5
+
+
+def test_looks_add_up_as_the_filter_says():
+    grid = OccupancyGrid((0.0, -5.0), (12.0, 5.0), 0.25)
+    for _ in range(3):
+        grid.update((0.1, 0.1), 0.0, 0.5, np.empty((0, 2)), 10.0)
+    odds = (P_FREE / (1 - P_FREE)) ** 3
+    assert grid.probability[20, 12] == pytest.approx(odds / (1 + odds), abs=1e-6)
+    for _ in range(200):
+        grid.update((0.1, 0.1), 0.0, 0.5, np.empty((0, 2)), 10.0)
+    assert grid.log_odds.min() == pytest.approx(-12.0)
+
+
+@given(x=st.floats(-3, 15), y=st.floats(-8, 8), yaw=st.floats(-7, 7), half=st.floats(0.05, 1.5))
+@settings(max_examples=40, deadline=None)
+def test_looks_from_anywhere_stay_within_the_grid(x, y, yaw, half):
+    grid = OccupancyGrid((0.0, -5.0), (12.0, 5.0), 0.5)
+    grid.update((x, y), yaw, half, np.array([[0.1, 3.0]]), 6.0)
+    assert np.isfinite(grid.log_odds).all()
+    assert (grid.log_odds[~grid.seen] == 0.0).all()
+
+
+def test_a_grid_without_area_is_refused():
+    with pytest.raises(InputError, match="want an area and a cell size"):
+        OccupancyGrid((0.0, 0.0), (0.0, 5.0))
+
+
+# Slots (T §3.3.2)
+
+
+@pytest.fixture(scope="module")
+def mini():
+    return Scenario.named("mini").lot
+
+
+def drive_by(lot, scene, noise=None, step=1.0):
+    """A filter after a laser has passed the whole lot."""
+    slots = SlotFilter(lot)
+    for x in np.arange(lot.vertex_xy[:, 0].min(), lot.vertex_xy[:, 0].max(), step):
+        pose = np.array([x, lot.vertex_xy[:, 1].mean(), 0.0])
+        slots.see_through(laser_sweep(LASER, MOUNT, pose, LASER.scan(scene.scan_plane, pose, noise)))
+    return slots
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_beams_tell_taken_slots_from_free_ones(mini, seed):
+    rng = np.random.default_rng(seed)
+    taken = rng.random(mini.n_slots) < 0.5
+    states = drive_by(mini, slot_lot(mini).scene(taken, seed), rng).states()
+    assert states.in_view.all()
+    np.testing.assert_array_equal(states.occupied, taken)
+
+
+def test_people_and_traffic_are_not_parked_cars(mini):
+    scene = slot_lot(mini).scene(np.zeros(mini.n_slots, bool))
+    people = np.column_stack([mini.slot_xy, np.zeros(mini.n_slots)])
+    still = np.zeros(mini.n_slots)
+    driving = np.array([[mini.slot_xy[0, 0] + 6.0, 0.0, 0.0]])
+    busy = scene.with_movers(Movers(driving, np.array([2]), people, still, still.astype(int)))
+    assert not drive_by(mini, busy).states().occupied.any()
+
+
+def test_a_slot_that_nobody_saw_stays_unknown(mini):
+    slots = SlotFilter(mini)
+    pose = np.array([*mini.vertex_xy[0], 0.0])
+    wall = np.full(LASER.n_beams, 0.5, np.float32)
+    slots.see_through(laser_sweep(LASER, MOUNT, pose, wall))
+    states = slots.states()
+    assert not states.in_view.any()
+    assert (states.p_occupied == 0.5).all()
+    assert slots.thesis_states().in_view.all()  # the thesis calls them free
+
+
+def test_a_detection_goes_to_its_slot_and_one_elsewhere_to_none(mini):
+    slots = SlotFilter(mini)
+    xy = np.array([mini.slot_xy[3] + [0.3, -0.4], mini.slot_xy[3] + [0.0, 50.0]])
+    cars = CarSightings(xy, np.zeros(2), np.ones((2, 2)), np.ones(2), np.ones(2, np.float32))
+    assert slots.see_cars(cars).tolist() == [3, -1]
+    states = slots.states()
+    assert states.occupied.tolist() == [i == 3 for i in range(mini.n_slots)]
+    assert states.p_occupied[3] == pytest.approx(P_OCCUPIED)
+
+
+def test_a_car_that_leaves_during_the_drive_is_noticed(mini):
+    full = slot_lot(mini).scene(np.ones(mini.n_slots, bool))
+    slots = drive_by(mini, full)
+    empty = slot_lot(mini).scene(np.zeros(mini.n_slots, bool))
+    for x in np.linspace(mini.vertex_xy[:, 0].min(), mini.vertex_xy[:, 0].max(), 20):
+        pose = np.array([x, mini.vertex_xy[:, 1].mean(), 0.0])
+        slots.see_through(laser_sweep(LASER, MOUNT, pose, LASER.scan(empty.scan_plane, pose)))
+    assert not slots.states().occupied.any()
+
+
+@pytest.mark.parametrize(
+    ("scan", "message"),
+    [
+        (np.zeros(5, np.float32), r"scan has shape \(5,\), want \(1081,\)"),
+        (np.full(1081, np.nan, np.float32), r"scan\[0\] is nan m"),
+        (np.full(1081, -1.0, np.float32), r"scan\[0\] is -1"),
+    ],
+)
+def test_bad_scans_are_named(scan, message):
+    with pytest.raises(InputError, match=message):
+        laser_sweep(LASER, MOUNT, np.zeros(3), scan)
+
+
+def test_a_scan_without_a_return_sees_through_everything(mini):
+    slots = SlotFilter(mini)
+    pose = np.array([*mini.vertex_xy[0], 0.0])
+    slots.see_through(laser_sweep(LASER, MOUNT, pose, np.full(LASER.n_beams, np.inf, np.float32)))
+    assert slots.in_view[0]
+    assert not slots.states().occupied.any()
+
+
+# Inference over sessions (T §3.3.3)
+
+
+def sessions(times, occupied, known=None):
+    occupied = np.array(occupied, bool)
+    known = np.ones_like(occupied) if known is None else np.array(known, bool)
+    return SessionLog(np.array(times, float), occupied, known)
+
+
+def test_counts_are_the_thesis_counts():
+    log = sessions([0, 1, 2, 3], [[1, 0], [1, 0], [1, 1], [0, 0]], [[1, 1], [1, 1], [1, 0], [1, 0]])
+    np.testing.assert_allclose(counted(log), [0.75, 0.0])
+    assert counted(sessions([0], [[0]], [[0]]))[0] == 0.5
+
+
+def test_predictions_come_from_the_asked_hour_and_kind_of_day():
+    tuesday, sunday, hour = 86_400.0, 6 * 86_400.0, 3600.0
+    times = [tuesday + 9 * hour] * 6 + [tuesday + 20 * hour] * 6 + [sunday + 9 * hour] * 6
+    log = sessions(times, [[1, 1]] * 6 + [[0, 0]] * 6 + [[0, 1]] * 6)
+    morning = predict(log, 3 * 86_400.0 + 9 * hour)  # a Thursday
+    evening = predict(log, 3 * 86_400.0 + 20 * hour)
+    weekend = predict(log, 5 * 86_400.0 + 9 * hour)
+    assert (morning.p_occupied > 0.75).all()
+    assert (evening.p_occupied < 0.3).all()
+    assert weekend.p_occupied[0] < 0.5 < weekend.p_occupied[1]
+
+
+def test_few_sessions_are_unsure_and_many_are_sharp():
+    one, many = sessions([0.0], [[1, 0]]), sessions(np.zeros(60), [[1, 0]] * 60)
+    a, b = predict(one), predict(many)
+    assert (a.low <= a.p_occupied).all()
+    assert (a.p_occupied <= a.high).all()
+    assert ((b.high - b.low) < 0.3 * (a.high - a.low)).all()
+    assert b.p_occupied[0] > 0.9 > 0.7 > a.p_occupied[0]
+
+
+def test_a_slot_that_was_never_seen_is_like_its_lot():
+    known = np.ones((20, 3), bool)
+    known[:, 2] = False
+    log = sessions(np.zeros(20), [[1, 1, 0]] * 20, known)
+    found = predict(log)
+    assert found.p_occupied[2] > 0.8
+    assert found.sessions.tolist() == [20, 20, 0]
+    assert found.high[2] - found.low[2] > found.high[0] - found.low[0]
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say():
+    rng = np.random.default_rng(0)
+    true = rng.beta(4, 4, 400)
+    log = sessions(np.zeros(12), rng.random((12, 400)) < true)
+    found = predict(log, 0.0, confidence=0.9)
+    inside = ((found.low <= true) & (true <= found.high)).mean()
+    assert 0.8 < inside <= 1.0
+
+
+def test_a_map_is_a_prior_of_a_search():
+    import gymnasium as gym
+
+    lot = Scenario.named("mini").lot
+    log = sessions([40_000.0] * 9, [np.arange(lot.n_slots) % 2 == 0] * 9)
+    scenario = Scenario.named("mini", prior=MapPrior(log))
+    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    observation, _ = env.reset(seed=0)
+    even = observation["p_occupied"][::2]
+    assert even.min() > observation["p_occupied"][1::2].max()
+    forecast = MapPrior(log).forecast(Arrival(40_000.0))
+    assert (forecast.relaxation_rate > 0).all()
+
+
+def test_an_empty_map_predicts_nothing():
+    with pytest.raises(InputError, match="the map holds no session"):
+        predict(sessions([], np.empty((0, 3))))
+
+
+# The map file
+
+
+def session(lot, key, p=0.9):
+    values = np.full(lot.n_slots, p)
+    values[0] = np.nan
+    return Session(key, 36_000.0, "laser", "sunny", values, np.array([[1.0, 2.0, 0.5]]))
+
+
+def test_what_is_written_comes_back(mini, tmp_path):
+    with MapStore(tmp_path / "m.sqlite", mini) as store:
+        store.add(session(mini, "a"))
+        store.add(session(mini, "b", 0.1))
+        assert store.has("a")
+        assert not store.has("c")
+    with MapStore(tmp_path / "m.sqlite", mini, create=False) as store:
+        a, b = store.sessions()
+        np.testing.assert_array_equal(a.p_occupied, session(mini, "a").p_occupied)
+        np.testing.assert_array_equal(b.cars, [[1.0, 2.0, 0.5]])
+        log = store.log()
+    assert log.known.sum() == 2 * (mini.n_slots - 1)
+    assert log.occupied[0, 1:].all()
+    assert not log.occupied[1].any()
+
+
+def test_files_that_are_no_maps_are_refused(mini, tmp_path):
+    (tmp_path / "text").write_text("this is a letter to my aunt, and no map at all" * 20)
+    other = sqlite3.connect(tmp_path / "other")
+    other.execute("CREATE TABLE t (x)")
+    other.commit()
+    MapStore(tmp_path / "newer", mini).close()
+    newer = sqlite3.connect(tmp_path / "newer")
+    newer.execute(f"PRAGMA user_version = {VERSION + 1}")
+    newer.commit()
+    MapStore(tmp_path / "else", ParkingLot.packaged("jam")).close()
+    for name, message in (
+        ("text", "is no map file"),
+        ("other", "no map file of parkenv"),
+        ("newer", "newer parkenv"),
+        ("else", "is a map of lot 'jam', not of 'mini'"),
+        ("none", "no such map file"),
+    ):
+        with pytest.raises(InputError, match=message):
+            MapStore(tmp_path / name, mini, create=False)
+
+
+def test_a_session_is_written_once(mini, tmp_path):
+    with MapStore(tmp_path / "m", mini) as store:
+        store.add(session(mini, "a"))
+        with pytest.raises(InputError, match="'a' already"):
+            store.add(session(mini, "a"))
+
+
+_WRITER = """
+import sys, numpy as np
+from pathlib import Path
+from parkenv import ParkingLot
+from parkenv.mapping.store import MapStore, Session
+lot = ParkingLot.packaged("mini")
+with MapStore(Path(sys.argv[1]), lot) as store:
+    for k in range(int(sys.argv[3])):
+        store.add(Session(f"{sys.argv[2]}{k:04d}", 0.0, "laser", "rain", np.full(lot.n_slots, 0.7), np.zeros((50, 3))))
+        print(k, flush=True)
+"""
+
+
+def test_two_processes_write_at_once(mini, tmp_path):
+    file = tmp_path / "m.sqlite"
+    work = [
+        subprocess.Popen([sys.executable, "-c", _WRITER, file, name, "15"], stdout=subprocess.PIPE)
+        for name in "ab"
+    ]
+    assert [w.wait(60) for w in work] == [0, 0]
+    with MapStore(file, mini, create=False) as store:
+        assert len(store.sessions()) == 30
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+def test_a_kill_leaves_whole_sessions_only(mini, tmp_path):
+    file = tmp_path / "m.sqlite"
+    writer = subprocess.Popen(
+        [sys.executable, "-c", _WRITER, file, "a", "5000"], stdout=subprocess.PIPE, text=True
+    )
+    for _ in range(5):
+        writer.stdout.readline()
+    time.sleep(0.01)
+    os.kill(writer.pid, signal.SIGKILL)
+    writer.wait(30)
+    with MapStore(file, mini, create=False) as store:
+        there = store.sessions()
+    assert len(there) >= 5
+    for one in there:
+        assert len(one.cars) == 50
+        assert np.isfinite(one.p_occupied).all()
+
+
+# Slots that nobody mapped, and poses that are off
+
+
+def test_slots_are_found_where_cars_stand_again_and_again():
+    lot = ParkingLot.packaged("campus")
+    rng = np.random.default_rng(3)
+    seen = []
+    for _ in range(20):
+        taken = np.flatnonzero(rng.random(lot.n_slots) < 0.6)
+        turned = (
+            lot.slot_yaw[taken] + rng.normal(0, 0.05, len(taken)) + np.pi * rng.integers(0, 2, len(taken))
+        )
+        seen.append(np.column_stack([lot.slot_xy[taken] + rng.normal(0, 0.2, (len(taken), 2)), turned]))
+    passing = np.column_stack([rng.uniform(0, 100, (30, 2)), rng.uniform(0, 3, 30)])
+    found = discover(np.concatenate([*seen, passing]))
+    score = score_discovery(found, lot)
+    assert score.recall > 0.98
+    assert score.precision > 0.98
+    assert score.error < 0.25
+    assert len(discover(np.empty((0, 3))).xy) == 0
+
+
+def test_pose_errors_are_as_large_as_stated_and_grow_along_the_way():
+    path = np.column_stack([np.arange(0.0, 4000.0, 1.0), np.zeros(4000), np.zeros(4000)])
+    error = PoseNoise(0.5, 0.02, 30.0).estimated(path, np.random.default_rng(0)) - path
+    assert error[:, 0].std() == pytest.approx(0.5, rel=0.25)
+    assert error[:, 2].std() == pytest.approx(0.02, rel=0.25)
+    near = np.corrcoef(error[:-1, 0], error[1:, 0])[0, 1]
+    far = np.corrcoef(error[:-300, 0], error[300:, 0])[0, 1]
+    assert near > 0.9 > 0.4 > abs(far)
+    np.testing.assert_array_equal(PoseNoise().estimated(path, np.random.default_rng(0)), path)
+    with pytest.raises(InputError, match="position is -1"):
+        PoseNoise(-1.0)
+
+
+def test_half_a_metre_of_pose_error_is_borne_and_two_are_not(mini):
+    taken = np.arange(mini.n_slots) % 3 == 0
+    scene = slot_lot(mini).scene(taken, 5)
+
+    def accuracy(position):
+        right = []
+        for seed in range(6):
+            rng = np.random.default_rng(seed)
+            slots = SlotFilter(mini)
+            xs = np.arange(mini.vertex_xy[:, 0].min(), mini.vertex_xy[:, 0].max(), 1.0)
+            true = np.column_stack([xs, np.full(len(xs), mini.vertex_xy[:, 1].mean()), np.zeros(len(xs))])
+            for pose, belief in zip(true, PoseNoise(position).estimated(true, rng), strict=True):
+                slots.see_through(laser_sweep(LASER, MOUNT, belief, LASER.scan(scene.scan_plane, pose)))
+            right.append((slots.states().occupied == taken).mean())
+        return np.mean(right)
+
+    assert accuracy(0.0) == 1.0
+    assert accuracy(0.3) > 0.9
+    assert accuracy(2.0) < accuracy(0.3)

@@ -1,0 +1,168 @@
+"""The stack on simulated drives: sessions, the map that they make, and searches that live on what it sees."""
+
+import json
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from parkenv import InputError, OccupancyProcess, Scenario, Traffic
+from parkenv.evaluation.surveys import map_error, run_survey
+from parkenv.mapping.inference import SessionLog
+from parkenv.mapping.store import MapStore
+from parkenv.mapping.survey import Survey, SurveySettings
+from parkenv.occupancy import ArrivalWindow
+from parkenv.perception.stack import PerceptionStack
+from sim_sensors.laser import LaserScanner
+from sim_sensors.rig import Mount, SensorRig
+
+PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
+BUSY = Traffic(cars=2, pedestrians=4)
+
+
+def halves(name="mini"):
+    """Every other slot taken for ever."""
+    lot = Scenario.named(name).lot
+    taken = np.arange(lot.n_slots) % 2 == 0
+    world = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
+    return Scenario.named(name, occupancy=world, traffic=BUSY), taken
+
+
+@pytest.mark.parametrize("rig", ["laser", "stereo"])
+def test_a_session_finds_which_slots_are_taken(rig):
+    scenario, taken = halves()
+    result = Survey(scenario, SurveySettings(rig=rig, weather="overcast")).drive(0, pictures=2)
+    np.testing.assert_array_equal(result.truth, taken)
+    assert result.slot_accuracy >= 0.9
+    assert result.slot_accuracy_seen >= 0.9
+    assert result.found >= 0.8 * result.parked
+    assert result.right >= 0.6 * result.detections > 0
+    assert np.median(result.range_error) < (0.1 if rig == "laser" else 0.4)
+    assert len(result.looks) == 2
+    assert result.grid.seen.any()
+
+
+def test_equal_sessions_are_equal():
+    scenario, _ = halves()
+    one, two = (Survey(scenario, SurveySettings(weather="rain", every=4.0)).drive(3) for _ in range(2))
+    np.testing.assert_array_equal(one.session.p_occupied, two.session.p_occupied)
+    np.testing.assert_array_equal(one.session.cars, two.session.cars)
+    assert one.session.key == two.session.key
+
+
+def test_a_survey_goes_on_where_it_was(tmp_path):
+    scenario, _ = halves()
+    settings = SurveySettings(weather="sunny", every=4.0)
+    told = []
+    first = run_survey(scenario, settings, 1, tmp_path / "m.sqlite", on_session=told.append)
+    both = run_survey(scenario, settings, 2, tmp_path / "m.sqlite", on_session=told.append)
+    assert both.rows[0] == first.rows[0]
+    assert [r["key"] for r in told] == [r["key"] for r in both.rows]  # the first was not driven again
+    with MapStore(tmp_path / "m.sqlite", scenario.lot, create=False) as store:
+        assert [s.key for s in store.sessions()] == sorted(r["key"] for r in both.rows)
+    with pytest.raises(InputError, match="sessions is 0"):
+        run_survey(scenario, settings, 0, tmp_path / "m.sqlite")
+
+
+def test_the_maps_error_is_zero_where_it_is_right():
+    scenario, taken = halves()
+    log = SessionLog(np.zeros(500), np.tile(taken, (500, 1)), np.ones((500, len(taken)), bool))
+    error, expected = map_error(scenario, [0.0], log)
+    assert error < 0.02
+    assert expected < 0.01
+
+
+def test_survey_and_map_on_the_command_line(tmp_path):
+    def parkenv(*words):
+        return subprocess.run([*PARKENV, *map(str, words)], capture_output=True, text=True)
+
+    out = tmp_path / "s"
+    done = parkenv(
+        "survey", "--scenario", "mini", "-n", 1, "--weather", "sunny", "--every", 3, "--jobs", 1, "--out", out
+    )
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads((out / "summary.json").read_text())["rows"]
+    assert {
+        "sessions", "slots", "car_detection_rate", "detection_precision", "range_abs_error_m", "slot_accuracy",
+        "slot_accuracy_seen", "unknown_fraction", "occupancy_mae", "seconds_per_frame",
+    } <= set(row)  # fmt: skip
+    pictures = sorted(p.name for p in out.glob("*.png"))
+    assert pictures == ["detections_mini.png", "map_mini.png", "session_mini.png"]
+    file = out / "map.sqlite"
+    asked = parkenv(
+        "map", file, "--scenario", "mini", "--weekday", "tue", "--hour", 9.5, "--out", tmp_path / "m"
+    )
+    assert asked.returncode == 0, asked.stderr
+    assert "mini, tue 09:30, 1 sessions" in asked.stdout
+    assert len((tmp_path / "m" / "slots.csv").read_text().splitlines()) == 11
+    for words, message in (
+        (["map", file, "--scenario", "campus"], "is a map of lot 'mini', not of 'campus'"),
+        (["map", file, "--scenario", "mini", "--slot", "Z9"], "--slot Z9: lot 'mini' has no such slot"),
+        (["map", tmp_path / "none", "--scenario", "mini"], "no such map file"),
+        (["survey", "--rig", "sonar", "--out", tmp_path / "x"], "rig is 'sonar', want one of laser, stereo"),
+        (["survey", "--weather", "snow", "--out", tmp_path / "x"], "weather is 'snow'"),
+    ):
+        bad = parkenv(*words)
+        assert bad.returncode == 2
+        assert message in bad.stderr
+        assert len(bad.stderr.splitlines()) == 1
+
+
+def test_the_search_sees_what_is_there_and_nothing_else():
+    scenario, taken = halves()
+    env = gym.make("parkenv/SearchPerception-v0", scenario=scenario, weather="sunny").unwrapped
+    prior = env.reset(seed=0)[0]["p_occupied"]
+    lot = scenario.lot
+    for _ in range(6):
+        action = int(np.flatnonzero(lot.neighbors[env.state.vertex] >= 0)[-1])
+        observation, *_ = env.step(action)
+    seen = env.state.belief.seen
+    assert seen.sum() >= 4
+    believed = observation["p_occupied"] > 0.5
+    assert (believed == taken)[seen].mean() >= 0.9
+    np.testing.assert_array_equal(observation["p_occupied"][~seen], prior[~seen])
+
+
+def test_the_search_and_its_worlds_are_the_same_as_without_sensors():
+    plain = gym.make("parkenv/Search-v0", scenario="mini")
+    seeing = gym.make("parkenv/SearchPerception-v0", scenario="mini", weather="overcast")
+    first, _ = plain.reset(seed=4)
+    second, _ = seeing.reset(seed=4)
+    np.testing.assert_array_equal(first["p_occupied"], second["p_occupied"])
+    for action in (3, 3):
+        _, reward, _, _, info = plain.step(action)
+        _, other, _, _, told = seeing.step(action)
+        assert reward == other
+        assert info["drive_s"] == told["drive_s"]
+
+
+def test_a_rig_that_cannot_see_or_range_is_refused():
+    laser = SensorRig(lasers=(("laser", LaserScanner(), Mount(z=0.5)),))
+    with pytest.raises(InputError, match="no camera, or nothing to measure distances with"):
+        PerceptionStack(laser)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"rig": "radar"}, "rig is 'radar'"),
+        ({"weather": "hail"}, "weather is 'hail'"),
+        ({"windows": ()}, "windows is empty"),
+        ({"every": 0.0}, "every is 0"),
+    ],
+)
+def test_bad_settings_are_named(wrong, message):
+    with pytest.raises(InputError, match=message):
+        SurveySettings(**wrong)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "rig"), [("campus", "laser"), ("street", "laser"), ("campus", "stereo")])
+def test_held_out_sessions_are_as_right_as_promised(name, rig):
+    scenario = Scenario.named(name, traffic=BUSY)
+    window = ArrivalWindow((1,), 36_000.0, 43_200.0)
+    survey = Survey(scenario, SurveySettings(rig=rig, windows=(window,), seed=777))
+    results = [survey.drive(k) for k in range(2)]
+    assert np.mean([r.slot_accuracy for r in results]) >= (0.97 if rig == "laser" else 0.94)
