@@ -23,7 +23,13 @@ def _sensors(seed: int, seconds: float) -> list[BenchRow]:
     return sensor_rows(seed, seconds)
 
 
-PARTS: dict[str, Callable[[int, float], list[BenchRow]]] = {"sensors": _sensors}
+def _perception(seed: int, seconds: float) -> list[BenchRow]:
+    from parkenv.evaluation.bench_perception import perception_rows
+
+    return perception_rows(seed, seconds)
+
+
+PARTS: dict[str, Callable[[int, float], list[BenchRow]]] = {"sensors": _sensors, "perception": _perception}
 
 
 def bench(

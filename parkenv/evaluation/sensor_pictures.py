@@ -18,8 +18,8 @@ from parkenv.envs.drawing import write_text
 from parkenv.evaluation.lot_picture import draw_lot
 from parkenv.evaluation.picture_files import STYLE, save_picture
 from parkenv.lot import ParkingLot
+from parkenv.perception.sweeps import disparity
 from parkenv.whole_files import written_whole
-from sim_sensors.camera import StereoCamera, StereoFrame
 from sim_sensors.ground_truth import VehicleBoxes, View
 from sim_sensors.rig import Capture, SensorRig
 
@@ -45,25 +45,6 @@ def with_boxes(image: Image, boxes: VehicleBoxes) -> Image:
         cv2.rectangle(drawn, (left, top), (end + 4, top + 20), BOX_COLORS[view], cv2.FILLED)
         write_text(drawn, label, (left + 4, top + 15), (16, 16, 16), 13, 600)
     return drawn
-
-
-def disparity(pair: StereoFrame, stereo: StereoCamera, nearest: float = NEAREST) -> NDArray[np.float32]:
-    """Disparity, (h, w) float32 px, by OpenCV's semi-global matching; NaN where it finds no match."""
-    most = stereo.camera.fx * stereo.baseline / nearest
-    matcher = cv2.StereoSGBM.create(
-        minDisparity=0,
-        numDisparities=16 * int(np.ceil(most / 16)),
-        blockSize=5,
-        P1=8 * 25,
-        P2=32 * 25,
-        disp12MaxDiff=1,
-        uniquenessRatio=5,
-        speckleWindowSize=80,
-        speckleRange=2,
-    )
-    left, right = (cv2.cvtColor(f.image, cv2.COLOR_RGB2GRAY) for f in (pair.left, pair.right))
-    found = matcher.compute(left, right).astype(np.float32) / 16.0
-    return np.where(found > 0.0, found, np.nan).astype(np.float32)
 
 
 def draw_scan(ax: Axes, lot: ParkingLot, capture: Capture, rig: SensorRig) -> None:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from parkenv.errors import InputError
 from parkenv.lot import ParkingLot
@@ -14,6 +15,8 @@ from parkenv.lot import ParkingLot
 FloatArray = NDArray[np.float64]
 
 _TURN_M = 3.0  # a quarter turn counts as so many metres when cars are compared
+_WIDTH = 0.7  # of the reach: standard deviation of the kernel by which density is told
+_ROOM = (4.2, 1.9)  # m along and across a slot, closer than which there is no other: a car's length and width
 
 
 class FoundSlots(NamedTuple):
@@ -46,11 +49,13 @@ class DiscoveryScore(NamedTuple):
     yaw_error: float
 
 
-def discover(cars: FloatArray, *, reach: float = 0.8, least: int = 3) -> FoundSlots:
-    """Cluster the poses of cars over many sessions: dense places are slots, single cars are not.
+def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSlots:
+    """Slots from the poses of cars over many sessions: dense places are slots, single cars are not.
 
-    DBSCAN (Ester et al. 1996) on position and direction; cars that stand a quarter turn apart count as 3 m apart, and
-    nose-in and nose-out are the same. The middle of a cluster is the median of its cars.
+    The densest place is a slot, then the densest of those where another slot does not reach, and so on: two cars never
+    stood in each other, so neighbours do not grow together however many sessions there are, as the clusters of a
+    chaining method do once poses scatter by more than the gap between cars. Directions count as well, a quarter turn
+    as 3 m; nose-in and nose-out are the same. A slot's place is the median of the cars within reach.
 
     Args:
         cars: (n, 3) x, y in m and yaw in rad, world frame, of all sessions.
@@ -58,28 +63,66 @@ def discover(cars: FloatArray, *, reach: float = 0.8, least: int = 3) -> FoundSl
         least: how many cars make a slot.
 
     Raises:
-        InputError: a wrong shape or a number that is not finite.
-    """
-    from sklearn.cluster import DBSCAN
+        InputError: a wrong shape, a number that is not finite, a reach that is not above 0, or no least car.
 
+    Example:
+        >>> found = discover(np.array([[0.0, 0.1, 1.6], [0.1, 0.0, 4.7], [-0.1, 0.0, 1.5], [2.5, 0.0, 1.6]]))
+        >>> found.xy.round(1).tolist(), found.cars.tolist()
+        ([[0.0, 0.0]], [3])
+    """
     if cars.ndim != 2 or cars.shape[1] != 3 or not np.isfinite(cars).all():
         raise InputError(f"cars have shape {cars.shape}, want finite (n, 3)")
-    if not len(cars):
-        return FoundSlots(np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.int64))
+    if not (math.isfinite(reach) and reach > 0.0):
+        raise InputError(f"reach is {reach} m, want a finite number above 0")
+    if least < 1:
+        raise InputError(f"least is {least} cars, want at least 1")
     # Twice the angle is the same for both ways round.
     turn = _TURN_M / 2.0 * np.stack([np.cos(2.0 * cars[:, 2]), np.sin(2.0 * cars[:, 2])], axis=1)
-    label = DBSCAN(eps=reach, min_samples=least).fit_predict(np.column_stack([cars[:, :2], turn]))
+    place = np.column_stack([cars[:, :2], turn])
+    tree = cKDTree(place)
+    density, near = _density(tree, reach)
+    within = cKDTree(cars[:, :2])
+    open_to_slots = near >= least
     xy, yaw, count = [], [], []
-    for k in range(label.max() + 1):
-        these = cars[label == k]
-        xy.append(np.median(these[:, :2], axis=0))
-        yaw.append(0.5 * math.atan2(np.sin(2 * these[:, 2]).sum(), np.cos(2 * these[:, 2]).sum()) % math.pi)
+    for k in np.argsort(-density, kind="stable").tolist():
+        if not open_to_slots[k]:
+            continue
+        middle = np.median(place[tree.query_ball_point(place[k], reach)], axis=0)
+        # Once more from the middle, where the cars on the other side of it are within reach as well.
+        these = tree.query_ball_point(middle, reach) or [k]
+        middle = np.median(place[these], axis=0)
+        direction = 0.5 * math.atan2(middle[3], middle[2]) % math.pi
+        around = np.array(within.query_ball_point(middle[:2], math.hypot(*_ROOM)), dtype=np.int64)
+        open_to_slots[around[_inside(cars[around, :2] - middle[:2], direction)]] = False
+        open_to_slots[k] = False
+        xy.append(middle[:2])
+        yaw.append(direction)
         count.append(len(these))
     return FoundSlots(np.array(xy).reshape(-1, 2), np.array(yaw), np.array(count, dtype=np.int64))
 
 
+def _density(tree: cKDTree, reach: float) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Of each pose how dense poses lie there, and how many are within reach, itself included."""
+    width = _WIDTH * reach
+    pairs = tree.query_pairs(2.0 * width, output_type="ndarray")
+    away = np.linalg.norm(tree.data[pairs[:, 0]] - tree.data[pairs[:, 1]], axis=1)
+    weight = np.exp(-0.5 * (away / width) ** 2)
+    density, near = np.ones(tree.n), np.ones(tree.n, dtype=np.int64)
+    for side in (0, 1):
+        density += np.bincount(pairs[:, side], weight, minlength=tree.n)
+        near += np.bincount(pairs[away <= reach, side], minlength=tree.n)
+    return density, near
+
+
+def _inside(away: FloatArray, direction: float) -> NDArray[np.bool_]:
+    """Which points, from a slot's middle, are too near to it for another slot's middle."""
+    c, s = math.cos(direction), math.sin(direction)
+    along, across = c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]
+    return np.asarray((np.abs(along) < _ROOM[0]) & (np.abs(across) < _ROOM[1]))
+
+
 def score_discovery(
-    found: FoundSlots, lot: ParkingLot, *, within: float = 1.0, turned: float = math.radians(20.0)
+    found: FoundSlots, lot: ParkingLot, *, within: float = 1.0, turned: float = math.radians(15.0)
 ) -> DiscoveryScore:
     """Match found slots to the lot's, one to one, the nearest pairs first.
 

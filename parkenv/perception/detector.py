@@ -252,6 +252,7 @@ class Detector:
         enough = (math.log(self.threshold / (1.0 - self.threshold)) - offset) / slope
         least = self.least_height or window.height / _ZOOM
         n_sizes = 1 + int(math.log(max(most / least, 1.0)) / math.log(self.scale_step) + 1e-9)
+        smaller: Image | None = None
         for size in range(n_sizes):
             region_height = least * self.scale_step**size
             region_width = region_height * model.region_aspect
@@ -259,8 +260,12 @@ class Detector:
             if region_width > width + 2 * edge_x or region_height > height + 2 * edge_y:
                 break
             scale_x, scale_y = window.width / region_width, window.height / region_height
-            level = _resized(grey, scale_x, scale_y, edge_x, edge_y)
-            score = correlate(window.features(level), model.weights)
+            scaled = _scaled(grey if smaller is None else smaller, (width * scale_x, height * scale_y))
+            if scale_x <= 1.0 and scale_y <= 1.0:
+                smaller = scaled
+            score = correlate(
+                window.features(_bordered(scaled, edge_x * scale_x, edge_y * scale_y)), model.weights
+            )
             row, column = np.nonzero(score > enough - model.bias)
             scores.append(score[row, column] + np.float32(model.bias))
             left, top = column * CELL / scale_x - edge_x, row * CELL / scale_y - edge_y
@@ -314,12 +319,20 @@ def best_boxes(boxes: Float32Array, value: Float32Array, overlap: float) -> NDAr
     return np.array(kept, dtype=np.int64)
 
 
-def _resized(grey: Image, scale_x: float, scale_y: float, edge_x: int, edge_y: int) -> Image:
-    """The image with its border carried on by so many px, scaled."""
-    # The border is added after scaling: it costs less, and is the same.
-    height, width = grey.shape
-    size = max(1, round(width * scale_x)), max(1, round(height * scale_y))
-    smaller = scale_x < 1.0 and scale_y < 1.0
-    level = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
-    x, y = round(edge_x * scale_x), round(edge_y * scale_y)
-    return np.asarray(cv2.copyMakeBorder(level, y, y, x, x, cv2.BORDER_REPLICATE))
+def _scaled(image: Image, size: tuple[float, float]) -> Image:
+    """An image at another size, width and height in px.
+
+    A pyramid's next level is made from the one before: a step is small enough for linear interpolation, which is many
+    times as fast as averaging the whole image anew.
+    """
+    width, height = (max(1, round(s)) for s in size)
+    far = image.shape[1] > 1.6 * width or image.shape[0] > 1.6 * height
+    return np.asarray(
+        cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if far else cv2.INTER_LINEAR)
+    )
+
+
+def _bordered(level: Image, x: float, y: float) -> Image:
+    """A level with its border carried on, px; before scaling it would cost more and be the same."""
+    left, top = round(x), round(y)
+    return np.asarray(cv2.copyMakeBorder(level, top, top, left, left, cv2.BORDER_REPLICATE))
