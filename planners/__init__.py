@@ -4,6 +4,7 @@ They know the lot and a belief, never what stands in the slots; the oracle alone
 """
 
 from planners.agent import AGENT_NAMES, Agent, SearchAgent, make_agent
+from planners.label_setting import label_setting
 from planners.mdp import CirclingWarning, ParkingMDP
 from planners.policy_iteration import Solution, policy_iteration
 from planners.value_iteration import value_iteration
@@ -15,6 +16,7 @@ __all__ = [
     "ParkingMDP",
     "SearchAgent",
     "Solution",
+    "label_setting",
     "make_agent",
     "policy_iteration",
     "value_iteration",

@@ -52,14 +52,10 @@ class TargetAgent(SearchAgent[Eyes]):
         seen_free = p < memory.forecast
         previous = memory.target
         if previous < 0 or not candidates[previous] or self.changes_mind(seen_free, previous):
-            seconds = self.routes.seconds_from(vertex)[: len(p)]
-            within_reach = candidates & np.isfinite(seconds)
-            if not within_reach.any():
+            memory.target = self.choose(candidates, seen_free, vertex, previous)
+            if memory.target < 0:
                 # Everything has been seen taken: what was seen longest ago may be free by now.
-                within_reach = np.isfinite(seconds)
-                memory.target = int(np.where(within_reach, p, np.inf).argmin())
-            else:
-                memory.target = self.choose(within_reach, seen_free, seconds, previous)
+                memory.target = int(np.where(self.within_reach(vertex), p, np.inf).argmin())
         if memory.target == vertex:
             return PARK
         return self.routes.move_toward(vertex, memory.target)
@@ -69,17 +65,30 @@ class TargetAgent(SearchAgent[Eyes]):
         self,
         candidates: NDArray[np.bool_],
         seen_free: NDArray[np.bool_],
-        seconds: NDArray[np.float64],
+        vertex: int,
         previous: int,
     ) -> int:
-        """The slot to drive to.
+        """The slot to drive to, or -1 where no candidate is within reach.
 
         Args:
-            candidates: (n_slots,) free-looking and within reach; at least one.
+            candidates: (n_slots,) free-looking.
             seen_free: (n_slots,) seen free.
-            seconds: (n_slots,) s, drive time to each slot.
+            vertex: where the car is.
             previous: the slot that it was driving to, or -1 at the start.
         """
+
+    def within_reach(self, vertex: int) -> NDArray[np.bool_]:
+        """Which slots, (n_slots,), a way leads to."""
+        return np.asarray(np.isfinite(self.routes.seconds_from(vertex)[: self.problem.lot.n_slots]))
+
+    def shortest_walks(self, candidates: NDArray[np.bool_], vertex: int) -> NDArray[np.bool_]:
+        """The candidates within reach, (n_slots,), that have the shortest walk; none where none is within reach."""
+        walk_s = np.where(candidates, self.problem.walk_s, np.inf)
+        best = np.asarray(candidates & (walk_s == walk_s.min()))
+        if not len(self.routes.nearest(vertex, best)[0]):
+            walk_s[~self.within_reach(vertex)] = np.inf
+            best = np.asarray(np.isfinite(walk_s) & (walk_s == walk_s.min()))
+        return best
 
     def changes_mind(self, seen_free: NDArray[np.bool_], target: int) -> bool:
         """Whether what is seen makes the agent leave a target that still looks free."""
@@ -96,13 +105,13 @@ class GreedyGoalAgent(TargetAgent):
         self,
         candidates: NDArray[np.bool_],
         seen_free: NDArray[np.bool_],
-        seconds: NDArray[np.float64],
+        vertex: int,
         previous: int,
     ) -> int:
         """The shortest walk; among equals the shortest drive."""
         del seen_free, previous
-        slots = np.flatnonzero(candidates)
-        return int(slots[np.lexsort((seconds[slots], self.problem.walk_s[slots]))[0]])
+        slots, _ = self.routes.nearest(vertex, self.shortest_walks(candidates, vertex))
+        return int(slots[0]) if len(slots) else -1
 
 
 class GreedyDriveAgent(TargetAgent):
@@ -114,13 +123,13 @@ class GreedyDriveAgent(TargetAgent):
         self,
         candidates: NDArray[np.bool_],
         seen_free: NDArray[np.bool_],
-        seconds: NDArray[np.float64],
+        vertex: int,
         previous: int,
     ) -> int:
         """The shortest drive; among equals the shortest walk."""
         del seen_free, previous
-        slots = np.flatnonzero(candidates)
-        return int(slots[np.lexsort((self.problem.walk_s[slots], seconds[slots]))[0]])
+        slots, _ = self.routes.nearest(vertex, candidates)
+        return int(slots[self.problem.walk_s[slots].argmin()]) if len(slots) else -1
 
 
 class FirstFreeAgent(TargetAgent):
@@ -149,16 +158,19 @@ class FirstFreeAgent(TargetAgent):
         self,
         candidates: NDArray[np.bool_],
         seen_free: NDArray[np.bool_],
-        seconds: NDArray[np.float64],
+        vertex: int,
         previous: int,
     ) -> int:
         """A free slot in sight that is near enough; at first the one at the goal; then the next ones."""
         good = candidates & seen_free & self._near
         if good.any():
-            return int(np.where(good, seconds, np.inf).argmin())
+            slots, _ = self.routes.nearest(vertex, good)
+            if len(slots):
+                return int(slots[0])
         if previous < 0:
-            return int(np.where(candidates, self.problem.walk_s, np.inf).argmin())
-        return int(np.where(candidates, seconds, np.inf).argmin())
+            candidates = self.shortest_walks(candidates, vertex)
+        slots, _ = self.routes.nearest(vertex, candidates)
+        return int(slots[0]) if len(slots) else -1
 
     def changes_mind(self, seen_free: NDArray[np.bool_], target: int) -> bool:
         """At the first near slot seen free it stops driving on."""

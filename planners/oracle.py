@@ -178,10 +178,9 @@ class OracleAgent(SearchAgent[Foresight]):
         return slots[starts[vertex] : starts[vertex + 1]]
 
     def _nearest_unseen(self, vertex: int, unseen: NDArray[np.bool_]) -> tuple[int, float]:
-        """The next slot of a tour and the drive to it, s; inf where none is within reach."""
-        seconds = np.where(unseen, self.routes.seconds_from(vertex)[: len(unseen)], np.inf)
-        nearest = int(seconds.argmin())
-        return nearest, float(seconds[nearest])
+        """The next slot of a tour and the drive to it, s; -1 and inf where none is within reach."""
+        slots, seconds = self.routes.nearest(vertex, unseen)
+        return int(slots[0]) if len(slots) else -1, seconds
 
     def _tour_s(self, vertex: int, at_most: float) -> float:
         """How long it takes to see every slot, s; inf where that is over `at_most`, or some are out of reach."""

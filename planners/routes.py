@@ -1,19 +1,24 @@
-"""Shortest drives over the lot's graph."""
+"""Shortest drives over the lot's graph, searched no farther than is asked for."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import dijkstra
 
 from parkenv.errors import InputError
+from parkenv.lot import MOVES
 from parkenv.scenario import SearchProblem
+from planners.heap import pop, push
+from planners.label_setting import edges_in
+
+FloatArray = NDArray[np.float64]
 
 _KEPT_TARGETS = 64
+_NOBODY = -1
 
 
 class DriveRoutes:
@@ -24,15 +29,28 @@ class DriveRoutes:
     """
 
     def __init__(self, problem: SearchProblem) -> None:
-        self._neighbors = problem.lot.neighbors
-        self._seconds: Any = problem.lot.drive_matrix() / problem.v_drive
-        self._backward: Any = self._seconds.T.tocsr()
-        self._move_s = np.where(self._neighbors >= 0, problem.move_s, np.inf)
-        self._moves: OrderedDict[int, NDArray[np.int8]] = OrderedDict()
+        self._neighbors, self._move_s = problem.lot.neighbors, problem.move_s
+        n_moves = len(MOVES)
+        self._out_start = np.arange(0, n_moves * len(self._neighbors) + 1, n_moves, dtype=np.int32)
+        self._out_target, self._out_s = self._neighbors.ravel(), self._move_s.ravel()
+        self._in_start, self._in_source, _, self._in_s = edges_in(self._neighbors, self._move_s)
+        self._moves: OrderedDict[int, dict[int, int]] = OrderedDict()
 
-    def seconds_from(self, vertex: int) -> NDArray[np.float64]:
+    def seconds_from(self, vertex: int) -> FloatArray:
         """Drive time, (n_vertices,) s, from a vertex to every other; inf where no way leads."""
-        return np.asarray(dijkstra(self._seconds, indices=[vertex])[0], dtype=np.float64)
+        nowhere = np.zeros(0, dtype=np.bool_)
+        return self._outward(vertex, nowhere)[0]
+
+    def nearest(self, vertex: int, slots: NDArray[np.bool_]) -> tuple[NDArray[np.int64], float]:
+        """Those of some slots, (n_slots,) bool, that are the shortest drive away, ascending, and that drive, s.
+
+        None, and inf, where no way leads to any.
+        """
+        seconds, reached = self._outward(vertex, slots)
+        if reached == _NOBODY:
+            return np.empty(0, dtype=np.int64), np.inf
+        least = float(seconds[reached])
+        return np.flatnonzero(slots & (seconds[: len(slots)] == least)), least
 
     def move_toward(self, vertex: int, target: int) -> int:
         """The first move of a shortest way.
@@ -40,10 +58,15 @@ class DriveRoutes:
         Raises:
             InputError: no way leads to the target, or the car is there already.
         """
-        move = int(self._moves_to(target)[vertex])
-        if move < 0:
+        moves = self._moves.setdefault(target, {})
+        self._moves.move_to_end(target)
+        if len(self._moves) > _KEPT_TARGETS:
+            self._moves.popitem(last=False)
+        if vertex not in moves:
+            moves |= self._moves_along(vertex, target)
+        if vertex not in moves:
             raise InputError(f"no way leads on from vertex {vertex} to vertex {target}")
-        return move
+        return moves[vertex]
 
     def way(self, vertex: int, target: int) -> Iterator[tuple[int, int]]:
         """A shortest way, hop by hop: the move and the vertex that it leads to; nothing where the car is there.
@@ -56,16 +79,63 @@ class DriveRoutes:
             vertex = int(self._neighbors[vertex, move])
             yield move, vertex
 
-    def _moves_to(self, target: int) -> NDArray[np.int8]:
-        """(n_vertices,) the first move toward the target from everywhere, -1 where there is none."""
-        if target in self._moves:
-            self._moves.move_to_end(target)
-            return self._moves[target]
-        seconds = np.append(dijkstra(self._backward, indices=[target])[0], np.inf)
-        through = self._move_s + seconds[self._neighbors]
-        moves = np.where(np.isfinite(seconds[:-1]), through.argmin(axis=1), -1).astype(np.int8)
-        moves[target] = -1
-        self._moves[target] = moves
-        if len(self._moves) > _KEPT_TARGETS:
-            self._moves.popitem(last=False)
+    def _outward(self, vertex: int, ends: NDArray[np.bool_]) -> tuple[FloatArray, int]:
+        """Drive times up to the nearest of `ends` and the place of one, or `_NOBODY`; later ones are upper bounds."""
+        seconds = np.full(len(self._neighbors), np.inf)
+        reached = _search(self._out_start, self._out_target, self._out_s, vertex, ends, seconds)
+        return seconds, int(reached)
+
+    def _moves_along(self, vertex: int, target: int) -> dict[int, int]:
+        """The moves of a shortest way, by the vertices that they are made at; none where no way leads on."""
+        seconds = np.full(len(self._neighbors), np.inf)
+        end = np.zeros(vertex + 1, dtype=np.bool_)
+        end[vertex] = True
+        moves: dict[int, int] = {}
+        if _search(self._in_start, self._in_source, self._in_s, target, end, seconds) == _NOBODY:
+            return moves
+        while vertex != target:
+            following = self._neighbors[vertex]
+            through = np.where(following >= 0, self._move_s[vertex] + seconds[following], np.inf)
+            moves[vertex] = int(through.argmin())
+            vertex = int(following[moves[vertex]])
         return moves
+
+
+@njit(cache=True, error_model="numpy")
+def _search(
+    start: NDArray[np.int32],
+    leads_to: NDArray[np.int32],
+    edge_s: FloatArray,
+    origin: int,
+    ends: NDArray[np.bool_],
+    seconds: FloatArray,
+) -> int:
+    """Dijkstra's algorithm until the first of `ends`, (k,) bool of the first k vertices, is settled.
+
+    Args:
+        start: (n + 1,) the edges of v are rows `start[v]` to `start[v + 1]` of the next two.
+        leads_to: (m,) the vertex at an edge's other end; -1 is no edge.
+        edge_s: (m,) s.
+        origin: where it starts.
+        ends: where it may stop.
+        seconds: (n,) inf, filled: exact up to where it stopped, since every edge takes time; upper bounds beyond.
+
+    Returns:
+        One of the nearest of `ends`, or -1.
+    """
+    keys, vertices = np.empty(len(leads_to) + 1), np.empty(len(leads_to) + 1, dtype=np.int32)
+    seconds[origin] = 0.0
+    size = push(keys, vertices, 0, 0.0, origin)
+    while size > 0:
+        v, far = vertices[0], keys[0]
+        size = pop(keys, vertices, size)
+        if far > seconds[v]:
+            continue
+        if v < len(ends) and ends[v]:
+            return int(v)
+        for e in range(start[v], start[v + 1]):
+            u = leads_to[e]
+            if u >= 0 and far + edge_s[e] < seconds[u]:
+                seconds[u] = far + edge_s[e]
+                size = push(keys, vertices, size, seconds[u], u)
+    return _NOBODY

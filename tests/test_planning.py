@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from parkenv import InputError, ParkingLot, Scenario
 from parkenv.lot import PARK
-from planners import CirclingWarning, ParkingMDP, policy_iteration, value_iteration
+from planners import CirclingWarning, ParkingMDP, label_setting, policy_iteration, value_iteration
 
 
 def line(p_free, walk_s, hop_s=1.0, failure_s=10.0, gamma=0.999):
@@ -29,7 +29,7 @@ def retry_value(mdp):
     return (p * mdp.park_reward - (1 - p) * mdp.failure_s) / (1 - mdp.gamma * (1 - p))
 
 
-@pytest.mark.parametrize("solve", [policy_iteration, value_iteration])
+@pytest.mark.parametrize("solve", [policy_iteration, value_iteration, label_setting])
 def test_one_slot_is_a_geometric_series(solve):
     mdp = ParkingMDP([[-1] * 4], np.zeros((1, 4)), [0.25], [30.0], failure_s=10.0, wait_s=100.0, gamma=0.99)
     # Three failures on average, each but the first one decision later.
@@ -39,7 +39,7 @@ def test_one_slot_is_a_geometric_series(solve):
     assert solution.policy[0] == PARK
 
 
-@pytest.mark.parametrize("solve", [policy_iteration, value_iteration])
+@pytest.mark.parametrize("solve", [policy_iteration, value_iteration, label_setting])
 @pytest.mark.parametrize("gamma", [0.9, 0.99, 0.999])
 def test_parking_along_a_line_is_the_best_stop(solve, gamma):
     """The textbook case: the value is the best over slots of driving there and trying until it works."""

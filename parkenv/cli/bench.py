@@ -29,7 +29,17 @@ def _perception(seed: int, seconds: float) -> list[BenchRow]:
     return perception_rows(seed, seconds)
 
 
-PARTS: dict[str, Callable[[int, float], list[BenchRow]]] = {"sensors": _sensors, "perception": _perception}
+def _planning(seed: int, seconds: float) -> list[BenchRow]:
+    from parkenv.evaluation.bench_planning import planning_rows
+
+    return planning_rows(seed, seconds)
+
+
+PARTS: dict[str, Callable[[int, float], list[BenchRow]]] = {
+    "sensors": _sensors,
+    "perception": _perception,
+    "planning": _planning,
+}
 
 
 def bench(

@@ -1,0 +1,96 @@
+"""Shortest drives: against scipy's, from both ends, and no farther than is asked for."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse.csgraph import dijkstra
+
+from parkenv import InputError, Lane, ParkingLot, Scenario
+from planners import make_agent
+from planners.routes import DriveRoutes
+
+LOTS = {
+    "campus": ParkingLot.packaged("campus"),
+    "street": ParkingLot.packaged("street"),
+    "grid": ParkingLot.grid(4, 10),
+    "city": ParkingLot.city(300),
+}
+
+
+@pytest.fixture(scope="module", params=LOTS)
+def drives(request):
+    scenario = Scenario.on_lot(LOTS[request.param])
+    return scenario, DriveRoutes(scenario), dijkstra(scenario.lot.drive_matrix() / scenario.v_drive)
+
+
+def test_drive_times_are_those_of_scipy(drives):
+    scenario, routes, seconds = drives
+    for vertex in range(0, scenario.lot.n_vertices, 7):
+        np.testing.assert_allclose(routes.seconds_from(vertex), seconds[vertex], rtol=1e-12)
+
+
+def test_ways_are_as_long_as_they_should_be(drives):
+    scenario, routes, seconds = drives
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        vertex, target = rng.integers(scenario.lot.n_vertices, size=2)
+        here, took = int(vertex), 0.0
+        for move, following in routes.way(int(vertex), int(target)):
+            assert scenario.lot.neighbors[here, move] == following
+            took += scenario.move_s[here, move]
+            here = following
+        assert here == target
+        assert took == pytest.approx(seconds[vertex, target], abs=1e-9)
+
+
+@given(seed=st.integers(0, 2**32 - 1), chance=st.sampled_from([0.0, 0.01, 0.1, 1.0]))
+@settings(max_examples=60, deadline=None)
+def test_the_nearest_are_all_that_are_as_near(seed, chance):
+    rng = np.random.default_rng(seed)
+    lot = LOTS["grid"]
+    routes = DriveRoutes(Scenario.on_lot(lot))
+    vertex, slots = int(rng.integers(lot.n_vertices)), rng.random(lot.n_slots) < chance
+    seconds = np.where(slots, routes.seconds_from(vertex)[: lot.n_slots], np.inf)
+    found, least = routes.nearest(vertex, slots)
+    assert least == seconds.min()
+    np.testing.assert_array_equal(found, np.flatnonzero(np.isfinite(seconds) & (seconds == seconds.min())))
+
+
+def one_way_past_two_slots():
+    """The entry lies between the slots: the first cannot be driven to."""
+    return ParkingLot(
+        name="one way",
+        slot_ids=("before", "after"),
+        slot_xy=[[10.0, -5.0], [30.0, -5.0]],
+        slot_yaw=[-np.pi / 2] * 2,
+        slot_length=[5.0] * 2,
+        slot_width=[2.5] * 2,
+        slot_mouth=[0, 0],
+        lanes=[Lane(np.array([[0.0, 0.0], [20.0, 0.0], [40.0, 0.0]]), oneway=True)],
+        entries=[[20.0, 0.0]],
+        goals=[[0.0, -10.0]],
+    )
+
+
+def test_what_no_way_leads_to_is_left_out():
+    lot = one_way_past_two_slots()
+    scenario = Scenario.on_lot(lot)
+    routes, entry = DriveRoutes(scenario), int(lot.entry_vertices[0])
+    assert routes.nearest(entry, np.array([True, False]))[1] == np.inf
+    assert list(routes.nearest(entry, np.array([True, True]))[0]) == [1]
+    with pytest.raises(InputError, match="no way leads on"):
+        routes.move_toward(entry, 0)
+    with pytest.raises(InputError, match="no way leads on"):
+        routes.move_toward(1, 1)
+    assert list(routes.way(1, 1)) == []
+
+
+@pytest.mark.parametrize("name", ["greedy-goal", "greedy-drive", "first-free"])
+def test_agents_head_for_what_they_can_reach(name):
+    """The slot with the shorter walk lies behind the entry, on a one-way lane."""
+    lot = one_way_past_two_slots()
+    agent, vertex = make_agent(name, Scenario.on_lot(lot)), int(lot.entry_vertices[0])
+    observation = {"vertex": vertex, "p_occupied": np.full(2, 0.5, dtype=np.float32)}
+    move, _ = agent.predict(observation)
+    assert lot.neighbors[vertex, int(move)] == 1
