@@ -97,16 +97,22 @@ _AGENTS: dict[str, tuple[str, str]] = {
     "first-free": ("planners.greedy", "FirstFreeAgent"),
     "random": ("planners.greedy", "RandomAgent"),
     "oracle": ("planners.oracle", "OracleAgent"),
+    "belief": ("planners.belief_search", "BeliefAgent"),
+    "mdp-tuned": ("planners.tuning", "TunedAgent"),
+    "exact": ("planners.exact", "ExactAgent"),
 }
 
-AGENT_NAMES = tuple(_AGENTS)
+SMALL_LOTS_ONLY = ("exact",)
+"""Agents that refuse lots over a certain size and looks that may err."""
+AGENT_NAMES = tuple(name for name in _AGENTS if name not in SMALL_LOTS_ONLY)
+"""Agents for lots of any kind; those that keep a table of all drives say so where a lot is too large for it."""
 
 
 def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) -> SearchAgent[Any]:
     """Make an agent that knows the scenario's public part: lot, goal, speeds and costs.
 
     Args:
-        name: one of `AGENT_NAMES`.
+        name: one of `AGENT_NAMES` or `SMALL_LOTS_ONLY`.
         scenario: the scenario; what stands in its slots is kept from the agent.
         options: the agent's own, such as `failure_s=5.0` of "mdp".
 

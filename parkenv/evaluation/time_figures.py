@@ -23,6 +23,7 @@ Row = Mapping[str, Any]
 AGENT_COLORS = {
     "mdp": "#0072b2",
     "mdp-static": "#56b4e9",
+    "mdp-tuned": "#117733",
     "greedy-goal": "#e69f00",
     "greedy-drive": "#d55e00",
     "first-free": "#009e73",

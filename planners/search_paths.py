@@ -1,0 +1,473 @@
+"""What a path through a lot is worth to a car that may stop at any free slot it has seen, compiled.
+
+A path says where to look next as long as all that was seen is taken. At every vertex of it the car knows what it
+has passed, and either settles for the best free slot so far, which may mean to drive back, or goes on. That is
+optimal stopping with recall, and its value follows exactly by going through the path backwards: the state is
+which slot is the best so far, or none.
+
+A slot may be taken while the car drives to it, and one seen taken may have come free: both by two-state
+chains, p(t) = p∞ + (p(0) - p∞)·exp(-rt). Whoever comes too late goes on searching, for a time that is
+estimated once a decision.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+UNSEEN, LOOKS_FREE, LOOKS_TAKEN = 0, 1, 2
+
+LOST = 0.002
+"""Chance of having found nothing worth stopping for at which a path ends; what remains is estimated."""
+MOST_OPTIONS = 12
+"""Slots known to be free that are kept in mind, best first."""
+
+
+class Ground(NamedTuple):
+    """What stays the same in a search.
+
+    Attributes:
+        seconds: (n_vertices, n_vertices) float64, s, drive times.
+        following: (n_vertices, n_vertices) int16, the next vertex of a shortest way.
+        view_starts: (n_vertices + 1,) int64, rows of `view_slots`.
+        view_slots: int64, slots in view of each vertex.
+        walk_s: (n_slots,) float64, s.
+        wait_s: s, what it takes to look again where the car stands.
+        give_up_s: s, from a lot that is proven full to the goal.
+        failure_s: s, what it costs to find a slot taken on arrival: nothing if that shows before the try.
+    """
+
+    seconds: FloatArray
+    following: NDArray[np.int16]
+    view_starts: IntArray
+    view_slots: IntArray
+    walk_s: FloatArray
+    wait_s: float
+    give_up_s: float
+    failure_s: float
+
+
+class Outlook(NamedTuple):
+    """What is believed of the slots at one decision.
+
+    Attributes:
+        kind: (n_slots,) int8, UNSEEN, LOOKS_FREE or LOOKS_TAKEN.
+        free: (n_slots,) float64, P(free now).
+        usual: (n_slots,) float64, P(free) that it relaxes to.
+        rate: (n_slots,) float64, 1/s, how fast.
+        odds: (n_slots,) float64, P(taken)/P(free) about when the car could be there; inf where hopeless.
+    """
+
+    kind: NDArray[np.int8]
+    free: FloatArray
+    usual: FloatArray
+    rate: FloatArray
+    odds: FloatArray
+
+
+class Path(NamedTuple):
+    """Room for one path, used again and again.
+
+    Attributes:
+        vertices: (most,) int64.
+        times: (most,) float64, s from now.
+        starts: (most + 1,) int64, which looks are made at each vertex: `starts[k]` to `starts[k + 1]`.
+        slots: (n_slots,) int64, the slots looked at, in order.
+        chances: (n_slots,) float64, P(free) at the look.
+        found: (n_slots,) float64, s from now, when the look is made.
+        looked: (n_slots,) uint8, scratch.
+        values: (n_slots,) float64, scratch of the way back.
+        offers: (n_slots,) float64, scratch of the way back.
+    """
+
+    vertices: IntArray
+    times: FloatArray
+    starts: IntArray
+    slots: IntArray
+    chances: FloatArray
+    found: FloatArray
+    looked: NDArray[np.uint8]
+    values: FloatArray
+    offers: FloatArray
+
+
+def new_path(n_slots: int, n_vertices: int) -> Path:
+    """Room for a path on a lot of that size."""
+    most = 4 * n_vertices + 16
+    return Path(
+        np.zeros(most, np.int64),
+        np.zeros(most),
+        np.zeros(most + 1, np.int64),
+        np.zeros(n_slots, np.int64),
+        np.zeros(n_slots),
+        np.zeros(n_slots),
+        np.zeros(n_slots, np.uint8),
+        np.zeros(n_slots),
+        np.zeros(n_slots),
+    )
+
+
+@njit(cache=True)
+def decayed(rate: float, seconds: float) -> float:
+    """1 - exp(-rate · seconds), quick where little happens."""
+    x = rate * seconds
+    if x < 1e-3:
+        return x
+    return 1.0 - math.exp(-x)
+
+
+@njit(cache=True)
+def nearest_promise(
+    vertex: int, cost: float, ground: Ground, outlook: Outlook, looked: NDArray[np.uint8]
+) -> tuple[int, float]:
+    """The slot that the thesis's planner would drive to among those not looked at, and its expected time, s.
+
+    With γ = 1 its plan is to drive to one slot and to try until it is free: drive + walk + cost·(1 - p)/p.
+    """
+    best, chosen = np.inf, -1
+    row = ground.seconds[vertex]
+    for s in range(len(looked)):
+        if looked[s] == 0:
+            value = row[s] + ground.walk_s[s] + cost * outlook.odds[s]
+            if value < best:
+                best, chosen = value, s
+    return chosen, best
+
+
+@njit(cache=True)
+def lay(
+    vertex: int,
+    targets: IntArray,
+    n_targets: int,
+    cost: float,
+    ground: Ground,
+    outlook: Outlook,
+    path: Path,
+) -> tuple[int, float]:
+    """Lay a path: past the targets, then as the thesis's planner drives while all that it sees is taken.
+
+    Returns:
+        The number of vertices, and the time, s, that is left at its end if nothing was found.
+    """
+    n = len(outlook.kind)
+    unproven = 0
+    for s in range(n):
+        path.looked[s] = 1 if outlook.kind[s] == LOOKS_FREE else 0
+        if outlook.kind[s] != LOOKS_TAKEN:
+            unproven += 1
+    for i in range(ground.view_starts[vertex], ground.view_starts[vertex + 1]):
+        s = ground.view_slots[i]
+        if outlook.kind[s] != UNSEEN:
+            path.looked[s] = 1
+    path.vertices[0], path.times[0] = vertex, 0.0
+    path.starts[0] = path.starts[1] = 0
+    k, looks, time, passed = 0, 0, 0.0, 0
+    choose, target = True, -1
+    while k + 2 < len(path.vertices):
+        while passed < n_targets and (
+            targets[passed] == vertex or ground.following[vertex, targets[passed]] < 0
+        ):
+            passed += 1
+            choose = True
+        if passed < n_targets:
+            target = targets[passed]
+        elif choose or target == vertex:
+            target, value = nearest_promise(vertex, cost, ground, outlook, path.looked)
+            if target < 0 or not value < np.inf:
+                break
+            choose = False
+            if _unsatisfied(vertex, value, looks, ground, path) <= LOST:
+                break
+        if target == vertex:
+            time += ground.wait_s
+        else:
+            following = int(ground.following[vertex, target])
+            time += ground.seconds[vertex, following]
+            vertex = following
+        k += 1
+        path.vertices[k], path.times[k] = vertex, time
+        for i in range(ground.view_starts[vertex], ground.view_starts[vertex + 1]):
+            s = ground.view_slots[i]
+            if path.looked[s]:
+                continue
+            path.looked[s] = 1
+            chance = outlook.free[s]
+            if outlook.kind[s] != UNSEEN:
+                chance += (outlook.usual[s] - chance) * decayed(outlook.rate[s], time)
+            else:
+                unproven -= 1
+            path.slots[looks], path.chances[looks], path.found[looks] = s, chance, time
+            looks += 1
+            choose = True
+        path.starts[k + 1] = looks
+        if unproven == 0:
+            return k + 1, ground.give_up_s
+    _, left = nearest_promise(vertex, max(cost, 1.0), ground, outlook, path.looked)
+    return k + 1, min(left, ground.give_up_s)
+
+
+@njit(cache=True)
+def _unsatisfied(vertex: int, promise_s: float, looks: int, ground: Ground, path: Path) -> float:
+    """Chance that none of the slots looked at is free and as good as what driving on promises."""
+    chance = 1.0
+    for j in range(looks):
+        s = path.slots[j]
+        if ground.seconds[vertex, s] + ground.walk_s[s] <= promise_s:
+            chance *= 1.0 - path.chances[j]
+    return chance
+
+
+@njit(cache=True)
+def offer(
+    vertex: int,
+    slot: int,
+    free: float,
+    age: float,
+    late_s: float,
+    ground: Ground,
+    outlook: Outlook,
+) -> float:
+    """Expected time, s, of driving to a slot that was free with some probability a while ago.
+
+    Args:
+        vertex: where from.
+        slot: where to.
+        free: P(free) when last seen.
+        age: s since then.
+        late_s: s that the search takes on if it is taken.
+        ground: the lot.
+        outlook: the belief.
+    """
+    drive = ground.seconds[vertex, slot]
+    if drive == np.inf:
+        return np.inf
+    p = free + (outlook.usual[slot] - free) * decayed(outlook.rate[slot], age + drive)
+    expected: float = drive + p * ground.walk_s[slot] + (1.0 - p) * (late_s + ground.failure_s)
+    return expected
+
+
+@njit(cache=True)
+def worth(
+    n_path: int,
+    left_s: float,
+    options: IntArray,
+    n_options: int,
+    late_s: float,
+    ground: Ground,
+    outlook: Outlook,
+    path: Path,
+) -> float:
+    """Least expected time, s, of going on along a laid path and stopping at will.
+
+    Args:
+        n_path: its vertices.
+        left_s: s, left at its end if nothing was found.
+        options: slots that are known to be free now.
+        n_options: how many.
+        late_s: s that the search takes on where a slot is gone on arrival.
+        ground: the lot.
+        outlook: the belief.
+        path: the path.
+
+    Returns:
+        The value of driving on to its second vertex; inf where it has none.
+    """
+    if n_path < 2:
+        return np.inf
+    values, offers, slots, times = path.values, path.offers, path.slots, path.times
+    nothing, ahead, onward = left_s, np.inf, 0.0
+    for k in range(n_path - 1, 0, -1):
+        # `values` and `nothing` hold what follows at the next vertex, `onward` is the drive there, and `ahead`
+        # bounds from below what any look still to come can offer.
+        vertex, first, last = path.vertices[k], path.starts[k], path.starts[k + 1]
+        stop = np.inf
+        for i in range(n_options):
+            s = options[i]
+            stop = min(stop, offer(vertex, s, outlook.free[s], times[k], late_s, ground, outlook))
+        for j in range(last):
+            since = times[k] - path.found[j]
+            offers[j] = min(stop, offer(vertex, slots[j], 1.0, since, late_s, ground, outlook))
+            if offers[j] <= ahead:
+                values[j] = offers[j]
+            else:
+                values[j] = min(offers[j], onward + values[j])
+        nothing = min(stop, onward + nothing)
+        # Now back to before the looks at this vertex: the best slot that they show replaces a worse one.
+        _best_first(first, last, path)
+        for j in range(first):
+            rest, expected = 1.0, 0.0
+            for i in range(first, last):
+                if offers[i] >= offers[j]:
+                    break
+                expected += rest * path.chances[i] * values[i]
+                rest *= 1.0 - path.chances[i]
+            values[j] = expected + rest * values[j]
+        rest, expected = 1.0, 0.0
+        for i in range(first, last):
+            expected += rest * path.chances[i] * values[i]
+            rest *= 1.0 - path.chances[i]
+            ahead = min(ahead, ground.seconds[vertex, slots[i]] + ground.walk_s[slots[i]])
+        nothing = expected + rest * nothing
+        onward = times[k] - times[k - 1]
+        ahead += onward
+    return onward + nothing
+
+
+@njit(cache=True)
+def _best_first(first: int, last: int, path: Path) -> None:
+    """Order the looks made at one vertex by what they offer."""
+    for i in range(first + 1, last):
+        j = i
+        while j > first and path.offers[j] < path.offers[j - 1]:
+            for values in (path.offers, path.values, path.chances):
+                values[j], values[j - 1] = values[j - 1], values[j]
+            path.slots[j], path.slots[j - 1] = path.slots[j - 1], path.slots[j]
+            j -= 1
+
+
+@njit(cache=True)
+def _shows_news(vertex: int, ground: Ground, outlook: Outlook) -> bool:
+    """Whether a slot is in view of a vertex that has not been seen yet, or may have come free."""
+    for i in range(ground.view_starts[vertex], ground.view_starts[vertex + 1]):
+        s = ground.view_slots[i]
+        if outlook.kind[s] == UNSEEN or (outlook.kind[s] == LOOKS_TAKEN and outlook.rate[s] > 0.0):
+            return True
+    return False
+
+
+class Budget(NamedTuple):
+    """How far to search.
+
+    Attributes:
+        costs: (k,) float64, s, failure costs with which the thesis's planner lays paths.
+        work: how many steps of the way back may be made; it bounds the time of a decision.
+        depth: how many targets a path may have before the thesis's planner goes on.
+    """
+
+    costs: FloatArray
+    work: int
+    depth: int
+
+
+@njit(cache=True)
+def best_path(
+    vertex: int,
+    targets: IntArray,
+    n_targets: int,
+    cost: float,
+    budget: Budget,
+    ground: Ground,
+    outlook: Outlook,
+    path: Path,
+) -> tuple[float, float, int, int, int, float]:
+    """Search for the path of the least expected time, from the last decision's on.
+
+    Candidates are the paths of the thesis's planner at several failure costs, then those past one target
+    more, which may be any vertex, put in at any place. Ties go to what was found first.
+
+    Args:
+        vertex: where the car is.
+        targets: (depth,) int64, of the last decision's path; written to.
+        n_targets: how many.
+        cost: s, failure cost of the last decision's path.
+        budget: how far to search.
+        ground: the lot.
+        outlook: the belief.
+        path: room for one.
+
+    Returns:
+        Expected s of the path; expected s of going to the best slot known now; that slot or -1; the vertex that
+        comes next on the path or -1; the number of targets; the failure cost.
+    """
+    n = len(outlook.kind)
+    options, n_options = np.empty(MOST_OPTIONS, np.int64), 0
+    depth, work = budget.depth, 0
+    trial, kept = np.empty(depth, np.int64), np.empty(depth, np.int64)
+
+    # What a failure on arrival costs: the search as it would be if nothing were known to be free.
+    late_s, base = np.inf, cost
+    for i in range(len(budget.costs)):
+        n_path, left = lay(vertex, trial, 0, budget.costs[i], ground, outlook, path)
+        value = worth(n_path, left, options, 0, 0.0, ground, outlook, path)
+        if value < late_s:
+            late_s, base = value, budget.costs[i]
+    late_s = min(late_s, ground.give_up_s)
+    at_hand, slot = np.inf, -1
+    offers = np.full(MOST_OPTIONS, np.inf)
+    for s in range(n):
+        if outlook.kind[s] != LOOKS_FREE:
+            continue
+        value = offer(vertex, s, outlook.free[s], 0.0, late_s, ground, outlook)
+        if value < at_hand:
+            at_hand, slot = value, s
+        if n_options < MOST_OPTIONS:
+            place = n_options
+            n_options += 1
+        elif value < offers[MOST_OPTIONS - 1]:
+            place = MOST_OPTIONS - 1
+        else:
+            continue
+        while place > 0 and offers[place - 1] > value:
+            offers[place], options[place] = offers[place - 1], options[place - 1]
+            place -= 1
+        offers[place], options[place] = value, s
+
+    best, following, n_kept = np.inf, -1, 0
+    if n_targets > 0 and targets[0] == vertex:
+        for i in range(1, n_targets):
+            targets[i - 1] = targets[i]
+        n_targets -= 1
+    for i in range(-1, len(budget.costs)):
+        tried = n_targets if i < 0 else 0
+        if i >= 0:
+            cost = budget.costs[i]
+        n_path, left = lay(vertex, targets, tried, cost, ground, outlook, path)
+        value = worth(n_path, left, options, n_options, late_s, ground, outlook, path)
+        if value < best - 1e-9:
+            best, base, n_kept, following = value, cost, tried, path.vertices[1]
+            for j in range(tried):
+                kept[j] = targets[j]
+    if best == np.inf:
+        return best, at_hand, slot, -1, 0, base
+
+    # The near ones matter for the step to be taken now, and come first where the budget is small.
+    nearest_first = np.argsort(ground.seconds[vertex])
+    for _ in range(depth):
+        improved = False
+        n_before = n_kept
+        for j in range(n_kept):
+            targets[j] = kept[j]
+        if n_before == depth:
+            break
+        for place in range(n_before + 1):
+            before = vertex if place == 0 else targets[place - 1]
+            for u in nearest_first:
+                if work > budget.work or not ground.seconds[vertex, u] < min(best, at_hand):
+                    break
+                if u == before or not _shows_news(u, ground, outlook):
+                    continue
+                for j in range(place):
+                    trial[j] = targets[j]
+                trial[place] = u
+                for j in range(place, n_before):
+                    trial[j + 1] = targets[j]
+                n_path, left = lay(vertex, trial, n_before + 1, base, ground, outlook, path)
+                value = worth(n_path, left, options, n_options, late_s, ground, outlook, path)
+                looks = path.starts[n_path]
+                work += n_path * (looks // 2 + n // 8 + 4)
+                if value < best - 1e-6:
+                    best, n_kept, following, improved = value, n_before + 1, path.vertices[1], True
+                    for j in range(n_kept):
+                        kept[j] = trial[j]
+        if not improved:
+            break
+    for j in range(n_kept):
+        targets[j] = kept[j]
+    return best, at_hand, slot, following, n_kept, base

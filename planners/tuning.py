@@ -1,0 +1,234 @@
+"""`mdp-tuned`: the thesis's planner at the failure cost that its own forecast recommends.
+
+The failure cost is the one number of the thesis's planner that has no right value (T §4.3 shows 10 s to be too bold
+and 90 s too careful). Here it is chosen by simulation: worlds are drawn from the forecast alone, slots being
+independent and lasting, the planner searches all of them at each cost, and the cost with the least mean time wins.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numba import njit
+from numpy.typing import ArrayLike, NDArray
+
+from parkenv.errors import InputError
+from parkenv.scenario import SearchProblem
+from planners.agent import Observation, SearchAgent
+from planners.replanning import Plan, ReplanningAgent
+from planners.road_table import RoadTable
+from planners.search_paths import Ground, Outlook, nearest_promise
+
+FloatArray = NDArray[np.float64]
+
+COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+"""Failure costs, s, to choose from: twice as high each time."""
+WORLDS = 128
+_MOST_STEPS = 2000
+_KEPT = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning:
+    """What the simulation found.
+
+    Attributes:
+        costs: (k,) float64, s, the failure costs compared.
+        mean_s: (k,) float64, s, mean total time of the planner at each, in the same worlds.
+    """
+
+    costs: FloatArray
+    mean_s: FloatArray
+
+    @property
+    def best(self) -> float:
+        """The failure cost with the least mean time, s; among equals the lowest."""
+        return float(self.costs[self.mean_s.argmin()])
+
+
+def tune_failure_cost(
+    problem: SearchProblem,
+    p_occupied: ArrayLike,
+    vertex: int,
+    *,
+    costs: Sequence[float] = COSTS,
+    worlds: int = WORLDS,
+    seed: int = 0,
+    table: RoadTable | None = None,
+) -> Tuning:
+    """Simulate the thesis's planner in worlds drawn from a forecast.
+
+    Slots are seen without error when they come in view, and last; a lot seen to be full costs `give_up_s`.
+
+    Args:
+        problem: lot, goal, speeds and costs.
+        p_occupied: (n_slots,) the forecast.
+        vertex: where the search begins.
+        costs: failure costs to compare, s, each above 0.
+        worlds: how many worlds are drawn; the same ones for each cost.
+        seed: of the worlds.
+        table: the lot's drives, where they are at hand.
+
+    Raises:
+        InputError: a cost or a number of worlds that is not positive, probabilities of a wrong number or size.
+    """
+    p = np.asarray(p_occupied, dtype=np.float64)
+    tried = np.asarray(costs, dtype=np.float64)
+    if p.shape != (problem.lot.n_slots,) or not ((p >= 0.0) & (p <= 1.0)).all():
+        raise InputError(f"p_occupied: want {problem.lot.n_slots} probabilities, got shape {p.shape}")
+    if not len(tried) or not (np.isfinite(tried) & (tried > 0.0)).all():
+        raise InputError(f"costs are {list(costs)}, want finite seconds above 0")
+    if worlds < 1:
+        raise InputError(f"worlds is {worlds}, want at least 1")
+    table = table or RoadTable.of(problem)
+    taken = np.random.default_rng(seed).random((worlds, len(p))) < p
+    starts, slots = problem.slots_in_view
+    ground = Ground(
+        table.seconds,
+        table.following,
+        starts,
+        slots,
+        problem.walk_s,
+        problem.wait_s,
+        problem.give_up_s,
+        problem.failure_s,
+    )
+    return Tuning(tried, _mean_times(vertex, taken, p, tried, ground))
+
+
+@njit(cache=True)
+def _mean_times(
+    vertex: int, taken: NDArray[np.bool_], p_occupied: FloatArray, costs: FloatArray, ground: Ground
+) -> FloatArray:
+    n_worlds, n = taken.shape
+    mean = np.zeros(len(costs))
+    nothing = np.zeros(n)
+    odds, hidden = np.empty(n), np.zeros(n, np.uint8)
+    kind = np.zeros(n, np.int8)
+    outlook = Outlook(kind, nothing, nothing, nothing, odds)
+    for c in range(len(costs)):
+        for w in range(n_worlds):
+            kind[:] = 0
+            for s in range(n):
+                odds[s] = p_occupied[s] / (1.0 - p_occupied[s]) if p_occupied[s] < 1.0 else np.inf
+            mean[c] += _search(vertex, taken[w], costs[c], ground, outlook, hidden) / n_worlds
+    return mean
+
+
+@njit(cache=True)
+def _search(
+    vertex: int,
+    taken: NDArray[np.bool_],
+    cost: float,
+    ground: Ground,
+    outlook: Outlook,
+    hidden: NDArray[np.uint8],
+) -> float:
+    """Total time, s, of the thesis's planner in one world; `hidden` is all zero, no slot is left out."""
+    total, unseen, found = 0.0, len(taken), False
+    for _ in range(_MOST_STEPS):
+        target, value = nearest_promise(vertex, cost, ground, outlook, hidden)
+        if target < 0 or not value < np.inf:
+            break
+        if target == vertex and outlook.kind[target] != 0:
+            return float(total + ground.walk_s[target])
+        if target == vertex:
+            # The search begins before this slot: it tries without having looked.
+            if not taken[target]:
+                return float(total + ground.walk_s[target])
+            total += ground.failure_s
+        else:
+            following = int(ground.following[vertex, target])
+            total += ground.seconds[vertex, following]
+            vertex = following
+        for i in range(ground.view_starts[vertex], ground.view_starts[vertex + 1]):
+            s = ground.view_slots[i]
+            if outlook.kind[s] == 0:
+                outlook.kind[s] = 1
+                unseen -= 1
+                found = found or not taken[s]
+                outlook.odds[s] = np.inf if taken[s] else 0.0
+        if unseen == 0 and not found:
+            break
+    return total + ground.give_up_s
+
+
+@dataclass
+class TunedPlan:
+    """What the tuned planner remembers.
+
+    Attributes:
+        failure_s: s, the failure cost that it chose.
+        plan: the thesis's planner's own memory.
+    """
+
+    failure_s: float
+    plan: Plan
+
+    @property
+    def replans(self) -> int:
+        """How often it has planned anew since the episode began."""
+        return self.plan.replans
+
+    @property
+    def policy(self) -> NDArray[np.int64]:
+        """The action for each vertex, (n_vertices,) int64."""
+        return self.plan.policy
+
+
+class TunedAgent(SearchAgent[TunedPlan]):
+    """`mdp-tuned`: at the arrival chooses its failure cost for the forecast, then is the thesis's planner.
+
+    Args:
+        problem: lot, goal, speeds and costs.
+        worlds: how many worlds are drawn from the forecast.
+        seed: of those worlds.
+        gamma: discount a decision.
+
+    Raises:
+        InputError: no worlds, or a lot too large for a table of all drives.
+    """
+
+    name: ClassVar[str] = "mdp-tuned"
+
+    def __init__(
+        self, problem: SearchProblem, worlds: int = WORLDS, seed: int = 0, gamma: float = 0.9999
+    ) -> None:
+        super().__init__(problem)
+        if worlds < 1:
+            raise InputError(f"worlds is {worlds}, want at least 1")
+        self.worlds, self.seed, self.gamma = worlds, seed, gamma
+        self._table = RoadTable.of(self.problem)
+        self._planners = {c: ReplanningAgent(self.problem, failure_s=c, gamma=gamma) for c in COSTS}
+        self._tuned: OrderedDict[tuple[int, bytes], Tuning] = OrderedDict()
+
+    def tuning(self, p_occupied: NDArray[np.floating], vertex: int) -> Tuning:
+        """The simulation for a forecast, (n_slots,), and an entry; kept for the next search like it."""
+        # To the percent: arrivals within minutes of each other have the same forecast.
+        rounded = np.round(np.asarray(p_occupied, dtype=np.float64), 2)
+        key = vertex, rounded.tobytes()
+        if key not in self._tuned:
+            self._tuned[key] = tune_failure_cost(
+                self.problem,
+                np.clip(rounded, 0.001, 0.999),
+                vertex,
+                worlds=self.worlds,
+                seed=self.seed,
+                table=self._table,
+            )
+            if len(self._tuned) > _KEPT:
+                self._tuned.popitem(last=False)
+        return self._tuned[key]
+
+    def begin(self, observation: Observation) -> TunedPlan:
+        """Choose the failure cost, and plan at it."""
+        best = self.tuning(observation["p_occupied"], int(observation["vertex"])).best
+        return TunedPlan(best, self._planners[best].begin(observation))
+
+    def decide(self, observation: Observation, memory: TunedPlan) -> int:
+        """As the thesis's planner at the chosen cost."""
+        return self._planners[memory.failure_s].decide(observation, memory.plan)

@@ -1,0 +1,41 @@
+"""Random small lots on which the optimum is known exactly."""
+
+from dataclasses import fields
+
+import numpy as np
+
+from parkenv import ParkingLot, SightingModel
+from parkenv.scenario import SearchProblem
+
+SHAPES = ((1, 12), (2, 6), (4, 3), (2, 5), (3, 4), (1, 9))
+PITCHES = (2.5, 6.0, 15.0)
+VIEWS = (0.0, 6.0)
+MEAN_FREE = (0.1, 0.3, 0.6)
+
+
+def small_lot(seed: int, shapes=SHAPES):
+    """Problem, forecast and entry: rows and aisles, any goal, any speeds; 324 seeds are three full rounds.
+
+    The slots' chances rise with the walk, are all the same, or follow a beta distribution.
+    """
+    rng = np.random.default_rng([7, seed])
+    plain = ParkingLot.grid(*shapes[seed % len(shapes)], pitch=PITCHES[seed // 6 % 3])
+    west, south, east, north = plain.bounds()
+    goal = [[rng.uniform(west - 10.0, east + 10.0), rng.uniform(south - 10.0, north + 10.0)]]
+    features = {f.name: getattr(plain, f.name) for f in fields(plain) if f.init}
+    problem = SearchProblem(
+        lot=ParkingLot(**{**features, "goals": np.array(goal)}),
+        v_drive=rng.uniform(1.5, 4.0),
+        v_walk=rng.uniform(0.8, 1.6),
+        give_up_s=300.0,
+        sighting=SightingModel(view_range=VIEWS[seed // 18 % 2]),
+    )
+    mean, walk, n = MEAN_FREE[seed // 36 % 3], problem.walk_s, problem.lot.n_slots
+    if seed % 3 == 0:
+        far = (walk - walk.min()) / (np.ptp(walk) + 1e-9)
+        free = 2.0 * mean * (0.15 + 0.85 * far) * rng.uniform(0.6, 1.4, n)
+    elif seed % 3 == 1:
+        free = np.full(n, mean)
+    else:
+        free = rng.beta(4.0 * mean, 4.0 * (1.0 - mean), n)
+    return problem, 1.0 - np.clip(free, 0.01, 0.99), int(problem.lot.entry_vertices[0])

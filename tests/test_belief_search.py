@@ -1,0 +1,249 @@
+"""The planner on the true model: against the exact optimum, in the environment, where things go wrong."""
+
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from small_lots import small_lot
+
+from parkenv import InputError, Lane, OccupancyProcess, ParkingLot, Scenario, SightingModel
+from parkenv.evaluation.compare import Case, at_occupancy
+from parkenv.evaluation.episodes import EpisodeRunner
+from parkenv.evaluation.statistics import mean_interval
+from planners import make_agent
+from planners.exact import ExactSolution
+from planners.expected_time import expected_time
+from planners.map_doubt import MapDoubt
+
+
+def gap(seed, **options):
+    """How much longer than the optimum it takes on a random small lot whose map is right, %."""
+    problem, p, entry = small_lot(seed)
+    best = ExactSolution(problem, p.astype(np.float32), entry).expected_s
+    agent = make_agent("belief", problem, **options)
+    return 100.0 * (expected_time(agent, problem, p, entry) / best - 1.0)
+
+
+def test_it_stays_near_the_optimum_on_small_lots():
+    """One of each kind of slot chances, pitch, view and shape, without two-aisle lots, whose trees are large."""
+    seeds = [s for s in range(0, 324, 5) if s % 6 in (3, 5) or s // 18 % 2 == 1]
+    gaps = np.array([gap(s, trusting=True) for s in seeds])
+    assert gaps.min() > -1e-3
+    assert gaps.mean() < 0.1
+    assert np.quantile(gaps, 0.95) < 0.5
+
+
+@pytest.mark.slow
+def test_the_gap_to_the_optimum_on_324_small_lots():
+    gaps = np.array([gap(seed, trusting=True) for seed in range(324)])
+    assert gaps.min() > -1e-3
+    assert gaps.mean() < 0.5
+    assert np.quantile(gaps, 0.95) < 2.0
+
+
+@pytest.mark.slow
+def test_doubting_a_map_that_is_right_costs_little():
+    gaps = np.array([gap(seed) for seed in range(0, 324, 3)])
+    assert gaps.mean() < 2.0
+
+
+def world(lot, taken, prior_logit=0.0, stay_s=1e9, **changes):
+    """Slots that are taken, or free, for good; the forecast says otherwise."""
+    occupancy = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), stay_s)
+    prior = OccupancyProcess.from_demand(np.full(lot.n_slots, prior_logit), np.zeros(168), stay_s)
+    return Scenario(name="fixed", lot=lot, occupancy=occupancy, prior=prior, **changes)
+
+
+def search(scenario, seed=0, **options):
+    return EpisodeRunner(scenario, "belief", make_agent("belief", scenario, **options)).run(seed).row
+
+
+# --- the environment ---------------------------------------------------------------------------------
+
+
+def test_equal_seeds_give_equal_searches():
+    scenario = Scenario.named("campus")
+    runner = EpisodeRunner(scenario, "belief", make_agent("belief", scenario))
+    assert runner.run(3).row == runner.run(3).row == search(scenario, 3)
+
+
+def decision_times(scenario, seed, **options):
+    """Processor time, s, of each decision: other work on the machine does not count."""
+    agent, env = make_agent("belief", scenario, **options), gym.make("parkenv/Search-v0", scenario=scenario)
+    observation, _ = env.reset(seed=seed)
+    memory, over, times = None, False, []
+    while not over:
+        start = time.process_time()
+        action, memory = agent.predict(observation, memory)
+        times.append(time.process_time() - start)
+        observation, _, over, _, _ = env.step(action)
+    return times
+
+
+def test_decisions_keep_to_their_budget():
+    scenario = at_occupancy(Scenario.named("campus"), 0.95)
+    search(scenario)
+    usual, quick = decision_times(scenario, 1), decision_times(scenario, 1, budget_ms=0.2)
+    assert np.median(usual) < 0.02
+    assert np.median(quick) < 0.5 * np.median(usual)
+
+
+def test_it_parks_at_once_in_an_empty_lot_that_is_known_to_be():
+    lot = ParkingLot.grid(2, 20)
+    empty = world(lot, np.zeros(lot.n_slots, dtype=bool), prior_logit=-5.0)
+    row = search(empty)
+    assert row["total_s"] == pytest.approx(row["bound_s"], abs=1.0)
+
+
+def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong():
+    """On jam the tuned planner trusts its map into every aisle; what the first slots show is enough to doubt it."""
+    scenario = Scenario.named("jam")
+    ours, theirs = (
+        np.array([r["total_s"] for r in Case(scenario, name).run(range(10))[0]])
+        for name in ("belief", "mdp-tuned")
+    )
+    _, _, high = mean_interval(ours - theirs)
+    assert high < -15.0
+
+
+def test_what_it_saw_tells_how_long_cars_stay():
+    """The rate is not observed; the way in which a sighting fades is."""
+    scenario = Scenario.named("street")
+    agent = make_agent("belief", scenario)
+    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    observation, _ = env.reset(seed=2)
+    memory = None
+    for _ in range(12):
+        action, memory = agent.predict(observation, memory)
+        observation, _, over, _, _ = env.step(action)
+        if over:
+            break
+    told = memory.leaving[np.isfinite(memory.leaving)]
+    assert len(told) > 0
+    # Cars stay half an hour on average.
+    np.testing.assert_allclose(told, 1.0 / 1800.0, rtol=0.02)
+
+
+# --- doubt -------------------------------------------------------------------------------------------
+
+
+def test_doubt_moves_with_what_is_seen_and_not_without():
+    rng = np.random.default_rng(0)
+    forecast, walk = rng.uniform(0.2, 0.9, 60), rng.uniform(10.0, 90.0, 60)
+    doubt = MapDoubt(forecast, walk)
+    np.testing.assert_allclose(doubt.p_occupied(), forecast)
+    near = np.argsort(walk)[:15]
+    doubt.look(near, np.ones(15, dtype=bool))
+    fuller = doubt.p_occupied()
+    assert (fuller > forecast).all()
+    # It learns more of slots as near as those that it saw.
+    moved = np.log(fuller / (1 - fuller)) - np.log(forecast / (1 - forecast))
+    assert moved[near].mean() > 1.5 * moved[np.argsort(walk)[-15:]].mean()
+
+
+def test_doubt_stays_small_where_the_map_is_right():
+    rng = np.random.default_rng(1)
+    forecast, walk = rng.uniform(0.1, 0.9, 200), rng.uniform(10.0, 90.0, 200)
+    off = []
+    for _ in range(20):
+        doubt = MapDoubt(forecast, walk)
+        seen = rng.permutation(200)[:60]
+        doubt.look(seen, rng.random(60) < forecast[seen])
+        off.append(np.abs(doubt.p_occupied() - forecast).mean())
+    assert np.mean(off) < 0.05
+
+
+# --- where things go wrong ---------------------------------------------------------------------------
+
+
+def test_nothing_free_anywhere_ends_in_proof():
+    lot = ParkingLot.grid(2, 8)
+    row = search(world(lot, np.ones(lot.n_slots, dtype=bool), give_up_s=400.0))
+    assert row["gave_up_s"] == 400.0
+    assert not row["truncated"]
+    assert row["failed_parks"] == 0
+    assert row["drive_s"] < 120.0
+
+
+def test_the_goal_may_be_the_entry():
+    lot = ParkingLot.grid(2, 10)
+    here = ParkingLot(**{**features(lot), "goals": lot.entries})
+    taken = np.arange(lot.n_slots) % 3 != 0
+    row = search(world(here, taken))
+    assert row["parked"]
+    assert row["total_s"] <= 2.0 * row["bound_s"] + 20.0
+
+
+@pytest.mark.parametrize("taken", [False, True])
+def test_one_slot(taken):
+    lot = ParkingLot.grid(1, 1)
+    row = search(world(lot, np.array([taken]), give_up_s=50.0))
+    assert row["parked"] != taken
+    assert row["gave_up_s"] == (50.0 if taken else 0.0)
+
+
+def features(lot):
+    from dataclasses import fields
+
+    return {f.name: getattr(lot, f.name) for f in fields(lot) if f.init}
+
+
+def cut_in_two():
+    """Two lots side by side; the entry leads into the western one alone."""
+    west = ParkingLot.grid(2, 5)
+    f = features(west)
+    shift = np.array([200.0, 0.0])
+    n = west.n_slots
+    return ParkingLot(
+        **{
+            **f,
+            "slot_ids": tuple(map(str, range(2 * n))),
+            "slot_xy": np.concatenate([west.slot_xy, west.slot_xy + shift]),
+            **{k: np.tile(f[k], 2) for k in ("slot_yaw", "slot_length", "slot_width", "slot_mouth")},
+            "lanes": (*west.lanes, *(Lane(lane.points + shift, lane.oneway) for lane in west.lanes)),
+            "goals": west.goals + shift,
+        }
+    )
+
+
+def test_a_lot_cut_in_two_is_searched_where_a_way_leads():
+    lot = cut_in_two()
+    half = lot.n_slots // 2
+    taken = np.arange(lot.n_slots) < half
+    taken[2] = False
+    row = search(world(lot, taken))
+    assert row["slot"] == "2"
+    # Nothing within reach is free, and the other half cannot be proven full: the step limit ends it.
+    taken[2] = True
+    row = search(world(lot, taken))
+    assert row["truncated"]
+    assert row["failed_parks"] == 0
+
+
+@pytest.mark.parametrize("prior_logit", [-6.0, 6.0])
+def test_a_prior_that_is_badly_wrong_does_not_keep_it_from_parking(prior_logit):
+    lot = ParkingLot.grid(4, 12)
+    taken = np.ones(lot.n_slots, dtype=bool)
+    taken[[7, 30]] = False
+    row = search(world(lot, taken, prior_logit=prior_logit))
+    assert row["parked"]
+    assert row["failed_parks"] == 0
+    assert row["drive_s"] < 400.0
+
+
+def test_looks_that_err_cost_tries_but_do_not_trap_it():
+    scenario = Scenario.named("campus", sighting=SightingModel(hit_rate=0.9, false_alarm_rate=0.1))
+    rows = [search(scenario, seed) for seed in range(4)]
+    assert all(row["parked"] for row in rows)
+    assert max(row["failed_parks"] for row in rows) <= 5
+
+
+def test_bad_options_and_endless_lots_are_refused():
+    with pytest.raises(InputError, match="budget_ms is 0"):
+        make_agent("belief", Scenario.named("mini"), budget_ms=0.0)
+    from planners import road_table
+
+    big = ParkingLot.city(road_table.MOST_VERTICES + 100)
+    with pytest.raises(InputError, match="want at most 4000"):
+        make_agent("belief", Scenario.on_lot(big))

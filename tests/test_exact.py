@@ -1,0 +1,200 @@
+"""The exact optimum: closed forms, brute force, nobody below it, limits."""
+
+import itertools
+from functools import cache
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from small_lots import small_lot
+
+from parkenv import InputError, Lane, Mouth, OccupancyProcess, ParkingLot, Scenario, SightingModel
+from parkenv.evaluation.episodes import EpisodeRunner
+from parkenv.scenario import SearchProblem
+from planners import make_agent
+from planners.exact import ExactSolution
+from planners.expected_time import expected_time
+
+BLIND = SightingModel(view_range=0.0)
+
+
+def one_way_line(n, goal_x, pitch=10.0):
+    """Slots along a one-way lane, from west to east; whoever has passed one cannot come back."""
+    xy = np.column_stack([np.arange(1, n + 1) * pitch, np.full(n, -3.0)])
+    return ParkingLot(
+        name="line",
+        slot_ids=tuple(map(str, range(n))),
+        slot_xy=xy,
+        slot_yaw=np.zeros(n),
+        slot_length=np.full(n, 5.0),
+        slot_width=np.full(n, 2.0),
+        slot_mouth=np.full(n, Mouth.LEFT, dtype=np.int8),
+        lanes=(Lane(np.array([[0.0, 0.0], [(n + 1) * pitch, 0.0]]), oneway=True),),
+        entries=np.array([[0.0, 0.0]]),
+        goals=np.array([[goal_x, 0.0]]),
+    )
+
+
+@pytest.mark.parametrize("p_free", [0.05, 0.2, 0.5, 0.9])
+@pytest.mark.parametrize("goal_x", [125.0, 60.0])
+def test_parking_along_a_line_is_the_threshold_policy(p_free, goal_x):
+    """The textbook case: without a way back V_k = p·min(walk_k, d + V_k+1) + (1 - p)·(d + V_k+1)."""
+    n, pitch = 12, 10.0
+    problem = SearchProblem(lot=one_way_line(n, goal_x), sighting=BLIND, give_up_s=200.0)
+    entry = int(problem.lot.entry_vertices[0])
+    hop = pitch / problem.v_drive
+    onward, takes = problem.give_up_s, []
+    for k in reversed(range(n)):
+        takes.append(problem.walk_s[k] <= onward)
+        here = p_free * min(problem.walk_s[k], onward) + (1.0 - p_free) * onward
+        onward = hop + here
+    takes.reverse()
+    solution = ExactSolution(problem, np.full(n, 1.0 - p_free), entry)
+    # The last look has no way on: it ends the search either way.
+    assert solution.expected_s == pytest.approx(onward)
+    # Far from the goal it drives on past free slots, then takes the first one.
+    assert takes == sorted(takes)
+    for k in range(n):
+        decision = solution.decide(seen=(1 << (k + 1)) - 1, vertex=k, free=1 << k)
+        if decision is not None:
+            assert (decision[1] == -1) == takes[k]
+
+
+def brute_force(problem, p, entry):
+    """The same optimum with nothing left out: single moves to where something new is seen, no reduction."""
+    lot, n = problem.lot, problem.lot.n_slots
+    starts, slots = problem.slots_in_view
+    view = [frozenset(slots[starts[v] : starts[v + 1]].tolist()) for v in range(lot.n_vertices)]
+
+    def reach(vertex, seen):
+        seconds, done = {vertex: 0.0}, set()
+        again = problem.wait_s if (lot.neighbors[vertex] < 0).any() else np.inf
+        while rest := {v: s for v, s in seconds.items() if v not in done}:
+            v = min(rest, key=rest.get)
+            done.add(v)
+            if view[v] - seen and v != vertex:
+                continue
+            for m in range(4):
+                u = int(lot.neighbors[v, m])
+                if u == vertex:
+                    again = min(again, seconds[v] + problem.move_s[v, m])
+                elif u >= 0:
+                    seconds[u] = min(seconds.get(u, np.inf), seconds[v] + problem.move_s[v, m])
+        if view[vertex] - seen:
+            seconds[vertex] = again
+        return seconds
+
+    @cache
+    def value(vertex, seen, free):
+        if len(seen) == n and not free:
+            return problem.give_up_s
+        seconds = reach(vertex, seen)
+        best = min((seconds[s] + problem.walk_s[s] for s in free if s in seconds), default=np.inf)
+        for v, drive in seconds.items():
+            new = sorted(view[v] - seen)
+            if not new:
+                continue
+            total = drive
+            for outcome in itertools.product((True, False), repeat=len(new)):
+                chance = np.prod(
+                    [1.0 - p[s] if is_free else p[s] for s, is_free in zip(new, outcome, strict=True)]
+                )
+                found = frozenset(s for s, is_free in zip(new, outcome, strict=True) if is_free)
+                total += chance * value(v, seen | frozenset(new), free | found)
+            best = min(best, total)
+        return best
+
+    return value(entry, frozenset(), frozenset())
+
+
+@pytest.mark.parametrize("seed", range(36))
+def test_the_reductions_lose_nothing(seed):
+    problem, p, entry = small_lot(seed, shapes=((2, 3), (1, 6), (3, 2)))
+    assert ExactSolution(problem, p, entry).expected_s == pytest.approx(
+        brute_force(problem, p, entry), rel=1e-9
+    )
+
+
+@pytest.mark.parametrize("seed", range(0, 108, 9))
+def test_the_agent_takes_as_long_as_it_says_and_nobody_takes_less(seed):
+    problem, p, entry = small_lot(seed, shapes=((2, 4), (1, 7), (4, 2)))
+    best = ExactSolution(problem, p.astype(np.float32), entry).expected_s
+    assert expected_time(make_agent("exact", problem), problem, p, entry) == pytest.approx(best, rel=1e-6)
+    for name in ("mdp", "mdp-tuned", "belief", "greedy-goal", "greedy-drive", "first-free"):
+        assert expected_time(make_agent(name, problem), problem, p, entry) >= best * (1.0 - 1e-6), name
+
+
+def test_the_mean_of_searches_in_the_environment_is_the_expectation():
+    """The environment plays by the rules that the dynamic program assumes."""
+    lot = ParkingLot.packaged("mini")
+    # An hour of equilibrium at 60 %, in which nothing moves while a car searches.
+    lasting = OccupancyProcess.from_demand(np.full(lot.n_slots, np.log(1.5)), np.zeros(168), 1e7)
+    scenario = Scenario(name="lasting", lot=lot, occupancy=lasting, give_up_s=300.0)
+    entry = int(lot.entry_vertices[0])
+    runner = EpisodeRunner(scenario, "exact", make_agent("exact", scenario))
+    totals = np.array([runner.run(seed).row["total_s"] for seed in range(600)])
+    expected = ExactSolution(scenario, np.full(lot.n_slots, 0.6), entry).expected_s
+    assert abs(totals.mean() - expected) < 4.0 * totals.std() / np.sqrt(len(totals))
+
+
+def test_the_agent_copes_with_cars_that_come_and_go():
+    scenario = Scenario.named("mini")
+    busy = scenario.replace(occupancy=scenario.occupancy.at_mean_occupancy(0.9, 10 * 3600.0))
+    runner = EpisodeRunner(busy, "exact", make_agent("exact", busy))
+    rows = [runner.run(seed).row for seed in range(40)]
+    assert all(row["parked"] or row["gave_up_s"] > 0.0 for row in rows)
+    assert not any(row["truncated"] for row in rows)
+
+
+def test_a_certain_lot_is_a_shortest_way():
+    problem, p, entry = small_lot(3)
+    certain = np.ones(len(p))
+    certain[4] = 0.0
+    from planners.routes import DriveRoutes
+
+    way = DriveRoutes(problem).seconds_from(entry)[4] + problem.walk_s[4]
+    assert ExactSolution(problem, certain, entry).expected_s == pytest.approx(way)
+    assert expected_time(make_agent("exact", problem), problem, certain, entry) == pytest.approx(way)
+
+
+def test_what_is_too_large_or_uncertain_is_refused_with_the_limit():
+    with pytest.raises(InputError, match="at most 25 slots"):
+        make_agent("exact", Scenario.named("campus"))
+    with pytest.raises(InputError, match="seen without error"):
+        make_agent("exact", Scenario.named("mini", sighting=SightingModel(hit_rate=0.9)))
+    problem, p, entry = small_lot(2)
+    with pytest.raises(InputError, match="over 500 belief states, the limit"):
+        ExactSolution(problem, p, entry, most_states=500)
+    with pytest.raises(InputError, match="want 12 probabilities"):
+        ExactSolution(problem, p[:3], entry)
+    with pytest.raises(InputError, match="seen without error"):
+        expected_time(
+            make_agent("belief", problem), problem.replace(sighting=SightingModel(hit_rate=0.9)), p, entry
+        )
+
+
+def test_it_goes_on_from_what_it_knows():
+    """Knowing where a free slot is can only help; knowing that a slot is taken is worth what it spares."""
+    problem, p, entry = small_lot(1)
+    n = len(p)
+    blind = ExactSolution(problem, p, entry).expected_s
+    slot = int(problem.walk_s.argmin())
+    seen = np.arange(n) == slot
+    with_free = ExactSolution(problem, p, entry, seen, seen).expected_s
+    with_taken = ExactSolution(problem, p, entry, seen, np.zeros(n, dtype=bool)).expected_s
+    assert with_free < blind < with_taken
+    assert with_taken * p[slot] + with_free * (1.0 - p[slot]) <= blind
+
+
+def test_the_agent_runs_from_any_entry_of_the_environment():
+    scenario = Scenario.named("mini")
+    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    agent = make_agent("exact", scenario)
+    observation, _ = env.reset(seed=1)
+    memory, over = None, False
+    while not over:
+        action, memory = agent.predict(observation, memory)
+        observation, _, terminated, truncated, info = env.step(action)
+        over = terminated or truncated
+    assert terminated
+    assert info["failed_parks"] == 0

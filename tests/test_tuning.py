@@ -1,0 +1,75 @@
+"""Tuning the thesis's planner by simulation on the forecast alone."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from small_lots import small_lot
+
+from parkenv import InputError, OccupancyProcess, Scenario
+from parkenv.evaluation.episodes import EpisodeRunner
+from planners import make_agent
+from planners.expected_time import expected_time
+from planners.tuning import tune_failure_cost
+
+COSTS = (1.0, 4.0, 16.0, 64.0)
+
+
+@pytest.mark.parametrize("seed", [3, 5, 21, 39, 59, 75])
+def test_the_simulation_agrees_with_the_planner_itself(seed):
+    """Its mean over worlds is the planner's exact expectation, up to the luck of the draw."""
+    problem, p, entry = small_lot(seed)
+    found = tune_failure_cost(problem, p, entry, costs=COSTS, worlds=4000, seed=1)
+    exact = [expected_time(make_agent("mdp", problem, failure_s=c), problem, p, entry) for c in COSTS]
+    np.testing.assert_allclose(found.mean_s, exact, rtol=0.05)
+    assert exact[COSTS.index(found.best)] <= min(exact) * 1.03
+
+
+def test_the_same_seed_gives_the_same_choice_and_another_one_other_worlds():
+    problem, p, entry = small_lot(2)
+    one, two, other = (tune_failure_cost(problem, p, entry, seed=s) for s in (0, 0, 1))
+    np.testing.assert_array_equal(one.mean_s, two.mean_s)
+    assert (one.mean_s != other.mean_s).any()
+
+
+def test_it_sees_the_forecast_and_not_the_world():
+    """Two worlds that could not differ more, one map: the choice is the same."""
+    scenario = Scenario.named("jam")
+    full = OccupancyProcess.from_demand(np.full(scenario.lot.n_slots, 9.0), np.zeros(168))
+    chosen = []
+    for s in (scenario, scenario.replace(occupancy=full, prior=scenario.prior)):
+        observation, _ = gym.make("parkenv/Search-v0", scenario=s).reset(seed=4)
+        agent = make_agent("mdp-tuned", s)
+        chosen.append(agent.begin(observation).failure_s)
+    assert chosen[0] == chosen[1]
+
+
+def test_it_is_the_planner_of_the_thesis_at_the_chosen_cost():
+    scenario = Scenario.named("campus")
+    tuned = EpisodeRunner(scenario, "mdp-tuned", make_agent("mdp-tuned", scenario))
+    for seed in range(3):
+        row = tuned.run(seed).row
+        observation, _ = tuned.env.reset(seed=seed)
+        cost = tuned.agent.begin(observation).failure_s
+        plain = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario, failure_s=cost)).run(seed).row
+        assert row == plain
+
+
+def test_a_forecast_is_simulated_once():
+    scenario = Scenario.named("mini")
+    agent = make_agent("mdp-tuned", scenario)
+    entry = int(scenario.lot.entry_vertices[0])
+    p = np.full(scenario.lot.n_slots, 0.7)
+    assert agent.tuning(p, entry) is agent.tuning(p + 0.001, entry)
+    assert agent.tuning(p, entry) is not agent.tuning(p + 0.02, entry)
+
+
+def test_what_cannot_be_simulated_is_refused():
+    problem, p, entry = small_lot(0)
+    with pytest.raises(InputError, match="worlds is 0"):
+        tune_failure_cost(problem, p, entry, worlds=0)
+    with pytest.raises(InputError, match="worlds is 0"):
+        make_agent("mdp-tuned", problem, worlds=0)
+    with pytest.raises(InputError, match="above 0"):
+        tune_failure_cost(problem, p, entry, costs=(0.0, 1.0))
+    with pytest.raises(InputError, match="want 12 probabilities"):
+        tune_failure_cost(problem, p[:4], entry)
