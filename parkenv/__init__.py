@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 from gymnasium.envs.registration import register, registry
 
 if TYPE_CHECKING:
-    from parkenv.belief import SightBand, SightingModel
     from parkenv.errors import InputError
     from parkenv.lot import Lane, Mouth, ParkingLot
     from parkenv.occupancy import ArrivalWindow, OccupancyProcess
     from parkenv.occupancy_log import OccupancyLog
     from parkenv.recorded_occupancy import RecordedOccupancy
     from parkenv.scenario import Scenario, SearchProblem
+    from parkenv.sighting import SightBand, SightingModel
     from parkenv.traffic import Traffic
 
 __version__ = "0.1.0"
@@ -33,8 +33,8 @@ _EXPORTS = {
     "RecordedOccupancy": "parkenv.recorded_occupancy",
     "Scenario": "parkenv.scenario",
     "SearchProblem": "parkenv.scenario",
-    "SightBand": "parkenv.belief",
-    "SightingModel": "parkenv.belief",
+    "SightBand": "parkenv.sighting",
+    "SightingModel": "parkenv.sighting",
     "Traffic": "parkenv.traffic",
 }
 

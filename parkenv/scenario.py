@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from parkenv.belief import SightingModel, SightRates
 from parkenv.errors import InputError
 from parkenv.lot import ParkingLot
 from parkenv.occupancy import Arrival, ArrivalWindow, Forecast, OccupancyModel, OccupancyProcess, PriorModel
+from parkenv.sighting import SightingModel, SightRates
 from parkenv.traffic import Traffic
 
 FloatArray = NDArray[np.float64]
@@ -88,10 +88,11 @@ class SearchProblem:
         return _read_only(starts.astype(np.int64)), _read_only(slot[order].astype(np.int64))
 
     @cached_property
-    def sight_rates(self) -> SightRates:
-        """How well each of `slots_in_view` is seen, row by row of it.
+    def sight_lines(self) -> tuple[FloatArray, NDArray[np.bool_]]:
+        """How far away each of `slots_in_view` is, m, and whether it is beside the car, row by row of it.
 
-        A slot is beside a car that stands before it or another slot if it lies to the right, within 45° of abreast.
+        Distances are between vertices, as the view range is. A slot is beside a car that stands before it or another
+        slot if it lies to the right, within 45° of abreast.
         """
         starts, slots = self.slots_in_view
         viewer = np.repeat(np.arange(self.lot.n_vertices), np.diff(starts))
@@ -99,8 +100,12 @@ class SearchProblem:
         to_slot = self.lot.slot_xy[slots] - self.lot.vertex_xy[viewer]
         angle = np.arctan2(to_slot[:, 1], to_slot[:, 0]) - self.lot.vertex_yaw[viewer]
         beside = (np.sin(angle) <= -math.sqrt(0.5)) & (viewer < self.lot.n_slots)
-        rates = self.sighting.rates(np.hypot(away[:, 0], away[:, 1]), beside)
-        return SightRates(*map(_read_only, rates))
+        return _read_only(np.hypot(away[:, 0], away[:, 1])), _read_only(beside)
+
+    @cached_property
+    def sight_rates(self) -> SightRates:
+        """How well each of `slots_in_view` is seen, row by row of it."""
+        return SightRates(*map(_read_only, self.sighting.rates(*self.sight_lines)))
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed, checked again.

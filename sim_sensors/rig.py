@@ -33,6 +33,10 @@ class Sensed(Drawable, Protocol):
         """Footprints and walls at knee height."""
 
 
+RIG_NAMES = ("laser", "stereo", "both_sides")
+"""Rigs that `SensorRig.named` knows."""
+
+
 @dataclass(frozen=True)
 class Mount:
     """Where a sensor sits: vehicle frame, x forward, y left, z up from the ground, origin below its middle.
@@ -117,6 +121,17 @@ class SensorRig:
         for name in names:
             if names.count(name) > 1:
                 raise SensorError(f"sensor name {name!r} stands twice, want different ones")
+
+    @classmethod
+    def named(cls, name: str) -> SensorRig:
+        """One of `RIG_NAMES`: `laser` is the thesis's, `stereo` and `both_sides` are as their methods say.
+
+        Raises:
+            SensorError: another name.
+        """
+        if name not in RIG_NAMES:
+            raise SensorError(f"rig is {name!r}, want one of {', '.join(RIG_NAMES)}")
+        return {"laser": cls.thesis, "stereo": cls.stereo, "both_sides": cls.both_sides}[name]()
 
     @classmethod
     def thesis(cls) -> SensorRig:

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 MAY_SEE_PLANNERS = ("parkenv/evaluation/", "parkenv/cli/")
-PLANNERS_MAY_SEE = {"parkenv.lot", "parkenv.belief", "parkenv.scenario", "parkenv.errors"}
+PLANNERS_MAY_SEE = {"parkenv.lot", "parkenv.belief", "parkenv.scenario", "parkenv.sighting", "parkenv.errors"}
 
 
 def imports(path):

@@ -3,12 +3,12 @@
 import math
 from dataclasses import replace
 
-import cv2
 import numba
 import numpy as np
 import pytest
 from toy_scene import ToyScene, box_mesh, parked_cars, random_boxes, toy_scene
 
+from parkenv.perception.sweeps import disparity
 from sim_sensors.camera import PinholeCamera, StereoCamera, camera_pose
 from sim_sensors.errors import SensorError
 from sim_sensors.ground_truth import View, vehicle_boxes
@@ -156,28 +156,24 @@ def test_a_stereo_pair_agrees_with_its_depth():
     scene = random_boxes(3, count=60)
     stereo = StereoCamera()
     pair = stereo.render_stereo(scene, camera_pose(0.0, 0.0, 1.4, 0.9, -0.04), Weather.draw("sunny", 2), 1)
-    left, right = (cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY) for frame in (pair.left, pair.right))
-    matcher = cv2.StereoSGBM.create(0, 64, 5, 200, 800, 1, 0, 8, 80, 2, cv2.StereoSGBM_MODE_SGBM_3WAY)
-    disparity = matcher.compute(left, right).astype(np.float32) / 16.0
-    ground = (pair.left.ids == 0) & (pair.left.depth < 7.0) & (disparity > 0)
+    shifts = disparity(pair, stereo)
+    ground = (pair.left.ids == 0) & (pair.left.depth < 7.0) & (shifts > 0)
     assert ground.sum() > 5000
-    depth = stereo.camera.fx * stereo.baseline / disparity[ground]
+    depth = stereo.camera.fx * stereo.baseline / shifts[ground]
     assert np.median(np.abs(depth - pair.left.depth[ground])) < 0.15
 
 
 def test_stereo_measures_bodies_and_misses_windows():
     # T §3.3: through the windows a stereo camera sees what is behind, and the car seems farther than it is.
     scene, stereo = parked_cars(), StereoCamera(PinholeCamera.from_field_of_view())
-    matcher = cv2.StereoSGBM.create(0, 64, 5, 200, 800, 1, 0, 8, 80, 2, cv2.StereoSGBM_MODE_SGBM_3WAY)
     near, far, windows = [], [], []
     for i in range(4):
         pose = camera_pose(-20.0 + 9.0 * i, 0.3, 1.35, -math.pi / 2, -0.04)
         pair = stereo.render_stereo(scene, pose, Weather.draw("sunny", i), i)
-        left, right = (cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY) for frame in (pair.left, pair.right))
-        disparity = matcher.compute(left, right).astype(np.float32) / 16.0
-        depth = stereo.camera.fx * stereo.baseline / np.maximum(disparity, 1e-3)
+        shifts = disparity(pair, stereo)
+        depth = stereo.camera.fx * stereo.baseline / shifts
         truth, pane = pair.left.depth, pair.left.glass_depth
-        matched = (disparity > 0) & (pair.left.ids > 0)
+        matched = (shifts > 0) & (pair.left.ids > 0)
         body = matched & np.isinf(pane)
         near.append(np.abs(depth - truth)[body & (truth > 5.0) & (truth < 7.0)])
         far.append(np.abs(depth - truth)[body & (truth > 7.0) & (truth < 10.0)])

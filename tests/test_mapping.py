@@ -120,7 +120,7 @@ def test_a_slot_that_nobody_saw_stays_unknown(mini):
 def test_a_detection_goes_to_its_slot_and_one_elsewhere_to_none(mini):
     slots = SlotFilter(mini)
     xy = np.array([mini.slot_xy[3] + [0.3, -0.4], mini.slot_xy[3] + [0.0, 50.0]])
-    cars = CarSightings(xy, np.zeros(2), np.ones((2, 2)), np.ones(2), np.ones(2, np.float32))
+    cars = CarSightings(xy, np.zeros(2), np.ones((2, 2)), np.ones(2), np.ones(2, np.float32), np.arange(2))
     assert slots.see_cars(cars).tolist() == [3, -1]
     states = slots.states()
     assert states.occupied.tolist() == [i == 3 for i in range(mini.n_slots)]

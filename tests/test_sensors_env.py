@@ -134,7 +134,7 @@ def test_frames_show_the_camera_beside_the_lot():
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"rig": "lidar"}, "rig is 'lidar', want a SensorRig or one of thesis, stereo, both_sides"),
+        ({"rig": "lidar"}, "rig is 'lidar', want a SensorRig or one of laser, stereo, both_sides"),
         ({"rig": 3}, "rig is a int"),
         ({"weather": "snow"}, "weather is 'snow'"),
         ({"captures": 0}, "captures is 0, want a whole number of at least 1"),

@@ -7,7 +7,7 @@ import warnings
 
 import typer
 
-from parkenv.cli import bench, compare, demo, detect, lot, occupancy, plan, sensors, survey
+from parkenv.cli import bench, compare, demo, detect, lot, occupancy, plan, sensors, sight, survey
 from parkenv.errors import InputError
 from sim_sensors.errors import SensorError
 
@@ -28,6 +28,7 @@ app.add_typer(sensors.app, name="sensors")
 app.command("demo")(demo.demo)
 app.command("survey")(survey.survey)
 app.command("map")(survey.show_map)
+app.command("fit-sight")(sight.fit_sight)
 app.command("detect")(detect.detect)
 app.command("train-detector")(detect.train_detector)
 app.command("evaluate-detector")(detect.evaluate_detector)

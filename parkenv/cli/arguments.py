@@ -15,6 +15,7 @@ from parkenv.errors import InputError
 from parkenv.lot import ParkingLot
 from parkenv.occupancy import ArrivalWindow, OccupancyModel, OccupancyProcess
 from parkenv.scenario import Scenario
+from parkenv.sighting import SIGHT_NAMES, SightingModel
 
 WORLD = "The world"
 COSTS = "Costs and speeds"
@@ -67,6 +68,27 @@ DaysOption = Annotated[
 ViewRangeOption = Annotated[
     float | None,
     typer.Option("--view-range", help="How far slots are seen from the car, m.", rich_help_panel=WORLD),
+]
+SightOption = Annotated[
+    str | None,
+    typer.Option(
+        "--sight",
+        metavar="perfect|laser|stereo|FILE",
+        help="How slots are seen: without error within --view-range; as the detection and mapping stack was "
+        "measured to see with a rig; or as a file of `parkenv fit-sight` says.  [default: perfect; with --sensors "
+        "as measured of the rig]",
+        rich_help_panel=WORLD,
+    ),
+]
+SensorsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--sensors",
+        metavar="laser|stereo|both_sides",
+        help="Look through this rig's simulated sensors, detector and all, where the sighting model would stand for "
+        "them: about a second a step.",
+        rich_help_panel=WORLD,
+    ),
 ]
 FailureCostOption = Annotated[
     str,
@@ -176,6 +198,32 @@ def occupancy_of(path: Path, lot: ParkingLot, mapping: Path | None) -> Occupancy
     return RecordedOccupancy(log, lot.walk_m(), placed)
 
 
+def sighting_of(word: str) -> SightingModel:
+    """The sighting model that a word or a file stands for.
+
+    Raises:
+        InputError: neither a known word nor a file.
+    """
+    if word == "perfect":
+        return SightingModel()
+    if word in SIGHT_NAMES:
+        return SightingModel.named(word)
+    if not Path(word).exists():
+        raise InputError(
+            f"--sight is {word!r}, want perfect, {', '.join(SIGHT_NAMES)}, or a file that is there"
+        )
+    return SightingModel.from_file(word)
+
+
+def rig_of(word: str | None) -> str | None:
+    """A rig's name, checked."""
+    from sim_sensors.rig import RIG_NAMES
+
+    if word is not None and word not in RIG_NAMES:
+        raise InputError(f"--sensors is {word!r}, want one of {', '.join(RIG_NAMES)}")
+    return word
+
+
 def scenarios_of(
     scenario: str | None,
     lot: Path | None,
@@ -185,6 +233,7 @@ def scenarios_of(
     arrival: str,
     days: str,
     view_range: float | None,
+    sight: str = "perfect",
 ) -> list[Scenario]:
     """What the options of the world describe: packaged scenarios, or one on a lot file."""
     if lot is None:
@@ -210,8 +259,8 @@ def scenarios_of(
             f"--arrival {arrival} --days {days}: {error}; a window lies within one day"
         ) from error
     changes: dict[str, Any] = {"arrival": window}
-    if view_range is not None:
-        changes["sighting"] = dataclasses.replace(made[0].sighting, view_range=view_range)
+    seeing = sighting_of(sight)
+    changes["sighting"] = seeing if view_range is None else dataclasses.replace(seeing, view_range=view_range)
     return [s.replace(**changes) for s in made]
 
 

@@ -47,6 +47,8 @@ def compare(
     arrival: args.ArrivalOption = "08:00-13:00",
     days: args.DaysOption = "weekdays",
     view_range: args.ViewRangeOption = None,
+    sight: args.SightOption = None,
+    sensors: args.SensorsOption = None,
     agents: Annotated[
         str,
         typer.Option(
@@ -105,20 +107,22 @@ def compare(
     walk = args.speeds("--v-walk-kmh", v_walk_kmh)
     drive = args.speeds("--v-drive-kmh", v_drive_kmh)
     levels = [] if occupancy_levels == "none" else _levels(occupancy_levels)
-    scenarios = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range)
+    rig = args.rig_of(sensors)
+    sight = sight or ("perfect" if rig is None else "stereo" if rig == "stereo" else "laser")
+    scenarios = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range, sight)
     for name in names:
         make_agent(name, scenarios[0])
 
     seeds = range(seed, seed + episodes)
     cases = [
-        (Case(setting, name), seeds)
+        (Case(setting, name, rig=rig), seeds)
         for s in scenarios
         for setting in settings_of(s, failure, walk, drive)
         for name in names
     ]
     fewer = seeds[: max(1, episodes // 3)]
     sweep = [
-        (Case(setting, name, level), fewer)
+        (Case(setting, name, level, rig), fewer)
         for s in scenarios
         if isinstance(s.occupancy, OccupancyProcess)
         for level in levels
@@ -135,6 +139,8 @@ def compare(
         "arrival": arrival,
         "days": days,
         "view_range": view_range,
+        "sight": repr(scenarios[0].sighting),
+        "sensors": rig,
     }
     out = out or Path("results/compare")
     for s in scenarios:

@@ -56,6 +56,7 @@ def demo(
     from parkenv.mapping.survey import SurveySettings
     from parkenv.occupancy import Arrival, ArrivalWindow
     from parkenv.scenario import Scenario
+    from parkenv.sighting import SightingModel
     from parkenv.traffic import Traffic
 
     its = Scenario.named(scenario, traffic=Traffic(cars=3, pedestrians=5))
@@ -88,10 +89,10 @@ def demo(
             save_session(its.lot, run.shown, out / "session.png")
         progress.advance(bar)
 
-        known = its.replace(prior=MapPrior(log))
+        known = its.replace(prior=MapPrior(log), sighting=SightingModel.named("laser"))
         # Worlds of the searches are others than those of the survey: their seeds lie far from its own.
         seeds = range(seed + 1_000_000, seed + 1_000_000 + searches)
-        cases = [(Case(known, name, env_id="parkenv/SearchPerception-v0"), seeds) for name in AGENTS]
+        cases = [(Case(known, name, rig="laser"), seeds) for name in AGENTS]
         bar = progress.add_task("3/3 searching through the sensors", total=len(AGENTS) * searches)
         run_cases(cases, folder, jobs=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n))
     rows = table(cases, folder)

@@ -63,8 +63,16 @@ def survey(
     * `parkenv survey --scenario street --rig stereo --weather rain --hours 12:00-13:00`
     """
     from parkenv.evaluation.results import make_folder, write_summary
-    from parkenv.evaluation.survey_pictures import save_detections, save_map, save_session
+    from parkenv.evaluation.survey_pictures import (
+        save_detection_reach,
+        save_detections,
+        save_found_slots,
+        save_graph,
+        save_map,
+        save_session,
+    )
     from parkenv.evaluation.surveys import run_survey, summarize
+    from parkenv.mapping.discovery import discover, score_discovery
     from parkenv.mapping.inference import predict
     from parkenv.mapping.odometry import PoseNoise
     from parkenv.mapping.store import MapStore
@@ -97,16 +105,22 @@ def survey(
         progress.update(task, completed=sessions)
     row = summarize(its, settings, run, out / MAP_FILE)
     with MapStore(out / MAP_FILE, its.lot, create=False) as store:
-        log = store.log()
+        log, poses = store.log(), store.cars()
     first = settings.windows[0]
     time = 86_400.0 * first.weekdays[0] + 0.5 * (first.start_s + first.end_s)
+    predicted = predict(log, time)
     save_map(
-        its.lot, predict(log, time), its.occupancy.forecast(Arrival(time)).p_occupied,
+        its.lot, predicted, its.occupancy.forecast(Arrival(time)).p_occupied,
         f"{its.name} after {row['sessions']} sessions", out / f"map_{its.name}.png",
     )  # fmt: skip
+    title = f"{its.name}, rig {rig}, {row['sessions']} sessions"
+    save_detection_reach(row["detection_by_distance"], title, out / f"reach_{its.name}.png")
     if run.shown is not None:
         save_detections(run.shown, out / f"detections_{its.name}.png")
         save_session(its.lot, run.shown, out / f"session_{its.name}.png")
+        save_graph(its.lot, predicted, run.shown, out / f"graph_{its.name}.png")
+    found = discover(poses)
+    save_found_slots(its.lot, found, score_discovery(found, its.lot), out / f"slots_found_{its.name}.png")
     table = make_table(None, ["figure", "value"])
     for name in (
         "car_detection_rate",
@@ -122,6 +136,11 @@ def survey(
         "occupancy_mae", f"{row['occupancy_mae']:.3f} (counts alone: {row['occupancy_mae_expected']:.3f})"
     )
     table.add_row("seconds_per_frame", f"{row['seconds_per_frame']:.4f}")
+    console.print(table)
+    table = make_table(None, ["weather", "sessions", "cars found", "slots right"])
+    for name, its_row in row["by_weather"].items():
+        rates = (f"{its_row[c]:.1%}" for c in ("car_detection_rate", "slot_accuracy"))
+        table.add_row(name, str(its_row["sessions"]), *rates)
     console.print(table)
     summary = {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "rows": [row]}
     write_summary(out, summary)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from parkenv.errors import InputError
 from parkenv.lot_scene import LotScenes, slot_lot
 from parkenv.scenario import Scenario
-from sim_sensors.rig import Capture, SensorRig
+from sim_sensors.rig import RIG_NAMES, Capture, SensorRig
 from sim_sensors.weather import PRESETS, Weather
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-RIGS = {"thesis": SensorRig.thesis, "stereo": SensorRig.stereo, "both_sides": SensorRig.both_sides}
 _SEEDS = 1 << 31
 
 
@@ -38,7 +37,7 @@ class Lookout:
 
     Args:
         scenario: the world, with its traffic.
-        rig: thesis, stereo, both_sides, or any rig.
+        rig: laser, stereo, both_sides, or any rig.
         weather: one of `sim_sensors.weather.PRESETS`; None draws one for each world.
         captures: how many there are at most on an edge.
         every: m; captures on an edge are at least so far apart, but for the one where it ends.
@@ -51,11 +50,13 @@ class Lookout:
         self, scenario: Scenario, rig: str | SensorRig, weather: str | None, captures: int, every: float
     ) -> None:
         if isinstance(rig, str):
-            if rig not in RIGS:
-                raise InputError(f"rig is {rig!r}, want a SensorRig or one of {', '.join(RIGS)}")
-            rig = RIGS[rig]()
+            if rig not in RIG_NAMES:
+                raise InputError(f"rig is {rig!r}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
+            rig = SensorRig.named(rig)
         elif not isinstance(rig, SensorRig):
-            raise InputError(f"rig is a {type(rig).__name__}, want a SensorRig or one of {', '.join(RIGS)}")
+            raise InputError(
+                f"rig is a {type(rig).__name__}, want a SensorRig or one of {', '.join(RIG_NAMES)}"
+            )
         if weather is not None and weather not in PRESETS:
             raise InputError(f"weather is {weather!r}, want None or one of {', '.join(PRESETS)}")
         if isinstance(captures, bool) or not isinstance(captures, (int, np.integer)) or captures < 1:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +14,20 @@ from parkenv.mapping.slots import SlotFilter
 from parkenv.perception.detector import Detector
 from parkenv.perception.stack import PerceptionStack
 from parkenv.scenario import Scenario
+from parkenv.sighting import SightingModel
 from sim_sensors.rig import SensorRig
 
-TRUST = 0.98
-"""P(a state that the stack reports is right): looks that follow one another err alike, however sure each is."""
+
+class Report(NamedTuple):
+    """What the stack said of the slots after a step.
+
+    Attributes:
+        slots: (k,) int64, those of which it could tell, ascending.
+        looks_taken: (k,) bool.
+    """
+
+    slots: NDArray[np.int64]
+    looks_taken: NDArray[np.bool_]
 
 
 class SearchPerceptionEnv(SearchEnv):
@@ -45,8 +55,11 @@ class SearchPerceptionEnv(SearchEnv):
     As in `parkenv/Search-v0`; *proven full* is what the stack takes for full.
 
     ## Arguments
-    - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v0`; its `sighting` is not used.
-    - `rig`: thesis, stereo, both_sides, or a `sim_sensors.rig.SensorRig` that can see and range.
+    - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v0`. Its `sighting` is what the
+      car takes its eyes to be worth, and how far away slots may be of which it takes note; where that is perfect,
+      what was measured of the rig (`SightingModel.named`).
+    - `rig`: laser (the thesis's: a camera and a 270° laser), stereo, both_sides, or a `sim_sensors.rig.SensorRig`
+      that can see and range.
     - `weather`: sunny, overcast, low_sun, dusk or rain; None draws one.
     - `captures`: how many there are at most on an edge.
     - `every`: m; on short edges captures are at least so far apart.
@@ -71,7 +84,7 @@ class SearchPerceptionEnv(SearchEnv):
         self,
         scenario: str | Scenario = "campus",
         render_mode: str | None = None,
-        rig: str | SensorRig = "thesis",
+        rig: str | SensorRig = "laser",
         weather: str | None = None,
         captures: int = 2,
         every: float = 1.25,
@@ -81,19 +94,31 @@ class SearchPerceptionEnv(SearchEnv):
         super().__init__(scenario, render_mode, **changes)
         self._lookout = Lookout(self.scenario, rig, weather, captures, every)
         self._stack = PerceptionStack(self._lookout.rig, detector)
+        if self.scenario.sighting.perfect:
+            measured = SightingModel.named("laser" if self.rig.lasers else "stereo")
+            self.scenario = self.scenario.replace(sighting=measured)
+            self._view_starts, self._view_slots = self.scenario.slots_in_view
+            self._rates = self.scenario.sight_rates
         self._before: tuple[int, float] | None = None
         self._moments: list[Moment] = []
+        self._report = Report(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.bool_))
 
     @property
     def rig(self) -> SensorRig:
         """The sensors, where they sit, and how they are built."""
         return self._lookout.rig
 
+    @property
+    def report(self) -> Report:
+        """What the stack said of the slots after the last step."""
+        return self._report
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start a search; see the class."""
         self._before, self._moments = None, []
+        self._report = Report(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.bool_))
         return super().reset(seed=seed, options=options)
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -115,9 +140,11 @@ class SearchPerceptionEnv(SearchEnv):
             for view in look.views:
                 slots.see_cars(view.cars)
         states = slots.states()
-        seen = np.flatnonzero(states.in_view & (states.p_occupied != 0.5))
-        trust = np.full(len(seen), TRUST)
-        state.belief.update(seen, states.occupied[seen], trust, 1.0 - trust)
+        rows = slice(self._view_starts[state.vertex], self._view_starts[state.vertex + 1])
+        near, rates = self._view_slots[rows], self._rates.of(rows)
+        told = states.in_view[near] & (states.p_occupied[near] != 0.5)
+        self._report = Report(near[told], states.occupied[near[told]])
+        state.belief.update(*self._report, rates.hit[told], rates.false_alarm[told])
 
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
         """The lot from above, and beside it the newest pictures."""

@@ -11,12 +11,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.belief import SightRates, SlotBelief
+from parkenv.belief import SlotBelief
 from parkenv.errors import InputError
 from parkenv.keyed_random import ENTRY_STREAM, SIGHTING_STREAM, VIEW_STREAM, keyed_uniform, world_key
 from parkenv.lot import ACTIONS, PARK
 from parkenv.occupancy import Arrival, World
 from parkenv.scenario import Scenario
+from parkenv.sighting import SightRates
 
 if TYPE_CHECKING:
     from parkenv.envs.rendering import SearchRenderer

@@ -62,7 +62,7 @@ class SearchSensorsEnv(SearchEnv):
     ## Arguments
     - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v0`. `traffic=Traffic(cars=4,
       pedestrians=6)` lets others drive and walk through the pictures.
-    - `rig`: thesis, stereo, both_sides, or a `sim_sensors.rig.SensorRig`.
+    - `rig`: laser (the thesis's: a camera and a 270° laser), stereo, both_sides, or a `sim_sensors.rig.SensorRig`.
     - `weather`: sunny, overcast, low_sun, dusk or rain; None draws one.
     - `captures`: how many there are at most on an edge.
     - `every`: m; on short edges captures are at least so far apart.
@@ -85,7 +85,7 @@ class SearchSensorsEnv(SearchEnv):
         self,
         scenario: str | Scenario = "campus",
         render_mode: str | None = None,
-        rig: str | SensorRig = "thesis",
+        rig: str | SensorRig = "laser",
         weather: str | None = None,
         captures: int = 4,
         every: float = 1.0,

@@ -33,13 +33,13 @@ class Case:
         scenario: with the setting's costs and speeds.
         agent: the agent's name.
         occupancy_level: the mean occupancy that the world was set to; None where it was left as it is.
-        env_id: the environment: how the car sees.
+        rig: whose sensors the car sees through; None where the scenario's sighting model stands for them.
     """
 
     scenario: Scenario
     agent: str
     occupancy_level: float | None = None
-    env_id: str = "parkenv/Search-v0"
+    rig: str | None = None
 
     @property
     def columns(self) -> Row:
@@ -80,7 +80,7 @@ class Case:
         return self._runner().run(seed).trace
 
     def _runner(self) -> EpisodeRunner:
-        return EpisodeRunner(self.scenario, self.agent, make_agent(self.agent, self.scenario), self.env_id)
+        return EpisodeRunner(self.scenario, self.agent, make_agent(self.agent, self.scenario), self.rig)
 
 
 def settings_of(

@@ -61,16 +61,20 @@ class EpisodeRunner:
         scenario: the scenario, with the costs and speeds of the setting.
         name: the agent's name, for the trace.
         agent: the agent.
-        env_id: `parkenv/Search-v0`, or `parkenv/SearchPerception-v0` to look through the sensors.
+        rig: of `parkenv/SearchPerception-v0`, to look through its sensors; None for `parkenv/Search-v0`.
     """
 
     def __init__(
-        self, scenario: Scenario, name: str, agent: SearchAgent[Any], env_id: str = "parkenv/Search-v0"
+        self, scenario: Scenario, name: str, agent: SearchAgent[Any], rig: str | None = None
     ) -> None:
         self.scenario = scenario
         self.name = name
         self.agent = agent
-        self.env = gym.make(env_id, scenario=scenario)
+        self.env = (
+            gym.make("parkenv/Search-v0", scenario=scenario)
+            if rig is None
+            else gym.make("parkenv/SearchPerception-v0", scenario=scenario, rig=rig)
+        )
         self._routes = DriveRoutes(scenario)
 
     def run(self, seed: int) -> Episode:

@@ -7,13 +7,16 @@ from pathlib import Path
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
+from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, PathPatch, Polygon, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.typing import ColorType
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from parkenv.envs.rendering import BELIEF_ANCHORS
 from parkenv.errors import InputError
 from parkenv.lot import ParkingLot, is_building, mouth_heading
 from parkenv.lot_generators import ONE_WAY_HALF_WIDTH, TWO_WAY_HALF_WIDTH
@@ -31,6 +34,10 @@ ENTRY = "#1d8a4e"
 GOAL = "#ffc53a"
 GRAPH = "#ffd98a"
 INK = "#333333"
+BELIEF_MAP = LinearSegmentedColormap.from_list("belief", [[c / 255 for c in rgb] for rgb in BELIEF_ANCHORS])
+"""From free to taken."""
+SMALLEST_DISC = 6.0
+"""Points."""
 
 
 def draw_lot(
@@ -59,10 +66,8 @@ def draw_lot(
     ax.set_facecolor(GROUND)
     ax.spines[:].set_visible(False)
     # Paint has a width on the ground, within what the eye can make out.
-    box = ax.get_window_extent()
-    across, down = np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())
-    points_per_m = float(min(box.width / across, box.height / down)) / ax.figure.dpi * 72
-    paint_width = float(np.clip(0.12 * points_per_m, 0.2, 1.2))
+    scale = points_per_m(ax)
+    paint_width = float(np.clip(0.12 * scale, 0.2, 1.2))
 
     ax.add_patch(_patch(_asphalt(lot), facecolor=ASPHALT, edgecolor="none", zorder=0.5))
     _draw_lane_marks(lot, ax, paint_width)
@@ -79,9 +84,46 @@ def draw_lot(
         else:
             ax.plot(*wall.T, color=WALL, linewidth=1.6, solid_capstyle="butt", zorder=0.8)
     if show_graph:
-        _draw_graph(lot, ax, points_per_m)
-    _draw_entries_and_goals(lot, ax, points_per_m)
+        _draw_graph(lot, ax, scale)
+    _draw_entries_and_goals(lot, ax, scale)
     _draw_scale_bar(ax, x0, y0 - 0.5 * margin - bar_room, x1 - x0)
+
+
+def draw_discs(lot: ParkingLot, ax: Axes, outer: FloatArray, inner: FloatArray) -> None:
+    """Draw two discs at each slot, as T Fig. 4.7: an outer one for a prediction, an inner one for what is there.
+
+    Args:
+        lot: drawn in `ax` already.
+        ax: where to draw.
+        outer: (n_slots,) probabilities that the slot is taken; their colours are those of `BELIEF_MAP`.
+        inner: (n_slots, 3 or 4) RGB(A) in 0..1.
+    """
+    scale = points_per_m(ax)
+    # As wide as the slot, or larger where that would be too small to see and neighbours leave room.
+    nearest = np.asarray(cKDTree(lot.slot_xy).query(lot.slot_xy, k=2)[0])[:, 1]
+    size = np.minimum(lot.slot_width, lot.slot_length)
+    size = np.maximum(size, np.minimum(nearest, SMALLEST_DISC / scale))
+    for share, colors, edge in ((0.92, BELIEF_MAP(outer), "none"), (0.52, inner, "#181b1f")):
+        discs = EllipseCollection(
+            share * size,
+            share * size,
+            np.zeros(lot.n_slots),
+            units="xy",
+            offsets=lot.slot_xy,
+            offset_transform=ax.transData,
+            facecolors=colors,
+            edgecolors=edge,
+            linewidths=float(np.clip(0.12 * scale, 0.2, 0.7)),
+            zorder=1.5,
+        )
+        ax.add_collection(discs)
+
+
+def points_per_m(ax: Axes) -> float:
+    """How large a metre of the lot is in axes with an equal aspect, points."""
+    box = ax.get_window_extent()
+    across, down = np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())
+    return float(min(box.width / across, box.height / down)) / ax.figure.dpi * 72
 
 
 def save_lot_picture(lot: ParkingLot, path: str | Path, *, show_graph: bool = False) -> None:

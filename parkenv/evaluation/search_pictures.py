@@ -10,28 +10,22 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import EllipseCollection, PolyCollection
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import Normal, Stroke
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from parkenv.envs.rendering import BELIEF_ANCHORS
 from parkenv.errors import InputError
 from parkenv.evaluation.episodes import SearchTrace
-from parkenv.evaluation.lot_picture import draw_lot
+from parkenv.evaluation.lot_picture import BELIEF_MAP, draw_discs, draw_lot, points_per_m
 from parkenv.evaluation.picture_files import INK, STYLE, TIME_COLORS, save_picture
 from parkenv.lot import PARK
 from parkenv.scenario import KMH
 
 FloatArray = NDArray[np.float64]
 
-BELIEF_MAP = LinearSegmentedColormap.from_list("belief", [[c / 255 for c in rgb] for rgb in BELIEF_ANCHORS])
 PATH, WALK = "#ffd000", "#1852ba"
-SMALLEST_DISC = 6.0
-"""Points."""
 POLICY_SCALE = 2.2
 """Points a metre from which arrows at every vertex can be told apart."""
 
@@ -49,26 +43,8 @@ def draw_search(trace: SearchTrace, ax: Axes) -> None:
     """
     lot = trace.scenario.lot
     draw_lot(lot, ax)
-    scale = _points_per_m(ax)
-    # As wide as the slot, or larger where that would be too small to see and neighbours leave room.
-    nearest = np.asarray(cKDTree(lot.slot_xy).query(lot.slot_xy, k=2)[0])[:, 1]
-    size = np.minimum(lot.slot_width, lot.slot_length)
-    size = np.maximum(size, np.minimum(nearest, SMALLEST_DISC / scale))
-    for share, values in ((0.92, trace.forecast), (0.52, trace.occupied.astype(np.float64))):
-        diameter = share * size
-        discs = EllipseCollection(
-            diameter,
-            diameter,
-            np.zeros(lot.n_slots),
-            units="xy",
-            offsets=lot.slot_xy,
-            offset_transform=ax.transData,
-            facecolors=BELIEF_MAP(values),
-            edgecolors=INK if share < 0.6 else "none",
-            linewidths=float(np.clip(0.12 * scale, 0.2, 0.7)),
-            zorder=1.5,
-        )
-        ax.add_collection(discs)
+    scale = points_per_m(ax)
+    draw_discs(lot, ax, trace.forecast, BELIEF_MAP(trace.occupied.astype(np.float64)))
     if _shows_policy(trace, scale):
         _draw_policy(trace, ax, scale)
     _draw_path(trace, ax, scale)
@@ -232,7 +208,7 @@ def save_searches(traces: Sequence[SearchTrace], path: str | Path) -> None:
             bottom = total[1] - (line + 1) * (height + title)
             box = left / total[0], bottom / total[1], width / total[0], height / total[1]
             draw_search(trace, figure.add_axes(box))
-        policy = any(_shows_policy(t, _points_per_m(ax)) for t, ax in zip(traces, figure.axes, strict=True))
+        policy = any(_shows_policy(t, points_per_m(ax)) for t, ax in zip(traces, figure.axes, strict=True))
         _draw_key(figure, key, zoom, policy=policy)
         save_picture(figure, path)
 
@@ -278,8 +254,3 @@ def _draw_key(figure: Figure, height: float, zoom: float, *, policy: bool) -> No
         handlelength=1.8,
         columnspacing=1.1,
     )
-
-
-def _points_per_m(ax: Axes) -> float:
-    low, high = ax.get_xlim()
-    return float(ax.get_window_extent().width / ax.get_figure(root=True).dpi * 72 / (high - low))  # type: ignore[union-attr]

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from parkenv.evaluation.lot_picture import draw_lot
+from parkenv.evaluation.lot_picture import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.evaluation.picture_files import STYLE, save_picture
 from parkenv.lot import ParkingLot
+from parkenv.mapping.discovery import DiscoveryScore, FoundSlots
 from parkenv.mapping.inference import Prediction
 from parkenv.mapping.survey import SessionResult
 from parkenv.perception.detector import Detections
@@ -25,6 +29,13 @@ FloatArray = NDArray[np.float64]
 SIDE_COLOR, END_COLOR = (255, 208, 0), (86, 180, 233)
 TAKEN, FREE, UNKNOWN = "#d1495b", "#2a9d8f", "#9aa0a6"
 WRONG = "#ffd000"
+WEATHER_COLORS = {
+    "sunny": "#e69f00",
+    "overcast": "#7f7f7f",
+    "low_sun": "#d55e00",
+    "dusk": "#332288",
+    "rain": "#0072b2",
+}
 
 
 def draw_detections(image: NDArray[np.uint8], found: Detections) -> NDArray[np.uint8]:
@@ -78,6 +89,70 @@ def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
         axes[1].set_title(f"{len(cars)} sightings of cars, each with the direction fitted to its beams")
         _draw_states(lot, result, axes[2])
         figure.tight_layout()
+        save_picture(figure, path)
+
+
+def save_graph(lot: ParkingLot, predicted: Prediction, result: SessionResult, path: Path) -> None:
+    """The lot's graph with what the map predicts of each slot and what one session saw of it (T Fig. 4.7)."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(11.0, _height(lot, 11.0, 1) + 0.5), layout="constrained")
+        ax = figure.subplots()
+        draw_lot(lot, ax, show_graph=True)
+        states = result.states
+        seen = BELIEF_MAP(states.occupied.astype(np.float64))
+        seen[~states.in_view] = (*to_rgb(UNKNOWN), 1.0)
+        draw_discs(lot, ax, predicted.p_occupied, seen)
+        ax.set_title(
+            f"{lot.name}: the graph; outside what the map predicts, inside what one session saw "
+            f"({result.session.weather.replace('_', ' ')})"
+        )
+        scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(0, 1), BELIEF_MAP)
+        figure.colorbar(scale, ax=ax, fraction=0.02, label="P(taken)")
+        save_picture(figure, path)
+
+
+def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, path: Path) -> None:
+    """Slots that the cars of all sessions have shown, over the true ones that nobody told."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(11.0, _height(lot, 11.0, 1)), layout="constrained")
+        ax = figure.subplots()
+        draw_lot(lot, ax)
+        ahead = np.stack([np.cos(found.yaw), np.sin(found.yaw)], axis=1)
+        ends = found.xy[:, None] + 2.0 * np.array([-1.0, 1.0])[None, :, None] * ahead[:, None]
+        ax.add_collection(LineCollection(list(ends), colors=WRONG, linewidths=1.6, zorder=3))
+        ax.plot(*found.xy.T, linestyle="none", marker="o", markersize=3.0, color=WRONG, zorder=3.1)
+        off = f", {score.error:.2f} m off in the mean" if score.recall else ""
+        ax.set_title(
+            f"{lot.name}: {len(found.xy)} slots found without a map; {score.precision:.0%} of them are true, "
+            f"{score.recall:.0%} of {lot.n_slots} found{off}"
+        )
+        save_picture(figure, path)
+
+
+def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
+    """In which weather and from which distance cars are missed: rows of `surveys.detection_by_distance`."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.0, 3.8), layout="constrained")
+        ax = figure.subplots()
+        for i, weather in enumerate(dict.fromkeys(row["weather"] for row in rows)):
+            its = [row for row in rows if row["weather"] == weather]
+            color = WEATHER_COLORS.get(weather, UNKNOWN)
+            # Side by side, or the bars of the intervals hide each other.
+            x = np.array([np.mean(row["distance_m"]) for row in its]) + 0.09 * (i - 2)
+            rate = np.array([row["rate"] for row in its])
+            low, high = np.array([row["rate_ci95"] for row in its]).T
+            ax.plot(
+                x, rate, color=color, marker="o", markersize=4, linewidth=1.6, label=weather.replace("_", " ")
+            )
+            ax.vlines(x, low, high, color=color, linewidth=1.2, alpha=0.7)
+        ax.set(
+            xlabel="distance from the camera to the car's middle, m",
+            ylabel="detected in a frame in which it stands clear",
+            ylim=(0.0, 1.03),
+        )
+        ax.grid(axis="y")
+        ax.legend(loc="lower left", ncols=2)
+        ax.set_title(title)
         save_picture(figure, path)
 
 

@@ -17,6 +17,7 @@ from parkenv.errors import InputError
 from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
+from parkenv.mapping.survey_score import DISTANCE_ENDS, WAYS
 from parkenv.occupancy import Arrival
 from parkenv.scenario import Scenario
 from parkenv.whole_files import written_whole
@@ -24,9 +25,12 @@ from parkenv.whole_files import written_whole
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
 
+ERROR_COLUMNS = ("range_error_m", "range_error_p95_m", "place_error_m", "heading_error_deg")
 SESSION_COLUMNS = (
-    "key", "weather", "time_s", "parked", "found", "detections", "right", "range_error_m", "range_error_p95_m",
+    "key", "weather", "time_s", "parked", "found", "detections", "right",
+    *ERROR_COLUMNS, *(f"thesis_{name}" for name in ERROR_COLUMNS),
     "slot_accuracy", "slot_accuracy_seen", "unknown_fraction", "occupied_fraction", "seconds_per_frame",
+    "cars_in_frame", "cars_detected",
 )  # fmt: skip
 
 
@@ -45,21 +49,30 @@ class SurveyRun:
 
 def session_row(result: SessionResult) -> Row:
     """What `sessions.csv` says of a session."""
-    error = result.range_error
+    score = result.score
     return dict(
         zip(
             SESSION_COLUMNS,
             (
                 result.session.key, result.session.weather, result.arrival.time, result.parked, result.found,
-                result.detections, result.right,
-                float(np.median(error)) if len(error) else float("nan"),
-                float(np.quantile(error, 0.95)) if len(error) else float("nan"),
+                score.detections, score.right,
+                *(value for way in WAYS for value in _error_columns(score.errors(way))),
                 result.slot_accuracy, result.slot_accuracy_seen, float(1.0 - result.states.in_view.mean()),
                 float(result.truth.mean()), float(np.median(result.frame_s)),
+                *(" ".join(map(str, counts.tolist())) for counts in score.in_frame.T),
             ),
             strict=True,
         )
     )  # fmt: skip
+
+
+def _error_columns(errors: FloatArray) -> tuple[float, ...]:
+    """`ERROR_COLUMNS`: medians but for the second."""
+    if not len(errors):
+        return (float("nan"),) * len(ERROR_COLUMNS)
+    middle = np.median(errors, axis=0)
+    far = float(np.quantile(errors[:, 0], 0.95))
+    return float(middle[0]), far, float(middle[1]), float(np.degrees(middle[2]))
 
 
 def run_survey(
@@ -127,13 +140,61 @@ def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_
             "median": _mean(run.rows, "range_error_m"),
             "p95": _mean(run.rows, "range_error_p95_m"),
         },
+        "car_pose": {
+            name: {c: _mean(run.rows, prefix + c) for c in ERROR_COLUMNS}
+            for name, prefix in (("fitted", ""), ("thesis", "thesis_"))
+        },
         "slot_accuracy": _mean(run.rows, "slot_accuracy"),
         "slot_accuracy_seen": _mean(run.rows, "slot_accuracy_seen"),
         "unknown_fraction": _mean(run.rows, "unknown_fraction"),
+        "by_weather": {
+            weather: {
+                "sessions": len(its),
+                "car_detection_rate": sum(r["found"] for r in its) / max(sum(r["parked"] for r in its), 1),
+                "slot_accuracy": _mean(its, "slot_accuracy"),
+            }
+            for weather in sorted({r["weather"] for r in run.rows})
+            for its in [[r for r in run.rows if r["weather"] == weather]]
+        },
+        "detection_by_distance": detection_by_distance(run.rows),
         "occupancy_mae": error,
         "occupancy_mae_expected": expected,
         "seconds_per_frame": _mean(run.rows, "seconds_per_frame"),
     }
+
+
+def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
+    """How often a parked car that stands clear in a frame is detected there, by weather and distance.
+
+    Args:
+        rows: of sessions.
+
+    Returns:
+        Rows with weather, distance_m (both ends of the bin), in_frame, detected, rate and its 95 % interval
+        (Wilson's), for every bin that holds a car.
+    """
+    from scipy.stats import binomtest
+
+    counts: dict[str, NDArray[np.int64]] = {}
+    for row in rows:
+        found = np.array([[int(n) for n in str(row[c]).split()] for c in ("cars_in_frame", "cars_detected")])
+        counts[row["weather"]] = counts.get(row["weather"], 0) + found
+    result = []
+    for weather, (there, detected) in sorted(counts.items()):
+        for i, end in enumerate(DISTANCE_ENDS):
+            if there[i]:
+                test = binomtest(int(detected[i]), int(there[i])).proportion_ci(method="wilson")
+                result.append(
+                    {
+                        "weather": weather,
+                        "distance_m": [0.0 if i == 0 else DISTANCE_ENDS[i - 1], end],
+                        "in_frame": int(there[i]),
+                        "detected": int(detected[i]),
+                        "rate": float(detected[i] / there[i]),
+                        "rate_ci95": [float(test.low), float(test.high)],
+                    }
+                )
+    return result
 
 
 def map_error(scenario: Scenario, times: Sequence[float], log: SessionLog) -> tuple[float, float]:
@@ -197,9 +258,8 @@ def _read_rows(path: Path) -> list[Row]:
         if tuple(raw) != SESSION_COLUMNS:
             raise InputError(f"{path}: not written by this version of parkenv; use another folder")
         whole = ("parked", "found", "detections", "right")
-        rows.append(
-            {k: v if k in ("key", "weather") else int(v) if k in whole else float(v) for k, v in raw.items()}
-        )
+        words = ("key", "weather", "cars_in_frame", "cars_detected")
+        rows.append({k: v if k in words else int(v) if k in whole else float(v) for k, v in raw.items()})
     return rows
 
 

@@ -158,6 +158,12 @@ class MapStore:
         known = np.isfinite(p)
         return SessionLog(np.array([s.time for s in sessions]), np.where(known, p, 0.0) > 0.5, known)
 
+    def cars(self) -> FloatArray:
+        """(n, 3) x, y in m and yaw in rad of every car seen in any session."""
+        with self._said_plainly(), self._transaction():
+            rows = self._db.execute("SELECT x, y, yaw FROM car ORDER BY session, rowid").fetchall()
+        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+
     def _insert(self, session: Session, seen: list[int]) -> None:
         head = (session.key, session.time, session.rig, session.weather)
         number = self._db.execute(

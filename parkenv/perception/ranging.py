@@ -47,6 +47,7 @@ class CarSightings:
         size: (n, 2) float64, m, length and width.
         distance: (n,) float64, m, from the sensor to what it met of the car.
         probability: (n,) float32, of the detection.
+        detection: (n,) int64, which detection each is of; some are of none that stands anywhere.
 
     Raises:
         InputError: columns of different lengths, or a place that is not finite.
@@ -57,10 +58,13 @@ class CarSightings:
     size: FloatArray
     distance: FloatArray
     probability: Float32Array
+    detection: NDArray[np.int64]
 
     def __post_init__(self) -> None:
         n = len(self.yaw)
-        shapes = {"xy": (n, 2), "yaw": (n,), "size": (n, 2), "distance": (n,), "probability": (n,)}
+        shapes = {"xy": (n, 2), "size": (n, 2)} | dict.fromkeys(
+            ("yaw", "distance", "probability", "detection"), (n,)
+        )
         for name, want in shapes.items():
             value = getattr(self, name)
             if value.shape != want or not np.isfinite(value).all():
@@ -73,8 +77,9 @@ class CarSightings:
     def none(cls) -> CarSightings:
         """No car."""
         return cls(
-            np.empty((0, 2)), np.empty(0), np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.float32)
-        )
+            np.empty((0, 2)), np.empty(0), np.empty((0, 2)), np.empty(0), np.empty(0, dtype=np.float32),
+            np.empty(0, dtype=np.int64),
+        )  # fmt: skip
 
     @property
     def poses(self) -> FloatArray:
@@ -147,8 +152,8 @@ def car_beams(
     if last - first + 1 < _LEAST_BEAMS:
         return CarBeams(met[:0], (False, False))
     cut = (
-        goes_on[0] and (first == 0 or _nearer(sweep, met[first - 1], met[first])),
-        goes_on[1] and (last == len(met) - 1 or _nearer(sweep, met[last + 1], met[last])),
+        goes_on[0] and _hidden(sweep.distance[: met[first] + 1][::-1]),
+        goes_on[1] and _hidden(sweep.distance[met[last] :]),
     )
     return CarBeams(met[first : last + 1], cut)
 
@@ -220,6 +225,7 @@ def locate(
         np.array([[c.length, c.width] for c in cars]),
         np.array(distances),
         detections.probability[rows],
+        np.array(rows, dtype=np.int64),
     )
 
 
@@ -273,6 +279,7 @@ def _straight_behind(
         np.tile([CAR_LENGTH, CAR_WIDTH], (len(rows), 1)),
         distance,
         detections.probability[rows],
+        rows.astype(np.int64),
     )
 
 
@@ -283,8 +290,18 @@ def _require_same_axis(sweep: Sweep, mount: Mount, vehicle: FloatArray) -> None:
         raise InputError(f"camera and sweep are {apart:.2f} m apart, want both on one vertical axis (T §4.1)")
 
 
-def _nearer(sweep: Sweep, beam: np.int64, than: np.int64) -> bool:
-    return bool(sweep.distance[beam] < sweep.distance[than])
+def _hidden(distance: FloatArray) -> bool:
+    """Whether a car may go on behind what the beams after its last one meet, or where there is no beam.
+
+    Args:
+        distance: (k,) m, of its last beam and of those after it, outwards.
+    """
+    # The next beam may have dropped out; the one after it tells, too.
+    after = distance[1:3]
+    if not len(after) or np.isnan(after).any():
+        return True
+    met = after[np.isfinite(after)]
+    return bool(len(met) and met[0] < distance[0])
 
 
 def _turned(angle: FloatArray) -> FloatArray:

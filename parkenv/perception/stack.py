@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.perception.detector import Detections, Detector
-from parkenv.perception.ranging import CarSightings, locate
+from parkenv.perception.ranging import CarSightings, locate, locate_by_disparity, locate_plainly
 from parkenv.perception.sweeps import Sweep, disparity, laser_sweep, stereo_sweep
 from sim_sensors.camera import PinholeCamera
 from sim_sensors.rig import Capture, Mount, SensorRig
@@ -29,6 +29,8 @@ class View:
         camera, mount: how it is built, and where it sits.
         image: (h, w, 3) uint8.
         detections: in the image.
+        sweep: what the detections were ranged with.
+        disparity: (h, w) float32, px, of a stereo camera; None of others.
         cars: the detections that stand somewhere.
     """
 
@@ -37,6 +39,8 @@ class View:
     mount: Mount
     image: NDArray[np.uint8]
     detections: Detections
+    sweep: Sweep
+    disparity: NDArray[np.float32] | None
     cars: CarSightings
 
 
@@ -91,14 +95,27 @@ class PerceptionStack:
         views, sweeps = [], list(lasers.values())
         for name, camera, mount in self.rig.cameras:
             image = capture.images[name].image
-            views.append(self._view(name, camera, mount, image, next(iter(sweeps)), here))
+            views.append(self._view(name, camera, mount, image, None, next(iter(sweeps)), here))
         for name, stereo, mount in self.rig.stereo_cameras:
             pair = capture.pairs[name]
-            seen = stereo_sweep(stereo, mount, here, disparity(pair, stereo))
+            shifts = disparity(pair, stereo)
+            seen = stereo_sweep(stereo, mount, here, shifts)
             sweeps.append(seen)
             ranged = next(iter(lasers.values()), seen)
-            views.append(self._view(name, stereo.camera, mount, pair.left.image, ranged, here))
+            views.append(self._view(name, stereo.camera, mount, pair.left.image, shifts, ranged, here))
         return Look(here, tuple(views), tuple(sweeps))
+
+    def locate_plainly(self, view: View, vehicle: FloatArray) -> CarSightings:
+        """Where the thesis's way puts the cars of a view: the median in each box, and the car straight behind it.
+
+        Args:
+            view: of this stack.
+            vehicle: (3,) where the car took itself to be.
+        """
+        if view.disparity is not None and not self.rig.lasers:
+            (stereo,) = (camera for name, camera, _ in self.rig.stereo_cameras if name == view.name)
+            return locate_by_disparity(view.detections, view.disparity, stereo, view.mount, vehicle)
+        return locate_plainly(view.detections, view.sweep, view.camera, view.mount, vehicle)
 
     def _view(
         self,
@@ -106,8 +123,10 @@ class PerceptionStack:
         camera: PinholeCamera,
         mount: Mount,
         image: NDArray[np.uint8],
+        shifts: NDArray[np.float32] | None,
         sweep: Sweep,
         vehicle: FloatArray,
     ) -> View:
         found = self.detector.detect(image)
-        return View(name, camera, mount, image, found, locate(found, sweep, camera, mount, vehicle))
+        cars = locate(found, sweep, camera, mount, vehicle)
+        return View(name, camera, mount, image, found, sweep, shifts, cars)

@@ -1,0 +1,318 @@
+"""Ranging: the beams of a box, distances, a car's pose from its sides, and depths from a stereo pair."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from laser_drive import CAMERA, EYE, LASER, MOUNT, look, turned_off
+
+from parkenv import InputError, ParkingLot
+from parkenv.lot_scene import slot_lot
+from parkenv.mapping.route import survey_route
+from parkenv.perception.box_fit import fit_box
+from parkenv.perception.detector import Detections
+from parkenv.perception.ranging import (
+    CarSightings,
+    beams_between,
+    bearings,
+    body_depth,
+    car_beams,
+    locate,
+    locate_by_disparity,
+    locate_plainly,
+    median_depth,
+    median_distance,
+)
+from parkenv.perception.sweeps import Sweep, disparity, laser_sweep, stereo_sweep
+from sim_sensors.footprints import ScanPlane
+from sim_sensors.ground_truth import View, vehicle_boxes
+from sim_sensors.rig import Mount, SensorRig, poses_along
+
+ORIGIN = np.zeros(3)
+
+
+def rectangle(x, y, yaw, length, width):
+    ahead, left = np.array([math.cos(yaw), math.sin(yaw)]), np.array([-math.sin(yaw), math.cos(yaw)])
+    corners = [(1, 1), (-1, 1), (-1, -1), (1, -1)]
+    return [[x, y] + 0.5 * (a * length * ahead + b * width * left) for a, b in corners]
+
+
+def swept(*cars, pose=(0.0, 0.0, 0.0), rng=None):
+    """What the laser sees of cars, each x, y, yaw, length, width."""
+    plane = ScanPlane(np.array([rectangle(*car) for car in cars]))
+    return laser_sweep(LASER, MOUNT, np.array(pose), LASER.scan(plane, pose, rng))
+
+
+def boxes_of(*boxes, ends=True):
+    table = np.array(boxes, dtype=np.float32).reshape(-1, 4)
+    sure = np.ones(len(table), dtype=np.float32)
+    return Detections(table, sure, sure, np.full(len(table), ends), table)
+
+
+# Which beams (eq. 3.2)
+
+
+def test_the_middle_of_the_image_is_the_beam_to_the_right():
+    """Camera along -π/2 of the laser, first beam at -3π/4, steps of a quarter degree: beam 180 looks straight."""
+    sweep = swept((0.0, -5.0, 0.0, 4.0, 2.0))
+    box = np.array([[CAMERA.cx - 4.0, 0.0, CAMERA.cx + 4.0, 9.0]], dtype=np.float32)
+    left, right = bearings(CAMERA, EYE, ORIGIN, box)[0]
+    assert left > -math.pi / 2 > right
+    beams = beams_between(sweep, left, right)
+    assert beams.tolist() == list(range(178, 183))
+
+
+@given(yaw=st.floats(-10, 10), u=st.floats(0, 639), v=st.floats(0, 639))
+def test_beams_of_a_box_are_those_that_the_camera_sees_in_it(yaw, u, v):
+    pose = np.array([3.0, -2.0, yaw])
+    sweep = laser_sweep(LASER, MOUNT, pose, np.full(LASER.n_beams, 5.0, np.float32))
+    left, right = min(u, v), max(u, v)
+    margins = bearings(CAMERA, EYE, pose, np.array([[left, 0.0, right, 9.0]]))[0]
+    beams = beams_between(sweep, *margins)
+    column = CAMERA.cx - CAMERA.fx * np.tan(LASER.angles - EYE.yaw)
+    ahead = np.abs(LASER.angles - EYE.yaw) < math.pi / 2
+    inside = ahead & (column > left + 1e-6) & (column < right - 1e-6)
+    at_margin = ahead & ((np.abs(column - left) < 1e-5) | (np.abs(column - right) < 1e-5))
+    assert set(np.flatnonzero(inside)) <= set(beams) <= set(np.flatnonzero(inside | at_margin))
+
+
+# Which of them end on the car
+
+
+def test_beams_that_pass_the_car_do_not_count():
+    """The box is too wide by a half on either side: the median is the wall's, the run the car's."""
+    sweep = swept((0.0, -4.0, 0.0, 1.8, 2.0), (0.0, -11.0, 0.0, 60.0, 2.0))
+    beams = beams_between(sweep, -math.pi / 2 + 0.7, -math.pi / 2 - 0.7)
+    assert median_distance(sweep, beams) > 10.0
+    run = car_beams(sweep, beams)
+    assert np.median(sweep.distance[run.beams]) == pytest.approx(3.0, abs=0.1)
+    assert run.cut == (False, False)
+
+
+def test_a_neighbour_at_the_margin_does_not_count():
+    """Something stands a metre nearer, before the car's left edge, and fills a third of the box."""
+    sweep = swept((0.0, -8.0, 0.0, 1.8, 4.0), (1.6, -4.0, 0.0, 2.0, 2.0))
+    left, right = math.atan2(-6.0, 1.6), math.atan2(-6.0, -1.0)
+    run = car_beams(sweep, beams_between(sweep, left, right))
+    assert np.median(sweep.distance[run.beams]) == pytest.approx(6.03, abs=0.03)
+    assert run.cut == (False, True), "the van hides where the car ends"
+
+
+def test_a_run_goes_on_where_the_image_ends():
+    sweep = swept((0.0, -3.6, 0.0, 4.4, 1.8))
+    left, right = -math.pi / 2 + 0.2, -math.pi / 2 - 0.2
+    inside = beams_between(sweep, left, right)
+    short, whole = car_beams(sweep, inside), car_beams(sweep, inside, (True, True))
+    assert set(short.beams) <= set(inside)
+    ends = sweep.points(whole.beams[[0, -1]])[:, 0]
+    assert ends == pytest.approx([-2.2, 2.2], abs=0.05)
+
+
+def test_what_no_beam_meets_has_no_distance():
+    sweep = laser_sweep(LASER, MOUNT, ORIGIN, np.full(LASER.n_beams, np.inf, np.float32))
+    beams = beams_between(sweep, -1.0, -2.0)
+    assert len(beams)
+    assert math.isnan(median_distance(sweep, beams))
+    assert not len(car_beams(sweep, beams).beams)
+    box = boxes_of([300, 200, 340, 300])
+    assert len(locate(box, sweep, CAMERA, EYE, ORIGIN)) == 0
+    assert len(locate_plainly(box, sweep, CAMERA, EYE, ORIGIN)) == 0
+
+
+def test_no_detection_is_no_car():
+    sweep = swept((0.0, -5.0, 0.0, 4.0, 2.0))
+    for way in (locate, locate_plainly):
+        assert len(way(boxes_of(), sweep, CAMERA, EYE, ORIGIN)) == 0
+
+
+def test_sensors_must_stand_on_one_axis():
+    sweep = swept((0.0, -5.0, 0.0, 4.0, 2.0))
+    for way in (locate, locate_plainly):
+        with pytest.raises(InputError, match=r"camera and sweep are 2\.00 m apart"):
+            way(boxes_of([300, 200, 340, 300]), sweep, CAMERA, Mount(x=2.0, z=1.3, yaw=EYE.yaw), ORIGIN)
+
+
+def test_sightings_are_checked():
+    good = CarSightings(
+        np.zeros((1, 2)), np.zeros(1), np.ones((1, 2)), np.ones(1), np.ones(1, np.float32), np.zeros(1, int)
+    )
+    assert good.poses.tolist() == [[0.0, 0.0, 0.0]]
+    with pytest.raises(InputError, match=r"xy of car sightings is \(2, 2\), want \(1, 2\)"):
+        CarSightings(
+            np.zeros((2, 2)),
+            np.zeros(1),
+            np.ones((1, 2)),
+            np.ones(1),
+            np.ones(1, np.float32),
+            np.zeros(1, int),
+        )
+    with pytest.raises(InputError, match="yaw of car sightings"):
+        CarSightings(
+            np.zeros((1, 2)),
+            np.full(1, np.nan),
+            np.ones((1, 2)),
+            np.ones(1),
+            np.ones(1, np.float32),
+            np.zeros(1, int),
+        )
+
+
+# A car's pose from its sides
+
+
+@given(
+    bearing=st.floats(-1.7, -0.6),
+    away=st.floats(4.0, 9.0),
+    yaw=st.floats(0.0, math.pi - 0.01),
+    length=st.floats(3.8, 5.0),
+    width=st.floats(1.6, 2.0),
+    seed=st.integers(0, 9),
+)
+@settings(max_examples=80, deadline=None)
+def test_two_sides_tell_the_pose_from_anywhere(bearing, away, yaw, length, width, seed):
+    x, y = away * math.cos(bearing), away * math.sin(bearing)
+    ahead = abs(x * math.cos(yaw) + y * math.sin(yaw)) - 0.5 * length
+    aside = abs(y * math.cos(yaw) - x * math.sin(yaw)) - 0.5 * width
+    if min(ahead, aside) < 1.0:
+        return  # the sensor sees one side only, or the other at a grazing angle
+    sweep = swept((x, y, yaw, length, width), rng=np.random.default_rng(seed))
+    car = fit_box(sweep.points(np.flatnonzero(np.isfinite(sweep.distance))), np.zeros(2), end_on=False)
+    assert turned_off(car.yaw, yaw) < math.radians(3)
+    assert math.hypot(car.x - x, car.y - y) < 0.15 + 0.5 * max(0.0, 4.4 - length) + 0.5 * max(
+        0.0, 1.8 - width
+    )
+    # A side that is looked along keeps its last half metre to itself.
+    for seen, true in ((car.seen_length, length), (car.seen_width, width)):
+        assert true - 0.5 < seen < true + 0.15
+
+
+@pytest.mark.parametrize(("end_on", "yaw", "y"), [(True, math.pi / 2, -6.2), (False, 0.0, -4.9)])
+def test_one_short_side_is_an_end_or_a_flank_as_the_detector_says(end_on, yaw, y):
+    points = np.column_stack([np.linspace(-0.9, 0.9, 40), np.full(40, -4.0)])
+    car = fit_box(points, np.zeros(2), end_on=end_on)
+    assert turned_off(car.yaw, yaw) < 0.03
+    assert (car.x, car.y) == pytest.approx((0.0, y), abs=0.03)
+
+
+def test_a_car_goes_on_from_where_the_view_is_cut():
+    """A flank from 1 m to 4 m ahead; its near end is real, or its far one."""
+    flank = np.column_stack([np.linspace(1.0, 4.0, 60), np.full(60, -3.0)])
+    near = fit_box(flank, np.zeros(2), end_on=False, cut=(False, True))
+    far = fit_box(flank, np.zeros(2), end_on=False, cut=(True, False))
+    assert near.x == pytest.approx(1.0 + 2.2, abs=0.05)
+    assert far.x == pytest.approx(4.0 - 2.2, abs=0.05)
+
+
+def test_points_are_checked():
+    with pytest.raises(InputError, match=r"points have shape \(0, 2\)"):
+        fit_box(np.empty((0, 2)), np.zeros(2), end_on=True)
+    with pytest.raises(InputError, match=r"want .* finite numbers"):
+        fit_box(np.array([[0.0, np.inf]]), np.zeros(2), end_on=True)
+
+
+@pytest.mark.parametrize("name", ["campus", "street"])
+def test_fitted_cars_stand_where_the_cars_do(name):
+    """Along a survey of parked cars: heading and place of the fit beside those of the thesis's way (T §4.2)."""
+    lot = ParkingLot.packaged(name)
+    rng = np.random.default_rng(1)
+    scene = slot_lot(lot, 1).scene(rng.random(lot.n_slots) < 0.6)
+    off = {locate: [], locate_plainly: []}
+    for pose in poses_along(survey_route(lot).path, 8.0):
+        sweep, found, places = look(scene, pose, rng=rng)
+        for k in range(len(found)):
+            true = scene.vehicle_pose[places[k]]
+            for way, errors in off.items():
+                car = way(found.chosen(np.array([k])), sweep, CAMERA, EYE, pose)
+                errors += [
+                    (np.hypot(*(xy - true[:2])), turned_off(yaw, true[2]))
+                    for xy, yaw in zip(car.xy, car.yaw, strict=True)
+                ]
+    fitted, plain = (np.array(off[way]) for way in (locate, locate_plainly))
+    assert len(fitted) > 25
+    assert np.median(fitted[:, 0]) < 0.3 < np.median(plain[:, 0])
+    assert (fitted[:, 0] > 1.0).mean() < 0.05 < (plain[:, 0] > 1.0).mean()
+    assert np.median(fitted[:, 1]) < math.radians(2) < math.radians(15) < np.median(plain[:, 1])
+
+
+# Depth from a stereo pair
+
+
+@pytest.fixture(scope="module")
+def pairs():
+    """Pairs of a row of perpendicular slots and of a kerb, with what stands in their boxes."""
+    rig = SensorRig.stereo()
+    _, stereo, mount = rig.stereo_cameras[0]
+    looks = []
+    for name in ("campus", "street"):
+        lot = ParkingLot.packaged(name)
+        scene = slot_lot(lot, 2).scene(np.random.default_rng(2).random(lot.n_slots) < 0.7)
+        way = poses_along(survey_route(lot).path, 1.0)
+        cars = [len(look(scene, pose)[1]) for pose in way]
+        for pose in way[np.argsort(cars)[-40::8]]:
+            pair = rig.capture(scene, pose).pairs["right"]
+            boxes = vehicle_boxes(stereo.camera, scene, mount.camera_pose(pose), pair.left)
+            near = (boxes.visible_fraction > 0.6) & (boxes.distance < 10.0) & (boxes.ids <= scene.n_vehicles)
+            found = boxes_of(*boxes.visible_box[near].tolist(), ends=False)
+            found.ends[:] = boxes.view[near] != View.SIDE
+            looks.append((scene, pose, pair, disparity(pair, stereo), found, boxes.ids[near] - 1))
+    return stereo, mount, looks
+
+
+def test_the_mode_low_in_the_box_is_not_biased_as_the_median_is(pairs):
+    """Windows, ground and background pull the median of a box away from the car (T §3.2.3)."""
+    stereo, mount, looks = pairs
+    far_off, near_off = [], []
+    for scene, pose, _, disparities, found, places in looks:
+        exact, ids = LASER.scan_with_ids(scene.scan_plane, mount.in_world(pose))
+        for box, place in zip(found.boxes, places, strict=True):
+            hit = ids == place + 1
+            if hit.sum() >= 10:
+                true = np.median((exact * np.cos(LASER.angles))[hit])
+                far_off.append(median_depth(disparities, box, stereo) - true)
+                near_off.append(body_depth(disparities, box, stereo) - true)
+    assert len(near_off) >= 15
+    assert np.median(far_off) > 0.1
+    assert abs(np.median(near_off)) < 0.5 * np.median(far_off)
+    assert np.median(np.abs(near_off)) < 0.7 * np.median(np.abs(far_off))
+
+
+def test_cars_are_placed_from_stereo_alone(pairs):
+    stereo, mount, looks = pairs
+    errors = {"fitted": [], "thesis": []}
+    for scene, pose, _, disparities, found, places in looks:
+        sweep = stereo_sweep(stereo, mount, pose, disparities)
+        for k, place in enumerate(places):
+            one, true = found.chosen(np.array([k])), scene.vehicle_pose[place]
+            fitted = locate(one, sweep, stereo.camera, mount, pose)
+            plain = locate_by_disparity(one, disparities, stereo, mount, pose)
+            if len(fitted) and len(plain):
+                for name, car in (("fitted", fitted), ("thesis", plain)):
+                    errors[name].append((np.hypot(*(car.xy[0] - true[:2])), turned_off(car.yaw[0], true[2])))
+    fitted, thesis = np.array(errors["fitted"]), np.array(errors["thesis"])
+    assert len(fitted) >= 8
+    assert np.median(fitted[:, 0]) < min(0.6, np.median(thesis[:, 0]))
+    assert np.median(fitted[:, 1]) < math.radians(10) < np.median(thesis[:, 1])
+
+
+def test_a_box_without_a_match_has_no_depth(pairs):
+    stereo, mount, _ = pairs
+    nothing = np.full((480, 640), np.nan, np.float32)
+    box = boxes_of([100, 100, 300, 300])
+    assert math.isnan(median_depth(nothing, box.boxes[0], stereo))
+    assert math.isnan(body_depth(nothing, box.boxes[0], stereo))
+    assert len(locate_by_disparity(box, nothing, stereo, mount, ORIGIN)) == 0
+    sweep = stereo_sweep(stereo, mount, ORIGIN, nothing)
+    assert np.isnan(sweep.distance).all()
+    assert len(locate(box, sweep, stereo.camera, mount, ORIGIN)) == 0
+
+
+def test_a_wall_fills_a_stereo_sweep(pairs):
+    """Every pixel at 6 m: what stands at bumper height is met there in every direction, and angles ascend."""
+    stereo, mount, _ = pairs
+    disparities = np.full((480, 640), stereo.camera.fx * stereo.baseline / 6.0, np.float32)
+    sweep = stereo_sweep(stereo, mount, ORIGIN, disparities)
+    assert (np.diff(sweep.angle) > 0.0).all()
+    assert sweep.points(np.arange(len(sweep.angle)))[:, 1] == pytest.approx(-6.0, abs=1e-4)
+    assert isinstance(sweep, Sweep)
