@@ -143,6 +143,11 @@ class SightingModel:
         with written_whole(path) as beside:
             beside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
+    @classmethod
+    def blind(cls) -> Self:
+        """Nothing is seen of a slot before somebody tries to park there."""
+        return cls(0.0, bands=tuple(SightBand(0.0, beside, 0.0, 1.0, 0.0) for beside in (False, True)))
+
     @property
     def perfect(self) -> bool:
         """Whether every look shows the truth."""

@@ -158,6 +158,39 @@ def test_figures_and_occupancy_levels(tmp_path):
     assert swept[1]["total_s"] < swept[3]["total_s"], "a fuller lot takes longer"
 
 
+def test_the_sweep_over_failure_costs_tells_seen_slots_from_unseen_ones(tmp_path):
+    done = parkenv(
+        "compare", "--scenario", "mini", "--agents", "greedy-drive,oracle", "-n", 6, "--failure-cost", "sweep",
+        "--jobs", 1, "--out", tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert [p.name for p in tmp_path.glob("*.png")] == ["time_against_failure_cost_mini.png"]
+    rows = json.loads((tmp_path / "summary.json").read_text())["rows"]
+    tries = {(r["scenario"], r["failure_cost_s"]): r for r in rows if r["agent"] == "greedy-drive"}
+    assert len(tries) == 26
+    assert all(r["failed_s"] == 0.0 for (name, _), r in tries.items() if name == "mini")
+    unseen = [tries["mini-unseen", cost]["total_s"] for cost in (0.0, 8.0, 30.0, 120.0)]
+    assert unseen == sorted(unseen)
+    assert tries["mini-unseen", 120.0]["failed_parks"] > 0.0
+
+
+def test_both_solvers_search_alike(tmp_path):
+    for solver in ("label_setting", "policy_iteration"):
+        done = parkenv(*small(tmp_path / solver, "--solver", solver, agents="mdp"))
+        assert done.returncode == 0, done.stderr
+    fast, plain = (episodes_of(tmp_path / s) for s in ("label_setting", "policy_iteration"))
+    assert fast == plain
+
+
+def test_searches_with_the_stacks_sight_differ_from_perfect_ones_but_little(tmp_path):
+    for sight in ("perfect", "laser"):
+        done = parkenv(*small(tmp_path / sight, "--sight", sight, agents="greedy-drive", episodes=40))
+        assert done.returncode == 0, done.stderr
+    perfect, laser = (rows_without_times(tmp_path / s)[0] for s in ("perfect", "laser"))
+    assert perfect["total_s"] != laser["total_s"]
+    assert laser["total_s"] == pytest.approx(perfect["total_s"], rel=0.3)
+
+
 def test_plan_writes_a_path_and_a_picture(tmp_path):
     done = parkenv("plan", "--scenario", "jam", "--failure-cost", "10,90", "--out", tmp_path)
     assert done.returncode == 0, done.stderr
@@ -347,6 +380,18 @@ def test_columns_are_stable():
         "v_drive_kmh",
         "seed",
     )
+
+
+def test_words_for_sight_are_checked(tmp_path):
+    (tmp_path / "odd.json").write_text("{}")
+    for words, message in (
+        (("--sight", "keen"), "--sight is 'keen', want perfect, laser, stereo, or a file that is there"),
+        (("--sight", tmp_path / "odd.json"), "odd.json: want a JSON object"),
+        (("--sensors", "radar"), "--sensors is 'radar', want one of laser, stereo, both_sides"),
+        (("--solver", "guess"), "solver is 'guess', want one of"),
+        (("--budget-ms", "-1"), "budget_ms is -1"),
+    ):
+        assert_one_line_and_exit_2(parkenv(*small(tmp_path / "x", *words, agents="mdp,belief")), message)
 
 
 def test_help_names_every_command():

@@ -112,7 +112,7 @@ def test_lines_against_occupancy_are_labelled_where_they_end(tmp_path):
     rows += [row("random", failed=f, occupancy=o) for f, o in zip((5.0, 80.0, 9000.0), levels, strict=True)]
     limit = time_figures._limit(rows)
     ax = axes()
-    time_figures._draw_lines(ax, rows, limit)
+    time_figures._draw_lines(ax, rows, limit, lambda row: 100.0 * row["occupancy"])
     assert sorted(text.get_text() for text in ax.texts) == ["mdp", "oracle", "random ↑ 9,090 s"]
     heights = sorted(text.xyann[1] for text in ax.texts)
     assert np.diff(heights).min() > 0.06 - 1e-9

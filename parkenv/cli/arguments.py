@@ -127,6 +127,10 @@ def numbers(option: str, text: str) -> list[float]:
     return values
 
 
+SWEEP = (0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0)
+"""s, the failure costs of `--failure-cost sweep`."""
+
+
 def speeds(option: str, text: str) -> list[float]:
     """Comma-separated speeds, km/h, that a person or a car may have."""
     return _between(option, text, 0.1, 300.0, "a speed above 0: 0.1 to 300 km/h")

@@ -58,7 +58,16 @@ def compare(
     episodes: Annotated[
         int, typer.Option("--episodes", "-n", min=1, help="Searches a setting and agent.")
     ] = 200,
-    failure_cost: args.FailureCostOption = "10",
+    failure_cost: Annotated[
+        str,
+        typer.Option(
+            "--failure-cost",
+            metavar="S[,S...]|sweep",
+            help="Seconds lost by a try at a taken slot. `sweep` draws total time against it from 0 to 120 s, with and "
+            "without sight of the slots before a try.",
+            rich_help_panel=args.COSTS,
+        ),
+    ] = "10",
     v_walk_kmh: args.WalkOption = "4",
     v_drive_kmh: args.DriveOption = "10",
     occupancy_levels: Annotated[
@@ -70,6 +79,16 @@ def compare(
             "time against occupancy. A recorded world is as full as it is: its searches are binned instead.",
         ),
     ] = LEVELS,
+    solver: Annotated[
+        str,
+        typer.Option(
+            "--solver",
+            help="Of mdp and mdp-static: label_setting, or the thesis's policy_iteration; the plans are the same.",
+        ),
+    ] = "label_setting",
+    budget_ms: Annotated[
+        float, typer.Option("--budget-ms", help="About how long belief may take for a decision, ms.")
+    ] = 10.0,
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 0,
     out: Annotated[
@@ -95,34 +114,50 @@ def compare(
     Examples:
     * `parkenv compare --scenario campus,jam --failure-cost 10,90 --out results`
 
+    * `parkenv compare --failure-cost sweep --agents mdp,mdp-tuned,belief,oracle`
+
     * `parkenv compare --lot lot.geojson --occupancy log.csv.gz --agents mdp,greedy-goal,oracle -n 300`
     """
-    from parkenv.evaluation.compare import Case, at_occupancy, check_worlds, run_cases, settings_of, table
+    from parkenv.evaluation.compare import (
+        Case,
+        at_occupancy,
+        check_worlds,
+        run_cases,
+        settings_of,
+        table,
+        unseen,
+    )
     from parkenv.evaluation.results import ResultFolder
     from parkenv.occupancy import OccupancyProcess
     from planners.agent import make_agent
 
     names = args.words("--agents", agents)
-    failure = args.costs("--failure-cost", failure_cost)
+    sweeps = failure_cost == "sweep"
+    failure = list(args.SWEEP) if sweeps else args.costs("--failure-cost", failure_cost)
     walk = args.speeds("--v-walk-kmh", v_walk_kmh)
     drive = args.speeds("--v-drive-kmh", v_drive_kmh)
-    levels = [] if occupancy_levels == "none" else _levels(occupancy_levels)
+    levels = [] if sweeps or occupancy_levels == "none" else _levels(occupancy_levels)
     rig = args.rig_of(sensors)
     sight = sight or ("perfect" if rig is None else "stereo" if rig == "stereo" else "laser")
     scenarios = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range, sight)
+    options: dict[str, dict[str, Any]] = {
+        "mdp": {"solver": solver}, "mdp-static": {"solver": solver}, "belief": {"budget_ms": budget_ms},
+    }  # fmt: skip
     for name in names:
-        make_agent(name, scenarios[0])
+        make_agent(name, scenarios[0], **options.get(name, {}))
+    if sweeps:
+        scenarios = [s for its in scenarios for s in (its, unseen(its))]
 
     seeds = range(seed, seed + episodes)
     cases = [
-        (Case(setting, name, rig=rig), seeds)
+        (Case(setting, name, rig=rig, options=options.get(name, {})), seeds)
         for s in scenarios
         for setting in settings_of(s, failure, walk, drive)
         for name in names
     ]
     fewer = seeds[: max(1, episodes // 3)]
     sweep = [
-        (Case(setting, name, level, rig), fewer)
+        (Case(setting, name, level, rig, options.get(name, {})), fewer)
         for s in scenarios
         if isinstance(s.occupancy, OccupancyProcess)
         for level in levels
@@ -141,6 +176,7 @@ def compare(
         "view_range": view_range,
         "sight": repr(scenarios[0].sighting),
         "sensors": rig,
+        "options": options,
     }
     out = out or Path("results/compare")
     for s in scenarios:
@@ -167,7 +203,10 @@ def compare(
         raise typer.Exit(130)
     if figures:
         with console.status("Drawing figures"):
-            _draw(out, rows, sweep_rows, cases, folder, seed)
+            if sweeps:
+                _draw_sweep(out, rows)
+            else:
+                _draw(out, rows, sweep_rows, cases, folder, seed)
     console.print(f"Episodes, summary and figures are in {out}")
 
 
@@ -259,6 +298,15 @@ def _seconds(value: float, signed: bool = False) -> str:
 
 PICTURED = ("greedy-goal", "first-free", "oracle")
 """Agents whose paths are drawn beside the first agent's."""
+
+
+def _draw_sweep(out: Path, rows: list[Any]) -> None:
+    from parkenv.evaluation.compare import UNSEEN
+    from parkenv.evaluation.time_figures import save_time_against_failure_cost
+
+    for name in dict.fromkeys(row["scenario"].removesuffix(UNSEEN) for row in rows):
+        seen, unseen = ([r for r in rows if r["scenario"] == n] for n in (name, name + UNSEEN))
+        save_time_against_failure_cost(seen, unseen, out / f"time_against_failure_cost_{name}.png")
 
 
 def _draw(

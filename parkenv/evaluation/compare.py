@@ -5,8 +5,8 @@ from __future__ import annotations
 import itertools
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,11 @@ from parkenv.evaluation.statistics import mean_interval, summarize
 from parkenv.keyed_random import world_key
 from parkenv.occupancy import ArrivalWindow, OccupancyProcess
 from parkenv.scenario import KMH, Scenario
+from parkenv.sighting import SightingModel
 from planners.agent import make_agent
 
+UNSEEN = "-unseen"
+"""What the names of scenarios end with whose slots are not seen before a try."""
 BLOCK = 10
 """Episodes a task: few enough to lose little to a crash, enough to make up for starting one."""
 
@@ -33,6 +36,7 @@ class Case:
         scenario: with the setting's costs and speeds.
         agent: the agent's name.
         occupancy_level: the mean occupancy that the world was set to; None where it was left as it is.
+        options: of the agent, as `make_agent` takes them.
         rig: whose sensors the car sees through; None where the scenario's sighting model stands for them.
     """
 
@@ -40,6 +44,7 @@ class Case:
     agent: str
     occupancy_level: float | None = None
     rig: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def columns(self) -> Row:
@@ -80,7 +85,8 @@ class Case:
         return self._runner().run(seed).trace
 
     def _runner(self) -> EpisodeRunner:
-        return EpisodeRunner(self.scenario, self.agent, make_agent(self.agent, self.scenario), self.rig)
+        agent = make_agent(self.agent, self.scenario, **self.options)
+        return EpisodeRunner(self.scenario, self.agent, agent, self.rig)
 
 
 def settings_of(
@@ -94,6 +100,11 @@ def settings_of(
         scenario.replace(failure_s=failure, v_walk=walk * KMH, v_drive=drive * KMH)
         for failure, walk, drive in itertools.product(failure_s, v_walk_kmh, v_drive_kmh)
     ]
+
+
+def unseen(scenario: Scenario) -> Scenario:
+    """The scenario with slots that nobody sees before trying to park there, under a name of its own."""
+    return scenario.replace(name=f"{scenario.name}{UNSEEN}", sighting=SightingModel.blind())
 
 
 def at_occupancy(scenario: Scenario, level: float) -> Scenario:

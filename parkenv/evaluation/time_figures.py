@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -156,7 +156,8 @@ def save_time_against_occupancy(rows: Sequence[Row], path: str | Path) -> None:
         figure = Figure(figsize=(6.0 if columns == 1 else 10.0, 0.4 + 3.7 * lines), layout="constrained")
         axes = figure.subplots(lines, columns, squeeze=False, sharey=True)
         for ax, cost in zip(axes.flat, costs, strict=False):
-            _draw_lines(ax, [row for row in rows if row["failure_cost_s"] == cost], limit)
+            its = [row for row in rows if row["failure_cost_s"] == cost]
+            _draw_lines(ax, its, limit, lambda row: 100.0 * float(row["occupancy"]))
             ax.set_title(f"failure cost {cost:g} s")
             ax.set_xlabel("slots taken at the arrival, %")
         for ax in axes.flat[len(costs) :]:
@@ -167,12 +168,47 @@ def save_time_against_occupancy(rows: Sequence[Row], path: str | Path) -> None:
         save_picture(figure, path)
 
 
-def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float) -> None:
+def save_time_against_failure_cost(seen: Sequence[Row], unseen: Sequence[Row], path: str | Path) -> None:
+    """How the total time depends on what a failed try costs, with and without sight of the slots before a try.
+
+    Args:
+        seen: rows with failure_cost_s, agent, total_s, total_s_ci95, of one scenario.
+        unseen: the same where nobody sees a slot before trying it.
+        path: the PNG to write.
+
+    Raises:
+        InputError: there are no rows, or the file cannot be written.
+    """
+    _require_rows(seen)
+    _require_rows(unseen)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(11.0, 4.2), layout="constrained")
+        panels = (("slots seen from the lane", seen), ("slots seen only by trying", unseen))
+        for ax, (title, rows) in zip(figure.subplots(1, 2), panels, strict=True):
+            _draw_lines(ax, rows, _limit(rows), lambda row: float(row["failure_cost_s"]))
+            last = max(row["failure_cost_s"] for row in rows)
+            # A cost of 0 has its place, too.
+            ax.set_xscale("symlog", linthresh=1.0, linscale=0.4)
+            ticks = [tick for tick in (0, 1, 2, 5, 10, 20, 50, 100) if tick <= last]
+            ax.set(xlim=(0.0, 1.08 * last), xticks=ticks, xticklabels=[str(tick) for tick in ticks])
+            ax.minorticks_off()
+            ax.set_title(title)
+            ax.set_xlabel(
+                "failure cost, s: what a try at a taken slot takes, and what planners are told of it"
+            )
+            ax.set_ylabel("mean total time, s; 95 % interval")
+        _name(figure, seen)
+        save_picture(figure, path)
+
+
+def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Row], float]) -> None:
+    """A line an agent; `along` says where a row lies on the axis below."""
     ends = []
+    places = [along(row) for row in rows]
     for agent in dict.fromkeys(row["agent"] for row in rows):
-        own = sorted((row for row in rows if row["agent"] == agent), key=lambda row: float(row["occupancy"]))
+        own = sorted((row for row in rows if row["agent"] == agent), key=along)
         color = AGENT_COLORS.get(agent, OTHER_AGENT)
-        x = np.array([100.0 * row["occupancy"] for row in own])
+        x = np.array([along(row) for row in own])
         total = np.array([row["total_s"] for row in own])
         low, high = np.array([_interval(row) for row in own]).T
         dashes = (0, (4, 2)) if agent == "oracle" else "-"
@@ -180,17 +216,16 @@ def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float) -> None:
         ax.fill_between(x, low, high, where=total <= limit, color=color, alpha=0.15, linewidth=0)
         ax.plot(x, total, color=color, linestyle=dashes, linewidth=1.8, marker="o", markersize=3.5)
         ends.append((total[-1], x[-1], agent, color))
-    right = max(x for _, x, *_ in ends)
-    ax.set(xlim=(min(100.0 * row["occupancy"] for row in rows) - 1.0, right + 1.0), ylim=(0, limit))
+    ax.set(xlim=(min(places) - 1.0, max(places) + 1.0), ylim=(0, limit))
     ends.sort()
-    places = _spread([min(total / limit, 1.0) for total, *_ in ends], 0.062)
-    for (total, x, agent, color), place in zip(ends, places, strict=True):
+    heights = _spread([min(total / limit, 1.0) for total, *_ in ends], 0.062)
+    for (total, x, agent, color), height in zip(ends, heights, strict=True):
         off = total > limit
         link = {"arrowstyle": "-", "color": color, "linewidth": 0.7, "relpos": (0, 0.5), "shrinkB": 3}
         ax.annotate(
             f"{agent} ↑ {total:,.0f} s" if off else agent,
             (x, min(total, limit)),
-            (1.035, place),
+            (1.035, height),
             textcoords="axes fraction",
             va="center",
             color=color,
