@@ -1,0 +1,131 @@
+"""How slots are seen: rates by distance and side, files of them, and what is counted of the real stack."""
+
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from parkenv import InputError, Scenario, SightBand, SightingModel
+from parkenv.evaluation.sight_fit import BAND_ENDS, LookCounts, count_looks
+from parkenv.lot import PARK
+from parkenv.sighting import SIGHT_NAMES
+
+BANDS = (SightBand(3.0, True, 0.9, 0.99, 0.01), SightBand(9.0, True, 0.5, 0.9, 0.2))
+
+
+def test_the_nearest_band_that_reaches_holds():
+    rates = SightingModel(12.0, 0.8, 0.3, BANDS).rates(
+        np.array([0.0, 3.0, 3.1, 9.0, 9.1, 1.0]), np.array([1, 1, 1, 1, 1, 0], dtype=bool)
+    )
+    assert rates.seen.tolist() == [0.9, 0.9, 0.5, 0.5, 1.0, 1.0]
+    assert rates.hit.tolist() == [0.99, 0.99, 0.9, 0.9, 0.8, 0.8]
+    assert rates.false_alarm.tolist() == [0.01, 0.01, 0.2, 0.2, 0.3, 0.3]
+
+
+def test_files_bring_back_what_was_written(tmp_path):
+    model = SightingModel(12.0, 0.8, 0.3, BANDS)
+    model.to_file(tmp_path / "sight.json")
+    assert SightingModel.from_file(tmp_path / "sight.json") == model
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "want a sighting model"),
+        ("{", "not JSON"),
+        ("[]", "want a JSON object"),
+        ('{"format": "parkenv-sighting", "version": 7}', "version is 7, want 1"),
+        ('{"format": "parkenv-sighting", "version": 1, "bands": []}', "view_range"),
+        (
+            '{"format": "parkenv-sighting", "version": 1, "bands": [], "view_range": 3, "hit_rate": 2, '
+            '"false_alarm_rate": 0}',
+            "hit_rate is 2",
+        ),
+    ],
+)
+def test_bad_files_are_named(tmp_path, text, message):
+    file = tmp_path / "sight.json"
+    if text is not None:
+        file.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        SightingModel.from_file(file)
+    assert str(file) in str(caught.value)
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(InputError, match="sighting is 'sonar', want one of laser, stereo"):
+        SightingModel.named("sonar")
+
+
+@pytest.mark.parametrize("name", SIGHT_NAMES)
+def test_the_stack_is_nearly_always_right_beside_the_car(name):
+    model = SightingModel.named(name)
+    rates = model.rates(np.array([0.0]), np.array([True]))
+    assert rates.hit[0] > 0.95
+    assert rates.false_alarm[0] < 0.05
+
+
+def test_unseen_slots_are_known_once_they_were_tried():
+    env = gym.make("parkenv/Search-v0", scenario="mini", sighting=SightingModel.blind()).unwrapped
+    prior = env.reset(seed=0)[0]["p_occupied"]
+    lot = env.scenario.lot
+    while True:
+        slot = env.state.vertex
+        if slot < lot.n_slots and env.state.world.occupied(np.array([slot]), env.state.time)[0]:
+            break
+        env.step(int(np.flatnonzero(lot.neighbors[slot] >= 0)[-1]))
+    assert not env.state.belief.seen.any()
+    observation, *_ = env.step(PARK)
+    assert env.state.belief.seen.tolist() == [s == slot for s in range(lot.n_slots)]
+    assert observation["p_occupied"][slot] > 0.99  # the try took its time, in which cars may leave
+    others = np.arange(lot.n_slots) != slot
+    np.testing.assert_array_equal(observation["p_occupied"][others], prior[others])
+
+
+@given(
+    hit=st.floats(0.7, 1.0),
+    false_alarm=st.floats(0.0, 0.3),
+    seen=st.floats(0.1, 1.0),
+    seed=st.integers(0, 99),
+)
+def test_counts_give_the_rates_that_they_were_drawn_from(hit, false_alarm, seen, seed):
+    rng = np.random.default_rng(seed)
+    n, looks = 4000, LookCounts.none().looks
+    for band in range(len(BAND_ENDS)):
+        for side in (0, 1):
+            for taken, rate in ((0, false_alarm), (1, hit)):
+                told = rng.binomial(n, seen)
+                said = rng.binomial(told, rate)
+                looks[band, side, taken] = n - told, told - said, said
+    model = LookCounts(looks).fitted()
+    rates = model.rates(np.array(BAND_ENDS), np.ones(len(BAND_ENDS), dtype=bool))
+    np.testing.assert_allclose(rates.seen, seen, atol=0.03)
+    np.testing.assert_allclose(rates.hit, hit, atol=0.1)
+    np.testing.assert_allclose(rates.false_alarm, false_alarm, atol=0.1)
+
+
+def test_too_few_looks_are_refused():
+    with pytest.raises(InputError, match="want at least 20 of each"):
+        LookCounts.none().fitted()
+
+
+def test_looks_of_a_real_search_are_counted():
+    """Every slot in view after every step is counted once, and the stack is right about most that it speaks of."""
+    scenario = Scenario.named("mini")
+    looks = count_looks(scenario, "laser", "greedy-drive", range(3), "overcast").looks
+    said = looks.sum(axis=(0, 1))
+    assert said.sum() >= 10
+    right = said[0, 1] + said[1, 2]
+    assert right >= 0.9 * said[:, 1:].sum() > 0
+    again = count_looks(scenario, "laser", "greedy-drive", range(3), "overcast").looks
+    np.testing.assert_array_equal(looks, again)
+    with pytest.raises(InputError, match="rig is 'sonar'"):
+        count_looks(scenario, "sonar", "mdp", [0])
+
+
+def test_the_file_says_what_it_is(tmp_path):
+    SightingModel().to_file(tmp_path / "s.json")
+    assert json.loads((tmp_path / "s.json").read_text())["format"] == "parkenv-sighting"
