@@ -93,7 +93,7 @@ def test_bad_model_files_are_told_apart(model, tmp_path):
     with zipfile.ZipFile(tmp_path / "new.npz") as archive:
         weights, raw = archive.read("weights.npy"), archive.read("settings.npy")
     start = raw.index(b'{"bias"')  # the header of the array is a dict, too
-    text = raw[start:].replace(b'"version": 1', b'"version": 9')
+    text = raw[start:].replace(b'"version": 2', b'"version": 9')
     assert json.loads(text)["version"] == 9
     with zipfile.ZipFile(tmp_path / "new.npz", "w") as archive:
         archive.writestr("weights.npy", weights)
@@ -101,7 +101,7 @@ def test_bad_model_files_are_told_apart(model, tmp_path):
     for name, message in (
         ("text.npz", "is no car model"),
         ("other.npz", "is no car model"),
-        ("new.npz", "is a model of version 9, want 1"),
+        ("new.npz", "is a model of version 9, want 2"),
         ("none.npz", "no such model; want side, front, or an .npz file"),
     ):
         with pytest.raises(InputError, match=message):

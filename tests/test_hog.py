@@ -66,11 +66,11 @@ def test_a_descriptor_has_the_thesis_number_of_values():
 
 
 @pytest.mark.parametrize("normalization", ["cell", "neighbors", "blocks"])
-def test_brightness_and_contrast_hardly_matter(normalization):
+def test_exposure_hardly_matters(normalization):
     rng = np.random.default_rng(2)
-    crop = np.kron(rng.integers(0, 100, (16, 32)), np.ones((4, 4))).astype(np.uint8)
+    crop = np.kron(rng.integers(10, 80, (16, 32)), np.ones((4, 4))).astype(np.uint8)
     descriptor = Descriptor(128, 64, normalization)
-    a, b = descriptor.describe(crop), descriptor.describe((2 * crop + 30).astype(np.uint8))
+    a, b = descriptor.describe(crop), descriptor.describe((3 * crop).astype(np.uint8))
     assert np.abs(a - b).max() < 0.02
     assert np.isfinite(descriptor.describe(np.full((64, 128), 9, np.uint8))).all()
 

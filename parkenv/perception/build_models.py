@@ -16,6 +16,7 @@ from parkenv.perception.hog import Descriptor
 from parkenv.perception.simulated_photos import (
     END_ASPECT,
     END_CAR,
+    FRAMES,
     SIDE_ASPECT,
     SIDE_CAR,
     SimulatedPhoto,
@@ -28,7 +29,7 @@ FOLDER = Path(__file__).parent / "models"
 
 def build(photos: list[SimulatedPhoto], seed: int, progress: Callable[[str], None]) -> dict[str, CarModel]:
     """The side and the front model from simulated pictures."""
-    settings = TrainingSettings(seed=seed)
+    settings = TrainingSettings(penalty=0.1, jitter=4, seed=seed)
     empty = [p.labelled.image for p in photos if not len(p.labelled.boxes)]
     peopled = [p.labelled for p in photos if len(p.labelled.boxes)]
     told = f"{len(photos)} simulated pictures, seed {seed}"
@@ -58,9 +59,9 @@ def build(photos: list[SimulatedPhoto], seed: int, progress: Callable[[str], Non
     return {"side": side, "front": front}
 
 
-def main(scenes: int = 100, seed: int = 0, folder: Path = FOLDER) -> None:
+def main(scenes: int = 60, seed: int = 0, folder: Path = FOLDER) -> None:
     """Make the pictures, train, and write `side.npz` and `front.npz`."""
-    pictures = track(simulated_photos(scenes, seed), "Taking pictures", total=20 * scenes)
+    pictures = track(simulated_photos(scenes, seed), "Taking pictures", total=FRAMES * scenes)
     folder.mkdir(parents=True, exist_ok=True)
     for name, model in build(list(pictures), seed, typer.echo).items():
         model.save(folder / f"{name}.npz")

@@ -25,7 +25,7 @@ Float32Array = NDArray[np.float32]
 SHIPPED = ("side", "front")
 """Models that come with the package; trained on simulated images alone."""
 _FORMAT = "parkenv-car-model"
-_VERSION = 1
+_VERSION = 2  # 1 knew no root of the grey values
 _ZOOM = 1.6
 _MOST_WINDOWS = 2000  # the best of them; a model that likes more places than that has nothing to say
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # equal models are equal files

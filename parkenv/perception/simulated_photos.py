@@ -10,19 +10,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.perception.backdrops import with_backdrop
 from parkenv.perception.car_datasets import LabelledImage
 from parkenv.perception.detector import as_grey
+from parkenv.perception.simulated_streets import Street
 from sim_sensors.camera import PinholeCamera, camera_pose
 from sim_sensors.ground_truth import VehicleBoxes, View, vehicle_boxes
-from sim_sensors.scene import Scene
-from sim_sensors.slot_scenes import ParkingManners, SlotLot, slot_surroundings
-from sim_sensors.surroundings import Surroundings
 from sim_sensors.weather import PRESETS, Weather
 
 Image = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
 
-SIDE_CAR = (0.07, 0.22, 0.93, 0.88)
+SIDE_CAR = (0.08, 0.22, 0.92, 0.885)
 """Where a car lies in a side view's region, left, top, right, bottom: as in UIUC's crops."""
 SIDE_ASPECT = 2.5
 END_CAR = (0.08, 0.12, 0.92, 0.92)
@@ -32,7 +31,14 @@ END_ASPECT = 1.0
 _CLEAR = 0.8  # visible share from which a car is a positive
 _NEGLIGIBLE = 0.25  # share below which a car may be missed
 _LEAST_WIDTH = 36  # px
-_FRAMES, _WEATHERS = 20, 2
+_WEATHERS = 4
+_FROM_AFAR = 0.6  # share of pictures that long lenses take
+_AFAR_SIZE = (400, 300)  # px
+_TEXTURED = 0.9  # share of pictures with a backdrop
+_SEEDS = 1 << 20
+
+FRAMES = 20
+"""Pictures of every street."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,25 +57,22 @@ class SimulatedPhoto:
 
 
 def simulated_photos(n_scenes: int, seed: int = 0) -> Iterator[SimulatedPhoto]:
-    """Pictures of random car parks in random light, twenty of each, every fifth without a car.
+    """Pictures of random streets in random light, twenty of each, every fifth without a car.
 
-    Cars stand along the street, across it or aslant; lenses, heights and distances differ; trees, walls, houses, posts
-    and people stand before and behind them. Every picture then goes through random exposure, blur, noise and scale.
+    Cars stand along the street, across it or aslant; half of the pictures are taken with long lenses, the others as
+    rigs see. Texture lies over what is behind the cars, and every picture goes through random exposure, blur and noise.
 
     Args:
-        n_scenes: how many car parks.
+        n_scenes: how many streets.
         seed: 0 or more.
     """
     for number in range(n_scenes):
         rng = np.random.default_rng([seed, number])
-        lot = _car_park(rng, seed * 100_003 + number)
-        n = len(np.asarray(lot.slot_xy))
+        street = Street.draw(rng)
         weathers = [_weather(rng) for _ in range(_WEATHERS)]
-        for frame in range(_FRAMES):
-            empty = frame % 5 == 4
-            taken = np.zeros(n, dtype=bool) if empty else rng.random(n) < rng.uniform(0.35, 1.0)
-            scene = lot.scene(taken, int(rng.integers(1 << 20)))
-            yield _photo(scene, weathers[frame % _WEATHERS], rng, f"scene {number}, frame {frame}")
+        for frame in range(FRAMES):
+            name = f"street {number}, frame {frame}"
+            yield _photo(street, weathers[frame % _WEATHERS], rng, name, empty=frame % 5 == 4)
 
 
 def region_of(box: FloatArray, car: tuple[float, float, float, float], aspect: float) -> FloatArray:
@@ -88,94 +91,93 @@ def region_of(box: FloatArray, car: tuple[float, float, float, float], aspect: f
 
 
 def roughened(image: Image, rng: np.random.Generator) -> Image:
-    """The image through another camera: contrast, gamma, blur, noise."""
+    """The image through another camera: exposure, contrast, gamma, blur, sharpening, noise."""
     values = image.astype(np.float32) / 255.0
-    low, high = np.quantile(values, [0.02, 0.98])
-    if rng.random() < 0.5 and high - low > 0.05:
+    height = len(values)
+    # As a photographer would, it is exposed for what stands on the ground, and not for the sky.
+    middle = values[int(0.3 * height) : int(0.8 * height) + 1]
+    low, high = np.quantile(middle, [rng.uniform(0.0, 0.04), rng.uniform(0.93, 1.0)])
+    if rng.random() < 0.75 and high - low > 0.03:
         values = np.clip((values - low) / (high - low), 0.0, 1.0)
-    values = values ** np.float32(rng.uniform(0.55, 1.7))
-    values = np.clip((values - 0.5) * rng.uniform(0.6, 1.5) + 0.5 + rng.uniform(-0.12, 0.12), 0.0, 1.0)
+    values = values ** np.float32(math.exp(rng.uniform(-0.6, 0.35)))
+    contrast, brightness = math.exp(rng.uniform(-0.7, 0.2)), rng.uniform(-0.1, 0.1)
+    values = np.clip((values - 0.5) * np.float32(contrast) + np.float32(0.5 + brightness), 0.0, 1.0)
     if rng.random() < 0.6:
         values = cv2.GaussianBlur(values, (0, 0), float(rng.uniform(0.3, 1.3)))
-    values += rng.normal(0.0, rng.uniform(0.0, 0.035), values.shape).astype(np.float32)
+    if rng.random() < 0.2:
+        values = values + (values - cv2.GaussianBlur(values, (0, 0), 1.2)) * np.float32(rng.uniform(0.4, 1.2))
+    values = values + rng.normal(0.0, rng.uniform(0.0, 0.03), values.shape).astype(np.float32)
     return np.asarray(np.clip(255.0 * values, 0, 255), dtype=np.uint8)
 
 
-def _car_park(rng: np.random.Generator, seed: int) -> SlotLot:
-    kind = rng.choice(["along", "across", "aslant"], p=[0.55, 0.35, 0.1])
-    count = int(rng.integers(8, 13))
-    if kind == "along":
-        length, width, pitch, yaw = 6.0, 2.1, rng.uniform(5.6, 7.5), rng.choice([0.0, math.pi])
-    else:
-        turn = math.pi / 2 if kind == "across" else rng.uniform(0.9, 1.3)
-        length, width, pitch, yaw = 5.0, 2.5, 2.5 / math.sin(turn), turn * rng.choice([1.0, -1.0])
-    x = pitch * (np.arange(count) - (count - 1) / 2.0)
-    rows = [np.column_stack([x, np.zeros(count)])]
-    # A second row behind the first, and one on the other side of the street.
-    depth = 2.6 if kind == "along" else 5.6
-    if rng.random() < 0.3:
-        rows.append(
-            np.column_stack([x + rng.uniform(0.0, 2.0), np.full(count, depth + rng.uniform(0.0, 6.0))])
-        )
-    xy = np.concatenate(rows)
-    plain = SlotLot(
-        xy, np.full(len(xy), yaw), length, width, kerbside=kind == "along",
-        surroundings=Surroundings(seed=seed), manners=ParkingManners(nose_out=0.5), seed=seed,
-    )  # fmt: skip
-    back = float(xy[:, 1].max()) + 3.5
-    around = slot_surroundings(plain, [np.array([[-30.0, -6.0], [30.0, -6.0]])], **_scenery(rng, back, seed))
-    return SlotLot(
-        xy, np.full(len(xy), yaw), length, width, kerbside=kind == "along",
-        surroundings=around, manners=plain.manners, seed=seed,
-    )  # fmt: skip
-
-
-def _scenery(rng: np.random.Generator, back: float, seed: int) -> dict[str, object]:
-    things: dict[str, object] = {"seed": seed % 9973}
-    if rng.random() < 0.45:
-        y, far = back + rng.uniform(1.0, 8.0), back + 20.0
-        edges = np.sort(rng.uniform(-40.0, 40.0, 2)) + np.array([-12.0, 12.0])
-        outline = [[edges[0], y], [edges[1], y], [edges[1], far], [edges[0], far]]
-        things |= {"buildings": [outline], "building_heights": [rng.uniform(3.5, 14.0)]}
-    elif rng.random() < 0.6:
-        things["walls"] = [[-45.0, back, 45.0, back + rng.uniform(-0.5, 2.0), rng.uniform(0.6, 2.6)]]
-    trees = int(rng.integers(0, 9))
-    spots = np.column_stack([rng.uniform(-30, 30, trees), rng.uniform(back + 0.5, back + 14.0, trees)])
-    things["trees"] = np.column_stack([spots, rng.uniform(4.0, 10.0, trees)])
-    before = int(rng.integers(0, 3))
-    spots = np.column_stack([rng.uniform(-20, 20, before), rng.uniform(-3.4, -2.8, before)])
-    things["lamp_posts"] = np.column_stack([spots, rng.uniform(-3, 3, before)])
-    people = int(rng.integers(0, 5))
-    spots = np.column_stack([rng.uniform(-18, 18, people), rng.choice([-3.6, back - 0.5], people)])
-    things["pedestrians"] = np.column_stack([spots, rng.uniform(-3, 3, people), rng.random(people)])
-    if rng.random() < 0.5:
-        things["kerbs"] = [[[-40.0, back - 1.0], [40.0, back - 1.0]]]
-    return things
-
-
 def _weather(rng: np.random.Generator) -> Weather:
-    return Weather.draw(str(rng.choice(PRESETS)), int(rng.integers(1 << 20)))
+    return Weather.draw(str(rng.choice(PRESETS)), int(rng.integers(_SEEDS)))
 
 
-def _photo(scene: Scene, weather: Weather, rng: np.random.Generator, name: str) -> SimulatedPhoto:
-    camera = PinholeCamera.from_field_of_view(horizontal=rng.uniform(0.7, 1.6))
-    away = rng.uniform(4.2, 13.0)
-    pose = camera_pose(
-        rng.uniform(-14.0, 14.0), -away, rng.uniform(0.9, 2.0), math.pi / 2 + rng.normal(0.0, 0.12),
-        rng.uniform(-0.12, 0.04), rng.normal(0.0, 0.01),
-    )  # fmt: skip
-    frame = camera.render(scene, pose, weather, int(rng.integers(1 << 20)))
+def _photo(
+    street: Street, weather: Weather, rng: np.random.Generator, name: str, *, empty: bool
+) -> SimulatedPhoto:
+    n = len(street.pose)
+    there = np.zeros(n, dtype=np.bool_) if empty else rng.random(n) < rng.uniform(0.4, 1.0)
+    aimed_at = int(rng.integers(street.first))
+    if not empty:
+        there[aimed_at] = True
+    scene = street.scene(there, rng.random(n) < 0.5)
+    if rng.random() < _FROM_AFAR:
+        camera, pose = _from_afar(street, aimed_at, rng)
+    else:
+        camera, pose = _as_rigs_see(street, rng)
+    frame = camera.render(scene, pose, weather, int(rng.integers(_SEEDS)))
     boxes = vehicle_boxes(camera, scene, pose, frame)
-    grey = roughened(as_grey(frame.image), rng)
-    sides, ends = _crops(grey, boxes, rng)
-    there = boxes.visible_fraction > _NEGLIGIBLE
-    return SimulatedPhoto(LabelledImage(name, grey, boxes.visible_box[there].astype(np.float64)), sides, ends)
+    there_at_all = boxes.visible_fraction > _NEGLIGIBLE
+    grey, clear = as_grey(frame.image), boxes.visible_fraction > _CLEAR
+    if rng.random() < _TEXTURED:
+        nearest = boxes.distance[clear].min() if clear.any() else rng.uniform(6.0, 20.0)
+        behind = nearest + rng.uniform(1.5, 5.0)
+        grey = with_backdrop(grey, frame.depth > behind, rng)
+        # Cars that the texture may lie on are no examples; nor does it make them wrong.
+        clear &= boxes.distance < behind - 1.5
+    grey = roughened(grey, rng)
+    sides, ends = _crops(grey, boxes, clear, rng)
+    labelled = LabelledImage(name, grey, boxes.visible_box[there_at_all].astype(np.float64))
+    return SimulatedPhoto(labelled, sides, ends)
 
 
-def _crops(grey: Image, boxes: VehicleBoxes, rng: np.random.Generator) -> tuple[list[Image], list[Image]]:
+def _from_afar(street: Street, car: int, rng: np.random.Generator) -> tuple[PinholeCamera, FloatArray]:
+    """As photographers and cameras across the street see: a long lens, straight at one car."""
+    width, height = _AFAR_SIZE
+    away, height_m = rng.uniform(7.0, 32.0), rng.uniform(0.9, 2.4)
+    extent, smallest, largest = (4.6, 90.0, 230.0) if street.kind == "along" else (1.8, 56.0, 170.0)
+    focal = math.exp(rng.uniform(math.log(smallest), math.log(largest))) * away / extent
+    camera = PinholeCamera(width, height, focal, focal, width / 2.0, height / 2.0, coarse_beyond=math.inf)
+    aside = rng.normal(0.0, 0.17) * away
+    # The car is not always in the middle of the picture.
+    pan, tilt = rng.normal(0.0, 0.15, 2) * np.array([2.0 * width, height]) / (2.0 * focal)
+    pose = camera_pose(
+        float(street.pose[car, 0]) + aside, street.front - away, height_m,
+        math.pi / 2 + math.atan2(aside, away) + pan, math.atan2(0.7 - height_m, away) + tilt,
+        rng.normal(0.0, 0.015),
+    )  # fmt: skip
+    return camera, pose
+
+
+def _as_rigs_see(street: Street, rng: np.random.Generator) -> tuple[PinholeCamera, FloatArray]:
+    """As the camera of a car that drives past the slots sees: wide and near."""
+    camera = PinholeCamera.from_field_of_view(horizontal=rng.uniform(0.8, 1.6))
+    pose = camera_pose(
+        rng.uniform(-14.0, 14.0), street.front - rng.uniform(1.6, 9.0), rng.uniform(1.0, 1.8),
+        math.pi / 2 + rng.normal(0.0, 0.15), rng.uniform(-0.1, 0.05), rng.normal(0.0, 0.01),
+    )  # fmt: skip
+    return camera, pose
+
+
+def _crops(
+    grey: Image, boxes: VehicleBoxes, clear: NDArray[np.bool_], rng: np.random.Generator
+) -> tuple[list[Image], list[Image]]:
+    """Sides and ends of the clear cars that are whole in the picture and seen straight."""
     crops: dict[View, list[Image]] = {View.SIDE: [], View.END: []}
     height, width = grey.shape
-    for i in np.flatnonzero(boxes.visible_fraction > _CLEAR).tolist():
+    for i in np.flatnonzero(clear).tolist():
         view, box = View(boxes.view[i]), boxes.box[i].astype(np.float64)
         whole = box[0] > 0 and box[1] > 0 and box[2] < width and box[3] < height
         wide, high = box[2] - box[0], box[3] - box[1]

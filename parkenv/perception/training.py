@@ -77,9 +77,9 @@ def train(
 ) -> CarModel:
     """Train a model; equal arguments give equal weights, bit for bit, on one machine.
 
-    Positives are mirrored and jittered; windows that hold half a car are negatives from the start. Then the model
-    scans the negative images, and what it takes for cars joins the negatives, round after round (Dalal and Triggs
-    2005). Scores are calibrated to probabilities on cross-validated ones (Platt 1999).
+    All crops are mirrored, and positives jittered; windows that hold half a car are negatives from the start. Then the
+    model scans the negative images, and what it takes for cars joins the negatives, round after round (Dalal and
+    Triggs 2005). Scores are calibrated to probabilities on cross-validated ones (Platt 1999).
 
     Args:
         positives: grey crops, uint8, in which the car lies alike; stretched into the window.
@@ -113,7 +113,9 @@ def train(
     beside = [_beside(p, size, rng) for p in positives for _ in range(settings.misaligned)]
     plain = [cv2.resize(n, size, interpolation=_how(n, size)) for n in negatives]
     yes = np.stack([descriptor.describe(c) for c in cars])
-    no = np.stack([descriptor.describe(c) for c in beside + plain])
+    others = beside + plain
+    others += [np.ascontiguousarray(c[:, ::-1]) for c in others]
+    no = np.stack([descriptor.describe(c) for c in others])
 
     model = CarModel(
         descriptor, np.zeros(descriptor.shape, np.float32), 0.0, aspect, car, (1.0, 0.0), ends, trained_on

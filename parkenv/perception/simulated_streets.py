@@ -1,0 +1,141 @@
+"""Random streets and car parks to take training pictures of: rows of cars, and what stands before and behind them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_sensors.scene import Fleet, Scene
+from sim_sensors.surroundings import Surroundings
+from sim_sensors.vehicles import VehicleModel
+
+FloatArray = NDArray[np.float64]
+
+BODY_SHARE = {"hatchback": 0.26, "sedan": 0.34, "estate": 0.14, "suv": 0.14, "van": 0.09, "pickup": 0.03}
+"""How common each body is. Flatter than a European lot's: photographs come from everywhere and from any decade."""
+
+_KINDS = ("along", "across", "aslant")
+_REACH = 24.0  # m, half the length of a row
+_DEPTH = {"along": 2.3, "across": 5.4, "aslant": 5.4}  # m, of a row
+_SEEDS = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Street:
+    """Cars in rows along the x axis; pictures are taken from the negative y side.
+
+    Attributes:
+        kind: `along`: the first row shows its sides; `across` or `aslant`: its ends.
+        pose: (n, 3) float64: x, y in m, yaw in rad; the first row's first.
+        first: how many cars are in the first row.
+        front: m, y of the first row's mouth.
+        fleet: a model for every car, in order, and the surroundings.
+    """
+
+    kind: str
+    pose: FloatArray
+    first: int
+    front: float
+    fleet: Fleet
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator) -> Street:
+        """One or two rows with walls, houses, trees, posts and people around them."""
+        kind = str(rng.choice(_KINDS, p=[0.52, 0.40, 0.08]))
+        poses, models = _row(rng, kind, 0.0, _REACH)
+        first, back = len(poses), 0.5 * _DEPTH[kind]
+        if rng.random() < 0.5:
+            other = str(rng.choice(_KINDS))
+            y = back + 0.5 * _DEPTH[other] + rng.uniform(0.5, 7.0)
+            more_poses, more_models = _row(rng, other, y, 1.25 * _REACH)
+            poses, models, back = [*poses, *more_poses], [*models, *more_models], y + 0.5 * _DEPTH[other]
+        front = -0.5 * _DEPTH[kind]
+        around = _surroundings(rng, front, back, _DEPTH[kind])
+        return cls(kind, np.array(poses), first, front, Fleet(tuple(models), around))
+
+    def scene(self, there: NDArray[np.bool_], turned: NDArray[np.bool_]) -> Scene:
+        """The street with some of its cars.
+
+        Args:
+            there: (n,) which of them stand there.
+            turned: (n,) which of them head the other way.
+        """
+        chosen = np.flatnonzero(there)
+        pose = self.pose[chosen].copy()
+        pose[:, 2] += math.pi * turned[chosen]
+        return Scene(pose, chosen, self.fleet)
+
+
+def _row(
+    rng: np.random.Generator, kind: str, y: float, reach: float
+) -> tuple[list[list[float]], list[VehicleModel]]:
+    """Poses and models of cars side by side, or nose to tail, from -reach to reach."""
+    turn = {"along": 0.0, "across": 0.5 * math.pi, "aslant": rng.uniform(0.9, 1.3) * rng.choice([-1.0, 1.0])}[
+        kind
+    ]
+    gap = rng.uniform(0.5, 2.5) if kind == "along" else rng.uniform(0.55, 1.3)
+    bodies, shares = list(BODY_SHARE), list(BODY_SHARE.values())
+    poses, models = [], []
+    x = -reach
+    while x < reach:
+        model = VehicleModel.from_seed(str(rng.choice(bodies, p=shares)), int(rng.integers(_SEEDS)))
+        # Cars aslant lie beside each other along their flanks, not along the boxes about them.
+        wide = (
+            model.length if kind == "along" else model.width / abs(math.sin(turn)) + 0.3 * abs(math.cos(turn))
+        )
+        x += 0.5 * wide
+        poses.append([x, y + rng.normal(0.0, 0.15), turn + rng.normal(0.0, 0.03)])
+        models.append(model)
+        x += 0.5 * wide + gap * rng.uniform(0.8, 1.5)
+    return poses, models
+
+
+def _surroundings(rng: np.random.Generator, front: float, back: float, depth: float) -> Surroundings:
+    buildings, walls, kerbs, markings = [], [], [], []
+    if rng.random() < 0.6:
+        y = back + rng.uniform(0.8, 9.0)
+        low, high = np.sort(rng.uniform(-40.0, 40.0, 2)) + np.array([-12.0, 12.0])
+        buildings = [[[low, y], [high, y], [high, y + 15.0], [low, y + 15.0]]]
+    if rng.random() < 0.5:
+        walls = [[-45.0, back + 0.4, 45.0, back + rng.uniform(0.4, 0.9), rng.uniform(0.5, 2.6)]]
+    trees = int(rng.integers(0, 22)) if rng.random() < 0.7 else 0
+    posts, people = int(rng.integers(0, 4)), int(rng.integers(0, 6))
+    if rng.random() < 0.5:
+        kerbs = [[[-40.0, back + 0.2], [40.0, back + 0.2]]]
+    if rng.random() < 0.7:
+        lines = np.arange(-_REACH, _REACH, rng.uniform(2.5, 6.0))
+        markings = [[x, front, x, front + depth, 0.1] for x in lines.tolist()]
+    return Surroundings(
+        paved=[[[-45.0, front - 40.0], [45.0, front - 40.0], [45.0, back + 1.5], [-45.0, back + 1.5]]],
+        markings=markings,
+        buildings=buildings,
+        building_heights=rng.uniform(3.5, 14.0, len(buildings)),
+        walls=walls,
+        kerbs=kerbs,
+        trees=np.column_stack(
+            [
+                rng.uniform(-35.0, 35.0, trees),
+                rng.uniform(back + 1.0, back + 16.0, trees),
+                rng.uniform(2.5, 10.0, trees),
+            ]
+        ),
+        lamp_posts=np.column_stack(
+            [
+                rng.uniform(-20.0, 20.0, posts),
+                front - rng.uniform(0.6, 1.5, posts),
+                rng.uniform(-3.0, 3.0, posts),
+            ]
+        ),
+        pedestrians=np.column_stack(
+            [
+                rng.uniform(-18.0, 18.0, people),
+                rng.choice([front - 1.2, back + 0.3], people),
+                rng.uniform(-3.0, 3.0, people),
+                rng.random(people),
+            ]
+        ),
+        seed=int(rng.integers(9973)),
+    )
