@@ -49,7 +49,8 @@ class SightBand:
         up_to: m, distance from the car to the slot's vertex; the nearest band that reaches holds.
         beside: whether these are the slots on the right of a car that stands on its lane, where the thesis's camera
             looks.
-        seen_rate: P(a slot in view is made out at all).
+        seen_rate: P(a slot in view is made out at all). What hides a slot goes on hiding it: who looks again from as
+            far away sees as much of it as before.
         hit_rate: P(looks taken | taken).
         false_alarm_rate: P(looks taken | free).
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from parkenv import InputError
-from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_test, read_uiuc_training
+from parkenv.perception.car_datasets import Crops, read_crop_folder, read_uiuc_test, read_uiuc_training
+from parkenv.perception.cross_validation import cross_validated
 from parkenv.perception.detection_scores import matches, recall_at, recall_precision
 from parkenv.perception.detector import CarModel, Detector, as_grey, best_boxes
 from parkenv.perception.hog import Descriptor
@@ -279,3 +280,12 @@ def test_bad_detectors_are_named(model, settings, message):
 def test_a_model_wants_weights_of_its_window():
     with pytest.raises(InputError, match=r"weights are \(3,\), want finite \(8, 9, 16\)"):
         CarModel(Descriptor(), np.zeros(3, np.float32), 0.0, 2.5)
+
+
+def test_held_out_blocks_are_judged_once_each(crops):
+    scores = cross_validated(Crops(*crops), folds=3, seed=1, settings=TrainingSettings(rounds=0, jitter=0))
+    assert sum(s.n_cars for s in scores) == len(crops[0])
+    assert sum(s.n_others for s in scores) == len(crops[1])
+    assert min(s.auc for s in scores) > 0.8
+    with pytest.raises(InputError, match="folds is 1, want 2 to 30"):
+        cross_validated(Crops(*crops), folds=1)

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import Progress, track
+from rich.table import Table
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
+
+if TYPE_CHECKING:
+    from parkenv.perception.cross_validation import CropScore
 
 _MODEL_HELP = "side, front, or an .npz that train-detector wrote"
 
@@ -96,16 +101,36 @@ def train_detector(
     ] = "neighbors",
     penalty: Annotated[float, typer.Option("--penalty", help="C of the support vector machine.")] = 0.01,
     rounds: Annotated[int, typer.Option("--rounds", min=0, help="How often hard negatives are mined.")] = 3,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of jitter and solver.")] = 0,
+    jitter: Annotated[
+        int, typer.Option("--jitter", min=0, help="Shifted copies of each car; 0 where cars lie anyhow.")
+    ] = 2,
+    misaligned: Annotated[
+        int,
+        typer.Option(
+            "--misaligned", min=0, help="Crops beside each car that are none; 0 where cars lie anyhow."
+        ),
+    ] = 2,
+    folds: Annotated[
+        int,
+        typer.Option(
+            "--folds", min=0, help="Also judge the training on crops held out, in so many parts (0: do not)."
+        ),
+    ] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Of jitter, solver and folds.")] = 0,
 ) -> None:
     """Train a car model on photographs: crops of cars that lie alike, and images without cars.
+
+    With `--folds` the crops are cut into 30 blocks of file order, which are held out by turns: pictures that follow one
+    another often show the same car.
 
     Examples:
     * `parkenv train-detector --uiuc CarData --out side.npz`
 
-    * `parkenv train-detector --crops kitti --front --out front.npz`
+    * `parkenv train-detector --crops kitti --front --normalization blocks --penalty 0.02 --jitter 0 --misaligned 0
+    --rounds 0 --folds 3 --out front.npz`
     """
     from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
+    from parkenv.perception.cross_validation import cross_validated
     from parkenv.perception.hog import Descriptor
     from parkenv.perception.training import TrainingSettings, train
 
@@ -114,19 +139,55 @@ def train_detector(
     if out.suffix != ".npz":
         raise InputError(f"--out {out}: want a name that ends in .npz")
     data = read_uiuc_training(uiuc) if uiuc is not None else read_crop_folder(Path(str(crops)))
+    descriptor = Descriptor(128, 128 if front else 64, normalization)
+    settings = TrainingSettings(
+        penalty=penalty, rounds=rounds, jitter=jitter, misaligned=misaligned, seed=seed
+    )
     console = make_console()
     with console.status("Training") as status:
+        if folds:
+            scores = cross_validated(
+                data,
+                folds=folds,
+                seed=seed,
+                descriptor=descriptor,
+                ends=front,
+                settings=settings,
+                progress=status.update,
+            )
+            console.print(_cross_validation_table(scores))
         model = train(
             data.positives,
             data.negatives,
-            descriptor=Descriptor(128, 128 if front else 64, normalization),
+            descriptor=descriptor,
             ends=front,
-            settings=TrainingSettings(penalty=penalty, rounds=rounds, seed=seed),
+            settings=settings,
             trained_on=f"{len(data.positives)} crops and {len(data.negatives)} others in {uiuc or crops}",
             progress=status.update,
         )
     model.save(out)
     console.print(f"Trained on {model.trained_on}. Written: {out}")
+
+
+def _cross_validation_table(scores: Sequence[CropScore]) -> Table:
+    from parkenv.perception.cross_validation import FALSE_POSITIVES
+
+    rates = [f"recall at {rate:.1%} false positives" for rate in FALSE_POSITIVES]
+    table = make_table("On crops held out", ["part", "cars", "others", "AUC", *rates])
+    for i, score in enumerate(scores):
+        table.add_row(
+            str(i + 1),
+            str(score.n_cars),
+            str(score.n_others),
+            f"{score.auc:.4f}",
+            *(f"{r:.3f}" for r in score.recall),
+        )
+    count = len(scores)
+    table.add_row(
+        "mean", "", "", f"{sum(s.auc for s in scores) / count:.4f}",
+        *(f"{sum(s.recall[k] for s in scores) / count:.3f}" for k in range(len(rates))),
+    )  # fmt: skip
+    return table
 
 
 def evaluate_detector(

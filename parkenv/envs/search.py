@@ -321,10 +321,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             return
         looks_taken = state.world.occupied(slots, state.time)
         if not sighting.perfect:
-            seen = _chances(state, VIEW_STREAM, slots) < rates.seen
+            # What hides a slot goes on hiding it: one chance a search, which a nearer look may beat.
+            seen = _chances(state, VIEW_STREAM, slots, 0) < rates.seen
             slots, looks_taken, rates = slots[seen], looks_taken[seen], SightRates(*(r[seen] for r in rates))
             rate = np.where(looks_taken, rates.hit, rates.false_alarm)
-            looks_taken = _chances(state, SIGHTING_STREAM, slots) < rate
+            looks_taken = _chances(state, SIGHTING_STREAM, slots, int(state.time * 1000.0)) < rate
         state.belief.update(slots, looks_taken, rates.hit, rates.false_alarm)
 
     def _observation(self, state: SearchState) -> dict[str, Any]:
@@ -336,9 +337,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         }
 
 
-def _chances(state: SearchState, stream: int, slots: NDArray[np.int64]) -> NDArray[np.float64]:
-    """A uniform number for each slot, keyed by the millisecond: whoever looks at a slot then makes the same error."""
-    when = int(state.time * 1000.0)
+def _chances(state: SearchState, stream: int, slots: NDArray[np.int64], when: int) -> NDArray[np.float64]:
+    """A uniform number for each slot, keyed by a time, ms: whoever looks at a slot then makes the same error."""
     return np.array([keyed_uniform(state.key, stream, int(s), when) for s in slots])
 
 

@@ -1,0 +1,106 @@
+"""How good training is on crops that it has not seen, where only one set of crops is at hand."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.perception.car_datasets import Crops
+from parkenv.perception.detection_scores import recall_at
+from parkenv.perception.detector import CarModel
+from parkenv.perception.training import train
+
+BLOCKS = 30
+"""Runs of file order that a set is cut into; near one another lie pictures of one car, which belong together."""
+FALSE_POSITIVES = (0.001, 0.002, 0.01)
+_Image = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class CropScore:
+    """How well a model tells crops of cars from others.
+
+    Attributes:
+        auc: area under the curve of true against false positives.
+        recall: share of the cars found at each share of `FALSE_POSITIVES`.
+        n_cars, n_others: how many crops that was.
+    """
+
+    auc: float
+    recall: tuple[float, ...]
+    n_cars: int
+    n_others: int
+
+
+def score_on_crops(model: CarModel, crops: Crops) -> CropScore:
+    """Judge a model on crops, each stretched into its window."""
+    from sklearn.metrics import roc_auc_score
+
+    window = (model.descriptor.width, model.descriptor.height)
+    scores = [
+        model.scores(
+            np.stack([cv2.resize(i, window, interpolation=cv2.INTER_LINEAR) for i in images])
+        ).astype(np.float64)
+        for images in (crops.positives, crops.negatives)
+    ]
+    labels = np.repeat([1, 0], [len(s) for s in scores])
+    return CropScore(
+        float(roc_auc_score(labels, np.concatenate(scores))),
+        tuple(recall_at(rate, scores[0], scores[1]) for rate in FALSE_POSITIVES),
+        len(scores[0]),
+        len(scores[1]),
+    )
+
+
+def cross_validated(
+    crops: Crops,
+    *,
+    folds: int = 5,
+    seed: int = 0,
+    progress: Callable[[str], None] = lambda _: None,
+    **training: Any,
+) -> list[CropScore]:
+    """Train on all blocks of file order but some, and judge on these, until each block was judged once.
+
+    Args:
+        crops: of cars and of others.
+        folds: how many models are trained.
+        seed: of which blocks go together.
+        progress: called with a line for each fold.
+        **training: of `train`.
+
+    Raises:
+        InputError: fewer than two folds, more than blocks, or fewer crops than blocks.
+    """
+    if not 2 <= folds <= BLOCKS:
+        raise InputError(f"folds is {folds}, want 2 to {BLOCKS}")
+    for name in ("positives", "negatives"):
+        if len(getattr(crops, name)) < BLOCKS:
+            raise InputError(f"{len(getattr(crops, name))} {name}, want at least {BLOCKS} to cross-validate")
+    fold_of = np.random.default_rng(seed).permutation(np.arange(BLOCKS) % folds)
+    scores = []
+    for fold in range(folds):
+        progress(f"fold {fold + 1} of {folds}")
+        model = train(
+            _part(crops.positives, fold_of, fold, False),
+            _part(crops.negatives, fold_of, fold, False),
+            **training,
+        )
+        held_out = replace(
+            crops,
+            positives=_part(crops.positives, fold_of, fold, True),
+            negatives=_part(crops.negatives, fold_of, fold, True),
+        )
+        scores.append(score_on_crops(model, held_out))
+    return scores
+
+
+def _part(images: Sequence[_Image], fold_of: NDArray[np.int64], fold: int, inside: bool) -> list[_Image]:
+    block = np.arange(len(images)) * BLOCKS // len(images)
+    return [i for i, b in zip(images, block, strict=True) if (fold_of[b] == fold) == inside]
