@@ -174,6 +174,15 @@ def test_the_sweep_over_failure_costs_tells_seen_slots_from_unseen_ones(tmp_path
     assert tries["mini-unseen", 120.0]["failed_parks"] > 0.0
 
 
+def test_where_the_optimum_is_known_the_table_says_how_far_off_others_are(tmp_path):
+    done = parkenv(*small(tmp_path, agents="exact,greedy-drive", episodes=6))
+    assert done.returncode == 0, done.stderr
+    assert "over exact" in done.stdout
+    exact, greedy = rows_without_times(tmp_path)
+    assert exact["gap_to_exact"] == 0.0
+    assert greedy["gap_to_exact"] == pytest.approx(greedy["total_s"] / exact["total_s"] - 1.0)
+
+
 def test_both_solvers_search_alike(tmp_path):
     for solver in ("label_setting", "policy_iteration"):
         done = parkenv(*small(tmp_path / solver, "--solver", solver, agents="mdp"))

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from parkenv import InputError, Scenario, SightBand, SightingModel
+from parkenv import InputError, Scenario, SightBand, SightingModel, Traffic
+from parkenv.evaluation.compare import Case
 from parkenv.evaluation.sight_fit import BAND_ENDS, LookCounts, count_looks
 from parkenv.lot import PARK
 from parkenv.sighting import SIGHT_NAMES
@@ -129,3 +130,20 @@ def test_looks_of_a_real_search_are_counted():
 def test_the_file_says_what_it_is(tmp_path):
     SightingModel().to_file(tmp_path / "s.json")
     assert json.loads((tmp_path / "s.json").read_text())["format"] == "parkenv-sighting"
+
+
+@pytest.mark.slow
+def test_the_fast_environment_stands_for_the_slow_one():
+    """Through the sensors and with the model fitted to them: the same ranking, and means close to each other."""
+    scenario = Scenario.named("campus", sighting=SightingModel.named("laser"), traffic=Traffic(3, 5))
+    means = {}
+    for rig in ("laser", None):
+        for agent in ("first-free", "greedy-drive", "greedy-goal"):
+            rows, _ = Case(scenario, agent, rig=rig).run(range(2_000, 2_008))
+            means[rig, agent] = np.mean([row["total_s"] for row in rows])
+    slow, fast = (
+        [means[rig, a] for a in ("first-free", "greedy-drive", "greedy-goal")] for rig in ("laser", None)
+    )
+    assert slow == sorted(slow)
+    assert fast == sorted(fast)
+    np.testing.assert_allclose(fast, slow, rtol=0.2)

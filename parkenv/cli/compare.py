@@ -266,6 +266,8 @@ def result_tables(rows: list[Row], width: int) -> list[Table]:
             (f"minus {first} [95 %]", lambda r, a=first: _difference(r, a)),  # type: ignore[misc]
             ("regret s", lambda r: _seconds(r["regret_s"])),
         )
+        if any("gap_to_exact" in row for row in its_rows):
+            results = (*results, ("over exact", lambda r: f"{r['gap_to_exact']:+.2%}"))
         title = (
             f"{name}: failure cost {failure:g} s, walk {walk:g} km/h, drive {drive:g} km/h, "
             f"{max(r['episodes'] for r in its_rows)} searches"

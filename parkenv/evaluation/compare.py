@@ -14,7 +14,7 @@ from joblib import Parallel, delayed
 
 from parkenv.errors import InputError
 from parkenv.evaluation.episodes import EpisodeRunner, SearchTrace
-from parkenv.evaluation.results import ResultFolder, Row, episode_key
+from parkenv.evaluation.results import SETTING_COLUMNS, ResultFolder, Row, episode_key
 from parkenv.evaluation.statistics import mean_interval, summarize
 from parkenv.keyed_random import world_key
 from parkenv.occupancy import ArrivalWindow, OccupancyProcess
@@ -194,7 +194,10 @@ def _blocks(seeds: Sequence[int], size: int) -> Iterator[Sequence[int]]:
 
 
 def table(cases: Sequence[tuple[Case, range]], folder: ResultFolder) -> list[Row]:
-    """A row for every case that has finished episodes, in order; differences are to the first agent's."""
+    """A row for every case that has finished episodes, in order; differences are to the first agent's.
+
+    Where `exact` is among the agents, `gap_to_exact` says by which share of its mean others take longer.
+    """
     rows = []
     first: dict[tuple[Any, ...], list[Row]] = {}
     for case, seeds in cases:
@@ -207,6 +210,12 @@ def table(cases: Sequence[tuple[Case, range]], folder: ResultFolder) -> list[Row
         decision_s = list(itertools.chain.from_iterable(folder.decision_s(key) for key in keys))
         rows.append(summarize(columns, episodes, first.get(setting), decision_s))
         first.setdefault(setting, episodes)
+    names = [c for c in SETTING_COLUMNS if c != "agent"]
+    optimum = {tuple(r[c] for c in names): r["total_s"] for r in rows if r["agent"] == "exact"}
+    for row in rows:
+        best = optimum.get(tuple(row[c] for c in names))
+        if best is not None:
+            row["gap_to_exact"] = row["total_s"] / best - 1.0
     return rows
 
 
