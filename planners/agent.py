@@ -105,7 +105,7 @@ _AGENTS: dict[str, tuple[str, str]] = {
 SMALL_LOTS_ONLY = ("exact",)
 """Agents that refuse lots over a certain size and looks that may err."""
 AGENT_NAMES = tuple(name for name in _AGENTS if name not in SMALL_LOTS_ONLY)
-"""Agents for lots of any kind; those that keep a table of all drives say so where a lot is too large for it."""
+"""Agents for lots of any kind and size."""
 
 
 def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) -> SearchAgent[Any]:

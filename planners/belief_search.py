@@ -14,13 +14,13 @@ from parkenv.lot import PARK
 from parkenv.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
 from planners.map_doubt import MapDoubt
-from planners.road_table import RoadTable
+from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
+from planners.routes import DriveRoutes
 from planners.search_paths import (
     LOOKS_FREE,
     LOOKS_TAKEN,
     UNSEEN,
     Budget,
-    Ground,
     Outlook,
     Path,
     best_path,
@@ -44,14 +44,18 @@ class Search:
     """What the agent remembers of an episode.
 
     Attributes:
-        forecast: (n_slots,) float32, the belief before anything was seen.
+        forecast: (n_slots,) float32, the belief in all slots of the lot before anything was seen.
+        near: the part of the lot that is planned for. The next six are of its slots, with its numbers.
+        n_unseen: how many of its slots had not been seen when it was chosen.
         doubt: how far the forecast is thought to be off.
         kind: (n_slots,) int8, UNSEEN, LOOKS_FREE or LOOKS_TAKEN at the last look.
         looked_at: (n_slots,) float64, s, when each slot was last in view.
         p_occupied: (n_slots,) float32, the last observation's.
         time: s since the search began, of the last observation.
         leaving: (n_slots,) float64, 1/s, the rate at which a parked car leaves; NaN where nothing has told yet.
-        targets: (DEPTH,) int64, what the path of the last decision goes past first.
+        targets: (DEPTH,) int64, what the path of the last decision goes past first, as the part numbers it.
+        path: room for one.
+        gate: the vertex that the car drives to before it plans, or -1.
         n_targets: how many those are.
         cost: s, the failure cost with which that path goes on.
         replans: how often the path ahead has changed.
@@ -59,6 +63,8 @@ class Search:
     """
 
     forecast: NDArray[np.float32]
+    near: Neighborhood
+    n_unseen: int
     doubt: MapDoubt
     kind: NDArray[np.int8]
     looked_at: FloatArray
@@ -66,6 +72,8 @@ class Search:
     time: float
     leaving: FloatArray
     targets: NDArray[np.int64]
+    path: Path
+    gate: int = -1
     n_targets: int = 0
     cost: float = COSTS[0]
     replans: int = 0
@@ -75,21 +83,22 @@ class Search:
 class BeliefAgent(SearchAgent[Search]):
     """`belief`: drives the path on which stopping at the best moment is expected to take the least time.
 
-    Model: a slot is free with the probability that the map gives, shifted by what the slots seen so far say of
-    the map (`MapDoubt`); it is revealed when it comes in view; once seen, its state lasts and decays as a two-state
-    chain, so a free slot may be gone on arrival and a taken one may come free. At each decision candidate
-    paths are laid: as the thesis's planner would go on if all that it sees were taken, at several
-    failure costs, and past up to three vertices put in before. Each is valued exactly by optimal stopping with
-    recall (`search_paths`), so whatever lies on the way counts; the best one's first step is taken, and
-    its targets are where the next decision starts from.
+    Model: a slot is free with the probability that the map gives, unless the map is off in one of several ways, of
+    which the slots seen so far tell (`MapDoubt`); it is revealed when it comes in view; once seen, its state lasts and
+    decays as a two-state chain, so a free slot may be gone on arrival and a taken one may come free. At each
+    decision candidate paths are laid: as the thesis's planner would go on if all that it sees were taken, at several
+    failure costs, and past up to three vertices put in before. Each is valued by optimal stopping with recall
+    (`search_paths`), so whatever lies on the way counts, and so does that taken slots make the map more doubtful; the
+    best one's first step is taken, and its targets are where the next decision starts from.
 
     Why it wins over the thesis's planner: that one values the one slot it drives to, takes the next try for as
     promising as the first, and needs a failure cost to stand for all else, which goes wrong by a factor where the
     map is wrong. This one has no cost to tune, and on small lots stays within a thousandth of the exact optimum
     on average (tests). Where it does not win: on large lots whose map is right, the thesis's planner with its
     failure cost tuned to the forecast is as good, and in nearly empty lots both park at once. What it values is
-    one path at a time, so it does not foresee that it will leave the path for another after a sighting, nor that what
-    it sees will change its mind about the map.
+    one path at a time, so it does not foresee that it will leave the path for another after a sighting. Where an
+    event has filled a lot against the map, those who take the first free slot they see do better: to turn round as
+    early as they do, one must distrust maps so much that it costs as much where they are right.
 
     What it may know: rates are not observed, so the rate at which cars leave is read off the way in which a slot's
     belief decays once it is out of view; until then stays of two hours are assumed.
@@ -99,96 +108,141 @@ class BeliefAgent(SearchAgent[Search]):
         budget_ms: about how long a decision may take, ms. It is counted in work, not on the clock, so
             that the same observations give the same actions on every machine.
         trusting: whether the map is taken at its word, without `MapDoubt`.
+        most_vertices: a lot with more is planned for in part (`Neighborhoods`).
 
     Raises:
-        InputError: a budget that is not positive, or a lot too large for a table of all drives.
+        InputError: a budget that is not positive, or a bad `most_vertices`.
     """
 
     name: ClassVar[str] = "belief"
 
-    def __init__(self, problem: SearchProblem, budget_ms: float = 10.0, trusting: bool = False) -> None:
+    def __init__(
+        self,
+        problem: SearchProblem,
+        budget_ms: float = 10.0,
+        trusting: bool = False,
+        most_vertices: int = MOST_VERTICES,
+    ) -> None:
         super().__init__(problem)
         if not (budget_ms > 0.0 and math.isfinite(budget_ms)):
             raise InputError(f"budget_ms is {budget_ms}, want a finite number above 0")
-        problem = self.problem
         self.trusting = trusting
-        self.table = RoadTable.of(problem)
         self._budget = Budget(np.array(COSTS), int(budget_ms * WORK_PER_MS), DEPTH)
-        starts, slots = problem.slots_in_view
-        self._ground = Ground(
-            self.table.seconds,
-            self.table.following,
-            starts,
-            slots,
-            problem.walk_s,
-            problem.wait_s,
-            problem.give_up_s,
-            # Where a slot is seen for what it is, nobody tries a taken one.
-            0.0 if problem.sighting.perfect else problem.failure_s,
-        )
-        self._path: Path = new_path(problem.lot.n_slots, problem.lot.n_vertices)
+        # Where a slot is seen for what it is, nobody tries a taken one.
+        self._failure_s = 0.0 if self.problem.sighting.perfect else self.problem.failure_s
+        self._neighborhoods = Neighborhoods(self.problem, most_vertices)
+        self._routes = DriveRoutes(self.problem)
 
     def begin(self, observation: Observation) -> Search:
         """Nothing seen yet."""
-        n = self.problem.lot.n_slots
         forecast = np.array(observation["p_occupied"])
+        vertex = int(observation["vertex"])
+        memory = self._search(self._neighborhoods.toward(vertex), forecast, float(observation["time"][1]))
+        if memory.near.place(vertex) < 0:
+            memory.gate = memory.near.gate
+        return memory
+
+    def _search(self, near: Neighborhood, forecast: NDArray[np.float32], time: float) -> Search:
+        n, p = near.n_slots, forecast[near.slots]
         return Search(
             forecast=forecast,
-            doubt=MapDoubt(forecast.astype(np.float64), self.problem.walk_s),
+            near=near,
+            n_unseen=n,
+            doubt=MapDoubt(p.astype(np.float64), near.walk_s, self.trusting),
             kind=np.full(n, UNSEEN, dtype=np.int8),
             looked_at=np.zeros(n),
-            p_occupied=forecast,
-            time=float(observation["time"][1]),
+            p_occupied=p,
+            time=time,
             leaving=np.full(n, np.nan),
             targets=np.zeros(DEPTH, dtype=np.int64),
+            path=new_path(n, len(near.vertices)),
         )
 
     def decide(self, observation: Observation, memory: Search) -> int:
         """Take in what was seen, search for the best path, and go its first step or to the slot to settle for."""
         vertex = int(observation["vertex"])
         self._take_in(observation, vertex, memory)
-        outlook = self._outlook(vertex, memory)
+        if memory.gate not in (-1, vertex):
+            return self._routes.move_toward(vertex, memory.gate)
+        memory.gate = -1
+        here = memory.near.place(vertex)
+        # Half of what there was to see has been seen: time to look farther.
+        spent = not memory.near.whole and 2 * _n_unseen(memory.kind) < memory.n_unseen
+        action = None if here < 0 or spent else self._act(vertex, here, memory)
+        if action is None and not memory.near.whole:
+            self._move_on(observation, vertex, memory)
+            if memory.gate >= 0:
+                return self._routes.move_toward(vertex, memory.gate)
+            action = self._act(vertex, memory.near.place(vertex), memory)
+        return self._wait(vertex) if action is None else action
+
+    def _act(self, vertex: int, here: int, memory: Search) -> int | None:
+        """What the best path begins with, or None where there is none."""
+        near = memory.near
         before = memory.targets[: memory.n_targets].tolist(), memory.cost
         onward_s, at_hand_s, slot, following, memory.n_targets, memory.cost = best_path(
-            vertex,
+            here,
             memory.targets,
             memory.n_targets,
             memory.cost,
             self._budget,
-            self._ground,
-            outlook,
-            self._path,
+            near.ground(self.problem, self._failure_s),
+            self._outlook(here, memory),
+            memory.path,
         )
         memory.expected_s = min(onward_s, at_hand_s)
         memory.replans += before != (memory.targets[: memory.n_targets].tolist(), memory.cost)
         if slot >= 0 and at_hand_s <= onward_s:
-            return PARK if slot == vertex else self.table.move(vertex, slot)
-        if following < 0 or following == vertex:
-            return self._wait(vertex)
-        return self.table.move_to(vertex, following)
+            return PARK if slot == here else near.table.move(here, slot)
+        if following < 0:
+            return None
+        return self._wait(vertex) if following == here else near.table.move_to(here, following)
+
+    def _move_on(self, observation: Observation, vertex: int, memory: Search) -> None:
+        """Plan for the part of the lot around the car from now on, and take along what is known of it."""
+        old = memory.near
+        taken = np.flatnonzero(np.asarray(observation["p_occupied"]) > memory.forecast)
+        near = self._neighborhoods.around(vertex, taken)
+        new = self._search(near, memory.forecast, memory.time)
+        _, ours, theirs = np.intersect1d(old.slots, near.slots, assume_unique=True, return_indices=True)
+        new.looked_at[theirs], new.leaving[theirs] = memory.looked_at[ours], memory.leaving[ours]
+        for f in ("near", "doubt", "kind", "looked_at", "p_occupied", "leaving", "targets", "path"):
+            setattr(memory, f, getattr(new, f))
+        memory.n_targets = 0
+        memory.gate = -1 if near.gate == vertex else near.gate
+        self._take_in(observation, vertex, memory)
+        memory.n_unseen = _n_unseen(memory.kind)
 
     def _take_in(self, observation: Observation, vertex: int, memory: Search) -> None:
-        p, time = np.asarray(observation["p_occupied"]), float(observation["time"][1])
-        starts, slots = self.problem.slots_in_view
+        p, time = np.asarray(observation["p_occupied"])[memory.near.slots], float(observation["time"][1])
+        forecast = memory.forecast[memory.near.slots]
         in_view = np.zeros(len(p), dtype=np.bool_)
-        in_view[slots[starts[vertex] : starts[vertex + 1]]] = True
-        self._watch_ageing(p, time, in_view, memory)
-        kind = np.where(p < memory.forecast, LOOKS_FREE, np.where(p > memory.forecast, LOOKS_TAKEN, UNSEEN))
+        here = memory.near.place(vertex)
+        if here >= 0:
+            starts = memory.near.view_starts
+            in_view[memory.near.view_slots[starts[here] : starts[here + 1]]] = True
+        self._watch_ageing(p, forecast, time, in_view, memory)
+        kind = np.where(p < forecast, LOOKS_FREE, np.where(p > forecast, LOOKS_TAKEN, UNSEEN))
         first = np.flatnonzero((kind != UNSEEN) & (memory.kind == UNSEEN))
         memory.doubt.look(first, kind[first] == LOOKS_TAKEN)
         # A sighting that has quite faded leaves the slot as good as unseen, but it was a first look once.
         memory.kind = np.where(kind == UNSEEN, memory.kind, kind).astype(np.int8)
         memory.looked_at[in_view] = time
-        memory.p_occupied, memory.time = np.array(p), time
+        memory.p_occupied, memory.time = p, time
 
     def _watch_ageing(
-        self, p: NDArray[np.float32], time: float, in_view: NDArray[np.bool_], memory: Search
+        self,
+        p: NDArray[np.float32],
+        forecast: NDArray[np.float32],
+        time: float,
+        in_view: NDArray[np.bool_],
+        memory: Search,
     ) -> None:
         """Read the rate at which cars leave off the beliefs that have grown older."""
         elapsed = time - memory.time
         if not elapsed > 0.0:
             return
-        forecast = memory.forecast.astype(np.float64)
+        forecast = forecast.astype(np.float64)
         was, now = memory.p_occupied - forecast, p - forecast
         ageing = np.flatnonzero(
             ~in_view & (np.abs(was) > 0.05) & (now * was > 0.0) & (np.abs(now) <= np.abs(was))
@@ -196,24 +250,28 @@ class BeliefAgent(SearchAgent[Search]):
         rate = np.log(was[ageing] / now[ageing]) / elapsed
         memory.leaving[ageing] = rate * (1.0 - forecast[ageing])
 
-    def _outlook(self, vertex: int, memory: Search) -> Outlook:
+    def _outlook(self, here: int, memory: Search) -> Outlook:
         told = memory.leaving[np.isfinite(memory.leaving)]
         typical = float(np.median(told)) if len(told) else 1.0 / USUAL_STAY
         leaving = np.where(np.isfinite(memory.leaving), memory.leaving, typical)
-        expected = memory.forecast.astype(np.float64) if self.trusting else memory.doubt.p_occupied()
-        usual = np.maximum(1.0 - expected, 1e-6)
+        weights, free_if = memory.doubt.mixture()
+        usual = np.maximum(weights @ free_if, 1e-6)
         rate = leaving / usual
         seen_free = memory.kind == LOOKS_FREE
         free = np.where(memory.kind == UNSEEN, usual, 1.0 - memory.p_occupied.astype(np.float64))
         # The observation ages by the map; a lot that is fuller than the map takes free slots faster.
         kept = usual + (1.0 - usual) * np.exp(-rate * (memory.time - memory.looked_at))
         free = np.where(seen_free, np.minimum(free, kept), free)
-        drive = self._ground.seconds[vertex, : len(free)]
+        drive = memory.near.table.seconds[here, : len(free)]
         there = usual + (free - usual) * np.exp(-rate * np.where(np.isfinite(drive), drive, 0.0))
         odds = np.divide(1.0 - there, there, out=np.full(len(free), np.inf), where=there > 0.0)
-        return Outlook(memory.kind, free, usual, rate, odds)
+        return Outlook(memory.kind, free, weights, np.ascontiguousarray(free_if.T), usual, rate, odds)
 
     def _wait(self, vertex: int) -> int:
         """A move that the graph does not have; where it has all four, the shortest."""
         missing = np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)
         return int(missing[0]) if len(missing) else int(self.problem.move_s[vertex].argmin())
+
+
+def _n_unseen(kind: NDArray[np.int8]) -> int:
+    return int((kind == UNSEEN).sum())

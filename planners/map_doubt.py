@@ -1,9 +1,13 @@
 """Doubt in the map: what the slots seen so far say of those not yet seen.
 
 Forecasts err together: on the day of an event every slot near the goal is likelier to be taken than the map
-says. So the log-odds that slot s is taken are held to be logit(forecast_s) + a·(1 - z_s) + b·z_s, where z_s runs from
-0 at the slot nearest to the goal to 1 at the farthest, and (a, b) is unknown and small most of the time. Every
-first look at a slot tells of (a, b) by Bayes's rule, on a grid.
+says, and a map may be plain wrong. Each hypothesis of how the map is off gives every slot a probability of its own,
+and given the hypothesis slots are independent. First looks tell of the hypotheses by Bayes's rule, and so may looks
+that are only imagined: on a path on which all was taken so far, the next slot is likelier to be taken, too.
+
+The hypotheses are: the map is right; the log-odds of the slots nearest to the goal, a fifth of the lot to all of it,
+are shifted alike; or the map knows nothing, and slots are the fuller the nearer to the goal they are. As the map
+speaks of the average day, the unshifted log-odds are such that the mean over shifts is what the map says.
 """
 
 from __future__ import annotations
@@ -13,12 +17,23 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-SHIFTS = np.array([-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0, 4.0])
-"""Values of a and of b, logits. The last one is an event: 60 % taken becomes 99 %."""
-TYPICAL_SHIFT = 1.0
-"""Scale of the double exponential prior of a and of b, logits, where the map is off."""
-MAP_IS_RIGHT = 0.9
-"""Prior probability that the map is not off at all."""
+OFF = {
+    **dict.fromkeys(
+        ((shift, reach) for shift in (-2.0, -1.0, 1.0, 2.0) for reach in (0.2, 0.4, 0.6, 0.8, 1.0)), 1e-3
+    ),
+    **dict.fromkeys(((4.0, reach) for reach in (0.6, 0.8, 1.0)), 1e-2),
+}
+"""Prior probability of each shift, logits, of the slots nearest to the goal, as parts of the lot.
+
+The last ones are events, which fill most of a lot: 60 % becomes 99 %. Were they thought likelier, fewer taken slots
+would make the car turn round where there is one, and more often where there is none.
+"""
+KNOWS_NOTHING = {(level, slope): 3e-4 for level in (-2.0, 0.0, 2.0, 4.0) for slope in (0.0, 2.0, 4.0)}
+"""Where the map knows nothing: log-odds of the slot in the middle, and how much higher they are at the goal, and
+lower at the farthest slot; and the prior probability of each.
+"""
+_NEGLIGIBLE = 5e-4
+"""Hypotheses below this are not followed: where the map is right, those that it knows nothing would only blur it."""
 
 
 class MapDoubt:
@@ -27,6 +42,7 @@ class MapDoubt:
     Args:
         p_occupied: (n_slots,) float64, the forecast.
         walk_s: (n_slots,) float64, s.
+        trusting: whether the forecast is taken to be right.
 
     Example:
         A map says 60 % everywhere; of ten slots seen all are taken, so the others are thought fuller.
@@ -40,38 +56,51 @@ class MapDoubt:
         True
     """
 
-    def __init__(self, p_occupied: FloatArray, walk_s: FloatArray) -> None:
-        p = np.clip(p_occupied, 1e-6, 1.0 - 1e-6)
-        rank = np.argsort(np.argsort(walk_s, kind="stable"), kind="stable")
-        far = rank / max(len(walk_s) - 1, 1)
-        near_shift, far_shift = (g.ravel()[:, None] for g in np.meshgrid(SHIFTS, SHIFTS))
-        logits = np.log(p / (1.0 - p)) + near_shift * (1.0 - far) + far_shift * far
-        self._taken = 1.0 / (1.0 + np.exp(-logits))
-        self._log_taken = -np.logaddexp(0.0, -logits)
-        self._log_free = -np.logaddexp(0.0, logits)
-        # Grid points stand for unequal stretches of the shift.
-        width = np.gradient(SHIFTS)
-        each = np.log(width) - np.abs(SHIFTS) / TYPICAL_SHIFT
-        off = np.exp(np.add.outer(each, each).ravel())
-        exact = (near_shift[:, 0] == 0.0) & (far_shift[:, 0] == 0.0)
-        self._log_weight = np.log(MAP_IS_RIGHT * exact + (1.0 - MAP_IS_RIGHT) * off / off.sum())
-        # The mean over the grid is not the forecast itself where that is uneven; what is told is how it moved.
-        self._forecast = p
-        self._at_first = self._mean()
+    def __init__(self, p_occupied: FloatArray, walk_s: FloatArray, trusting: bool = False) -> None:
+        p = np.clip(np.asarray(p_occupied, dtype=np.float64), 1e-6, 1.0 - 1e-6)
+        if trusting:
+            self._taken, self._log_weight = p[None, :], np.zeros(1)
+        else:
+            self._taken, self._log_weight = _hypotheses(p, walk_s)
+        self._log_taken, self._log_free = np.log(self._taken), np.log1p(-self._taken)
 
     def look(self, slots: NDArray[np.int64], taken: NDArray[np.bool_]) -> None:
         """Take in first looks at slots, (k,) int64, that showed them taken or not, (k,) bool."""
         told = self._log_taken[:, slots[taken]].sum(axis=1) + self._log_free[:, slots[~taken]].sum(axis=1)
         self._log_weight += told
 
+    def mixture(self) -> tuple[FloatArray, FloatArray]:
+        """The hypotheses that are worth a thought: their probabilities, (k,), and P(free) under each, (k, n_slots)."""
+        weight = np.exp(self._log_weight - self._log_weight.max())
+        kept = weight >= _NEGLIGIBLE * weight.sum()
+        return weight[kept] / weight[kept].sum(), 1.0 - self._taken[kept]
+
     def p_occupied(self) -> FloatArray:
         """Probability, (n_slots,), that a slot not yet seen is taken."""
-        mean = self._mean()
-        moved = np.log(mean / (1.0 - mean)) - np.log(self._at_first / (1.0 - self._at_first))
-        odds = self._forecast / (1.0 - self._forecast) * np.exp(moved)
-        return np.asarray(odds / (1.0 + odds))
+        weight, free = self.mixture()
+        return np.asarray(1.0 - weight @ free)
 
-    def _mean(self) -> FloatArray:
-        weight = np.exp(self._log_weight - self._log_weight.max())
-        mean: FloatArray = np.clip(weight @ self._taken / weight.sum(), 1e-9, 1.0 - 1e-9)
-        return mean
+
+def _hypotheses(p: FloatArray, walk_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """P(taken), (k, n_slots), under each hypothesis, and the log of its prior probability, (k,)."""
+    n = len(p)
+    rank = np.argsort(np.argsort(walk_s, kind="stable"), kind="stable")
+    shift, prior = [np.zeros(n)], [1.0 - sum(OFF.values()) - sum(KNOWS_NOTHING.values())]
+    for (size, reach), chance in OFF.items():
+        shift.append(np.where(rank < reach * n, size, 0.0))
+        prior.append(chance)
+    nearness = 1.0 - 2.0 * rank / max(n - 1, 1)
+    blank = _logistic(np.stack([level + slope * nearness for level, slope in KNOWS_NOTHING]))
+    shifts, weight = np.stack(shift), np.array(prior)[:, None] / sum(prior)
+    logits, most = np.log(p / (1.0 - p)), np.abs(shifts).max()
+    low, high = logits - most, logits + most
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        too_full = (weight * _logistic(middle + shifts)).sum(axis=0) > p
+        low, high = np.where(too_full, low, middle), np.where(too_full, middle, high)
+    taken = np.concatenate([_logistic(low + shifts), blank])
+    return np.clip(taken, 1e-9, 1.0 - 1e-9), np.log([*prior, *KNOWS_NOTHING.values()])
+
+
+def _logistic(logits: FloatArray) -> FloatArray:
+    return np.asarray(1.0 / (1.0 + np.exp(-logits)))

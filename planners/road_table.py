@@ -1,4 +1,4 @@
-"""Every drive of a lot at once: times between all vertices, and the way from each to each."""
+"""Every drive of a lot, or of a part of it, at once: times between all vertices, and the way from each to each."""
 
 from __future__ import annotations
 
@@ -8,15 +8,13 @@ from typing import Any, Self
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.errors import InputError
 from parkenv.scenario import SearchProblem
 
 FloatArray = NDArray[np.float64]
-
-MOST_VERTICES = 4000
-"""The table grows with the square: this many vertices take 160 MB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,8 +25,8 @@ class RoadTable:
         seconds: (n_vertices, n_vertices) float64, s, from row to column; inf where no way leads.
         following: (n_vertices, n_vertices) int16, the vertex that comes next on a shortest way from row to
             column, -1 where no way leads and on the diagonal.
-        neighbors: (n_vertices, 4) int32, of the lot.
-        move_s: (n_vertices, 4) float64, s, of the problem.
+        neighbors: (n_vertices, 4) int32, where each move leads, or -1.
+        move_s: (n_vertices, 4) float64, s, of each of them.
     """
 
     seconds: FloatArray
@@ -38,22 +36,24 @@ class RoadTable:
 
     @classmethod
     def of(cls, problem: SearchProblem) -> Self:
-        """The table of a problem's lot at its driving speed.
+        """The table of a problem's whole lot."""
+        return cls.over(problem.lot.neighbors, problem.move_s)
 
-        Raises:
-            InputError: the lot has more than `MOST_VERTICES` vertices.
-        """
-        lot = problem.lot
-        if lot.n_vertices > MOST_VERTICES:
-            raise InputError(
-                f"lot {lot.name!r} has {lot.n_vertices} vertices, want at most {MOST_VERTICES}: "
-                "this planner keeps the drive between any two"
-            )
-        matrix: Any = lot.drive_matrix() / problem.v_drive
+    @classmethod
+    def over(cls, neighbors: NDArray[np.int32], move_s: FloatArray) -> Self:
+        """The table of a graph: (n_vertices, 4) neighbours, -1 for none, and drive times, s."""
+        n = len(neighbors)
+        source, move = np.nonzero(neighbors >= 0)
+        target, drive = neighbors[source, move], move_s[source, move]
+        # Parallel edges would be added up by the matrix: keep the quickest.
+        order = np.lexsort((drive, target, source))
+        source, target, drive = source[order], target[order], drive[order]
+        first = np.r_[True, (np.diff(source) != 0) | (np.diff(target) != 0)][: len(source)]
+        matrix: Any = csr_matrix((drive[first], (source[first], target[first])), shape=(n, n))
         seconds = np.ascontiguousarray(dijkstra(matrix), dtype=np.float64)
         following = np.empty(seconds.shape, dtype=np.int16)
-        _follow(seconds, lot.neighbors, problem.move_s, following)
-        return cls(seconds, following, lot.neighbors, problem.move_s)
+        _follow(seconds, neighbors, move_s, following)
+        return cls(seconds, following, neighbors, move_s)
 
     def move(self, vertex: int, target: int) -> int:
         """The first move of a shortest way.

@@ -26,6 +26,12 @@ UNSEEN, LOOKS_FREE, LOOKS_TAKEN = 0, 1, 2
 
 LOST = 0.002
 """Chance of having found nothing worth stopping for at which a path ends; what remains is estimated."""
+MOST_HYPOTHESES = 64
+"""How many ways of how a map may be off there is room for."""
+WORTH_A_LOOK = 0.1
+"""How far, of all the way, a slot seen taken must have come back to its usual chance to be worth another look."""
+MOST_STEPS = 400
+"""Vertices at which a path ends in any case."""
 MOST_OPTIONS = 12
 """Slots known to be free that are kept in mind, best first."""
 
@@ -42,6 +48,7 @@ class Ground(NamedTuple):
         wait_s: s, what it takes to look again where the car stands.
         give_up_s: s, from a lot that is proven full to the goal.
         failure_s: s, what it costs to find a slot taken on arrival: nothing if that shows before the try.
+        whole: whether these are all slots that there are, so that the lot may be proven full.
     """
 
     seconds: FloatArray
@@ -52,6 +59,7 @@ class Ground(NamedTuple):
     wait_s: float
     give_up_s: float
     failure_s: float
+    whole: bool
 
 
 class Outlook(NamedTuple):
@@ -60,6 +68,8 @@ class Outlook(NamedTuple):
     Attributes:
         kind: (n_slots,) int8, UNSEEN, LOOKS_FREE or LOOKS_TAKEN.
         free: (n_slots,) float64, P(free now).
+        weights: (k,) float64, probabilities of the hypotheses of how the map is off.
+        free_if: (n_slots, k) float64, P(free) of an unseen slot under each of them.
         usual: (n_slots,) float64, P(free) that it relaxes to.
         rate: (n_slots,) float64, 1/s, how fast.
         odds: (n_slots,) float64, P(taken)/P(free) about when the car could be there; inf where hopeless.
@@ -67,6 +77,8 @@ class Outlook(NamedTuple):
 
     kind: NDArray[np.int8]
     free: FloatArray
+    weights: FloatArray
+    free_if: FloatArray
     usual: FloatArray
     rate: FloatArray
     odds: FloatArray
@@ -79,12 +91,14 @@ class Path(NamedTuple):
         vertices: (most,) int64.
         times: (most,) float64, s from now.
         starts: (most + 1,) int64, which looks are made at each vertex: `starts[k]` to `starts[k + 1]`.
-        slots: (n_slots,) int64, the slots looked at, in order.
-        chances: (n_slots,) float64, P(free) at the look.
-        found: (n_slots,) float64, s from now, when the look is made.
-        looked: (n_slots,) uint8, scratch.
-        values: (n_slots,) float64, scratch of the way back.
-        offers: (n_slots,) float64, scratch of the way back.
+        slots: (most_looks,) int64, the slots looked at, in order.
+        chances: (most_looks,) float64, P(free) at the look, if all so far were taken.
+        found: (most_looks,) float64, s from now, when the look is made.
+        looked: (n_slots,) float64, s from now, when the path last looked at a slot; -1 where it has not yet, -inf
+            where it need not since the slot is known to be free.
+        values: (most_looks,) float64, scratch of the way back.
+        offers: (most_looks,) float64, scratch of the way back.
+        weights: float64, scratch: the hypotheses' probabilities as they are along the path.
     """
 
     vertices: IntArray
@@ -93,24 +107,27 @@ class Path(NamedTuple):
     slots: IntArray
     chances: FloatArray
     found: FloatArray
-    looked: NDArray[np.uint8]
+    looked: FloatArray
     values: FloatArray
     offers: FloatArray
+    weights: FloatArray
 
 
 def new_path(n_slots: int, n_vertices: int) -> Path:
     """Room for a path on a lot of that size."""
-    most = 4 * n_vertices + 16
+    most = min(4 * n_vertices + 16, MOST_STEPS)
+    most_looks = n_slots + min(n_slots, MOST_STEPS)
     return Path(
         np.zeros(most, np.int64),
         np.zeros(most),
         np.zeros(most + 1, np.int64),
-        np.zeros(n_slots, np.int64),
+        np.zeros(most_looks, np.int64),
+        np.zeros(most_looks),
+        np.zeros(most_looks),
         np.zeros(n_slots),
-        np.zeros(n_slots),
-        np.zeros(n_slots, np.uint8),
-        np.zeros(n_slots),
-        np.zeros(n_slots),
+        np.zeros(most_looks),
+        np.zeros(most_looks),
+        np.zeros(MOST_HYPOTHESES),
     )
 
 
@@ -121,24 +138,6 @@ def decayed(rate: float, seconds: float) -> float:
     if x < 1e-3:
         return x
     return 1.0 - math.exp(-x)
-
-
-@njit(cache=True)
-def nearest_promise(
-    vertex: int, cost: float, ground: Ground, outlook: Outlook, looked: NDArray[np.uint8]
-) -> tuple[int, float]:
-    """The slot that the thesis's planner would drive to among those not looked at, and its expected time, s.
-
-    With γ = 1 its plan is to drive to one slot and to try until it is free: drive + walk + cost·(1 - p)/p.
-    """
-    best, chosen = np.inf, -1
-    row = ground.seconds[vertex]
-    for s in range(len(looked)):
-        if looked[s] == 0:
-            value = row[s] + ground.walk_s[s] + cost * outlook.odds[s]
-            if value < best:
-                best, chosen = value, s
-    return chosen, best
 
 
 @njit(cache=True)
@@ -153,24 +152,25 @@ def lay(
 ) -> tuple[int, float]:
     """Lay a path: past the targets, then as the thesis's planner drives while all that it sees is taken.
 
+    It may come back to slots that it saw taken, once they are likely enough to have come free.
+
     Returns:
         The number of vertices, and the time, s, that is left at its end if nothing was found.
     """
     n = len(outlook.kind)
-    unproven = 0
+    # In a part of a lot there is always a slot more that has not been seen.
+    unproven = 0 if ground.whole else 1
     for s in range(n):
-        path.looked[s] = 1 if outlook.kind[s] == LOOKS_FREE else 0
+        path.looked[s] = -np.inf if outlook.kind[s] == LOOKS_FREE else -1.0
         if outlook.kind[s] != LOOKS_TAKEN:
             unproven += 1
-    for i in range(ground.view_starts[vertex], ground.view_starts[vertex + 1]):
-        s = ground.view_slots[i]
-        if outlook.kind[s] != UNSEEN:
-            path.looked[s] = 1
     path.vertices[0], path.times[0] = vertex, 0.0
     path.starts[0] = path.starts[1] = 0
     k, looks, time, passed = 0, 0, 0.0, 0
     choose, target = True, -1
-    while k + 2 < len(path.vertices):
+    weights = path.weights[: len(outlook.weights)]
+    weights[:] = outlook.weights
+    while k + 2 < len(path.vertices) and looks < len(path.slots):
         while passed < n_targets and (
             targets[passed] == vertex or ground.following[vertex, targets[passed]] < 0
         ):
@@ -179,8 +179,8 @@ def lay(
         if passed < n_targets:
             target = targets[passed]
         elif choose or target == vertex:
-            target, value = nearest_promise(vertex, cost, ground, outlook, path.looked)
-            if target < 0 or not value < np.inf:
+            target, value = _next_target(vertex, time, cost, ground, outlook, path)
+            if target < 0:
                 break
             choose = False
             if _unsatisfied(vertex, value, looks, ground, path) <= LOST:
@@ -195,22 +195,85 @@ def lay(
         path.vertices[k], path.times[k] = vertex, time
         for i in range(ground.view_starts[vertex], ground.view_starts[vertex + 1]):
             s = ground.view_slots[i]
-            if path.looked[s]:
+            if path.looked[s] == -np.inf or looks == len(path.slots):
                 continue
-            path.looked[s] = 1
-            chance = outlook.free[s]
-            if outlook.kind[s] != UNSEEN:
-                chance += (outlook.usual[s] - chance) * decayed(outlook.rate[s], time)
-            else:
+            if outlook.kind[s] == UNSEEN and path.looked[s] < 0.0:
+                chance = _foreseen(weights, outlook.free_if[s])
                 unproven -= 1
+            else:
+                chance = _free_again(s, time, outlook, path)
+                if chance == 0.0:
+                    continue
             path.slots[looks], path.chances[looks], path.found[looks] = s, chance, time
+            path.looked[s] = time
             looks += 1
             choose = True
         path.starts[k + 1] = looks
         if unproven == 0:
             return k + 1, ground.give_up_s
-    _, left = nearest_promise(vertex, max(cost, 1.0), ground, outlook, path.looked)
-    return k + 1, min(left, ground.give_up_s)
+    _, left = _next_target(vertex, time, max(cost, 1.0), ground, outlook, path)
+    return k + 1, min(left, _round_again(time, looks, outlook, ground, path), ground.give_up_s)
+
+
+@njit(cache=True)
+def _round_again(time: float, looks: int, outlook: Outlook, ground: Ground, path: Path) -> float:
+    """Expected s of going round past the same slots, which all were taken, until one of them has come free."""
+    found, walk = 0.0, 0.0
+    for j in range(looks):
+        s = path.slots[j]
+        chance = outlook.usual[s] * decayed(outlook.rate[s], time)
+        found += chance
+        walk += chance * ground.walk_s[s]
+    return time / found + walk / found if found > 0.0 else np.inf
+
+
+@njit(cache=True)
+def _free_again(slot: int, time: float, outlook: Outlook, path: Path) -> float:
+    """P(free) some time later of a slot seen taken, really or along the path; 0 where it is not worth a look."""
+    usual = outlook.usual[slot]
+    if path.looked[slot] >= 0.0:
+        chance = usual * decayed(outlook.rate[slot], time - path.looked[slot])
+    else:
+        chance = outlook.free[slot]
+        chance += (usual - chance) * decayed(outlook.rate[slot], time)
+    return chance if chance >= WORTH_A_LOOK * usual else 0.0
+
+
+@njit(cache=True)
+def _next_target(
+    vertex: int, time: float, cost: float, ground: Ground, outlook: Outlook, path: Path
+) -> tuple[int, float]:
+    """The slot that the thesis's planner would drive to at some time of a path, and its expected time, s.
+
+    With γ = 1 its plan is to drive to one slot and to try until it is free: drive + walk + cost·(1 - p)/p.
+    """
+    best, chosen = np.inf, -1
+    row = ground.seconds[vertex]
+    for s in range(len(outlook.kind)):
+        value = row[s] + ground.walk_s[s]
+        if value >= best or path.looked[s] == -np.inf:
+            continue
+        if outlook.kind[s] == UNSEEN and path.looked[s] < 0.0:
+            value += cost * outlook.odds[s]
+        else:
+            chance = _free_again(s, time + row[s], outlook, path)
+            value += cost * (1.0 - chance) / chance if chance > 0.0 else np.inf
+        if value < best:
+            best, chosen = value, s
+    return chosen, best
+
+
+@njit(cache=True)
+def _foreseen(weights: FloatArray, free_if: FloatArray) -> float:
+    """P(free) of a slot at its first look; the hypotheses are left as they are once it was seen taken."""
+    free, taken = 0.0, 0.0
+    for h in range(len(weights)):
+        free += weights[h] * free_if[h]
+        weights[h] *= 1.0 - free_if[h]
+        taken += weights[h]
+    for h in range(len(weights)):
+        weights[h] /= taken
+    return free / (free + taken)
 
 
 @njit(cache=True)

@@ -19,9 +19,10 @@ from numpy.typing import ArrayLike, NDArray
 from parkenv.errors import InputError
 from parkenv.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
+from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.replanning import Plan, ReplanningAgent
-from planners.road_table import RoadTable
-from planners.search_paths import Ground, Outlook, nearest_promise
+from planners.routes import DriveRoutes
+from planners.search_paths import Ground
 
 FloatArray = NDArray[np.float64]
 
@@ -58,11 +59,12 @@ def tune_failure_cost(
     costs: Sequence[float] = COSTS,
     worlds: int = WORLDS,
     seed: int = 0,
-    table: RoadTable | None = None,
+    near: Neighborhood | None = None,
 ) -> Tuning:
     """Simulate the thesis's planner in worlds drawn from a forecast.
 
-    Slots are seen without error when they come in view, and last; a lot seen to be full costs `give_up_s`.
+    Slots are seen without error when they come in view, and last; a lot seen to be full costs `give_up_s`. A large
+    lot is simulated where the search will take place (`Neighborhoods`), from the gate on where it starts far away.
 
     Args:
         problem: lot, goal, speeds and costs.
@@ -71,7 +73,7 @@ def tune_failure_cost(
         costs: failure costs to compare, s, each above 0.
         worlds: how many worlds are drawn; the same ones for each cost.
         seed: of the worlds.
-        table: the lot's drives, where they are at hand.
+        near: the part of the lot to simulate, with its drives; where None it is made.
 
     Raises:
         InputError: a cost or a number of worlds that is not positive, probabilities of a wrong number or size.
@@ -84,20 +86,12 @@ def tune_failure_cost(
         raise InputError(f"costs are {list(costs)}, want finite seconds above 0")
     if worlds < 1:
         raise InputError(f"worlds is {worlds}, want at least 1")
-    table = table or RoadTable.of(problem)
+    near = near or Neighborhoods(problem).toward(vertex)
+    here = near.place(vertex)
+    p = p[near.slots]
     taken = np.random.default_rng(seed).random((worlds, len(p))) < p
-    starts, slots = problem.slots_in_view
-    ground = Ground(
-        table.seconds,
-        table.following,
-        starts,
-        slots,
-        problem.walk_s,
-        problem.wait_s,
-        problem.give_up_s,
-        problem.failure_s,
-    )
-    return Tuning(tried, _mean_times(vertex, taken, p, tried, ground))
+    ground = near.ground(problem, problem.failure_s)
+    return Tuning(tried, _mean_times(here if here >= 0 else near.place(near.gate), taken, p, tried, ground))
 
 
 @njit(cache=True)
@@ -106,16 +100,13 @@ def _mean_times(
 ) -> FloatArray:
     n_worlds, n = taken.shape
     mean = np.zeros(len(costs))
-    nothing = np.zeros(n)
-    odds, hidden = np.empty(n), np.zeros(n, np.uint8)
-    kind = np.zeros(n, np.int8)
-    outlook = Outlook(kind, nothing, nothing, nothing, odds)
+    odds, seen = np.empty(n), np.empty(n, np.bool_)
     for c in range(len(costs)):
         for w in range(n_worlds):
-            kind[:] = 0
+            seen[:] = False
             for s in range(n):
                 odds[s] = p_occupied[s] / (1.0 - p_occupied[s]) if p_occupied[s] < 1.0 else np.inf
-            mean[c] += _search(vertex, taken[w], costs[c], ground, outlook, hidden) / n_worlds
+            mean[c] += _search(vertex, taken[w], costs[c], ground, odds, seen) / n_worlds
     return mean
 
 
@@ -125,16 +116,16 @@ def _search(
     taken: NDArray[np.bool_],
     cost: float,
     ground: Ground,
-    outlook: Outlook,
-    hidden: NDArray[np.uint8],
+    odds: FloatArray,
+    seen: NDArray[np.bool_],
 ) -> float:
-    """Total time, s, of the thesis's planner in one world; `hidden` is all zero, no slot is left out."""
+    """Total time, s, of the thesis's planner in one world; its belief, P(taken)/P(free), and memory are written to."""
     total, unseen, found = 0.0, len(taken), False
     for _ in range(_MOST_STEPS):
-        target, value = nearest_promise(vertex, cost, ground, outlook, hidden)
+        target, value = _promise(vertex, cost, ground, odds)
         if target < 0 or not value < np.inf:
             break
-        if target == vertex and outlook.kind[target] != 0:
+        if target == vertex and seen[target]:
             return float(total + ground.walk_s[target])
         if target == vertex:
             # The search begins before this slot: it tries without having looked.
@@ -147,14 +138,29 @@ def _search(
             vertex = following
         for i in range(ground.view_starts[vertex], ground.view_starts[vertex + 1]):
             s = ground.view_slots[i]
-            if outlook.kind[s] == 0:
-                outlook.kind[s] = 1
+            if not seen[s]:
+                seen[s] = True
                 unseen -= 1
                 found = found or not taken[s]
-                outlook.odds[s] = np.inf if taken[s] else 0.0
+                odds[s] = np.inf if taken[s] else 0.0
         if unseen == 0 and not found:
             break
     return total + ground.give_up_s
+
+
+@njit(cache=True)
+def _promise(vertex: int, cost: float, ground: Ground, odds: FloatArray) -> tuple[int, float]:
+    """The slot that the thesis's planner drives to, and the time, s, that it expects.
+
+    With γ = 1 its plan is to drive to one slot and to try until it is free: drive + walk + cost·(1 - p)/p.
+    """
+    best, chosen = np.inf, -1
+    row = ground.seconds[vertex]
+    for s in range(len(odds)):
+        value = row[s] + ground.walk_s[s] + cost * odds[s]
+        if value < best:
+            best, chosen = value, s
+    return chosen, best
 
 
 @dataclass
@@ -163,10 +169,12 @@ class TunedPlan:
 
     Attributes:
         failure_s: s, the failure cost that it chose.
+        gate: the vertex that it drives to before it follows its plan, or -1.
         plan: the thesis's planner's own memory.
     """
 
     failure_s: float
+    gate: int
     plan: Plan
 
     @property
@@ -183,34 +191,44 @@ class TunedPlan:
 class TunedAgent(SearchAgent[TunedPlan]):
     """`mdp-tuned`: at the arrival chooses its failure cost for the forecast, then is the thesis's planner.
 
+    On a lot too large to be simulated it first drives to the gate of the part that was.
+
     Args:
         problem: lot, goal, speeds and costs.
         worlds: how many worlds are drawn from the forecast.
         seed: of those worlds.
         gamma: discount a decision.
+        most_vertices: a lot with more is simulated in part (`Neighborhoods`).
 
     Raises:
-        InputError: no worlds, or a lot too large for a table of all drives.
+        InputError: no worlds, or a bad `most_vertices`.
     """
 
     name: ClassVar[str] = "mdp-tuned"
 
     def __init__(
-        self, problem: SearchProblem, worlds: int = WORLDS, seed: int = 0, gamma: float = 0.9999
+        self,
+        problem: SearchProblem,
+        worlds: int = WORLDS,
+        seed: int = 0,
+        gamma: float = 0.9999,
+        most_vertices: int = MOST_VERTICES,
     ) -> None:
         super().__init__(problem)
         if worlds < 1:
             raise InputError(f"worlds is {worlds}, want at least 1")
         self.worlds, self.seed, self.gamma = worlds, seed, gamma
-        self._table = RoadTable.of(self.problem)
-        self._planners = {c: ReplanningAgent(self.problem, failure_s=c, gamma=gamma) for c in COSTS}
+        self._neighborhoods = Neighborhoods(self.problem, most_vertices)
+        self._routes = DriveRoutes(self.problem)
+        self._planners: dict[float, ReplanningAgent] = {}
         self._tuned: OrderedDict[tuple[int, bytes], Tuning] = OrderedDict()
 
     def tuning(self, p_occupied: NDArray[np.floating], vertex: int) -> Tuning:
         """The simulation for a forecast, (n_slots,), and an entry; kept for the next search like it."""
         # To the percent: arrivals within minutes of each other have the same forecast.
+        near = self._neighborhoods.toward(vertex)
         rounded = np.round(np.asarray(p_occupied, dtype=np.float64), 2)
-        key = vertex, rounded.tobytes()
+        key = vertex, rounded[near.slots].tobytes()
         if key not in self._tuned:
             self._tuned[key] = tune_failure_cost(
                 self.problem,
@@ -218,7 +236,7 @@ class TunedAgent(SearchAgent[TunedPlan]):
                 vertex,
                 worlds=self.worlds,
                 seed=self.seed,
-                table=self._table,
+                near=near,
             )
             if len(self._tuned) > _KEPT:
                 self._tuned.popitem(last=False)
@@ -226,9 +244,19 @@ class TunedAgent(SearchAgent[TunedPlan]):
 
     def begin(self, observation: Observation) -> TunedPlan:
         """Choose the failure cost, and plan at it."""
-        best = self.tuning(observation["p_occupied"], int(observation["vertex"])).best
-        return TunedPlan(best, self._planners[best].begin(observation))
+        vertex = int(observation["vertex"])
+        best = self.tuning(observation["p_occupied"], vertex).best
+        if best not in self._planners:
+            self._planners[best] = ReplanningAgent(self.problem, failure_s=best, gamma=self.gamma)
+        near = self._neighborhoods.toward(vertex)
+        gate = near.gate if near.place(vertex) < 0 else -1
+        return TunedPlan(best, gate, self._planners[best].begin(observation))
 
     def decide(self, observation: Observation, memory: TunedPlan) -> int:
-        """As the thesis's planner at the chosen cost."""
+        """As the thesis's planner at the chosen cost, from the gate on."""
+        vertex = int(observation["vertex"])
+        if vertex == memory.gate:
+            memory.gate = -1
+        if memory.gate >= 0:
+            return self._routes.move_toward(vertex, memory.gate)
         return self._planners[memory.failure_s].decide(observation, memory.plan)

@@ -26,7 +26,7 @@ from parkenv.errors import InputError
 
 Row = dict[str, Any]
 
-DEFAULT_AGENTS = "mdp,mdp-static,greedy-goal,greedy-drive,first-free,random,oracle"
+DEFAULT_AGENTS = "mdp,mdp-static,mdp-tuned,belief,greedy-goal,greedy-drive,first-free,random,oracle"
 LEVELS = "0.5,0.7,0.8,0.9,0.95,0.99"
 
 

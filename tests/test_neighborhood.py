@@ -1,0 +1,137 @@
+"""Large lots are planned for in part: which part, that leaving out the rest changes nothing, and how it moves on."""
+
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy.sparse.csgraph import dijkstra
+
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario
+from parkenv.evaluation.compare import at_occupancy
+from parkenv.evaluation.episodes import EpisodeRunner
+from planners import make_agent
+from planners.neighborhood import Neighborhoods
+
+
+def everything_at_best(problem, start):
+    """Drives, s, from a vertex and between all, and g: the drive to a vertex and the best from there if all is free."""
+    seconds = dijkstra(problem.lot.drive_matrix() / problem.v_drive)
+    least = (seconds[:, : problem.lot.n_slots] + problem.walk_s).min(axis=1)
+    return seconds, seconds[start] + least
+
+
+def test_a_small_lot_is_one_neighbourhood():
+    problem = Scenario.named("street").public()
+    near = Neighborhoods(problem).toward(0)
+    assert near.whole
+    np.testing.assert_array_equal(near.slots, np.arange(problem.lot.n_slots))
+    np.testing.assert_array_equal(near.walk_s, problem.walk_s)
+    assert Neighborhoods(problem).around(3, np.arange(5)).whole
+
+
+@pytest.mark.parametrize("name", ["campus", "street"])
+def test_a_part_holds_the_vertices_that_may_do_best_and_the_ways_to_them(name):
+    problem = Scenario.named(name).public()
+    lot, most = problem.lot, problem.lot.n_vertices // 2
+    start = int(lot.neighbors[problem.walk_s.argmin()].max())
+    near = Neighborhoods(problem, most).around(start, np.empty(0, dtype=np.int64))
+    seconds, g = everything_at_best(problem, start)
+    assert len(near.vertices) == most
+    assert not near.whole
+    inside = np.isin(np.arange(lot.n_vertices), near.vertices)
+    assert g[inside].max() <= g[~inside].min() + 1e-9
+    np.testing.assert_allclose(near.table.seconds[near.place(start)], seconds[start, near.vertices])
+    # Ways among the others may leave the part; what is there is true.
+    assert (near.table.seconds >= seconds[np.ix_(near.vertices, near.vertices)] - 1e-9).all()
+    for v, vertex in enumerate(near.vertices):
+        starts, slots = problem.slots_in_view
+        here = near.slots[near.view_slots[near.view_starts[v] : near.view_starts[v + 1]]]
+        seen = slots[starts[vertex] : starts[vertex + 1]]
+        np.testing.assert_array_equal(here, seen[inside[seen]])
+        assert near.place(int(vertex)) == v
+    assert near.place(int(np.flatnonzero(~inside)[0])) == -1
+
+
+def test_slots_known_to_be_taken_draw_nobody():
+    problem = Scenario.named("campus").public()
+    start = int(problem.walk_s.argmin())
+    parts = Neighborhoods(problem, 80)
+    before = parts.around(start, np.empty(0, dtype=np.int64))
+    taken = before.slots[np.argsort(before.walk_s)[:60]]
+    after = parts.around(start, taken)
+    assert not np.isin(after.slots, before.slots).all()
+
+
+def test_far_from_the_goal_the_part_begins_at_a_gate_on_a_quickest_way():
+    problem = Scenario.on_lot(ParkingLot.city(3000)).public()
+    entry = int(problem.lot.entry_vertices[0])
+    parts = Neighborhoods(problem, 500)
+    near = parts.toward(entry)
+    assert near is parts.toward(entry)
+    assert near.place(entry) == -1
+    _, g = everything_at_best(problem, entry)
+    assert g[near.gate] == pytest.approx(g[entry])
+    assert near.place(int(problem.walk_s.argmin())) >= 0
+
+
+@pytest.mark.parametrize(("level", "seeds"), [(0.6, 4), (0.9, 4)])
+def test_leaving_out_what_cannot_matter_changes_nothing(level, seeds):
+    """The farthest tenth of a lot: the searches are the same to the last second."""
+    scenario = at_occupancy(Scenario.on_lot(ParkingLot.grid(8, 40)), level)
+    most = scenario.lot.n_vertices * 9 // 10
+    whole, part = (
+        EpisodeRunner(scenario, "belief", make_agent("belief", scenario, trusting=True, most_vertices=m))
+        for m in (scenario.lot.n_vertices, most)
+    )
+    for seed in range(seeds):
+        assert part.run(seed).row["total_s"] == pytest.approx(whole.run(seed).row["total_s"], abs=1e-6)
+
+
+def nearly_full(lot, free):
+    taken = np.ones(lot.n_slots, dtype=bool)
+    taken[free] = False
+    occupancy = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
+    prior = OccupancyProcess.from_demand(np.full(lot.n_slots, 1.0), np.zeros(168), 1e9)
+    return Scenario(name="nearly-full", lot=lot, occupancy=occupancy, prior=prior)
+
+
+@pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
+def test_where_a_part_is_full_the_search_goes_on_beyond_it(name):
+    lot = ParkingLot.city(600)
+    order = np.argsort(lot.walk_m())
+    free = order[-40:]
+    scenario = nearly_full(lot, free)
+    runner = EpisodeRunner(scenario, name, make_agent(name, scenario, most_vertices=150))
+    near = Neighborhoods(scenario.public(), 150).toward(int(lot.entry_vertices[0]))
+    row = runner.run(0).row
+    assert row["parked"]
+    assert row["failed_parks"] == 0
+    assert not np.isin(near.slots, free).any()
+
+
+def test_a_bad_size_is_refused():
+    with pytest.raises(InputError, match="most_vertices is 3"):
+        make_agent("belief", Scenario.named("campus"), most_vertices=3)
+    with pytest.raises(InputError, match="most_vertices is 40000"):
+        make_agent("mdp-tuned", Scenario.named("campus"), most_vertices=40_000)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
+def test_a_city_of_100_000_slots(name):
+    scenario = at_occupancy(Scenario.on_lot(ParkingLot.city(100_000)), 0.95)
+    make_agent(name, Scenario.on_lot(ParkingLot.city(3000)))  # compiles
+    agent, env = make_agent(name, scenario), gym.make("parkenv/Search-v0", scenario=scenario)
+    for seed in range(2):
+        observation, _ = env.reset(seed=seed)
+        memory, over, times = None, False, []
+        while not over:
+            start = time.process_time()
+            action, memory = agent.predict(observation, memory)
+            times.append(time.process_time() - start)
+            observation, _, terminated, truncated, info = env.step(action)
+            over = terminated or truncated
+        assert info["parked"]
+        assert info["failed_parks"] == 0
+    assert np.median(times) < 0.03
