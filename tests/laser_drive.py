@@ -12,6 +12,7 @@ _RIG = SensorRig.thesis()
 _, CAMERA, EYE = _RIG.cameras[0]
 _, LASER, MOUNT = _RIG.lasers[0]
 LEAST_BEAMS, FARTHEST_M = 8, 12.0
+CAR_HIGH = 1.5
 END_LIMIT = math.radians(60.0)
 
 
@@ -33,7 +34,9 @@ def seen_cars(scene, pose, scan, ids):
         if on_it.sum() < LEAST_BEAMS or np.median(scan[on_it]) > FARTHEST_M:
             continue
         column = CAMERA.cx - CAMERA.fx * np.tan(off[on_it])
-        boxes.append([column.min(), 200.0, column.max(), 300.0])
+        depth = np.median((scan * np.cos(off))[on_it])
+        rows = CAMERA.cy + CAMERA.fy * (EYE.z - np.array([CAR_HIGH, 0.0])) / depth
+        boxes.append([column.min(), rows[0], column.max(), rows[1]])
         x, y, yaw = scene.vehicle_pose[car - 1]
         angle = abs(math.atan2(y - pose[1], x - pose[0]) - yaw) % math.pi
         ends.append(min(angle, math.pi - angle) < END_LIMIT)

@@ -121,6 +121,18 @@ def test_what_no_beam_meets_has_no_distance():
     assert len(locate_plainly(box, sweep, CAMERA, EYE, ORIGIN)) == 0
 
 
+@pytest.mark.parametrize(
+    ("top", "bottom", "stands"),
+    [(200, 345, True), (0, 150, False), (40, 345, False), (300, 345, False), (230, 260, False)],
+    ids=["as cars do", "in the sky", "as high as a house", "as low as a kerb", "hovering"],
+)
+def test_what_does_not_stand_on_the_ground_as_cars_do_is_none(top, bottom, stands):
+    """The car's face is 4 m away and the eye 1.3 m high, so the ground there is 104 px below the horizon."""
+    sweep = swept((0.0, -5.0, 0.0, 4.0, 2.0))
+    found = locate(boxes_of([180, top, 460, bottom], ends=False), sweep, CAMERA, EYE, ORIGIN)
+    assert len(found) == stands
+
+
 def test_no_detection_is_no_car():
     sweep = swept((0.0, -5.0, 0.0, 4.0, 2.0))
     for way in (locate, locate_plainly):

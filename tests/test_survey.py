@@ -73,7 +73,7 @@ def test_a_survey_goes_on_where_it_was(tmp_path):
 def test_the_maps_error_is_zero_where_it_is_right():
     scenario, taken = halves()
     log = SessionLog(np.zeros(500), np.tile(taken, (500, 1)), np.ones((500, len(taken)), bool))
-    error, expected = map_error(scenario, [0.0], log)
+    error, expected = map_error(scenario, [ArrivalWindow((0,), 0.0, 0.0)], log)
     assert error < 0.02
     assert expected < 0.01
 

@@ -71,8 +71,8 @@ def survey(
         save_map,
         save_session,
     )
-    from parkenv.evaluation.surveys import run_survey, summarize
-    from parkenv.mapping.discovery import discover, score_discovery
+    from parkenv.evaluation.surveys import run_survey, slots_found, summarize
+    from parkenv.mapping.discovery import score_discovery
     from parkenv.mapping.inference import predict
     from parkenv.mapping.odometry import PoseNoise
     from parkenv.mapping.store import MapStore
@@ -105,7 +105,7 @@ def survey(
         progress.update(task, completed=sessions)
     row = summarize(its, settings, run, out / MAP_FILE)
     with MapStore(out / MAP_FILE, its.lot, create=False) as store:
-        log, poses = store.log(), store.cars()
+        log, found = store.log(), slots_found(store)
     first = settings.windows[0]
     time = 86_400.0 * first.weekdays[0] + 0.5 * (first.start_s + first.end_s)
     predicted = predict(log, time)
@@ -119,7 +119,6 @@ def survey(
         save_detections(run.shown, out / f"detections_{its.name}.png")
         save_session(its.lot, run.shown, out / f"session_{its.name}.png")
         save_graph(its.lot, predicted, run.shown, out / f"graph_{its.name}.png")
-    found = discover(poses)
     save_found_slots(its.lot, found, score_discovery(found, its.lot), out / f"slots_found_{its.name}.png")
     table = make_table(None, ["figure", "value"])
     for name in (

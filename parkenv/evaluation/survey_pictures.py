@@ -26,7 +26,7 @@ from parkenv.perception.detector import Detections
 
 FloatArray = NDArray[np.float64]
 
-SIDE_COLOR, END_COLOR = (255, 208, 0), (86, 180, 233)
+SIDE_COLOR, END_COLOR, NOWHERE_COLOR = (255, 208, 0), (86, 180, 233), (200, 200, 200)
 TAKEN, FREE, UNKNOWN = "#d1495b", "#2a9d8f", "#9aa0a6"
 WRONG = "#ffd000"
 WEATHER_COLORS = {
@@ -38,19 +38,33 @@ WEATHER_COLORS = {
 }
 
 
-def draw_detections(image: NDArray[np.uint8], found: Detections) -> NDArray[np.uint8]:
-    """A copy of an image, (h, w, 3) RGB, with what was detected in it."""
+def draw_detections(
+    image: NDArray[np.uint8], found: Detections, placed: NDArray[np.int64] | None = None
+) -> NDArray[np.uint8]:
+    """A copy of an image, (h, w, 3) RGB, with what was detected in it.
+
+    Args:
+        image: the image.
+        found: in it.
+        placed: rows of those that stand somewhere; others are drawn thin and grey. All of them where None.
+    """
     drawn = image.copy()
-    for box, p, end in zip(found.boxes, found.probability, found.ends, strict=True):
-        color = END_COLOR if end else SIDE_COLOR
+    for i, (box, p, end) in enumerate(zip(found.boxes, found.probability, found.ends, strict=True)):
         left, top, right, bottom = (round(float(v)) for v in box)
+        if placed is not None and i not in placed:
+            cv2.rectangle(drawn, (left, top), (right, bottom), NOWHERE_COLOR, 1, cv2.LINE_AA)
+            continue
+        color = END_COLOR if end else SIDE_COLOR
         cv2.rectangle(drawn, (left, top), (right, bottom), color, 2, cv2.LINE_AA)
         cv2.putText(drawn, f"{p:.2f}", (left + 4, max(top, 0) + 16), color, cv2.FontFace("sans"), 14, 700)
     return drawn
 
 
 def save_detections(result: SessionResult, path: Path) -> None:
-    """Some frames of a session with their detections (T Fig. 4.4); yellow sides, blue fronts and rears."""
+    """Some frames of a session with their detections (T Fig. 4.4).
+
+    Yellow are sides, blue fronts and rears, thin and grey what no beam met or what is seen too little of.
+    """
     with mpl.rc_context(STYLE):
         n = len(result.looks)
         figure = Figure(figsize=(4.2 * n, 3.5))
@@ -59,7 +73,8 @@ def save_detections(result: SessionResult, path: Path) -> None:
         )
         for i, (_, look) in enumerate(result.looks):
             ax = figure.add_subplot(1, n, i + 1)
-            ax.imshow(draw_detections(look.views[0].image, look.views[0].detections))
+            view = look.views[0]
+            ax.imshow(draw_detections(view.image, view.detections, view.cars.detection))
             ax.set_axis_off()
         figure.subplots_adjust(0.01, 0.01, 0.99, 0.9, wspace=0.02)
         save_picture(figure, path)

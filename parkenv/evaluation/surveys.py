@@ -14,11 +14,12 @@ from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
 from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
 from parkenv.mapping.survey_score import DISTANCE_ENDS, WAYS
-from parkenv.occupancy import Arrival
+from parkenv.occupancy import DAY_S, Arrival, ArrivalWindow
 from parkenv.scenario import Scenario
 from parkenv.whole_files import written_whole
 
@@ -124,8 +125,8 @@ def run_survey(
 def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_file: Path) -> Row:
     """The row of `summary.json`."""
     with MapStore(map_file, scenario.lot, create=False) as store:
-        log = store.log()
-    error, expected = map_error(scenario, _test_times(settings), log)
+        log, found = store.log(), score_discovery(slots_found(store), scenario.lot)
+    error, expected = map_error(scenario, settings.windows, log)
     parked = sum(r["parked"] for r in run.rows)
     detections = sum(r["detections"] for r in run.rows)
     return {
@@ -157,10 +158,20 @@ def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_
             for its in [[r for r in run.rows if r["weather"] == weather]]
         },
         "detection_by_distance": detection_by_distance(run.rows),
+        "slots_found": found._asdict(),
         "occupancy_mae": error,
         "occupancy_mae_expected": expected,
         "seconds_per_frame": _mean(run.rows, "seconds_per_frame"),
     }
+
+
+def slots_found(store: MapStore) -> FoundSlots:
+    """Slots that the cars of all sessions in a map file show; nobody tells where any are.
+
+    What passes or is taken for a car now and then adds up over sessions, so the more there are the more cars a slot
+    must have had.
+    """
+    return discover(store.cars(), least=max(3, len(store.log().time) // 2))
 
 
 def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
@@ -197,23 +208,27 @@ def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
     return result
 
 
-def map_error(scenario: Scenario, times: Sequence[float], log: SessionLog) -> tuple[float, float]:
-    """How far the map's predictions are from the true probabilities, and how far counts of as many sessions would be.
+def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: SessionLog) -> tuple[float, float]:
+    """How far the map's predictions are from the true probabilities, and how far counts alone would be.
 
     Args:
         scenario: whose occupancy is the truth.
-        times: s since Monday 00:00, at which to ask.
+        windows: in which sessions began; the map is asked at the middle of each, on its first day.
         log: the map's sessions.
 
     Returns:
-        Mean over slots and times of |predicted - true|; the same of a mean of independent draws at that very hour.
+        Mean over slots and windows of |predicted - true|; and the sampling error that is to be expected of counts: the
+        same of the mean of as many independent draws as there are sessions in the window, at its very middle.
     """
     errors, chances = [], []
-    for time in times:
+    hour = log.time % DAY_S
+    for window in windows:
+        time = DAY_S * window.weekdays[0] + 0.5 * (window.start_s + window.end_s)
+        draws = int(((hour >= window.start_s) & (hour <= window.end_s)).sum())
         true = scenario.occupancy.forecast(Arrival(time)).p_occupied
         errors.append(np.abs(predict(log, time).p_occupied - true))
         # Mean absolute deviation of a binomial share, by its normal limit.
-        chances.append(np.sqrt(2.0 / np.pi * true * (1.0 - true) / max(len(log.time), 1)))
+        chances.append(np.sqrt(2.0 / np.pi * true * (1.0 - true) / max(draws, 1)))
     return float(np.mean(errors)), float(np.mean(chances))
 
 
@@ -239,11 +254,6 @@ def _drive(scenario: Scenario, settings: SurveySettings, number: int, pictures: 
         _KEPT.clear()
         _KEPT[name] = Survey(scenario, settings)
     return _KEPT[name].drive(number, pictures=pictures)
-
-
-def _test_times(settings: SurveySettings) -> list[float]:
-    """The middle of every window, on its first day."""
-    return [86_400.0 * w.weekdays[0] + 0.5 * (w.start_s + w.end_s) for w in settings.windows]
 
 
 def _mean(rows: Sequence[Row], column: str) -> float:

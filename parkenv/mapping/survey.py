@@ -78,7 +78,7 @@ class SessionResult:
         score: what else was right and wrong.
         frame_s: (f,) s, that each capture took to be understood.
         grid: of the session.
-        looks: some captures with what was made of them, for pictures.
+        looks: some captures that show many cars, with what was made of them, for pictures.
     """
 
     session: Session
@@ -148,14 +148,15 @@ class Survey:
         poses = poses_along(self.route.path, settings.every)
         believed = settings.pose_noise.estimated(poses, rng)
         times = arrival.time + settings.every / scenario.v_drive * np.arange(len(poses))
-        kept = (len(poses) * np.linspace(0.15, 0.85, pictures)).astype(int).tolist()
+        # Of each stretch of the way, the capture that shows most.
+        shown: dict[int, tuple[int, Capture, Look]] = {}
 
         slots, score = SlotFilter(lot), SurveyScore(lot.n_slots)
         last_look = np.full(lot.n_slots, arrival.time)
         low_x, low_y, high_x, high_y = lot.bounds()
         grid = OccupancyGrid((low_x - 2.0, low_y - 2.0), (high_x + 2.0, high_y + 2.0), 0.25)
         cars: list[FloatArray] = []
-        looks, frame_s = [], []
+        frame_s = []
         for i, (pose, belief, time) in enumerate(zip(poses, believed, times.tolist(), strict=True)):
             scene = scenes.at(time, pose)
             capture = self.stack.rig.capture(scene, pose, weather, int(rng.integers(_SEEDS)))
@@ -174,8 +175,9 @@ class Survey:
             last_look[slots.told] = time
             plainly = [self.stack.locate_plainly(view, belief) for view in look.views]
             score.take(scene, capture, look, placed, plainly)
-            if i in kept:
-                looks.append((capture, look))
+            stretch, cars_there = i * pictures // len(poses), sum(len(view.cars) for view in look.views)
+            if pictures and (stretch not in shown or cars_there > shown[stretch][0]):
+                shown[stretch] = cars_there, capture, look
         truth = np.array(
             [world.occupied([s], t)[0] for s, t in enumerate(last_look.tolist())], dtype=np.bool_
         )
@@ -185,7 +187,8 @@ class Survey:
         session = Session(self.key_of(number), arrival.time, settings.rig, preset, p, found_cars)
         return SessionResult(
             session, arrival, states, truth,
-            int(truth.sum()), int((truth & score.found).sum()), score, np.array(frame_s), grid, tuple(looks),
+            int(truth.sum()), int((truth & score.found).sum()), score, np.array(frame_s), grid,
+            tuple((capture, look) for _, capture, look in shown.values()),
         )  # fmt: skip
 
 

@@ -31,6 +31,10 @@ GAP = 0.5
 """m, between the ends of neighbouring beams that belong to different things."""
 WHOLE_END = 1.2
 """m; an end of which so much is seen is a car's, and not a glimpse of its flank."""
+OFF_GROUND = 0.7
+"""m, that the lower edge of a box may lie above or below the ground."""
+CAR_HEIGHT = (0.8, 3.2)
+"""m, between which the upper edge of a box lies."""
 _LEAST_BEAMS = 3
 _MARGIN = 0.02  # of an image's width; boxes that come as close to its margin are taken to end there
 _SAME_AXIS = 0.1  # m, between a camera and the sweep that stands for it
@@ -185,7 +189,8 @@ def locate(
 ) -> CarSightings:
     """Where the detected cars stand: `car_beams` of each box, and a car fitted to them.
 
-    Detections without a thing at bumper height are dropped, and cars of which too little is seen to tell how they lie:
+    Detections without a thing at bumper height are dropped, those that at its distance would not stand on the ground
+    or be no car's height, and cars of which too little is seen to tell how they lie:
     neither a flank nor an end, or not all of them at the image's margin. Who drives on sees them better from elsewhere.
 
     Args:
@@ -208,6 +213,8 @@ def locate(
         )
         beams, cut = car_beams(sweep, beams_between(sweep, left, right), clipped)
         if not len(beams):
+            continue
+        if not _stands(detections.boxes[i], float(np.median(sweep.distance[beams])), camera, mount):
             continue
         car = fit_box(
             sweep.points(beams), np.array([sweep.x, sweep.y]), end_on=bool(detections.ends[i]), cut=cut
@@ -288,6 +295,19 @@ def _require_same_axis(sweep: Sweep, mount: Mount, vehicle: FloatArray) -> None:
     apart = math.hypot(sweep.x - x, sweep.y - y)
     if apart > _SAME_AXIS:
         raise InputError(f"camera and sweep are {apart:.2f} m apart, want both on one vertical axis (T §4.1)")
+
+
+def _stands(box: Float32Array, distance: float, camera: PinholeCamera, mount: Mount) -> bool:
+    """Whether a box is as low and as high as that of a car on the ground at a distance, m."""
+    left, top, right, bottom = box.tolist()
+    aside = math.atan((0.5 * (left + right) - camera.cx) / camera.fx)
+    depth = distance * math.cos(aside)
+    low, high = (
+        mount.z + depth * math.tan(mount.pitch - math.atan((row - camera.cy) / camera.fy))
+        for row in (bottom, top)
+    )
+    at_margin = bottom >= (1.0 - _MARGIN) * camera.height
+    return (at_margin or abs(low) <= OFF_GROUND) and CAR_HEIGHT[0] <= high <= CAR_HEIGHT[1]
 
 
 def _hidden(distance: FloatArray) -> bool:
