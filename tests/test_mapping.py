@@ -185,6 +185,13 @@ def test_predictions_come_from_the_asked_hour_and_kind_of_day():
     assert weekend.p_occupied[0] < 0.5 < weekend.p_occupied[1]
 
 
+def test_the_same_weekday_says_a_little_more_than_another():
+    monday, tuesday, hour = 0.0, 86_400.0, 3600.0
+    log = sessions([monday + 9 * hour] * 4 + [tuesday + 9 * hour] * 4, [[1]] * 4 + [[0]] * 4)
+    on = [predict(log, day * 86_400.0 + 9 * hour).p_occupied[0] for day in range(5)]
+    assert on[0] > on[2] == on[3] == on[4] > on[1]
+
+
 def test_few_sessions_are_unsure_and_many_are_sharp():
     one, many = sessions([0.0], [[1, 0]]), sessions(np.zeros(60), [[1, 0]] * 60)
     a, b = predict(one), predict(many)
