@@ -108,6 +108,22 @@ AGENT_NAMES = tuple(name for name in _AGENTS if name not in SMALL_LOTS_ONLY)
 """Agents for lots of any kind and size."""
 
 
+def require_sight(name: str, problem: SearchProblem) -> None:
+    """Refuse problems in which no slot is made out before somebody tries to park there.
+
+    Args:
+        name: of the agent that refuses.
+        problem: how slots are seen.
+
+    Raises:
+        InputError: nothing is seen.
+    """
+    if not problem.sight_rates.seen.any():
+        raise InputError(
+            f"{name} plans on what it sees from the lane, and here slots are seen only by trying; take mdp"
+        )
+
+
 def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) -> SearchAgent[Any]:
     """Make an agent that knows the scenario's public part: lot, goal, speeds and costs.
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from parkenv.errors import InputError
 from parkenv.lot import PARK
 from parkenv.scenario import SearchProblem
-from planners.agent import Observation, SearchAgent
+from planners.agent import Observation, SearchAgent, require_sight
 from planners.map_doubt import MapDoubt
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.routes import DriveRoutes
@@ -111,7 +111,7 @@ class BeliefAgent(SearchAgent[Search]):
         most_vertices: a lot with more is planned for in part (`Neighborhoods`).
 
     Raises:
-        InputError: a budget that is not positive, or a bad `most_vertices`.
+        InputError: a budget that is not positive, a bad `most_vertices`, or a problem in which nothing is seen.
     """
 
     name: ClassVar[str] = "belief"
@@ -124,6 +124,7 @@ class BeliefAgent(SearchAgent[Search]):
         most_vertices: int = MOST_VERTICES,
     ) -> None:
         super().__init__(problem)
+        require_sight(self.name, problem)
         if not (budget_ms > 0.0 and math.isfinite(budget_ms)):
             raise InputError(f"budget_ms is {budget_ms}, want a finite number above 0")
         self.trusting = trusting

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
 from parkenv.scenario import SearchProblem
-from planners.agent import Observation, SearchAgent
+from planners.agent import Observation, SearchAgent, require_sight
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.replanning import Plan, ReplanningAgent
 from planners.routes import DriveRoutes
@@ -215,6 +215,7 @@ class TunedAgent(SearchAgent[TunedPlan]):
         most_vertices: int = MOST_VERTICES,
     ) -> None:
         super().__init__(problem)
+        require_sight(self.name, problem)
         if worlds < 1:
             raise InputError(f"worlds is {worlds}, want at least 1")
         self.worlds, self.seed, self.gamma = worlds, seed, gamma

@@ -160,7 +160,7 @@ def test_figures_and_occupancy_levels(tmp_path):
 
 def test_the_sweep_over_failure_costs_tells_seen_slots_from_unseen_ones(tmp_path):
     done = parkenv(
-        "compare", "--scenario", "mini", "--agents", "greedy-drive,oracle", "-n", 6, "--failure-cost", "sweep",
+        "compare", "--scenario", "mini", "--agents", "greedy-drive,mdp-tuned", "-n", 6, "--failure-cost", "sweep",
         "--jobs", 1, "--out", tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -168,6 +168,7 @@ def test_the_sweep_over_failure_costs_tells_seen_slots_from_unseen_ones(tmp_path
     rows = json.loads((tmp_path / "summary.json").read_text())["rows"]
     tries = {(r["scenario"], r["failure_cost_s"]): r for r in rows if r["agent"] == "greedy-drive"}
     assert len(tries) == 26
+    assert {r["scenario"] for r in rows if r["agent"] == "mdp-tuned"} == {"mini"}
     assert all(r["failed_s"] == 0.0 for (name, _), r in tries.items() if name == "mini")
     unseen = [tries["mini-unseen", cost]["total_s"] for cost in (0.0, 8.0, 30.0, 120.0)]
     assert unseen == sorted(unseen)

@@ -13,6 +13,7 @@ from parkenv.evaluation.compare import Case
 from parkenv.evaluation.sight_fit import BAND_ENDS, LookCounts, count_looks
 from parkenv.lot import PARK
 from parkenv.sighting import SIGHT_NAMES
+from planners import make_agent
 
 BANDS = (SightBand(3.0, True, 0.9, 0.99, 0.01), SightBand(9.0, True, 0.5, 0.9, 0.2))
 
@@ -147,3 +148,9 @@ def test_the_fast_environment_stands_for_the_slow_one():
     assert slow == sorted(slow)
     assert fast == sorted(fast)
     np.testing.assert_allclose(fast, slow, rtol=0.2)
+
+
+@pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
+def test_agents_that_plan_on_what_they_see_refuse_to_search_blindly(name):
+    with pytest.raises(InputError, match="slots are seen"):
+        make_agent(name, Scenario.named("mini", sighting=SightingModel.blind()))
