@@ -206,7 +206,8 @@ def _calibration(yes: Float32Array, no: Float32Array, settings: TrainingSettings
             scores.append(x @ weights + bias)
             labels.append(np.full(len(x), label))
     fit = LogisticRegression(C=1e3).fit(np.concatenate(scores)[:, None], np.concatenate(labels))
-    return float(fit.coef_[0, 0]), float(fit.intercept_[0])
+    # Its last digits depend on how many threads summed up; nobody needs them, and equal training makes equal files.
+    return round(float(fit.coef_[0, 0]), 6), round(float(fit.intercept_[0]), 6)
 
 
 def _how(image: Image, size: tuple[int, int]) -> int:
