@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from parkenv.errors import InputError
-from parkenv.lot import ParkingLot
+from parkenv.lot import ACTIONS, PARK, ParkingLot
 from parkenv.occupancy import Arrival, ArrivalWindow, Forecast, OccupancyModel, OccupancyProcess, PriorModel
 from parkenv.sighting import SightingModel, SightRates
 from parkenv.traffic import Traffic
@@ -72,6 +72,14 @@ class SearchProblem:
     def move_s(self) -> FloatArray:
         """Drive time of each edge, (n_vertices, 4) s; 0 where there is none (eq. 3.22)."""
         return _read_only(self.lot.edge_length / self.v_drive)
+
+    @cached_property
+    def action_masks(self) -> NDArray[np.int8]:
+        """(n_vertices, 5) 1 where the graph has the action: an edge to drive along, or a slot to park in."""
+        masks = np.zeros((self.lot.n_vertices, len(ACTIONS)), dtype=np.int8)
+        masks[:, :PARK] = self.lot.neighbors >= 0
+        masks[: self.lot.n_slots, PARK] = 1
+        return _read_only(masks)
 
     @cached_property
     def slots_in_view(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
-from parkenv.lot import ACTIONS, PARK
+from parkenv.lot import PARK
 from parkenv.scenario import SearchProblem
 from planners.agent import Agent
 
@@ -59,9 +59,7 @@ class _Histories:
 
     def __init__(self, agent: Agent, problem: SearchProblem, forecast: NDArray[np.float64]) -> None:
         self.agent, self.problem, self.forecast = agent, problem, forecast
-        self.masks = np.zeros((problem.lot.n_vertices, len(ACTIONS)), dtype=np.int8)
-        self.masks[:, :PARK] = problem.lot.neighbors >= 0
-        self.masks[: problem.lot.n_slots, PARK] = 1
+        self.masks = problem.action_masks
 
     def mean(
         self,

@@ -105,7 +105,8 @@ def survey(
         progress.update(task, completed=sessions)
     row = summarize(its, settings, run, out / MAP_FILE)
     with MapStore(out / MAP_FILE, its.lot, create=False) as store:
-        log, found = store.log(), slots_found(store)
+        log = store.log()
+        found = slots_found(store, len(log.time))
     first = settings.windows[0]
     time = 86_400.0 * first.weekdays[0] + 0.5 * (first.start_s + first.end_s)
     predicted = predict(log, time)

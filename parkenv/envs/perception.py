@@ -30,6 +30,9 @@ class Report(NamedTuple):
     looks_taken: NDArray[np.bool_]
 
 
+_NOTHING = Report(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.bool_))
+
+
 class SearchPerceptionEnv(SearchEnv):
     """`parkenv/Search-v0` whose belief is what the detection and mapping stack makes of simulated sensors.
 
@@ -101,7 +104,7 @@ class SearchPerceptionEnv(SearchEnv):
             self._rates = self.scenario.sight_rates
         self._before: tuple[int, float] | None = None
         self._moments: list[Moment] = []
-        self._report = Report(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.bool_))
+        self._report = _NOTHING
 
     @property
     def rig(self) -> SensorRig:
@@ -118,7 +121,7 @@ class SearchPerceptionEnv(SearchEnv):
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start a search; see the class."""
         self._before, self._moments = None, []
-        self._report = Report(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.bool_))
+        self._report = _NOTHING
         return super().reset(seed=seed, options=options)
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:

@@ -166,9 +166,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
                 "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
             }
         )
-        self._masks = np.zeros((lot.n_vertices, len(ACTIONS)), dtype=np.int8)
-        self._masks[:, :PARK] = lot.neighbors >= 0
-        self._masks[: lot.n_slots, PARK] = 1
+        self._masks = self.scenario.action_masks
         self._view_starts, self._view_slots = self.scenario.slots_in_view
         self._rates = self.scenario.sight_rates
         self._state: SearchState | None = None

@@ -125,7 +125,8 @@ def run_survey(
 def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_file: Path) -> Row:
     """The row of `summary.json`."""
     with MapStore(map_file, scenario.lot, create=False) as store:
-        log, found = store.log(), score_discovery(slots_found(store), scenario.lot)
+        log = store.log()
+        found = score_discovery(slots_found(store, len(log.time)), scenario.lot)
     error, expected = map_error(scenario, settings.windows, log)
     parked = sum(r["parked"] for r in run.rows)
     detections = sum(r["detections"] for r in run.rows)
@@ -165,13 +166,13 @@ def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_
     }
 
 
-def slots_found(store: MapStore) -> FoundSlots:
+def slots_found(store: MapStore, sessions: int) -> FoundSlots:
     """Slots that the cars of all sessions in a map file show; nobody tells where any are.
 
     What passes or is taken for a car now and then adds up over sessions, so the more there are the more cars a slot
     must have had.
     """
-    return discover(store.cars(), least=max(3, len(store.log().time) // 2))
+    return discover(store.cars(), least=max(3, sessions // 2))
 
 
 def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
