@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-import os
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -17,8 +16,12 @@ from parkenv.occupancy import ArrivalWindow, OccupancyModel, OccupancyProcess
 from parkenv.scenario import Scenario
 from parkenv.sighting import SIGHT_NAMES, SightingModel
 
+if TYPE_CHECKING:
+    from parkenv.evaluation.workers import Workers
+
 WORLD = "The world"
 COSTS = "Costs and speeds"
+MACHINES = "Machines"
 
 LotOption = Annotated[
     Path | None,
@@ -112,6 +115,28 @@ JobsOption = Annotated[
 ]
 
 
+BackendOption = Annotated[
+    str,
+    typer.Option(
+        "--backend",
+        metavar="loky|ray|dask",
+        help="Where workers run: on this machine (loky), or on a Ray or Dask cluster (extras ray, dask). The result is "
+        "the same.",
+        rich_help_panel=MACHINES,
+    ),
+]
+AddressOption = Annotated[
+    str | None,
+    typer.Option(
+        "--address",
+        metavar="HOST:PORT",
+        help="Of the cluster: Ray's head, HOST:6379 or ray://HOST:10001; Dask's scheduler, tcp://HOST:8786. Without "
+        "one a cluster is started on this machine.",
+        rich_help_panel=MACHINES,
+    ),
+]
+
+
 def numbers(option: str, text: str) -> list[float]:
     """Comma-separated numbers.
 
@@ -159,11 +184,15 @@ def words(option: str, text: str) -> list[str]:
     return values
 
 
-def worker_count(jobs: int) -> int:
-    """How many processes to start: all cores that this process may use where 0 is asked for."""
-    return jobs or len(
-        os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
-    )
+def workers_of(jobs: int, backend: str, address: str | None) -> Workers:
+    """Where tasks run; with `with`, clusters are connected to, and left again.
+
+    Raises:
+        InputError: options that do not go together.
+    """
+    from parkenv.evaluation.workers import Workers
+
+    return Workers(jobs or None, backend, address)
 
 
 def lot_of(path: Path, goal: str | None = None) -> ParkingLot:

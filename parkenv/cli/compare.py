@@ -93,6 +93,8 @@ def compare(
     ] = 10.0,
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 0,
+    backend: args.BackendOption = "loky",
+    address: args.AddressOption = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -125,7 +127,6 @@ def compare(
         Case,
         at_occupancy,
         check_worlds,
-        run_cases,
         settings_of,
         table,
         unseen,
@@ -185,9 +186,10 @@ def compare(
     out = out or Path("results/compare")
     for s in scenarios:
         check_worlds(s, seeds)
-    folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)
     console = make_console()
-    interrupted = _run(console, cases + sweep, folder, args.worker_count(jobs), run_cases)
+    with args.workers_of(jobs, backend, address) as workers:
+        folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)
+        interrupted = _run(console, cases + sweep, folder, workers)
 
     rows, sweep_rows = table(cases, folder), table(sweep, folder)
     summary = {
@@ -223,8 +225,10 @@ def _levels(text: str) -> list[float]:
     return sorted(levels)
 
 
-def _run(console: Console, cases: list[Any], folder: Any, jobs: int, run_cases: Any) -> bool:
+def _run(console: Console, cases: list[Any], folder: Any, workers: Any) -> bool:
     """Run with a progress bar; whether Ctrl-C ended it."""
+    from parkenv.evaluation.compare import run_cases
+
     progress = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -237,7 +241,7 @@ def _run(console: Console, cases: list[Any], folder: Any, jobs: int, run_cases: 
     with progress:
         bar = progress.add_task("Searching", total=sum(len(seeds) for _, seeds in cases))
         try:
-            run_cases(cases, folder, jobs=jobs, on_progress=lambda n: progress.advance(bar, n))
+            run_cases(cases, folder, workers=workers, on_progress=lambda n: progress.advance(bar, n))
         except KeyboardInterrupt:
             return True
     return False

@@ -64,16 +64,15 @@ def demo(
     settings = SurveySettings(every=every, windows=tuple(ArrivalWindow.parse(h) for h in hours), seed=seed)
     make_folder(out)
     console = make_console()
-    workers = args.worker_count(jobs)
     map_file = out / "map.sqlite"
     folder = ResultFolder(out, _settings(its, settings, sessions, seed), resume=_goes_on(out), overwrite=True)
-    with Progress(
+    with args.workers_of(jobs, "loky", None) as workers, Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         console=console, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
         bar = progress.add_task("1/3 surveying (compiles first after an installation)", total=sessions)
         run = run_survey(
-            its, settings, sessions, map_file, jobs=workers, on_session=lambda _: progress.advance(bar)
+            its, settings, sessions, map_file, workers=workers, on_session=lambda _: progress.advance(bar)
         )
         progress.update(bar, completed=sessions)
 
@@ -94,7 +93,9 @@ def demo(
         seeds = range(seed + 1_000_000, seed + 1_000_000 + searches)
         cases = [(Case(known, name, rig="laser"), seeds) for name in AGENTS]
         bar = progress.add_task("3/3 searching through the sensors", total=len(AGENTS) * searches)
-        run_cases(cases, folder, jobs=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n))
+        run_cases(
+            cases, folder, workers=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n)
+        )
     rows = table(cases, folder)
     surveyed = summarize(its, settings, run, map_file)
     summary = {

@@ -30,6 +30,8 @@ def fit_sight(
     ] = None,
     seed: args.SeedOption = 500_000,
     jobs: args.JobsOption = 0,
+    backend: args.BackendOption = "loky",
+    address: args.AddressOption = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="The JSON file to write.")] = Path("sight.json"),
 ) -> None:
     """Search through the sensors, and count how often the stack is right about slots, by distance and side.
@@ -48,7 +50,7 @@ def fit_sight(
         for its in args.scenarios_of(scenario, None, None, None, None, arrival, days, None)
     ]
     console = make_console()
-    with Progress(
+    with args.workers_of(jobs, backend, address) as workers, Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         console=console, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
@@ -61,7 +63,7 @@ def fit_sight(
             searches,
             seed=seed,
             weather=weather,
-            jobs=args.worker_count(jobs),
+            workers=workers,
             on_progress=lambda: progress.advance(bar),
         )
     model = counts.fitted()

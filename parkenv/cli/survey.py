@@ -48,6 +48,8 @@ def survey(
     pedestrians: Annotated[int, typer.Option("--pedestrians", min=0, help="People who walk about.")] = 5,
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 0,
+    backend: args.BackendOption = "loky",
+    address: args.AddressOption = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder for map.sqlite, pictures, summary.json.")
     ] = Path("results/survey"),
@@ -92,14 +94,17 @@ def survey(
     )
     make_folder(out)
     console = make_console()
-    with Progress(console=console, disable=not console.is_terminal) as progress:
+    with (
+        args.workers_of(jobs, backend, address) as workers,
+        Progress(console=console, disable=not console.is_terminal) as progress,
+    ):
         task = progress.add_task("Driving (compiles first after an installation)", total=sessions)
         run = run_survey(
             its,
             settings,
             sessions,
             out / MAP_FILE,
-            jobs=jobs or -1,
+            workers=workers,
             on_session=lambda _: progress.advance(task),
         )
         progress.update(task, completed=sessions)

@@ -7,15 +7,16 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
 
 from parkenv.errors import InputError
 from parkenv.evaluation.episodes import EpisodeRunner, SearchTrace
 from parkenv.evaluation.results import SETTING_COLUMNS, ResultFolder, Row, episode_key
 from parkenv.evaluation.statistics import mean_interval, summarize
+from parkenv.evaluation.workers import HERE, Workers
 from parkenv.keyed_random import world_key
 from parkenv.occupancy import ArrivalWindow, OccupancyProcess
 from parkenv.scenario import KMH, Scenario
@@ -135,7 +136,7 @@ def run_cases(
     cases: Sequence[tuple[Case, range]],
     folder: ResultFolder,
     *,
-    jobs: int = 1,
+    workers: Workers = HERE,
     block_size: int = BLOCK,
     on_progress: Callable[[int], None] = lambda _: None,
 ) -> None:
@@ -144,7 +145,7 @@ def run_cases(
     Args:
         cases: each with the seeds of its episodes.
         folder: where finished episodes go.
-        jobs: worker processes. The result does not depend on it.
+        workers: where they run. The result does not depend on it.
         block_size: episodes a task.
         on_progress: told how many episodes have just been finished.
 
@@ -158,18 +159,16 @@ def run_cases(
     ]
     done = sum(len(seeds) for _, seeds in cases) - sum(len(block) for _, block in tasks)
     on_progress(done)
-    with Parallel(
-        n_jobs=jobs, return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs"
-    ) as parallel:
-        told = set()
-        for rows, timings, messages in parallel(delayed(case.run_reporting)(block) for case, block in tasks):
-            folder.add(rows, timings)
-            on_progress(len(rows))
-            for message in messages:
-                # Once an agent and scenario: figures in the text differ from episode to episode.
-                if (topic := message.partition(":")[0]) not in told:
-                    told.add(topic)
-                    warnings.warn(message, stacklevel=2)
+    told = set()
+    work = [partial(case.run_reporting, block) for case, block in tasks]
+    for _, (rows, timings, messages) in workers.results(work):
+        folder.add(rows, timings)
+        on_progress(len(rows))
+        for message in messages:
+            # Once an agent and scenario: figures in the text differ from episode to episode.
+            if (topic := message.partition(":")[0]) not in told:
+                told.add(topic)
+                warnings.warn(message, stacklevel=2)
 
 
 def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.evaluation.workers import HERE, Workers
 from parkenv.scenario import Scenario
 from parkenv.sighting import SightBand, SightingModel
 from planners.agent import make_agent
@@ -125,7 +126,7 @@ def measure_sight(
     *,
     seed: int = 0,
     weather: str | None = None,
-    jobs: int = 1,
+    workers: Workers = HERE,
     on_progress: Callable[[], None] = lambda: None,
 ) -> LookCounts:
     """`count_looks` of all drivers in all scenarios.
@@ -136,17 +137,17 @@ def measure_sight(
         searches: of each driver in each scenario.
         seed: of the first search.
         weather: drawn for each search where None.
-        jobs: worker processes; the result does not depend on it.
+        workers: where they run; the result does not depend on it.
         on_progress: called when a search is done.
     """
     tasks = [
-        delayed(count_looks)(scenario, rig, driver, [s], weather)
+        partial(count_looks, scenario, rig, driver, [s], weather)
         for scenario in scenarios
         for s in range(seed, seed + searches)
         for driver in DRIVERS
     ]
     counts = LookCounts.none()
-    for looks in Parallel(n_jobs=jobs, return_as="generator_unordered")(tasks):
+    for _, looks in workers.results(tasks):
         counts += looks
         on_progress()
     return counts

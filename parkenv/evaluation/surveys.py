@@ -6,14 +6,15 @@ import csv
 import io
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.evaluation.workers import HERE, Workers
 from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
 from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.store import MapStore
@@ -82,7 +83,7 @@ def run_survey(
     sessions: int,
     map_file: Path,
     *,
-    jobs: int = 1,
+    workers: Workers = HERE,
     pictures: int = 4,
     on_session: Callable[[Row], None] = lambda _: None,
 ) -> SurveyRun:
@@ -93,7 +94,7 @@ def run_survey(
         settings: how to drive.
         sessions: how many.
         map_file: made where it is not there. Beside it, `sessions.csv` keeps how good each session was.
-        jobs: worker processes; the result does not depend on it.
+        workers: where they are driven; the result does not depend on it.
         pictures: captures kept of the first session.
         on_session: told of each session that is done.
 
@@ -110,7 +111,7 @@ def run_survey(
         wanted = [survey.key_of(k) for k in range(sessions)]
         missing = [k for k, key in enumerate(wanted) if not store.has(key) or key not in rows]
         shown = None
-        for number, result in zip(missing, _driven(survey, missing, jobs, pictures), strict=True):
+        for number, result in zip(missing, _driven(survey, missing, workers, pictures), strict=True):
             row = session_row(result)
             rows[row["key"]] = row
             _write_rows(table, list(rows.values()))
@@ -233,15 +234,16 @@ def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: Session
     return float(np.mean(errors)), float(np.mean(chances))
 
 
-def _driven(survey: Survey, numbers: Sequence[int], jobs: int, pictures: int) -> Iterator[SessionResult]:
-    """Sessions in order, on several processes where asked."""
-    if jobs == 1 or len(numbers) < 2:
+def _driven(
+    survey: Survey, numbers: Sequence[int], workers: Workers, pictures: int
+) -> Iterator[SessionResult]:
+    """Sessions in order."""
+    if workers.in_process or len(numbers) < 2:
         for k in numbers:
             yield survey.drive(k, pictures=pictures if k == 0 else 0)
         return
-    work = Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="n_jobs")
-    yield from work(
-        delayed(_drive)(survey.scenario, survey.settings, k, pictures if k == 0 else 0) for k in numbers
+    yield from workers.in_order(
+        [partial(_drive, survey.scenario, survey.settings, k, pictures if k == 0 else 0) for k in numbers]
     )
 
 

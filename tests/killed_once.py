@@ -1,0 +1,29 @@
+"""Tasks for tests of workers; a module of its own, so that workers of other processes can import it."""
+
+import os
+import signal
+import time
+from pathlib import Path
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def square_killed_once(marker: str, number: int) -> int:
+    """As `square`, but the first process that gets number 3 is killed in the middle of it."""
+    time.sleep(0.05)
+    if number == 3:
+        try:
+            Path(marker).touch(exist_ok=False)
+        except FileExistsError:
+            pass
+        else:
+            os.kill(os.getpid(), signal.SIGKILL)
+    with Path(f"{marker}.{number}").open("a") as file:
+        file.write("run\n")
+    return number * number
+
+
+def die() -> None:
+    os.kill(os.getpid(), signal.SIGKILL)

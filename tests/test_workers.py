@@ -1,0 +1,122 @@
+"""Tasks give the same results wherever they run, and a dead worker loses its own task only."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import killed_once
+import pytest
+
+from parkenv.errors import InputError
+from parkenv.evaluation.workers import HERE, Workers
+
+CLUSTERS = ("ray", "dask")
+PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
+
+
+@pytest.fixture(autouse=True)
+def _importable_by_workers(monkeypatch):
+    here = str(Path(__file__).parent)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")])))
+
+
+def of(backend: str) -> Workers:
+    for module in {"ray": ["ray"], "dask": ["dask", "distributed"]}.get(backend, []):
+        pytest.importorskip(module, reason=f"the extra {backend} is not installed")
+    return Workers(2, backend)
+
+
+def squares(workers: Workers, count: int) -> dict[int, int]:
+    return dict(workers.results([partial(killed_once.square, k) for k in range(count)]))
+
+
+def test_results_carry_the_number_of_their_task_and_come_in_order_where_asked():
+    with Workers(2) as workers:
+        assert squares(workers, 20) == {k: k * k for k in range(20)}
+        ordered = workers.in_order([partial(killed_once.square, k) for k in range(20)])
+        assert list(ordered) == [k * k for k in range(20)]
+    assert squares(HERE, 5) == {k: k * k for k in range(5)}
+    assert list(HERE.results([])) == []
+
+
+@pytest.mark.parametrize("backend", ["loky", *(pytest.param(c, marks=pytest.mark.slow) for c in CLUSTERS)])
+@pytest.mark.filterwarnings("default")  # the libraries' own, about sockets and workers that died
+def test_a_killed_worker_loses_its_own_task_which_is_run_again(tmp_path, backend):
+    marker = str(tmp_path / "killed")
+    with of(backend) as workers:
+        tasks = [partial(killed_once.square_killed_once, marker, k) for k in range(12)]
+        told = list(workers.results(tasks))
+    assert sorted(told) == [(k, k * k) for k in range(12)], "every task once"
+    assert Path(marker).exists()
+    assert Path(f"{marker}.3").read_text() == "run\n"
+    again = sum(Path(f"{marker}.{k}").read_text().count("run") for k in range(12)) - 12
+    # loky breaks up the pool when a worker dies, so that the one beside it starts its task over, too.
+    assert again <= (3 if backend == "loky" else 0)
+
+
+def test_workers_that_die_again_and_again_end_the_run_with_a_word():
+    with Workers(2) as workers, pytest.raises(RuntimeError, match="3 times in a row a loky worker died"):
+        list(workers.results([killed_once.die]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        ((1, "slurm"), "backend is 'slurm', want one of loky, ray, dask"),
+        ((1, "loky", "localhost:1"), "address goes with the backend ray or dask"),
+        ((0,), "jobs is 0, want at least 1"),
+    ],
+)
+def test_what_does_not_go_together_is_refused(arguments, wanted):
+    with pytest.raises(InputError, match=wanted):
+        Workers(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("backend", "address", "wanted"),
+    [
+        ("ray", "127.0.0.1:9", "nobody listens there"),
+        ("dask", "tcp://127.0.0.1:9", "nobody listens there"),
+        ("dask", "tcp://somewhere", "want HOST:PORT"),
+        ("ray", "127.0.0.1:notaport", "want HOST:PORT"),
+    ],
+)
+def test_an_address_where_nobody_listens_is_one_clear_line_at_once(tmp_path, backend, address, wanted):
+    start = time.monotonic()
+    done = subprocess.run(
+        [*PARKENV, "compare", "--scenario", "mini", "--out", tmp_path / "out", "--backend", backend,
+         "--address", address],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert wanted in " ".join(done.stderr.split())
+    assert time.monotonic() - start < 15
+    assert not (tmp_path / "out" / "episodes.csv").exists()
+
+
+@pytest.mark.slow
+def test_a_comparison_is_the_same_on_processes_ray_and_dask(tmp_path):
+    for backend in CLUSTERS:
+        of(backend)
+    summaries, episodes = [], []
+    for backend in ("loky", *CLUSTERS):
+        out = tmp_path / backend
+        subprocess.run(
+            [*PARKENV, "compare", "--scenario", "mini,campus", "--agents", "mdp,greedy-goal,oracle",
+             "--episodes", "12", "--occupancy-levels", "none", "--no-figures", "--jobs", "2", "--out", out,
+             "--backend", backend],
+            check=True, capture_output=True,
+        )  # fmt: skip
+        summary = json.loads((out / "summary.json").read_text())
+        assert backend in summary.pop("command")
+        for row in summary["rows"]:  # wall time is the machine's
+            del row["decision_ms"], row["decision_ms_p99"]
+        summaries.append(summary)
+        episodes.append((out / "episodes.csv").read_bytes())
+    assert summaries[0]["complete"]
+    assert summaries[0] == summaries[1] == summaries[2]
+    assert episodes[0] == episodes[1] == episodes[2]
