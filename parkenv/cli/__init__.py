@@ -7,7 +7,19 @@ import warnings
 
 import typer
 
-from parkenv.cli import bench, compare, demo, detect, lot, occupancy, plan, sensors, sight, survey
+from parkenv.cli import (
+    bench,
+    benchmark,
+    compare,
+    demo,
+    detect,
+    lot,
+    occupancy,
+    plan,
+    sensors,
+    sight,
+    survey,
+)
 from parkenv.errors import InputError
 from sim_sensors.errors import SensorError
 
@@ -33,6 +45,7 @@ app.command("detect")(detect.detect)
 app.command("train-detector")(detect.train_detector)
 app.command("evaluate-detector")(detect.evaluate_detector)
 app.command("bench")(bench.bench)
+app.add_typer(benchmark.app, name="benchmark")
 
 
 def _show_version(wanted: bool) -> None:

@@ -189,7 +189,7 @@ def compare(
     console = make_console()
     with args.workers_of(jobs, backend, address) as workers:
         folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)
-        interrupted = _run(console, cases + sweep, folder, workers)
+        interrupted = run_with_bar(console, cases + sweep, folder, workers)
 
     rows, sweep_rows = table(cases, folder), table(sweep, folder)
     summary = {
@@ -225,7 +225,7 @@ def _levels(text: str) -> list[float]:
     return sorted(levels)
 
 
-def _run(console: Console, cases: list[Any], folder: Any, workers: Any) -> bool:
+def run_with_bar(console: Console, cases: list[Any], folder: Any, workers: Any) -> bool:
     """Run with a progress bar; whether Ctrl-C ended it."""
     from parkenv.evaluation.compare import run_cases
 

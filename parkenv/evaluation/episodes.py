@@ -10,6 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.envs.search import SearchState
 from parkenv.scenario import Scenario
 from planners.agent import SearchAgent
 from planners.oracle import OracleAgent, best_slot
@@ -77,6 +78,16 @@ class EpisodeRunner:
         )
         self._routes = DriveRoutes(scenario)
 
+    def bound_s(self, seed: int) -> float:
+        """Total time in the world of `seed` of one who knows it all: nobody is faster."""
+        self.env.reset(seed=seed)
+        hidden = self.env.unwrapped.state  # type: ignore[attr-defined]
+        return self._bound_s(hidden)
+
+    def _bound_s(self, start: SearchState) -> float:
+        choice = best_slot(self.scenario, self._routes, start.world, start.vertex, start.time)
+        return min(choice.total_s, self.scenario.give_up_s)
+
     def run(self, seed: int) -> Episode:
         """Search once in the world of `seed`.
 
@@ -89,7 +100,7 @@ class EpisodeRunner:
         everything = np.arange(scenario.lot.n_slots)
         occupied = hidden.world.occupied(everything, hidden.time)
         forecast = hidden.belief.prior
-        choice = best_slot(scenario, self._routes, hidden.world, hidden.vertex, hidden.time)
+        bound_s = self._bound_s(hidden)
         if isinstance(self.agent, OracleAgent):
             self.agent.reveal(hidden.world, hidden.time)
 
@@ -121,7 +132,7 @@ class EpisodeRunner:
             **info,
             "steps": len(decision_s),
             "truncated": bool(truncated),
-            "bound_s": min(choice.total_s, scenario.give_up_s),
+            "bound_s": bound_s,
         }
         trace = SearchTrace(scenario, self.name, list(hidden.path), occupied, forecast, policy, info)
         return Episode(row, trace, decision_s)

@@ -1,0 +1,131 @@
+"""`parkenv benchmark`: fixed suites, whose results can be compared and checked."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from parkenv import __version__
+from parkenv.cli import arguments as args
+from parkenv.cli.compare import run_with_bar
+from parkenv.cli.tables import make_console, make_table
+from parkenv.errors import InputError
+
+RESULT = "result.json"
+AGENTS = "belief,mdp-tuned,mdp,first-free,greedy-drive,greedy-goal"
+
+app = typer.Typer(
+    help="Run a fixed benchmark suite, and check the results of others.",
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+)
+
+
+@app.command("run")
+def run(
+    suite: Annotated[str, typer.Argument(help="The suite; `parkenv benchmark show v1` tells of it.")] = "v1",
+    agents: Annotated[str, typer.Option("--agents", metavar="NAME[,NAME...]", help="Who searches.")] = AGENTS,
+    jobs: args.JobsOption = 0,
+    backend: args.BackendOption = "loky",
+    address: args.AddressOption = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help=f"Folder for {RESULT} and the searches.  [default: results/SUITE]"),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the run in --out: add what is missing.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results in --out.")] = False,
+) -> None:
+    """Run agents through all searches of a suite, and write a result that others can check.
+
+    Scenarios, costs, speeds and seeds are the suite's. An agent's score in a task is the mean time of one who knows
+    every slot's future over the agent's own; the score of the suite is the mean over its tasks, 1 at best.
+
+    Examples:
+    * `parkenv benchmark run v1 --agents belief,mdp --out results/v1`
+
+    * `parkenv benchmark check results/v1/result.json`
+    """
+    from parkenv.evaluation.benchmark import Suite, result_of
+    from parkenv.evaluation.results import ResultFolder, write_summary
+
+    its = Suite.named(suite)
+    cases = its.cases(args.words("--agents", agents))
+    out = out or Path("results") / suite
+    settings = {"version": __version__, "suite": its.name, "suite_sha256": its.fingerprint}
+    console = make_console()
+    with args.workers_of(jobs, backend, address) as workers:
+        folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)
+        interrupted = run_with_bar(console, cases, folder, workers)
+    order = [case.key(seed) for case, seeds in cases for seed in seeds]
+    command = ["parkenv", *sys.argv[1:]]
+    if interrupted:
+        folder.finish(order, {"command": command, "complete": False}, complete=False)
+        console.print(f"Interrupted. What was finished is in {out}; the same command with --resume goes on.")
+        raise typer.Exit(130)
+    result = result_of(its, cases, folder, command)
+    folder.finish(
+        order, {"command": command, "version": __version__, "complete": True, "rows": result["rows"]}
+    )
+    write_summary(out, result, RESULT)
+    _print(console, [result])
+    console.print(f"Written: {out / RESULT}, and every search beside it")
+
+
+@app.command("check")
+def check(
+    files: Annotated[list[Path], typer.Argument(help="Result files.")],
+) -> None:
+    """Make sure that results are complete and of the suite's own worlds, and put them side by side.
+
+    Every search has to be there; means and scores are computed anew, and so are the clairvoyant bounds of the first
+    searches of each task: a run in other worlds, or at other costs and speeds, has others.
+    """
+    from parkenv.evaluation.benchmark import check_result
+
+    console = make_console()
+    with console.status("Checking"):
+        results = [check_result(file) for file in files]
+    if len({result["suite"] for result in results}) > 1:
+        raise InputError("the results are of different suites; check those of one at a time")
+    _print(console, results)
+    console.print(f"{'Complete and unaltered' if len(files) == 1 else 'All complete and unaltered'}.")
+
+
+@app.command("show")
+def show(suite: Annotated[str, typer.Argument(help="The suite.")] = "v1") -> None:
+    """Tell what a suite asks for."""
+    from parkenv.evaluation.benchmark import Suite
+
+    its = Suite.named(suite)
+    console = make_console()
+    console.print(f"{its.name}: {its.description}")
+    table = make_table(None, ["task", "scenario", "slots", "mean occupancy", "sight", "walking"])
+    for task in its.tasks:
+        made = task.made(its.arrival)
+        level = "as it comes" if task.occupancy_level is None else f"{task.occupancy_level:.0%}"
+        table.add_row(
+            task.name, task.scenario, str(made.lot.n_slots), level, task.sight, f"{made.v_walk * 3.6:g} km/h"
+        )
+    console.print(table)
+    console.print(
+        f"{len(its.seeds)} searches a task, seeds {its.seeds[0]} to {its.seeds[-1]}; suite {its.fingerprint[:16]}"
+    )
+
+
+def _print(console: Console, results: list[dict[str, Any]]) -> None:
+    tasks = list(dict.fromkeys(row["task"] for result in results for row in result["rows"]))
+    table = make_table("Mean total time, s, and the score", ["agent", *tasks, "score"])
+    lines = []
+    for result in results:
+        mean = {(row["agent"], row["task"]): row["total_s"] for row in result["rows"]}
+        for agent, score in result["scores"].items():
+            lines.append((score, agent, [f"{mean[agent, task]:.1f}" for task in tasks]))
+    for score, agent, cells in sorted(lines, key=lambda line: -line[0]):
+        table.add_row(agent, *cells, f"{score:.4f}")
+    console.print(table)

@@ -1,0 +1,103 @@
+"""Benchmark suites: a result can be checked by anybody, and one that was tampered with is refused."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+
+from parkenv.errors import InputError
+from parkenv.evaluation import benchmark
+from parkenv.evaluation.benchmark import Suite, check_result, result_of
+from parkenv.evaluation.compare import run_cases
+from parkenv.evaluation.results import ResultFolder, write_summary
+
+PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
+AGENTS = ("first-free", "greedy-goal")
+
+
+@pytest.fixture(scope="module")
+def small():
+    """The suite with fewer searches and tasks, so that a test may run it."""
+    suite = Suite.named("v1")
+    return replace(suite, seeds=suite.seeds[:6], tasks=suite.tasks[3:5])
+
+
+@pytest.fixture(scope="module")
+def result(small, tmp_path_factory):
+    folder = ResultFolder(tmp_path_factory.mktemp("benchmark") / "run", {})
+    cases = small.cases(AGENTS)
+    run_cases(cases, folder)
+    return result_of(small, cases, folder, ["parkenv", "benchmark", "run"])
+
+
+def checked(content, small, path, monkeypatch):
+    monkeypatch.setattr(benchmark.Suite, "named", classmethod(lambda cls, name: small))
+    write_summary(path, content, "result.json")
+    return check_result(path / "result.json")
+
+
+def test_a_result_passes_its_own_check_and_scores_are_shares_of_the_bound(
+    result, small, tmp_path, monkeypatch
+):
+    assert checked(result, small, tmp_path, monkeypatch) == json.loads(json.dumps(result))
+    assert {(r["agent"], r["task"]) for r in result["rows"]} == {
+        (agent, task.name) for agent in AGENTS for task in small.tasks
+    }
+    for row in result["rows"]:
+        searches = result["episodes"][row["agent"]][row["task"]]
+        assert row["score"] == pytest.approx(sum(searches["bound_s"]) / sum(searches["total_s"]))
+        assert row["total_s"] - row["regret_s"] == pytest.approx(sum(searches["bound_s"]) / 6, abs=1e-5)
+
+
+def faster(content):
+    for tasks in content["episodes"].values():
+        for searches in tasks.values():
+            searches["total_s"][0] = searches["bound_s"][0] - 1.0
+
+
+def other_worlds(content):
+    content["episodes"]["first-free"]["mini"]["bound_s"][3] += 1.0
+    content["episodes"]["first-free"]["mini"]["total_s"][3] += 1.0
+
+
+@pytest.mark.parametrize(
+    ("change", "wanted"),
+    [
+        (faster, "beats the clairvoyant bound"),
+        (other_worlds, "first-free in mini: was not run in the suite's worlds"),
+        (lambda c: c["episodes"]["first-free"]["mini"]["total_s"].pop(), "wants 6 searches, has 5"),
+        (lambda c: c["rows"].pop(), "rows or scores are not those of its agents"),
+        (lambda c: c["episodes"]["first-free"].pop("mini"), "first-free in mini: wants 6 searches, has 0"),
+        (lambda c: c["rows"][0].update(total_s=20.0), "its row is not what its searches come to"),
+        (lambda c: c["scores"].update({"greedy-goal": 0.99}), "the score of greedy-goal"),
+        (lambda c: c.update(suite_sha256="0" * 64), "settings that are not those of suite v1"),
+        (lambda c: c.pop("scores"), "'scores' is a required property"),
+    ],
+)
+def test_what_was_altered_or_left_out_is_found(result, small, tmp_path, monkeypatch, change, wanted):
+    altered = json.loads(json.dumps(result))
+    change(altered)
+    with pytest.raises(InputError, match=wanted):
+        checked(altered, small, tmp_path, monkeypatch)
+
+
+def test_suites_do_not_change():
+    suite = Suite.named("v1")
+    assert len(suite.tasks) == 8
+    assert suite.fingerprint == "eb8b33585e781fa69eb00fe155aefb44a18fee96789c25a0b65ef4199264b03b"
+
+
+def test_the_command_tells_of_suites_and_refuses_what_is_none(tmp_path):
+    def parkenv(*arguments):
+        return subprocess.run([*PARKENV, "benchmark", *map(str, arguments)], capture_output=True, text=True)
+
+    shown = parkenv("show", "v1")
+    assert shown.returncode == 0
+    assert "campus-full" in shown.stdout
+    unknown = parkenv("run", "v7", "--out", tmp_path / "out")
+    assert (unknown.returncode, "known: v1" in unknown.stderr) == (2, True)
+    (tmp_path / "torn.json").write_text('{"format": "park')
+    torn = parkenv("check", tmp_path / "torn.json")
+    assert (torn.returncode, "no benchmark result" in torn.stderr) == (2, True)
