@@ -6,8 +6,9 @@ and given the hypothesis slots are independent. First looks tell of the hypothes
 that are only imagined: on a path on which all was taken so far, the next slot is likelier to be taken, too.
 
 The hypotheses are: the map is right; the log-odds of the slots nearest to the goal, a fifth of the lot to all of it,
-are shifted alike; or the map knows nothing, and slots are the fuller the nearer to the goal they are. As the map
-speaks of the average day, the unshifted log-odds are such that the mean over shifts is what the map says.
+are shifted alike; an event has filled the slots nearest to the goal, six tenths of the lot or more; or the map knows
+nothing, and slots are the fuller the nearer to the goal they are. As the map speaks of the average day, the unshifted
+log-odds are such that the mean over shifts and events is what the map says.
 """
 
 from __future__ import annotations
@@ -17,17 +18,20 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-OFF = {
-    **dict.fromkeys(
-        ((shift, reach) for shift in (-2.0, -1.0, 1.0, 2.0) for reach in (0.2, 0.4, 0.6, 0.8, 1.0)), 1e-3
-    ),
-    **dict.fromkeys(((4.0, reach) for reach in (0.6, 0.8, 1.0)), 1e-2),
-}
-"""Prior probability of each shift, logits, of the slots nearest to the goal, as parts of the lot.
+OFF = dict.fromkeys(
+    ((shift, reach) for shift in (-2.0, -1.0, 1.0, 2.0) for reach in (0.2, 0.4, 0.6, 0.8, 1.0)), 1e-3
+)
+"""Prior probability of each shift, logits, of the slots nearest to the goal, as parts of the lot."""
+EVENTS = dict.fromkeys((0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0), 0.08 / 7)
+"""Prior probability, in a very large lot, of events that fill the slots nearest to the goal, as parts of the lot.
 
-The last ones are events, which fill most of a lot: 60 % becomes 99 %. Were they thought likelier, fewer taken slots
-would make the car turn round where there is one, and more often where there is none.
+Were they thought likelier, fewer taken slots would make the car turn round where there is one, and more often where
+there is none.
 """
+AT_EVENTS = 0.998
+"""How often a slot is taken at an event, unless the map says still more."""
+LARGE = 40
+"""Slots of a lot in which an event is half as likely as in a very large one: small ones fill up on ordinary days."""
 KNOWS_NOTHING = {(level, slope): 3e-4 for level in (-2.0, 0.0, 2.0, 4.0) for slope in (0.0, 2.0, 4.0)}
 """Where the map knows nothing: log-odds of the slot in the middle, and how much higher they are at the goal, and
 lower at the farthest slot; and the prior probability of each.
@@ -85,14 +89,21 @@ def _hypotheses(p: FloatArray, walk_s: FloatArray) -> tuple[FloatArray, FloatArr
     """P(taken), (k, n_slots), under each hypothesis, and the log of its prior probability, (k,)."""
     n = len(p)
     rank = np.argsort(np.argsort(walk_s, kind="stable"), kind="stable")
-    shift, prior = [np.zeros(n)], [1.0 - sum(OFF.values()) - sum(KNOWS_NOTHING.values())]
+    large = n / (n + LARGE)
+    doubts = sum(OFF.values()) + large * sum(EVENTS.values()) + sum(KNOWS_NOTHING.values())
+    shift, prior = [np.zeros(n)], [1.0 - doubts]
     for (size, reach), chance in OFF.items():
         shift.append(np.where(rank < reach * n, size, 0.0))
         prior.append(chance)
+    event = np.log(AT_EVENTS / (1.0 - AT_EVENTS))
+    logits = np.log(p / (1.0 - p))
+    for reach, chance in EVENTS.items():
+        shift.append(np.where(rank < reach * n, np.maximum(event - logits, 0.0), 0.0))
+        prior.append(large * chance)
     nearness = 1.0 - 2.0 * rank / max(n - 1, 1)
     blank = _logistic(np.stack([level + slope * nearness for level, slope in KNOWS_NOTHING]))
     shifts, weight = np.stack(shift), np.array(prior)[:, None] / sum(prior)
-    logits, most = np.log(p / (1.0 - p)), np.abs(shifts).max()
+    most = np.abs(shifts).max()
     low, high = logits - most, logits + most
     for _ in range(30):
         middle = 0.5 * (low + high)

@@ -7,7 +7,11 @@ which slot is the best so far, or none.
 
 A slot may be taken while the car drives to it, and one seen taken may have come free: both by two-state
 chains, p(t) = p∞ + (p(0) - p∞)·exp(-rt). Whoever comes too late goes on searching, for a time that is
-estimated once a decision.
+estimated once a decision, or tries the next of those that it knows to be free.
+
+What is left where a path ends is the time that it takes to drive a part of it again and again until a slot has come
+free, or to stand and wait for one. So long as slots change, this is what most of the time goes into in a lot that is
+almost full.
 """
 
 from __future__ import annotations
@@ -30,8 +34,12 @@ MOST_HYPOTHESES = 64
 """How many ways of how a map may be off there is room for."""
 WORTH_A_LOOK = 0.1
 """How far, of all the way, a slot seen taken must have come back to its usual chance to be worth another look."""
+AGAIN_S = 10.0
+"""s that must pass before a slot is looked at once more; a later look makes up for those left out."""
 MOST_STEPS = 400
 """Vertices at which a path ends in any case."""
+KEPT_IN_MIND = 32
+"""Vertices along which a free slot that was passed is kept in mind."""
 MOST_OPTIONS = 12
 """Slots known to be free that are kept in mind, best first."""
 
@@ -73,6 +81,8 @@ class Outlook(NamedTuple):
         usual: (n_slots,) float64, P(free) that it relaxes to.
         rate: (n_slots,) float64, 1/s, how fast.
         odds: (n_slots,) float64, P(taken)/P(free) about when the car could be there; inf where hopeless.
+        least_odds: (n_slots,) float64, P(taken)/P(free) that it relaxes to: no slot seen taken has better ones.
+        told: whether rates were seen at work, so that it is safe to count on cars to leave.
     """
 
     kind: NDArray[np.int8]
@@ -82,6 +92,8 @@ class Outlook(NamedTuple):
     usual: FloatArray
     rate: FloatArray
     odds: FloatArray
+    least_odds: FloatArray
+    told: bool
 
 
 class Path(NamedTuple):
@@ -96,8 +108,11 @@ class Path(NamedTuple):
         found: (most_looks,) float64, s from now, when the look is made.
         looked: (n_slots,) float64, s from now, when the path last looked at a slot; -1 where it has not yet, -inf
             where it need not since the slot is known to be free.
+        again: (n_slots,) float64, scratch of going round.
         values: (most_looks,) float64, scratch of the way back.
         offers: (most_looks,) float64, scratch of the way back.
+        until: (most_looks,) int64, scratch: the last vertex at which each slot is kept in mind.
+        ahead: (most,) float64, scratch: s that any look after each vertex takes at least.
         weights: float64, scratch: the hypotheses' probabilities as they are along the path.
     """
 
@@ -108,15 +123,18 @@ class Path(NamedTuple):
     chances: FloatArray
     found: FloatArray
     looked: FloatArray
+    again: FloatArray
     values: FloatArray
     offers: FloatArray
+    until: IntArray
+    ahead: FloatArray
     weights: FloatArray
 
 
 def new_path(n_slots: int, n_vertices: int) -> Path:
     """Room for a path on a lot of that size."""
     most = min(4 * n_vertices + 16, MOST_STEPS)
-    most_looks = n_slots + min(n_slots, MOST_STEPS)
+    most_looks = n_slots + min(n_slots + 64, MOST_STEPS)
     return Path(
         np.zeros(most, np.int64),
         np.zeros(most),
@@ -125,8 +143,11 @@ def new_path(n_slots: int, n_vertices: int) -> Path:
         np.zeros(most_looks),
         np.zeros(most_looks),
         np.zeros(n_slots),
+        np.zeros(n_slots),
         np.zeros(most_looks),
         np.zeros(most_looks),
+        np.zeros(most_looks, np.int64),
+        np.zeros(most),
         np.zeros(MOST_HYPOTHESES),
     )
 
@@ -160,7 +181,10 @@ def lay(
     n = len(outlook.kind)
     # In a part of a lot there is always a slot more that has not been seen.
     unproven = 0 if ground.whole else 1
+    unseen = 0 if ground.whole else n
     for s in range(n):
+        if outlook.kind[s] == UNSEEN and ground.seconds[vertex, s] < np.inf:
+            unseen += 1
         path.looked[s] = -np.inf if outlook.kind[s] == LOOKS_FREE else -1.0
         if outlook.kind[s] != LOOKS_TAKEN:
             unproven += 1
@@ -200,6 +224,7 @@ def lay(
             if outlook.kind[s] == UNSEEN and path.looked[s] < 0.0:
                 chance = _foreseen(weights, outlook.free_if[s])
                 unproven -= 1
+                unseen -= 1
             else:
                 chance = _free_again(s, time, outlook, path)
                 if chance == 0.0:
@@ -207,24 +232,83 @@ def lay(
             path.slots[looks], path.chances[looks], path.found[looks] = s, chance, time
             path.looked[s] = time
             looks += 1
-            choose = True
+            # What was promised on setting out stays the best until it was seen: all else has but grown worse.
+            choose = choose or s == target
         path.starts[k + 1] = looks
         if unproven == 0:
-            return k + 1, ground.give_up_s
-    _, left = _next_target(vertex, time, max(cost, 1.0), ground, outlook, path)
-    return k + 1, min(left, _round_again(time, looks, outlook, ground, path), ground.give_up_s)
+            # The last look proves the lot full if it shows no free slot. It may be better not to make it.
+            none, walk = 1.0, np.inf
+            for j in range(path.starts[k], looks):
+                none *= 1.0 - path.chances[j]
+                walk = min(walk, ground.walk_s[path.slots[j]])
+            proof = time - path.times[k - 1] + none * ground.give_up_s + (1.0 - none) * walk
+            spared = _go_round(k - 1, path.starts[k], outlook, ground, path)
+            if spared >= proof or not outlook.told:
+                return k + 1, ground.give_up_s
+            if k == 1:
+                path.vertices[1], path.times[1], path.starts[2] = path.vertices[0], ground.wait_s, 0
+                return 2, spared
+            return k, spared
+    # A half of the path tells of what follows if as many slots are left that have not been seen.
+    left = _as_before(k, looks, ground, path) if unseen >= looks - path.starts[k // 2] else np.inf
+    return k + 1, min(left, _go_round(k, looks, outlook, ground, path), ground.give_up_s)
 
 
 @njit(cache=True)
-def _round_again(time: float, looks: int, outlook: Outlook, ground: Ground, path: Path) -> float:
-    """Expected s of going round past the same slots, which all were taken, until one of them has come free."""
+def _go_round(last: int, looks: int, outlook: Outlook, ground: Ground, path: Path) -> float:
+    """Expected s from a vertex of a path on where nothing new is looked at: a part of it is driven again and again."""
+    best, leaving, walk = np.inf, 0.0, 0.0
+    v = path.vertices[last]
+    for i in range(ground.view_starts[v], ground.view_starts[v + 1]):
+        s = ground.view_slots[i]
+        if path.looked[s] >= 0.0 or outlook.kind[s] == LOOKS_TAKEN:
+            leaves = outlook.usual[s] * outlook.rate[s]
+            leaving += leaves
+            walk += leaves * ground.walk_s[s]
+    if leaving > 0.0:
+        # Or the car stands and waits for what is in view.
+        best = (1.0 + walk) / leaving
+    for quarter in range(4):
+        best = min(best, _round_again(quarter * last // 4, last, looks, outlook, ground, path))
+    return best
+
+
+@njit(cache=True)
+def _round_again(first: int, last: int, looks: int, outlook: Outlook, ground: Ground, path: Path) -> float:
+    """Expected s of driving a part of a path again and again until a slot on it has come free.
+
+    All its slots were just seen taken. Each look finds a car gone with the chance that the time since the look before
+    gives, so that many looks at few slots count for no more than they are worth.
+    """
+    start, end = path.vertices[first], path.vertices[last]
+    period = path.times[last] - path.times[first] + ground.seconds[end, start]
+    if end == start:
+        period = max(period, ground.wait_s)
+    for j in range(path.starts[first], looks):
+        path.again[path.slots[j]] = -1.0
     found, walk = 0.0, 0.0
-    for j in range(looks):
-        s = path.slots[j]
-        chance = outlook.usual[s] * decayed(outlook.rate[s], time)
+    for j in range(path.starts[first], looks):
+        s, since = path.slots[j], path.again[path.slots[j]]
+        gap = path.found[j] - since if since >= 0.0 else period - (path.looked[s] - path.found[j])
+        path.again[s] = path.found[j]
+        usual = 0.0
+        for h in range(len(outlook.weights)):
+            usual += path.weights[h] * outlook.free_if[s, h]
+        chance = usual * decayed(outlook.rate[s] * outlook.usual[s] / usual, gap)
         found += chance
         walk += chance * ground.walk_s[s]
-    return time / found + walk / found if found > 0.0 else np.inf
+    return period / found + walk / found if found > 0.0 else np.inf
+
+
+@njit(cache=True)
+def _as_before(last: int, looks: int, ground: Ground, path: Path) -> float:
+    """Expected s of going on where slots are left to see, if they show up as often as on the path's second half."""
+    first = last // 2
+    found, walk = 0.0, 0.0
+    for j in range(path.starts[first], looks):
+        found += path.chances[j]
+        walk += path.chances[j] * ground.walk_s[path.slots[j]]
+    return (path.times[last] - path.times[first]) / found + walk / found if found > 0.0 else np.inf
 
 
 @njit(cache=True)
@@ -232,6 +316,8 @@ def _free_again(slot: int, time: float, outlook: Outlook, path: Path) -> float:
     """P(free) some time later of a slot seen taken, really or along the path; 0 where it is not worth a look."""
     usual = outlook.usual[slot]
     if path.looked[slot] >= 0.0:
+        if time - path.looked[slot] < AGAIN_S:
+            return 0.0
         chance = usual * decayed(outlook.rate[slot], time - path.looked[slot])
     else:
         chance = outlook.free[slot]
@@ -256,6 +342,8 @@ def _next_target(
         if outlook.kind[s] == UNSEEN and path.looked[s] < 0.0:
             value += cost * outlook.odds[s]
         else:
+            if value + cost * outlook.least_odds[s] >= best:
+                continue
             chance = _free_again(s, time + row[s], outlook, path)
             value += cost * (1.0 - chance) / chance if chance > 0.0 else np.inf
         if value < best:
@@ -322,7 +410,7 @@ def worth(
     left_s: float,
     options: IntArray,
     n_options: int,
-    late_s: float,
+    late_s: FloatArray,
     ground: Ground,
     outlook: Outlook,
     path: Path,
@@ -334,7 +422,7 @@ def worth(
         left_s: s, left at its end if nothing was found.
         options: slots that are known to be free now.
         n_options: how many.
-        late_s: s that the search takes on where a slot is gone on arrival.
+        late_s: (n_slots,) float64, s that the search takes on where each slot is gone on arrival.
         ground: the lot.
         outlook: the belief.
         path: the path.
@@ -344,27 +432,43 @@ def worth(
     """
     if n_path < 2:
         return np.inf
-    values, offers, slots, times = path.values, path.offers, path.slots, path.times
-    nothing, ahead, onward = left_s, np.inf, 0.0
+    values, offers, slots, times, until = path.values, path.offers, path.slots, path.times, path.until
+    # What any look still to come can offer, at each vertex, is bounded from below. A slot that is better than that
+    # is taken at once; others are kept in mind for a while, in which they grow no better.
+    ahead = np.inf
     for k in range(n_path - 1, 0, -1):
-        # `values` and `nothing` hold what follows at the next vertex, `onward` is the drive there, and `ahead`
-        # bounds from below what any look still to come can offer.
+        path.ahead[k] = ahead
+        for j in range(path.starts[k], path.starts[k + 1]):
+            ahead = min(ahead, ground.seconds[path.vertices[k], slots[j]] + ground.walk_s[slots[j]])
+        ahead += times[k] - times[k - 1]
+    for k in range(1, n_path):
+        for j in range(path.starts[k], path.starts[k + 1]):
+            at_once = offer(path.vertices[k], slots[j], 1.0, 0.0, late_s[slots[j]], ground, outlook)
+            until[j] = k if at_once <= path.ahead[k] else min(k + KEPT_IN_MIND, n_path - 1)
+    nothing, onward = left_s, 0.0
+    for k in range(n_path - 1, 0, -1):
+        # `values` and `nothing` hold what follows at the next vertex, and `onward` is the drive there.
         vertex, first, last = path.vertices[k], path.starts[k], path.starts[k + 1]
+        oldest = path.starts[max(k - KEPT_IN_MIND, 1)]
         stop = np.inf
         for i in range(n_options):
             s = options[i]
-            stop = min(stop, offer(vertex, s, outlook.free[s], times[k], late_s, ground, outlook))
-        for j in range(last):
+            stop = min(stop, offer(vertex, s, outlook.free[s], times[k], late_s[s], ground, outlook))
+        for j in range(oldest, last):
+            if until[j] < k:
+                continue
             since = times[k] - path.found[j]
-            offers[j] = min(stop, offer(vertex, slots[j], 1.0, since, late_s, ground, outlook))
-            if offers[j] <= ahead:
+            offers[j] = min(stop, offer(vertex, slots[j], 1.0, since, late_s[slots[j]], ground, outlook))
+            if offers[j] <= path.ahead[k]:
                 values[j] = offers[j]
             else:
-                values[j] = min(offers[j], onward + values[j])
+                values[j] = min(offers[j], onward + (nothing if until[j] == k else values[j]))
         nothing = min(stop, onward + nothing)
         # Now back to before the looks at this vertex: the best slot that they show replaces a worse one.
         _best_first(first, last, path)
-        for j in range(first):
+        for j in range(oldest, first):
+            if until[j] < k:
+                continue
             rest, expected = 1.0, 0.0
             for i in range(first, last):
                 if offers[i] >= offers[j]:
@@ -376,10 +480,8 @@ def worth(
         for i in range(first, last):
             expected += rest * path.chances[i] * values[i]
             rest *= 1.0 - path.chances[i]
-            ahead = min(ahead, ground.seconds[vertex, slots[i]] + ground.walk_s[slots[i]])
         nothing = expected + rest * nothing
         onward = times[k] - times[k - 1]
-        ahead += onward
     return onward + nothing
 
 
@@ -403,6 +505,28 @@ def _shows_news(vertex: int, ground: Ground, outlook: Outlook) -> bool:
         if outlook.kind[s] == UNSEEN or (outlook.kind[s] == LOOKS_TAKEN and outlook.rate[s] > 0.0):
             return True
     return False
+
+
+@njit(cache=True)
+def _mark(
+    on_way: NDArray[np.bool_],
+    vertex: int,
+    targets: IntArray,
+    n_targets: int,
+    n_path: int,
+    ground: Ground,
+    path: Path,
+) -> None:
+    """Find the vertices that a path reaches by a shortest way from its start or last target: no use to put them in."""
+    on_way[:] = False
+    passed, since, origin = 0, 0.0, vertex
+    for k in range(n_path):
+        v = path.vertices[k]
+        while passed < n_targets and targets[passed] == v:
+            passed += 1
+            since, origin = path.times[k], v
+        if path.times[k] - since <= ground.seconds[origin, v] + 1e-9:
+            on_way[passed, v] = True
 
 
 class Budget(NamedTuple):
@@ -456,9 +580,10 @@ def best_path(
 
     # What a failure on arrival costs: the search as it would be if nothing were known to be free.
     late_s, base = np.inf, cost
+    late = np.zeros(n)
     for i in range(len(budget.costs)):
         n_path, left = lay(vertex, trial, 0, budget.costs[i], ground, outlook, path)
-        value = worth(n_path, left, options, 0, 0.0, ground, outlook, path)
+        value = worth(n_path, left, options, 0, late, ground, outlook, path)
         if value < late_s:
             late_s, base = value, budget.costs[i]
     late_s = min(late_s, ground.give_up_s)
@@ -481,6 +606,20 @@ def best_path(
             offers[place], options[place] = offers[place - 1], options[place - 1]
             place -= 1
         offers[place], options[place] = value, s
+    # Whoever finds a slot gone may have another one to fall back on.
+    for s in range(n):
+        late[s] = late_s
+        for i in range(n_options):
+            o = options[i]
+            if o != s:
+                fall_back = offer(s, o, outlook.free[o], ground.seconds[vertex, s], late_s, ground, outlook)
+                late[s] = min(late[s], fall_back)
+    at_hand, slot = np.inf, -1
+    for i in range(n_options):
+        s = options[i]
+        value = offer(vertex, s, outlook.free[s], 0.0, late[s], ground, outlook)
+        if value < at_hand:
+            at_hand, slot = value, s
 
     best, following, n_kept = np.inf, -1, 0
     if n_targets > 0 and targets[0] == vertex:
@@ -492,7 +631,7 @@ def best_path(
         if i >= 0:
             cost = budget.costs[i]
         n_path, left = lay(vertex, targets, tried, cost, ground, outlook, path)
-        value = worth(n_path, left, options, n_options, late_s, ground, outlook, path)
+        value = worth(n_path, left, options, n_options, late, ground, outlook, path)
         if value < best - 1e-9:
             best, base, n_kept, following = value, cost, tried, path.vertices[1]
             for j in range(tried):
@@ -502,6 +641,7 @@ def best_path(
 
     # The near ones matter for the step to be taken now, and come first where the budget is small.
     nearest_first = np.argsort(ground.seconds[vertex])
+    on_way = np.empty((depth, len(ground.seconds)), np.bool_)
     for _ in range(depth):
         improved = False
         n_before = n_kept
@@ -509,12 +649,14 @@ def best_path(
             targets[j] = kept[j]
         if n_before == depth:
             break
+        n_path, left = lay(vertex, targets, n_before, base, ground, outlook, path)
+        _mark(on_way, vertex, targets, n_before, n_path, ground, path)
         for place in range(n_before + 1):
             before = vertex if place == 0 else targets[place - 1]
             for u in nearest_first:
                 if work > budget.work or not ground.seconds[vertex, u] < min(best, at_hand):
                     break
-                if u == before or not _shows_news(u, ground, outlook):
+                if u == before or on_way[place, u] or not _shows_news(u, ground, outlook):
                     continue
                 for j in range(place):
                     trial[j] = targets[j]
@@ -522,9 +664,9 @@ def best_path(
                 for j in range(place, n_before):
                     trial[j + 1] = targets[j]
                 n_path, left = lay(vertex, trial, n_before + 1, base, ground, outlook, path)
-                value = worth(n_path, left, options, n_options, late_s, ground, outlook, path)
+                value = worth(n_path, left, options, n_options, late, ground, outlook, path)
                 looks = path.starts[n_path]
-                work += n_path * (looks // 2 + n // 8 + 4)
+                work += 15 * (n_path + looks) + n
                 if value < best - 1e-6:
                     best, n_kept, following, improved = value, n_before + 1, path.vertices[1], True
                     for j in range(n_kept):

@@ -30,8 +30,8 @@ def test_it_stays_near_the_optimum_on_small_lots():
     seeds = [s for s in range(0, 324, 5) if s % 6 in (3, 5) or s // 18 % 2 == 1]
     gaps = np.array([gap(s, trusting=True) for s in seeds])
     assert gaps.min() > -1e-3
-    assert gaps.mean() < 0.1
-    assert np.quantile(gaps, 0.95) < 0.5
+    assert gaps.mean() < 0.02
+    assert np.quantile(gaps, 0.95) < 0.1
 
 
 @pytest.mark.slow
@@ -104,7 +104,8 @@ def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong():
         for name in ("belief", "mdp-tuned")
     )
     _, _, high = mean_interval(ours - theirs)
-    assert high < -15.0
+    assert high < -50.0
+    assert ours.mean() < 92.0
 
 
 def test_what_it_saw_tells_how_long_cars_stay():

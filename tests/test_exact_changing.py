@@ -1,0 +1,86 @@
+"""The optimum where slots change: closed forms, the static optimum as a limit, and searches in the environment."""
+
+import numpy as np
+import pytest
+
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightingModel
+from parkenv.evaluation.episodes import EpisodeRunner
+from parkenv.evaluation.statistics import mean_interval
+from planners import make_agent
+from planners.exact import ExactSolution
+from planners.exact_changing import ChangingAgent, ChangingSolution
+
+
+def busy(n_slots=3, stay_s=20.0, taken=(0.7, 0.85, 0.8), give_up_s=600.0):
+    """A row of slots that are seen from their own vertex alone; every move takes a multiple of 2 s."""
+    p = np.array(taken)
+    return Scenario(
+        name="busy",
+        lot=ParkingLot.grid(1, n_slots, pitch=6.0),
+        occupancy=OccupancyProcess.from_demand(np.log(p / (1.0 - p)), np.zeros(168), stay_s),
+        v_drive=3.0,
+        wait_s=2.0,
+        give_up_s=give_up_s,
+        sighting=SightingModel(view_range=0.0),
+        entry=0,
+    )
+
+
+def solved(scenario, stay_s, taken, memory_steps=12):
+    p = np.array(taken)
+    return ChangingSolution(scenario.public(), p, 1.0 / (stay_s * (1.0 - p)), 2.0, memory_steps)
+
+
+def times(scenario, agent, searches):
+    runner = EpisodeRunner(scenario, agent.name, agent)
+    return np.array([runner.run(seed).row["total_s"] for seed in range(searches)])
+
+
+def test_one_slot_is_one_look():
+    """Seen taken it proves the lot full: there is nothing to be had by waiting."""
+    scenario = busy(1, taken=(0.8,), give_up_s=50.0)
+    found = solved(scenario, 20.0, (0.8,))
+    entry = int(scenario.lot.entry_vertices[0])
+    drive = float(scenario.move_s[entry][scenario.lot.neighbors[entry] >= 0].min())
+    assert found.expected_s(entry) == pytest.approx(drive + 0.2 * scenario.walk_s[0] + 0.8 * 50.0, abs=0.01)
+
+
+def test_slots_that_hardly_change_give_the_static_optimum():
+    scenario = busy(give_up_s=60.0)
+    p = np.array([0.7, 0.85, 0.8])
+    entry = int(scenario.lot.entry_vertices[0])
+    changing = ChangingSolution(scenario.public(), p, np.full(3, 1e-9), 2.0, 2)
+    assert changing.expected_s(entry) == pytest.approx(
+        ExactSolution(scenario.public(), p, entry).expected_s, abs=0.01
+    )
+
+
+def test_searches_take_as_long_as_it_says_and_belief_hardly_longer():
+    taken = (0.7, 0.85, 0.8)
+    scenario = busy(taken=taken)
+    found = solved(scenario, 20.0, taken)
+    assert found.rounding_error < 1e-6
+    assert found.belief_error < 0.05
+    best = times(scenario, ChangingAgent(found), 200)
+    mean, low, high = mean_interval(best)
+    assert low - 1.0 < found.expected_s(int(scenario.lot.entry_vertices[0])) < high + 1.0
+    ours = times(scenario, make_agent("belief", scenario), 200)
+    assert ours.mean() - mean < 0.02 * mean
+    # The thesis's planner looks at the last slot as well, and so proves the lot full.
+    theirs = times(scenario, make_agent("mdp-tuned", scenario), 60)
+    assert theirs.mean() > 3.0 * mean
+
+
+def test_what_it_cannot_solve_is_refused():
+    scenario = busy()
+    with pytest.raises(InputError, match="belief states"):
+        solved(scenario, 20.0, (0.7, 0.85, 0.8), memory_steps=200)
+    with pytest.raises(InputError, match="want 3 probabilities"):
+        ChangingSolution(scenario.public(), np.full(2, 0.5), np.ones(3), 2.0, 4)
+    with pytest.raises(InputError, match="want 3 finite rates"):
+        ChangingSolution(scenario.public(), np.full(3, 0.5), np.zeros(3), 2.0, 4)
+    with pytest.raises(InputError, match="memory_steps 1"):
+        ChangingSolution(scenario.public(), np.full(3, 0.5), np.ones(3), 2.0, 1)
+    blind = scenario.replace(sighting=SightingModel(hit_rate=0.9))
+    with pytest.raises(InputError, match="without error"):
+        ChangingSolution(blind.public(), np.full(3, 0.5), np.ones(3), 2.0, 4)
