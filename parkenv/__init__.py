@@ -61,10 +61,21 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-for _name, _entry_point in {
-    "parkenv/Search-v0": "parkenv.envs.search:SearchEnv",
-    "parkenv/SearchSensors-v0": "parkenv.envs.sensors:SearchSensorsEnv",
-    "parkenv/SearchPerception-v0": "parkenv.envs.perception:SearchPerceptionEnv",
-}.items():
+for _name, _entry_point, _vector_entry_point in (
+    (
+        "parkenv/Search-v0",
+        "parkenv.envs.search:SearchEnv",
+        "parkenv.envs.search_vector:ParkSearchVectorEnv",
+    ),
+    ("parkenv/SearchSensors-v0", "parkenv.envs.sensors:SearchSensorsEnv", None),
+    ("parkenv/SearchPerception-v0", "parkenv.envs.perception:SearchPerceptionEnv", None),
+):
     if _name not in registry:
-        register(id=_name, entry_point=_entry_point, max_episode_steps=2000)
+        register(
+            id=_name,
+            entry_point=_entry_point,
+            vector_entry_point=_vector_entry_point,
+            max_episode_steps=2000,
+        )
+if "parkenv/Drive-v0" not in registry:
+    register(id="parkenv/Drive-v0", entry_point="parkenv.envs.drive:DriveEnv", max_episode_steps=600)

@@ -59,19 +59,39 @@ def keyed_exponential(key: np.uint64, stream: int, slot: int, index: int) -> flo
     return -math.log(keyed_uniform(key, stream, slot, index))
 
 
+@njit(cache=True)
+def _absorbed(state: np.uint64, word: np.uint64) -> np.uint64:
+    mixed: np.uint64 = _mix64(np.uint64(state) + _GOLDEN + np.uint64(word))
+    return mixed
+
+
+@njit(cache=True)
+def episode_key(seed_state: np.uint64, episode: int) -> np.uint64:
+    """Key of a world, from `seed_state` and an episode number below 2**64 (compiled; for batches too)."""
+    # The number of words goes in first, so that no two (seed, episode) pairs spell the same words.
+    key: np.uint64 = _absorbed(_absorbed(seed_state, np.uint64(1)), np.uint64(episode))
+    return key
+
+
+def seed_state(seed: int) -> np.uint64:
+    """What is mixed of a seed, a non-negative integer of any size, before the episode number."""
+    return _with_words(np.uint64(0), "seed", seed)
+
+
 def world_key(seed: int, episode: int) -> np.uint64:
     """Mix a seed and an episode number, non-negative integers of any size, into the key of one world.
 
     >>> len({world_key(0, 1), world_key(0, 1), world_key(1, 0)})
     2
     """
-    state = 0
-    for name, given in (("seed", seed), ("episode", episode)):
-        number = operator.index(given)
-        if number < 0:
-            raise InputError(f"{name}: got {number}, wanted an integer >= 0")
-        n_words = max(1, -(-number.bit_length() // _WORD_BITS))
-        # The number of words goes in first, so that no two (seed, episode) pairs spell the same words.
-        for word in (n_words, *((number >> (_WORD_BITS * i)) & _WORD for i in range(n_words))):
-            state = int(_mix64(np.uint64((state + int(_GOLDEN) + word) & _WORD)))
-    return np.uint64(state)
+    return _with_words(seed_state(seed), "episode", episode)
+
+
+def _with_words(state: np.uint64, name: str, given: int) -> np.uint64:
+    number = operator.index(given)
+    if number < 0:
+        raise InputError(f"{name}: got {number}, wanted an integer >= 0")
+    n_words = max(1, -(-number.bit_length() // _WORD_BITS))
+    for word in (n_words, *((number >> (_WORD_BITS * i)) & _WORD for i in range(n_words))):
+        state = np.uint64(_absorbed(state, np.uint64(word)))
+    return state

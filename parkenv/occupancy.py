@@ -7,7 +7,6 @@ import json
 import math
 import os
 import re
-from collections import OrderedDict
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -18,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 from parkenv.errors import InputError
+from parkenv.fading import fading
 from parkenv.keyed_random import ARRIVAL_STREAM, OCCUPANCY_STREAM, keyed_exponential, keyed_uniform
 from parkenv.whole_files import written_whole
 
@@ -37,7 +37,6 @@ MIN_PROBABILITY = 0.001
 MAX_PROBABILITY = 0.999
 
 MAX_RATE = 1e3
-_CACHE_BYTES = 1 << 26
 _NEVER_WEEKS = 1e9
 _FORGOTTEN = 1e-17
 _FORMAT = "parkenv-occupancy-process"
@@ -163,7 +162,7 @@ class OccupancyModel(PriorModel, Protocol):
 
 
 @njit(cache=True)
-def _hour_of_week(time: float) -> tuple[float, int, float]:
+def hour_of_week(time: float) -> tuple[float, int, float]:
     """Week, hour of the week and second of the hour."""
     week = np.floor(time / WEEK_S)
     second = time - week * WEEK_S
@@ -174,7 +173,7 @@ def _hour_of_week(time: float) -> tuple[float, int, float]:
 @njit(cache=True)
 def _time_after(profile: FloatArray, table: FloatArray, since: float, hazard: float) -> float:
     """When the hazard that a unit slot has gathered since `since` reaches `hazard`; table[-1] must be > 0."""
-    week, hour, second = _hour_of_week(since)
+    week, hour, second = hour_of_week(since)
     target = table[hour] + profile[hour] * second + hazard
     more_weeks = np.floor(target / table[WEEK_HOURS])
     if not more_weeks < _NEVER_WEEKS:
@@ -188,62 +187,104 @@ def _time_after(profile: FloatArray, table: FloatArray, since: float, hazard: fl
 
 
 @njit(cache=True)
-def _marginal(arrival_factor: float, departure_factor: float, profiles: FloatArray, time: float) -> float:
-    """P(occupied) at `time` in the periodic regime of p' = λ(t)(1−p) − μ(t)p.
+def _marginal_at_hour(
+    arrival_factor: float,
+    departure_factor: float,
+    arrival_profile: FloatArray,
+    departure_profile: FloatArray,
+    now: int,
+) -> float:
+    """P(occupied) when hour `now` of the week begins, in the periodic regime of p' = λ(t)(1−p) − μ(t)p.
 
     The affine map over the week that ends at `time` is gathered backwards, latest piece first, so it can
     stop as soon as the past is forgotten. A slot that never changes has no regime; it gets 0.5.
     """
-    _, now, second = _hour_of_week(time)
     p, gain, gathered = 0.0, 1.0, 0.0
-    for back in range(WEEK_HOURS + 1):
-        duration = HOUR_S
-        if back == 0:
-            duration = second
-        elif back == WEEK_HOURS:
-            duration = HOUR_S - second
+    for back in range(1, WEEK_HOURS + 1):
         hour = (now - back) % WEEK_HOURS
-        arrival = arrival_factor * profiles[0, hour]
-        rate = arrival + departure_factor * profiles[1, hour]
+        arrival = arrival_factor * arrival_profile[hour]
+        rate = arrival + departure_factor * departure_profile[hour]
         if rate > 0.0:
-            moved = -math.expm1(-rate * duration)
+            moved = -math.expm1(-rate * HOUR_S)
             p += gain * (arrival / rate) * moved
             gain *= 1.0 - moved
-            gathered += rate * duration
+            gathered += rate * HOUR_S
             if gain < _FORGOTTEN:
                 return float(p)
     return float(p / -math.expm1(-gathered)) if gathered > 0.0 else 0.5
 
 
 @njit(cache=True)
-def _marginals(factors: FloatArray, profiles: FloatArray, time: float) -> FloatArray:
-    p = np.empty(factors.shape[1])
-    for slot in range(p.size):
-        p[slot] = _marginal(factors[0, slot], factors[1, slot], profiles, time)
+def marginal_from(
+    arrival_factor: float,
+    departure_factor: float,
+    arrival_profile: FloatArray,
+    departure_profile: FloatArray,
+    hour: int,
+    second: float,
+    kept: FloatArray,
+    row: int,
+) -> float:
+    """P(occupied) of one slot at a second of an hour of the week (compiled; for batches too).
+
+    Args:
+        arrival_factor: of the slot.
+        departure_factor: of the slot.
+        arrival_profile: (168,) 1/s.
+        departure_profile: (168,) 1/s.
+        hour: of the week.
+        second: of the hour.
+        kept: what was worked out before; 0 where nothing was.
+        row: where in `kept` the slot's probability at the beginning of the hour is, or goes.
+    """
+    start = kept[row]
+    if start == 0.0:
+        start = _marginal_at_hour(arrival_factor, departure_factor, arrival_profile, departure_profile, hour)
+        kept[row] = start
+    arrival = arrival_factor * arrival_profile[hour]
+    rate = arrival + departure_factor * departure_profile[hour]
+    equilibrium = arrival / rate if rate > 0.0 else 0.0
+    p: float = equilibrium + (start - equilibrium) * fading(rate * second)
     return p
 
 
 @njit(cache=True)
-def _holding_end(
-    key: np.uint64,
-    slot: int,
-    flip: int,
-    state: int,
-    since: float,
-    factors: FloatArray,
-    profiles: FloatArray,
-    tables: FloatArray,
+def _marginals(
+    factors: FloatArray, profiles: FloatArray, hour: int, second: float, kept: FloatArray
+) -> FloatArray:
+    n = factors.shape[1]
+    p = np.empty(n)
+    for s in range(n):
+        p[s] = marginal_from(
+            factors[0, s], factors[1, s], profiles[0], profiles[1], hour, second, kept, hour * n + s
+        )
+    return p
+
+
+@njit(cache=True)
+def holding_end(
+    key: np.uint64, slot: int, flip: int, since: float, factor: float, profile: FloatArray, table: FloatArray
 ) -> float:
-    factor = factors[state, slot]
-    if factor * tables[state, WEEK_HOURS] <= 0.0:
+    """When the stretch of constant state ends that began at `since`, s (compiled; for batches too).
+
+    Args:
+        key: the world's key.
+        slot: index of the slot.
+        flip: number of the stretch, 1 for the first.
+        since: s.
+        factor: of the rate at which the state is left.
+        profile: (168,) 1/s, of that rate.
+        table: (169,) its hazard, gathered since Monday 00:00, at full hours.
+    """
+    if factor * table[WEEK_HOURS] <= 0.0:
         return np.inf
     hazard = keyed_exponential(key, OCCUPANCY_STREAM, slot, flip) / factor
-    end: float = _time_after(profiles[state], tables[state], since, hazard)
+    end: float = _time_after(profile, table, since, hazard)
     return end
 
 
 @njit(cache=True)
-def seek(
+def _seek(
     slot: int,
     time: float,
     key: np.uint64,
@@ -251,37 +292,37 @@ def seek(
     factors: FloatArray,
     profiles: FloatArray,
     tables: FloatArray,
+    kept: FloatArray,
     span: FloatArray,
     flips: IntArray,
     states: NDArray[np.uint8],
 ) -> None:
-    """Move one slot's cursor to the stretch of constant state that holds `time` (compiled; for batches too).
+    """Move one slot's cursor to the stretch of constant state that holds `time`, s, at or after `arrival`.
 
-    Args:
-        slot: index of the slot.
-        time: s, at or after `arrival`.
-        key: the world's key.
-        arrival: s, when the world begins.
-        factors: (2, n) float64, arrival and departure factors.
-        profiles: (2, 168) float64, 1/s.
-        tables: (2, 169) float64, cumulative hazards of the profiles.
-        span: (n, 2) float64, s, changed in place: begin and end of the stretch.
-        flips: (n,) int64, changed in place: stretches begun so far, 0 = cursor not set.
-        states: (n,) uint8, changed in place: 1 = occupied. Rows of factors, profiles and tables are the
-            rates of leaving state 0 and state 1.
+    Rows of factors, profiles and tables are the rates of leaving state 0 and state 1. Changed in place:
+    span, (n, 2) s, begin and end of the stretch; flips, (n,) stretches begun so far, 0 = cursor not set;
+    states, (n,) 1 = occupied.
     """
     if flips[slot] == 0 or time < span[slot, 0]:
-        p = _marginal(factors[0, slot], factors[1, slot], profiles, arrival)
-        states[slot] = 1 if keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < p else 0
+        _, hour, second = hour_of_week(arrival)
+        row = hour * flips.size + slot
+        p = marginal_from(
+            factors[0, slot], factors[1, slot], profiles[0], profiles[1], hour, second, kept, row
+        )
+        state = 1 if keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < p else 0
+        states[slot] = state
         flips[slot] = 1
         span[slot, 0] = arrival
-        span[slot, 1] = _holding_end(key, slot, 1, states[slot], arrival, factors, profiles, tables)
+        span[slot, 1] = holding_end(
+            key, slot, 1, arrival, factors[state, slot], profiles[state], tables[state]
+        )
     while time >= span[slot, 1]:
-        states[slot] = 1 - states[slot]
+        state = 1 - states[slot]
+        states[slot] = state
         flips[slot] += 1
         span[slot, 0] = span[slot, 1]
-        span[slot, 1] = _holding_end(
-            key, slot, flips[slot], states[slot], span[slot, 0], factors, profiles, tables
+        span[slot, 1] = holding_end(
+            key, slot, flips[slot], span[slot, 0], factors[state, slot], profiles[state], tables[state]
         )
 
 
@@ -294,6 +335,7 @@ def _look(
     factors: FloatArray,
     profiles: FloatArray,
     tables: FloatArray,
+    kept: FloatArray,
     span: FloatArray,
     flips: IntArray,
     states: NDArray[np.uint8],
@@ -302,7 +344,7 @@ def _look(
     for i, slot in enumerate(slots):
         if not 0 <= slot < flips.size:
             raise IndexError("slot index out of range")
-        seek(slot, time, key, arrival, factors, profiles, tables, span, flips, states)
+        _seek(slot, time, key, arrival, factors, profiles, tables, kept, span, flips, states)
         occupied[i] = states[slot] == 1
     return occupied
 
@@ -355,6 +397,7 @@ class ProcessWorld:
             process.factors,
             process.profiles,
             process.tables,
+            process.kept,
             self._span,
             self._flips,
             self._states,
@@ -379,6 +422,7 @@ class OccupancyProcess:
         factors: (2, n) float64, read-only, the two factors stacked; row = the state that is left.
         profiles: (2, 168) float64, 1/s, read-only, likewise.
         tables: (2, 169) float64, read-only, the profiles' hazard gathered since Monday 00:00, at full hours.
+        kept: (168 * n,) float64, marginals at full hours, hour by hour, that have been asked for; 0 elsewhere.
 
     Raises:
         InputError: a wrong shape, a value that is negative or not finite, or a rate above 1000/s.
@@ -391,7 +435,7 @@ class OccupancyProcess:
     factors: FloatArray = field(init=False, repr=False)
     profiles: FloatArray = field(init=False, repr=False)
     tables: FloatArray = field(init=False, repr=False)
-    _hour_marginals: OrderedDict[int, FloatArray] = field(init=False, repr=False, default_factory=OrderedDict)
+    kept: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         arrival = _checked("arrival_factor", self.arrival_factor)
@@ -407,6 +451,8 @@ class OccupancyProcess:
         for name, array in (("factors", factors), ("profiles", profiles), ("tables", tables)):
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+        # Memory that nobody has touched costs nothing, so a million slots may have their whole week.
+        object.__setattr__(self, "kept", np.zeros(WEEK_HOURS * arrival.size))
         for name, row in zip(_FIELDS, (factors[0], profiles[0], factors[1], profiles[1]), strict=True):
             object.__setattr__(self, name, row)
 
@@ -520,18 +566,9 @@ class OccupancyProcess:
 
     def marginal(self, time: float) -> FloatArray:
         """(n,) float64: P(occupied) at `time`, when nothing has been seen."""
-        _, hour, second = _hour_of_week(time)
-        start = self._hour_marginals.get(hour)
-        if start is None:
-            # Bounded by bytes: a small lot keeps the whole week, a million slots a few hours.
-            if len(self._hour_marginals) >= max(1, _CACHE_BYTES // (8 * self.n_slots)):
-                self._hour_marginals.popitem(last=False)
-            start = self._hour_marginals[hour] = _marginals(self.factors, self.profiles, hour * HOUR_S)
-        arrival, departure = self.factors * self.profiles[:, hour, None]
-        rate = arrival + departure
-        equilibrium = np.divide(arrival, rate, out=np.zeros_like(rate), where=rate > 0)
-        marginal: FloatArray = equilibrium + (start - equilibrium) * np.exp(-rate * second)
-        return marginal
+        _, hour, second = hour_of_week(time)
+        marginals: FloatArray = _marginals(self.factors, self.profiles, hour, second, self.kept)
+        return marginals
 
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
         """Weekday and time of day, both uniform in the window."""
@@ -544,7 +581,7 @@ class OccupancyProcess:
 
     def forecast(self, arrival: Arrival) -> Forecast:
         """The marginal at the arrival, clipped to [0.001, 0.999], and the rates of that hour."""
-        _, hour, _ = _hour_of_week(arrival.time)
+        _, hour, _ = hour_of_week(arrival.time)
         rates = self.factors * self.profiles[:, hour, None]
         return Forecast(
             np.clip(self.marginal(arrival.time), MIN_PROBABILITY, MAX_PROBABILITY), rates[0] + rates[1]

@@ -154,15 +154,47 @@ class RecordedWorld:
         return answer
 
 
-class _Layout(NamedTuple):
+class Layout(NamedTuple):
     """What does not depend on the second of an arrival on a given day."""
 
     log_slot: IntArray  # (n,)
     record: IntArray  # (n,)
     held_out: frozenset[int]  # days that the world replays: the forecast must not know them
-    share: FloatArray  # (m, 24) share of each hour taken, summed over the other days
+    share: FloatArray  # (m * 24,) share of each hour taken, summed over the other days
+    lot_share: FloatArray  # (24,) the same, summed over the slots, too
     n_days: IntArray  # (m,) other days with a record
+    n_records: int  # all of them
     relaxation_rate: float
+
+
+@njit(cache=True, error_model="numpy")
+def recorded_forecast(
+    log_slot: int, second: float, share: FloatArray, lot_share: FloatArray, n_days: FloatArray, n_records: int
+) -> float:
+    """P(taken) at a second of the day, from the hour around it; arguments as in `Layout` (for batches, too)."""
+    low, high = max(second - HOUR_S / 2, 0.0), min(second + HOUR_S / 2, DAY_S)
+    taken = in_all = 0.0
+    for hour in range(int(low // HOUR_S), min(int(high // HOUR_S), DAY_HOURS - 1) + 1):
+        weight = (min((hour + 1) * HOUR_S, high) - max(hour * HOUR_S, low)) / (high - low)
+        taken += weight * share[log_slot * DAY_HOURS + hour]
+        in_all += weight * lot_share[hour]
+    p = (taken + PRIOR_DAYS * in_all / n_records) / (n_days[log_slot] + PRIOR_DAYS)
+    return float(min(max(p, MIN_PROBABILITY), MAX_PROBABILITY))
+
+
+@njit(cache=True)
+def _forecast(
+    log_slots: IntArray,
+    second: float,
+    share: FloatArray,
+    lot_share: FloatArray,
+    n_days: IntArray,
+    n_records: int,
+) -> FloatArray:
+    p = np.empty(log_slots.size)
+    for i, log_slot in enumerate(log_slots):
+        p[i] = recorded_forecast(log_slot, second, share, lot_share, n_days, n_records)
+    return p
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +218,7 @@ class RecordedOccupancy:
     log: OccupancyLog
     walk_m: FloatArray
     mapping: IntArray | None = None
-    _layouts: dict[int, _Layout] = field(init=False, repr=False, default_factory=dict)
+    _layouts: dict[int, Layout] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         walk = np.array(self.walk_m, float)
@@ -207,12 +239,17 @@ class RecordedOccupancy:
 
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
         """A recorded day, uniform among those on the window's weekdays, and a time of day, uniform in it."""
+        days = self.days_in(window)
+        day = days[int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(days))]
+        return Arrival(weekday_of(day) * DAY_S + window.draw_second(key), day)
+
+    def days_in(self, window: ArrivalWindow) -> list[str]:
+        """The recorded days on the window's weekdays; InputError if there are none."""
         days = [day for day in self.log.days if weekday_of(day) in window.weekdays]
         if not days:
             names = ",".join(DAY_NAMES[weekday] for weekday in window.weekdays)
             raise InputError(f"{self.log.source}: no recorded day is one of {names}")
-        day = days[int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(days))]
-        return Arrival(weekday_of(day) * DAY_S + window.draw_second(key), day)
+        return days
 
     def world(self, key: np.uint64, arrival: Arrival) -> RecordedWorld:  # noqa: ARG002 - the day decides all
         """The replay of the arrival's day."""
@@ -226,28 +263,28 @@ class RecordedOccupancy:
         one chain with constant rates, fitted to all looks on those days.
         """
         layout = self._layout(arrival)
-        hours = np.arange(DAY_HOURS) * HOUR_S
         second = arrival.time - weekday_of(arrival.day) * DAY_S
-        overlap = np.minimum(hours + HOUR_S, second + HOUR_S / 2) - np.maximum(hours, second - HOUR_S / 2)
-        weight = np.maximum(overlap, 0.0)
-        taken = layout.share @ (weight / weight.sum())
-        lot_mean = taken.sum() / layout.n_days.sum()
-        p = (taken + PRIOR_DAYS * lot_mean) / (layout.n_days + PRIOR_DAYS)
-        p = np.clip(p, MIN_PROBABILITY, MAX_PROBABILITY)[layout.log_slot]
+        p = _forecast(
+            layout.log_slot, second, layout.share, layout.lot_share, layout.n_days, layout.n_records
+        )
         return Forecast(p, np.full(self.n_slots, layout.relaxation_rate))
 
-    def _layout(self, arrival: Arrival) -> _Layout:
+    def _layout(self, arrival: Arrival) -> Layout:
         if arrival.day not in self.log.days:
             raise InputError(f"Arrival.day: got {arrival.day!r}, wanted a recorded day of {self.log.source}")
         second = arrival.time - weekday_of(arrival.day) * DAY_S
         if not 0 <= second < DAY_S:
             raise InputError(f"Arrival.time: got {arrival.time}, wanted a second of {arrival.day}")
-        day = self.log.days.index(arrival.day)
-        if day not in self._layouts:
-            self._layouts[day] = self._lay_out(day)
-        return self._layouts[day]
+        return self.layout(arrival.day)
 
-    def _lay_out(self, day: int) -> _Layout:
+    def layout(self, day: str) -> Layout:
+        """How the log lies on the lot when `day`, one of the log's, is replayed."""
+        index = self.log.days.index(day)
+        if index not in self._layouts:
+            self._layouts[index] = self._lay_out(index)
+        return self._layouts[index]
+
+    def _lay_out(self, day: int) -> Layout:
         log = self.log
         same_class = np.flatnonzero(log.weekend == log.weekend[day])
         replay_order = np.roll(same_class, -int(np.searchsorted(same_class, day)))
@@ -272,12 +309,16 @@ class RecordedOccupancy:
                 f"{log.source}: no two consecutive looks on the days that are left to forecast from"
             )
         rates = fit_constant_rates((looks.end - looks.start)[used], looks.before[used], looks.after[used])
-        return _Layout(
+        share = log.replayed_share[:, others].sum(axis=1)
+        n_days = log.recorded[:, others].sum(axis=1)
+        return Layout(
             log_slot,
             days * len(log.slot_ids) + log_slot,
             frozenset(held_out),
-            log.replayed_share[:, others].sum(axis=1),
-            log.recorded[:, others].sum(axis=1),
+            share.ravel(),
+            share.sum(axis=0),
+            n_days,
+            int(n_days.sum()),
             sum(rates),
         )
 

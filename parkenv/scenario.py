@@ -189,6 +189,15 @@ class Scenario(SearchProblem):
         return cls(**{"name": name, **make()}).replace(**changes)
 
     @classmethod
+    def of(cls, scenario: str | Scenario, **changes: Any) -> Scenario:
+        """A scenario, or the one that comes with the package under a name, with some fields changed."""
+        if isinstance(scenario, str):
+            return cls.named(scenario, **changes)
+        if not isinstance(scenario, Scenario):
+            raise InputError(f"scenario is a {type(scenario).__name__}, want a Scenario or the name of one")
+        return scenario.replace(**changes)
+
+    @classmethod
     def on_lot(cls, lot: ParkingLot, occupancy: OccupancyModel | None = None, **fields: Any) -> Self:
         """A scenario on any lot, with a typical day's occupancy where none is given."""
         goal = fields.get("goal", 0)

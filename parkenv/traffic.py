@@ -109,6 +109,19 @@ class LotTraffic:
             )
         return Movers(cars, model, people, stride, look)
 
+    def poses_at(self, times: FloatArray) -> FloatArray:
+        """Where everybody is, each at a time of their own, as those need it who wait for somebody on their way.
+
+        Args:
+            times: (cars + pedestrians,) s, the cars first.
+
+        Returns:
+            (cars + pedestrians, 3) x, y in m and yaw in rad.
+        """
+        loops = [loop for loop, _ in (*self._cars, *self._people)]
+        poses = [loop.pose(time) for loop, time in zip(loops, np.asarray(times).tolist(), strict=True)]
+        return np.array(poses).reshape(-1, 3)
+
     def _car(self, rng: np.random.Generator, slots: SlotLot) -> tuple[_Loop, int]:
         assert self._routes is not None
         path = self._routes.round_trip(rng)

@@ -10,7 +10,14 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 MAY_SEE_PLANNERS = ("parkenv/evaluation/", "parkenv/cli/")
-PLANNERS_MAY_SEE = {"parkenv.lot", "parkenv.belief", "parkenv.scenario", "parkenv.sighting", "parkenv.errors"}
+PLANNERS_MAY_SEE = {
+    "parkenv.lot",
+    "parkenv.belief",
+    "parkenv.scenario",
+    "parkenv.sighting",
+    "parkenv.errors",
+    "parkenv.driving.vehicle",  # the car's size and limits, and how it moves
+}
 
 
 def imports(path):

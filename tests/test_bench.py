@@ -82,4 +82,24 @@ def test_bench_writes_its_rows(tmp_path):
 def test_an_unknown_part_is_named():
     result = CliRunner().invoke(app, ["bench", "engine"])
     assert isinstance(result.exception, InputError)
-    assert "no part 'engine' to measure, want some of sensors, perception, planning" in str(result.exception)
+    assert "no part 'engine' to measure, want some of sensors, perception, planning, env" in str(
+        result.exception
+    )
+
+
+def test_steps_are_measured_and_peers_that_are_not_there_are_named(monkeypatch):
+    from parkenv.evaluation import bench_env
+
+    monkeypatch.setattr(bench_env, "find_spec", lambda name: None)
+    rows = bench_env.env_rows(seed=0, seconds=0.0, batch=4, large=300)
+    measured = [row for row in rows if row["part"] in ("batch", "single") and row["value"] is not None]
+    assert len(measured) == 5
+    assert all(row["value"] > 0 and row["ratio"] == row["value"] / row["peer_value"] for row in measured)
+    absent = [row["case"] for row in rows if row["value"] is None]
+    assert absent == [
+        f"{name}: not installed"
+        for name in ("highway_env parking-v0", "minigrid MiniGrid-Empty-8x8-v0", "envpool CartPole-v1")
+    ]
+    memory = {row["case"]: row["value"] for row in rows if row["part"] == "memory"}
+    # Of each slot 40 + 16 + 4 bytes, and the belief.
+    assert memory["batch of 4, 200 slots, full belief"] == pytest.approx(200 * 64 / 1024, rel=0.1)

@@ -1,4 +1,6 @@
+import dataclasses
 import sys
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -9,7 +11,7 @@ from parkenv.envs import rendering
 from parkenv.envs.rendering import SearchRenderer, belief_colors, clock
 from parkenv.errors import InputError
 from parkenv.lot import PARK, Lane, ParkingLot
-from parkenv.occupancy import OccupancyProcess
+from parkenv.occupancy import Arrival, OccupancyProcess
 from parkenv.scenario import Scenario
 
 
@@ -48,6 +50,18 @@ def middle_of_slot(renderer, state, slot, along=0.0):
     return row, column
 
 
+def stand_in(env, p_occupied=None, seen=None, **changes):
+    """The state of an environment, but for some of it."""
+    state = env.unwrapped.state
+    belief = state.belief
+    if p_occupied is not None:
+        belief = dataclasses.replace(belief, p_occupied=p_occupied)
+    if seen is not None:
+        belief = dataclasses.replace(belief, seen=seen)
+    names = ("arrival", "time", "vertex", "path", "parked", "over", "failed_parks", "walk_s", "gave_up_s")
+    return SimpleNamespace(**{n: getattr(state, n) for n in names} | {"belief": belief} | changes)
+
+
 def test_frames_are_what_gymnasium_asks_for_and_do_not_depend_on_history():
     env = start(row_lot())
     first = env.render()
@@ -66,10 +80,8 @@ def test_frames_are_what_gymnasium_asks_for_and_do_not_depend_on_history():
 
 def test_slots_have_the_colour_of_the_belief_and_cars_stand_where_the_truth_is_taken():
     env = start(row_lot())
-    state = env.unwrapped.state
     renderer = SearchRenderer(env.unwrapped.scenario)
-    state.belief.p_occupied[:] = np.linspace(0, 1, 10)
-    state.belief.seen[:] = np.arange(10) >= 5
+    state = stand_in(env, p_occupied=np.linspace(0, 1, 10), seen=np.arange(10) >= 5)
     occupied = np.arange(10) % 2 == 1
     frame = renderer.frame(state, occupied)
     colors = belief_colors(state.belief.p_occupied, state.belief.seen)
@@ -109,7 +121,7 @@ def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
     nothing = np.zeros(4000, dtype=bool)
     frames = {}
     for vertex in (0, 2000, 3999, 0):
-        state.vertex, state.path = vertex, [vertex]
+        state = stand_in(env, vertex=vertex, path=[vertex])
         frame = renderer.frame(state, nothing)
         column, row = renderer._ground.view(scenario.lot.vertex_xy[vertex])
         assert 0.2 * 640 < column < 0.8 * 640
@@ -159,18 +171,17 @@ def test_a_full_lot_ends_at_a_junction_too():
         out = np.flatnonzero(env.unwrapped.action_masks()[:PARK])
         onward = lot.vertex_xy[lot.neighbors[env.unwrapped.state.vertex, out], 0]
         _, _, over, _, _ = env.step(int(out[np.argmax(onward)]))
-    state = env.unwrapped.state
-    state.vertex = 10
+    state = stand_in(env, vertex=10)
     assert (env.render()[446:] == rendering.GAVE_UP).all(axis=2).any()
     assert "every slot is taken" in SearchRenderer(env.unwrapped.scenario).text(state)
 
 
 def test_text_tells_place_time_and_surroundings():
     env = start(row_lot())
-    state = env.unwrapped.state
     renderer = SearchRenderer(env.unwrapped.scenario)
-    state.vertex, state.path, state.time = 3, [3], 86400 + 9 * 3600 + 41 * 60 + 7
-    state.belief.p_occupied[2:5] = [0.0, 1.0, 0.0]
+    p_occupied = np.insert(np.full(7, 0.5), 2, [0.0, 1.0, 0.0])
+    moment = 86400 + 9 * 3600 + 41 * 60 + 7
+    state = stand_in(env, p_occupied, vertex=3, path=[3], time=moment, arrival=Arrival(moment))
     text = renderer.text(state)
     lines = text.splitlines()
     assert "at slot A3" in lines[0]

@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 
 import parkenv
 from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightBand, SightingModel
-from parkenv.belief import SlotBelief
+from parkenv.belief import after_look, relaxed
 from parkenv.envs.wrappers import ThesisReward
+from parkenv.fading import fading
 from parkenv.lot import PARK
-from parkenv.occupancy import Forecast
 from parkenv.scenario import SCENARIO_NAMES
 
-ENV_IDS = [name for name in gym.registry if name.startswith("parkenv/")]
+ENV_IDS = [name for name in gym.registry if name.startswith("parkenv/Search")]
 
 
 def always(lot, occupied):
@@ -273,14 +273,42 @@ def test_only_slots_in_view_are_learnt_of():
 
 
 def test_a_sighting_is_bayes_rule_and_relaxes_exponentially():
-    forecast = Forecast(p_occupied=np.array([0.6, 0.6]), relaxation_rate=np.array([1 / 600, 1 / 600]))
-    belief = SlotBelief(forecast, time=100.0)
-    belief.update(np.array([0]), np.array([True]), np.array([0.9]), np.array([0.2]))
-    seen = 0.9 * 0.6 / (0.9 * 0.6 + 0.2 * 0.4)
-    assert belief.p_occupied[0] == pytest.approx(seen)
-    belief.relax(100.0 + 300.0)
-    assert belief.p_occupied[0] == pytest.approx(0.6 + (seen - 0.6) * np.exp(-0.5))
-    assert belief.p_occupied[1] == 0.6
+    said = after_look(0.6, True, 0.9, 0.2)
+    assert said == pytest.approx(0.9 * 0.6 / (0.9 * 0.6 + 0.2 * 0.4))
+    assert relaxed(0.6, 1 / 600, said, 300.0) == pytest.approx(0.6 + (said - 0.6) * np.exp(-0.5), rel=1e-14)
+    assert relaxed(0.6, 1 / 600, said, 0.0) == pytest.approx(said, rel=1e-15)
+    # What is certain stays so to the last bit until time passes.
+    assert [relaxed(0.3, 1 / 600, certain, 0.0) for certain in (0.0, 1.0)] == [0.0, 1.0]
+    assert relaxed(0.6, 1 / 600, said, 1e9) == 0.6
+    assert after_look(0.0, True, 1.0, 0.0) == 1.0, "a look that was held to be impossible is believed"
+
+
+@given(x=st.floats(0.0, 600.0))
+@settings(deadline=None)
+def test_fading_is_the_exponential(x):
+    assert fading(x) == pytest.approx(np.exp(-x), rel=1e-14)
+
+
+def test_the_belief_in_a_slot_left_behind_grows_old():
+    lot = ParkingLot.grid(1, 12)
+    process = OccupancyProcess.from_demand(np.zeros(12), np.zeros(168), 600.0)
+    scenario = Scenario(name="a", lot=lot, occupancy=process, sighting=SightingModel(view_range=0.0))
+    env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+    observation, _ = env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    last = {}
+    for _ in range(200):
+        observation, *_ = env.step(rng.choice(np.flatnonzero(observation["action_mask"][:PARK])))
+        slot, now = int(observation["vertex"]), env.state.time
+        if slot < lot.n_slots:
+            last[slot] = now, float(env.state.world.occupied([slot], now)[0])
+        belief = env.state.belief
+        for s, (then, taken) in last.items():
+            expected = belief.prior[s] + (taken - belief.prior[s]) * np.exp((then - now) * 2 / 600)
+            assert belief.p_occupied[s] == pytest.approx(expected)
+        np.testing.assert_array_equal(observation["p_occupied"], belief.p_occupied.astype(np.float32))
+        assert set(np.flatnonzero(belief.seen)) == set(last)
+    assert len(last) > 5
 
 
 def test_noisy_sight_errs_as_often_as_stated():

@@ -15,6 +15,7 @@ from parkenv.cli import (
     detect,
     lot,
     occupancy,
+    park,
     plan,
     sensors,
     sight,
@@ -44,6 +45,7 @@ app.command("fit-sight")(sight.fit_sight)
 app.command("detect")(detect.detect)
 app.command("train-detector")(detect.train_detector)
 app.command("evaluate-detector")(detect.evaluate_detector)
+app.command("park")(park.park)
 app.command("bench")(bench.bench)
 app.add_typer(benchmark.app, name="benchmark")
 

@@ -35,10 +35,24 @@ def _planning(seed: int, seconds: float) -> list[BenchRow]:
     return planning_rows(seed, seconds)
 
 
+def _drive(seed: int, seconds: float) -> list[BenchRow]:
+    from parkenv.evaluation.bench_drive import drive_rows
+
+    return drive_rows(seed, seconds)
+
+
+def _env(seed: int, seconds: float) -> list[BenchRow]:
+    from parkenv.evaluation.bench_env import env_rows
+
+    return env_rows(seed, seconds)
+
+
 PARTS: dict[str, Callable[[int, float], list[BenchRow]]] = {
     "sensors": _sensors,
     "perception": _perception,
     "planning": _planning,
+    "env": _env,
+    "drive": _drive,
 }
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from parkenv.envs.lookout import Lookout, Moment
 from parkenv.envs.search import SearchEnv, SearchState
+from parkenv.envs.search_step import drive_or_park, settle, take_in
 from parkenv.envs.sensors import beside_the_lot
 from parkenv.mapping.slots import SlotFilter
 from parkenv.perception.detector import Detector
@@ -100,8 +101,9 @@ class SearchPerceptionEnv(SearchEnv):
         if self.scenario.sighting.perfect:
             measured = SightingModel.named("laser" if self.rig.lasers else "stereo")
             self.scenario = self.scenario.replace(sighting=measured)
-            self._view_starts, self._view_slots = self.scenario.slots_in_view
-            self._rates = self.scenario.sight_rates
+            self._make_search()
+        self._view_starts, self._view_slots = self.scenario.slots_in_view
+        self._rates = self.scenario.sight_rates
         self._before: tuple[int, float] | None = None
         self._moments: list[Moment] = []
         self._report = _NOTHING
@@ -129,12 +131,16 @@ class SearchPerceptionEnv(SearchEnv):
         self._before = (self.state.vertex, self.state.time)
         return super().step(action)
 
+    def _advance(self, action: int) -> None:
+        """Act; capture, detect, range, and tell the belief what the slots look like."""
+        drive_or_park(self.search, 0, action)
+        self._state.come_along()
+        if not self._state.parked:
+            self._look(self._state)
+        settle(self.search, 0)
+
     def _look(self, state: SearchState) -> None:
-        """Capture, detect, range, and tell the belief what the slots look like."""
-        if state.vertex < self.scenario.lot.n_slots:
-            state.passed.add(state.vertex)
         self._moments = self._lookout.look(state, self._before)
-        state.belief.relax(state.time)
         slots = SlotFilter(self.scenario.lot)
         for _, capture in self._moments:
             look = self._stack.look(capture)
@@ -147,7 +153,7 @@ class SearchPerceptionEnv(SearchEnv):
         near, rates = self._view_slots[rows], self._rates.of(rows)
         told = states.in_view[near] & (states.p_occupied[near] != 0.5)
         self._report = Report(near[told], states.occupied[near[told]])
-        state.belief.update(*self._report, rates.hit[told], rates.false_alarm[told])
+        take_in(self.search, 0, *self._report, rates.hit[told], rates.false_alarm[told])
 
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
         """The lot from above, and beside it the newest pictures."""

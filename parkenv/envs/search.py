@@ -2,69 +2,170 @@
 
 from __future__ import annotations
 
-import copy
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.belief import SlotBelief
+from parkenv.envs.search_step import (
+    ARRIVAL,
+    CHOICE,
+    DRIVE_S,
+    DRIVEN_M,
+    EPISODE,
+    FAILED_PARKS,
+    FAILED_S,
+    FLAGS,
+    GAVE_UP_S,
+    KEY,
+    N_KNOWN_TAKEN,
+    N_PASSED,
+    N_TOUCHED,
+    OVER,
+    PARKED,
+    PARKED_WALK_S,
+    SEED_STATE,
+    SEEN,
+    STEP_DRIVE,
+    STEP_GAVE_UP,
+    TIME,
+    VERTEX,
+    WALKED_M,
+    WHO,
+    Search,
+    arrive,
+    belief,
+    foresee,
+    step_one,
+)
+from parkenv.envs.search_tables import SearchTables
 from parkenv.errors import InputError
-from parkenv.keyed_random import ENTRY_STREAM, SIGHTING_STREAM, VIEW_STREAM, keyed_uniform, world_key
+from parkenv.keyed_random import seed_state
 from parkenv.lot import ACTIONS, PARK
 from parkenv.occupancy import Arrival, World
+from parkenv.recorded_occupancy import RecordedOccupancy
 from parkenv.scenario import Scenario
-from parkenv.sighting import SightRates
 
 if TYPE_CHECKING:
     from parkenv.envs.rendering import SearchRenderer
 
-_TRIED = np.ones(1, dtype=np.bool_), np.ones(1), np.zeros(1)  # it is taken, and that is certain
-
 LATEST = 1e8
 """Bound, s, of the observed times: Gymnasium wants one, and three years are more than any search takes."""
+_REBUILT = (
+    "search",
+    "_state",
+    "_numbers",
+    "_counts",
+    "_p_occupied",
+    "_clock",
+    "_seeded_with",
+    "_begun",
+    "_over",
+)
 REWARD_TERMS = ("drive", "failed", "walk", "gave_up")
 
 
-@dataclass
-class SearchState:
-    """Everything that changes during an episode; `SearchEnv.get_state` hands out a copy."""
+class SavedSearch(NamedTuple):
+    """What `SearchEnv.get_state` hands out: copies of all that changes, and the stops so far."""
 
-    key: np.uint64
-    arrival: Arrival
-    world: World
-    belief: SlotBelief
-    vertex: int
-    time: float
-    passed: set[int]
+    arrays: tuple[NDArray[Any], ...]
     path: list[int]
-    drive_s: float = 0.0
-    failed_s: float = 0.0
-    walk_s: float = 0.0
-    gave_up_s: float = 0.0
-    driven_m: float = 0.0
-    walked_m: float = 0.0
-    failed_parks: int = 0
-    parked: bool = False
-    over: bool = False
 
-    def metrics(self) -> dict[str, Any]:
-        """The episode so far, in the words of the result tables."""
-        return {
-            "drive_s": self.drive_s,
-            "failed_s": self.failed_s,
-            "walk_s": self.walk_s,
-            "gave_up_s": self.gave_up_s,
-            "total_s": self.drive_s + self.failed_s + self.walk_s + self.gave_up_s,
-            "driven_m": self.driven_m,
-            "walked_m": self.walked_m,
-            "failed_parks": self.failed_parks,
-            "slots_passed": len(self.passed),
-            "parked": self.parked,
-        }
+
+class SearchState:
+    """The episode under way, hidden truth included; it goes along with the environment.
+
+    Attributes:
+        path: vertices that the car has stopped at, in order.
+    """
+
+    def __init__(self, scenario: Scenario, search: Search) -> None:
+        self._scenario, self._search = scenario, search
+        self.path: list[int] = []
+        self._world: tuple[np.uint64, World] | None = None
+
+    def _number(self, column: int) -> float:
+        return float(self._search.numbers[0, column])
+
+    def _count(self, column: int) -> int:
+        return int(self._search.counts[0, column])
+
+    def come_along(self) -> None:
+        """Add to the path where the car is, if it has moved."""
+        if self.path[-1] != self.vertex:
+            self.path.append(self.vertex)
+
+    @property
+    def key(self) -> np.uint64:
+        """Key of the world."""
+        return np.uint64(self._search.counts.view(np.uint64)[0, KEY])
+
+    @property
+    def arrival(self) -> Arrival:
+        """When the search began."""
+        return arrival_of(self._scenario, self._search, 0)
+
+    @property
+    def world(self) -> World:
+        """The truth; questions to it change nothing."""
+        if self._world is None or self._world[0] != self.key:
+            self._world = self.key, self._scenario.occupancy.world(self.key, self.arrival)
+        return self._world[1]
+
+    @property
+    def belief(self) -> SlotBelief:
+        """What the car believes now, a copy."""
+        forecast = self._scenario.forecast(self.arrival)
+        p, seen = forecast.p_occupied.copy(), np.zeros(len(forecast.p_occupied), dtype=np.bool_)
+        _read_belief(self._search, p, seen)
+        return SlotBelief(forecast.p_occupied, forecast.relaxation_rate, p, seen, self._count(N_KNOWN_TAKEN))
+
+    @property
+    def vertex(self) -> int:
+        """Where the car is."""
+        return self._count(VERTEX)
+
+    @property
+    def time(self) -> float:
+        """Now, s since Monday 00:00."""
+        return self._number(TIME)
+
+    @property
+    def walk_s(self) -> float:
+        """The walk to the goal, s; 0 before the car is parked."""
+        return self._number(PARKED_WALK_S)
+
+    @property
+    def gave_up_s(self) -> float:
+        """What it cost to go elsewhere, s."""
+        return self._number(GAVE_UP_S)
+
+    @property
+    def failed_parks(self) -> int:
+        """Tries at taken slots."""
+        return self._count(FAILED_PARKS)
+
+    @property
+    def parked(self) -> bool:
+        """Whether the car is parked."""
+        return self._count(PARKED) == 1
+
+    @property
+    def over(self) -> bool:
+        """Whether the search is over."""
+        return self._count(OVER) == 1
+
+
+@njit(cache=True)
+def _read_belief(search: Search, p: NDArray[np.float64], seen: NDArray[np.bool_]) -> None:
+    for column in range(search.counts[0, N_TOUCHED]):
+        slot = search.marks[0, column, WHO]
+        p[slot] = belief(search, 0, column)
+        seen[slot] = search.marks[0, column, FLAGS] & SEEN != 0
 
 
 class SearchEnv(gym.Env[dict[str, Any], np.int64]):
@@ -148,30 +249,28 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     def __init__(
         self, scenario: str | Scenario = "campus", render_mode: str | None = None, **changes: Any
     ) -> None:
-        if isinstance(scenario, str):
-            scenario = Scenario.named(scenario)
-        elif not isinstance(scenario, Scenario):
-            raise InputError(f"scenario is a {type(scenario).__name__}, want a Scenario or the name of one")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise InputError(f"render_mode is {render_mode!r}, want one of {self.metadata['render_modes']}")
-        self.scenario = scenario.replace(**changes)
+        self.scenario = Scenario.of(scenario, **changes)
         self.render_mode = render_mode
         lot = self.scenario.lot
         self.action_space = spaces.Discrete(len(ACTIONS))
-        self.observation_space = spaces.Dict(
-            {
-                "vertex": spaces.Discrete(lot.n_vertices),
-                "time": spaces.Box(0.0, LATEST, (2,), np.float32),
-                "p_occupied": spaces.Box(0.0, 1.0, (lot.n_slots,), np.float32),
-                "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
-            }
-        )
-        self._masks = self.scenario.action_masks
-        self._view_starts, self._view_slots = self.scenario.slots_in_view
-        self._rates = self.scenario.sight_rates
-        self._state: SearchState | None = None
-        self._episode = 0
+        self.observation_space = search_space(lot.n_slots, lot.n_vertices)
+        self._masks = list(self.scenario.action_masks)
         self._renderer: SearchRenderer | None = None
+        self._make_search()
+
+    def _make_search(self) -> None:
+        tables = SearchTables.of([self.scenario])
+        self.search = Search.on(tables, np.zeros(1, dtype=np.int64), full_belief=True)
+        self._state = SearchState(self.scenario, self.search)
+        # The rows of this one search, as far as a step reads them.
+        self._numbers = self.search.numbers[0, : TIME + 1]
+        self._counts = self.search.counts[0, : VERTEX + 1]
+        self._p_occupied = self.search.p_occupied[0]
+        self._clock = np.zeros(2, dtype=np.float32)
+        self._seeded_with: int | None = None
+        self._begun = self._over = False
 
     @property
     def state(self) -> SearchState:
@@ -180,23 +279,34 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
         """
-        if self._state is None:
+        if not self._begun:
             raise gym.error.ResetNeeded("the environment has no episode yet: call reset() first")
         return self._state
 
-    def get_state(self) -> tuple[int, SearchState]:
+    def get_state(self) -> SavedSearch:
         """A copy of the episode, which `set_state` brings back."""
-        return self._episode, copy.deepcopy(self.state)
+        return SavedSearch(tuple(a.copy() for a in self.search.changing()), list(self.state.path))
 
-    def set_state(self, state: tuple[int, SearchState]) -> None:
+    def set_state(self, state: SavedSearch) -> None:
         """Go on from a state that `get_state` of an environment with the same scenario returned."""
-        episode, episode_state = state
-        if len(episode_state.belief.p_occupied) != self.scenario.lot.n_slots:
-            raise InputError(
-                f"state is of a lot with {len(episode_state.belief.p_occupied)} slots, this one has "
-                f"{self.scenario.lot.n_slots}"
-            )
-        self._episode, self._state = episode, copy.deepcopy(episode_state)
+        slots, n_slots = state.arrays[-1].shape[-1], self.scenario.lot.n_slots
+        if slots != n_slots:
+            raise InputError(f"state is of a lot with {slots} slots, this one has {n_slots}")
+        for mine, saved in zip(self.search.changing(), state.arrays, strict=True):
+            mine[...] = saved
+        self._state.path = list(state.path)
+        self._begun, self._over = True, self._state.over
+
+    def __getstate__(self) -> dict[str, Any]:
+        rest = {k: v for k, v in self.__dict__.items() if k not in _REBUILT}
+        return rest | {"saved": self.get_state() if self._begun else None}
+
+    def __setstate__(self, content: dict[str, Any]) -> None:
+        saved = content.pop("saved")
+        self.__dict__.update(content)
+        self._make_search()
+        if saved is not None:
+            self.set_state(saved)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -205,70 +315,56 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         super().reset(seed=seed)
         if options:
             raise InputError(f"reset takes no options, got {', '.join(options)}")
-        self._episode = 0 if seed is not None else self._episode + 1
+        counts = self.search.counts
+        counts[0, EPISODE] = 0 if seed is not None else counts[0, EPISODE] + 1
         _ = self.np_random  # draws a seed where none was ever given
-        key = world_key(self.np_random_seed, self._episode)
-        scenario = self.scenario
-        arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
-        entries = scenario.lot.entry_vertices
-        entry = scenario.entry
-        if entry is None:
-            entry = int(keyed_uniform(key, ENTRY_STREAM, 0, 0) * len(entries))
-        vertex = int(entries[entry])
-        self._state = SearchState(
-            key=key,
-            arrival=arrival,
-            world=scenario.occupancy.world(key, arrival),
-            belief=SlotBelief(scenario.forecast(arrival), arrival.time),
-            vertex=vertex,
-            time=arrival.time,
-            passed=set(),
-            path=[vertex],
-        )
+        if self._seeded_with != self.np_random_seed:
+            self._seeded_with = self.np_random_seed
+            counts.view(np.uint64)[0, SEED_STATE] = seed_state(self.np_random_seed)
+        arrive(self.search, 0)
+        if len(self.search.asked):
+            forecast = self.scenario.forecast(self._state.arrival)
+            self.search.asked[0] = forecast.p_occupied, forecast.relaxation_rate
+        foresee(self.search, 0)
+        self._begun, self._over = True, False
+        self._state.path = [self._state.vertex]
         if self.render_mode == "human":
             self.render()
         return self._observation(self._state), {}
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Drive along an edge, or try to park; see the class."""
-        state, lot = self.state, self.scenario.lot
-        if state.over:
+        state = self.state
+        if self._over:
             raise gym.error.ResetNeeded("the search is over: call reset()")
-        chosen = _action_number(action)
-        drive = failed = walk = gave_up = 0.0
-        if not self._masks[state.vertex, chosen]:
-            drive = self.scenario.wait_s
-        elif chosen < PARK:
-            drive = float(self.scenario.move_s[state.vertex, chosen])
-            state.driven_m += float(lot.edge_length[state.vertex, chosen])
-            state.vertex = int(lot.neighbors[state.vertex, chosen])
-            state.path.append(state.vertex)
-        elif state.world.occupied(np.array([state.vertex]), state.time)[0]:
-            failed = self.scenario.failure_s
-            state.failed_parks += 1
-            state.belief.update(np.array([state.vertex]), *_TRIED)
-        else:
-            state.parked = True
-            state.walked_m = float(lot.walk_m(self.scenario.goal)[state.vertex])
-            walk = float(self.scenario.walk_s[state.vertex])
-        state.time += drive + failed
-        if not state.parked:
-            self._look(state)
-            if state.belief.proven_full:
-                gave_up = self.scenario.give_up_s
-        state.drive_s += drive
-        state.failed_s += failed
-        state.walk_s += walk
-        state.gave_up_s += gave_up
-        terminated = state.over = state.parked or state.belief.proven_full
-        info: dict[str, Any] = {
-            "reward_terms": dict(zip(REWARD_TERMS, (-drive, -failed, -walk, -gave_up), strict=True))
-        }
+        self._advance(_action_number(action))
+        numbers, counts = self._numbers.tolist(), self._counts.tolist()
+        if counts[VERTEX] != state.path[-1]:
+            state.path.append(counts[VERTEX])
+        drive, failed, walk, gave_up = numbers[STEP_DRIVE : STEP_GAVE_UP + 1]
         # A time limit ends the episode from outside, so the metrics are there at every step.
-        info |= state.metrics()
+        info = {
+            "reward_terms": {"drive": -drive, "failed": -failed, "walk": -walk, "gave_up": -gave_up},
+            "drive_s": numbers[DRIVE_S],
+            "failed_s": numbers[FAILED_S],
+            "walk_s": numbers[PARKED_WALK_S],
+            "gave_up_s": numbers[GAVE_UP_S],
+            "total_s": numbers[DRIVE_S] + numbers[FAILED_S] + numbers[PARKED_WALK_S] + numbers[GAVE_UP_S],
+            "driven_m": numbers[DRIVEN_M],
+            "walked_m": numbers[WALKED_M],
+            "failed_parks": counts[FAILED_PARKS],
+            "slots_passed": counts[N_PASSED],
+            "parked": counts[PARKED] == 1,
+        }
         if self.render_mode == "human":
             self.render()
-        return self._observation(state), -(drive + failed + walk + gave_up), terminated, False, info
+        reward = -(drive + failed + walk + gave_up)
+        self._over = counts[OVER] == 1
+        return self._observation(state), reward, self._over, False, info
+
+    def _advance(self, action: int) -> None:
+        """Act, and look around."""
+        step_one(self.search, 0, action)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """(5,) bool, which actions the graph has here; the name that sb3-contrib looks for."""
@@ -307,41 +403,42 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self._renderer.close()
             self._renderer = None
 
-    def _look(self, state: SearchState) -> None:
-        """See the slots in view of the car, as well as the sighting model lets it."""
-        vertex, sighting = state.vertex, self.scenario.sighting
-        if vertex < self.scenario.lot.n_slots:
-            state.passed.add(vertex)
-        rows = slice(self._view_starts[vertex], self._view_starts[vertex + 1])
-        slots, rates = self._view_slots[rows], self._rates.of(rows)
-        state.belief.relax(state.time)
-        if not len(slots):
-            return
-        looks_taken = state.world.occupied(slots, state.time)
-        if not sighting.perfect:
-            # What hides a slot goes on hiding it: one chance a search, which a nearer look may beat.
-            seen = _chances(state, VIEW_STREAM, slots, 0) < rates.seen
-            slots, looks_taken, rates = slots[seen], looks_taken[seen], SightRates(*(r[seen] for r in rates))
-            rate = np.where(looks_taken, rates.hit, rates.false_alarm)
-            looks_taken = _chances(state, SIGHTING_STREAM, slots, int(state.time * 1000.0)) < rate
-        state.belief.update(slots, looks_taken, rates.hit, rates.false_alarm)
-
-    def _observation(self, state: SearchState) -> dict[str, Any]:
+    def _observation(self, state: SearchState) -> dict[str, Any]:  # noqa: ARG002 - sensors look from it
+        vertex, time = self._counts.item(VERTEX), self._numbers.item(TIME)
+        self._clock[0] = time
+        self._clock[1] = time - self._numbers.item(ARRIVAL)
         return {
-            "vertex": np.int64(state.vertex),
-            "time": np.array([state.time, state.time - state.arrival.time], dtype=np.float32),
-            "p_occupied": state.belief.p_occupied.astype(np.float32),
-            "action_mask": self._masks[state.vertex].copy(),
+            "vertex": np.int64(vertex),
+            "time": self._clock.copy(),
+            "p_occupied": self._p_occupied.copy(),
+            "action_mask": self._masks[vertex].copy(),
         }
 
 
-def _chances(state: SearchState, stream: int, slots: NDArray[np.int64], when: int) -> NDArray[np.float64]:
-    """A uniform number for each slot, keyed by a time, ms: whoever looks at a slot then makes the same error."""
-    return np.array([keyed_uniform(state.key, stream, int(s), when) for s in slots])
+def arrival_of(scenario: Scenario, search: Search, e: int) -> Arrival:
+    """When search `e` began."""
+    time = float(search.numbers[e, ARRIVAL])
+    if isinstance(scenario.occupancy, RecordedOccupancy):
+        return Arrival(time, scenario.occupancy.days_in(scenario.arrival)[int(search.counts[e, CHOICE])])
+    return Arrival(time)
+
+
+def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
+    """What is observed in a lot of some size; see `SearchEnv`."""
+    return spaces.Dict(
+        {
+            "vertex": spaces.Discrete(n_vertices),
+            "time": spaces.Box(0.0, LATEST, (2,), np.float32),
+            "p_occupied": spaces.Box(0.0, 1.0, (n_slots,), np.float32),
+            "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
+        }
+    )
 
 
 def _action_number(action: Any) -> int:
     """The action as an int; arrays of one element will do, as models return them."""
+    if type(action) in (int, np.int64) and 0 <= action <= PARK:
+        return int(action)
     number = np.asarray(action)
     if number.size != 1 or not np.issubdtype(number.dtype, np.integer) or not 0 <= number.item() <= PARK:
         raise InputError(f"action is {action!r}, want a whole number from 0 to {PARK} ({', '.join(ACTIONS)})")

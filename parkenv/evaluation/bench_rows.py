@@ -14,14 +14,14 @@ class BenchRow(TypedDict):
 
     Keys:
         part, case: what was measured, and on what.
-        value, unit: the figure.
+        value, unit: the figure; None where nothing was measured, the case says why.
         peer, peer_value: what else does the same job, and its figure; None where there is none.
         ratio: ours over the peer's, above 1 means that we are faster.
     """
 
     part: str
     case: str
-    value: float
+    value: float | None
     unit: str
     peer: str | None
     peer_value: float | None
@@ -50,10 +50,15 @@ def duration(part: str, case: str, value: float, unit: str, **peers: float) -> l
     return [_row(part, case, value, unit, name, other, other / value) for name, other in peers.items()]
 
 
+def absent(part: str, case: str, unit: str) -> list[BenchRow]:
+    """The row of something that could not be measured."""
+    return [_row(part, case, None, unit, None, None, None)]
+
+
 def _row(
     part: str,
     case: str,
-    value: float,
+    value: float | None,
     unit: str,
     peer: str | None,
     peer_value: float | None,

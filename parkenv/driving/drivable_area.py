@@ -1,0 +1,85 @@
+"""Where the asphalt of a lot ends: its kerbs."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from parkenv.lot import ParkingLot, mouth_heading
+from parkenv.lot_graph import SLOT_REACH, linestrings
+
+FloatArray = NDArray[np.float64]
+
+ROAD_HALF_WIDTH = 3.0
+"""m, from the centre line of a lane without slots to its kerbs."""
+HALF_WIDTHS = (2.0, 4.0)
+"""m, between which half the width of a lane lies that has slots along it: they begin where it ends."""
+JOINT = 0.6
+"""m; gaps up to twice as wide between slots are asphalt."""
+STRAIGHTENED = 0.03
+"""m, by which kerbs may be off to have fewer corners."""
+
+
+_JOINED_WHOLE = 2000  # slots, up to which a lot's asphalt is made once and for all
+
+
+class DrivableArea:
+    """The asphalt of a lot: its lanes as wide as the slots along them leave them, its slots, and the ways in.
+
+    Args:
+        lot: the lot.
+    """
+
+    def __init__(self, lot: ParkingLot) -> None:
+        self._lot = lot
+        lanes = linestrings([lane.points for lane in lot.lanes])
+        mouth = np.asarray(shapely.points(lot.mouth_xy()))
+        slot, served_by = shapely.STRtree(lanes).query_nearest(mouth, all_matches=False)
+        reach = np.full(len(lanes), np.inf)
+        np.minimum.at(reach, served_by, shapely.distance(lanes[served_by], mouth[slot]))
+        self._lanes = lanes
+        self._half_width = np.where(np.isinf(reach), ROAD_HALF_WIDTH, np.clip(reach, *HALF_WIDTHS))
+        # A bay goes on, as wide as its mouth, to its lane; of an oblique one both sides do so along the slot.
+        heading = mouth_heading(lot.slot_yaw, lot.slot_mouth)
+        outward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        away = ((lot.vertex_xy[: lot.n_slots] - lot.mouth_xy()) * outward).sum(axis=1)
+        onward = np.clip(away, 0.0, SLOT_REACH)[:, None] * outward
+        corners = lot.slot_corners()
+        way_in = np.concatenate([corners, corners + onward[:, None]], axis=1)
+        self._bays = np.asarray(shapely.convex_hull(shapely.multipoints(np.asarray(shapely.points(way_in)))))
+        self._tree = shapely.STRtree(self._bays)
+        self._whole: shapely.Geometry | None = None
+
+    def around(self, center: FloatArray, reach: float) -> shapely.Geometry:
+        """The asphalt near a point, (2,) m; exact within `reach` m of it along both axes, and anything beyond."""
+        if self._lot.n_slots > _JOINED_WHOLE:
+            return self._joined(shapely.box(*(center - reach - 10.0), *(center + reach + 10.0)))
+        if self._whole is None:
+            west, south, east, north = self._lot.bounds()
+            self._whole = self._joined(shapely.box(west - 100.0, south - 100.0, east + 100.0, north + 100.0))
+        return self._whole
+
+    def _joined(self, window: shapely.Geometry) -> shapely.Geometry:
+        lanes = shapely.intersection(self._lanes, window)
+        roads = shapely.buffer(lanes, self._half_width, cap_style="square", join_style="mitre")
+        near = np.sort(self._tree.query(window))
+        area = shapely.union_all(np.concatenate([roads, self._bays[near]]))
+        joined = shapely.buffer(shapely.buffer(area, JOINT, join_style="mitre"), -JOINT, join_style="mitre")
+        # Shrinking with sharp corners takes too much away where the outline turns inward.
+        return shapely.union(joined, area).simplify(STRAIGHTENED)
+
+    def kerbs(self, center: FloatArray, reach: float) -> FloatArray:
+        """Ends, (m, 2, 2) m, of the straight pieces of kerb within `reach` m of a point, (2,) m, along both axes."""
+        edge = shapely.boundary(self.around(center, reach))
+        window = shapely.box(*(center - reach), *(center + reach))
+        lines = shapely.get_parts(shapely.intersection(edge, window))
+        pieces = [
+            [start, end]
+            for line in lines
+            if line.geom_type == "LineString"
+            for start, end in pairwise(shapely.get_coordinates(line))
+        ]
+        return np.array(pieces).reshape(-1, 2, 2)

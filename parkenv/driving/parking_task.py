@@ -1,0 +1,379 @@
+"""Tasks of getting a car into a slot: which one, from where, and what stands around."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+
+from parkenv.driving.drivable_area import DrivableArea
+from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
+from parkenv.driving.vehicle import STATE_SIZE, VehicleParameters, move_along, placed
+from parkenv.errors import InputError
+from parkenv.lot import Mouth, ParkingLot
+from parkenv.lot_graph import LANE_OFFSET, linestrings
+from sim_sensors.slot_scenes import ParkingManners, SlotLot
+from sim_sensors.surroundings import Surroundings
+
+FloatArray = NDArray[np.float64]
+
+KINDS = ("perpendicular", "oblique", "parallel")
+"""How slots lie to their lane."""
+WAYS = ("nose-in", "back-in")
+"""How a car stands in a perpendicular or oblique slot; in a parallel one it stands as traffic runs."""
+STARTS = ("lane", "way-out")
+REACH = 30.0
+"""m, from the slot's middle along both axes: what lies farther away is not part of a task."""
+AREA = REACH - 3.0
+"""m, likewise: a car whose middle is farther away has left the area of its task."""
+FARTHEST = AREA - 7.0
+"""m, the greatest `distance` of a start."""
+UPRIGHT = math.radians(75.0)
+"""Angle between a slot and its lane from which the slot is perpendicular."""
+
+_ASIDE, _ASKEW = 0.2, math.radians(4.0)  # greatest offsets of a start on the lane
+_TRIES = 64
+_STEP = 0.1
+_MOST_KNOWN = 1 << 15
+_ARRIVALS = 16  # different cars, each standing in its own way, that a slot may hold
+
+
+@dataclass(frozen=True, eq=False)
+class ParkingTask:
+    """A slot to park in, all that stands around it, and where the car starts; what everybody may know.
+
+    Args:
+        vehicle: the car.
+        lot: the lot's name.
+        slot_id: the slot's name.
+        kind: one of `KINDS`.
+        way: one of `WAYS`.
+        slot: (3,) float64, x, y in m and yaw in rad of the slot, world frame.
+        size: length and width of the slot, m.
+        target: (3,) where the middle of the parked car is to be, and its yaw.
+        start: (6,) the vehicle's state at the start.
+        obstacles: parked cars, walls and kerbs within `REACH`.
+
+    Raises:
+        InputError: a slot that the car does not fit into, or a start that is not finite.
+    """
+
+    vehicle: VehicleParameters
+    lot: str
+    slot_id: str
+    kind: str
+    way: str
+    slot: FloatArray
+    size: tuple[float, float]
+    target: FloatArray
+    start: FloatArray
+    obstacles: Obstacles
+
+    def __post_init__(self) -> None:
+        require_room(self.vehicle, self.size, f"slot {self.slot_id!r} of lot {self.lot!r}")
+        for name, length in (("slot", 3), ("target", 3), ("start", STATE_SIZE)):
+            values = np.array(getattr(self, name), dtype=np.float64)
+            if values.shape != (length,) or not np.isfinite(values).all():
+                raise InputError(f"parking task: {name} is {values.tolist()}, want {length} finite numbers")
+            values.flags.writeable = False
+            object.__setattr__(self, name, values)
+
+    @cached_property
+    def room(self) -> FloatArray:
+        """(2,) m: how far the car's ends and sides are from the slot's when it stands in its middle."""
+        return 0.5 * np.array([self.size[0] - self.vehicle.length, self.size[1] - self.vehicle.width])
+
+    def in_slot_frame(self, points: FloatArray) -> FloatArray:
+        """Points, (..., 2) m, in the frame of the slot: origin in its middle, x along its yaw."""
+        x, y, yaw = self.slot.tolist()
+        turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+        local: FloatArray = (points - np.array([x, y])) @ turn
+        return local
+
+
+@dataclass(frozen=True, eq=False)
+class ParkingTasks:
+    """Draws tasks on one lot; a task is a pure function of a key.
+
+    Args:
+        lot: the lot.
+        vehicle: the car.
+        kinds: from which kinds of slots to draw, each as often as the others; None: those that the lot has.
+        ways: of standing in perpendicular and oblique slots, each as often as the other.
+        slot: the name of the only slot to park in; None draws one.
+        occupancy: share, 0 to 1, of the other slots that are taken.
+        slack: m around the slot that are kept clear of parked cars. 0 leaves whoever parked beside it, however
+            crookedly, within the limits of `manners`; 3 clears the slots beside it.
+        distance: m, least and greatest: how far before the slot the car starts.
+        starts: `lane`: on the lane, `distance` before the slot, in either direction of a two-way one; `way-out`:
+            where a random drive of `distance` out of the slot ends, so that a short one is an easy task.
+        manners: how the other cars stand in their slots.
+
+    Raises:
+        InputError: a value out of its range; a slot that is not there, or that the car does not fit into; no slot of
+            these kinds that it fits into.
+
+    Example:
+        >>> task = ParkingTasks(ParkingLot.packaged("campus"), kinds=("oblique",)).draw(7)
+        >>> task.kind, task.slot_id[0], task.size
+        ('oblique', 'F', (5.0, 2.5))
+    """
+
+    lot: ParkingLot
+    vehicle: VehicleParameters = field(default_factory=VehicleParameters)
+    kinds: tuple[str, ...] | None = None
+    ways: tuple[str, ...] = WAYS
+    slot: str | None = None
+    occupancy: float = 0.85
+    slack: float = 0.0
+    distance: tuple[float, float] = (4.0, 14.0)
+    starts: str = "lane"
+    manners: ParkingManners = field(default_factory=ParkingManners)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.lot, ParkingLot):
+            raise InputError(f"lot is a {type(self.lot).__name__}, want a ParkingLot")
+        if not isinstance(self.vehicle, VehicleParameters):
+            raise InputError(f"vehicle is a {type(self.vehicle).__name__}, want VehicleParameters")
+        for name, known in (("kinds", KINDS), ("ways", WAYS)):
+            words = getattr(self, name)
+            if words is None:
+                continue
+            object.__setattr__(self, name, tuple(words))
+            if isinstance(words, str) or not words or not set(words) <= set(known):
+                raise InputError(f"{name} is {words!r}, want some of {', '.join(known)}")
+        if self.starts not in STARTS:
+            raise InputError(f"starts is {self.starts!r}, want one of {', '.join(STARTS)}")
+        for name, most in (("occupancy", 1.0), ("slack", REACH)):
+            value = getattr(self, name)
+            if not (isinstance(value, int | float) and 0.0 <= value <= most):
+                raise InputError(f"{name} is {value!r}, want 0 to {most:g}")
+        if len(self.distance) != 2 or not 0.0 <= self.distance[0] <= self.distance[1] <= FARTHEST:
+            raise InputError(f"distance is {self.distance!r}, want least and greatest, 0 to {FARTHEST:g} m")
+        if self.slot is not None and self.slot not in self.lot.slot_ids:
+            raise InputError(f"lot {self.lot.name!r} has no slot {self.slot!r}")
+        if not any(map(len, self._choice.values())):
+            raise InputError(
+                f"lot {self.lot.name!r} has no slot of the kinds {', '.join(self.kinds or KINDS)} that is at least "
+                f"{self.vehicle.length:g} m × {self.vehicle.width:g} m, the size of the car"
+            )
+
+    @cached_property
+    def slot_kinds(self) -> list[str]:
+        """The kind of each slot."""
+        lot = self.lot
+        angle = np.abs(np.sin(lot.slot_yaw - lot.vertex_yaw[: lot.n_slots]))
+        upright = np.where(angle >= math.sin(UPRIGHT), KINDS[0], KINDS[1])
+        return [str(kind) for kind in np.where(lot.slot_mouth == Mouth.REAR, upright, KINDS[2])]
+
+    @cached_property
+    def _choice(self) -> dict[str, list[int]]:
+        """The slots to draw from, by kind."""
+        lot, vehicle = self.lot, self.vehicle
+        if self.slot is not None:
+            i = lot.slot_ids.index(self.slot)
+            size = (float(lot.slot_length[i]), float(lot.slot_width[i]))
+            require_room(vehicle, size, f"slot {self.slot!r} of lot {lot.name!r}")
+            chosen = [i]
+        else:
+            chosen = np.flatnonzero(
+                (lot.slot_length >= vehicle.length) & (lot.slot_width >= vehicle.width)
+            ).tolist()
+        choice: dict[str, list[int]] = {}
+        for i in chosen:
+            if self.kinds is None or self.slot_kinds[i] in self.kinds:
+                choice.setdefault(self.slot_kinds[i], []).append(i)
+        return choice
+
+    @cached_property
+    def _area(self) -> DrivableArea:
+        return DrivableArea(self.lot)
+
+    @cached_property
+    def slot_cars(self) -> SlotLot:
+        """The cars that may stand in the slots."""
+        lot = self.lot
+        return SlotLot(
+            lot.slot_xy,
+            lot.slot_yaw,
+            lot.slot_length,
+            lot.slot_width,
+            kerbside=lot.slot_mouth != Mouth.REAR,
+            surroundings=Surroundings(),
+            manners=self.manners,
+        )
+
+    @cached_property
+    def _walls(self) -> tuple[shapely.STRtree, FloatArray]:
+        legs = np.array([leg for wall in self.lot.walls for leg in pairwise(wall)]).reshape(-1, 2, 2)
+        return shapely.STRtree(np.asarray(shapely.linestrings(legs))), legs
+
+    def draw(self, key: int, start: ArrayLike | None = None) -> ParkingTask:
+        """The task of a key.
+
+        Args:
+            key: 0 or more.
+            start: (3,) x, y in m and yaw in rad of the rear axle; None draws one.
+
+        Raises:
+            InputError: a start that is not three finite numbers, touches something, or lies outside the
+                `AREA`; or no start without a contact could be drawn.
+        """
+        rng = np.random.default_rng([int(key), 0])
+        kinds = sorted(self._choice)
+        of_kind = self._choice[kinds[rng.integers(len(kinds))]]
+        i = of_kind[rng.integers(len(of_kind))]
+        way = self.ways[rng.integers(len(self.ways))]
+        kind, lot = self.slot_kinds[i], self.lot
+        if kind == "parallel":
+            way = WAYS[0]
+        slot = np.array([*lot.slot_xy[i], lot.slot_yaw[i]])
+        target = slot + np.array([0.0, 0.0, math.pi if way == WAYS[1] else 0.0])
+        obstacles = self._around(i, rng)
+        space = LotSpace(self.vehicle, obstacles)
+        if start is None:
+            drawn = (
+                self._way_out(target, space, rng)
+                if self.starts == "way-out"
+                else self._on_lane(i, space, rng)
+            )
+            if drawn is None:
+                raise InputError(
+                    f"slot {lot.slot_ids[i]!r} of lot {lot.name!r}: no start without a contact was found on the lane, "
+                    "want more room there"
+                )
+        else:
+            drawn = self._given(start, slot, space)
+        return ParkingTask(
+            vehicle=self.vehicle,
+            lot=lot.name,
+            slot_id=lot.slot_ids[i],
+            kind=kind,
+            way=way,
+            slot=slot,
+            size=(float(lot.slot_length[i]), float(lot.slot_width[i])),
+            target=target,
+            start=np.r_[drawn, np.zeros(STATE_SIZE - 3)],
+            obstacles=obstacles,
+        )
+
+    @cached_property
+    def _outlines(self) -> dict[tuple[int, int], FloatArray]:
+        return {}
+
+    def _outline(self, slot: int, arrival: int) -> FloatArray:
+        """Footprint, (k, 2) m, of a car in a slot."""
+        known = self._outlines
+        if (slot, arrival) not in known:
+            if len(known) >= _MOST_KNOWN:
+                known.clear()
+            pose, model = self.slot_cars.arrival(slot, arrival)
+            known[slot, arrival] = placed(self.slot_cars.fleet.models[model].footprint(), pose)
+        return known[slot, arrival]
+
+    def _around(self, i: int, rng: np.random.Generator) -> Obstacles:
+        """What stands around slot i, the nearest first of each kind."""
+        lot = self.lot
+        center = lot.slot_xy[i]
+        offset = np.abs(lot.slot_xy - center).max(axis=1)
+        near = np.flatnonzero((offset <= REACH) & (np.arange(lot.n_slots) != i))
+        near = near[rng.random(len(near)) < self.occupancy]
+        near = near[np.argsort(offset[near], kind="stable")]
+        box = shapely.Polygon(lot.slot_corners()[i])
+        outlines: list[tuple[Thing, FloatArray]] = []
+        arrivals = rng.integers(_ARRIVALS, size=len(near))
+        for j, arrival in zip(near.tolist(), arrivals.tolist(), strict=True):
+            outline = self._outline(j, arrival)
+            close = self.slack > 0.0 and offset[j] < self.slack + 12.0
+            if not (close and shapely.distance(box, shapely.Polygon(outline)) < self.slack):
+                outlines.append((Thing.PARKED_CAR, outline))
+        tree, legs = self._walls
+        walls = legs[np.sort(tree.query(shapely.box(*(center - REACH), *(center + REACH))))]
+        for thing, lines in ((Thing.KERB, self._area.kerbs(center, REACH)), (Thing.WALL, walls)):
+            order = np.argsort(
+                shapely.distance(shapely.Point(center), shapely.linestrings(lines)), kind="stable"
+            )
+            outlines += [(thing, line) for line in lines[order]]
+        return Obstacles.of(outlines)
+
+    def _on_lane(self, i: int, space: LotSpace, rng: np.random.Generator) -> FloatArray | None:
+        """A rear-axle pose on the lane before slot i."""
+        lot = self.lot
+        lanes = linestrings([lane.points for lane in lot.lanes])
+        mouth = shapely.Point(lot.mouth_xy()[i])
+        k = int(np.argmin(shapely.distance(lanes, mouth)))
+        line, oneway = lanes[k], lot.lanes[k].oneway
+        at = float(shapely.line_locate_point(line, mouth))
+        heading = np.array([math.cos(lot.vertex_yaw[i]), math.sin(lot.vertex_yaw[i])])
+        with_line = 1.0 if _tangent(line, at) @ heading >= 0.0 else -1.0
+        for _ in range(_TRIES):
+            direction = with_line
+            if not oneway and lot.slot_mouth[i] == Mouth.REAR and rng.random() < 0.5:
+                direction = -with_line
+            station = np.clip(at - direction * rng.uniform(*self.distance), 0.0, line.length)
+            ahead = direction * _tangent(line, station)
+            right = np.array([ahead[1], -ahead[0]])
+            aside = (0.0 if oneway else LANE_OFFSET) + rng.uniform(-_ASIDE, _ASIDE)
+            xy = shapely.get_coordinates(line.interpolate(station))[0] + aside * right
+            yaw = math.atan2(ahead[1], ahead[0]) + rng.uniform(-_ASKEW, _ASKEW)
+            pose = self.vehicle.at_rear_axle(np.array([*xy, yaw]))
+            if not space.touched(*pose.tolist()):
+                return pose
+        return None
+
+    def _way_out(self, target: FloatArray, space: LotSpace, rng: np.random.Generator) -> FloatArray | None:
+        """Where a random drive out of the slot ends: a rear-axle pose."""
+        x, y, yaw = self.vehicle.at_rear_axle(target).tolist()
+        if space.touched(x, y, yaw):
+            return None
+        sharpest = 1.0 / self.vehicle.turning_radius
+        left = rng.uniform(*self.distance)
+        for _ in range(_TRIES):
+            curvature, forward = sharpest * rng.uniform(-1.0, 1.0), rng.choice([-1.0, 1.0])
+            for _ in range(int(rng.integers(5, 40))):
+                ahead = move_along(x, y, yaw, curvature, forward * min(_STEP, left))
+                if left <= 0.0 or space.touched(*ahead):
+                    break
+                (x, y, yaw), left = ahead, left - _STEP
+        return np.array([x, y, yaw])
+
+    def _given(self, start: ArrayLike, slot: FloatArray, space: LotSpace) -> FloatArray:
+        try:
+            pose = np.array(start, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"start is {start!r:.60}, want x, y in m and yaw in rad") from error
+        if pose.shape != (3,) or not np.isfinite(pose).all():
+            raise InputError(f"start is {pose.tolist()}, want three finite numbers: x, y in m and yaw in rad")
+        if np.abs(self.vehicle.at_middle(pose)[:2] - slot[:2]).max() > AREA:
+            raise InputError(f"start {pose.tolist()} is more than {AREA:g} m away from the slot")
+        touched = Thing(space.touched(*pose.tolist()))
+        if touched:
+            raise InputError(
+                f"start {pose.tolist()}: the car touches a {touched.words} there, want a free place"
+            )
+        return pose
+
+
+def require_room(vehicle: VehicleParameters, size: tuple[float, float], what: str) -> None:
+    """Refuse slots that a car does not fit into.
+
+    Raises:
+        InputError: a length or width that is no number, or less than the car's.
+    """
+    for name, own, needed in (("long", size[0], vehicle.length), ("wide", size[1], vehicle.width)):
+        if not (math.isfinite(own) and own >= needed):
+            raise InputError(f"{what} is {own:g} m {name}, want at least {needed:g} m, as the car is")
+
+
+def _tangent(line: shapely.LineString, station: float) -> FloatArray:
+    """Unit vector, (2,), along a line at a station, m."""
+    step = 0.05
+    low = min(max(station - step, 0.0), line.length - 2 * step)
+    ends = [shapely.get_coordinates(line.interpolate(s))[0] for s in (low, low + 2 * step)]
+    along = ends[1] - ends[0]
+    return np.asarray(along / np.hypot(*along))

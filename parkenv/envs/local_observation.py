@@ -1,0 +1,441 @@
+"""What lies around the car, as a vector of the same length on every lot: for policies that go from lot to lot.
+
+The vector has 46 + 8k numbers from 0 to 1. A time of s seconds is written as s / (s + 60), so that a minute is a half
+and what is far away or missing comes near, or to, 1. A chance of p is written as p. "Ahead" of a move are those k slots
+nearest by drive to which the shortest drive from here begins with that move.
+
+| Index | Meaning |
+|---|---|
+| 0 | whether there is a slot here |
+| 1 | chance that it is free; 0 where there is none |
+| 2 | walk from it to the goal; 1 where there is none |
+| 3 | time since the search began |
+| 4 | how many slots have been seen, n / (n + 20) |
+| 5 | share of them that looked free when first seen |
+| 6 | share of them that was forecast to be free |
+| 7-10 | forecast share of free slots among the quarters of the lot by walk, nearest to the goal first |
+| 11 | chance that the remembered slot is free: of those seen free the one with the shortest drive and walk; 0 if none |
+| 12 | walk from it; 1 if there is none |
+| 13 | drive to it as the crow flies; 1 if there is none |
+| 14 + 8a | for the moves a up, down, left, right: whether the graph has it |
+| 15 + 8a | its drive; 1 if there is none, as all times below |
+| 16 + 8a | it, and from there on the shortest drive and walk by way of any slot, were all free |
+| 17 + 8a | whether it leads back to where the car came from |
+| 18 + 8a | chance that at least one of the slots ahead is free |
+| 19 + 8a | expected drive and walk by way of the best free slot ahead; a minute more than the worst where none is |
+| 20 + 8a | share of the slots ahead that have been seen |
+| 21 + 8a | drive from there to the remembered slot as the crow flies |
+| 46 + 8i | for the k slots nearest by drive, nearest first: chance that it is free; 0 if there is none |
+| 47 + 8i | whether it has been seen |
+| 48 + 8i | drive to it; 1 if there is none |
+| 49 + 8i | walk from it; 1 if there is none |
+| 50 + 8i to 53 + 8i | whether the drive to it begins with up, down, left, right |
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numba import njit
+from numpy.typing import NDArray
+
+from parkenv.envs.search import SearchEnv
+from parkenv.envs.search_step import (
+    ARRIVAL,
+    ASKED_FOR,
+    BEFORE,
+    EXPECTED_FREE,
+    FLAGS,
+    LOOKED,
+    LOOKED_TAKEN,
+    N_REGIONS,
+    N_SEEN,
+    N_TOUCHED,
+    PRIOR,
+    RATE,
+    REGION,
+    REMEMBERED,
+    SAID,
+    SCENARIO,
+    SEEN,
+    SEEN_FREE,
+    STEPS,
+    TIME,
+    VERTEX,
+    WHO,
+    Search,
+    begin_slot,
+    belief,
+    forecast,
+    relax_all,
+    touched,
+)
+from parkenv.envs.search_tables import N_ACTIONS, TARGETS, VIEWED, VIEWS, WALK_S
+from parkenv.errors import InputError
+from parkenv.lot import MOVES
+from parkenv.scenario import SearchProblem
+
+FloatArray = NDArray[np.float64]
+
+MINUTE = 60.0
+MANY_SLOTS = 20.0
+N_MOVES = len(MOVES)
+HERE, PER_MOVE, PER_NEAR = 14, 8, 8
+FIRST_NEAR = HERE + N_MOVES * PER_MOVE
+SAMPLES = 4
+_NOWHERE = -1
+
+
+class Surroundings(NamedTuple):
+    """What is near each vertex of one lot or several; rows are vertices, lot after lot.
+
+    Attributes:
+        first: (n_lots,) int64, each lot's first row.
+        fixed: (n, 46 + 8k) float32, the observation but for what changes.
+        starts: (n + 1,) int32, where each row's slots begin.
+        slots: int32, those that are near or ahead, each once.
+        near: (n, k) int32, which of its slots are nearest; -1 past the last.
+        ahead: (n, 4, k) int32, which lie ahead of each move, least drive and walk first; -1 past the last.
+        total_s: (n, 4, k) s, that drive and walk.
+        crow_s: (n, 2) s, coordinates over speed.
+        samples: (n_lots, 4, 4) int32, slots of each quarter of the lot by walk.
+    """
+
+    first: NDArray[np.int64]
+    fixed: NDArray[np.float32]
+    starts: NDArray[np.int32]
+    slots: NDArray[np.int32]
+    near: NDArray[np.int32]
+    ahead: NDArray[np.int32]
+    total_s: FloatArray
+    crow_s: FloatArray
+    samples: NDArray[np.int32]
+
+    @classmethod
+    def of(cls, problems: Sequence[SearchProblem], k: int) -> Surroundings:
+        """Find out what is near where.
+
+        Args:
+            problems: with the lots.
+            k: slots that are told of, and that lie ahead of a move.
+
+        Raises:
+            InputError: k is not a whole number of at least 1.
+        """
+        if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
+            raise InputError(f"k is {k!r}, want a whole number of at least 1")
+        parts = [_around(problem, int(k)) for problem in problems]
+        joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
+        first = np.concatenate([[0], np.cumsum([p.lot.n_vertices for p in problems])[:-1]])
+        count, *rest = joined
+        starts = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
+        fixed, slots, near, ahead, total_s, crow_s, samples = rest
+        return cls(first.astype(np.int64), fixed, starts, slots, near, ahead, total_s, crow_s, samples)
+
+
+def local_space(k: int) -> spaces.Dict:
+    """What is observed: `local`, (46 + 8k,) float32, and `action_mask`, (5,) int8."""
+    return spaces.Dict(
+        {
+            "local": spaces.Box(0.0, 1.0, (FIRST_NEAR + PER_NEAR * k,), np.float32),
+            "action_mask": spaces.Box(0, 1, (N_ACTIONS,), np.int8),
+        }
+    )
+
+
+class LocalObservation(
+    gym.ObservationWrapper[dict[str, Any], np.int64, dict[str, Any]], gym.utils.RecordConstructorArgs
+):
+    """`parkenv/Search-v0` observed as `local` and `action_mask`; see the module for what `local` says.
+
+    Args:
+        env: `parkenv/Search-v0`, or one that observes what it does.
+        k: how many slots it tells of.
+
+    Raises:
+        TypeError: another environment.
+        InputError: k is not a whole number of at least 1.
+
+    Example:
+        >>> import gymnasium as gym
+        >>> import parkenv
+        >>> env = LocalObservation(gym.make("parkenv/Search-v0", scenario="mini"), k=5)
+        >>> observation, info = env.reset(seed=0)
+        >>> observation["local"].shape
+        (86,)
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], k: int = 5) -> None:
+        gym.utils.RecordConstructorArgs.__init__(self, k=k)
+        super().__init__(env)
+        if not isinstance(env.unwrapped, SearchEnv):
+            raise TypeError(f"LocalObservation wraps parkenv/Search-v0, not {type(env.unwrapped).__name__}")
+        self._surroundings = Surroundings.of([env.unwrapped.scenario], k)
+        self.observation_space = local_space(k)
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """What lies around the car now."""
+        local = np.empty(self._surroundings.fixed.shape[1], dtype=np.float32)
+        assert isinstance(self.env.unwrapped, SearchEnv)
+        observe_surroundings(self.env.unwrapped.search, self._surroundings, 0, local)
+        return {"local": local, "action_mask": observation["action_mask"]}
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def observe_surroundings(search: Search, around: Surroundings, e: int, local: NDArray[np.float32]) -> None:
+    """Write what lies around the car of search `e`; to be called after each step and each beginning."""
+    counts, numbers, marks = search.counts, search.numbers, search.marks[e]
+    lot, time = counts[e, SCENARIO], numbers[e, TIME]
+    if counts[e, STEPS] == 0:
+        _foresee_regions(search, around, e)
+    _remember(search, around, e)
+    row = around.first[lot] + counts[e, VERTEX]
+    for i in range(local.size):
+        local[i] = around.fixed[row, i]
+    begin, n = around.starts[row], around.starts[row + 1] - around.starts[row]
+    memory, place = search.memory[e], search.place[e]
+    prior, away, faded = search.scratch[0], search.scratch[1], search.scratch[2]
+    n_touched = counts[e, N_TOUCHED]
+    for i in range(n):
+        slot = around.slots[begin + i]
+        column = place[slot]
+        if column >= n_touched or marks[column, WHO] != slot:
+            column = begin_slot(search, e, slot)
+            n_touched += 1
+        marks[i, ASKED_FOR] = column
+        prior[i] = memory[column, PRIOR]
+        away[i] = memory[column, SAID] - memory[column, PRIOR]
+        faded[i] = memory[column, RATE] * (time - memory[column, LOOKED])
+    relax_all(n, prior, away, faded)
+    p_taken = prior
+    if local[0] == 1.0:
+        local[1] = 1.0 - p_taken[around.near[row, 0]]
+    local[3] = _squashed(time - numbers[e, ARRIVAL])
+    n_seen = counts[e, N_SEEN]
+    if n_seen > 0:
+        local[4] = n_seen / (n_seen + MANY_SLOTS)
+        local[5] = numbers[e, SEEN_FREE] / n_seen
+        local[6] = numbers[e, EXPECTED_FREE] / n_seen
+    for region in range(N_REGIONS):
+        local[7 + region] = numbers[e, REGION + region]
+    remembered = counts[e, REMEMBERED]
+    if remembered != _NOWHERE:
+        local[11] = 1.0 - belief(search, e, touched(search, e, remembered))
+        local[12] = _squashed(search.reals[search.at[lot, WALK_S] + remembered])
+        local[13] = _squashed(_crow_s(around, row, around.first[lot] + remembered))
+    targets = search.at[lot, TARGETS] + counts[e, VERTEX] * N_ACTIONS
+    for move in range(N_MOVES):
+        at = HERE + PER_MOVE * move
+        if local[at] == 0.0:
+            continue
+        target = search.ints[targets + move]
+        local[at + 3] = 1.0 if target == counts[e, BEFORE] else 0.0
+        if remembered != _NOWHERE:
+            local[at + 7] = _squashed(
+                _crow_s(around, around.first[lot] + target, around.first[lot] + remembered)
+            )
+        none_free, expected, n_ahead, n_seen_ahead, worst = 1.0, 0.0, 0, 0, 0.0
+        for i in range(around.ahead.shape[2]):
+            which = around.ahead[row, move, i]
+            if which == _NOWHERE:
+                break
+            worst = around.total_s[row, move, i]
+            expected += none_free * (1.0 - p_taken[which]) * worst
+            none_free *= p_taken[which]
+            n_ahead += 1
+            n_seen_ahead += 1 if marks[marks[which, ASKED_FOR], FLAGS] & SEEN != 0 else 0
+        if n_ahead > 0:
+            local[at + 4] = 1.0 - none_free
+            local[at + 5] = _squashed(expected + none_free * (worst + MINUTE))
+            local[at + 6] = n_seen_ahead / n_ahead
+    for i in range(around.near.shape[1]):
+        which = around.near[row, i]
+        if which == _NOWHERE:
+            break
+        local[FIRST_NEAR + PER_NEAR * i] = 1.0 - p_taken[which]
+        local[FIRST_NEAR + PER_NEAR * i + 1] = (
+            1.0 if marks[marks[which, ASKED_FOR], FLAGS] & SEEN != 0 else 0.0
+        )
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _squashed(seconds: float) -> float:
+    return seconds / (seconds + MINUTE)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _crow_s(around: Surroundings, one: int, other: int) -> float:
+    """Drive between two vertices, s, as the crow flies."""
+    dx = around.crow_s[one, 0] - around.crow_s[other, 0]
+    dy = around.crow_s[one, 1] - around.crow_s[other, 1]
+    return math.sqrt(dx * dx + dy * dy)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _foresee_regions(search: Search, around: Surroundings, e: int) -> None:
+    """What is forecast of a few slots of each quarter of the lot."""
+    lot = search.counts[e, SCENARIO]
+    for region in range(N_REGIONS):
+        free = 0.0
+        for i in range(SAMPLES):
+            free += 1.0 - forecast(search, e, around.samples[lot, region, i])[0]
+        search.numbers[e, REGION + region] = free / SAMPLES
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _remember(search: Search, around: Surroundings, e: int) -> None:
+    """Keep in mind the best slot that was seen free, and forget it when it is seen taken."""
+    at, ints, counts = search.at, search.ints, search.counts
+    lot, vertex = counts[e, SCENARIO], counts[e, VERTEX]
+    walk, first = at[lot, WALK_S], around.first[lot]
+    best, least = counts[e, REMEMBERED], np.inf
+    if best != _NOWHERE:
+        least = search.reals[walk + best] + _crow_s(around, first + vertex, first + best)
+    views = at[lot, VIEWS] + vertex
+    for i in range(ints[views], ints[views + 1]):
+        slot = ints[at[lot, VIEWED] + i]
+        column = search.place[e, slot]
+        if column >= counts[e, N_TOUCHED] or search.marks[e, column, WHO] != slot:
+            continue
+        flags = search.marks[e, column, FLAGS]
+        if flags & SEEN == 0 or search.memory[e, column, LOOKED] != search.numbers[e, TIME]:
+            continue
+        if flags & LOOKED_TAKEN != 0:
+            if slot == best:
+                best, least = _NOWHERE, np.inf
+            continue
+        total = search.reals[walk + slot] + _crow_s(around, first + vertex, first + slot)
+        if total < least:
+            best, least = slot, total
+    counts[e, REMEMBERED] = best
+
+
+def _around(problem: SearchProblem, k: int) -> tuple[NDArray[Any], ...]:
+    """Of one lot: how many slots each row has, and the arrays of `Surroundings` without `first` and `starts`."""
+    lot = problem.lot
+    n = lot.n_vertices
+    neighbors, move_s, walk_s = lot.neighbors, problem.move_s, problem.walk_s
+    near, near_s, near_move, ahead, ahead_s = _nearest(neighbors, move_s, lot.n_slots, k)
+    total_s = ahead_s + np.where(ahead >= 0, walk_s[ahead], np.inf)
+    order = np.argsort(total_s, axis=2, kind="stable")
+    ahead, total_s = (np.take_along_axis(a, order, axis=2) for a in (ahead, total_s))
+    count, slots, near_index, ahead_index = _without_repeats(near, ahead)
+
+    def squashed(seconds: FloatArray) -> FloatArray:
+        with np.errstate(invalid="ignore"):
+            return np.where(np.isfinite(seconds), seconds / (seconds + MINUTE), 1.0)
+
+    fixed = np.zeros((n, FIRST_NEAR + PER_NEAR * k), dtype=np.float32)
+    fixed[: lot.n_slots, 0] = 1.0
+    fixed[:, 2] = 1.0
+    fixed[: lot.n_slots, 2] = squashed(walk_s)
+    fixed[:, 12:14] = 1.0
+    best_s = _best_totals(neighbors, move_s, walk_s)
+    moves = fixed[:, HERE:FIRST_NEAR].reshape(n, N_MOVES, PER_MOVE)
+    there = neighbors >= 0
+    moves[..., 0] = there
+    moves[..., 1] = squashed(np.where(there, move_s, np.inf))
+    moves[..., 2] = squashed(np.where(there, move_s + best_s[neighbors], np.inf))
+    moves[..., 5] = moves[..., 7] = 1.0
+    nearest = fixed[:, FIRST_NEAR:].reshape(n, k, PER_NEAR)
+    nearest[..., 2] = squashed(near_s)
+    nearest[..., 3] = squashed(np.where(near >= 0, walk_s[near], np.inf))
+    nearest[..., 4:] = near_move[..., None] == np.arange(N_MOVES)
+    crow_s = lot.vertex_xy / problem.v_drive
+    by_walk = np.argsort(walk_s, kind="stable")
+    shares = (np.arange(N_REGIONS)[:, None] + (np.arange(SAMPLES) + 0.5) / SAMPLES) / N_REGIONS
+    samples = by_walk[(shares * lot.n_slots).astype(np.int64)].astype(np.int32)
+    finite = np.where(ahead_index >= 0, total_s, 0.0)
+    return count, fixed, slots, near_index, ahead_index, finite, crow_s, samples[None]
+
+
+@njit(cache=True)
+def _nearest(
+    neighbors: NDArray[np.int32], move_s: FloatArray, n_slots: int, k: int
+) -> tuple[NDArray[np.int32], FloatArray, NDArray[np.int32], NDArray[np.int32], FloatArray]:
+    """The k slots nearest to each vertex by drive: slot, drive, first move; and nearest by each first move."""
+    n = len(neighbors)
+    near = np.full((n, k), _NOWHERE, np.int32)
+    near_s = np.full((n, k), np.inf)
+    near_move = np.full((n, k), _NOWHERE, np.int32)
+    ahead = np.full((n, N_MOVES, k), _NOWHERE, np.int32)
+    ahead_s = np.full((n, N_MOVES, k), np.inf)
+    settled = np.full(n, _NOWHERE, np.int32)
+    # A move that is no shortest way to anything would have the whole lot searched for slots ahead of it.
+    patience = 64 + 8 * k * N_MOVES
+    for v in range(n):
+        heap: list[tuple[float, int, int]] = [(0.0, v, _NOWHERE)]
+        n_near, n_settled = 0, 0
+        n_ahead = np.zeros(N_MOVES, np.int64)
+        wanting = 0
+        for move in range(N_MOVES):
+            wanting += neighbors[v, move] >= 0
+        while len(heap) > 0 and n_settled < patience and (n_near < k or wanting > 0):
+            seconds, at, first = heapq.heappop(heap)
+            if settled[at] == v:
+                continue
+            settled[at] = v
+            n_settled += 1
+            if at < n_slots:
+                if n_near < k:
+                    near[v, n_near], near_s[v, n_near], near_move[v, n_near] = at, seconds, first
+                    n_near += 1
+                if first != _NOWHERE and n_ahead[first] < k:
+                    ahead[v, first, n_ahead[first]], ahead_s[v, first, n_ahead[first]] = at, seconds
+                    n_ahead[first] += 1
+                    wanting -= n_ahead[first] == k
+            for move in range(N_MOVES):
+                to = np.int64(neighbors[at, move])
+                if to >= 0 and settled[to] != v:
+                    way = move if at == v else first
+                    heapq.heappush(heap, (seconds + move_s[at, move], int(to), way))
+    return near, near_s, near_move, ahead, ahead_s
+
+
+@njit(cache=True)
+def _without_repeats(
+    near: NDArray[np.int32], ahead: NDArray[np.int32]
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+    """How many different slots each row names, these, and what is named as indices into them."""
+    n, k = near.shape
+    wanted = np.concatenate((near, ahead.reshape(n, N_MOVES * k)), axis=1)
+    index = np.full(wanted.shape, _NOWHERE, np.int32)
+    count = np.zeros(n, np.int32)
+    slots = np.empty(wanted.size, np.int32)
+    size = 0
+    for v in range(n):
+        for i in range(wanted.shape[1]):
+            if wanted[v, i] == _NOWHERE:
+                continue
+            for j in range(count[v]):
+                if slots[size + j] == wanted[v, i]:
+                    index[v, i] = j
+            if index[v, i] == _NOWHERE:
+                index[v, i] = count[v]
+                slots[size + count[v]] = wanted[v, i]
+                count[v] += 1
+        size += count[v]
+    return count, slots[:size].copy(), index[:, :k].copy(), index[:, k:].copy().reshape(n, N_MOVES, k)
+
+
+@njit(cache=True)
+def _best_totals(neighbors: NDArray[np.int32], move_s: FloatArray, walk_s: FloatArray) -> FloatArray:
+    """Least drive and walk from each vertex by way of any slot, (n,) s; inf where none can be reached."""
+    best = np.full(len(neighbors), np.inf)
+    best[: len(walk_s)] = walk_s
+    better = True
+    while better:
+        better = False
+        for v in range(len(neighbors)):
+            for move in range(N_MOVES):
+                to = neighbors[v, move]
+                if to >= 0 and move_s[v, move] + best[to] < best[v]:
+                    best[v] = move_s[v, move] + best[to]
+                    better = True
+    return best

@@ -1,0 +1,606 @@
+"""The compiled search: what one action does to the car, the slots in view, and the belief.
+
+`parkenv/Search-v0` and its batch are this code, so they agree to the bit. Nothing in it costs more in a larger lot:
+only slots that were touched in a search, that is looked at or asked for, take any memory that has to be reset.
+
+Kernels are compiled without numba's reference counting (`_nrt`), which would take most of a step's time: none of them
+allocates anything.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from parkenv.belief import after_look, relaxed
+from parkenv.envs.search_tables import (
+    ARRIVAL_WEEKDAYS,
+    ASKED,
+    DAY_HEAD,
+    ENTRIES,
+    FAILURE_S,
+    FALSE_ALARM_RATE,
+    GIVE_UP_S,
+    HAZARDS,
+    HIT_RATE,
+    LOG,
+    LOG_HEAD,
+    METRES,
+    N_ACTIONS,
+    N_ENTRIES,
+    N_SLOTS,
+    N_WEEKDAYS,
+    NUMBERS,
+    PER_LOG_SLOT,
+    PERFECT,
+    PRIOR_KEPT,
+    PRIOR_KIND,
+    PRIOR_REALS,
+    PROCESS,
+    PROFILES,
+    SECONDS,
+    SEEN_RATE,
+    TARGETS,
+    VIEWED,
+    VIEWS,
+    WALK_M,
+    WALK_S,
+    WINDOW_END,
+    WINDOW_START,
+    WORLD_INTS,
+    WORLD_KEPT,
+    WORLD_KIND,
+    WORLD_REALS,
+    SearchTables,
+)
+from parkenv.fading import fading
+from parkenv.keyed_random import (
+    ARRIVAL_STREAM,
+    ENTRY_STREAM,
+    OCCUPANCY_STREAM,
+    SIGHTING_STREAM,
+    VIEW_STREAM,
+    episode_key,
+    keyed_uniform,
+)
+from parkenv.lot import PARK
+from parkenv.occupancy import (
+    DAY_S,
+    HOUR_S,
+    MAX_PROBABILITY,
+    MIN_PROBABILITY,
+    WEEK_HOURS,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    holding_end,
+    hour_of_week,
+    marginal_from,
+)
+from parkenv.recorded_occupancy import recorded_forecast
+
+# Columns of `Search.numbers`, a row a search: times in s, distances in m.
+(
+    DRIVE_S, FAILED_S, PARKED_WALK_S, GAVE_UP_S, DRIVEN_M, WALKED_M,
+    STEP_DRIVE, STEP_FAILED, STEP_WALK, STEP_GAVE_UP,
+    ARRIVAL, SECOND_OF_HOUR, SECOND_OF_DAY, TIME, SEEN_FREE, EXPECTED_FREE, REGION,
+) = range(17)  # fmt: skip
+N_TERMS = 4
+N_REGIONS = 4
+N_NUMBERS = REGION + N_REGIONS
+
+# Columns of `Search.counts`; those before EPISODE belong to the search under way.
+(
+    FAILED_PARKS, N_PASSED, PARKED, OVER, VERTEX, BEFORE, N_TOUCHED, N_SEEN, N_KNOWN_TAKEN, STEPS, HOUR, CHOICE, KEY,
+    REMEMBERED, EPISODE, SEED_STATE, SCENARIO,
+) = range(17)  # fmt: skip
+N_COUNTS = SCENARIO + 1
+
+# Numbers of a touched slot in `Search.memory`: forecast, how fast sightings fade, what the last look left of the
+# belief, when that was, until when the slot's true state surely lasts.
+PRIOR, RATE, SAID, LOOKED, UNTIL = range(5)
+N_MEMORIES = UNTIL + 1
+
+# Marks of a touched slot in `Search.marks`: which one it is; what is below; number of the stretch of its true state.
+# ASKED_FOR lists the columns of slots that one observation asks for. `Search.place` has the column of each slot, if WHO
+# of that column says so, too: to forget all is to set N_TOUCHED to 0.
+WHO, FLAGS, FLIPS, ASKED_FOR = range(4)
+N_MARKS = ASKED_FOR + 1
+# In FLAGS: it is taken; UNTIL is exactly when that ends; it was seen; it looked taken; the car stopped there.
+TAKEN, EXACT, SEEN, LOOKED_TAKEN, PASSED = 1, 2, 4, 8, 16
+
+_SAFE = 1.0 - 1e-6
+_MOMENT = 1e-6
+
+
+class Search(NamedTuple):
+    """Searches under way, one or many, and the tables that they live on.
+
+    Attributes:
+        at, ints, reals, kept: as in `SearchTables`.
+        numbers: (n, 21) float64.
+        counts: (n, 17) int64.
+        memory: (n, m, 5) float64, a column a touched slot; m is the slots of the largest lot.
+        marks: (n, m, 4) int32, likewise.
+        place: (n, m) int32, a slot's column.
+        asked: (n, 2, m) float64, forecast and relaxation rate of priors that are asked in Python; (0, 2, 0) without.
+        scratch: (3, m) float64, where beliefs are reckoned.
+        p_occupied: (n, m) float32, belief in every slot, if it is kept up; (0, 0) if not.
+    """
+
+    at: IntArray
+    ints: NDArray[np.int32]
+    reals: FloatArray
+    kept: FloatArray
+    numbers: FloatArray
+    counts: IntArray
+    memory: FloatArray
+    marks: NDArray[np.int32]
+    place: NDArray[np.int32]
+    asked: FloatArray
+    scratch: FloatArray
+    p_occupied: NDArray[np.float32]
+
+    @classmethod
+    def on(cls, tables: SearchTables, scenario_of: IntArray, full_belief: bool) -> Search:
+        """Searches that have not begun.
+
+        Args:
+            tables: of the scenarios.
+            scenario_of: (n,) which scenario each search is in.
+            full_belief: whether to keep up `p_occupied`.
+        """
+        n, m = len(scenario_of), int(tables.at[:, N_SLOTS].max())
+        counts = np.zeros((n, N_COUNTS), dtype=np.int64)
+        counts[:, SCENARIO] = scenario_of
+        asked = bool((tables.at[:, PRIOR_KIND] == ASKED).any())
+        return cls(
+            *tables,
+            np.zeros((n, N_NUMBERS)),
+            counts,
+            np.zeros((n, m, N_MEMORIES)),
+            np.zeros((n, m, N_MARKS), dtype=np.int32),
+            np.zeros((n, m), dtype=np.int32),
+            np.zeros((n, 2, m) if asked else (0, 2, 0)),
+            np.empty((3, m)),
+            np.ones((n, m) if full_belief else (0, 0), dtype=np.float32),
+        )
+
+    def changing(self) -> tuple[NDArray[Any], ...]:
+        """The arrays that a step changes."""
+        return self.numbers, self.counts, self.memory, self.marks, self.place, self.asked, self.p_occupied
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def arrive(search: Search, e: int) -> None:
+    """Begin search `e` in the world of its seed and episode; nothing has been seen."""
+    at, ints, reals, counts, numbers = search.at, search.ints, search.reals, search.counts, search.numbers
+    row = counts[e, SCENARIO]
+    key = episode_key(np.uint64(counts[e, SEED_STATE]), counts[e, EPISODE])
+    choice = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * at[row, N_WEEKDAYS])
+    midnight = ints[at[row, ARRIVAL_WEEKDAYS] + choice] * DAY_S
+    start, end = reals[at[row, NUMBERS] + WINDOW_START], reals[at[row, NUMBERS] + WINDOW_END]
+    arrival = midnight + (start + keyed_uniform(key, ARRIVAL_STREAM, 0, 1) * (end - start))
+    _, hour, second = hour_of_week(arrival)
+    entry = int(keyed_uniform(key, ENTRY_STREAM, 0, 0) * at[row, N_ENTRIES])
+    for i in range(N_NUMBERS):
+        numbers[e, i] = 0.0
+    for i in range(EPISODE):
+        counts[e, i] = 0
+    numbers[e, ARRIVAL] = numbers[e, TIME] = arrival
+    numbers[e, SECOND_OF_HOUR] = second
+    numbers[e, SECOND_OF_DAY] = arrival - midnight
+    counts[e, VERTEX] = counts[e, BEFORE] = ints[at[row, ENTRIES] + entry]
+    counts[e, HOUR] = hour
+    counts[e, CHOICE] = choice
+    counts[e, KEY] = np.int64(key)
+    counts[e, REMEMBERED] = -1
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+def step_one(search: Search, e: int, action: int) -> None:
+    """Everything that an action does in search `e`; what it cost is in the STEP columns."""
+    drive_or_park(search, e, action)
+    if search.counts[e, PARKED] == 0:
+        look(search, e)
+    settle(search, e)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+def drive_or_park(search: Search, e: int, action: int) -> None:
+    """Move the car, or try to park it."""
+    counts, numbers = search.counts, search.numbers
+    at = search.at[counts[e, SCENARIO]]
+    vertex = counts[e, VERTEX]
+    edge = vertex * N_ACTIONS + action
+    drive, failed, walk = search.reals[at[SECONDS] + edge], 0.0, 0.0
+    numbers[e, DRIVEN_M] += search.reals[at[METRES] + edge]
+    target = search.ints[at[TARGETS] + edge]
+    if target != vertex:
+        counts[e, BEFORE] = vertex
+        counts[e, VERTEX] = target
+    elif action == PARK and vertex < at[N_SLOTS]:
+        if tried(search, e, vertex):
+            failed = search.reals[at[NUMBERS] + FAILURE_S]
+        else:
+            walk = search.reals[at[WALK_S] + vertex]
+            numbers[e, WALKED_M] = search.reals[at[WALK_M] + vertex]
+    numbers[e, TIME] += drive + failed
+    numbers[e, STEP_DRIVE], numbers[e, STEP_FAILED], numbers[e, STEP_WALK] = drive, failed, walk
+    counts[e, STEPS] += 1
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def tried(search: Search, e: int, slot: int) -> bool:
+    """Try to park; whether the slot is taken, which is then certain."""
+    column = touched(search, e, slot)
+    if is_taken(search, e, column, search.numbers[e, TIME]):
+        search.counts[e, FAILED_PARKS] += 1
+        learn(search, e, column, True, 1.0)
+        return True
+    search.counts[e, PARKED] = 1
+    return False
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+def look(search: Search, e: int) -> None:
+    """See the slots in view of the car, as well as the sighting model lets it."""
+    if search.at[search.counts[e, SCENARIO], PERFECT] == 1:
+        look_perfectly(search, e)
+    else:
+        look_badly(search, e)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+def look_perfectly(search: Search, e: int) -> None:
+    """See what is there. This is `touched`, `is_taken` and `learn` for every slot in view, and most of a step's work.
+
+    What does not change is read once, before the loop: the compiler cannot know that no store changes it.
+    """
+    ints, counts, numbers = search.ints, search.counts, search.numbers
+    place, marks, memory = search.place[e], search.marks[e], search.memory[e]
+    row, vertex, time = counts[e, SCENARIO], counts[e, VERTEX], numbers[e, TIME]
+    views, viewed = search.at[row, VIEWS] + vertex, search.at[row, VIEWED]
+    begin, end = viewed + ints[views], viewed + ints[views + 1]
+    n_touched, n_known_taken, n_passed = counts[e, N_TOUCHED], counts[e, N_KNOWN_TAKEN], counts[e, N_PASSED]
+    for i in range(begin, end):
+        slot = ints[i]
+        column = place[slot]
+        if column >= n_touched or marks[column, WHO] != slot:
+            column = begin_slot(search, e, slot)
+            n_touched += 1
+        if time >= memory[column, UNTIL]:
+            _find_out(search, e, column, time)
+        flags = marks[column, FLAGS]
+        if flags & SEEN == 0:
+            counts[e, N_SEEN] += 1
+            numbers[e, SEEN_FREE] += 1 - (flags & TAKEN)
+            numbers[e, EXPECTED_FREE] += 1.0 - memory[column, PRIOR]
+        if slot == vertex and flags & PASSED == 0:
+            flags |= PASSED
+            n_passed += 1
+        taken = flags & TAKEN
+        n_known_taken += taken - (flags & LOOKED_TAKEN) // LOOKED_TAKEN
+        marks[column, FLAGS] = (flags & ~LOOKED_TAKEN) | SEEN | (taken * LOOKED_TAKEN)
+        memory[column, SAID] = float(taken)
+        memory[column, LOOKED] = time
+    counts[e, N_KNOWN_TAKEN] = n_known_taken
+    counts[e, N_PASSED] = n_passed
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def look_badly(search: Search, e: int) -> None:
+    """See some of what is there, and some of it wrongly."""
+    at, ints, reals, counts = search.at, search.ints, search.reals, search.counts
+    row, vertex, time = counts[e, SCENARIO], counts[e, VERTEX], search.numbers[e, TIME]
+    key = np.uint64(counts[e, KEY])
+    pass_by(search, e)
+    views = at[row, VIEWS] + vertex
+    for i in range(ints[views], ints[views + 1]):
+        slot = ints[at[row, VIEWED] + i]
+        # What hides a slot goes on hiding it: one chance a search, which a nearer look may beat.
+        if keyed_uniform(key, VIEW_STREAM, slot, 0) >= reals[at[row, SEEN_RATE] + i]:
+            continue
+        column = touched(search, e, slot)
+        hit, false_alarm = reals[at[row, HIT_RATE] + i], reals[at[row, FALSE_ALARM_RATE] + i]
+        rate = hit if is_taken(search, e, column, time) else false_alarm
+        # By the millisecond: whoever looks at a slot then makes the same error.
+        looks_taken = keyed_uniform(key, SIGHTING_STREAM, slot, int(time * 1000.0)) < rate
+        learn(
+            search,
+            e,
+            column,
+            looks_taken,
+            after_look(belief(search, e, column), looks_taken, hit, false_alarm),
+        )
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def take_in(
+    search: Search, e: int, slots: IntArray, looks_taken: BoolArray, hit: FloatArray, false_alarm: FloatArray
+) -> None:
+    """In place of `look`: what somebody else made of the slots, each (k,)."""
+    pass_by(search, e)
+    for i in range(slots.size):
+        column = touched(search, e, slots[i])
+        said = after_look(belief(search, e, column), looks_taken[i], hit[i], false_alarm[i])
+        learn(search, e, column, looks_taken[i], said)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+def settle(search: Search, e: int) -> None:
+    """Give up a lot that is proven full, and add the step to the episode."""
+    counts, numbers = search.counts, search.numbers
+    row = counts[e, SCENARIO]
+    full = counts[e, N_KNOWN_TAKEN] == search.at[row, N_SLOTS]
+    gave_up = search.reals[search.at[row, NUMBERS] + GIVE_UP_S] if full else 0.0
+    numbers[e, STEP_GAVE_UP] = gave_up
+    counts[e, OVER] = int(full or counts[e, PARKED] == 1)
+    for term in range(N_TERMS):
+        numbers[e, DRIVE_S + term] += numbers[e, STEP_DRIVE + term]
+    if search.p_occupied.size > 0:
+        renew(search, e)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def pass_by(search: Search, e: int) -> None:
+    """Count the slot that the car stops at, the first time."""
+    vertex = search.counts[e, VERTEX]
+    if vertex < search.at[search.counts[e, SCENARIO], N_SLOTS]:
+        column = touched(search, e, vertex)
+        if search.marks[e, column, FLAGS] & PASSED == 0:
+            search.marks[e, column, FLAGS] |= PASSED
+            search.counts[e, N_PASSED] += 1
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def learn(search: Search, e: int, column: int, looks_taken: bool, said: float) -> None:
+    """Hold `said` of a slot from now on."""
+    counts, flags = search.counts, search.marks[e, column, FLAGS]
+    if flags & SEEN == 0:
+        counts[e, N_SEEN] += 1
+        search.numbers[e, SEEN_FREE] += 0.0 if looks_taken else 1.0
+        search.numbers[e, EXPECTED_FREE] += 1.0 - search.memory[e, column, PRIOR]
+    looked_taken = LOOKED_TAKEN if looks_taken else 0
+    counts[e, N_KNOWN_TAKEN] += int(looks_taken) - int(flags & LOOKED_TAKEN != 0)
+    search.marks[e, column, FLAGS] = (flags & ~LOOKED_TAKEN) | looked_taken | SEEN
+    search.memory[e, column, SAID] = said
+    search.memory[e, column, LOOKED] = search.numbers[e, TIME]
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+def belief(search: Search, e: int, column: int) -> float:
+    """The belief in a touched slot, now."""
+    said, elapsed = search.memory[e, column, SAID], search.numbers[e, TIME] - search.memory[e, column, LOOKED]
+    return float(relaxed(search.memory[e, column, PRIOR], search.memory[e, column, RATE], said, elapsed))
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+def renew(search: Search, e: int) -> None:
+    """Bring the full belief up to date; only touched slots can have changed."""
+    n, time = search.counts[e, N_TOUCHED], search.numbers[e, TIME]
+    memory, marks, out = search.memory[e], search.marks[e], search.p_occupied[e]
+    prior, away, faded = search.scratch[0], search.scratch[1], search.scratch[2]
+    for i in range(n):
+        prior[i] = memory[i, PRIOR]
+        away[i] = memory[i, SAID] - memory[i, PRIOR]
+        faded[i] = memory[i, RATE] * (time - memory[i, LOOKED])
+    relax_all(n, prior, away, faded)
+    for i in range(n):
+        out[marks[i, WHO]] = prior[i]
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+def relax_all(n: int, prior: FloatArray, away: FloatArray, faded: FloatArray) -> None:
+    """`relaxed` for n slots at once, into `prior`; a loop of its own, so that it becomes vector instructions."""
+    for i in range(n):
+        prior[i] = prior[i] + away[i] * fading(faded[i])
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def touched(search: Search, e: int, slot: int) -> int:
+    """The column of a slot, begun if there is none: what is forecast of it, and what stands there."""
+    marks, counts = search.marks, search.counts
+    column = search.place[e, slot]
+    if column < counts[e, N_TOUCHED] and marks[e, column, WHO] == slot:
+        return int(column)
+    return int(begin_slot(search, e, slot))
+
+
+@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+def begin_slot(search: Search, e: int, slot: int) -> int:
+    """A column for a slot that has none."""
+    marks, counts, memory = search.marks, search.counts, search.memory
+    row, arrival = counts[e, SCENARIO], search.numbers[e, ARRIVAL]
+    column = counts[e, N_TOUCHED]
+    counts[e, N_TOUCHED] = column + 1
+    search.place[e, slot] = column
+    marks[e, column, WHO] = slot
+    marks[e, column, FLIPS] = 1
+    prior, rate, in_world = forecast(search, e, slot)
+    memory[e, column, PRIOR] = memory[e, column, SAID] = prior
+    memory[e, column, RATE] = rate
+    memory[e, column, LOOKED] = arrival
+    if search.at[row, WORLD_KIND] == LOG:
+        marks[e, column, FLAGS] = 0
+        memory[e, column, UNTIL] = arrival
+        return int(column)
+    key, hour = np.uint64(counts[e, KEY]), counts[e, HOUR]
+    state = 1 if keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < in_world else 0
+    marks[e, column, FLAGS] = TAKEN if state == 1 else 0
+    # The stretch ends when its hazard has reached -log(u), which is more than 1 - u; until the hour ends the rate
+    # is constant. Mostly that is time enough, and spares us to find out when exactly it ends.
+    world, n = search.at[row, WORLD_REALS], search.at[row, N_SLOTS]
+    leaving = (
+        search.reals[world + PROFILES + HAZARDS + state * n + slot]
+        * search.reals[world + state * WEEK_HOURS + hour]
+    )
+    lasts = HOUR_S - search.numbers[e, SECOND_OF_HOUR]
+    hazard = (1.0 - keyed_uniform(key, OCCUPANCY_STREAM, slot, 1)) * _SAFE
+    if hazard < leaving * lasts:
+        lasts = hazard / leaving
+    memory[e, column, UNTIL] = arrival + lasts - _MOMENT
+    return int(column)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def is_taken(search: Search, e: int, column: int, time: float) -> bool:
+    """The truth about a touched slot at a time that does not come before that of earlier questions, s."""
+    if time >= search.memory[e, column, UNTIL]:
+        _find_out(search, e, column, time)
+    return bool(search.marks[e, column, FLAGS] & TAKEN != 0)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _find_out(search: Search, e: int, column: int, time: float) -> None:
+    """What stands in a slot at a time for which that is not known yet."""
+    if search.at[search.counts[e, SCENARIO], WORLD_KIND] == LOG:
+        _replay(search, e, column, time)
+    else:
+        _flip(search, e, column, time)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _flip(search: Search, e: int, column: int, time: float) -> None:
+    """Let cars come and go at a slot until `time`, as `OccupancyProcess` has them."""
+    marks, memory, reals = search.marks[e, column], search.memory[e, column], search.reals
+    row, slot, key = search.counts[e, SCENARIO], marks[WHO], np.uint64(search.counts[e, KEY])
+    world, n = search.at[row, WORLD_REALS], search.at[row, N_SLOTS]
+    since = search.numbers[e, ARRIVAL]
+    while time >= memory[UNTIL]:
+        if marks[FLAGS] & EXACT != 0:
+            since = memory[UNTIL]
+            marks[FLAGS] ^= TAKEN
+            marks[FLIPS] += 1
+        marks[FLAGS] |= EXACT
+        state = 1 if marks[FLAGS] & TAKEN != 0 else 0
+        profile, table = world + state * WEEK_HOURS, world + PROFILES + state * (WEEK_HOURS + 1)
+        memory[UNTIL] = holding_end(
+            key,
+            slot,
+            marks[FLIPS],
+            since,
+            reals[world + PROFILES + HAZARDS + state * n + slot],
+            reals[profile : profile + WEEK_HOURS],
+            reals[table : table + WEEK_HOURS + 1],
+        )
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _replay(search: Search, e: int, column: int, time: float) -> None:
+    """Read a slot's state off the log, as `RecordedWorld` does."""
+    ints, reals, counts = search.ints, search.reals, search.counts
+    row, choice = counts[e, SCENARIO], counts[e, CHOICE]
+    n, log = search.at[row, N_SLOTS], search.at[row, WORLD_INTS]
+    m, n_days, n_records = ints[log], ints[log + 1], ints[log + 2]
+    days = log + LOG_HEAD
+    record = ints[days + 2 * n * choice + search.marks[e, column, WHO]]
+    first = days + 2 * n * n_days
+    begin, end = ints[first + record], ints[first + record + 1]
+    looks = first + n_records + 1
+    per_day = DAY_HEAD + PER_LOG_SLOT * m
+    midnight = reals[search.at[row, WORLD_REALS] + choice * per_day]
+    from_s = search.at[row, WORLD_REALS] + n_days * per_day
+    second = time - midnight
+    i = begin + np.searchsorted(reals[from_s + begin : from_s + end], second, side="right") - 1
+    flags = search.marks[e, column, FLAGS] & ~TAKEN
+    search.marks[e, column, FLAGS] = flags | (TAKEN if ints[looks + i] != 0 else 0)
+    search.memory[e, column, UNTIL] = reals[from_s + i + 1] + midnight - _MOMENT if i + 1 < end else np.inf
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def forecast(search: Search, e: int, slot: int) -> tuple[float, float, float]:
+    """P(taken) that the car foresees for a slot, how fast sightings of it fade, 1/s, and P(taken) in the world."""
+    at = search.at
+    row = search.counts[e, SCENARIO]
+    p, rate, in_world = 0.0, 0.0, 0.0
+    if at[row, WORLD_KIND] == PROCESS:
+        in_world, rate = _process_marginal(search, e, slot, at[row, WORLD_REALS], at[row, WORLD_KEPT])
+        p = in_world
+    if at[row, PRIOR_KIND] == ASKED:
+        return search.asked[e, 0, slot], search.asked[e, 1, slot], in_world
+    if at[row, PRIOR_KIND] == LOG:
+        p, rate = _log_forecast(search, e, slot)
+    elif at[row, PRIOR_REALS] != at[row, WORLD_REALS]:
+        p, rate = _process_marginal(search, e, slot, at[row, PRIOR_REALS], at[row, PRIOR_KEPT])
+    return min(max(p, MIN_PROBABILITY), MAX_PROBABILITY), rate, in_world
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _process_marginal(search: Search, e: int, slot: int, model: int, kept: int) -> tuple[float, float]:
+    reals, hour = search.reals, search.counts[e, HOUR]
+    n = search.at[search.counts[e, SCENARIO], N_SLOTS]
+    factors = model + PROFILES + HAZARDS
+    arrivals, departures = reals[model : model + WEEK_HOURS], reals[model + WEEK_HOURS : model + PROFILES]
+    come, go = reals[factors + slot], reals[factors + n + slot]
+    second, row = search.numbers[e, SECOND_OF_HOUR], kept + hour * n + slot
+    p = marginal_from(come, go, arrivals, departures, hour, second, search.kept, row)
+    return p, come * arrivals[hour] + go * departures[hour]
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _log_forecast(search: Search, e: int, slot: int) -> tuple[float, float]:
+    ints, reals, counts = search.ints, search.reals, search.counts
+    row, choice = counts[e, SCENARIO], counts[e, CHOICE]
+    n, log = search.at[row, N_SLOTS], search.at[row, WORLD_INTS]
+    m = ints[log]
+    log_slot = ints[log + LOG_HEAD + 2 * n * choice + n + slot]
+    day = search.at[row, WORLD_REALS] + choice * (DAY_HEAD + PER_LOG_SLOT * m)
+    share = day + DAY_HEAD
+    p = recorded_forecast(
+        log_slot,
+        search.numbers[e, SECOND_OF_DAY],
+        reals[share : share + 24 * m],
+        reals[day + 3 : day + DAY_HEAD],
+        reals[share + 24 * m : share + PER_LOG_SLOT * m],
+        reals[day + 2],
+    )
+    return p, reals[day + 1]
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def foresee(search: Search, e: int) -> None:
+    """Write the forecast of every slot into the full belief."""
+    at, row, out = search.at, search.counts[e, SCENARIO], search.p_occupied[e]
+    n = at[row, N_SLOTS]
+    if at[row, PRIOR_KIND] != PROCESS:
+        for s in range(n):
+            out[s] = forecast(search, e, s)[0]
+        return
+    hour, model = search.counts[e, HOUR], at[row, PRIOR_REALS]
+    marginals = at[row, PRIOR_KEPT] + hour * n
+    for s in range(n):
+        if search.kept[marginals + s] == 0.0:
+            _process_marginal(search, e, s, model, at[row, PRIOR_KEPT])
+    factors = model + PROFILES + HAZARDS
+    _foresee_all(
+        search.reals[factors : factors + n],
+        search.reals[factors + n : factors + 2 * n],
+        search.reals[model + hour],
+        search.reals[model + WEEK_HOURS + hour],
+        search.kept[marginals : marginals + n],
+        search.numbers[e, SECOND_OF_HOUR],
+        out,
+    )
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _foresee_all(
+    come: FloatArray,
+    go: FloatArray,
+    coming: float,
+    going: float,
+    start: FloatArray,
+    second: float,
+    out: NDArray[np.float32],
+) -> None:
+    """`marginal_from` of many slots, whose marginals at the full hour are known, by vector instructions."""
+    for s in range(len(start)):
+        arrival = come[s] * coming
+        rate = arrival + go[s] * going
+        equilibrium = arrival / rate if rate > 0.0 else 0.0
+        p = equilibrium + (start[s] - equilibrium) * fading(rate * second)
+        out[s] = min(max(p, MIN_PROBABILITY), MAX_PROBABILITY)

@@ -1,0 +1,460 @@
+"""Many searches at once, compiled: the `vector_entry_point` of `parkenv/Search-v0`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space, create_empty_array
+from numba import njit
+from numpy.typing import NDArray
+
+from parkenv.envs.local_observation import Surroundings, local_space, observe_surroundings
+from parkenv.envs.search import REWARD_TERMS, arrival_of, search_space
+from parkenv.envs.search_step import (
+    ARRIVAL,
+    DRIVE_S,
+    DRIVEN_M,
+    EPISODE,
+    FAILED_PARKS,
+    N_PASSED,
+    N_TERMS,
+    OVER,
+    PARKED,
+    SCENARIO,
+    SEED_STATE,
+    STEP_DRIVE,
+    STEPS,
+    TIME,
+    VERTEX,
+    WALKED_M,
+    Search,
+    arrive,
+    foresee,
+    step_one,
+)
+from parkenv.envs.search_tables import MASKS, N_ACTIONS, SearchTables
+from parkenv.errors import InputError
+from parkenv.keyed_random import seed_state
+from parkenv.lot import ACTIONS, PARK
+from parkenv.occupancy import BoolArray, FloatArray, IntArray
+from parkenv.scenario import Scenario
+
+OBSERVATIONS = ("full", "local")
+TIME_METRICS = ("drive_s", "failed_s", "walk_s", "gave_up_s", "total_s", "driven_m", "walked_m")
+COUNT_METRICS = ("failed_parks", "slots_passed")
+
+
+class Steps(NamedTuple):
+    """What a step gave, besides observations.
+
+    Attributes:
+        rewards: (n,) float64.
+        terminated, truncated: (n,) bool.
+        terms: (4, n) float64, the reward's, where a search has ended; left over elsewhere, as all that follows.
+        times: (7, n) float64, `TIME_METRICS`.
+        tallies: (2, n) int64, `COUNT_METRICS`.
+        parked: (n,) bool.
+    """
+
+    rewards: FloatArray
+    terminated: BoolArray
+    truncated: BoolArray
+    terms: FloatArray
+    times: FloatArray
+    tallies: IntArray
+    parked: BoolArray
+
+    @classmethod
+    def of(cls, n: int) -> Self:
+        """Of n searches that have not begun."""
+        flags = [np.zeros(n, dtype=np.bool_) for _ in range(3)]
+        tallies = np.zeros((len(COUNT_METRICS), n), dtype=np.int64)
+        times = np.zeros((len(TIME_METRICS), n))
+        return cls(np.zeros(n), flags[0], flags[1], np.zeros((N_TERMS, n)), times, tallies, flags[2])
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def arrive_all(search: Search, which: BoolArray) -> None:
+    """Put cars at the entries of their next worlds."""
+    for e in range(len(which)):
+        if which[e]:
+            search.counts[e, EPISODE] += 1
+            arrive(search, e)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def step_full(
+    search: Search,
+    actions: IntArray,
+    fresh: BoolArray,
+    idle: BoolArray,
+    limit: int,
+    steps: Steps,
+    vertex: IntArray,
+    time: NDArray[np.float32],
+    mask: NDArray[np.int8],
+) -> int:
+    """Step all searches but the idle and the fresh ones, and observe; the first wrong action's index, or -1."""
+    wrong: int = _first_wrong(actions)
+    if wrong >= 0:
+        return wrong
+    for e in range(len(actions)):
+        if idle[e]:
+            continue
+        if fresh[e]:
+            foresee(search, e)
+        else:
+            step_one(search, e, actions[e])
+        _report(search, e, fresh[e], limit, steps, mask)
+        vertex[e] = search.counts[e, VERTEX]
+        now = search.numbers[e, TIME]
+        time[e, 0], time[e, 1] = now, now - search.numbers[e, ARRIVAL]
+    return -1
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def step_local(
+    search: Search,
+    around: Surroundings,
+    actions: IntArray,
+    fresh: BoolArray,
+    idle: BoolArray,
+    limit: int,
+    steps: Steps,
+    local: NDArray[np.float32],
+    mask: NDArray[np.int8],
+) -> int:
+    """As `step_full`, observing the cars' surroundings."""
+    wrong: int = _first_wrong(actions)
+    if wrong >= 0:
+        return wrong
+    for e in range(len(actions)):
+        if idle[e]:
+            continue
+        if not fresh[e]:
+            step_one(search, e, actions[e])
+        _report(search, e, fresh[e], limit, steps, mask)
+        observe_surroundings(search, around, e, local[e])
+    return -1
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _first_wrong(actions: IntArray) -> int:
+    for e in range(len(actions)):
+        if not 0 <= actions[e] < N_ACTIONS:
+            return e
+    return -1
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _report(search: Search, e: int, fresh: bool, limit: int, steps: Steps, mask: NDArray[np.int8]) -> None:
+    """Reward, ends, metrics where it ends, and what can be done next."""
+    counts, numbers = search.counts, search.numbers
+    bits = search.ints[search.at[counts[e, SCENARIO], MASKS] + counts[e, VERTEX]]
+    for action in range(N_ACTIONS):
+        mask[e, action] = (bits >> action) & 1
+    if fresh:
+        steps.rewards[e] = 0.0
+        steps.terminated[e] = steps.truncated[e] = False
+        return
+    cost = 0.0
+    for term in range(N_TERMS):
+        cost += numbers[e, STEP_DRIVE + term]
+    steps.rewards[e] = -cost
+    steps.terminated[e] = counts[e, OVER] == 1
+    steps.truncated[e] = counts[e, STEPS] >= limit
+    if not (steps.terminated[e] or steps.truncated[e]):
+        return
+    total = 0.0
+    for term in range(N_TERMS):
+        steps.terms[term, e] = -numbers[e, STEP_DRIVE + term]
+        steps.times[term, e] = numbers[e, DRIVE_S + term]
+        total += numbers[e, DRIVE_S + term]
+    steps.times[N_TERMS, e] = total
+    steps.times[N_TERMS + 1, e] = numbers[e, DRIVEN_M]
+    steps.times[N_TERMS + 2, e] = numbers[e, WALKED_M]
+    steps.tallies[0, e] = counts[e, FAILED_PARKS]
+    steps.tallies[1, e] = counts[e, N_PASSED]
+    steps.parked[e] = counts[e, PARKED] == 1
+
+
+class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]]):
+    """`parkenv/Search-v0` many times over, in one compiled step.
+
+    ## Description
+    World, decisions, rewards, ends and observations are those of `parkenv/Search-v0`: search i of a batch that was
+    reset with `seed=s` is the single environment that was reset with `seed=s + i`, bit for bit, through all the
+    episodes that follow.
+
+    ## Action space
+    `MultiDiscrete([5, ...])`: up, down, left, right, park.
+
+    ## Observation space
+    With `observation="full"` a `Dict` of `vertex`, `time`, `p_occupied` and `action_mask`, each as in
+    `parkenv/Search-v0` with a row a search. Where lots differ in size, `p_occupied` is 1 past a lot's last slot.
+
+    With `observation="local"` a `Dict` of `local` and `action_mask`; see `parkenv.envs.local_observation`. It has the
+    same size on every lot, and costs the same.
+
+    ## Rewards
+    As in `parkenv/Search-v0`, float64. `reward_terms` holds the last step's terms.
+
+    ## Starting state
+    As in `parkenv/Search-v0`. `reset(seed=s)` gives search i the seed s + i; a sequence gives each its own. Without a
+    seed every search goes on to the next world of its seed.
+
+    ## Episode end
+    As in `parkenv/Search-v0`; truncated after `max_episode_steps`. What then happens is `autoreset_mode`: NEXT_STEP,
+    whatever is done in the next step begins a new search, for a reward of 0; SAME_STEP, a new search begins at once,
+    and the last observations and infos are `info["final_obs"]` and `info["final_info"]`; DISABLED, those to begin anew
+    are named in `reset(options={"reset_mask": ...})`. Where a search ends, `info` has its metrics, as the single
+    environment's, with `_drive_s` and so on saying which searches they are of.
+
+    ## Arguments
+    - `num_envs`: how many.
+    - `scenario`: a `Scenario` or the name of a packaged one; or a sequence of such, of which search i gets the one at
+      i modulo their number.
+    - `observation`: full or local.
+    - `k`: how many slots `local` tells of.
+    - `max_episode_steps`: 2000 from `make_vec`.
+    - `autoreset_mode`: NEXT_STEP, SAME_STEP or DISABLED of `gymnasium.vector.AutoresetMode`, or its value.
+    - `copy`: False hands out arrays that the next step overwrites, and saves their copying.
+    - further keywords replace fields of the scenarios, e.g. `failure_s=90.0`.
+
+    ```python
+    >>> import gymnasium as gym
+    >>> import parkenv
+    >>> envs = gym.make_vec("parkenv/Search-v0", 3, vectorization_mode="vector_entry_point", scenario="mini")
+    >>> observations, infos = envs.reset(seed=0)
+    >>> observations["p_occupied"].shape
+    (3, 10)
+    >>> observations, rewards, terminations, truncations, infos = envs.step(envs.action_space.sample())
+    >>> rewards.shape
+    (3,)
+
+    ```
+
+    Raises:
+        InputError: an argument out of its range, by name.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium declares it so
+        "render_modes": [],
+        "autoreset_mode": AutoresetMode.NEXT_STEP,
+    }
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: str | Scenario | Sequence[str | Scenario] = "campus",
+        observation: str = "full",
+        k: int = 5,
+        max_episode_steps: int | None = 2000,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        copy: bool = True,
+        render_mode: str | None = None,
+        **changes: Any,
+    ) -> None:
+        _require_count("num_envs", num_envs)
+        if max_episode_steps is not None:
+            _require_count("max_episode_steps", max_episode_steps)
+        if observation not in OBSERVATIONS:
+            raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")
+        if render_mode is not None:
+            raise InputError(f"render_mode is {render_mode!r}, want None: a batch draws no pictures")
+        try:
+            mode = AutoresetMode(autoreset_mode)
+        except ValueError:
+            known = ", ".join(m.value for m in AutoresetMode)
+            raise InputError(f"autoreset_mode is {autoreset_mode!r}, want one of {known}") from None
+        given = [scenario] if isinstance(scenario, (str, Scenario)) else list(scenario)
+        if not given:
+            raise InputError("scenario is an empty sequence, want at least one scenario")
+        self.scenarios = [Scenario.of(one, **changes) for one in given]
+        self.num_envs = int(num_envs)
+        self.max_episode_steps = max_episode_steps
+        self.metadata = self.metadata | {"autoreset_mode": mode}
+        self.single_action_space = spaces.Discrete(N_ACTIONS)
+        self._full = observation == "full"
+        if self._full:
+            lots = [one.lot for one in self.scenarios]
+            n_slots, n_vertices = max(lot.n_slots for lot in lots), max(lot.n_vertices for lot in lots)
+            self.single_observation_space = search_space(n_slots, n_vertices)
+            self._surroundings: Surroundings | None = None
+        else:
+            self._surroundings = Surroundings.of(self.scenarios, k)
+            self.single_observation_space = local_space(k)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        n = self.num_envs
+        scenario_of = np.arange(n) % len(self.scenarios)
+        self._search = Search.on(SearchTables.of(self.scenarios), scenario_of, self._full)
+        empty: Any = create_empty_array(self.single_observation_space, n)
+        self._seen: dict[str, NDArray[Any]] = empty
+        if self._full:
+            self._seen["p_occupied"] = self._search.p_occupied
+        self._steps = Steps.of(n)
+        self._limit = max_episode_steps or np.iinfo(np.int64).max
+        self._mode, self._copy = mode, copy
+        self._begun = False
+        self._nobody = np.zeros(n, dtype=np.bool_)
+        self._done = self._nobody
+
+    @property
+    def reward_terms(self) -> dict[str, FloatArray]:
+        """The terms of the last step's rewards, (n_envs,) each."""
+        terms = -self._search.numbers[:, STEP_DRIVE : STEP_DRIVE + N_TERMS]
+        return dict(zip(REWARD_TERMS, terms.T, strict=True))
+
+    @property
+    def bytes_each(self) -> float:
+        """Memory of one search, bytes, in a lot of whose slots all have been looked at; the tables are shared."""
+        buffers = (*self._seen.values(), *self._steps, *self._search.changing())
+        return sum({id(a): a.nbytes for a in buffers}.values()) / self.num_envs
+
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+        """Start a search in every environment, or in those of `options["reset_mask"]`, (n_envs,) bool.
+
+        Args:
+            seed: the first one's, counted up from there; or one for each, None to go on; or None to go on.
+            options: nothing but `reset_mask`.
+
+        Raises:
+            InputError: another option, or as many seeds as there are no environments.
+        """
+        which = self._chosen(options)
+        if seed is None or isinstance(seed, (int, np.integer)):
+            super().reset(seed=None if seed is None else int(seed))
+        if seed is None and not self._begun:
+            _ = self.np_random  # draws a seed where none was ever given
+            seed = self.np_random_seed
+        if isinstance(seed, (int, np.integer)):
+            seed = [int(seed) + i for i in range(self.num_envs)]
+        seeds = [None] * self.num_envs if seed is None else list(seed)
+        if len(seeds) != self.num_envs:
+            raise InputError(
+                f"seed holds {len(seeds)} numbers, want {self.num_envs}, one for each environment"
+            )
+        counts = self._search.counts
+        for i in np.flatnonzero(which):
+            one = seeds[i]
+            if one is not None:
+                counts.view(np.uint64)[i, SEED_STATE] = seed_state(one)
+                counts[i, EPISODE] = -1
+        self._begun = True
+        self._arrive(which)
+        self._step(np.zeros(self.num_envs, dtype=np.int64), which, ~which)
+        self._done = self._done & ~which
+        return self._observations(), {}
+
+    def step(
+        self, actions: IntArray
+    ) -> tuple[dict[str, NDArray[Any]], FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """Take an action, (n_envs,) int, in every environment; see the class."""
+        if not self._begun:
+            raise gym.error.ResetNeeded("the environments have no episode yet: call reset() first")
+        actions = np.asarray(actions)
+        if actions.shape != (self.num_envs,) or actions.dtype.kind not in "iu":
+            raise InputError(
+                f"actions have shape {actions.shape} and type {actions.dtype}, want ({self.num_envs},) whole numbers"
+            )
+        fresh = self._nobody
+        if self._mode is AutoresetMode.NEXT_STEP:
+            fresh = self._done
+            if fresh.any():
+                self._arrive(fresh)
+        elif self._mode is AutoresetMode.DISABLED and self._done.any():
+            raise gym.error.ResetNeeded(f"search {int(np.argmax(self._done))} is over: reset it")
+        self._step(actions.astype(np.int64, copy=False), fresh, self._nobody)
+        steps = self._steps
+        self._done = done = steps.terminated | steps.truncated
+        info: dict[str, Any] = {}
+        if done.any():
+            info = self._metrics(done)
+            if self._mode is AutoresetMode.SAME_STEP:
+                info = {"final_info": info, "_final_info": done.copy()}
+                info["final_obs"], info["_final_obs"] = self._final_observations(done), done.copy()
+        results = steps.rewards, steps.terminated, steps.truncated
+        if self._copy or self._mode is AutoresetMode.SAME_STEP:
+            results = steps.rewards.copy(), steps.terminated.copy(), steps.truncated.copy()
+        if self._mode is AutoresetMode.SAME_STEP and done.any():
+            self._arrive(done)
+            self._step(actions.astype(np.int64, copy=False), done, ~done)
+            self._done = self._nobody
+        return self._observations(), *results, info
+
+    def _step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
+        """Begin the searches that are fresh, leave the idle ones alone, step the others."""
+        seen, steps = self._seen, self._steps
+        if self._surroundings is None:
+            wrong = step_full(
+                self._search, actions, fresh, idle, self._limit, steps,
+                seen["vertex"], seen["time"], seen["action_mask"],
+            )  # fmt: skip
+        else:
+            wrong = step_local(
+                self._search, self._surroundings, actions, fresh, idle, self._limit, steps,
+                seen["local"], seen["action_mask"],
+            )  # fmt: skip
+        if wrong >= 0:
+            raise InputError(
+                f"actions[{wrong}] is {actions[wrong]}, want a number from 0 to {PARK} ({', '.join(ACTIONS)})"
+            )
+
+    def _arrive(self, which: BoolArray) -> None:
+        """Put some of the cars at the entries of their next worlds."""
+        search = self._search
+        arrive_all(search, which)
+        if not len(search.asked):
+            return
+        for i in np.flatnonzero(which):
+            scenario = self.scenarios[i % len(self.scenarios)]
+            forecast = scenario.forecast(arrival_of(scenario, search, int(i)))
+            n = len(forecast.p_occupied)
+            search.asked[i, :, :n] = forecast.p_occupied, forecast.relaxation_rate
+
+    def _observations(self) -> dict[str, NDArray[Any]]:
+        return {name: a.copy() for name, a in self._seen.items()} if self._copy else dict(self._seen)
+
+    def _final_observations(self, done: BoolArray) -> NDArray[np.object_]:
+        final = np.full(self.num_envs, None, dtype=object)
+        for i in np.flatnonzero(done):
+            final[i] = {name: a[i].copy() for name, a in self._seen.items()}
+        return final
+
+    def _metrics(self, done: BoolArray) -> dict[str, Any]:
+        """What `SearchEnv`'s info says, and which searches it is of."""
+        steps = self._steps
+        mask = done.copy()
+        terms = dict(zip(REWARD_TERMS, steps.terms.copy(), strict=True))
+        metrics: dict[str, Any] = {"reward_terms": terms | {f"_{name}": mask for name in terms}}
+        metrics |= zip(TIME_METRICS, steps.times.copy(), strict=True)
+        metrics |= zip(COUNT_METRICS, steps.tallies.copy(), strict=True)
+        metrics["parked"] = steps.parked.copy()
+        return metrics | {f"_{name}": mask for name in metrics}
+
+    def _chosen(self, options: dict[str, Any] | None) -> BoolArray:
+        """Which environments to reset."""
+        rest = dict(options or {})
+        mask = np.asarray(rest.pop("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
+        if rest:
+            raise InputError(f"reset takes no option but reset_mask, got {', '.join(rest)}")
+        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
+            raise InputError(
+                f"reset_mask has shape {mask.shape} and type {mask.dtype}, want ({self.num_envs},) bool"
+            )
+        if not self._begun and not mask.all():
+            raise InputError("reset_mask leaves out environments that have no episode yet")
+        return mask
+
+
+def _require_count(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise InputError(f"{name} is {value!r}, want a whole number of at least 1")

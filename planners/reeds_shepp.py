@@ -1,0 +1,258 @@
+"""The shortest ways of a car that drives forward and backward between two poses, where nothing is in the way.
+
+After Reeds and Shepp, "Optimal paths for a car that goes both forwards and backwards", Pacific Journal of
+Mathematics 145 (1990): such a way is one of 48 words of at most five pieces, each a left turn, a right turn, both of
+the smallest radius, or straight. The words come from eight formulas (their section 8) and their mirror images in time,
+in the car's axis, and in the order of the pieces.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+RIGHT, STRAIGHT, LEFT = -1, 0, 1
+PIECES = 5
+MOST_WORDS = 96
+"""Rows that hold all words between any two poses: some of the 48 come in two versions."""
+
+_EDGE = 1e-9
+_HALF = 0.5 * math.pi
+
+
+@njit(cache=True, error_model="numpy")
+def _turned(angle: float) -> float:
+    """The same direction in [-π, π)."""
+    return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
+
+
+@njit(cache=True, error_model="numpy")
+def _outer(u: float, v: float, xi: float, eta: float, phi: float) -> tuple[float, float]:
+    """First and last turn of a word of four turns, whose inner ones are u and v (their section 8, τ and ω)."""
+    delta = _turned(u - v)
+    a, b = math.sin(u) - math.sin(delta), math.cos(u) - math.cos(delta) - 1.0
+    tau = math.atan2(eta * a - xi * b, xi * a + eta * b)
+    if 2.0 * (math.cos(delta) - math.cos(v) - math.cos(u)) + 3.0 < 0.0:
+        tau += math.pi
+    tau = _turned(tau)
+    return tau, _turned(tau - u + v - phi)
+
+
+@njit(cache=True, error_model="numpy")
+def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, turn: IntArray) -> int:
+    """One of the eight formulas: signed lengths and turns of a word from the origin to a pose; pieces, or 0.
+
+    Lengths are in turning radii. A minus in the names below is a piece driven backward.
+    """
+    ahead, left = x - math.sin(phi), y - 1.0 + math.cos(phi)  # for words that end in a left turn
+    across, down = x + math.sin(phi), y - 1.0 - math.cos(phi)  # for words that end in a right turn
+    if number == 0:  # L S L
+        u, t = math.hypot(ahead, left), math.atan2(left, ahead)
+        v = _turned(phi - t)
+        if t < -_EDGE or v < -_EDGE:
+            return 0
+        piece[0], piece[1], piece[2] = t, u, v
+        turn[0], turn[1], turn[2] = LEFT, STRAIGHT, LEFT
+        return 3
+    if number == 1:  # L S R
+        square = across * across + down * down
+        if square < 4.0:
+            return 0
+        u = math.sqrt(square - 4.0)
+        t = _turned(math.atan2(down, across) + math.atan2(2.0, u))
+        v = _turned(t - phi)
+        if t < -_EDGE or v < -_EDGE:
+            return 0
+        piece[0], piece[1], piece[2] = t, u, v
+        turn[0], turn[1], turn[2] = LEFT, STRAIGHT, RIGHT
+        return 3
+    if number == 2:  # L R- L, with the last turn in either direction
+        far = math.hypot(ahead, left)
+        if far > 4.0:
+            return 0
+        u = -2.0 * math.asin(0.25 * far)
+        t = _turned(math.atan2(left, ahead) + 0.5 * u + math.pi)
+        v = _turned(phi - t + u)
+        if t < -_EDGE or u > _EDGE:
+            return 0
+        piece[0], piece[1], piece[2] = t, u, v
+        turn[0], turn[1], turn[2] = LEFT, RIGHT, LEFT
+        return 3
+    if number == 3:  # L R L- R-
+        share = 0.25 * (2.0 + math.hypot(across, down))
+        if share > 1.0:
+            return 0
+        u = math.acos(share)
+        t, v = _outer(u, -u, across, down, phi)
+        if t < -_EDGE or v > _EDGE:
+            return 0
+        piece[0], piece[1], piece[2], piece[3] = t, u, -u, v
+        turn[0], turn[1], turn[2], turn[3] = LEFT, RIGHT, LEFT, RIGHT
+        return 4
+    if number == 4:  # L R- L- R
+        share = (20.0 - across * across - down * down) / 16.0
+        if share < 0.0 or share > 1.0:
+            return 0
+        u = -math.acos(share)
+        t, v = _outer(u, u, across, down, phi)
+        if u < -_HALF or t < -_EDGE or v < -_EDGE:
+            return 0
+        piece[0], piece[1], piece[2], piece[3] = t, u, u, v
+        turn[0], turn[1], turn[2], turn[3] = LEFT, RIGHT, LEFT, RIGHT
+        return 4
+    if number == 5:  # L R- S- L-
+        far = math.hypot(ahead, left)
+        if far < 2.0:
+            return 0
+        r = math.sqrt(far * far - 4.0)
+        u = 2.0 - r
+        t = _turned(math.atan2(left, ahead) + math.atan2(r, -2.0))
+        v = _turned(phi - _HALF - t)
+        if t < -_EDGE or u > _EDGE or v > _EDGE:
+            return 0
+        piece[0], piece[1], piece[2], piece[3] = t, -_HALF, u, v
+        turn[0], turn[1], turn[2], turn[3] = LEFT, RIGHT, STRAIGHT, LEFT
+        return 4
+    if number == 6:  # L R- S- R-
+        far = math.hypot(across, down)
+        if far < 2.0:
+            return 0
+        t = math.atan2(across, -down)
+        u = 2.0 - far
+        v = _turned(t + _HALF - phi)
+        if t < -_EDGE or u > _EDGE or v > _EDGE:
+            return 0
+        piece[0], piece[1], piece[2], piece[3] = t, -_HALF, u, v
+        turn[0], turn[1], turn[2], turn[3] = LEFT, RIGHT, STRAIGHT, RIGHT
+        return 4
+    # L R- S- L- R
+    far = math.hypot(across, down)
+    if far < 2.0:
+        return 0
+    u = 4.0 - math.sqrt(far * far - 4.0)
+    if u > _EDGE:
+        return 0
+    t = _turned(math.atan2((4.0 - u) * across - 2.0 * down, -2.0 * across + (u - 4.0) * down))
+    v = _turned(t - phi)
+    if t < -_EDGE or v < -_EDGE:
+        return 0
+    piece[0], piece[1], piece[2], piece[3], piece[4] = t, -_HALF, u, -_HALF, v
+    turn[0], turn[1], turn[2], turn[3], turn[4] = LEFT, RIGHT, STRAIGHT, LEFT, RIGHT
+    return 5
+
+
+@njit(cache=True, error_model="numpy")
+def words_between(
+    x: float, y: float, phi: float, pieces: FloatArray, turns: IntArray, counts: IntArray
+) -> int:
+    """All words that lead from the origin to a pose, in turning radii.
+
+    Args:
+        x: turning radii.
+        y: turning radii.
+        phi: rad.
+        pieces: (MOST_WORDS, 5), filled with the signed length of each piece, below 0 backward.
+        turns: (MOST_WORDS, 5), filled with `LEFT`, `STRAIGHT` or `RIGHT`.
+        counts: (MOST_WORDS,), filled with the number of pieces of each word.
+
+    Returns:
+        How many words there are, at least one.
+    """
+    n = 0
+    back_x, back_y = x * math.cos(phi) + y * math.sin(phi), x * math.sin(phi) - y * math.cos(phi)
+    for number in range(8):
+        # The order of pieces matters for words that do not read the same from both ends.
+        orders = 2 if number in (2, 5, 6) else 1
+        for order in range(orders):
+            ox, oy = (back_x, back_y) if order else (x, y)
+            for flip in range(2):  # in time: every piece the other way
+                for mirror in range(2):  # in the car's axis: left for right
+                    fx = -ox if flip else ox
+                    fy = -oy if mirror else oy
+                    angle = -phi if flip != mirror else phi
+                    count = _formula(number, fx, fy, angle, pieces[n], turns[n])
+                    if count == 0:
+                        continue
+                    if order:
+                        for i in range(count // 2):
+                            j = count - 1 - i
+                            pieces[n, i], pieces[n, j] = pieces[n, j], pieces[n, i]
+                            turns[n, i], turns[n, j] = turns[n, j], turns[n, i]
+                    for i in range(count):
+                        if flip:
+                            pieces[n, i] = -pieces[n, i]
+                        if mirror:
+                            turns[n, i] = -turns[n, i]
+                    counts[n] = count
+                    n += 1
+    return n
+
+
+@njit(cache=True, error_model="numpy")
+def word_cost(piece: FloatArray, count: int, radius: float, change_m: float) -> float:
+    """Length, m, of a word, and `change_m` for every change of direction within it."""
+    cost, direction = 0.0, 0.0
+    for i in range(count):
+        cost += abs(piece[i]) * radius
+        if abs(piece[i]) < _EDGE:
+            continue
+        if piece[i] * direction < 0.0:
+            cost += change_m
+        direction = piece[i]
+    return cost
+
+
+@njit(cache=True, error_model="numpy")
+def distance_between(
+    x: float,
+    y: float,
+    phi: float,
+    radius: float,
+    change_m: float,
+    pieces: FloatArray,
+    turns: IntArray,
+    counts: IntArray,
+) -> float:
+    """The least `word_cost` of all words to a pose, m; the arrays are `words_between`'s, to work in."""
+    n = words_between(x / radius, y / radius, phi, pieces, turns, counts)
+    best = math.inf
+    for k in range(n):
+        best = min(best, word_cost(pieces[k], counts[k], radius, change_m))
+    return best
+
+
+def reeds_shepp(
+    start: FloatArray, end: FloatArray, radius: float, change_m: float = 0.0
+) -> tuple[FloatArray, IntArray]:
+    """The shortest way between two poses of a car that drives forward and backward.
+
+    Args:
+        start: (3,) x, y in m and yaw in rad of the rear axle.
+        end: (3,) likewise.
+        radius: m, of the smallest turning circle.
+        change_m: m that a change of direction counts.
+
+    Returns:
+        (k,) signed lengths in m, below 0 backward, and (k,) turns, `LEFT`, `STRAIGHT` or `RIGHT`.
+
+    Example:
+        >>> length, turn = reeds_shepp(np.zeros(3), np.array([0.0, 2.0, np.pi]), radius=1.0)
+        >>> bool(np.isclose(np.abs(length).sum(), np.pi))
+        True
+    """
+    step = np.asarray(end, dtype=np.float64) - start
+    c, s = math.cos(start[2]), math.sin(start[2])
+    x, y = (c * step[0] + s * step[1]) / radius, (c * step[1] - s * step[0]) / radius
+    pieces, turns = np.zeros((MOST_WORDS, PIECES)), np.zeros((MOST_WORDS, PIECES), dtype=np.int64)
+    counts = np.zeros(MOST_WORDS, dtype=np.int64)
+    n = words_between(float(x), float(y), float(step[2]), pieces, turns, counts)
+    costs = [word_cost(pieces[k], int(counts[k]), radius, change_m) for k in range(n)]
+    best = int(np.argmin(costs))
+    kept = np.flatnonzero(np.abs(pieces[best, : counts[best]]) > _EDGE)
+    return pieces[best, kept] * radius, turns[best, kept]

@@ -1,0 +1,366 @@
+"""The planner that parks: clearance against pymunk, paths that touch nothing, tracking, whole parkings."""
+
+import dataclasses
+import json
+import math
+from functools import lru_cache
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from parkenv import InputError, ParkingLot, Traffic
+from parkenv.cli import app
+from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
+from parkenv.driving.parking_task import ParkingTasks
+from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
+from parkenv.evaluation import bench_drive
+from parkenv.evaluation.bench_drive import bare_physics, environment_steps
+from parkenv.evaluation.parking_runs import ParkingCase, park_all, park_once, parking_table
+from parkenv.evaluation.workers import Workers
+from planners.clearance import clearance, room_at, stands_free
+from planners.hybrid_astar import CarPath, SearchSettings, plan_path
+from planners.parking import ParkingAgent
+from planners.path_tracking import PathTracker, TrackingSettings
+
+CAR = VehicleParameters()
+LOTS = ("campus", "street", "jam", "mini")
+DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"
+LOW, HIGH = np.array([-20.0, -20.0]), np.array([20.0, 20.0])
+
+
+@lru_cache
+def tasks_on(lot):
+    return ParkingTasks(ParkingLot.packaged(lot))
+
+
+def planned(task, settings=None):
+    things = task.obstacles
+    target = task.vehicle.at_rear_axle(task.target)
+    return plan_path(task.vehicle, things.corners, things.n_corners, task.start[:3], target, settings)
+
+
+def polygon(rng, k):
+    angle = np.sort(rng.uniform(0.0, 2 * math.pi, k))
+    return rng.uniform(-6.0, 6.0, 2) + rng.uniform(0.3, 2.5) * np.stack(
+        [np.cos(angle), np.sin(angle)], axis=1
+    )
+
+
+@given(seed=st.integers(0, 10**6), k=st.sampled_from([2, 3, 4, 8, 24]))
+@settings(deadline=None, max_examples=60)
+def test_the_planners_check_and_pymunk_agree_on_what_is_touched(seed, k):
+    """Where the footprint grown by a millimetre is free pymunk tells no contact, and likewise the other way."""
+    rng = np.random.default_rng(seed)
+    things = Obstacles.of([(Thing.PARKED_CAR, polygon(rng, k)) for _ in range(4)])
+    if any(len(np.unique(o.round(3), axis=0)) < len(o) for o in things.outlines()):
+        return
+    space = LotSpace(CAR, things)
+    ours = clearance(CAR, things.corners, things.n_corners, LOW, HIGH)
+    for _ in range(20):
+        x, y, yaw = (float(v) for v in rng.uniform([-8.0, -8.0, -math.pi], [8.0, 8.0, math.pi]))
+        touched = bool(space.touched(x, y, yaw))
+        if stands_free(ours, x, y, yaw, 1e-3):
+            assert not touched
+        elif not stands_free(ours, x, y, yaw, -1e-3):
+            assert touched
+
+
+def test_room_is_the_distance_to_what_is_nearest():
+    wall = np.array([[[5.0, -9.0], [5.0, 9.0]]])
+    space = clearance(CAR, wall, np.array([2]), LOW, HIGH)
+    ahead = CAR.length - CAR.rear_overhang
+    assert room_at(space, 5.0 - ahead - 0.3, 0.0, 0.0, 1.0) == pytest.approx(0.3, abs=1e-3)
+    assert room_at(space, 5.0 - 0.5 * CAR.width - 0.2, 0.0, math.pi / 2, 1.0) == pytest.approx(0.2, abs=1e-3)
+    assert room_at(space, 4.0, 0.0, 0.0, 1.0) < 0.0
+    assert not stands_free(space, 19.9, 0.0, 0.0, 0.0), "outside the window nothing is known"
+
+
+@given(seed=st.integers(0, 10**6), lot=st.sampled_from(LOTS))
+@settings(deadline=None, max_examples=25)
+def test_a_path_leads_from_start_to_target_touches_nothing_and_can_be_steered(seed, lot):
+    task = tasks_on(lot).draw(seed)
+    path = planned(task)
+    assert path is not None
+    poses, curvature, direction = path.sampled(0.04)
+    target = task.vehicle.at_rear_axle(task.target)
+    np.testing.assert_allclose(poses[0], task.start[:3])
+    np.testing.assert_allclose(poses[-1, :2], target[:2], atol=1e-6)
+    assert math.remainder(poses[-1, 2] - target[2], 2 * math.pi) == pytest.approx(0.0, abs=1e-6)
+    space = LotSpace(task.vehicle, task.obstacles)
+    assert not any(space.touched(*pose) for pose in poses)
+    assert np.abs(curvature).max() <= 1.0 / task.vehicle.turning_radius
+    assert int((np.diff(direction) != 0).sum()) == path.direction_changes
+    step = np.hypot(*np.diff(poses[:, :2], axis=0).T)
+    assert step.sum() == pytest.approx(path.driven_m, rel=1e-3)
+
+
+def test_without_anything_in_the_way_the_path_is_as_good_as_the_word():
+    from planners.reeds_shepp import reeds_shepp
+
+    nothing = np.empty((0, 2, 2)), np.empty(0, dtype=np.int64)
+    quick = SearchSettings(steer_m=0.0, change_m=0.0)
+    for end in ([8.0, 3.0, 1.0], [-4.0, 2.0, 3.0], [0.0, 3.0, 0.0]):
+        path = plan_path(CAR, *nothing, np.zeros(3), np.array(end), quick)
+        radius = CAR.turning_radius * (1.0 + quick.reserve)
+        length = float(np.abs(reeds_shepp(np.zeros(3), np.array(end), radius)[0]).sum())
+        assert path.driven_m == pytest.approx(length, abs=1e-6)
+
+
+def test_equal_problems_have_equal_paths_and_mirrored_ones_equal_length():
+    task = tasks_on("campus").draw(11)
+    one, two = planned(task), planned(task)
+    np.testing.assert_array_equal(one.length, two.length)
+    mirror = np.array([1.0, -1.0])
+    target = task.vehicle.at_rear_axle(task.target)
+    flipped = plan_path(
+        CAR,
+        task.obstacles.corners * mirror,
+        task.obstacles.n_corners,
+        task.start[:3] * [1.0, -1.0, -1.0],
+        target * [1.0, -1.0, -1.0],
+    )
+    assert flipped.driven_m == pytest.approx(one.driven_m, rel=0.25)
+    assert flipped.direction_changes == one.direction_changes
+
+
+def test_a_slot_that_is_walled_in_has_no_path():
+    task = tasks_on("mini").draw(3)
+    box = task.vehicle.corners(task.vehicle.at_rear_axle(task.target))
+    center = box.mean(axis=0)
+    walls = [(Thing.WALL, center + 1.15 * (box[[i, (i + 1) % 4]] - center)) for i in range(4)]
+    closed = dataclasses.replace(task, obstacles=Obstacles.of(walls))
+    assert planned(closed, SearchSettings(attempts=((0.05, 0.5),))) is None
+    onto = dataclasses.replace(task, obstacles=Obstacles.of([(Thing.WALL, box[[0, 2]])]))
+    assert planned(onto) is None
+
+
+@pytest.mark.parametrize("lengths", [(6.0, 5.0), (-6.0, -5.0), (5.0, -7.0), (3.0, -3.0, 4.0)])
+@pytest.mark.parametrize("bends", [(0.0, 0.2, 0.0), (0.22, -0.22, 0.1)])
+def test_a_path_is_followed_to_the_centimetre_forward_and_in_reverse(lengths, bends):
+    """Off the path by a decimetre at first, the car comes back to it, and stops where the path ends."""
+    path = CarPath(np.zeros(3), np.array(lengths), np.array(bends[: len(lengths)]))
+    tracker = PathTracker(CAR, path)
+    state = np.array([0.0, 0.06, 0.0, 0.0, 0.0, 0.0])
+    offsets = []
+    for _ in range(400):
+        pedal, turn = tracker.command(state[:3], state[SPEED], state[STEERING])
+        if tracker.done:
+            break
+        offsets.append(abs(tracker.offset))
+        for _ in range(2):
+            advance(state, pedal, turn, CAR.limits)
+    assert tracker.done
+    assert max(offsets) <= 0.09
+    end = path.sampled()[0][-1]
+    assert np.hypot(*(state[:2] - end[:2])) < 0.06
+    assert abs(state[2] - end[2]) < 0.03
+    assert state[SPEED] == pytest.approx(0.0, abs=0.01)
+
+
+def test_no_faster_than_asked_for():
+    path = CarPath(np.zeros(3), np.array([25.0, -25.0]), np.zeros(2))
+    tracker = PathTracker(CAR, path, TrackingSettings(speed=1.5, reverse_speed=0.8))
+    state, speeds = np.zeros(6), []
+    while not tracker.done:
+        pedal, turn = tracker.command(state[:3], state[SPEED], state[STEERING])
+        for _ in range(2):
+            advance(state, pedal, turn, CAR.limits)
+            speeds.append(state[SPEED])
+    assert 1.45 < max(speeds) < 1.6
+    assert -0.9 < min(speeds) < -0.75
+
+
+@pytest.mark.parametrize("lot", LOTS)
+def test_the_planner_parks(lot):
+    env, agent = ParkingCase(ParkingLot.packaged(lot)).environment(), ParkingAgent()
+    for seed in range(6):
+        row = park_once(env, agent, seed).row
+        assert row["parked"], row
+        assert row["reason"] == ""
+        assert row["plans"] == 1
+        assert row["time_s"] < 45.0
+
+
+def park_thousand():
+    lots = [ParkingLot.packaged(name) for name in LOTS]
+    cases = [
+        ParkingCase(lots[0], ("perpendicular",)),
+        ParkingCase(lots[0], ("oblique",)),
+        *(ParkingCase(lot) for lot in lots[1:]),
+    ]
+    if DRAGON_LAKE.exists():
+        cases.append(ParkingCase(ParkingLot.from_file(DRAGON_LAKE)))
+    per_case = -(-1000 // len(cases))
+    with Workers(1) as workers:
+        return [p.row for some in park_all(cases, range(1000, 1000 + per_case), workers) for p in some]
+
+
+def test_the_planner_parks_on_an_imported_lot(tmp_path):
+    """Outlines in degrees, without names of lengths, widths or mouths, as maps have them."""
+    path = tmp_path / "imported.geojson"
+    ParkingLot.packaged("mini").to_file(path)
+    document = json.loads(path.read_text())
+    del document["frame"], document["parkenv"]
+
+    def in_degrees(part):
+        if isinstance(part[0], list):
+            return [in_degrees(p) for p in part]
+        return [7.85 + part[0] / (111320.0 * math.cos(math.radians(48.0))), 48.0 + part[1] / 111200.0]
+
+    for feature in document["features"]:
+        kept = ("kind", "oneway", "id")
+        feature["properties"] = {k: v for k, v in feature["properties"].items() if k in kept}
+        feature["geometry"]["coordinates"] = in_degrees(feature["geometry"]["coordinates"])
+    path.write_text(json.dumps(document))
+    env = ParkingCase(ParkingLot.from_file(path)).environment()
+    for seed in range(4):
+        row = park_once(env, ParkingAgent(), seed).row
+        assert row["parked"], row
+        assert row["kind"] == "perpendicular"
+
+
+@pytest.mark.slow
+def test_of_a_thousand_random_parkings_ninety_nine_in_a_hundred_succeed():
+    rows = park_thousand()
+    (overall,) = [row for row in parking_table(rows) if row["kind"] == "all"]
+    assert overall["episodes"] >= 1000
+    assert overall["success"] >= 0.99
+    assert overall["contacts"] <= 0.01 * overall["episodes"]
+    assert {row["kind"] for row in rows} == {"perpendicular", "oblique", "parallel"}
+
+
+def test_stable_baselines_evaluates_the_planner():
+    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    def made():
+        return gym.make("parkenv/Drive-v0", lot="mini", obstacle_map=True)
+
+    rewards, lengths = evaluate_policy(
+        ParkingAgent(), DummyVecEnv([made, made]), n_eval_episodes=4, warn=False, return_episode_rewards=True
+    )
+    assert len(rewards) == 4
+    # A tenth of a second a step, and nothing for the last: nobody touched anything.
+    np.testing.assert_allclose(rewards, -0.1 * (np.array(lengths) - 1), rtol=1e-6)
+
+
+def test_the_planner_waits_for_those_who_move():
+    env = gym.make(
+        "parkenv/Drive-v0", lot="campus", obstacle_map=True, traffic=Traffic(cars=6, pedestrians=10)
+    )
+    rows = [park_once(env, ParkingAgent(), seed).row for seed in range(8)]
+    assert all(row["reason"] in ("", "out of time") for row in rows)
+    assert sum(row["parked"] for row in rows) >= 6
+
+
+def test_an_observation_without_the_map_is_refused():
+    env = gym.make("parkenv/Drive-v0", lot="mini")
+    observation, _ = env.reset(seed=0)
+    with pytest.raises(InputError, match="no 'cars': make the environment with obstacle_map=True"):
+        ParkingAgent().predict(observation)
+
+
+def test_where_no_path_is_the_car_stays_and_that_is_said():
+    env = ParkingCase(ParkingLot.packaged("mini")).environment()
+    no_room = ParkingAgent(search=SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0))
+    parking = next(p for p in (park_once(env, no_room, seed) for seed in range(20)) if not p.row["parked"])
+    assert parking.row["reason"] == "no path was found"
+    assert parking.row["driven_m"] == 0.0
+    table = parking_table([parking.row])
+    assert table[-1]["success"] == 0.0
+    assert table[-1]["contacts"] == 0
+
+
+def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
+    from parkenv.evaluation import parking_runs
+
+    no_room = SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0)
+    monkeypatch.setattr(parking_runs, "ParkingAgent", lambda: ParkingAgent(search=no_room))
+    out = tmp_path / "park"
+    options = ["--lot", "mini", "--way", "back-in", "--episodes", "2", "--slack", "0", "--out", str(out)]
+    result = CliRunner().invoke(app, ["park", "--seed", "3", *options])
+    assert result.exit_code == 0, result.output
+    assert "failed: mini, seed 3" in result.output
+    assert "no path was found" in result.output
+    assert (out / "failures.png").exists()
+    assert not (out / "parkings.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: SearchSettings(greed=0.5), "search greed is 0.5, want at least 1"),
+        (lambda: SearchSettings(attempts=()), "search attempts are"),
+        (lambda: SearchSettings(most_expansions=0), "most_expansions is 0"),
+        (lambda: TrackingSettings(speed=0.0), "tracking speed is 0.0, want above 0"),
+        (lambda: TrackingSettings(firmness=math.nan), "tracking firmness is nan"),
+    ],
+)
+def test_settings_out_of_range_are_refused(make, message):
+    with pytest.raises(InputError, match=message):
+        make()
+
+
+WALL_TIMES = ("decision_ms", "planning_s", "first_planning_s")
+
+
+def test_results_do_not_depend_on_the_number_of_workers():
+    cases = [ParkingCase(ParkingLot.packaged("mini"))]
+
+    def rows(jobs):
+        with Workers(jobs) as workers:
+            return [
+                {k: v for k, v in p.row.items() if k not in WALL_TIMES}
+                for some in park_all(cases, range(3), workers)
+                for p in some
+            ]
+
+    np.testing.assert_equal(rows(1), rows(2))
+
+
+def test_park_writes_its_table_and_pictures(tmp_path):
+    out = tmp_path / "park"
+    result = CliRunner().invoke(app, ["park", "--lot", "mini", "--episodes", "3", "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["rows"][-1]["kind"] == "all"
+    assert summary["rows"][-1]["episodes"] == 3
+    assert sum(row["parked"] for row in summary["rows"][:-1]) == summary["rows"][-1]["parked"]
+    assert len((out / "episodes.csv").read_text().splitlines()) == 4
+    assert (out / "parkings.png").exists()
+    assert (out / "parking.gif").exists()
+    assert not (out / "failures.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--lot", "nowhere"], "nowhere: no such file"),
+        (["--kind", "diagonal"], "--kind has 'diagonal', want some of perpendicular, oblique, parallel"),
+        (["--way", "up"], "--way has 'up', want some of nose-in, back-in"),
+        (["--lot", "mini", "--kind", "parallel"], "'mini' has no slot of the kinds parallel"),
+    ],
+)
+def test_park_refuses_what_is_not_there(options, message, tmp_path):
+    result = CliRunner().invoke(app, ["park", "--out", str(tmp_path / "p"), *options])
+    assert isinstance(result.exception, InputError)
+    assert message in str(result.exception)
+    assert not (tmp_path / "p").exists()
+
+
+def test_bench_says_what_is_not_installed(monkeypatch):
+    monkeypatch.setattr(bench_drive, "find_spec", lambda name: None)
+    rows = bench_drive.drive_rows(seconds=0.02)
+    assert [row["case"] for row in rows if row["value"] is None] == ["highway-env parking-v0: not installed"]
+    assert {row["unit"] for row in rows} == {"physics steps/s", "ms"}
+
+
+def test_the_measured_rates_are_rates():
+    assert bare_physics(0, 0.02) > 1000.0
+    plain, scanning = (environment_steps(a, 0, 0.02) for a in ({}, {"laser": True}))
+    assert plain > scanning > 100.0

@@ -1,0 +1,381 @@
+"""The compiled batch of `parkenv/Search-v0`: parity with the single environment, resets, ends, bad input."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from gymnasium.vector.utils import batch_space
+
+import parkenv  # noqa: F401 - registers the ids
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightBand, SightingModel
+from parkenv.belief import after_look
+from parkenv.envs.local_observation import LocalObservation
+from parkenv.envs.search_vector import ParkSearchVectorEnv
+from parkenv.occupancy import Arrival, ArrivalWindow, Forecast
+from parkenv.occupancy_log import OccupancyLog
+from parkenv.recorded_occupancy import RecordedOccupancy
+from parkenv.scenario import SCENARIO_NAMES
+
+LIMIT = 40
+SIGHTS = {
+    "perfect": SightingModel(),
+    "noisy": SightingModel(8.0, hit_rate=0.9, false_alarm_rate=0.2),
+    "bands": SightingModel(
+        9.0, bands=(SightBand(4.0, True, 0.9, 0.95, 0.1), SightBand(9.0, False, 0.4, 0.8, 0.3))
+    ),
+    "laser": SightingModel.named("laser"),
+    "blind": SightingModel.blind(),
+}
+
+
+class Rumour:
+    """A prior that is neither a process nor a log, and says something else at every hour."""
+
+    def __init__(self, n_slots):
+        self.n_slots = n_slots
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        p = 0.1 + 0.8 * np.linspace(0, 1, self.n_slots) * (arrival.time % 3600) / 3600
+        return Forecast(p, np.full(self.n_slots, 1 / 900))
+
+
+def busy_log(n_slots=6, n_days=12):
+    """A log of weekdays in which slots change every few minutes."""
+    rng = np.random.default_rng(0)
+    days = [f"2015-11-{d:02d}" for d in range(2, 28) if d % 7 not in (0, 1)][:n_days]
+    slot, day, second, taken = [], [], [], []
+    for d in range(len(days)):
+        for s in range(n_slots):
+            times = np.sort(rng.uniform(7 * 3600, 20 * 3600, 150))
+            slot += [s] * len(times)
+            day += [d] * len(times)
+            second += times.tolist()
+            taken += (rng.random(len(times)) < 0.7).tolist()
+    ids = tuple(f"c{i}" for i in range(n_slots))
+    return OccupancyLog(
+        ids, tuple(days), np.array(slot), np.array(day), np.array(second), np.array(taken), 3600.0
+    )
+
+
+def recorded_scenario():
+    lot = ParkingLot.grid(2, 8)
+    occupancy = RecordedOccupancy(busy_log(), lot.walk_m(0))
+    return Scenario(name="log", lot=lot, occupancy=occupancy, arrival=ArrivalWindow.parse("08:00-13:00"))
+
+
+def restless_scenario():
+    """Slots change within seconds, so that worlds go through many stretches while the car looks."""
+    lot = ParkingLot.grid(2, 10)
+    process = OccupancyProcess.from_demand(np.linspace(0, 4, 20), np.sin(np.arange(168)), 15.0)
+    return Scenario(name="restless", lot=lot, occupancy=process, arrival=ArrivalWindow.parse("9:50-10:10"))
+
+
+def make_batch(n, scenario, **options):
+    return gym.make_vec(
+        "parkenv/Search-v0", n, vectorization_mode="vector_entry_point", scenario=scenario, **options
+    )
+
+
+def assert_parity(scenarios, observation="full", n=4, steps=250, k=5, **changes):
+    """Whole episodes, several in a row, of each search of a batch and of the single environment of its seed."""
+    envs = make_batch(n, scenarios, observation=observation, max_episode_steps=LIMIT, k=k, **changes)
+    each = scenarios if isinstance(scenarios, list) else [scenarios]
+    singles = [
+        gym.make("parkenv/Search-v0", scenario=each[i % len(each)], max_episode_steps=LIMIT, **changes)
+        for i in range(n)
+    ]
+    if observation == "local":
+        singles = [LocalObservation(env, k) for env in singles]
+    batch, _ = envs.reset(seed=7)
+    alone = [env.reset(seed=7 + i)[0] for i, env in enumerate(singles)]
+    rng = np.random.default_rng(0)
+    done, episodes = np.zeros(n, dtype=bool), 0
+    for _ in range(steps):
+        for i in range(n):
+            for name, value in alone[i].items():
+                there = batch[name][i]
+                if name == "p_occupied":
+                    assert (there[len(value) :] == 1.0).all()
+                    there = there[: len(value)]
+                np.testing.assert_array_equal(there, value, err_msg=name)
+        # Mostly what the graph has, and now and then what it does not.
+        actions = np.array(
+            [
+                rng.choice(np.flatnonzero(o["action_mask"])) if rng.random() < 0.9 else rng.integers(5)
+                for o in alone
+            ]
+        )
+        batch, rewards, terminated, truncated, info = envs.step(actions)
+        terms = envs.reward_terms
+        for i, env in enumerate(singles):
+            if done[i]:
+                alone[i], _ = env.reset()
+                assert (rewards[i], terminated[i], truncated[i]) == (0.0, False, False)
+                done[i] = False
+                continue
+            alone[i], reward, *ends, metrics = env.step(actions[i])
+            assert (rewards[i], terminated[i], truncated[i]) == (reward, *ends)
+            assert {name: values[i] for name, values in terms.items()} == metrics["reward_terms"]
+            done[i] = any(ends)
+            if done[i]:
+                episodes += 1
+                for name, value in metrics.items():
+                    assert info[f"_{name}"][i]
+                    if name != "reward_terms":
+                        assert info[name][i] == value, name
+    assert episodes >= n
+    return episodes
+
+
+@pytest.mark.parametrize("observation", ["full", "local"])
+@pytest.mark.parametrize("scenario", SCENARIO_NAMES)
+def test_a_batch_is_the_single_environment_many_times(scenario, observation):
+    assert_parity(scenario, observation)
+
+
+@pytest.mark.parametrize("observation", ["full", "local"])
+@pytest.mark.parametrize("sight", SIGHTS)
+def test_whatever_is_seen(sight, observation):
+    assert_parity("mini", observation, sighting=SIGHTS[sight])
+
+
+@pytest.mark.parametrize("observation", ["full", "local"])
+@pytest.mark.parametrize("make", [recorded_scenario, restless_scenario])
+def test_whatever_the_world_is(make, observation):
+    assert_parity(make(), observation)
+
+
+@pytest.mark.parametrize("observation", ["full", "local"])
+def test_whatever_is_foreseen(observation):
+    scenario = Scenario.named("mini")
+    assert_parity(scenario.replace(prior=Rumour(scenario.lot.n_slots)), observation)
+
+
+@pytest.mark.parametrize("observation", ["full", "local"])
+def test_different_lots_in_one_batch(observation):
+    assert_parity([recorded_scenario(), Scenario.named("mini"), Scenario.named("jam")], observation, n=6)
+
+
+def test_different_lots_share_one_space():
+    small, large = Scenario.named("mini"), Scenario.named("street")
+    envs = make_batch(3, [small, large])
+    observation, _ = envs.reset(seed=0)
+    assert observation["p_occupied"].shape == (3, large.lot.n_slots)
+    assert (observation["p_occupied"][[0, 2], small.lot.n_slots :] == 1.0).all()
+    assert envs.single_observation_space["vertex"].n == max(small.lot.n_vertices, large.lot.n_vertices)
+    assert envs.observation_space.contains(observation)
+
+
+def test_what_the_car_finds_is_what_the_world_says():
+    """The compiled search draws worlds lazily in its own way; `World` is asked for the same slots and times."""
+    for scenario in (restless_scenario(), recorded_scenario()):
+        env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+        rng = np.random.default_rng(1)
+        starts, slots = scenario.slots_in_view
+        looks = 0
+        for seed in range(10):
+            observation, _ = env.reset(seed=seed)
+            for _ in range(60):
+                moves = observation["action_mask"].copy()
+                moves[4] = 0
+                observation, _, terminated, _, _ = env.step(rng.choice(np.flatnonzero(moves)))
+                state = env.state
+                view = slots[starts[state.vertex] : starts[state.vertex + 1]]
+                truth = state.world.occupied(view, state.time)
+                np.testing.assert_array_equal(observation["p_occupied"][view], truth)
+                looks += len(view)
+                if terminated:
+                    break
+        assert looks > 1000
+
+
+@pytest.mark.parametrize("observation", ["full", "local"])
+def test_equal_seeds_give_equal_batches_of_any_size(observation):
+    def run(n, seed):
+        envs = make_batch(n, "street", observation=observation, max_episode_steps=LIMIT)
+        seen = [envs.reset(seed=seed)[0]]
+        rng = np.random.default_rng(0)
+        seen += [envs.step(rng.integers(0, 5, 8)[:n])[0] for _ in range(80)]
+        name = "p_occupied" if observation == "full" else "local"
+        return np.array([s[name] for s in seen])
+
+    np.testing.assert_array_equal(run(8, 3), run(8, 3))
+    np.testing.assert_array_equal(run(8, 3)[:, :5], run(5, 3))
+    assert (run(8, 3) != run(8, 4)).any()
+
+
+def test_gymnasium_s_own_batch_of_single_environments_says_the_same():
+    ours = make_batch(3, "mini", max_episode_steps=LIMIT)
+    theirs = gym.make_vec(
+        "parkenv/Search-v0", 3, vectorization_mode="sync", scenario="mini", max_episode_steps=LIMIT
+    )
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    assert ours.single_observation_space == theirs.single_observation_space
+    assert batch_space(ours.single_action_space, 3) == ours.action_space
+    pairs = [(ours.reset(seed=1), theirs.reset(seed=1))]
+    rng = np.random.default_rng(3)
+    for _ in range(150):
+        actions = rng.integers(0, 5, 3)
+        pairs.append((ours.step(actions), theirs.step(actions)))
+        assert ours.observation_space.contains(pairs[-1][0][0])
+    for (observation, *mine), (expected, *other) in pairs:
+        for name, value in expected.items():
+            np.testing.assert_array_equal(observation[name], value)
+            assert observation[name].dtype == value.dtype
+        for value, wanted in zip(mine[:-1], other[:-1], strict=True):
+            np.testing.assert_array_equal(value, wanted)
+            assert value.dtype == wanted.dtype
+
+
+def test_same_step_resets_at_once_and_hands_out_the_end():
+    later = make_batch(4, "mini", max_episode_steps=LIMIT)
+    at_once = make_batch(4, "mini", max_episode_steps=LIMIT, autoreset_mode=AutoresetMode.SAME_STEP)
+    assert at_once.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    rng = np.random.default_rng(5)
+    observation, _ = at_once.reset(seed=2)
+    expected, _ = later.reset(seed=2)
+    ends = 0
+    queue = [[] for _ in range(4)]
+    for _ in range(120):
+        actions = rng.integers(0, 5, 4)
+        observation, rewards, terminated, truncated, info = at_once.step(actions)
+        done = terminated | truncated
+        for i in range(4):
+            queue[i].append((actions[i], rewards[i], done[i]))
+        if done.any():
+            np.testing.assert_array_equal(info["_final_obs"], done)
+            np.testing.assert_array_equal(info["_final_info"], done)
+            for i in np.flatnonzero(done):
+                ends += 1
+                final = info["final_info"]
+                assert final["_total_s"][i]
+                assert final["total_s"][i] == pytest.approx(-sum(r for _, r, _ in queue[i]))
+                # What comes next is the next episode's beginning, not the end that is in final_obs.
+                assert observation["time"][i, 1] == 0.0
+                assert info["final_obs"][i]["time"][1] > 0.0 or final["parked"][i]
+                queue[i] = []
+    assert ends > 4
+    np.testing.assert_array_equal(expected["vertex"].shape, observation["vertex"].shape)
+
+
+def test_disabled_wants_those_that_ended_to_be_reset():
+    envs = make_batch(3, "mini", max_episode_steps=2, autoreset_mode="Disabled")
+    envs.reset(seed=0)
+    for _ in range(2):
+        *_, terminated, truncated, _ = envs.step(np.full(3, 2))
+    done = terminated | truncated
+    assert done.all()
+    with pytest.raises(gym.error.ResetNeeded, match="search 0 is over"):
+        envs.step(np.zeros(3, dtype=int))
+    observation, _ = envs.reset(options={"reset_mask": np.array([True, False, True])})
+    assert observation["time"][0, 1] == observation["time"][2, 1] == 0.0
+    assert observation["time"][1, 1] > 0.0
+    with pytest.raises(gym.error.ResetNeeded, match="search 1 is over"):
+        envs.step(np.zeros(3, dtype=int))
+
+
+def test_a_sequence_of_seeds_and_resets_without_one():
+    envs = make_batch(3, "mini")
+    first, _ = envs.reset(seed=[9, 9, 4])
+    np.testing.assert_array_equal(first["time"][0], first["time"][1])
+    single = gym.make("parkenv/Search-v0", scenario="mini")
+    single.reset(seed=4)
+    np.testing.assert_array_equal(envs.reset()[0]["time"][2], single.reset()[0]["time"])
+    kept, _ = envs.reset(seed=[None, 9, None])
+    np.testing.assert_array_equal(kept["time"][1], first["time"][1])
+    assert kept["time"][0, 0] != first["time"][0, 0]
+
+
+def test_what_is_handed_out_is_not_live_unless_asked():
+    for copy in (True, False):
+        envs = make_batch(4, "mini", copy=copy)
+        envs.reset(seed=0)
+        observation, rewards, *_ = envs.step(np.full(4, 3))
+        before = {name: value.copy() for name, value in observation.items()}, rewards.copy()
+        for action in (0, 1, 2, 3, 4):
+            envs.step(np.full(4, action))
+        same = all((observation[name] == value).all() for name, value in before[0].items())
+        assert same == copy
+        assert (rewards == before[1]).all() == copy
+
+
+def test_a_lot_of_ten_thousand_slots_touches_only_what_is_near():
+    scenario = Scenario.on_lot(ParkingLot.city(10_000))
+    envs = make_batch(2, scenario, observation="local")
+    observation, _ = envs.reset(seed=0)
+    assert (
+        observation["local"].shape
+        == make_batch(2, "mini", observation="local").reset(seed=0)[0]["local"].shape
+    )
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        envs.step(rng.integers(0, 4, 2))
+    from parkenv.envs.search_step import N_TOUCHED
+
+    assert 0 < envs._search.counts[:, N_TOUCHED].max() < 600
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"num_envs": 0}, "num_envs is 0, want a whole number of at least 1"),
+        ({"num_envs": -3}, "num_envs is -3"),
+        ({"num_envs": 2.5}, "num_envs is 2.5"),
+        ({"num_envs": True}, "num_envs is True"),
+        ({"max_episode_steps": 0}, "max_episode_steps is 0"),
+        ({"observation": "raw"}, "observation is 'raw', want one of full, local"),
+        ({"observation": "local", "k": 0}, "k is 0"),
+        ({"autoreset_mode": "Sometimes"}, "autoreset_mode is 'Sometimes', want one of NextStep"),
+        ({"scenario": []}, "scenario is an empty sequence"),
+        ({"scenario": ["mini", 3]}, "scenario is a int"),
+        ({"scenario": "moon"}, "unknown scenario 'moon'"),
+        ({"failure_cost": 3.0}, "no field 'failure_cost'"),
+        ({"render_mode": "rgb_array"}, "render_mode is 'rgb_array'"),
+    ],
+)
+def test_wrong_arguments_are_refused_by_name(wrong, message):
+    with pytest.raises(InputError, match=message):
+        ParkSearchVectorEnv(**({"scenario": "mini"} | wrong))
+
+
+def test_wrong_use_is_refused():
+    envs = make_batch(2, "mini")
+    with pytest.raises(gym.error.ResetNeeded):
+        envs.step(np.zeros(2, dtype=int))
+    with pytest.raises(InputError, match="no option but reset_mask, got speed"):
+        envs.reset(options={"speed": 1})
+    with pytest.raises(InputError, match="seed holds 3 numbers, want 2"):
+        envs.reset(seed=[1, 2, 3])
+    with pytest.raises(InputError, match="leaves out"):
+        envs.reset(options={"reset_mask": np.array([True, False])})
+    envs.reset(seed=0)
+    with pytest.raises(InputError, match="reset_mask has shape"):
+        envs.reset(options={"reset_mask": np.array([True])})
+    for wrong in (np.zeros(3, dtype=int), np.zeros(2), np.zeros((2, 1), dtype=int)):
+        with pytest.raises(InputError, match="actions have shape"):
+            envs.step(wrong)
+    before = envs._search.counts.copy()
+    for wrong in (5, -1):
+        with pytest.raises(InputError, match=rf"actions\[1\] is {wrong}, want a number from 0 to 4"):
+            envs.step(np.array([0, wrong]))
+    np.testing.assert_array_equal(envs._search.counts, before, err_msg="a refused step changes nothing")
+
+
+def test_a_world_of_another_kind_is_refused():
+    class Empty(Rumour):
+        def draw_arrival(self, window, key):
+            return Arrival(0.0)
+
+        def world(self, key, arrival):
+            return None
+
+    scenario = Scenario.named("mini").replace(occupancy=Empty(10))
+    with pytest.raises(
+        InputError, match="occupancy is a Empty, want an OccupancyProcess or a RecordedOccupancy"
+    ):
+        ParkSearchVectorEnv(2, scenario)
+
+
+def test_looks_are_bayes_rule():
+    assert after_look(0.5, False, 0.9, 0.2) == pytest.approx(0.1 * 0.5 / (0.1 * 0.5 + 0.8 * 0.5))

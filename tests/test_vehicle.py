@@ -1,0 +1,202 @@
+"""The car that drives: closed forms of the kinematic bicycle, limits, rest, symmetry; what it touches."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from parkenv import InputError
+from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
+from parkenv.driving.vehicle import (
+    ACCELERATION,
+    PHYSICS_S,
+    SPEED,
+    STEERING,
+    YAW,
+    VehicleParameters,
+    X,
+    Y,
+    advance,
+    drive,
+    move_along,
+)
+
+CAR = VehicleParameters()
+commands = st.lists(st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)), min_size=1, max_size=60)
+
+
+def driven(pairs, start=None):
+    """The states that a row of commands leads through, one a step."""
+    states = [np.zeros(6) if start is None else np.array(start, dtype=float)]
+    for acceleration, steering in pairs:
+        states.append(drive(CAR, states[-1], acceleration, steering)[-1])
+    return np.array(states)
+
+
+@given(steering=st.floats(0.05, 1.0), speed=st.floats(0.2, 3.0), side=st.sampled_from([-1.0, 1.0]))
+@settings(deadline=None)
+def test_the_rear_axle_runs_on_a_circle_of_wheelbase_over_tan_steering(steering, speed, side):
+    angle = side * steering * CAR.max_steering
+    radius = CAR.wheelbase / math.tan(angle)
+    path = drive(CAR, [0.0, 0.0, 0.0, speed, angle, 0.0], 0.0, side * steering, steps=400)
+    away = np.hypot(path[:, X], path[:, Y] - radius)
+    np.testing.assert_allclose(away, abs(radius), rtol=1e-9)
+    assert np.allclose(path[:, SPEED], speed)
+
+
+def test_the_default_car_turns_within_eleven_metres_from_kerb_to_kerb():
+    outer_wheel = math.hypot(CAR.turning_radius + 0.775, CAR.wheelbase)
+    assert 2 * outer_wheel == pytest.approx(10.9, abs=0.05)
+
+
+@given(steering=st.floats(-1.0, 1.0), steps=st.integers(1, 200))
+@settings(deadline=None)
+def test_a_car_at_rest_stays_where_it_is(steering, steps):
+    """Turning the wheels moves nothing."""
+    path = drive(CAR, np.array([3.0, -2.0, 0.7, 0.0, 0.0, 0.0]), 0.0, steering, steps)
+    assert (path[:, :3] == path[0, :3]).all()
+    assert (path[:, SPEED] == 0.0).all()
+
+
+@given(pairs=commands)
+@settings(deadline=None)
+def test_all_limits_and_rates_are_kept(pairs):
+    states = driven(pairs)
+    change = np.abs(np.diff(states, axis=0))
+    assert (np.abs(states[:, STEERING]) <= CAR.max_steering).all()
+    assert (change[:, STEERING] <= CAR.steering_rate * PHYSICS_S + 1e-12).all()
+    assert (states[:, SPEED] <= CAR.max_speed).all()
+    assert (states[:, SPEED] >= -CAR.max_reverse_speed).all()
+    assert (change[:, SPEED] <= CAR.max_braking * PHYSICS_S + 1e-12).all()
+    faster = np.abs(states[1:, SPEED]) > np.abs(states[:-1, SPEED]) + 1e-12
+    assert (change[faster, SPEED] <= CAR.max_acceleration * PHYSICS_S + 1e-12).all()
+    # Only coming to rest and meeting a limit of the speed end an acceleration at once.
+    held = states[:, ACCELERATION]
+    ended = held[1:] == 0.0
+    assert (np.abs(np.diff(held))[~ended] <= CAR.acceleration_rate * PHYSICS_S + 1e-9).all()
+
+
+@given(speed=st.floats(0.01, 8.0) | st.floats(-3.0, -0.01), brake=st.floats(0.05, 1.0))
+@settings(deadline=None)
+def test_brakes_take_energy_bring_the_car_to_rest_and_hold_it(speed, brake):
+    path = drive(CAR, [0.0, 0.0, 0.0, speed, 0.0, 0.0], -math.copysign(brake, speed), 0.0, steps=1)
+    states = [path[-1]]
+    while states[-1][SPEED] != 0.0:
+        states.append(drive(CAR, states[-1], -math.copysign(brake, speed), 0.0)[-1])
+        assert abs(states[-1][SPEED]) < abs(states[-2][SPEED])
+        assert states[-1][SPEED] * speed >= 0.0
+    rest = drive(CAR, states[-1], 0.0, 0.0, steps=10)
+    assert (rest[:, X] == rest[0, X]).all()
+
+
+def test_the_way_to_a_halt_is_that_of_constant_braking():
+    soft = dataclasses.replace(CAR, acceleration_rate=1e6)
+    state = np.array([0.0, 0.0, 0.0, 5.0, 0.0, 0.0])
+    while state[SPEED] > 0.0:
+        advance(state, -1.0, 0.0, soft.limits)
+    assert state[X] == pytest.approx(5.0**2 / (2 * soft.max_braking), rel=1e-12)
+
+
+@given(pairs=commands, speed=st.floats(-3.0, 3.0))
+@settings(deadline=None)
+def test_left_and_right_are_mirror_images(pairs, speed):
+    left = driven(pairs, [0.0, 0.0, 0.0, speed, 0.0, 0.0])
+    right = driven([(a, -s) for a, s in pairs], [0.0, 0.0, 0.0, speed, 0.0, 0.0])
+    np.testing.assert_array_equal(left * [1, -1, -1, 1, -1, 1], right)
+
+
+@given(curvature=st.floats(-0.3, 0.3), way=st.floats(-4.0, 4.0), pieces=st.integers(2, 20))
+@settings(deadline=None)
+def test_an_arc_in_pieces_is_the_same_arc(curvature, way, pieces):
+    """Exact integration: the step's length makes no difference."""
+    there = (1.0, 2.0, 0.5)
+    for _ in range(pieces):
+        there = move_along(*there, curvature, way / pieces)
+    np.testing.assert_allclose(there, move_along(1.0, 2.0, 0.5, curvature, way), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"length": 0.0}, "vehicle length is 0.0, want a finite number above 0"),
+        ({"width": float("nan")}, "vehicle width is nan"),
+        ({"wheelbase": 4.0}, "want both within the length"),
+        ({"max_steering": 1.6}, "below a right angle"),
+        ({"max_speed": 50.0}, "half a length in a step"),
+        ({"max_braking": "much"}, "vehicle max_braking is 'much'"),
+    ],
+)
+def test_a_car_that_cannot_be_is_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        dataclasses.replace(CAR, **change)
+
+
+@given(
+    speed=st.floats(0.5, CAR.max_speed),
+    offset=st.floats(-0.85, 0.85),
+    phase=st.floats(0.0, 1.0),
+    angle=st.floats(-1.2, 1.2),
+)
+@settings(deadline=None, max_examples=60)
+def test_nothing_is_passed_through_at_any_allowed_speed(speed, offset, phase, angle):
+    """A wall of no thickness and a pole across the way are touched, wherever a step ends."""
+    along = np.array([math.sin(angle), math.cos(angle)])
+    at = np.array([12.0 + phase, offset])
+    wall = np.stack([at - 0.05 * along, at + 0.05 * along])
+    space = LotSpace(CAR, Obstacles.of([(Thing.WALL, wall)]))
+    state = np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])
+    while state[X] < 20.0:
+        advance(state, 0.0, 0.0, CAR.limits)
+        if space.touched(*state[:3]):
+            break
+    assert state[X] + CAR.length - CAR.rear_overhang >= 12.0 - 0.05
+    assert state[X] < 12.5
+
+
+@pytest.mark.parametrize("thing", [t for t in Thing if t is not Thing.NOTHING])
+def test_what_is_touched_is_named(thing):
+    outline = np.array([[6.0, -1.0], [7.0, -1.0], [7.0, 1.0], [6.0, 1.0]])
+    if thing in (Thing.MOVING_CAR, Thing.PEDESTRIAN):
+        space = LotSpace(CAR, Obstacles.of([]), [(thing, outline - [6.5, 0.0])])
+        space.move([[30.0, 0.0, 0.0]])
+        assert space.touched(0.0, 0.0, 0.0) == Thing.NOTHING
+        space.move([[4.0, 0.0, 0.3]])
+        assert space.touched(0.0, 0.0, 0.0) == thing
+    else:
+        line = outline[:2] + np.array([0.0, 0.9]) if thing in (Thing.KERB, Thing.WALL) else outline
+        space = LotSpace(CAR, Obstacles.of([(thing, line)]))
+        assert space.touched(0.0, 1.5, 0.0) == Thing.NOTHING
+        assert space.touched(3.0, 0.0, 0.0) == thing
+        assert space.touched(0.0, 1.5, 0.0) == Thing.NOTHING
+
+
+def test_of_several_things_the_same_one_is_named_in_any_order():
+    car = (Thing.PARKED_CAR, np.array([[3.0, -1.0], [4.0, -1.0], [4.0, 1.0], [3.0, 1.0]]))
+    kerb = (Thing.KERB, np.array([[3.0, -1.0], [3.0, 1.0]]))
+    for things in ([car, kerb], [kerb, car]):
+        assert LotSpace(CAR, Obstacles.of(things)).touched(0.0, 0.0, 0.0) == Thing.PARKED_CAR
+
+
+def test_obstacles_that_do_not_fit_together_are_refused():
+    corners = np.zeros((2, 4, 2))
+    with pytest.raises(InputError, match="obstacles: corners"):
+        Obstacles(corners, np.array([4]), np.array([1, 1]))
+    with pytest.raises(InputError, match="n_corners 4 to 5, want 2 to 4"):
+        Obstacles(corners, np.array([4, 5]), np.array([1, 1]))
+    with pytest.raises(InputError, match="not finite"):
+        Obstacles(corners + np.nan, np.array([4, 4]), np.array([1, 1]))
+
+
+def test_corners_and_middle_agree():
+    pose = np.array([2.0, -1.0, 0.8])
+    corners = CAR.corners(pose)
+    np.testing.assert_allclose(corners.mean(axis=0), CAR.at_middle(pose)[:2])
+    np.testing.assert_allclose(CAR.at_rear_axle(CAR.at_middle(pose)), pose)
+    sides = np.hypot(*np.diff(corners[[0, 1, 2]], axis=0).T)
+    np.testing.assert_allclose(sides, [CAR.length, CAR.width])
+    assert corners.shape == (4, 2)
+    assert CAR.corners(np.zeros((5, 3))).shape == (5, 4, 2)
+    assert YAW == 2
