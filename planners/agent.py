@@ -124,22 +124,30 @@ def require_sight(name: str, problem: SearchProblem) -> None:
         )
 
 
-def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) -> SearchAgent[Any]:
+def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) -> Agent:
     """Make an agent that knows the scenario's public part: lot, goal, speeds and costs.
 
     Args:
-        name: one of `AGENT_NAMES` or `SMALL_LOTS_ONLY`.
+        name: one of `AGENT_NAMES` or `SMALL_LOTS_ONLY`; or `ALGORITHM:FILE` for a model of `parkenv train`, such as
+            `ppo:models/ppo.zip`.
         scenario: the scenario; what stands in its slots is kept from the agent.
         options: the agent's own, such as `failure_s=5.0` of "mdp".
 
     Raises:
         InputError: an unknown name or option; the message lists the known ones.
     """
+    algorithm, colon, file = name.partition(":")
+    if colon:
+        if options:
+            raise InputError(f"agent {name!r} has no options; got {', '.join(options)}")
+        learned: Agent = import_module("planners.learned").LearnedAgent(scenario, algorithm, file)
+        return learned
     try:
         module, class_name = _AGENTS[name]
     except KeyError:
-        raise InputError(f"unknown agent {name!r}; known: {', '.join(_AGENTS)}") from None
-    agent: Callable[..., SearchAgent[Any]] = getattr(import_module(module), class_name)
+        models = "and ALGORITHM:FILE for a trained model"
+        raise InputError(f"unknown agent {name!r}; known: {', '.join(_AGENTS)}, {models}") from None
+    agent: Callable[..., Agent] = getattr(import_module(module), class_name)
     known = [p for p in inspect.signature(agent).parameters if p != "problem"]
     for option in options:
         if option not in known:

@@ -20,6 +20,7 @@ from parkenv.cli import (
     sensors,
     sight,
     survey,
+    train,
 )
 from parkenv.errors import InputError
 from sim_sensors.errors import SensorError
@@ -35,6 +36,7 @@ app = typer.Typer(
 )
 app.command("compare")(compare.compare)
 app.command("plan")(plan.plan)
+app.command("park")(park.park)
 app.add_typer(lot.app, name="lot")
 app.add_typer(occupancy.app, name="occupancy")
 app.add_typer(sensors.app, name="sensors")
@@ -45,7 +47,7 @@ app.command("fit-sight")(sight.fit_sight)
 app.command("detect")(detect.detect)
 app.command("train-detector")(detect.train_detector)
 app.command("evaluate-detector")(detect.evaluate_detector)
-app.command("park")(park.park)
+app.command("train")(train.train)
 app.command("bench")(bench.bench)
 app.add_typer(benchmark.app, name="benchmark")
 

@@ -171,6 +171,18 @@ def run_cases(
                 warnings.warn(message, stacklevel=2)
 
 
+def rows_of(names: Sequence[str], scenario: Scenario, seeds: Sequence[int], workers: Workers) -> list[Row]:
+    """A row for each agent, as `table` has them, of searches of which nothing else is kept."""
+    cases = [Case(scenario, name) for name in names]
+    blocks = [(case, block) for case in cases for block in _blocks(seeds, BLOCK)]
+    episodes: dict[str, list[Row]] = {case.agent: [] for case in cases}
+    for number, (rows, _) in workers.results([partial(case.run, block) for case, block in blocks]):
+        episodes[blocks[number][0].agent] += rows
+    by_seed = {name: sorted(rows, key=lambda row: row["seed"]) for name, rows in episodes.items()}
+    first = by_seed[names[0]]
+    return [summarize(c.columns, by_seed[c.agent], None if i == 0 else first) for i, c in enumerate(cases)]
+
+
 def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
     """Make sure that the scenario has a world and a forecast for every search, before anything is written.
 

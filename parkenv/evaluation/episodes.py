@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from parkenv.envs.search import SearchState
 from parkenv.scenario import Scenario
-from planners.agent import SearchAgent
+from planners.agent import Agent
 from planners.oracle import OracleAgent, best_slot
 from planners.routes import DriveRoutes
 
@@ -65,9 +65,7 @@ class EpisodeRunner:
         rig: of `parkenv/SearchPerception-v0`, to look through its sensors; None for `parkenv/Search-v0`.
     """
 
-    def __init__(
-        self, scenario: Scenario, name: str, agent: SearchAgent[Any], rig: str | None = None
-    ) -> None:
+    def __init__(self, scenario: Scenario, name: str, agent: Agent, rig: str | None = None) -> None:
         self.scenario = scenario
         self.name = name
         self.agent = agent
@@ -76,6 +74,10 @@ class EpisodeRunner:
             if rig is None
             else gym.make("parkenv/SearchPerception-v0", scenario=scenario, rig=rig)
         )
+        if (k := getattr(agent, "local_k", None)) is not None:
+            from parkenv.envs.local_observation import LocalObservation
+
+            self.env = LocalObservation(self.env, k)
         self._routes = DriveRoutes(scenario)
 
     def bound_s(self, seed: int) -> float:

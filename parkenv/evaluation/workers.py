@@ -167,7 +167,8 @@ def _run_by_ray(tasks: dict[int, Task[Result]]) -> Iterator[tuple[int, Result]]:
     ray = importlib.import_module("ray")
     remote = ray.remote(num_cpus=1, max_retries=LOSSES)(_numbered)
     ahead = 2 * int(ray.cluster_resources().get("CPU", 1))
-    waiting, running = list(tasks.items())[::-1], []
+    waiting = list(tasks.items())[::-1]
+    running: list[Any] = []
     while waiting or running:
         while waiting and len(running) < ahead:
             running.append(remote.remote(*waiting.pop()))
