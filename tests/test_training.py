@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
@@ -142,18 +143,20 @@ def test_a_training_goes_on_from_its_checkpoint(trained, tmp_path):
     assert ModelCard.of_file(folder / "checkpoint.zip").steps == curve[-1]["steps"]
 
 
+@pytest.mark.slow
 def test_imitation_begins_near_the_planner():
-    shown = Demonstrations.collect("mdp", SCENARIO, range(5_000_000, 5_000_400))
+    campus = Scenario.named("campus")
+    shown = Demonstrations.collect("first-free", campus, range(5_000_000, 5_000_300))
     assert shown.local.shape == (len(shown.actions), 86)
-    assert (shown.masks[np.arange(len(shown.actions)), shown.actions] == 1).mean() > 0.99
+    assert (shown.masks[np.arange(len(shown.actions)), shown.actions] == 1).all()
     assert (shown.times > 0.0).all()
-    venv = SearchVecEnv(4, SCENARIO, reward_scale=0.01, max_episode_steps=MAX_STEPS)
-    model = PPO("MultiInputPolicy", venv, seed=0, policy_kwargs={"net_arch": [64, 64]})
-    fresh, _ = examined(model, SCENARIO, EXAMINED, 5)
-    clone(model, shown, 0)
-    cloned, _ = examined(model, SCENARIO, EXAMINED, 5)
-    planner = np.mean([row["total_s"] for row in Case(SCENARIO, "mdp").run(EXAMINED)[0]])
-    # The mean is of those few searches in which a clone drives in circles.
+    venv = SearchVecEnv(4, campus, reward_scale=0.01, max_episode_steps=MAX_STEPS)
+    model = MaskablePPO("MultiInputPolicy", venv, seed=0, policy_kwargs={"net_arch": [64, 64]})
+    fresh, _ = examined(model, campus, EXAMINED, 5)
+    clone(model, shown, 0, updates=2000)
+    cloned, _ = examined(model, campus, EXAMINED, 5)
+    planner = np.mean([row["total_s"] for row in Case(campus, "first-free").run(EXAMINED)[0]])
+    # The mean would be of those few searches in which a clone drives in circles.
     assert np.median(cloned) < 1.2 * planner < np.median(fresh)
 
 

@@ -15,7 +15,8 @@ from parkenv.evaluation.recipes import MAX_STEPS, REWARD_SCALE
 from parkenv.scenario import Scenario
 from planners.agent import make_agent
 
-EPOCHS = 12
+UPDATES = 3000
+"""Steps of the optimizer, enough for a policy that seldom strays from what it was shown."""
 BATCH = 512
 LEARNING_RATE = 1e-3
 
@@ -67,13 +68,14 @@ class Demonstrations:
         return cls(agent, np.stack(local), np.stack(masks), np.array(actions), np.concatenate(times))
 
 
-def clone(model: OnPolicyAlgorithm, shown: Demonstrations, seed: int) -> None:
+def clone(model: OnPolicyAlgorithm, shown: Demonstrations, seed: int, updates: int = UPDATES) -> None:
     """Fit a model's policy to what was shown, and its values to how long the searches took from there.
 
     Args:
         model: fresh, of ppo or maskable-ppo.
         shown: what to imitate.
         seed: of the order in which it is looked at.
+        updates: steps of the optimizer.
     """
     import torch
 
@@ -82,14 +84,13 @@ def clone(model: OnPolicyAlgorithm, shown: Demonstrations, seed: int) -> None:
     returns = torch.as_tensor(-REWARD_SCALE * shown.times, dtype=torch.float32)
     actions = torch.as_tensor(shown.actions)
     observed = {"local": torch.as_tensor(shown.local), "action_mask": torch.as_tensor(shown.masks)}
-    for _ in range(EPOCHS):
-        for rows in np.array_split(rng.permutation(len(actions)), max(1, len(actions) // BATCH)):
-            chosen = torch.as_tensor(rows)
-            values, log_prob, _ = policy.evaluate_actions(
-                {name: values[chosen] for name, values in observed.items()}, actions[chosen]
-            )
-            misjudged = torch.nn.functional.mse_loss(values.flatten(), returns[chosen])
-            loss = 0.5 * misjudged - log_prob.mean()
-            optimizer.zero_grad()
-            loss.backward()
-            optimizer.step()
+    for _ in range(updates):
+        chosen = torch.as_tensor(rng.integers(len(actions), size=BATCH))
+        values, log_prob, _ = policy.evaluate_actions(
+            {name: values[chosen] for name, values in observed.items()}, actions[chosen]
+        )
+        misjudged = torch.nn.functional.mse_loss(values.flatten(), returns[chosen])
+        loss = 0.5 * misjudged - log_prob.mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
