@@ -175,6 +175,22 @@ def test_the_sweep_over_failure_costs_tells_seen_slots_from_unseen_ones(tmp_path
     assert tries["mini-unseen", 120.0]["failed_parks"] > 0.0
 
 
+def test_agents_may_be_given_maps_that_are_wrong(tmp_path):
+    done = parkenv(
+        "compare", "--scenario", "mini", "--agents", "mdp,first-free,oracle", "-n", 12, "--map-says", "0,0.5,1",
+        "--occupancy-levels", "none", "--jobs", 1, "--out", tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "summary.json").read_text())["rows"]
+    total = {(row["scenario"], row["agent"]): row["total_s"] for row in rows}
+    worlds = ("mini", *(f"mini-map-says-{p}" for p in ("0", "0.5", "1")))
+    assert {name for name, _ in total} == set(worlds)
+    assert len({total[name, "oracle"] for name in worlds}) == 1, "the worlds are the same"
+    assert len({total[name, "mdp"] for name in worlds}) > 1, "the maps are not"
+    assert (tmp_path / "time_against_map_mini.png").exists()
+    assert not (tmp_path / "time_split_mini-map-says-1.png").exists()
+
+
 def test_where_the_optimum_is_known_the_table_says_how_far_off_others_are(tmp_path):
     done = parkenv(*small(tmp_path, agents="exact,greedy-drive", episodes=6))
     assert done.returncode == 0, done.stderr

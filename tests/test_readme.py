@@ -17,12 +17,14 @@ def blocks(language):
 
 
 def test_the_ten_lines_run_as_printed():
-    (program,) = blocks("python")
+    program, more = blocks("python")
     assert len([line for line in program.splitlines() if line.strip()]) <= 11
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True
     )
     assert re.fullmatch(r"\d+ s, of which \d+ s on foot\n", done.stdout)
+    imports = "import gymnasium as gym\nimport parkenv\n"
+    subprocess.run([sys.executable, "-c", imports + more], timeout=300, check=True)
 
 
 def test_links_and_pictures_exist():

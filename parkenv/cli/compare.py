@@ -29,6 +29,8 @@ Row = dict[str, Any]
 ON_SIGHT = ("belief", "mdp-tuned", "exact")
 """Agents that refuse problems in which slots are seen only by trying."""
 DEFAULT_AGENTS = "mdp,mdp-static,mdp-tuned,belief,greedy-goal,greedy-drive,first-free,random,oracle"
+MAP_SAYS = "-map-says-"
+"""What stands between the names of scenarios with maps that are wrong on purpose and what these say."""
 LEVELS = "0.5,0.7,0.8,0.9,0.95,0.99"
 
 
@@ -81,6 +83,16 @@ def compare(
             "time against occupancy. A recorded world is as full as it is: its searches are binned instead.",
         ),
     ] = LEVELS,
+    map_says: Annotated[
+        str | None,
+        typer.Option(
+            "--map-says",
+            metavar="P[,P...]",
+            help="Also with maps that are wrong on purpose: they say of every slot that it is taken with this "
+            "probability. Draws total time against it.",
+            rich_help_panel=args.WORLD,
+        ),
+    ] = None,
     solver: Annotated[
         str,
         typer.Option(
@@ -149,6 +161,8 @@ def compare(
     }  # fmt: skip
     for name in names:
         make_agent(name, scenarios[0], **options.get(name, {}))
+    maps = _maps(map_says, scenarios)
+    scenarios += [flat for flat, _ in maps.values()]
     if sweeps:
         scenarios = [s for its in scenarios for s in (its, unseen(its))]
 
@@ -164,7 +178,7 @@ def compare(
     sweep = [
         (Case(setting, name, level, rig, options.get(name, {})), fewer)
         for s in scenarios
-        if isinstance(s.occupancy, OccupancyProcess)
+        if isinstance(s.occupancy, OccupancyProcess) and s.name not in maps
         for level in levels
         for setting in settings_of(at_occupancy(s, level), failure, walk[:1], drive[:1])
         for name in names
@@ -181,6 +195,7 @@ def compare(
         "view_range": view_range,
         "sight": repr(scenarios[0].sighting),
         "sensors": rig,
+        "map_says": map_says,
         "options": options,
     }
     out = out or Path("results/compare")
@@ -213,8 +228,25 @@ def compare(
             if sweeps:
                 _draw_sweep(out, rows)
             else:
-                _draw(out, rows, sweep_rows, cases, folder, seed)
+                drawn = [(case, its) for case, its in cases if case.scenario.name not in maps]
+                _draw(out, [r for r in rows if r["scenario"] not in maps], sweep_rows, drawn, folder, seed)
+            if maps:
+                _draw_maps(out, rows, {name: said for name, (_, said) in maps.items()})
     console.print(f"Episodes, summary and figures are in {out}")
+
+
+def _maps(text: str | None, scenarios: list[Any]) -> dict[str, tuple[Any, float]]:
+    """Scenarios with flat maps and what these say, by name."""
+    from parkenv.flat_map import FlatMap
+
+    made = {}
+    for said in [] if text is None else sorted(args.numbers("--map-says", text)):
+        if not 0.0 <= said <= 1.0:
+            raise InputError(f"--map-says has {said:g}, want probabilities from 0 to 1")
+        for s in scenarios:
+            name = f"{s.name}{MAP_SAYS}{said:g}"
+            made[name] = (s.replace(name=name, prior=FlatMap(said, s.prior or s.occupancy)), said)
+    return made
 
 
 def _levels(text: str) -> list[float]:
@@ -309,6 +341,21 @@ def _seconds(value: float, signed: bool = False) -> str:
 
 PICTURED = ("greedy-goal", "first-free", "oracle")
 """Agents whose paths are drawn beside the first agent's."""
+
+
+def _draw_maps(out: Path, rows: list[Any], said: dict[str, float]) -> None:
+    from parkenv.evaluation.time_figures import save_time_against_map
+
+    # At the first of the costs and speeds, whatever else was asked for.
+    setting = {c: rows[0][c] for c in ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")}
+    rows = [row for row in rows if setting.items() <= row.items()]
+    for name in dict.fromkeys(flat.partition(MAP_SAYS)[0] for flat in said):
+        flat = [
+            row for row in rows if row["scenario"].partition(MAP_SAYS)[0] == name and row["scenario"] in said
+        ]
+        own = [row for row in rows if row["scenario"] == name]
+        path = out / f"time_against_map_{name}.png"
+        save_time_against_map(flat, own, lambda row: said[row["scenario"]], path)
 
 
 def _draw_sweep(out: Path, rows: list[Any]) -> None:

@@ -124,9 +124,8 @@ def train(
     _claim(out, settings, resume, overwrite)
     console = make_console()
     examined = range(EXAMINED_FROM, EXAMINED_FROM + examined_on)
-    at_test = range(TESTED_FROM, TESTED_FROM + 4 * examined_on)
+    at_test = range(TESTED_FROM, TESTED_FROM + 2 * examined_on)
     with args.workers_of(jobs, backend, address) as workers:
-        lines, tables = _planner_times(console, workers, compared, worlds[0], tested, examined, at_test)
         demonstrations = None
         if imitate is not None:
             from parkenv.evaluation.cloning import Demonstrations
@@ -140,6 +139,7 @@ def train(
         )
         numbers = range(seed, seed + seeds)
         curves = _train_all(console, training, numbers, out, workers)
+        lines, tables = _planner_times(console, workers, compared, worlds[0], tested, examined, at_test)
     rows, transfer = [], []
     with console.status("Testing"):
         for number, curve in zip(numbers, curves, strict=True):

@@ -174,7 +174,7 @@ def run_cases(
 def rows_of(names: Sequence[str], scenario: Scenario, seeds: Sequence[int], workers: Workers) -> list[Row]:
     """A row for each agent, as `table` has them, of searches of which nothing else is kept."""
     cases = [Case(scenario, name) for name in names]
-    blocks = [(case, block) for case in cases for block in _blocks(seeds, BLOCK)]
+    blocks = [(case, block) for case in cases for block in _blocks(seeds, 5 * BLOCK)]
     episodes: dict[str, list[Row]] = {case.agent: [] for case in cases}
     for number, (rows, _) in workers.results([partial(case.run, block) for case, block in blocks]):
         episodes[blocks[number][0].agent] += rows

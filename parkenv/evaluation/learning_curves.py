@@ -13,11 +13,12 @@ from matplotlib.ticker import FuncFormatter
 
 from parkenv.evaluation.picture_files import INK, STYLE, save_picture
 from parkenv.evaluation.statistics import mean_interval
+from parkenv.evaluation.time_figures import spread
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 OFF_SCALE = 2.0
 """Times above this many times the least one are off the figure."""
-_SPREAD = 0.035  # of the axis, the least distance of two words beside the lines
+_APART = 0.045  # of the axis, the least distance of two words beside the lines
 
 
 def across_seeds(curves: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, float]]:
@@ -88,10 +89,13 @@ def save_learning_curves(
         margin = 0.06 * (high - low)
         axes.set_ylim(low - margin, high + margin)
         shown = {name: t for name, t in planners.items() if t <= high + margin}
-        for (name, seconds), at in zip(shown.items(), _spread(list(shown.values()), high - low), strict=True):
+        ascending = sorted(shown.items(), key=lambda item: item[1])
+        bottom, top = axes.get_ylim()
+        heights = spread([(seconds - bottom) / (top - bottom) for _, seconds in ascending], _APART)
+        for (name, seconds), height in zip(ascending, heights, strict=True):
             axes.axhline(seconds, color=INK, lw=0.8, ls=(0, (4, 3)), zorder=1)
             axes.annotate(
-                f"{name}  {seconds:.1f}", (1.0, at), xycoords=("axes fraction", "data"), xytext=(5, 0),
+                f"{name}  {seconds:.1f}", (1.0, height), xycoords="axes fraction", xytext=(5, 0),
                 textcoords="offset points", va="center", fontsize=8, color=INK,
             )  # fmt: skip
         axes.set_xlim(left=0.0)
@@ -100,20 +104,3 @@ def save_learning_curves(
         axes.grid(axis="y")
         axes.legend(loc="upper right")
         save_picture(figure, path)
-
-
-def _spread(values: list[float], span: float) -> list[float]:
-    """Heights for words that belong to lines, far enough apart to be read."""
-    order = np.argsort(values)
-    heights = np.array(values, dtype=np.float64)[order]
-    for _ in range(200):
-        gaps = np.diff(heights)
-        close = np.flatnonzero(gaps < _SPREAD * span)
-        if not len(close):
-            break
-        push = 0.5 * (_SPREAD * span - gaps[close]) + 1e-6
-        np.subtract.at(heights, close, push)
-        np.add.at(heights, close + 1, push)
-    placed = np.empty_like(heights)
-    placed[order] = heights
-    return list(placed)

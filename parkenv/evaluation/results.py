@@ -48,7 +48,13 @@ _BOOL = {"parked", "truncated"}
 
 SUMMARY = "summary.json"
 SUMMARY_PARTIAL = "summary.partial.json"
-PICTURES = ("time_split_", "time_against_occupancy_", "time_against_failure_cost_", "searches_")
+PICTURES = (
+    "time_split_",
+    "time_against_occupancy_",
+    "time_against_failure_cost_",
+    "time_against_map_",
+    "searches_",
+)
 """What the names of a comparison's figures begin with."""
 
 Row = dict[str, Any]

@@ -201,6 +201,36 @@ def save_time_against_failure_cost(seen: Sequence[Row], unseen: Sequence[Row], p
         save_picture(figure, path)
 
 
+def save_time_against_map(
+    rows: Sequence[Row], own: Sequence[Row], said: Callable[[Row], float], path: str | Path
+) -> None:
+    """How the total time depends on what the map says where it says the same of every slot.
+
+    Args:
+        rows: with agent, total_s, total_s_ci95, of one world under several maps.
+        own: of the same world under the map that it comes with: dashed.
+        said: what a row's map says, 0 to 1.
+        path: the PNG to write.
+
+    Raises:
+        InputError: there are no rows, or the file cannot be written.
+    """
+    _require_rows(rows)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(6.6, 4.2), layout="constrained")
+        ax = figure.subplots()
+        limit = _limit(rows)
+        _draw_lines(ax, rows, limit, lambda row: 100.0 * said(row))
+        for row in own:
+            color = AGENT_COLORS.get(row["agent"], OTHER_AGENT)
+            ax.axhline(row["total_s"], color=color, linewidth=0.9, linestyle=(0, (2, 3)), zorder=1)
+        ax.set_title("dashed: with the scenario's own map")
+        ax.set_xlabel("what the map says of every slot: taken with this probability, %")
+        ax.set_ylabel("mean total time, s; 95 % interval")
+        _name(figure, own or rows)
+        save_picture(figure, path)
+
+
 def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Row], float]) -> None:
     """A line an agent; `along` says where a row lies on the axis below."""
     ends = []
@@ -218,7 +248,7 @@ def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Ro
         ends.append((total[-1], x[-1], agent, color))
     ax.set(xlim=(min(places) - 1.0, max(places) + 1.0), ylim=(0, limit))
     ends.sort()
-    heights = _spread([min(total / limit, 1.0) for total, *_ in ends], 0.062)
+    heights = spread([min(total / limit, 1.0) for total, *_ in ends], 0.062)
     for (total, x, agent, color), height in zip(ends, heights, strict=True):
         off = total > limit
         link = {"arrowstyle": "-", "color": color, "linewidth": 0.7, "relpos": (0, 0.5), "shrinkB": 3}
@@ -237,7 +267,7 @@ def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Ro
     ax.grid(axis="y")
 
 
-def _spread(places: Sequence[float], gap: float) -> FloatArray:
+def spread(places: Sequence[float], gap: float) -> FloatArray:
     """Move ascending places apart by at least `gap`, as little as will do, none above 1 where they fit."""
     spread = np.array(places, dtype=np.float64)
     for i in range(1, len(spread)):
