@@ -9,6 +9,7 @@ import pytest
 import parkenv  # noqa: F401  (registers the environments)
 from parkenv.envs import rendering
 from parkenv.envs.rendering import SearchRenderer, belief_colors, clock
+from parkenv.envs.window import Window
 from parkenv.errors import InputError
 from parkenv.lot import PARK, Lane, ParkingLot
 from parkenv.occupancy import Arrival, OccupancyProcess
@@ -229,18 +230,18 @@ def test_window(monkeypatch):
     import pygame
 
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
-    renderer = SearchRenderer(Scenario.on_lot(row_lot()))
+    window = Window("a title")
     frame = np.zeros((480, 640, 3), dtype=np.uint8)
     frame[100, 200] = 1, 2, 3
-    renderer.show(frame, 1000)
+    window.show(frame, 1000)
     assert pygame.display.get_surface().get_at((200, 100))[:3] == (1, 2, 3)
-    renderer.close()
-    renderer.close()
+    window.close()
+    window.close()
     assert not pygame.display.get_init()
 
 
 def test_a_window_without_pygame_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    renderer = SearchRenderer(Scenario.on_lot(row_lot()))
+    window = Window("a title")
     with pytest.raises(InputError, match=r'pip install "parkenv\[human\]"'):
-        renderer.show(np.zeros((480, 640, 3), dtype=np.uint8), 8)
+        window.show(np.zeros((480, 640, 3), dtype=np.uint8), 8)

@@ -377,14 +377,14 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._renderer = DriveRenderer(self.tasks.lot)
         frame = self._renderer.frame(self.state, [outline for _, outline in self._moving()])
         if self.render_mode == "human":
-            self._renderer.show(frame, self.metadata["render_fps"])
+            self._renderer.window.show(frame, self.metadata["render_fps"])
             return None
         return frame
 
     def close(self) -> None:
         """Close the window, if there is one."""
         if self._renderer is not None:
-            self._renderer.close()
+            self._renderer.window.close()
             self._renderer = None
 
     def _enter(self, state: DriveState) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -44,7 +44,7 @@ from parkenv.envs.rendering import (
     WIDTH,
     View,
 )
-from parkenv.errors import InputError
+from parkenv.envs.window import Window
 from parkenv.lot import ParkingLot, is_building
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class DriveRenderer:
         self._area = DrivableArea(lot)
         self._task: ParkingTask | None = None
         self._center: tuple[float, float] | None = None
-        self._window: Any = None
+        self.window = Window(f"parkenv: driving on {lot.name}")
 
     def frame(self, state: DriveState, outlines: Sequence[FloatArray] = ()) -> Image:
         """The manoeuvre as it stands, (480, 640, 3) uint8 RGB.
@@ -124,36 +124,6 @@ class DriveRenderer:
         draw_car(image, view, task.vehicle, state.vehicle, CAR)
         _draw_hud(image, state)
         return image
-
-    def show(self, frame: Image, fps: float) -> None:
-        """Show a frame in a window, at most `fps` of them a second.
-
-        Raises:
-            InputError: pygame is not installed.
-        """
-        try:
-            import pygame
-        except ImportError as error:
-            raise InputError(
-                'render_mode "human" needs pygame, which is not installed: pip install "parkenv[human]"'
-            ) from error
-        if self._window is None:
-            pygame.display.init()
-            self._window = pygame.display.set_mode(frame.shape[1::-1]), pygame.time.Clock()
-            pygame.display.set_caption(f"parkenv: driving on {self._lot.name}")
-        screen, ticker = self._window
-        screen.blit(pygame.surfarray.make_surface(frame.swapaxes(0, 1)), (0, 0))
-        pygame.event.pump()
-        pygame.display.flip()
-        ticker.tick(fps)
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._window is not None:
-            import pygame
-
-            pygame.display.quit()
-            self._window = None
 
 
 def _draw_movers(image: Image, view: View, poses: FloatArray, outlines: Sequence[FloatArray]) -> None:

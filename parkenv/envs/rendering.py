@@ -26,7 +26,7 @@ from parkenv.envs.drawing import (
     write_label,
     write_text,
 )
-from parkenv.errors import InputError
+from parkenv.envs.window import Window
 from parkenv.lot import ParkingLot, is_building
 from parkenv.occupancy import DAY_NAMES, DAY_S
 from parkenv.scenario import Scenario
@@ -216,7 +216,7 @@ class SearchRenderer:
         self.scenario = scenario
         self._ground: _Ground | None = None
         self._window_at: tuple[int, int] | None = None
-        self._window: Any = None
+        self.window = Window(f"parkenv: {scenario.name}")
         self._size = (float(WIDTH), float(HEIGHT - HUD))
         lot = scenario.lot
         room = (self._size[0] - 2 * MARGIN, self._size[1] - 2 * MARGIN)
@@ -272,37 +272,6 @@ class SearchRenderer:
             "<>^v car   + driven   G goal   E entry",
         ]
         return "\n".join(line[:TEXT_WIDTH] for line in lines)
-
-    def show(self, frame: Image, fps: float) -> None:
-        """Show a frame in a window, at most `fps` of them a second.
-
-        Raises:
-            InputError: pygame is not installed.
-        """
-        try:
-            import pygame
-        except ImportError as error:
-            raise InputError(
-                'render_mode "human" needs pygame, which is not installed: pip install "parkenv[human]"'
-            ) from error
-        if self._window is None:
-            pygame.display.init()
-            self._window = pygame.display.set_mode(frame.shape[1::-1]), pygame.time.Clock()
-            pygame.display.set_caption(f"parkenv: {self.scenario.name}")
-        screen, ticker = self._window
-        screen.blit(pygame.surfarray.make_surface(frame.swapaxes(0, 1)), (0, 0))
-        # Unanswered events make a desktop call the window frozen.
-        pygame.event.pump()
-        pygame.display.flip()
-        ticker.tick(fps)
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._window is not None:
-            import pygame
-
-            pygame.display.quit()
-            self._window = None
 
     def _ground_for(self, state: SearchState) -> _Ground:
         if self._whole is not None:

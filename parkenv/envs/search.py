@@ -387,7 +387,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             return self._renderer.text(state)
         frame = self._frame(state)
         if self.render_mode == "human":
-            self._renderer.show(frame, self.metadata["render_fps"])
+            self._renderer.window.show(frame, self.metadata["render_fps"])
             return None
         return frame
 
@@ -400,7 +400,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     def close(self) -> None:
         """Close the window, if there is one."""
         if self._renderer is not None:
-            self._renderer.close()
+            self._renderer.window.close()
             self._renderer = None
 
     def _observation(self, state: SearchState) -> dict[str, Any]:  # noqa: ARG002 - sensors look from it

@@ -1,0 +1,54 @@
+"""A window on the screen for `render_mode="human"`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+
+
+class Window:
+    """Shows frames; it opens with the first.
+
+    Args:
+        title: of the window.
+    """
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._screen: Any = None
+        self._ticker: Any = None
+
+    def show(self, frame: NDArray[np.uint8], fps: float) -> None:
+        """Show a frame, (h, w, 3), at most `fps` of them a second.
+
+        Raises:
+            InputError: pygame is not installed.
+        """
+        try:
+            import pygame
+        except ImportError as error:
+            raise InputError(
+                'render_mode "human" needs pygame, which is not installed: pip install "parkenv[human]"'
+            ) from error
+        if self._screen is None:
+            pygame.display.init()
+            self._screen = pygame.display.set_mode(frame.shape[1::-1])
+            self._ticker = pygame.time.Clock()
+            pygame.display.set_caption(self._title)
+        self._screen.blit(pygame.surfarray.make_surface(frame.swapaxes(0, 1)), (0, 0))
+        # Unanswered events make a desktop call the window frozen.
+        pygame.event.pump()
+        pygame.display.flip()
+        self._ticker.tick(fps)
+
+    def close(self) -> None:
+        """Close it, if it is open."""
+        if self._screen is not None:
+            import pygame
+
+            pygame.display.quit()
+            self._screen = None
