@@ -38,6 +38,9 @@ WORK_PER_MS = 50_000
 USUAL_STAY = 7200.0
 """How long a car is thought to stay, s, until ageing sightings tell."""
 
+STALE_S = 60.0
+"""s without a slot that was not seen before, after which it is time to look beyond the part of the lot."""
+
 
 @dataclass
 class Search:
@@ -52,6 +55,7 @@ class Search:
         looked_at: (n_slots,) float64, s, when each slot was last in view.
         p_occupied: (n_slots,) float32, the last observation's.
         time: s since the search began, of the last observation.
+        news: s, when a slot of that part was last seen for the first time, or the part was chosen.
         leaving: (n_slots,) float64, 1/s, the rate at which a parked car leaves; NaN where nothing has told yet.
         targets: (DEPTH,) int64, what the path of the last decision goes past first, as the part numbers it.
         path: room for one.
@@ -70,6 +74,7 @@ class Search:
     looked_at: FloatArray
     p_occupied: NDArray[np.float32]
     time: float
+    news: float
     leaving: FloatArray
     targets: NDArray[np.int64]
     path: Path
@@ -157,6 +162,7 @@ class BeliefAgent(SearchAgent[Search]):
             looked_at=np.zeros(n),
             p_occupied=p,
             time=time,
+            news=time,
             leaving=np.full(n, np.nan),
             targets=np.zeros(DEPTH, dtype=np.int64),
             path=new_path(n, len(near.vertices)),
@@ -168,10 +174,12 @@ class BeliefAgent(SearchAgent[Search]):
         self._take_in(observation, vertex, memory)
         if memory.gate not in (-1, vertex):
             return self._routes.move_toward(vertex, memory.gate)
-        memory.gate = -1
+        if memory.gate == vertex:
+            memory.gate, memory.news = -1, memory.time
         here = memory.near.place(vertex)
-        # Half of what there was to see has been seen: time to look farther.
-        spent = not memory.near.whole and 2 * _n_unseen(memory.kind) < memory.n_unseen
+        # Half of what there was to see has been seen, or nothing new for long: time to look farther.
+        half = 2 * _n_unseen(memory.kind) < memory.n_unseen
+        spent = not memory.near.whole and (half or memory.time - memory.news > STALE_S)
         action = None if here < 0 or spent else self._act(vertex, here, memory)
         if action is None and not memory.near.whole:
             self._move_on(observation, vertex, memory)
@@ -210,7 +218,7 @@ class BeliefAgent(SearchAgent[Search]):
         new = self._search(near, memory.forecast, memory.time)
         _, ours, theirs = np.intersect1d(old.slots, near.slots, assume_unique=True, return_indices=True)
         new.looked_at[theirs], new.leaving[theirs] = memory.looked_at[ours], memory.leaving[ours]
-        for f in ("near", "doubt", "kind", "looked_at", "p_occupied", "leaving", "targets", "path"):
+        for f in ("near", "news", "doubt", "kind", "looked_at", "p_occupied", "leaving", "targets", "path"):
             setattr(memory, f, getattr(new, f))
         memory.n_targets = 0
         memory.gate = -1 if near.gate == vertex else near.gate
@@ -228,6 +236,7 @@ class BeliefAgent(SearchAgent[Search]):
         self._watch_ageing(p, forecast, time, in_view, memory)
         kind = np.where(p < forecast, LOOKS_FREE, np.where(p > forecast, LOOKS_TAKEN, UNSEEN))
         first = np.flatnonzero((kind != UNSEEN) & (memory.kind == UNSEEN))
+        memory.news = time if len(first) else memory.news
         memory.doubt.look(first, kind[first] == LOOKS_TAKEN)
         # A sighting that has quite faded leaves the slot as good as unseen, but it was a first look once.
         memory.kind = np.where(kind == UNSEEN, memory.kind, kind).astype(np.int8)
