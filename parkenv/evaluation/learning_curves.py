@@ -102,5 +102,5 @@ def save_learning_curves(
         axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x / 1e6:g} M" if x else "0"))
         axes.set(xlabel="decisions in training", ylabel="mean total time, s", title=title)
         axes.grid(axis="y")
-        axes.legend(loc="upper right")
+        axes.legend(loc="upper right", frameon=True, facecolor="white", edgecolor="none", framealpha=1.0)
         save_picture(figure, path)
