@@ -139,7 +139,7 @@ def test_lines_against_occupancy_are_labelled_where_they_end(tmp_path):
     ],
 )
 def test_labels_are_spread(places, want):
-    assert time_figures._spread(places, 0.1) == pytest.approx(want)
+    assert time_figures.spread(places, 0.1) == pytest.approx(want)
 
 
 def test_every_agent_has_a_colour_of_its_own():
