@@ -10,6 +10,7 @@ import typer
 from parkenv.cli import (
     bench,
     benchmark,
+    calibrate,
     compare,
     demo,
     detect,
@@ -37,6 +38,8 @@ app = typer.Typer(
 app.command("compare")(compare.compare)
 app.command("plan")(plan.plan)
 app.command("park")(park.park)
+app.command("trip")(calibrate.trip)
+app.command("calibrate")(calibrate.calibrate)
 app.add_typer(lot.app, name="lot")
 app.add_typer(occupancy.app, name="occupancy")
 app.add_typer(sensors.app, name="sensors")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -74,6 +75,16 @@ def compare(
     ] = "10",
     v_walk_kmh: args.WalkOption = "4",
     v_drive_kmh: args.DriveOption = "10",
+    calibrated: Annotated[
+        Path | None,
+        typer.Option(
+            "--calibrated",
+            metavar="FILE",
+            help="Also compare under the failure cost and driving speed that `parkenv calibrate` measured: FILE is its "
+            "calibrated.json. Searches are the same as under the costs given here.",
+            rich_help_panel=args.COSTS,
+        ),
+    ] = None,
     occupancy_levels: Annotated[
         str,
         typer.Option(
@@ -132,6 +143,8 @@ def compare(
 
     * `parkenv compare --failure-cost sweep --agents mdp,mdp-tuned,belief,oracle`
 
+    * `parkenv compare --agents mdp,belief,oracle --calibrated results/calibrate/calibrated.json`
+
     * `parkenv compare --lot lot.geojson --occupancy log.csv.gz --agents mdp,greedy-goal,oracle -n 300`
     """
     from parkenv.evaluation.compare import (
@@ -145,6 +158,7 @@ def compare(
     )
     from parkenv.evaluation.results import ResultFolder
     from parkenv.occupancy import OccupancyProcess
+    from parkenv.scenario import KMH
     from planners.agent import make_agent
 
     names = args.words("--agents", agents)
@@ -166,11 +180,18 @@ def compare(
     if sweeps:
         scenarios = [s for its in scenarios for s in (its, unseen(its))]
 
+    measured = None if calibrated is None else _calibration(calibrated, scenarios)
+
     seeds = range(seed, seed + episodes)
     cases = [
         (Case(setting, name, rig=rig, options=options.get(name, {})), seeds)
         for s in scenarios
         for setting in settings_of(s, failure, walk, drive)
+        + (
+            settings_of(measured.applied(s), [measured.failure_s], walk, [measured.v_drive / KMH])
+            if measured
+            else []
+        )
         for name in names
         if not (s.name.endswith(UNSEEN) and name in ON_SIGHT)
     ]
@@ -197,6 +218,7 @@ def compare(
         "sensors": rig,
         "map_says": map_says,
         "options": options,
+        "calibrated": args.fingerprint(calibrated),
     }
     out = out or Path("results/compare")
     for s in scenarios:
@@ -214,12 +236,19 @@ def compare(
         "complete": not interrupted,
         "rows": rows,
         "occupancy_rows": sweep_rows,
+        "calibrated": None if measured is None else dataclasses.asdict(measured),
     }
     order = [case.key(s) for case, its_seeds in cases + sweep for s in its_seeds]
     folder.finish(order, summary, complete=not interrupted)
     # A sweep is to be looked at: it would print two tables for every cost.
     for printed in [] if sweeps else result_tables(rows, console.width):
         console.print(printed)
+    if measured is not None:
+        console.print(
+            f"Calibrated over {measured.trips} trips: failure cost {measured.failure_s:.4g} s, drive "
+            f"{measured.v_drive / KMH:.4g} km/h. Whoever parks needs {measured.manoeuvre_s:.1f} s more to get into the "
+            "slot, under either cost; the tables leave that out."
+        )
     if interrupted:
         console.print(f"Interrupted. What was finished is in {out}; the same command with --resume goes on.")
         raise typer.Exit(130)
@@ -247,6 +276,19 @@ def _maps(text: str | None, scenarios: list[Any]) -> dict[str, tuple[Any, float]
             name = f"{s.name}{MAP_SAYS}{said:g}"
             made[name] = (s.replace(name=name, prior=FlatMap(said, s.prior or s.occupancy)), said)
     return made
+
+
+def _calibration(path: Path, scenarios: list[Any]) -> Any:
+    from parkenv.evaluation.calibration import Calibration
+
+    measured = Calibration.from_file(path)
+    names = [s.name for s in scenarios]
+    if names != [measured.scenario]:
+        raise InputError(
+            f"--calibrated {path} was measured on {measured.scenario!r}, here are {', '.join(names)}; compare that "
+            "scenario alone, and without --failure-cost sweep"
+        )
+    return measured
 
 
 def _levels(text: str) -> list[float]:

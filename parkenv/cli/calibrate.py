@@ -1,0 +1,185 @@
+"""`parkenv calibrate` and `parkenv trip`: what driving takes, and a trip to look at."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from parkenv import __version__
+from parkenv.cli import arguments as args
+from parkenv.cli.tables import make_console, make_table
+from parkenv.errors import InputError
+
+ScenarioOption = Annotated[
+    str, typer.Option("--scenario", metavar="NAME", help="A packaged scenario: campus, jam, street, mini.")
+]
+AgentOption = Annotated[
+    str, typer.Option("--agent", metavar="NAME", help="Who decides where to drive and park.")
+]
+NoticeOption = Annotated[
+    float,
+    typer.Option(
+        "--notice-m",
+        help="Metres on along its path, where the car notices at the latest that it would drive into a taken slot.",
+    ),
+]
+SpeedOption = Annotated[
+    float | None,
+    typer.Option(
+        "--v-drive-kmh", metavar="V", help="Speed limit on the lanes, km/h.  [default: the scenario's]"
+    ),
+]
+
+
+def calibrate(
+    scenario: ScenarioOption = "campus",
+    trips: Annotated[
+        int, typer.Option("--trips", min=1, help="Trips with, and as many without, sight.")
+    ] = 100,
+    agent: AgentOption = "mdp",
+    notice_m: NoticeOption = 2.0,
+    v_drive_kmh: SpeedOption = None,
+    seed: args.SeedOption = 0,
+    jobs: args.JobsOption = 1,
+    backend: args.BackendOption = "loky",
+    address: args.AddressOption = None,
+    out: Annotated[
+        Path,
+        typer.Option(
+            "--out", "-o", help="Folder for calibrated.json, trips.jsonl, summary.json, the figure."
+        ),
+    ] = Path("results/calibrate"),
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with the trips in --out.")] = False,
+) -> None:
+    """Drive whole trips, and measure what the drive graph is told: driving speed and the cost of a failed try.
+
+    A car is driven along the lanes and into slots, as the agent decides. Every seed is driven twice: seeing the slots
+    as the scenario has it, for the speed and the manoeuvre; and without seeing any before a try, for the tries that
+    fail. `parkenv compare --calibrated OUT/calibrated.json` then sets agents side by side under both costs.
+
+    Examples:
+    * `parkenv calibrate --scenario campus --trips 200 --jobs 2 --out results/calibrate`
+
+    * `parkenv compare --calibrated results/calibrate/calibrated.json`
+    """
+    from parkenv.evaluation.calibration import (
+        TripFolder,
+        TripPlan,
+        drive_trips,
+        save_distributions,
+    )
+    from parkenv.evaluation.calibration import calibrate as calibration_of
+    from parkenv.evaluation.driven_search import DrivenSearch
+    from parkenv.evaluation.lot_driver import DrivingStyle
+    from parkenv.evaluation.results import make_folder, write_summary
+    from parkenv.scenario import KMH, Scenario
+
+    its = Scenario.named(scenario)
+    speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
+    style = DrivingStyle(speed=speed, notice_m=notice_m)
+    DrivenSearch(its, agent, style=style)  # complains before anything is driven
+    make_folder(out)
+    settings = {
+        "version": __version__, "scenario": scenario, "agent": agent, "style": dataclasses.asdict(style),
+    }  # fmt: skip
+    folder = TripFolder(out, settings, resume=resume)
+    console = make_console()
+    progress = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("trips"),
+        TimeRemainingColumn(),
+        console=console,
+    )
+    seeds = range(seed, seed + trips)
+    with progress, args.workers_of(jobs, backend, address) as workers:
+        bar = progress.add_task("Driving", total=2 * trips)
+        rows = drive_trips(
+            TripPlan(its, agent, style), seeds, folder, workers, lambda n: progress.advance(bar, n)
+        )
+    made, table = calibration_of(rows, its, speed)
+    made.to_file(out / "calibrated.json")
+    touched = sum(row["contacts"] for row in rows)
+    write_summary(
+        out,
+        {
+            "command": ["parkenv", *sys.argv[1:]],
+            "version": __version__,
+            "seed": seed,
+            **settings,
+            "trips": len(rows),
+            "contacts": touched,
+            "calibrated": dataclasses.asdict(made),
+            "rows": table,
+        },
+    )
+    title = f"{scenario}: {trips} trips with and {trips} without sight of the slots, by {agent}"
+    save_distributions(rows, speed, title, out / f"calibration_{scenario}.png")
+    printed = make_table(title, ("what", "n", "mean [95 %]", "median", "p95"))
+    for row in table:
+        low, high = row["mean_ci95"]
+        printed.add_row(
+            row["what"],
+            str(row["n"]),
+            f"{row['mean']:.2f} [{low:.2f}, {high:.2f}]",
+            f"{row['median']:.2f}" if "median" in row else "",
+            f"{row['p95']:.2f}" if "p95" in row else "",
+        )
+    console.print(printed)
+    console.print(
+        f"Calibrated: driving at {made.v_drive / KMH:.2f} km/h, a failed try costs {made.failure_s:.1f} s, and parking "
+        f"takes {made.manoeuvre_s:.1f} s that the drive graph leaves out. Contacts: {touched} in {len(rows)} trips."
+    )
+    console.print(f"Calibration, trips, summary and figure are in {out}")
+
+
+def trip(
+    scenario: ScenarioOption = "campus",
+    agent: AgentOption = "mdp",
+    blind: Annotated[
+        bool, typer.Option("--unseen", help="Let no slot be seen before a try, so that tries fail.")
+    ] = False,
+    notice_m: NoticeOption = 2.0,
+    seed: args.SeedOption = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The film, a GIF.")] = Path("results/trip.gif"),
+) -> None:
+    """Drive one trip from the entry into a slot, and film it from above, five times as fast as in life.
+
+    Example: `parkenv trip --scenario campus --seed 7 --unseen --out trip.gif`
+    """
+    from parkenv.evaluation.compare import unseen
+    from parkenv.evaluation.driven_search import DrivenSearch
+    from parkenv.evaluation.lot_driver import DrivingStyle
+    from parkenv.evaluation.results import make_folder
+    from parkenv.evaluation.trip_pictures import film_trip, save_film
+    from parkenv.scenario import Scenario
+
+    if out.suffix.lower() != ".gif":
+        raise InputError(f"--out is {out}, want a file that ends in .gif")
+    its = Scenario.named(scenario)
+    search = DrivenSearch(unseen(its) if blind else its, agent, style=DrivingStyle(notice_m=notice_m))
+    make_folder(out.parent)
+    console = make_console()
+    with console.status("Driving and drawing"):
+        driven, frames = film_trip(search, seed)
+        save_film(frames, out)
+    _show(console, driven)
+    console.print(f"The film is {out}")
+
+
+def _show(console: Any, driven: Any) -> None:
+    end = f"parked in {driven.slot}" if driven.parked else "not parked"
+    console.print(
+        f"{end}: {driven.total_s:.1f} s = {driven.lanes_s:.1f} s on the lanes + {driven.manoeuvre_s:.1f} s manoeuvre + "
+        f"{driven.failed_s:.1f} s failed tries + {driven.walk_s:.1f} s walk + {driven.gave_up_s:.1f} s elsewhere"
+    )
+    for t in driven.tries:
+        console.print(
+            f"  {t.slot} ({t.kind}{', ' + t.way if t.way else ''}): {t.seconds:.1f} s, {t.reason or 'parked'}"
+        )

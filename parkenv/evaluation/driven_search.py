@@ -1,0 +1,243 @@
+"""The whole trip: an agent decides on the drive graph, and a car drives it, from the entry into the slot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from parkenv.driving.vehicle import VehicleParameters
+from parkenv.envs.search import SearchEnv
+from parkenv.envs.search_step import (
+    DRIVEN_M,
+    FAILED_PARKS,
+    STEP_DRIVE,
+    STEP_FAILED,
+    STEP_WALK,
+    STEPS,
+    TIME,
+    drive_or_park,
+    learn,
+    look,
+    renew,
+    settle,
+    touched,
+)
+from parkenv.errors import InputError
+from parkenv.evaluation.lot_driver import Driver, DrivingStyle, Leg, LotDriver, Try
+from parkenv.lot import PARK
+from parkenv.scenario import Scenario
+from planners.agent import Agent, make_agent
+from planners.oracle import OracleAgent
+
+MOST_STEPS = 2000
+"""Decisions, after which a trip is given up, as in `parkenv/Search-v0`."""
+
+
+class DrivenSearchEnv(SearchEnv):
+    """`parkenv/Search-v0` in which time passes as it does on the road.
+
+    World, observations and decisions are those of `parkenv/Search-v0`. What an edge, a try and the parking take is
+    asked of a driver; a try fails as well where the car does not get into a free slot, which it then holds for taken.
+    The time of the manoeuvre into the slot counts as driven.
+
+    Args:
+        scenario: the scenario.
+        driver: who drives; with a `GraphDriver` this is `parkenv/Search-v0` itself.
+    """
+
+    def __init__(self, scenario: Scenario, driver: Driver) -> None:
+        super().__init__(scenario)
+        self.driver = driver
+        self._refused: set[int] = set()
+        self.manoeuvre: Try | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start a search, and the car at the entry."""
+        result = super().reset(seed=seed, options=options)
+        state = self.state
+        self._refused.clear()
+        self.manoeuvre = None
+        self.driver.begin(state.key, state.world, state.vertex, state.time)
+        return result
+
+    def _advance(self, action: int) -> None:
+        """Have the action driven, and let as much time pass as that took."""
+        state, search = self._state, self.search
+        numbers = search.numbers[0]
+        vertex, before = state.vertex, state.time
+        possible = self.scenario.action_masks[vertex, action] == 1
+        if possible and action == PARK:
+            self._park(vertex, before)
+        elif possible:
+            seconds = self.driver.drive(vertex, action)
+            drive_or_park(search, 0, action)
+            numbers[STEP_DRIVE], numbers[TIME] = seconds, before + seconds
+        else:
+            self.driver.wait(self.scenario.wait_s)
+            drive_or_park(search, 0, action)
+        if not state.parked:
+            look(search, 0)
+            for slot in self._refused:
+                # It looks free, and is of no use to this car.
+                learn(search, 0, touched(search, 0, slot), True, 1.0)
+        settle(search, 0)
+        renew(search, 0)
+        self._clock[:] = state.time, state.time - state.arrival.time
+
+    def _park(self, slot: int, before: float) -> None:
+        search, state = self.search, self._state
+        numbers, counts = search.numbers[0], search.counts[0]
+        taken = bool(state.world.occupied(np.array([slot]), before)[0])
+        outcome = self.driver.park(slot, taken)
+        if taken or not outcome.reason:
+            drive_or_park(search, 0, PARK)
+        else:
+            self._refused.add(slot)
+            counts[FAILED_PARKS] += 1
+            counts[STEPS] += 1
+            numbers[STEP_WALK] = 0.0
+        if not outcome.reason:
+            self.manoeuvre = outcome
+        lost = outcome.seconds if outcome.reason else 0.0
+        numbers[STEP_DRIVE], numbers[STEP_FAILED] = outcome.seconds - lost, lost
+        numbers[TIME] = before + outcome.seconds
+
+
+@dataclass(frozen=True)
+class Trip:
+    """One trip, driven from the entry to the goal.
+
+    Attributes:
+        seed: of the world.
+        agent: who decided.
+        total_s: all of it, the sum of the next five.
+        lanes_s: along the lanes, waiting included.
+        manoeuvre_s: from the decision to park until the car stood in the slot.
+        failed_s: of tries that failed.
+        walk_s: to the goal.
+        gave_up_s: of going elsewhere.
+        parked: whether the car was parked.
+        slot: where, by name.
+        slot_kind: how that slot lies to its lane.
+        graph_m: m of the graph's edges.
+        driven_m: m that the car drove, in either direction.
+        contacts: how often it touched something.
+        strays: how often it was off its way.
+        legs: the edges, in order.
+        tries: the tries to park, in order.
+    """
+
+    seed: int
+    agent: str
+    total_s: float
+    lanes_s: float
+    manoeuvre_s: float
+    failed_s: float
+    walk_s: float
+    gave_up_s: float
+    parked: bool
+    slot: str
+    slot_kind: str
+    graph_m: float
+    driven_m: float
+    contacts: int
+    strays: int
+    legs: tuple[Leg, ...]
+    tries: tuple[Try, ...]
+
+    @property
+    def failed(self) -> list[Try]:
+        """The tries that failed."""
+        return [t for t in self.tries if t.reason]
+
+
+class DrivenSearch:
+    """Drives trips in one scenario.
+
+    Args:
+        scenario: the scenario.
+        agent: who decides: a name that `make_agent` knows.
+        vehicle: the car.
+        style: how it is driven.
+
+    Raises:
+        InputError: an unknown agent; a speed that the car does not have; or a lot in which the car fits nowhere.
+
+    Example:
+        >>> import math
+        >>> trip = DrivenSearch(Scenario.named("mini")).run(seed=1)
+        >>> parts = trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.gave_up_s
+        >>> trip.parked, math.isclose(trip.total_s, parts)
+        (True, True)
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        agent: str = "mdp",
+        vehicle: VehicleParameters | None = None,
+        style: DrivingStyle | None = None,
+    ) -> None:
+        self.scenario, self.agent = scenario, agent
+        self._agent: Agent = make_agent(agent, scenario)
+        self.driver = LotDriver(scenario, vehicle, style)
+        self.env = DrivenSearchEnv(scenario, self.driver)
+
+    def run(self, seed: int, watch: Callable[[], None] | None = None) -> Trip:
+        """The trip in the world of a seed.
+
+        Args:
+            seed: 0 or more.
+            watch: called after every 0.1 s of driving; `driver` and `env` say where things stand.
+
+        Raises:
+            InputError: a seed that is no whole number of 0 or more.
+        """
+        if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
+            raise InputError(f"seed is {seed!r}, want a whole number of at least 0")
+        env, driver, scenario = self.env, self.driver, self.scenario
+        driver.watch = watch or (lambda: None)
+        observation, _ = env.reset(seed=int(seed))
+        if isinstance(self._agent, OracleAgent):
+            self._agent.reveal(env.state.world, env.state.time)
+        memory: Any = None
+        info: dict[str, Any] = {}
+        over = False
+        for _ in range(MOST_STEPS):
+            action, memory = self._agent.predict(observation, memory)
+            observation, _, over, _, info = env.step(action)
+            if over:
+                break
+        gave_up_s = float(info["gave_up_s"]) + (0.0 if over else scenario.give_up_s)
+        parked = env.manoeuvre
+        manoeuvre_s = parked.seconds if parked else 0.0
+        lanes_s, failed_s, walk_s = (
+            float(info["drive_s"]) - manoeuvre_s,
+            float(info["failed_s"]),
+            float(info["walk_s"]),
+        )
+        log = driver.log
+        return Trip(
+            seed=int(seed),
+            agent=self.agent,
+            total_s=lanes_s + manoeuvre_s + failed_s + walk_s + gave_up_s,
+            lanes_s=lanes_s,
+            manoeuvre_s=manoeuvre_s,
+            failed_s=failed_s,
+            walk_s=walk_s,
+            gave_up_s=gave_up_s,
+            parked=bool(info["parked"]),
+            slot=parked.slot if parked else "",
+            slot_kind=parked.kind if parked else "",
+            graph_m=float(env.search.numbers[0, DRIVEN_M]),
+            driven_m=log.driven_m,
+            contacts=len(log.contacts),
+            strays=log.strays,
+            legs=tuple(log.legs),
+            tries=tuple(log.tries),
+        )

@@ -1,0 +1,482 @@
+"""The whole trip: lines along lanes, lane keeping, tries that fail, and what many trips say of speeds and costs."""
+
+import dataclasses
+import json
+import math
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from parkenv import InputError, ParkingLot, Scenario
+from parkenv.cli import app
+from parkenv.driving.driven_lines import KEPT_RIGHT_M, DrivenLines
+from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
+from parkenv.envs.search import SearchEnv
+from parkenv.evaluation.calibration import (
+    SEEN,
+    UNSEEN,
+    Calibration,
+    TripFolder,
+    TripPlan,
+    calibrate,
+    drive_trips,
+)
+from parkenv.evaluation.compare import unseen
+from parkenv.evaluation.driven_search import DrivenSearch, DrivenSearchEnv
+from parkenv.evaluation.lot_driver import (
+    ACROSS,
+    ALONG,
+    NO_ROOM,
+    TAKEN,
+    TURN,
+    DrivingStyle,
+    GraphDriver,
+    LotDriver,
+)
+from parkenv.keyed_random import world_key
+from planners.agent import make_agent
+from planners.hybrid_astar import CarPath
+from planners.lane_keeping import LaneKeeper, joined, rounded
+from planners.path_tracking import TrackingSettings
+
+CAR = VehicleParameters()
+MINI = Scenario.named("mini")
+LOTS = ("campus", "jam", "street", "mini")
+
+
+@lru_cache
+def lines_of(name):
+    lot = ParkingLot.packaged(name)
+    return lot, DrivenLines(lot)
+
+
+@lru_cache
+def searched(name, blind=False, notice_m=2.0):
+    scenario = Scenario.named(name)
+    return DrivenSearch(unseen(scenario) if blind else scenario, style=DrivingStyle(notice_m=notice_m))
+
+
+def started(name, seed=0, **kinds):
+    """A driver in the world of a seed, at the entry, and the world."""
+    scenario = Scenario.named(name)
+    driver = LotDriver(scenario, **kinds)
+    key = world_key(seed, 0)
+    arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
+    world = scenario.occupancy.world(key, arrival)
+    driver.begin(key, world, int(scenario.lot.entry_vertices[0]), arrival.time)
+    return driver, world, arrival
+
+
+@pytest.mark.parametrize("name", LOTS)
+def test_every_edge_lies_on_a_line_that_keeps_right_and_is_as_long_as_the_graph_says(name):
+    lot, lines = lines_of(name)
+    source, column = np.nonzero(lot.neighbors >= 0)
+    across = 0
+    for v, c in zip(source.tolist(), column.tolist(), strict=True):
+        edge = lines.edge(v, int(lot.neighbors[v, c]), float(lot.edge_length[v, c]))
+        if edge.across:
+            across += 1
+            assert v < lot.n_slots
+            turned = lot.vertex_yaw[v] - lot.vertex_yaw[lot.neighbors[v, c]]
+            assert abs(math.remainder(turned, 2 * math.pi)) > 2.0
+        else:
+            assert edge.end - edge.start == pytest.approx(lot.edge_length[v, c], abs=1.0)
+        ends = ((v, edge.start), (int(lot.neighbors[v, c]), edge.end))
+        for vertex, station in ends[edge.across :]:
+            pose = lines.lines[edge.line].pose(station)
+            assert np.hypot(*(pose[:2] - lot.vertex_xy[vertex])) < 2.1
+            if vertex < lot.n_slots and not edge.across:
+                assert math.cos(pose[2] - lot.vertex_yaw[vertex]) > 0.99
+    assert (across > 0) == (name != "street"), "two-way lanes with slots on both sides have them"
+
+
+def test_a_line_is_beside_its_lane_by_what_cars_keep_to_the_right():
+    lot, lines = lines_of("campus")
+    points = lot.lanes[0].points
+    there, back = lines.lines[0], lines.lines[1]
+    np.testing.assert_allclose(there.points[:, 1], points[:, 1] - KEPT_RIGHT_M)
+    np.testing.assert_allclose(back.points[:, 1], points[::-1, 1] + KEPT_RIGHT_M)
+    assert there.pose(there.length + 5.0)[0] == pytest.approx(points[-1, 0] + 5.0), (
+        "straight on beyond its end"
+    )
+
+
+@given(
+    turns=st.lists(st.floats(-2.0, 2.0), min_size=1, max_size=4),
+    leg=st.floats(6.0, 20.0),
+    radius=st.floats(1.0, 8.0),
+)
+@settings(deadline=None, max_examples=50)
+def test_a_rounded_polyline_ends_where_the_polyline_does_and_turns_no_tighter_than_asked(turns, leg, radius):
+    yaw = np.cumsum([0.0, *turns])
+    points = np.concatenate([[[0.0, 0.0]], np.cumsum(leg * np.stack([np.cos(yaw), np.sin(yaw)], 1), axis=0)])
+    path = rounded(points, radius)
+    poses, curvature, _ = path.sampled(0.1)
+    np.testing.assert_allclose(poses[-1, :2], points[-1], atol=1e-3)
+    assert math.remainder(poses[-1, 2] - yaw[-1], 2 * math.pi) == pytest.approx(0.0, abs=1e-4)
+    room = (
+        0.5 * leg / math.tan(0.5 * max(abs(t) for t in turns))
+        if any(abs(t) > 1e-4 for t in turns)
+        else np.inf
+    )
+    assert np.abs(curvature).max() <= 1.0 / min(radius, room) + 1e-9
+    assert path.driven_m <= leg * (len(turns) + 1) + 1e-9
+
+
+def test_joined_paths_are_one_after_the_other():
+    first = CarPath(np.zeros(3), np.array([5.0]), np.array([0.0]), margin=0.2)
+    second = CarPath(np.array([5.0, 0.0, 0.0]), np.array([3.0]), np.array([0.1]), margin=0.1)
+    both = joined(first, second)
+    np.testing.assert_allclose(both.sampled()[0][-1], second.sampled()[0][-1])
+    assert (both.driven_m, both.margin) == (8.0, 0.1)
+
+
+@given(speed=st.floats(0.0, 4.0), turn=st.floats(-1.4, 1.4))
+@settings(deadline=None, max_examples=20)
+def test_a_lane_keeper_stays_near_its_path_at_any_speed_and_slows_down_in_turns(speed, turn):
+    points = np.array([[0.0, 0.0], [20.0, 0.0], [20.0 + 20.0 * math.cos(turn), 20.0 * math.sin(turn)]])
+    path = rounded(points, 6.0)
+    keeper = LaneKeeper(CAR, path, TrackingSettings(speed=4.0, blend_m=2.0, firmness=0.5), aside=1.5)
+    state = np.zeros(6)
+    state[SPEED] = speed
+    poses = path.sampled(0.05)[0]
+    worst = 0.0
+    for _ in range(600):
+        command = keeper.command(state[:3], float(state[SPEED]), float(state[STEERING]))
+        if keeper.done:
+            break
+        for _ in range(2):
+            advance(state, *command, CAR.limits)
+        worst = max(worst, float(np.hypot(*(poses[:, :2] - state[:2]).T).min()))
+        assert state[SPEED] ** 2 * abs(math.tan(state[STEERING])) / CAR.wheelbase < 2.2
+    assert keeper.done
+    assert worst < 0.35
+
+
+@pytest.mark.parametrize("name", ["mini", "campus"])
+def test_with_the_graphs_times_a_trip_is_the_search_itself(name):
+    """Replace what was driven by what the graph says, and every decision and second is that of Search-v0."""
+    scenario = unseen(Scenario.named(name))
+    agent = make_agent("mdp", scenario)
+    plain, driven = SearchEnv(scenario), DrivenSearchEnv(scenario, GraphDriver(scenario))
+    failed = 0
+    for seed in range(6):
+        ones, twos = plain.reset(seed=seed)[0], driven.reset(seed=seed)[0]
+        memory_one = memory_two = None
+        for _ in range(300):
+            one, memory_one = agent.predict(ones, memory_one)
+            two, memory_two = agent.predict(twos, memory_two)
+            assert one == two
+            ones, reward_one, over, _, info_one = plain.step(one)
+            twos, reward_two, over_two, _, info_two = driven.step(two)
+            assert (reward_one, over, info_one) == (reward_two, over_two, info_two)
+            for key in ones:
+                np.testing.assert_array_equal(ones[key], twos[key])
+            if over:
+                break
+        failed += info_one["failed_parks"]
+        assert driven.unwrapped.manoeuvre is None or driven.manoeuvre.seconds == 0.0
+    assert failed > 0, "or tries at taken slots were never compared"
+
+
+@pytest.mark.parametrize(
+    ("name", "seed", "blind"),
+    [("campus", 0, False), ("campus", 7, True), pytest.param("street", 4, True, marks=pytest.mark.slow)],
+)
+def test_a_trip_is_the_sum_of_its_parts_and_parks_without_a_contact(name, seed, blind):
+    search = searched(name, blind)
+    trip = search.run(seed)
+    scenario, driver = search.scenario, search.driver
+    assert trip.parked
+    assert trip.contacts == 0
+    assert trip.total_s == pytest.approx(
+        trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.gave_up_s
+    )
+    assert trip.lanes_s == pytest.approx(sum(leg.seconds for leg in trip.legs))
+    assert trip.graph_m == pytest.approx(sum(leg.graph_m for leg in trip.legs))
+    assert trip.failed_s == pytest.approx(sum(t.seconds for t in trip.failed))
+    assert trip.manoeuvre_s == trip.tries[-1].seconds
+    # The car's clock, the search's clock, and the parts agree.
+    began = search.env.state.arrival.time
+    assert driver.time - began == pytest.approx(trip.total_s - trip.walk_s)
+    assert search.env.state.time == pytest.approx(driver.time)
+    # It stands in the slot, which was free when it began to park.
+    slot = scenario.lot.slot_ids.index(trip.slot)
+    middle = driver.vehicle.at_middle(driver.state[:3])
+    assert np.hypot(*(middle[:2] - scenario.lot.slot_xy[slot])) < 0.25
+    assert driver.state[SPEED] == pytest.approx(0.0, abs=0.01)
+    assert not search.env.state.world.occupied([slot], driver.time - trip.manoeuvre_s)[0]
+    assert bool(trip.failed) == blind
+
+
+def test_equal_seeds_give_equal_trips_whatever_was_driven_before():
+    search = searched("campus", blind=True)
+    first = search.run(7)
+    search.run(3)
+    assert search.run(7) == first
+    assert DrivenSearch(search.scenario).run(7) == first
+
+
+def test_straight_on_the_car_drives_at_the_limit_and_slower_where_that_is_lower():
+    fast, _, _ = started("campus", style=DrivingStyle(speed=4.0))
+    slow, _, _ = started("campus", style=DrivingStyle(speed=2.0))
+    lot = fast.scenario.lot
+    v = int(lot.entry_vertices[0])
+    c = int(np.flatnonzero(lot.neighbors[v] >= 0)[0])
+    # The driver decides before the junction, so less than the whole edge is driven.
+    assert slow.drive(v, c) == pytest.approx(2.0 * fast.drive(v, c), rel=0.1)
+    assert fast.log.legs[0].kind == ALONG
+    assert fast.state[SPEED] == pytest.approx(4.0, abs=0.1)
+    junction = int(lot.neighbors[v, c])
+    away = next(
+        c for c in range(4) if lot.neighbors[junction, c] >= lot.n_slots and lot.neighbors[junction, c] != v
+    )
+    before = fast.time
+    fast.drive(junction, away)
+    assert fast.log.legs[-1].kind == TURN
+    assert fast.log.legs[-1].graph_m / (fast.time - before) < 4.0, "turning is slower"
+    assert not fast.log.contacts
+
+
+def test_crossing_a_lane_costs_nothing_before_one_drives_on_from_there():
+    driver, _, _ = started("mini")
+    lot = driver.scenario.lot
+    v = int(lot.entry_vertices[0])
+    c = int(np.flatnonzero(lot.neighbors[v] >= 0)[0])
+    driver.drive(v, c)
+    slot = int(lot.neighbors[v, c])
+    lines = DrivenLines(lot)
+    over = next(
+        c
+        for c in range(4)
+        if lot.neighbors[slot, c] >= 0
+        and lines.edge(slot, int(lot.neighbors[slot, c]), float(lot.edge_length[slot, c])).across
+    )
+    yaw = driver.state[2]
+    assert driver.drive(slot, over) == 0.0
+    opposite = int(lot.neighbors[slot, over])
+    onward = next(
+        c
+        for c in range(4)
+        if lot.neighbors[opposite, c] >= 0
+        and not lines.edge(
+            opposite, int(lot.neighbors[opposite, c]), float(lot.edge_length[opposite, c])
+        ).across
+    )
+    assert driver.drive(opposite, onward) > 5.0
+    assert [leg.kind for leg in driver.log.legs] == [ALONG, ACROSS, "round"]
+    assert abs(math.remainder(driver.state[2] - yaw, 2 * math.pi)) > 2.0
+
+
+def first_slot(driver):
+    lot = driver.scenario.lot
+    v = int(lot.entry_vertices[0])
+    c = int(np.flatnonzero(lot.neighbors[v] >= 0)[0])
+    driver.drive(v, c)
+    return int(lot.neighbors[v, c])
+
+
+def test_a_failed_try_takes_longer_the_later_it_is_noticed_and_ends_on_the_lane():
+    seconds = []
+    for notice_m in (0.8, 4.0, 30.0):
+        for seed in range(30):
+            driver, world, arrival = started("mini", seed, style=DrivingStyle(notice_m=notice_m))
+            slot = first_slot(driver)
+            if world.occupied([slot], driver.time)[0]:
+                break
+        result = driver.park(slot, taken=True)
+        assert (result.reason, result.slot) == (TAKEN, driver.scenario.lot.slot_ids[slot])
+        assert not driver.log.contacts
+        assert result.seconds == pytest.approx(driver.time - arrival.time - driver.log.legs[0].seconds)
+        pose = driver.vehicle.at_middle(driver.state[:3])
+        assert abs(abs(pose[1]) - KEPT_RIGHT_M) < 0.4, "back on the lane, which lies along y = 0"
+        assert min(abs(math.remainder(pose[2], math.pi)), 1.0) < 0.2
+        seconds.append(result.seconds)
+    assert seconds[0] > seconds[1] >= seconds[2]
+
+
+def test_a_slot_too_narrow_for_the_car_is_left_and_not_sought_again():
+    lot = ParkingLot.packaged("mini")
+    width = lot.slot_width.copy()
+    narrow = np.arange(0, lot.n_slots, 2)
+    width[narrow] = 2.2
+    scenario = MINI.replace(lot=dataclasses.replace(lot, slot_width=width))
+    wide = dataclasses.replace(CAR, width=2.25)
+    search = DrivenSearch(scenario, "greedy-drive", vehicle=wide)
+    refused = 0
+    for seed in range(8):
+        trip = search.run(seed)
+        names = [t.slot for t in trip.failed if t.reason == NO_ROOM]
+        refused += len(names)
+        assert len(set(names)) == len(names), "the same slot is not tried twice"
+        assert set(names) <= {lot.slot_ids[i] for i in narrow}
+        assert trip.slot not in {lot.slot_ids[i] for i in narrow}
+        assert trip.failed_s == pytest.approx(sum(t.seconds for t in trip.failed))
+    assert refused > 0
+
+
+def test_waiting_is_standing_still():
+    driver, _, _ = started("mini")
+    slot = first_slot(driver)
+    before = driver.time
+    assert driver.wait(4.0) == 4.0
+    assert driver.time == pytest.approx(before + 4.0)
+    assert driver.state[SPEED] == 0.0
+    assert slot < driver.scenario.lot.n_slots
+
+
+def test_bad_input_is_one_clear_error():
+    with pytest.raises(InputError, match=r"notice_m is 0\.3 m, want at least 0.8"):
+        DrivingStyle(notice_m=0.3)
+    with pytest.raises(InputError, match="driving speed is nan, want a finite number above 0"):
+        DrivingStyle(speed=math.nan)
+    with pytest.raises(InputError, match="speed on lanes is 30 m/s, want at most 8"):
+        DrivenSearch(MINI, style=DrivingStyle(speed=30.0))
+    with pytest.raises(InputError, match="unknown agent 'nobody'"):
+        DrivenSearch(MINI, "nobody")
+    with pytest.raises(InputError, match="seed is -1"):
+        searched("mini").run(-1)
+    with pytest.raises(InputError, match=r"seed is 1\.5"):
+        searched("mini").run(1.5)
+    with pytest.raises(InputError, match="calibration v_drive is 0"):
+        Calibration("mini", 0, 5.0, 10.0, 3, 2.7)
+
+
+def row(sight, seed, graph_m, lanes_s, tries):
+    failed = sum(t[3] for t in tries if t[4])
+    return {
+        "sight": sight, "seed": seed, "graph_m": graph_m, "lanes_s": lanes_s, "failed_s": failed,
+        "legs": [["along", graph_m, lanes_s]], "tries": tries,
+    }  # fmt: skip
+
+
+def test_a_calibration_is_metres_over_seconds_and_what_failed_tries_lose():
+    done = ["A1", "perpendicular", "back-in", 12.0, "", 0.0]
+    failed = [["A2", "perpendicular", "back-in", s, TAKEN, 5.0] for s in (16.0, 20.0)]
+    rows = [
+        row(SEEN, 0, 100.0, 40.0, [done]),
+        row(SEEN, 1, 50.0, 35.0, [done]),
+        row(UNSEEN, 0, 80.0, 90.0, [*failed, done]),
+    ]
+    made, table = calibrate(rows, MINI, 2.5)
+    assert made.v_drive == pytest.approx(150.0 / 75.0)
+    assert made.failure_s == pytest.approx(18.0 - 5.0 / 2.5)
+    assert made.manoeuvre_s == 12.0
+    by_name = {r["what"]: r for r in table}
+    assert by_name["failed_s"]["median"] == 18.0
+    low, high = by_name["v_drive_kmh"]["mean_ci95"]
+    assert low <= 7.2 <= high
+    assert made.applied(MINI).v_drive == made.v_drive
+    with pytest.raises(InputError, match="no try has failed"):
+        calibrate(rows[:2], MINI, 2.5)
+
+
+def test_a_calibration_comes_back_from_its_file_and_others_are_refused(tmp_path):
+    made = Calibration("mini", 2.5, 16.0, 15.0, 100, 2.7)
+    made.to_file(tmp_path / "calibrated.json")
+    assert Calibration.from_file(tmp_path / "calibrated.json") == made
+    content = json.loads((tmp_path / "calibrated.json").read_text())
+    for change, message in (
+        ({"format": "other"}, "not a calibration"),
+        ({"version": 99}, "version 99, want 1"),
+        ({"v_drive": None}, "v_drive is None"),
+    ):
+        (tmp_path / "bad.json").write_text(json.dumps(content | change))
+        with pytest.raises(InputError, match=message):
+            Calibration.from_file(tmp_path / "bad.json")
+    del content["failure_s"]
+    (tmp_path / "bad.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="has no failure_s"):
+        Calibration.from_file(tmp_path / "bad.json")
+    with pytest.raises(InputError, match="cannot be read"):
+        Calibration.from_file(tmp_path / "none.json")
+
+
+def test_trips_are_gone_on_with_where_they_were_left(tmp_path):
+    plan = TripPlan(MINI, "mdp", DrivingStyle())
+    settings_row = {"agent": "mdp"}
+    rows = drive_trips(plan, range(1, 3), TripFolder(tmp_path, settings_row))
+    text = (tmp_path / "trips.jsonl").read_text()
+    lines = text.splitlines(keepends=True)
+    assert len(lines) == 4
+    (tmp_path / "trips.jsonl").write_text(lines[0] + lines[2] + lines[3][:20])  # torn by a crash
+    told = []
+    again = drive_trips(
+        plan, range(1, 3), TripFolder(tmp_path, settings_row, resume=True), on_progress=told.append
+    )
+    assert told[0] == 2
+    assert sum(told) == 4
+    assert json.dumps(again) == json.dumps(rows)
+    assert (tmp_path / "trips.jsonl").read_text() == text
+    with pytest.raises(InputError, match="add --resume"):
+        TripFolder(tmp_path, settings_row)
+    with pytest.raises(InputError, match="other settings"):
+        TripFolder(tmp_path, {"agent": "belief"}, resume=True)
+
+
+@pytest.mark.slow
+def test_the_commands_calibrate_compare_and_film(tmp_path):
+    run = CliRunner().invoke
+    out = tmp_path / "calibrate"
+    result = run(app, ["calibrate", "--scenario", "mini", "--trips", "4", "--seed", "1", "--out", str(out)])
+    assert result.exit_code == 0, result.output
+    summary = json.loads((out / "summary.json").read_text())
+    made = Calibration.from_file(out / "calibrated.json")
+    assert summary["calibrated"] == dataclasses.asdict(made)
+    assert (out / "calibration_mini.png").stat().st_size > 10_000
+    assert 5.0 < made.failure_s < 40.0
+    compared = tmp_path / "compare"
+    words = [
+        "compare",
+        "--scenario",
+        "mini",
+        "--agents",
+        "mdp,greedy-goal",
+        "-n",
+        "4",
+        "--occupancy-levels",
+        "none",
+    ]
+    result = run(
+        app,
+        [
+            *words,
+            "--calibrated",
+            str(out / "calibrated.json"),
+            "--out",
+            str(compared),
+            "-j",
+            "1",
+            "--no-figures",
+        ],
+    )
+    assert result.exit_code == 0, result.output
+    rows = json.loads((compared / "summary.json").read_text())["rows"]
+    assert [r["failure_cost_s"] for r in rows] == [10.0, 10.0, made.failure_s, made.failure_s]
+    assert {r["agent"] for r in rows[2:]} == {"mdp", "greedy-goal"}
+    result = run(
+        app,
+        [
+            "compare",
+            "--scenario",
+            "campus",
+            "--calibrated",
+            str(out / "calibrated.json"),
+            "--out",
+            str(tmp_path / "x"),
+        ],
+    )
+    assert isinstance(result.exception, InputError)
+    assert "was measured on 'mini'" in str(result.exception)
+    film = tmp_path / "trip.gif"
+    result = run(app, ["trip", "--scenario", "mini", "--seed", "1", "--out", str(film)])
+    assert result.exit_code == 0, result.output
+    from PIL import Image
+
+    with Image.open(film) as picture:
+        assert picture.size == (640, 480)
+        assert picture.n_frames > 40
