@@ -243,9 +243,15 @@ def marginal_from(
         kept[row] = start
     arrival = arrival_factor * arrival_profile[hour]
     rate = arrival + departure_factor * departure_profile[hour]
-    equilibrium = arrival / rate if rate > 0.0 else 0.0
-    p: float = equilibrium + (start - equilibrium) * fading(rate * second)
+    p: float = marginal_later(start, arrival, rate, second)
     return p
+
+
+@njit(cache=True, inline="always")
+def marginal_later(start: float, arrival: float, rate: float, second: float) -> float:
+    """P(occupied) some seconds after it was `start`, by constant rates of arrival, and of arrival plus departure."""
+    equilibrium = arrival / rate if rate > 0.0 else 0.0
+    return float(equilibrium + (start - equilibrium) * fading(rate * second))
 
 
 @njit(cache=True)

@@ -105,7 +105,7 @@ def calibrate(
         )
     made, table = calibration_of(rows, its, speed)
     made.to_file(out / "calibrated.json")
-    touched = sum(row["contacts"] for row in rows)
+    touched, stuck = (sum(row[name] for row in rows) for name in ("contacts", "rescues"))
     write_summary(
         out,
         {
@@ -115,6 +115,7 @@ def calibrate(
             **settings,
             "trips": len(rows),
             "contacts": touched,
+            "rescues": stuck,
             "calibrated": dataclasses.asdict(made),
             "rows": table,
         },
@@ -134,7 +135,8 @@ def calibrate(
     console.print(printed)
     console.print(
         f"Calibrated: driving at {made.v_drive / KMH:.2f} km/h, a failed try costs {made.failure_s:.1f} s, and parking "
-        f"takes {made.manoeuvre_s:.1f} s that the drive graph leaves out. Contacts: {touched} in {len(rows)} trips."
+        f"takes {made.manoeuvre_s:.1f} s that the drive graph leaves out. In {len(rows)} trips: {touched} contacts, "
+        f"{stuck} times stuck."
     )
     console.print(f"Calibration, trips, summary and figure are in {out}")
 

@@ -48,33 +48,30 @@ from numpy.typing import NDArray
 from parkenv.envs.search import SearchEnv
 from parkenv.envs.search_step import (
     ARRIVAL,
-    ASKED_FOR,
     BEFORE,
+    BELIEF,
     EXPECTED_FREE,
     FLAGS,
     LOOKED,
     LOOKED_TAKEN,
     N_REGIONS,
     N_SEEN,
-    N_TOUCHED,
-    PRIOR,
-    RATE,
+    NOBODY,
     REGION,
     REMEMBERED,
-    SAID,
     SCENARIO,
     SEEN,
     SEEN_FREE,
     STEPS,
     TIME,
     VERTEX,
-    WHO,
     Search,
     begin_slot,
-    belief,
+    compiled,
     forecast,
-    relax_all,
-    touched,
+    inlined,
+    relax_touched,
+    spot,
 )
 from parkenv.envs.search_tables import N_ACTIONS, TARGETS, VIEWED, VIEWS, WALK_S
 from parkenv.errors import InputError
@@ -105,6 +102,9 @@ class Surroundings(NamedTuple):
         total_s: (n, 4, k) s, that drive and walk.
         crow_s: (n, 2) s, coordinates over speed.
         samples: (n_lots, 4, 4) int32, slots of each quarter of the lot by walk.
+        first_view: (n_lots,) int64, where each lot begins in `view_s`.
+        view_s: s, for each of the slots in view of each vertex the drive to it as the crow flies, and the walk.
+        columns: int32, where the columns of a row's slots are noted while a search is observed.
     """
 
     first: NDArray[np.int64]
@@ -116,6 +116,9 @@ class Surroundings(NamedTuple):
     total_s: FloatArray
     crow_s: FloatArray
     samples: NDArray[np.int32]
+    first_view: NDArray[np.int64]
+    view_s: FloatArray
+    columns: NDArray[np.int32]
 
     @classmethod
     def of(cls, problems: Sequence[SearchProblem], k: int) -> Surroundings:
@@ -136,7 +139,22 @@ class Surroundings(NamedTuple):
         count, *rest = joined
         starts = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
         fixed, slots, near, ahead, total_s, crow_s, samples = rest
-        return cls(first.astype(np.int64), fixed, starts, slots, near, ahead, total_s, crow_s, samples)
+        views = [_view_s(problem) for problem in problems]
+        first_view = np.concatenate([[0], np.cumsum([len(seconds) for seconds in views])[:-1]])
+        return cls(
+            first.astype(np.int64),
+            fixed,
+            starts,
+            slots,
+            near,
+            ahead,
+            total_s,
+            crow_s,
+            samples,
+            first_view.astype(np.int64),
+            np.concatenate(views),
+            np.zeros(int(count.max()), dtype=np.int32),
+        )
 
 
 def local_space(k: int) -> spaces.Dict:
@@ -187,10 +205,10 @@ class LocalObservation(
         return {"local": local, "action_mask": observation["action_mask"]}
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@compiled
 def observe_surroundings(search: Search, around: Surroundings, e: int, local: NDArray[np.float32]) -> None:
     """Write what lies around the car of search `e`; to be called after each step and each beginning."""
-    counts, numbers, marks = search.counts, search.numbers, search.marks[e]
+    counts, numbers = search.counts, search.numbers
     lot, time = counts[e, SCENARIO], numbers[e, TIME]
     if counts[e, STEPS] == 0:
         _foresee_regions(search, around, e)
@@ -198,24 +216,11 @@ def observe_surroundings(search: Search, around: Surroundings, e: int, local: ND
     row = around.first[lot] + counts[e, VERTEX]
     for i in range(local.size):
         local[i] = around.fixed[row, i]
-    begin, n = around.starts[row], around.starts[row + 1] - around.starts[row]
-    memory, place = search.memory[e], search.place[e]
-    prior, away, faded = search.scratch[0], search.scratch[1], search.scratch[2]
-    n_touched = counts[e, N_TOUCHED]
-    for i in range(n):
-        slot = around.slots[begin + i]
-        column = place[slot]
-        if column >= n_touched or marks[column, WHO] != slot:
-            column = begin_slot(search, e, slot)
-            n_touched += 1
-        marks[i, ASKED_FOR] = column
-        prior[i] = memory[column, PRIOR]
-        away[i] = memory[column, SAID] - memory[column, PRIOR]
-        faded[i] = memory[column, RATE] * (time - memory[column, LOOKED])
-    relax_all(n, prior, away, faded)
-    p_taken = prior
+    memory, marks, columns = search.memory[e], search.marks[e], around.columns
+    relax_touched(search, e)
+    _find_asked(search, around, e, row)
     if local[0] == 1.0:
-        local[1] = 1.0 - p_taken[around.near[row, 0]]
+        local[1] = 1.0 - memory[spot(columns[around.near[row, 0]]) + BELIEF]
     local[3] = _squashed(time - numbers[e, ARRIVAL])
     n_seen = counts[e, N_SEEN]
     if n_seen > 0:
@@ -226,7 +231,7 @@ def observe_surroundings(search: Search, around: Surroundings, e: int, local: ND
         local[7 + region] = numbers[e, REGION + region]
     remembered = counts[e, REMEMBERED]
     if remembered != _NOWHERE:
-        local[11] = 1.0 - belief(search, e, touched(search, e, remembered))
+        local[11] = 1.0 - memory[spot(np.int64(search.place[e, remembered])) + BELIEF]
         local[12] = _squashed(search.reals[search.at[lot, WALK_S] + remembered])
         local[13] = _squashed(_crow_s(around, row, around.first[lot] + remembered))
     targets = search.at[lot, TARGETS] + counts[e, VERTEX] * N_ACTIONS
@@ -240,16 +245,19 @@ def observe_surroundings(search: Search, around: Surroundings, e: int, local: ND
             local[at + 7] = _squashed(
                 _crow_s(around, around.first[lot] + target, around.first[lot] + remembered)
             )
+        ahead, total_s = around.ahead[row, move], around.total_s[row, move]
         none_free, expected, n_ahead, n_seen_ahead, worst = 1.0, 0.0, 0, 0, 0.0
-        for i in range(around.ahead.shape[2]):
-            which = around.ahead[row, move, i]
+        for i in range(ahead.size):
+            which = ahead[i]
             if which == _NOWHERE:
                 break
-            worst = around.total_s[row, move, i]
-            expected += none_free * (1.0 - p_taken[which]) * worst
-            none_free *= p_taken[which]
+            worst = total_s[i]
+            column = columns[which]
+            p_taken = memory[spot(column) + BELIEF]
+            expected += none_free * (1.0 - p_taken) * worst
+            none_free *= p_taken
             n_ahead += 1
-            n_seen_ahead += 1 if marks[marks[which, ASKED_FOR], FLAGS] & SEEN != 0 else 0
+            n_seen_ahead += (marks[column, FLAGS] // SEEN) & 1
         if n_ahead > 0:
             local[at + 4] = 1.0 - none_free
             local[at + 5] = _squashed(expected + none_free * (worst + MINUTE))
@@ -258,18 +266,29 @@ def observe_surroundings(search: Search, around: Surroundings, e: int, local: ND
         which = around.near[row, i]
         if which == _NOWHERE:
             break
-        local[FIRST_NEAR + PER_NEAR * i] = 1.0 - p_taken[which]
-        local[FIRST_NEAR + PER_NEAR * i + 1] = (
-            1.0 if marks[marks[which, ASKED_FOR], FLAGS] & SEEN != 0 else 0.0
-        )
+        column = columns[which]
+        local[FIRST_NEAR + PER_NEAR * i] = 1.0 - memory[spot(column) + BELIEF]
+        local[FIRST_NEAR + PER_NEAR * i + 1] = (marks[column, FLAGS] // SEEN) & 1
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@inlined
+def _find_asked(search: Search, around: Surroundings, e: int, row: int) -> None:
+    """Write the columns of the slots of a row of `around` into `around.columns`."""
+    place, begin = search.place[e], around.starts[row]
+    for i in range(around.starts[row + 1] - begin):
+        slot = around.slots[begin + i]
+        column = np.int64(place[slot])
+        if column == NOBODY:
+            column = begin_slot(search, e, slot)
+        around.columns[i] = column
+
+
+@inlined
 def _squashed(seconds: float) -> float:
     return seconds / (seconds + MINUTE)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@inlined
 def _crow_s(around: Surroundings, one: int, other: int) -> float:
     """Drive between two vertices, s, as the crow flies."""
     dx = around.crow_s[one, 0] - around.crow_s[other, 0]
@@ -277,7 +296,7 @@ def _crow_s(around: Surroundings, one: int, other: int) -> float:
     return math.sqrt(dx * dx + dy * dy)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@inlined
 def _foresee_regions(search: Search, around: Surroundings, e: int) -> None:
     """What is forecast of a few slots of each quarter of the lot."""
     lot = search.counts[e, SCENARIO]
@@ -288,32 +307,37 @@ def _foresee_regions(search: Search, around: Surroundings, e: int) -> None:
         search.numbers[e, REGION + region] = free / SAMPLES
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@inlined
 def _remember(search: Search, around: Surroundings, e: int) -> None:
     """Keep in mind the best slot that was seen free, and forget it when it is seen taken."""
-    at, ints, counts = search.at, search.ints, search.counts
-    lot, vertex = counts[e, SCENARIO], counts[e, VERTEX]
-    walk, first = at[lot, WALK_S], around.first[lot]
+    at, ints, counts, place, marks = search.at, search.ints, search.counts, search.place[e], search.marks[e]
+    lot, vertex, time = counts[e, SCENARIO], counts[e, VERTEX], search.numbers[e, TIME]
     best, least = counts[e, REMEMBERED], np.inf
+    if best != _NOWHERE and marks[place[best], FLAGS] & LOOKED_TAKEN != 0:
+        best = _NOWHERE
     if best != _NOWHERE:
-        least = search.reals[walk + best] + _crow_s(around, first + vertex, first + best)
-    views = at[lot, VIEWS] + vertex
+        crow_s = _crow_s(around, around.first[lot] + vertex, around.first[lot] + best)
+        least = search.reals[at[lot, WALK_S] + best] + crow_s
+    views, viewed, first = at[lot, VIEWS] + vertex, at[lot, VIEWED], around.first_view[lot]
     for i in range(ints[views], ints[views + 1]):
-        slot = ints[at[lot, VIEWED] + i]
-        column = search.place[e, slot]
-        if column >= counts[e, N_TOUCHED] or search.marks[e, column, WHO] != slot:
+        if around.view_s[first + i] >= least:
             continue
-        flags = search.marks[e, column, FLAGS]
-        if flags & SEEN == 0 or search.memory[e, column, LOOKED] != search.numbers[e, TIME]:
+        slot = ints[viewed + i]
+        column = place[slot]
+        if marks[column, FLAGS] & (SEEN | LOOKED_TAKEN) != SEEN:
             continue
-        if flags & LOOKED_TAKEN != 0:
-            if slot == best:
-                best, least = _NOWHERE, np.inf
-            continue
-        total = search.reals[walk + slot] + _crow_s(around, first + vertex, first + slot)
-        if total < least:
-            best, least = slot, total
+        if search.memory[e, spot(column) + LOOKED] == time:
+            best, least = np.int64(slot), around.view_s[first + i]
     counts[e, REMEMBERED] = best
+
+
+def _view_s(problem: SearchProblem) -> FloatArray:
+    """Drive as the crow flies and walk to each slot in view of each vertex, row by row, s."""
+    starts, slots = problem.slots_in_view
+    viewer = np.repeat(np.arange(problem.lot.n_vertices), np.diff(starts))
+    away = problem.lot.vertex_xy[slots] - problem.lot.vertex_xy[viewer]
+    seconds: FloatArray = np.hypot(away[:, 0], away[:, 1]) / problem.v_drive + problem.walk_s[slots]
+    return seconds
 
 
 def _around(problem: SearchProblem, k: int) -> tuple[NDArray[Any], ...]:

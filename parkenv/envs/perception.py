@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from parkenv.envs.lookout import Lookout, Moment
 from parkenv.envs.search import SearchEnv, SearchState
-from parkenv.envs.search_step import drive_or_park, settle, take_in
+from parkenv.envs.search_step import drive_or_park, renew, settle, take_in, tell_time
 from parkenv.envs.sensors import beside_the_lot
 from parkenv.mapping.slots import SlotFilter
 from parkenv.perception.detector import Detector
@@ -138,6 +138,8 @@ class SearchPerceptionEnv(SearchEnv):
         if not self._state.parked:
             self._look(self._state)
         settle(self.search, 0)
+        renew(self.search, 0)
+        tell_time(self.search, 0, self._clock)
 
     def _look(self, state: SearchState) -> None:
         self._moments = self._lookout.look(state, self._before)

@@ -14,33 +14,27 @@ from parkenv.belief import SlotBelief
 from parkenv.envs.search_step import (
     ARRIVAL,
     CHOICE,
-    DRIVE_S,
-    DRIVEN_M,
     EPISODE,
     FAILED_PARKS,
-    FAILED_S,
     FLAGS,
     GAVE_UP_S,
     KEY,
     N_KNOWN_TAKEN,
-    N_PASSED,
     N_TOUCHED,
     OVER,
     PARKED,
     PARKED_WALK_S,
     SEED_STATE,
     SEEN,
-    STEP_DRIVE,
     STEP_GAVE_UP,
     TIME,
     VERTEX,
-    WALKED_M,
     WHO,
     Search,
-    arrive,
+    begin,
     belief,
     foresee,
-    step_one,
+    step_alone,
 )
 from parkenv.envs.search_tables import SearchTables
 from parkenv.errors import InputError
@@ -162,7 +156,7 @@ class SearchState:
 
 @njit(cache=True)
 def _read_belief(search: Search, p: NDArray[np.float64], seen: NDArray[np.bool_]) -> None:
-    for column in range(search.counts[0, N_TOUCHED]):
+    for column in range(1, search.counts[0, N_TOUCHED] + 1):
         slot = search.marks[0, column, WHO]
         p[slot] = belief(search, 0, column)
         seen[slot] = search.marks[0, column, FLAGS] & SEEN != 0
@@ -257,6 +251,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self.action_space = spaces.Discrete(len(ACTIONS))
         self.observation_space = search_space(lot.n_slots, lot.n_vertices)
         self._masks = list(self.scenario.action_masks)
+        self._vertices = list(np.arange(lot.n_vertices))
         self._renderer: SearchRenderer | None = None
         self._make_search()
 
@@ -265,7 +260,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self.search = Search.on(tables, np.zeros(1, dtype=np.int64), full_belief=True)
         self._state = SearchState(self.scenario, self.search)
         # The rows of this one search, as far as a step reads them.
-        self._numbers = self.search.numbers[0, : TIME + 1]
+        self._numbers = self.search.numbers[0, : STEP_GAVE_UP + 1]
         self._counts = self.search.counts[0, : VERTEX + 1]
         self._p_occupied = self.search.p_occupied[0]
         self._clock = np.zeros(2, dtype=np.float32)
@@ -321,11 +316,12 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if self._seeded_with != self.np_random_seed:
             self._seeded_with = self.np_random_seed
             counts.view(np.uint64)[0, SEED_STATE] = seed_state(self.np_random_seed)
-        arrive(self.search, 0)
+        begin(self.search, 0)
         if len(self.search.asked):
             forecast = self.scenario.forecast(self._state.arrival)
             self.search.asked[0] = forecast.p_occupied, forecast.relaxation_rate
-        foresee(self.search, 0)
+            foresee(self.search, 0)
+        self._clock[:] = self._state.time, 0.0
         self._begun, self._over = True, False
         self._state.path = [self._state.vertex]
         if self.render_mode == "human":
@@ -338,33 +334,33 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if self._over:
             raise gym.error.ResetNeeded("the search is over: call reset()")
         self._advance(_action_number(action))
-        numbers, counts = self._numbers.tolist(), self._counts.tolist()
-        if counts[VERTEX] != state.path[-1]:
-            state.path.append(counts[VERTEX])
-        drive, failed, walk, gave_up = numbers[STEP_DRIVE : STEP_GAVE_UP + 1]
+        drive_s, failed_s, walk_s, gave_up_s, driven_m, walked_m, *terms = self._numbers.tolist()
+        drive, failed, walk, gave_up = terms
+        failed_parks, slots_passed, parked, over, vertex = self._counts.tolist()
+        if vertex != state.path[-1]:
+            state.path.append(vertex)
         # A time limit ends the episode from outside, so the metrics are there at every step.
         info = {
             "reward_terms": {"drive": -drive, "failed": -failed, "walk": -walk, "gave_up": -gave_up},
-            "drive_s": numbers[DRIVE_S],
-            "failed_s": numbers[FAILED_S],
-            "walk_s": numbers[PARKED_WALK_S],
-            "gave_up_s": numbers[GAVE_UP_S],
-            "total_s": numbers[DRIVE_S] + numbers[FAILED_S] + numbers[PARKED_WALK_S] + numbers[GAVE_UP_S],
-            "driven_m": numbers[DRIVEN_M],
-            "walked_m": numbers[WALKED_M],
-            "failed_parks": counts[FAILED_PARKS],
-            "slots_passed": counts[N_PASSED],
-            "parked": counts[PARKED] == 1,
+            "drive_s": drive_s,
+            "failed_s": failed_s,
+            "walk_s": walk_s,
+            "gave_up_s": gave_up_s,
+            "total_s": drive_s + failed_s + walk_s + gave_up_s,
+            "driven_m": driven_m,
+            "walked_m": walked_m,
+            "failed_parks": failed_parks,
+            "slots_passed": slots_passed,
+            "parked": parked == 1,
         }
         if self.render_mode == "human":
             self.render()
-        reward = -(drive + failed + walk + gave_up)
-        self._over = counts[OVER] == 1
-        return self._observation(state), reward, self._over, False, info
+        self._over = over == 1
+        return self._observation(state), -(drive + failed + walk + gave_up), self._over, False, info
 
     def _advance(self, action: int) -> None:
         """Act, and look around."""
-        step_one(self.search, 0, action)
+        step_alone(*self.search, action, self._clock)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """(5,) bool, which actions the graph has here; the name that sb3-contrib looks for."""
@@ -403,12 +399,10 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self._renderer.window.close()
             self._renderer = None
 
-    def _observation(self, state: SearchState) -> dict[str, Any]:  # noqa: ARG002 - sensors look from it
-        vertex, time = self._counts.item(VERTEX), self._numbers.item(TIME)
-        self._clock[0] = time
-        self._clock[1] = time - self._numbers.item(ARRIVAL)
+    def _observation(self, state: SearchState) -> dict[str, Any]:
+        vertex = state.path[-1]
         return {
-            "vertex": np.int64(vertex),
+            "vertex": self._vertices[vertex],
             "time": self._clock.copy(),
             "p_occupied": self._p_occupied.copy(),
             "action_mask": self._masks[vertex].copy(),
@@ -437,7 +431,7 @@ def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
 
 def _action_number(action: Any) -> int:
     """The action as an int; arrays of one element will do, as models return them."""
-    if type(action) in (int, np.int64) and 0 <= action <= PARK:
+    if (type(action) is int or type(action) is np.int64) and 0 <= action <= PARK:
         return int(action)
     number = np.asarray(action)
     if number.size != 1 or not np.issubdtype(number.dtype, np.integer) or not 0 <= number.item() <= PARK:

@@ -2,9 +2,6 @@
 
 `parkenv/Search-v0` and its batch are this code, so they agree to the bit. Nothing in it costs more in a larger lot:
 only slots that were touched in a search, that is looked at or asked for, take any memory that has to be reset.
-
-Kernels are compiled without numba's reference counting (`_nrt`), which would take most of a step's time: none of them
-allocates anything.
 """
 
 from __future__ import annotations
@@ -56,7 +53,6 @@ from parkenv.envs.search_tables import (
     WORLD_REALS,
     SearchTables,
 )
-from parkenv.fading import fading
 from parkenv.keyed_random import (
     ARRIVAL_STREAM,
     ENTRY_STREAM,
@@ -79,6 +75,7 @@ from parkenv.occupancy import (
     holding_end,
     hour_of_week,
     marginal_from,
+    marginal_later,
 )
 from parkenv.recorded_occupancy import recorded_forecast
 
@@ -100,20 +97,38 @@ N_NUMBERS = REGION + N_REGIONS
 N_COUNTS = SCENARIO + 1
 
 # Numbers of a touched slot in `Search.memory`: forecast, how fast sightings fade, what the last look left of the
-# belief, when that was, until when the slot's true state surely lasts.
-PRIOR, RATE, SAID, LOOKED, UNTIL = range(5)
-N_MEMORIES = UNTIL + 1
+# belief, when that was, until when the slot's true state surely lasts, the belief when it was last reckoned. A slot's
+# numbers are those at `spot` of its column and these: slots come in blocks of 8, and a block has 8 of the first
+# number, 8 of the second and so on. So the belief in 8 slots at once takes no more than a few vector instructions,
+# and what a search touches lies close together.
+BLOCK_BITS = 3
+BLOCK = 1 << BLOCK_BITS
+PRIOR, RATE, SAID, LOOKED, UNTIL, BELIEF = (BLOCK * number for number in range(6))
+N_MEMORIES = 6
+PER_BLOCK = BLOCK * N_MEMORIES
 
-# Marks of a touched slot in `Search.marks`: which one it is; what is below; number of the stretch of its true state.
-# ASKED_FOR lists the columns of slots that one observation asks for. `Search.place` has the column of each slot, if WHO
-# of that column says so, too: to forget all is to set N_TOUCHED to 0.
-WHO, FLAGS, FLIPS, ASKED_FOR = range(4)
-N_MARKS = ASKED_FOR + 1
+# Marks of a touched slot in `Search.marks`: which one it is; what is below; number of the stretch of its true state, 0
+# while nobody knows it. `Search.place` has the column of each slot, NOBODY's if it was not touched: nothing was ever
+# seen there, and nothing of it lasts.
+WHO, FLAGS, FLIPS = range(3)
+N_MARKS = FLIPS + 1
+NOBODY = 0
 # In FLAGS: it is taken; UNTIL is exactly when that ends; it was seen; it looked taken; the car stopped there.
 TAKEN, EXACT, SEEN, LOOKED_TAKEN, PASSED = 1, 2, 4, 8, 16
 
 _SAFE = 1.0 - 1e-6
 _MOMENT = 1e-6
+
+
+# Without numba's reference counting, which would take most of a step's time: no kernel here allocates anything.
+compiled = njit(cache=True, error_model="numpy", _nrt=False)
+inlined = njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+
+
+@inlined
+def blocks_of(n_columns: int) -> int:
+    """How many blocks hold so many columns."""
+    return (n_columns + BLOCK - 1) >> BLOCK_BITS
 
 
 class Search(NamedTuple):
@@ -123,11 +138,10 @@ class Search(NamedTuple):
         at, ints, reals, kept: as in `SearchTables`.
         numbers: (n, 21) float64.
         counts: (n, 17) int64.
-        memory: (n, m, 5) float64, a column a touched slot; m is the slots of the largest lot.
-        marks: (n, m, 4) int32, likewise.
+        memory: (n, 48 per block) float64, blocks of 8 columns; a column a touched slot, and the first is NOBODY's.
+        marks: (n, m + 1, 3) int32, a column a touched slot, likewise; m is the slots of the largest lot.
         place: (n, m) int32, a slot's column.
         asked: (n, 2, m) float64, forecast and relaxation rate of priors that are asked in Python; (0, 2, 0) without.
-        scratch: (3, m) float64, where beliefs are reckoned.
         p_occupied: (n, m) float32, belief in every slot, if it is kept up; (0, 0) if not.
     """
 
@@ -141,7 +155,6 @@ class Search(NamedTuple):
     marks: NDArray[np.int32]
     place: NDArray[np.int32]
     asked: FloatArray
-    scratch: FloatArray
     p_occupied: NDArray[np.float32]
 
     @classmethod
@@ -161,11 +174,10 @@ class Search(NamedTuple):
             *tables,
             np.zeros((n, N_NUMBERS)),
             counts,
-            np.zeros((n, m, N_MEMORIES)),
-            np.zeros((n, m, N_MARKS), dtype=np.int32),
+            np.zeros((n, blocks_of(m + 1) * PER_BLOCK)),
+            np.zeros((n, m + 1, N_MARKS), dtype=np.int32),
             np.zeros((n, m), dtype=np.int32),
             np.zeros((n, 2, m) if asked else (0, 2, 0)),
-            np.empty((3, m)),
             np.ones((n, m) if full_belief else (0, 0), dtype=np.float32),
         )
 
@@ -174,7 +186,15 @@ class Search(NamedTuple):
         return self.numbers, self.counts, self.memory, self.marks, self.place, self.asked, self.p_occupied
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@compiled
+def begin(search: Search, e: int) -> None:
+    """`arrive`, and foresee what can be foreseen without Python."""
+    arrive(search, e)
+    if search.at[search.counts[e, SCENARIO], PRIOR_KIND] != ASKED:
+        foresee(search, e)
+
+
+@compiled
 def arrive(search: Search, e: int) -> None:
     """Begin search `e` in the world of its seed and episode; nothing has been seen."""
     at, ints, reals, counts, numbers = search.at, search.ints, search.reals, search.counts, search.numbers
@@ -186,6 +206,7 @@ def arrive(search: Search, e: int) -> None:
     arrival = midnight + (start + keyed_uniform(key, ARRIVAL_STREAM, 0, 1) * (end - start))
     _, hour, second = hour_of_week(arrival)
     entry = int(keyed_uniform(key, ENTRY_STREAM, 0, 0) * at[row, N_ENTRIES])
+    forget(search, e)
     for i in range(N_NUMBERS):
         numbers[e, i] = 0.0
     for i in range(EPISODE):
@@ -200,7 +221,23 @@ def arrive(search: Search, e: int) -> None:
     counts[e, REMEMBERED] = -1
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+@compiled
+def forget(search: Search, e: int) -> None:
+    """Take the touched slots out of their columns."""
+    marks, memory, place = search.marks[e], search.memory[e], search.place[e]
+    for column in range(1, search.counts[e, N_TOUCHED] + 1):
+        place[marks[column, WHO]] = NOBODY
+        # Whole blocks are reckoned; what stands still in an empty column is a number in any case.
+        memory[spot(column) + RATE] = 0.0
+
+
+@inlined
+def spot(column: int) -> int:
+    """Where in `memory` the numbers of a column are."""
+    return (column >> BLOCK_BITS) * PER_BLOCK + (column & (BLOCK - 1))
+
+
+@inlined
 def step_one(search: Search, e: int, action: int) -> None:
     """Everything that an action does in search `e`; what it cost is in the STEP columns."""
     drive_or_park(search, e, action)
@@ -209,7 +246,41 @@ def step_one(search: Search, e: int, action: int) -> None:
     settle(search, e)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+@compiled
+def step_alone(
+    at: IntArray,
+    ints: NDArray[np.int32],
+    reals: FloatArray,
+    kept: FloatArray,
+    numbers: FloatArray,
+    counts: IntArray,
+    memory: FloatArray,
+    marks: NDArray[np.int32],
+    place: NDArray[np.int32],
+    asked: FloatArray,
+    p_occupied: NDArray[np.float32],
+    action: int,
+    clock: NDArray[np.float32],
+) -> None:
+    """`step_one`, `renew` and `tell_time` for the only search there is.
+
+    It takes the arrays of `Search` one by one: to look through a tuple from Python takes several times as long as the
+    step itself.
+    """
+    search = Search(at, ints, reals, kept, numbers, counts, memory, marks, place, asked, p_occupied)
+    step_one(search, 0, action)
+    renew(search, 0)
+    tell_time(search, 0, clock)
+
+
+@inlined
+def tell_time(search: Search, e: int, clock: NDArray[np.float32]) -> None:
+    """Write the time, s since Monday 00:00, and since the search began, into a clock, (2,)."""
+    now = search.numbers[e, TIME]
+    clock[0], clock[1] = now, now - search.numbers[e, ARRIVAL]
+
+
+@inlined
 def drive_or_park(search: Search, e: int, action: int) -> None:
     """Move the car, or try to park it."""
     counts, numbers = search.counts, search.numbers
@@ -233,7 +304,7 @@ def drive_or_park(search: Search, e: int, action: int) -> None:
     counts[e, STEPS] += 1
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@inlined
 def tried(search: Search, e: int, slot: int) -> bool:
     """Try to park; whether the slot is taken, which is then certain."""
     column = touched(search, e, slot)
@@ -245,7 +316,7 @@ def tried(search: Search, e: int, slot: int) -> bool:
     return False
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+@inlined
 def look(search: Search, e: int) -> None:
     """See the slots in view of the car, as well as the sighting model lets it."""
     if search.at[search.counts[e, SCENARIO], PERFECT] == 1:
@@ -254,44 +325,33 @@ def look(search: Search, e: int) -> None:
         look_badly(search, e)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+@inlined
 def look_perfectly(search: Search, e: int) -> None:
-    """See what is there. This is `touched`, `is_taken` and `learn` for every slot in view, and most of a step's work.
+    """See what is there.
 
-    What does not change is read once, before the loop: the compiler cannot know that no store changes it.
+    A slot whose state surely has lasted looks as it did before, and needs no more than a new time of the look.
     """
-    ints, counts, numbers = search.ints, search.counts, search.numbers
-    place, marks, memory = search.place[e], search.marks[e], search.memory[e]
-    row, vertex, time = counts[e, SCENARIO], counts[e, VERTEX], numbers[e, TIME]
+    ints, memory, place = search.ints, search.memory[e], search.place[e]
+    row, vertex, time = search.counts[e, SCENARIO], search.counts[e, VERTEX], search.numbers[e, TIME]
     views, viewed = search.at[row, VIEWS] + vertex, search.at[row, VIEWED]
-    begin, end = viewed + ints[views], viewed + ints[views + 1]
-    n_touched, n_known_taken, n_passed = counts[e, N_TOUCHED], counts[e, N_KNOWN_TAKEN], counts[e, N_PASSED]
-    for i in range(begin, end):
-        slot = ints[i]
-        column = place[slot]
-        if column >= n_touched or marks[column, WHO] != slot:
-            column = begin_slot(search, e, slot)
-            n_touched += 1
-        if time >= memory[column, UNTIL]:
-            _find_out(search, e, column, time)
-        flags = marks[column, FLAGS]
-        if flags & SEEN == 0:
-            counts[e, N_SEEN] += 1
-            numbers[e, SEEN_FREE] += 1 - (flags & TAKEN)
-            numbers[e, EXPECTED_FREE] += 1.0 - memory[column, PRIOR]
-        if slot == vertex and flags & PASSED == 0:
-            flags |= PASSED
-            n_passed += 1
-        taken = flags & TAKEN
-        n_known_taken += taken - (flags & LOOKED_TAKEN) // LOOKED_TAKEN
-        marks[column, FLAGS] = (flags & ~LOOKED_TAKEN) | SEEN | (taken * LOOKED_TAKEN)
-        memory[column, SAID] = float(taken)
-        memory[column, LOOKED] = time
-    counts[e, N_KNOWN_TAKEN] = n_known_taken
-    counts[e, N_PASSED] = n_passed
+    for i in range(viewed + ints[views], viewed + ints[views + 1]):
+        column = np.int64(place[ints[i]])
+        if time >= memory[spot(column) + UNTIL]:
+            column = see_anew(search, e, ints[i])
+        memory[spot(column) + LOOKED] = time
+    pass_by(search, e)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@inlined
+def see_anew(search: Search, e: int, slot: int) -> int:
+    """See perfectly what stands in a slot where it may have changed; the slot's column."""
+    column: int = touched(search, e, slot)
+    taken = is_taken(search, e, column, search.numbers[e, TIME])
+    learn(search, e, column, taken, 1.0 if taken else 0.0)
+    return column
+
+
+@compiled
 def look_badly(search: Search, e: int) -> None:
     """See some of what is there, and some of it wrongly."""
     at, ints, reals, counts = search.at, search.ints, search.reals, search.counts
@@ -318,7 +378,7 @@ def look_badly(search: Search, e: int) -> None:
         )
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@compiled
 def take_in(
     search: Search, e: int, slots: IntArray, looks_taken: BoolArray, hit: FloatArray, false_alarm: FloatArray
 ) -> None:
@@ -330,7 +390,7 @@ def take_in(
         learn(search, e, column, looks_taken[i], said)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+@inlined
 def settle(search: Search, e: int) -> None:
     """Give up a lot that is proven full, and add the step to the episode."""
     counts, numbers = search.counts, search.numbers
@@ -341,11 +401,9 @@ def settle(search: Search, e: int) -> None:
     counts[e, OVER] = int(full or counts[e, PARKED] == 1)
     for term in range(N_TERMS):
         numbers[e, DRIVE_S + term] += numbers[e, STEP_DRIVE + term]
-    if search.p_occupied.size > 0:
-        renew(search, e)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@inlined
 def pass_by(search: Search, e: int) -> None:
     """Count the slot that the car stops at, the first time."""
     vertex = search.counts[e, VERTEX]
@@ -356,84 +414,119 @@ def pass_by(search: Search, e: int) -> None:
             search.counts[e, N_PASSED] += 1
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@inlined
 def learn(search: Search, e: int, column: int, looks_taken: bool, said: float) -> None:
     """Hold `said` of a slot from now on."""
     counts, flags = search.counts, search.marks[e, column, FLAGS]
     if flags & SEEN == 0:
         counts[e, N_SEEN] += 1
         search.numbers[e, SEEN_FREE] += 0.0 if looks_taken else 1.0
-        search.numbers[e, EXPECTED_FREE] += 1.0 - search.memory[e, column, PRIOR]
+        search.numbers[e, EXPECTED_FREE] += 1.0 - search.memory[e, spot(column) + PRIOR]
     looked_taken = LOOKED_TAKEN if looks_taken else 0
     counts[e, N_KNOWN_TAKEN] += int(looks_taken) - int(flags & LOOKED_TAKEN != 0)
     search.marks[e, column, FLAGS] = (flags & ~LOOKED_TAKEN) | looked_taken | SEEN
-    search.memory[e, column, SAID] = said
-    search.memory[e, column, LOOKED] = search.numbers[e, TIME]
+    search.memory[e, spot(column) + SAID] = said
+    search.memory[e, spot(column) + LOOKED] = search.numbers[e, TIME]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+@inlined
 def belief(search: Search, e: int, column: int) -> float:
     """The belief in a touched slot, now."""
-    said, elapsed = search.memory[e, column, SAID], search.numbers[e, TIME] - search.memory[e, column, LOOKED]
-    return float(relaxed(search.memory[e, column, PRIOR], search.memory[e, column, RATE], said, elapsed))
+    memory, at = search.memory[e], spot(column)
+    elapsed = search.numbers[e, TIME] - memory[at + LOOKED]
+    return float(relaxed(memory[at + PRIOR], memory[at + RATE], memory[at + SAID], elapsed))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+@inlined
 def renew(search: Search, e: int) -> None:
     """Bring the full belief up to date; only touched slots can have changed."""
-    n, time = search.counts[e, N_TOUCHED], search.numbers[e, TIME]
+    relax_touched(search, e)
+    end = search.counts[e, N_TOUCHED] + 1
     memory, marks, out = search.memory[e], search.marks[e], search.p_occupied[e]
-    prior, away, faded = search.scratch[0], search.scratch[1], search.scratch[2]
-    for i in range(n):
-        prior[i] = memory[i, PRIOR]
-        away[i] = memory[i, SAID] - memory[i, PRIOR]
-        faded[i] = memory[i, RATE] * (time - memory[i, LOOKED])
-    relax_all(n, prior, away, faded)
-    for i in range(n):
-        out[marks[i, WHO]] = prior[i]
+    for first in range(0, end, BLOCK):
+        # A loop of fixed length, which is unrolled.
+        for column in range(first, first + BLOCK):
+            if NOBODY < column < end:
+                out[marks[column, WHO]] = memory[spot(column) + BELIEF]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
-def relax_all(n: int, prior: FloatArray, away: FloatArray, faded: FloatArray) -> None:
-    """`relaxed` for n slots at once, into `prior`; a loop of its own, so that it becomes vector instructions."""
-    for i in range(n):
-        prior[i] = prior[i] + away[i] * fading(faded[i])
+@inlined
+def relax_touched(search: Search, e: int) -> None:
+    """Reckon the belief in all touched slots, now."""
+    for block in range(blocks_of(search.counts[e, N_TOUCHED] + 1)):
+        relax_block(search.memory[e], block * PER_BLOCK, search.numbers[e, TIME])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@inlined
+def relax_block(memory: FloatArray, at: int, time: float) -> None:
+    """`relaxed` for the columns of a block that begins at `at`; a loop of its own, so that it becomes vector code."""
+    for i in range(at, at + BLOCK):
+        prior, elapsed = memory[i + PRIOR], time - memory[i + LOOKED]
+        memory[i + BELIEF] = relaxed(prior, memory[i + RATE], memory[i + SAID], elapsed)
+
+
+@inlined
 def touched(search: Search, e: int, slot: int) -> int:
-    """The column of a slot, begun if there is none: what is forecast of it, and what stands there."""
-    marks, counts = search.marks, search.counts
-    column = search.place[e, slot]
-    if column < counts[e, N_TOUCHED] and marks[e, column, WHO] == slot:
-        return int(column)
-    return int(begin_slot(search, e, slot))
+    """The column of a slot, begun if there is none."""
+    column = int(search.place[e, slot])
+    if column == NOBODY:
+        column = begin_slot(search, e, slot)
+    return column
 
 
-@njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+@inlined
 def begin_slot(search: Search, e: int, slot: int) -> int:
-    """A column for a slot that has none."""
-    marks, counts, memory = search.marks, search.counts, search.memory
-    row, arrival = counts[e, SCENARIO], search.numbers[e, ARRIVAL]
-    column = counts[e, N_TOUCHED]
-    counts[e, N_TOUCHED] = column + 1
+    """A column for a slot that has none, and in it what is forecast of the slot."""
+    marks, counts, memory = search.marks[e], search.counts, search.memory[e]
+    column = counts[e, N_TOUCHED] + 1
+    counts[e, N_TOUCHED] = column
     search.place[e, slot] = column
-    marks[e, column, WHO] = slot
-    marks[e, column, FLIPS] = 1
-    prior, rate, in_world = forecast(search, e, slot)
-    memory[e, column, PRIOR] = memory[e, column, SAID] = prior
-    memory[e, column, RATE] = rate
-    memory[e, column, LOOKED] = arrival
-    if search.at[row, WORLD_KIND] == LOG:
-        marks[e, column, FLAGS] = 0
-        memory[e, column, UNTIL] = arrival
-        return int(column)
-    key, hour = np.uint64(counts[e, KEY]), counts[e, HOUR]
-    state = 1 if keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < in_world else 0
-    marks[e, column, FLAGS] = TAKEN if state == 1 else 0
+    marks[column, WHO], marks[column, FLAGS], marks[column, FLIPS] = slot, 0, 0
+    at = spot(column)
+    prior, rate = forecast(search, e, slot)
+    memory[at + PRIOR] = memory[at + SAID] = memory[at + BELIEF] = prior
+    memory[at + RATE] = rate
+    memory[at + LOOKED] = search.numbers[e, ARRIVAL]
+    memory[at + UNTIL] = 0.0
+    return int(column)
+
+
+@inlined
+def is_taken(search: Search, e: int, column: int, time: float) -> bool:
+    """The truth about a touched slot at a time that does not come before that of earlier questions, s."""
+    if time >= search.memory[e, spot(column) + UNTIL]:
+        _find_out(search, e, column, time)
+    return bool(search.marks[e, column, FLAGS] & TAKEN != 0)
+
+
+@inlined
+def _find_out(search: Search, e: int, column: int, time: float) -> None:
+    """What stands in a slot at a time for which that is not known yet."""
+    if search.at[search.counts[e, SCENARIO], WORLD_KIND] == LOG:
+        _replay(search, e, column, time)
+        return
+    if search.marks[e, column, FLIPS] == 0:
+        _draw(search, e, column)
+    if time >= search.memory[e, spot(column) + UNTIL]:
+        _flip(search, e, column, time)
+
+
+@inlined
+def _draw(search: Search, e: int, column: int) -> None:
+    """What stood in a slot at the arrival, and until when at least."""
+    counts, marks, at = search.counts, search.marks[e, column], search.at[search.counts[e, SCENARIO]]
+    slot, key, hour = np.int64(marks[WHO]), np.uint64(counts[e, KEY]), counts[e, HOUR]
+    world, n = at[WORLD_REALS], at[N_SLOTS]
+    p = search.memory[e, spot(column) + PRIOR]
+    # The forecast of the world itself is its marginal, unless that was too sure to be believed.
+    own = at[PRIOR_KIND] == PROCESS and at[PRIOR_REALS] == world
+    if not (own and MIN_PROBABILITY < p < MAX_PROBABILITY):
+        p, _ = _process_marginal(search, e, slot, world, at[WORLD_KEPT])
+    state = 1 if keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < p else 0
+    marks[FLIPS] = 1
+    marks[FLAGS] |= TAKEN if state == 1 else 0
     # The stretch ends when its hazard has reached -log(u), which is more than 1 - u; until the hour ends the rate
     # is constant. Mostly that is time enough, and spares us to find out when exactly it ends.
-    world, n = search.at[row, WORLD_REALS], search.at[row, N_SLOTS]
     leaving = (
         search.reals[world + PROFILES + HAZARDS + state * n + slot]
         * search.reals[world + state * WEEK_HOURS + hour]
@@ -442,43 +535,26 @@ def begin_slot(search: Search, e: int, slot: int) -> int:
     hazard = (1.0 - keyed_uniform(key, OCCUPANCY_STREAM, slot, 1)) * _SAFE
     if hazard < leaving * lasts:
         lasts = hazard / leaving
-    memory[e, column, UNTIL] = arrival + lasts - _MOMENT
-    return int(column)
+    search.memory[e, spot(column) + UNTIL] = search.numbers[e, ARRIVAL] + lasts - _MOMENT
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
-def is_taken(search: Search, e: int, column: int, time: float) -> bool:
-    """The truth about a touched slot at a time that does not come before that of earlier questions, s."""
-    if time >= search.memory[e, column, UNTIL]:
-        _find_out(search, e, column, time)
-    return bool(search.marks[e, column, FLAGS] & TAKEN != 0)
-
-
-@njit(cache=True, error_model="numpy", _nrt=False)
-def _find_out(search: Search, e: int, column: int, time: float) -> None:
-    """What stands in a slot at a time for which that is not known yet."""
-    if search.at[search.counts[e, SCENARIO], WORLD_KIND] == LOG:
-        _replay(search, e, column, time)
-    else:
-        _flip(search, e, column, time)
-
-
-@njit(cache=True, error_model="numpy", _nrt=False)
+@compiled
 def _flip(search: Search, e: int, column: int, time: float) -> None:
     """Let cars come and go at a slot until `time`, as `OccupancyProcess` has them."""
-    marks, memory, reals = search.marks[e, column], search.memory[e, column], search.reals
+    marks, memory, reals = search.marks[e, column], search.memory[e], search.reals
+    until = spot(column) + UNTIL
     row, slot, key = search.counts[e, SCENARIO], marks[WHO], np.uint64(search.counts[e, KEY])
     world, n = search.at[row, WORLD_REALS], search.at[row, N_SLOTS]
     since = search.numbers[e, ARRIVAL]
-    while time >= memory[UNTIL]:
+    while time >= memory[until]:
         if marks[FLAGS] & EXACT != 0:
-            since = memory[UNTIL]
+            since = memory[until]
             marks[FLAGS] ^= TAKEN
             marks[FLIPS] += 1
         marks[FLAGS] |= EXACT
         state = 1 if marks[FLAGS] & TAKEN != 0 else 0
         profile, table = world + state * WEEK_HOURS, world + PROFILES + state * (WEEK_HOURS + 1)
-        memory[UNTIL] = holding_end(
+        memory[until] = holding_end(
             key,
             slot,
             marks[FLIPS],
@@ -489,7 +565,7 @@ def _flip(search: Search, e: int, column: int, time: float) -> None:
         )
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@compiled
 def _replay(search: Search, e: int, column: int, time: float) -> None:
     """Read a slot's state off the log, as `RecordedWorld` does."""
     ints, reals, counts = search.ints, search.reals, search.counts
@@ -508,40 +584,49 @@ def _replay(search: Search, e: int, column: int, time: float) -> None:
     i = begin + np.searchsorted(reals[from_s + begin : from_s + end], second, side="right") - 1
     flags = search.marks[e, column, FLAGS] & ~TAKEN
     search.marks[e, column, FLAGS] = flags | (TAKEN if ints[looks + i] != 0 else 0)
-    search.memory[e, column, UNTIL] = reals[from_s + i + 1] + midnight - _MOMENT if i + 1 < end else np.inf
+    until = reals[from_s + i + 1] + midnight - _MOMENT if i + 1 < end else np.inf
+    search.memory[e, spot(column) + UNTIL] = until
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
-def forecast(search: Search, e: int, slot: int) -> tuple[float, float, float]:
-    """P(taken) that the car foresees for a slot, how fast sightings of it fade, 1/s, and P(taken) in the world."""
-    at = search.at
-    row = search.counts[e, SCENARIO]
-    p, rate, in_world = 0.0, 0.0, 0.0
-    if at[row, WORLD_KIND] == PROCESS:
-        in_world, rate = _process_marginal(search, e, slot, at[row, WORLD_REALS], at[row, WORLD_KEPT])
-        p = in_world
-    if at[row, PRIOR_KIND] == ASKED:
-        return search.asked[e, 0, slot], search.asked[e, 1, slot], in_world
-    if at[row, PRIOR_KIND] == LOG:
+@inlined
+def forecast(search: Search, e: int, slot: int) -> tuple[float, float]:
+    """P(taken) that the car foresees for a slot, and how fast sightings of it fade, 1/s."""
+    at = search.at[search.counts[e, SCENARIO]]
+    if at[PRIOR_KIND] == ASKED:
+        return search.asked[e, 0, slot], search.asked[e, 1, slot]
+    if at[PRIOR_KIND] == LOG:
         p, rate = _log_forecast(search, e, slot)
-    elif at[row, PRIOR_REALS] != at[row, WORLD_REALS]:
-        p, rate = _process_marginal(search, e, slot, at[row, PRIOR_REALS], at[row, PRIOR_KEPT])
-    return min(max(p, MIN_PROBABILITY), MAX_PROBABILITY), rate, in_world
+    else:
+        p, rate = _process_marginal(search, e, slot, at[PRIOR_REALS], at[PRIOR_KEPT])
+    return min(max(p, MIN_PROBABILITY), MAX_PROBABILITY), rate
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@inlined
 def _process_marginal(search: Search, e: int, slot: int, model: int, kept: int) -> tuple[float, float]:
     reals, hour = search.reals, search.counts[e, HOUR]
     n = search.at[search.counts[e, SCENARIO], N_SLOTS]
+    start = search.kept[kept + hour * n + slot]
+    if start == 0.0:
+        start = _marginal_at_hour(reals, search.kept, model, kept, n, hour, slot)
+    factors = model + PROFILES + HAZARDS
+    arrival = reals[factors + slot] * reals[model + hour]
+    rate = arrival + reals[factors + n + slot] * reals[model + WEEK_HOURS + hour]
+    return marginal_later(start, arrival, rate, search.numbers[e, SECOND_OF_HOUR]), rate
+
+
+@compiled
+def _marginal_at_hour(
+    reals: FloatArray, kept: FloatArray, model: int, first: int, n: int, hour: int, slot: int
+) -> float:
+    """The marginal of a slot of a process at a full hour, which is kept from now on."""
     factors = model + PROFILES + HAZARDS
     arrivals, departures = reals[model : model + WEEK_HOURS], reals[model + WEEK_HOURS : model + PROFILES]
-    come, go = reals[factors + slot], reals[factors + n + slot]
-    second, row = search.numbers[e, SECOND_OF_HOUR], kept + hour * n + slot
-    p = marginal_from(come, go, arrivals, departures, hour, second, search.kept, row)
-    return p, come * arrivals[hour] + go * departures[hour]
+    come, go, row = reals[factors + slot], reals[factors + n + slot], first + hour * n + slot
+    marginal_from(come, go, arrivals, departures, hour, 0.0, kept, row)
+    return float(kept[row])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@compiled
 def _log_forecast(search: Search, e: int, slot: int) -> tuple[float, float]:
     ints, reals, counts = search.ints, search.reals, search.counts
     row, choice = counts[e, SCENARIO], counts[e, CHOICE]
@@ -561,7 +646,7 @@ def _log_forecast(search: Search, e: int, slot: int) -> tuple[float, float]:
     return p, reals[day + 1]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@compiled
 def foresee(search: Search, e: int) -> None:
     """Write the forecast of every slot into the full belief."""
     at, row, out = search.at, search.counts[e, SCENARIO], search.p_occupied[e]
@@ -572,9 +657,12 @@ def foresee(search: Search, e: int) -> None:
         return
     hour, model = search.counts[e, HOUR], at[row, PRIOR_REALS]
     marginals = at[row, PRIOR_KEPT] + hour * n
+    missing = 0
     for s in range(n):
-        if search.kept[marginals + s] == 0.0:
-            _process_marginal(search, e, s, model, at[row, PRIOR_KEPT])
+        missing += search.kept[marginals + s] == 0.0
+    if missing > 0:
+        for s in range(n):
+            _marginal_at_hour(search.reals, search.kept, model, at[row, PRIOR_KEPT], n, hour, s)
     factors = model + PROFILES + HAZARDS
     _foresee_all(
         search.reals[factors : factors + n],
@@ -587,7 +675,7 @@ def foresee(search: Search, e: int) -> None:
     )
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@compiled
 def _foresee_all(
     come: FloatArray,
     go: FloatArray,
@@ -597,10 +685,9 @@ def _foresee_all(
     second: float,
     out: NDArray[np.float32],
 ) -> None:
-    """`marginal_from` of many slots, whose marginals at the full hour are known, by vector instructions."""
+    """`forecast` of many slots, whose marginals at the full hour are known, by vector instructions."""
     for s in range(len(start)):
         arrival = come[s] * coming
         rate = arrival + go[s] * going
-        equilibrium = arrival / rate if rate > 0.0 else 0.0
-        p = equilibrium + (start[s] - equilibrium) * fading(rate * second)
+        p = marginal_later(start[s], arrival, rate, second)
         out[s] = min(max(p, MIN_PROBABILITY), MAX_PROBABILITY)

@@ -10,13 +10,11 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.envs.local_observation import Surroundings, local_space, observe_surroundings
 from parkenv.envs.search import REWARD_TERMS, arrival_of, search_space
 from parkenv.envs.search_step import (
-    ARRIVAL,
     DRIVE_S,
     DRIVEN_M,
     EPISODE,
@@ -29,13 +27,16 @@ from parkenv.envs.search_step import (
     SEED_STATE,
     STEP_DRIVE,
     STEPS,
-    TIME,
     VERTEX,
     WALKED_M,
     Search,
     arrive,
+    compiled,
     foresee,
+    inlined,
+    renew,
     step_one,
+    tell_time,
 )
 from parkenv.envs.search_tables import MASKS, N_ACTIONS, SearchTables
 from parkenv.errors import InputError
@@ -47,6 +48,9 @@ from parkenv.scenario import Scenario
 OBSERVATIONS = ("full", "local")
 TIME_METRICS = ("drive_s", "failed_s", "walk_s", "gave_up_s", "total_s", "driven_m", "walked_m")
 COUNT_METRICS = ("failed_parks", "slots_passed")
+# Gymnasium's names of the arrays that say which searches a metric is of.
+_WHICH = tuple(f"_{name}" for name in ("reward_terms", "parked", *TIME_METRICS, *COUNT_METRICS))
+_WHICH_TERMS = tuple(f"_{name}" for name in REWARD_TERMS)
 
 
 class Steps(NamedTuple):
@@ -78,7 +82,7 @@ class Steps(NamedTuple):
         return cls(np.zeros(n), flags[0], flags[1], np.zeros((N_TERMS, n)), times, tallies, flags[2])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@compiled
 def arrive_all(search: Search, which: BoolArray) -> None:
     """Put cars at the entries of their next worlds."""
     for e in range(len(which)):
@@ -87,7 +91,7 @@ def arrive_all(search: Search, which: BoolArray) -> None:
             arrive(search, e)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@compiled
 def step_full(
     search: Search,
     actions: IntArray,
@@ -103,21 +107,21 @@ def step_full(
     wrong: int = _first_wrong(actions)
     if wrong >= 0:
         return wrong
+    _step_all(search, actions, fresh, idle)
     for e in range(len(actions)):
         if idle[e]:
             continue
         if fresh[e]:
             foresee(search, e)
         else:
-            step_one(search, e, actions[e])
+            renew(search, e)
         _report(search, e, fresh[e], limit, steps, mask)
         vertex[e] = search.counts[e, VERTEX]
-        now = search.numbers[e, TIME]
-        time[e, 0], time[e, 1] = now, now - search.numbers[e, ARRIVAL]
+        tell_time(search, e, time[e])
     return -1
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@compiled
 def step_local(
     search: Search,
     around: Surroundings,
@@ -133,17 +137,23 @@ def step_local(
     wrong: int = _first_wrong(actions)
     if wrong >= 0:
         return wrong
+    _step_all(search, actions, fresh, idle)
     for e in range(len(actions)):
         if idle[e]:
             continue
-        if not fresh[e]:
-            step_one(search, e, actions[e])
         _report(search, e, fresh[e], limit, steps, mask)
         observe_surroundings(search, around, e, local[e])
     return -1
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@inlined
+def _step_all(search: Search, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
+    for e in range(len(actions)):
+        if not (idle[e] or fresh[e]):
+            step_one(search, e, actions[e])
+
+
+@compiled
 def _first_wrong(actions: IntArray) -> int:
     for e in range(len(actions)):
         if not 0 <= actions[e] < N_ACTIONS:
@@ -151,7 +161,7 @@ def _first_wrong(actions: IntArray) -> int:
     return -1
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@compiled
 def _report(search: Search, e: int, fresh: bool, limit: int, steps: Steps, mask: NDArray[np.int8]) -> None:
     """Reward, ends, metrics where it ends, and what can be done next."""
     counts, numbers = search.counts, search.numbers
@@ -377,7 +387,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._done = done = steps.terminated | steps.truncated
         info: dict[str, Any] = {}
         if done.any():
-            info = self._metrics(done)
+            info = self._metrics(done.copy())
             if self._mode is AutoresetMode.SAME_STEP:
                 info = {"final_info": info, "_final_info": done.copy()}
                 info["final_obs"], info["_final_obs"] = self._final_observations(done), done.copy()
@@ -432,13 +442,14 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     def _metrics(self, done: BoolArray) -> dict[str, Any]:
         """What `SearchEnv`'s info says, and which searches it is of."""
         steps = self._steps
-        mask = done.copy()
-        terms = dict(zip(REWARD_TERMS, steps.terms.copy(), strict=True))
-        metrics: dict[str, Any] = {"reward_terms": terms | {f"_{name}": mask for name in terms}}
-        metrics |= zip(TIME_METRICS, steps.times.copy(), strict=True)
-        metrics |= zip(COUNT_METRICS, steps.tallies.copy(), strict=True)
-        metrics["parked"] = steps.parked.copy()
-        return metrics | {f"_{name}": mask for name in metrics}
+        terms, times, tallies, parked = steps.terms, steps.times, steps.tallies, steps.parked
+        if self._copy:
+            terms, times, tallies, parked = terms.copy(), times.copy(), tallies.copy(), parked.copy()
+        of_terms = dict(zip(REWARD_TERMS, terms, strict=True)) | dict.fromkeys(_WHICH_TERMS, done)
+        metrics: dict[str, Any] = {"reward_terms": of_terms, "parked": parked}
+        metrics |= zip(TIME_METRICS, times, strict=True)
+        metrics |= zip(COUNT_METRICS, tallies, strict=True)
+        return metrics | dict.fromkeys(_WHICH, done)
 
     def _chosen(self, options: dict[str, Any] | None) -> BoolArray:
         """Which environments to reset."""

@@ -32,6 +32,10 @@ def env_rows(
 ) -> list[BenchRow]:
     """Rows of `parkenv bench env`, on one core; all take random actions.
 
+    A step is a whole `step()` of one environment, be it in a batch, with all that comes with it: observations, infos,
+    and new episodes where old ones end. Actions are drawn beforehand for all alike. Gymnasium's CartPole batch is
+    numpy on four numbers an environment, and so has no world to draw, nor a belief to keep.
+
     Steppers take turns, and each is judged by the median of its turns' rates, in seconds of this process: so a machine
     that is busy with something else slows all of them alike.
 

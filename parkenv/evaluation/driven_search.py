@@ -128,6 +128,7 @@ class Trip:
         driven_m: m that the car drove, in either direction.
         contacts: how often it touched something.
         strays: how often it was off its way.
+        rescues: how often it was stuck and put back on the lane.
         legs: the edges, in order.
         tries: the tries to park, in order.
     """
@@ -147,6 +148,7 @@ class Trip:
     driven_m: float
     contacts: int
     strays: int
+    rescues: int
     legs: tuple[Leg, ...]
     tries: tuple[Try, ...]
 
@@ -238,6 +240,7 @@ class DrivenSearch:
             driven_m=log.driven_m,
             contacts=len(log.contacts),
             strays=log.strays,
+            rescues=log.rescues,
             legs=tuple(log.legs),
             tries=tuple(log.tries),
         )

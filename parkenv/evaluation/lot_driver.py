@@ -34,6 +34,8 @@ two-way lane, for which the car turns round only when it drives on from there, a
 TAKEN, NO_ROOM, NO_WAY = "taken", "too narrow", "no way in"
 """Why a slot was left again."""
 
+RESCUE_S = 60.0
+"""s that pass until a car that is stuck is back on the lane."""
 TURN_IN_M = 9.0
 """m, from the rear axle to the middle of a junction where the driver decides where to go on."""
 
@@ -178,6 +180,7 @@ class DriveLog:
         driven_m: m, in either direction.
         contacts: what was touched, by name, once each time.
         strays: how often the car was off its way and sought another.
+        rescues: how often there was none, and it was put back on the lane.
     """
 
     legs: list[Leg] = field(default_factory=list)
@@ -185,6 +188,7 @@ class DriveLog:
     driven_m: float = 0.0
     contacts: list[str] = field(default_factory=list)
     strays: int = 0
+    rescues: int = 0
 
 
 class LotDriver:
@@ -377,13 +381,14 @@ class LotDriver:
             onward = _ONTO if askew < _AROUND else _BACK
             path = self._planned_onto(self.state[:3], line, now, onward, there, _WIDE[-1:])
             if path is None:
-                self.log.strays += 1
                 break
             tracker = PathTracker(self.vehicle, path)
             self._follow(tracker)
             if tracker.done:
                 break
             self.log.strays += 1
+        if not self._is_on(line):
+            self._rescue(line)
         self._follow_line(line)
         return TURN if askew < _AROUND else ROUND
 
@@ -533,7 +538,7 @@ class LotDriver:
                     if path is not None and (best is None or _seconds_of(path) < best[0]):
                         best = _seconds_of(path), path, index
             if best is None:
-                self.log.strays += 1
+                self._rescue(self._lines.lines[ways[0][0]])
                 break
             _, path, self._line = best
             tracker = PathTracker(self.vehicle, path)
@@ -546,6 +551,13 @@ class LotDriver:
         return own - station
 
     # --- The car and what is around it
+
+    def _rescue(self, line: DrivenLine) -> None:
+        """Put a car that is stuck back on a line."""
+        self.log.rescues += 1
+        self.time += RESCUE_S
+        pose = line.pose(line.station_of(self.state[:2]))
+        self.state = np.r_[pose, np.zeros(STATE_SIZE - 3)]
 
     def _halt(self, braking: float, tracker: PathTracker | None = None) -> None:
         """Brake until the car stands."""
