@@ -344,5 +344,5 @@ def save_distributions(rows: Sequence[Row], speed_limit: float, title: str, path
         kinds = [k for k in EDGE_KINDS if f"s_per_m.{k}" in known]
         ax.boxplot([known[f"s_per_m.{k}"] for k in kinds], tick_labels=kinds, whis=(5, 95), showfliers=False)
         ax.axhline(1.0 / speed_limit, color="#d55e00", lw=1.0, ls="--")
-        ax.set_title("s per metre of the graph, by edge (dashed: the speed limit; whiskers 5 to 95 %)")
+        ax.set_title("edges (s per m of the graph; dashed: speed limit)")
         save_picture(figure, path)
