@@ -206,16 +206,16 @@ def _planner_times(
     examined: range,
     at_test: range,
 ) -> tuple[dict[str, float], list[dict[str, Any]]]:
-    """Mean times of planners in the worlds of the examinations, and rows of those of the test."""  # fmt: skip
+    """Mean times of planners in the worlds of the examinations, and rows of those of the test."""
     from parkenv.evaluation.compare import rows_of
 
     if not names:
         return {}, []
     with console.status("Planners search in the same worlds"):
-        lines = {row["agent"]: row["total_s"] for row in rows_of(names, first, examined, workers)}
-        oracle = rows_of(names[:1], first, examined, workers)[0]["bound_s"]
+        rows = rows_of(names, first, examined, workers)
         tables = [row for world in tested for row in rows_of(names, world, at_test, workers)]
-    return {**lines, "clairvoyant bound": oracle}, tables
+    lines = {row["agent"]: row["total_s"] for row in rows}
+    return {**lines, "clairvoyant bound": rows[0]["bound_s"]}, tables
 
 
 def _train_all(
