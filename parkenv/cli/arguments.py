@@ -93,6 +93,15 @@ SensorsOption = Annotated[
         rich_help_panel=WORLD,
     ),
 ]
+RerunOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--rerun",
+        metavar="FILE.rrd",
+        help="Also record images, boxes, scans, grid, slots and path on one time line, for the Rerun viewer "
+        "(pip install 'parkenv[viewer]'; then: rerun FILE.rrd).",
+    ),
+]
 FailureCostOption = Annotated[
     str,
     typer.Option(

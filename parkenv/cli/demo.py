@@ -32,6 +32,7 @@ def demo(
     ] = 2.5,
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 0,
+    rerun: args.RerunOption = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for everything.")] = Path("results/demo"),
 ) -> None:
     """Survey a lot with simulated sensors, learn from it how often each slot is taken, and search there on other days.
@@ -48,6 +49,7 @@ def demo(
     """
     from parkenv.evaluation.compare import Case, run_cases, table
     from parkenv.evaluation.results import ResultFolder, make_folder
+    from parkenv.evaluation.sensor_log import require_viewer
     from parkenv.evaluation.survey_pictures import save_detections, save_map, save_session
     from parkenv.evaluation.surveys import run_survey, summarize
     from parkenv.evaluation.time_figures import save_time_split
@@ -59,6 +61,8 @@ def demo(
     from parkenv.sighting import SightingModel
     from parkenv.traffic import Traffic
 
+    if rerun is not None:
+        require_viewer()
     its = Scenario.named(scenario, traffic=Traffic(cars=3, pedestrians=5))
     hours = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
     settings = SurveySettings(every=every, windows=tuple(ArrivalWindow.parse(h) for h in hours), seed=seed)
@@ -112,6 +116,23 @@ def demo(
     for printed in result_tables(rows, console.width):
         console.print(printed)
     console.print(f"Pictures, the map, episodes.csv and summary.json are in {out}")
+    if rerun is not None:
+        with console.status(f"Driving the first survey and the first search once more for {rerun}"):
+            _record(known, settings, seeds[0], rerun)
+        console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
+
+
+def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:
+    """The first survey drive and the first search, on one time line."""
+    from parkenv.envs.perception import SearchPerceptionEnv
+    from parkenv.evaluation.sensor_log import record_search, record_session, sensor_log
+    from parkenv.mapping.survey import Survey
+    from planners.agent import make_agent
+
+    env = SearchPerceptionEnv(known, rig="laser")
+    with sensor_log(path, known.lot, env.rig) as log:
+        record_session(Survey(known, settings), 0, log)
+        record_search(env, make_agent(AGENTS[0], env.scenario), seed, log)
 
 
 def _settings(its: Scenario, settings: SurveySettings, sessions: int, seed: int) -> dict[str, Any]:

@@ -50,6 +50,7 @@ def survey(
     jobs: args.JobsOption = 0,
     backend: args.BackendOption = "loky",
     address: args.AddressOption = None,
+    rerun: args.RerunOption = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder for map.sqlite, pictures, summary.json.")
     ] = Path("results/survey"),
@@ -63,8 +64,11 @@ def survey(
     * `parkenv survey --sessions 21`
 
     * `parkenv survey --scenario street --rig stereo --weather rain --hours 12:00-13:00`
+
+    * `parkenv survey --scenario mini --sessions 1 --rerun drive.rrd`
     """
     from parkenv.evaluation.results import make_folder, write_summary
+    from parkenv.evaluation.sensor_log import record_session, require_viewer, sensor_log
     from parkenv.evaluation.survey_pictures import (
         save_detection_reach,
         save_detections,
@@ -78,12 +82,14 @@ def survey(
     from parkenv.mapping.inference import predict
     from parkenv.mapping.odometry import PoseNoise
     from parkenv.mapping.store import MapStore
-    from parkenv.mapping.survey import SurveySettings
+    from parkenv.mapping.survey import Survey, SurveySettings
     from parkenv.occupancy import Arrival, ArrivalWindow
     from parkenv.traffic import Traffic
 
     (its,) = args.scenarios_of(scenario, lot, occupancy, None, None, "08:00-13:00", days, None)
     its = its.replace(traffic=Traffic(cars, pedestrians))
+    if rerun is not None:
+        require_viewer()
     settings = SurveySettings(
         rig=rig,
         every=every,
@@ -112,8 +118,8 @@ def survey(
     with MapStore(out / MAP_FILE, its.lot, create=False) as store:
         log = store.log()
         found = slots_found(store, len(log.time))
-    first = settings.windows[0]
-    time = 86_400.0 * first.weekdays[0] + 0.5 * (first.start_s + first.end_s)
+    window = settings.windows[0]
+    time = 86_400.0 * window.weekdays[0] + 0.5 * (window.start_s + window.end_s)
     predicted = predict(log, time)
     save_map(
         its.lot, predicted, its.occupancy.forecast(Arrival(time)).p_occupied,
@@ -150,6 +156,12 @@ def survey(
     summary = {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "rows": [row]}
     write_summary(out, summary)
     console.print(f"Written: {out / MAP_FILE}, summary.json, sessions.csv and pictures")
+    if rerun is not None:
+        with console.status(f"Driving the first session once more for {rerun}"):
+            first = Survey(its, settings)
+            with sensor_log(rerun, its.lot, first.stack.rig) as recording:
+                record_session(first, 0, recording)
+        console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
 
 
 def show_map(

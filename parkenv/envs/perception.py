@@ -13,7 +13,7 @@ from parkenv.envs.search_step import drive_or_park, renew, settle, take_in, tell
 from parkenv.envs.sensors import beside_the_lot
 from parkenv.mapping.slots import SlotFilter
 from parkenv.perception.detector import Detector
-from parkenv.perception.stack import PerceptionStack
+from parkenv.perception.stack import Look, PerceptionStack
 from parkenv.scenario import Scenario
 from parkenv.sighting import SightingModel
 from sim_sensors.rig import SensorRig
@@ -105,7 +105,7 @@ class SearchPerceptionEnv(SearchEnv):
         self._view_starts, self._view_slots = self.scenario.slots_in_view
         self._rates = self.scenario.sight_rates
         self._before: tuple[int, float] | None = None
-        self._moments: list[Moment] = []
+        self._looks: list[tuple[Moment, Look]] = []
         self._report = _NOTHING
 
     @property
@@ -118,11 +118,16 @@ class SearchPerceptionEnv(SearchEnv):
         """What the stack said of the slots after the last step."""
         return self._report
 
+    @property
+    def looks(self) -> list[tuple[Moment, Look]]:
+        """What was captured on the way of the last step, oldest first, and what the stack made of it."""
+        return list(self._looks)
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start a search; see the class."""
-        self._before, self._moments = None, []
+        self._before, self._looks = None, []
         self._report = _NOTHING
         return super().reset(seed=seed, options=options)
 
@@ -142,10 +147,10 @@ class SearchPerceptionEnv(SearchEnv):
         tell_time(self.search, 0, self._clock)
 
     def _look(self, state: SearchState) -> None:
-        self._moments = self._lookout.look(state, self._before)
+        moments = self._lookout.look(state, self._before)
+        self._looks = [(moment, self._stack.look(moment.capture)) for moment in moments]
         slots = SlotFilter(self.scenario.lot)
-        for _, capture in self._moments:
-            look = self._stack.look(capture)
+        for _, look in self._looks:
             for sweep in look.sweeps:
                 slots.see_through(sweep)
             for view in look.views:
@@ -159,4 +164,4 @@ class SearchPerceptionEnv(SearchEnv):
 
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
         """The lot from above, and beside it the newest pictures."""
-        return beside_the_lot(super()._frame(state), self._moments, self.rig)
+        return beside_the_lot(super()._frame(state), [moment for moment, _ in self._looks], self.rig)

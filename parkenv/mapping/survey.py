@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time as clock
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,6 +106,28 @@ class SessionResult:
         return float((self.states.occupied == self.truth)[seen].mean()) if seen.any() else float("nan")
 
 
+class SurveyMoment(NamedTuple):
+    """What a session has come to after one capture.
+
+    Grid and slots are the session's own, which go on changing; who keeps them copies them.
+
+    Attributes:
+        time: s since Monday 00:00.
+        capture: what was measured.
+        look: what was made of it.
+        grid: of the session so far.
+        slots: what is known of the slots so far.
+        truth: (n_slots,) bool, what stands in the slots now; for pictures and scores only.
+    """
+
+    time: float
+    capture: Capture
+    look: Look
+    grid: OccupancyGrid
+    slots: SlotFilter
+    truth: BoolArray
+
+
 class Survey:
     """Sessions in a scenario's world.
 
@@ -128,12 +152,15 @@ class Survey:
         noise = f"{s.pose_noise.position:g}m{s.pose_noise.heading:g}rad"
         return f"{self.scenario.name}/{s.rig}/{s.weather or 'any'}/{s.every:g}m/{noise}/seed{s.seed}/{number:05d}"
 
-    def drive(self, number: int, *, pictures: int = 0) -> SessionResult:
+    def drive(
+        self, number: int, *, pictures: int = 0, on_moment: Callable[[SurveyMoment], None] | None = None
+    ) -> SessionResult:
         """Drive one session: at every pose detect, range, and update grid and slots.
 
         Args:
             number: 0 or more; equal numbers are equal drives.
             pictures: how many captures to keep.
+            on_moment: told of every capture, for those who watch.
         """
         scenario, settings, lot = self.scenario, self.settings, self.scenario.lot
         key = world_key(settings.seed, number)
@@ -173,6 +200,9 @@ class Survey:
                 cars.append(np.column_stack([view.cars.xy, view.cars.yaw]))
             frame_s.append(clock.perf_counter() - begun)
             last_look[slots.told] = time
+            if on_moment is not None:
+                taken = world.occupied(np.arange(lot.n_slots), time)
+                on_moment(SurveyMoment(time, capture, look, grid, slots, taken))
             plainly = [self.stack.locate_plainly(view, belief) for view in look.views]
             score.take(scene, capture, look, placed, plainly)
             stretch, cars_there = i * pictures // len(poses), sum(len(view.cars) for view in look.views)
