@@ -137,6 +137,10 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     `info` holds time_s, driven_m, direction_changes, position_error_m, angle_error_rad, contact, is_success and parked.
 
+    ## Keys
+    For `gymnasium.utils.play.play(env, noop=np.zeros(2, dtype=np.float32))` (needs the extra `human`): w and s
+    accelerate forward and backward, a and d steer left and right, two at once do both.
+
     ## Arguments
     - `lot`: a `ParkingLot`, the name of a packaged one (campus, jam, street, mini), or a lot file.
     - `kinds`, `ways`, `slot`, `occupancy`, `slack`, `distance`, `starts`, `vehicle`: as in `ParkingTasks`. For a
@@ -380,6 +384,16 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             self._renderer.window.show(frame, self.metadata["render_fps"])
             return None
         return frame
+
+    def get_keys_to_action(self) -> dict[tuple[int, ...], NDArray[np.float32]]:
+        """Keys of `gymnasium.utils.play`: w and s accelerate forward and backward, a and d steer left and right."""
+        along, aside = {"": 0.0, "w": 1.0, "s": -1.0}, {"": 0.0, "a": 1.0, "d": -1.0}
+        return {
+            tuple(sorted(map(ord, go + turn))): np.array([force, angle], dtype=np.float32)
+            for go, force in along.items()
+            for turn, angle in aside.items()
+            if go + turn
+        }
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -212,6 +212,10 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     slots_passed (slots whose vertex was driven to) and parked. A wrapper's time limit is not part of
     `get_state`: it goes on counting.
 
+    ## Keys
+    For `gymnasium.utils.play.play(env, wait_on_player=True, noop=4)` (needs the extra `human`): w, s, a, d drive up,
+    down, left, right; space parks.
+
     ## Arguments
     - `scenario`: a `Scenario`, or the name of a packaged one: campus, jam, street, mini.
     - `render_mode`: `rgb_array` (480, 640, 3), `human` (needs the extra `human`), or `ansi`.
@@ -392,6 +396,10 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         assert self._renderer is not None
         everything = np.arange(self.scenario.lot.n_slots)
         return self._renderer.frame(state, state.world.occupied(everything, state.time))
+
+    def get_keys_to_action(self) -> dict[tuple[int, ...], int]:
+        """Keys of `gymnasium.utils.play`: w, s, a, d drive up, down, left, right; space parks."""
+        return {(ord(key),): action for action, key in enumerate("wsad ")}
 
     def close(self) -> None:
         """Close the window, if there is one."""
