@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -13,6 +15,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.scenario import Scenario, SearchProblem
+from planners.learned import ALGORITHMS
 
 Observation = Mapping[str, Any]
 Memory = TypeVar("Memory")
@@ -128,28 +131,60 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
     """Make an agent that knows the scenario's public part: lot, goal, speeds and costs.
 
     Args:
-        name: one of `AGENT_NAMES` or `SMALL_LOTS_ONLY`; or `ALGORITHM:FILE` for a model of `parkenv train`, such as
-            `ppo:models/ppo.zip`.
+        name: one of `AGENT_NAMES` or `SMALL_LOTS_ONLY`; `ALGORITHM:FILE` for a model of `parkenv train`, such as
+            `ppo:models/ppo.zip`; or `MODULE:CLASS` for an agent of your own, such as `my_agents:Patient`: a class whose
+            first argument is the problem. The module is looked for in the working directory, too.
         scenario: the scenario; what stands in its slots is kept from the agent.
         options: the agent's own, such as `failure_s=5.0` of "mdp".
 
     Raises:
         InputError: an unknown name or option; the message lists the known ones.
     """
-    algorithm, colon, file = name.partition(":")
-    if colon:
+    before, colon, after = name.partition(":")
+    if colon and before in ALGORITHMS:
         if options:
             raise InputError(f"agent {name!r} has no options; got {', '.join(options)}")
-        learned: Agent = import_module("planners.learned").LearnedAgent(scenario, algorithm, file)
+        learned: Agent = import_module("planners.learned").LearnedAgent(scenario, before, after)
         return learned
-    try:
+    agent: Callable[..., Agent]
+    if colon:
+        agent = _class_of(before, after)
+        scenario = scenario.public() if isinstance(scenario, Scenario) else scenario
+    elif name in _AGENTS:
         module, class_name = _AGENTS[name]
-    except KeyError:
-        models = "and ALGORITHM:FILE for a trained model"
-        raise InputError(f"unknown agent {name!r}; known: {', '.join(_AGENTS)}, {models}") from None
-    agent: Callable[..., Agent] = getattr(import_module(module), class_name)
+        agent = getattr(import_module(module), class_name)
+    else:
+        others = "ALGORITHM:FILE for a trained model, MODULE:CLASS for your own"
+        raise InputError(f"unknown agent {name!r}; known: {', '.join(_AGENTS)}, {others}")
     known = [p for p in inspect.signature(agent).parameters if p != "problem"]
     for option in options:
         if option not in known:
             raise InputError(f"agent {name!r} has no option {option!r}; known: {', '.join(known) or 'none'}")
     return agent(scenario, **options)
+
+
+def _class_of(module: str, class_name: str) -> Callable[..., Agent]:
+    """An agent's class from a user's module."""
+    name = f"{module}:{class_name}"
+    here = str(Path.cwd())
+    # As `python -m` does; an installed command looks in its own folder instead.
+    if here not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        found = getattr(import_module(module), class_name)
+    except ModuleNotFoundError as error:
+        if error.name != module.partition(".")[0]:
+            raise
+        algorithms = ", ".join(ALGORITHMS)
+        raise InputError(
+            f"agent {name!r}: {module!r} is neither a module (looked in {here} and where Python does) nor an "
+            f"algorithm; algorithms: {algorithms}"
+        ) from None
+    except AttributeError:
+        raise InputError(f"agent {name!r}: module {module!r} has no {class_name!r}") from None
+    if not callable(getattr(found, "predict", None)):
+        raise InputError(
+            f"agent {name!r}: has no method predict(observation, state, episode_start, deterministic)"
+        )
+    agent: Callable[..., Agent] = found
+    return agent

@@ -1,5 +1,7 @@
 """Agents: the interface, what the strategies do, the oracle's bound, and the thesis's findings."""
 
+import sys
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -39,6 +41,40 @@ def test_unknown_names_and_options_are_refused_with_the_known_ones():
         make_agent("mdp", scenario, cost=3)
     with pytest.raises(InputError, match="within_m"):
         make_agent("first-free", scenario, within_m=0.0)
+
+
+def test_an_agent_of_your_own_is_named_by_module_and_class(tmp_path, monkeypatch):
+    (tmp_path / "my_agents.py").write_text(
+        "from planners.agent import SearchAgent\n"
+        "class Parker(SearchAgent):\n"
+        "    name = 'parker'\n"
+        "    def __init__(self, problem, action=4):\n"
+        "        super().__init__(problem)\n"
+        "        self.action, self.given = action, problem\n"
+        "    def begin(self, observation):\n"
+        "        return None\n"
+        "    def decide(self, observation, memory):\n"
+        "        return self.action\n"
+        "nothing = 3\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", list(sys.path))
+    scenario = Scenario.named("mini")
+    agent = make_agent("my_agents:Parker", scenario)
+    assert not hasattr(agent.given, "occupancy")  # what stands in the slots is kept from it
+    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    action, _ = agent.predict(env.reset(seed=0)[0])
+    assert action == 4
+    assert make_agent("my_agents:Parker", scenario, action=3).action == 3
+    for name, told in (
+        ("my_agents:Driver", "no 'Driver'"),
+        ("my_agents:nothing", "no method predict"),
+        ("no_such_module:Agent", "neither a module .* nor an algorithm"),
+        ("my_agents:Parker", "no option 'speed'; known: action"),
+    ):
+        options = {"speed": 1} if "speed" in told else {}
+        with pytest.raises(InputError, match=told):
+            make_agent(name, scenario, **options)
 
 
 @pytest.mark.parametrize("name", AGENT_NAMES)
