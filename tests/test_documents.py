@@ -1,0 +1,92 @@
+"""What README, documentation and contributing guide print must be true."""
+
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+
+from parkenv.cli import app
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+PAGES = {
+    str(path.relative_to(ROOT)): path.read_text(encoding="utf-8")
+    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md")))
+}
+
+
+def blocks(page, languages):
+    """Code blocks in one of these languages (a|b), as (language, text)."""
+    return re.findall(rf"^```({languages})\n(.*?)^```", page, flags=re.DOTALL | re.MULTILINE)
+
+
+def commands():
+    """Every `parkenv` command of every page, as words."""
+    for name, page in PAGES.items():
+        for _, block in blocks(page, "bash|sh"):
+            for line in block.replace("\\\n", " ").splitlines():
+                for part in line.split("&&"):
+                    words = shlex.split(part, comments=True)
+                    if words and words[0].endswith("parkenv"):
+                        yield pytest.param(words[1:], id=f"{name}: {' '.join(words[1:])}")
+
+
+def test_the_ten_lines_run_as_printed():
+    (_, program), (_, more) = blocks(README, "python")
+    assert len([line for line in program.splitlines() if line.strip()]) <= 11
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=120, check=True
+    )
+    assert re.fullmatch(r"\d+ s, of which \d+ s on foot\n", done.stdout)
+    imports = "import gymnasium as gym\nimport parkenv\n"
+    subprocess.run([sys.executable, "-c", imports + more], timeout=300, check=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in PAGES if name != "README.md"])
+def test_the_code_of_a_page_runs_from_top_to_bottom(name, tmp_path):
+    """Blocks of `python` and `bash` are run; those of `sh` need data, an installation or hours."""
+    program = ["import os, subprocess, sys"]
+    parkenv = f"{sys.executable} -c 'from parkenv.cli import main; main()'"
+    for language, block in blocks(PAGES[name], "python|bash"):
+        if language == "python":
+            program.append(block)
+        elif "pip install" not in block:
+            script = f'set -e\nparkenv() {{ {parkenv} "$@"; }}\n{block}'
+            program.append(f"subprocess.run(['bash', '-c', {script!r}], check=True)")
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join(program)], cwd=tmp_path, capture_output=True, text=True, timeout=900
+    )
+    assert done.returncode == 0, f"{done.stdout[-1000:]}\n{done.stderr[-3000:]}"
+
+
+@pytest.mark.parametrize("name", list(PAGES))
+def test_links_and_pictures_exist(name):
+    for target in re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", PAGES[name]):
+        if not target.startswith("http"):
+            assert (ROOT / name).parent.joinpath(target).exists(), target
+
+
+@pytest.mark.parametrize("words", list(commands()))
+def test_commands_have_options_that_exist(words):
+    """Every command is there, and has the options that it is given."""
+    command, rest = typer.main.get_command(app), list(words)
+    while hasattr(command, "commands") and rest[0] in command.commands:
+        command = command.commands[rest.pop(0)]
+    assert not hasattr(command, "commands") or rest == ["--help"] or command.name == "bench", words
+    options = {
+        "--help",
+        *(option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)),
+    }
+    assert {word for word in rest if word.startswith("--")} <= options
+
+
+def test_agents_in_the_table_are_the_agents_there_are():
+    from planners.agent import AGENT_NAMES, SMALL_LOTS_ONLY
+
+    listed = re.findall(r"^\| `([a-z-]+)` \|", README, flags=re.MULTILINE)
+    assert sorted(listed) == sorted((*AGENT_NAMES, *SMALL_LOTS_ONLY))
