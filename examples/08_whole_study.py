@@ -1,0 +1,46 @@
+"""A whole study: does a map that other drives made help, and does better planning on it help more?
+
+A lot of one's own, surveyed through simulated sensors on three days; then agents search there on new days: with the
+map, and with a map that says of every slot that half of the time it is taken. All meet the same cars.
+"""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from parkenv import ParkingLot, Scenario
+from parkenv.evaluation.compare import Case
+from parkenv.evaluation.statistics import mean_interval
+from parkenv.evaluation.surveys import run_survey, summarize
+from parkenv.flat_map import FlatMap
+from parkenv.mapping.inference import MapPrior
+from parkenv.mapping.store import MapStore
+from parkenv.mapping.survey import SurveySettings
+from parkenv.occupancy import ArrivalWindow
+
+lot = ParkingLot.grid(4, 20)
+world = Scenario.on_lot(lot, arrival=ArrivalWindow.parse("11:00-13:00"))
+print(f"{lot.n_slots} slots")
+
+with tempfile.TemporaryDirectory() as folder:
+    file = Path(folder) / "map.sqlite"
+    settings = SurveySettings(every=2.5, windows=(world.arrival,), seed=1)
+    run = run_survey(world, settings, 3, file, pictures=0)
+    surveyed = summarize(world, settings, run, file)
+    with MapStore(file, lot, create=False) as store:
+        log = store.log()
+found, right = surveyed["car_detection_rate"], surveyed["slot_accuracy"]
+print(f"3 drives: {found:.1%} of the cars found, {right:.1%} of the slots judged right")
+
+maps = {"no map": FlatMap(0.5, world.occupancy), "3 drives": MapPrior(log), "the truth": None}
+totals = {}
+for name, prior in maps.items():
+    for agent in ("first-free", "mdp", "belief"):
+        rows, _ = Case(world.replace(prior=prior), agent).run(range(100, 200))
+        totals[name, agent] = np.array([row["total_s"] for row in rows])
+
+print("\nseconds from the entry to the goal     (difference to mdp without a map, same worlds)")
+for (name, agent), seconds in totals.items():
+    mean, low, high = mean_interval(seconds - totals["no map", "mdp"])
+    print(f"{name:10s} {agent:11s} {seconds.mean():6.1f}     {mean:+6.1f} [{low:+.1f}, {high:+.1f}]")
