@@ -14,6 +14,7 @@ from parkenv.errors import InputError
 from parkenv.lot import Lane, ParkingLot, corner_points, mouth_heading, mouth_points
 from parkenv.lot_geojson import LotContents, LotProblem, graph_errors, read_contents
 from parkenv.lot_graph import places
+from parkenv.lot_import import import_lot, is_place
 from parkenv.slot_polygons import nearest_on_lanes
 
 LANE_GAP = 1.0
@@ -27,11 +28,17 @@ GOAL_REACH = 50.0
 def check_lot(path: str | Path) -> list[LotProblem]:
     """All that is wrong with a lot file, errors first; an empty list for a sound one. Does not raise.
 
+    Of OpenStreetMap and lists of slots it tells what is missing before a search can run there, and what an
+    import leaves out.
+
     A file with errors cannot be read. Warnings tell what can be driven but was hardly meant so: goals
     far from all lanes, lanes that cross or nearly touch without a common point, slots that overlap,
-    that turn their mouth away from their lane, that no entry leads to or from which no other is reached.
+    that turn their mouth away from their lane, that no entry leads to or from which no other is reached,
+    entries that lead to no slot.
     """
     path = Path(path)
+    if is_place(path):
+        return _place_problems(path)
     if is_dragon_lake(path):
         try:
             dragon_lake_lot(ParkingLot, path)
@@ -41,8 +48,27 @@ def check_lot(path: str | Path) -> list[LotProblem]:
     contents = read_contents(path)
     problems = [*contents.errors, *graph_errors(contents), *_drawing_warnings(contents)]
     if not any(problem.severity == "error" for problem in problems):
-        problems += _reach_warnings(ParkingLot(**contents.columns()), contents.numbers["slot"])
+        lot = ParkingLot(**contents.columns())
+        problems += _reach_warnings(lot, contents.numbers["slot"], contents.numbers["entry"])
     return problems
+
+
+def _place_problems(path: Path) -> list[LotProblem]:
+    """What a map or a list of slots lacks, and what of it makes no slot."""
+    try:
+        draft = import_lot(path)
+    except InputError as error:
+        return [LotProblem("error", None, str(error).removeprefix(f"{path}: "))]
+    problems = [LotProblem("error", None, text) for text in draft.missing]
+    warnings = [LotProblem("warning", None, f"left out: {left}") for left in draft.left_out]
+    if not problems:
+        try:
+            lot = draft.lot()
+        except InputError as error:
+            problems.append(LotProblem("error", None, str(error)))
+        else:
+            warnings += _reach_warnings(lot, [None] * lot.n_slots, [None] * len(lot.entries))
+    return problems + warnings
 
 
 def _drawing_warnings(contents: LotContents) -> list[LotProblem]:
@@ -124,8 +150,10 @@ def _loose_lanes(lanes: Sequence[Lane], numbers: Sequence[int]) -> Iterator[tupl
             )
 
 
-def _reach_warnings(lot: ParkingLot, numbers: Sequence[int]) -> Iterator[LotProblem]:
-    """Slots that no car gets to, and slots from which a car gets to no other."""
+def _reach_warnings(
+    lot: ParkingLot, numbers: Sequence[int | None], entry_numbers: Sequence[int | None]
+) -> Iterator[LotProblem]:
+    """Slots that no car gets to, slots from which a car gets to no other, entries that lead to none."""
     n = lot.n_slots
     graph = lot.drive_matrix()
     reached = np.isfinite(dijkstra(graph, indices=lot.entry_vertices, min_only=True))
@@ -142,3 +170,5 @@ def _reach_warnings(lot: ParkingLot, numbers: Sequence[int]) -> Iterator[LotProb
     ):
         for i in np.flatnonzero(fault).tolist():
             yield LotProblem("warning", numbers[i], f"slot {lot.slot_ids[i]!r:.40}: {message}")
+    for i in np.flatnonzero(~to_slot[lot.entry_vertices]).tolist():
+        yield LotProblem("warning", entry_numbers[i], "entry: no way leads from it to a slot")

@@ -11,6 +11,7 @@ from parkenv.errors import InputError
 from parkenv.lot import ParkingLot
 from parkenv.lot_geojson import graph_errors, read_contents
 from parkenv.lot_graph import GraphError
+from parkenv.lot_import import is_place
 
 LotT = TypeVar("LotT", bound=ParkingLot)
 
@@ -36,6 +37,8 @@ def read_lot(cls: type[LotT], path: Path) -> LotT:
             pass
     errors = [*contents.errors, *graph_errors(contents)]
     first = str(errors[0]).removeprefix("error: ")
+    if is_place(path):
+        raise InputError(f"{path}: {first}; `parkenv lot import {path}` makes a lot of it")
     more = f" (and {len(errors) - 1} more; `parkenv lot check {path}` lists all)" if len(errors) > 1 else ""
     raise InputError(f"{path}: {first}{more}")
 

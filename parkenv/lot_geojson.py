@@ -26,6 +26,7 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.local_frame import LocalFrame
 from parkenv.lot import SLOT_SIDE, Lane, Mouth, ParkingLot, corner_points, is_building, mouth_points
 from parkenv.lot_generators import Slots, bay_row
 from parkenv.lot_graph import GraphError, build_drive_graph, linestrings
@@ -195,7 +196,7 @@ def read_contents(path: Path) -> LotContents:
                 'for metres, the file needs the member "frame": "local"',
             )
             return contents
-        xy = _project(xy)
+        xy = LocalFrame.around(xy).to_xy(xy) if len(xy) else xy
 
     for feature in raw:
         if feature.kind != "slot":
@@ -310,20 +311,6 @@ def _position(kind: str, position: Any) -> tuple[float, float]:
 def _is_number(value: Any) -> bool:
     # NaN compares as false; a bool is an int to Python but no number to JSON.
     return type(value) in (float, int) and abs(value) <= FARTHEST
-
-
-def _project(lonlat: FloatArray) -> FloatArray:
-    """Metres east and north of the middle of all positions, distances from there being exact."""
-    from pyproj import Proj
-
-    if not len(lonlat):
-        return lonlat
-    lon, lat = lonlat.T
-    if np.ptp(lon) > 180.0:
-        lon = np.where(lon < 0.0, lon + 360.0, lon)  # a lot on the date line
-    lon_0, lat_0 = (lon.min() + lon.max()) / 2, (lat.min() + lat.max()) / 2
-    projection = Proj(proj="aeqd", lon_0=lon_0, lat_0=lat_0, ellps="WGS84")
-    return np.column_stack(projection(lon, lat))
 
 
 def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, exact: bool) -> None:

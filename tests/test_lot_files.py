@@ -607,6 +607,18 @@ def test_slots_that_cannot_be_reached_or_left_are_warned_of(tmp_path):
     ]
 
 
+def test_entries_that_lead_to_no_slot_are_warned_of(tmp_path):
+    doc = document()
+    # Cars that come in behind the end of a one-way lane can only turn round.
+    doc["features"] += [
+        feature("lane", "LineString", [[40, 0], [80, 0]], oneway=True),
+        feature("lane", "LineString", [[80, 0], [99, 0]]),
+        feature("entry", "Point", [99, 0]),
+    ]
+    problems = check_lot(written(tmp_path, doc))
+    assert [(p.feature, p.message) for p in problems] == [(8, "entry: no way leads from it to a slot")]
+
+
 def test_lanes_that_share_a_point_are_not_warned_of(tmp_path):
     doc = document()
     doc["features"][2] = feature("lane", "LineString", [[0, 0], [30, 0], [40, 0]])

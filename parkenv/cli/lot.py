@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -12,7 +13,7 @@ from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
 from parkenv.lot import ParkingLot
 
-app = typer.Typer(help="Show, check and convert lots.", no_args_is_help=True)
+app = typer.Typer(help="Show, check, import and convert lots.", no_args_is_help=True)
 
 
 def _load(lot: str) -> ParkingLot:
@@ -72,6 +73,86 @@ def check(
         console.print(f"{file}: {errors} errors, {len(problems) - errors} warnings", markup=False)
     if errors:
         raise typer.Exit(2)
+
+
+@app.command("import")
+def import_place(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="OpenStreetMap (.osm, Overpass .json, overpass-turbo .geojson), slot centres (.csv), "
+            "a Dragon Lake map (.yml) or a lot."
+        ),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The lot, native GeoJSON.")],
+    goal: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Where people walk to: LAT,LON, or X,Y in metres. Repeatable.  [default: building entrances, "
+            "the nearest building]"
+        ),
+    ] = None,
+    entry: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Where cars come in, likewise.  [default: where service roads meet a public street, or streets "
+            "leave the map]"
+        ),
+    ] = None,
+    bounds: Annotated[
+        str | None,
+        typer.Option(help="Read only what lies within SOUTH,WEST,NORTH,EAST, or X0,Y0,X1,Y1 in metres."),
+    ] = None,
+    disabled: Annotated[
+        bool, typer.Option("--disabled", help="Spaces for disabled drivers are slots, too.")
+    ] = False,
+    picture: Annotated[Path | None, typer.Option(help="A PNG to check the import by.")] = None,
+) -> None:
+    """Make a lot of a real place, say what was found and what was left out.
+
+    The picture is drawn, and the findings are told, also where something is missing; no lot is written then, and
+    the exit code is 2.
+
+    * `parkenv lot import map.osm --out lot.geojson --picture lot.png`
+    * `parkenv lot import slots.csv --out lot.geojson --entry 0,0 --goal 40,25`
+    """
+    from parkenv.lot_draft import Wishes
+    from parkenv.lot_import import import_lot
+
+    corners = None if bounds is None else _numbers("--bounds", bounds, 4)
+    wishes = Wishes(
+        goals=tuple((p[0], p[1]) for p in (_numbers("--goal", text, 2) for text in goal or ())),
+        entries=tuple((p[0], p[1]) for p in (_numbers("--entry", text, 2) for text in entry or ())),
+        bounds=None if corners is None else ((corners[0], corners[1]), (corners[2], corners[3])),
+        with_disabled=disabled,
+    )
+    draft = import_lot(file, wishes)
+    console = Console(highlight=False, soft_wrap=True)
+    for line in draft.found:
+        console.print(line, markup=False)
+    for left in draft.left_out:
+        console.print(f"left out: {left}", style="yellow", markup=False)
+    if picture is not None:
+        from parkenv.evaluation.import_picture import save_import_picture
+
+        save_import_picture(draft, picture)
+        console.print(f"Drawn in {picture}", markup=False)
+    try:
+        lot = draft.lot()
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    lot.to_file(out)
+    console.print(f"Wrote {out}: {lot.n_slots} slots, {lot.n_vertices} vertices", markup=False)
+
+
+def _numbers(option: str, text: str, count: int) -> list[float]:
+    try:
+        values = [float(word) for word in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != count or not all(map(math.isfinite, values)):
+        raise InputError(f"{option} is {text!r}, want {count} numbers with commas between")
+    return values
 
 
 @app.command()

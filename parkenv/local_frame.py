@@ -1,0 +1,66 @@
+"""Metres east and north of a place on the globe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from parkenv.errors import InputError
+
+if TYPE_CHECKING:
+    from pyproj import Proj
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """An azimuthal equidistant projection: distances and bearings from its middle are exact.
+
+    Args:
+        lon: degrees, of the middle, WGS 84.
+        lat: degrees, of the middle.
+
+    Raises:
+        InputError: no place on the globe.
+
+    Example:
+        >>> frame = LocalFrame(lon=7.85, lat=48.0)
+        >>> frame.to_xy([[7.85, 48.0]]).round(3).tolist()
+        [[0.0, 0.0]]
+    """
+
+    lon: float
+    lat: float
+
+    def __post_init__(self) -> None:
+        if not (abs(self.lon) <= 360.0 and abs(self.lat) <= 90.0):
+            raise InputError(f"frame at longitude {self.lon}, latitude {self.lat}: no place on the globe")
+
+    @classmethod
+    def around(cls, lonlat: ArrayLike) -> Self:
+        """The frame in the middle of positions, (n, 2) degrees, longitude first; n ≥ 1."""
+        lon, lat = np.asarray(lonlat, dtype=np.float64).T
+        if np.ptp(lon) > 180.0:
+            lon = np.where(lon < 0.0, lon + 360.0, lon)  # a place on the date line
+        return cls(float(lon.min() + lon.max()) / 2, float(lat.min() + lat.max()) / 2)
+
+    def to_xy(self, lonlat: ArrayLike) -> FloatArray:
+        """Metres east and north, (n, 2), of positions, (n, 2) degrees, longitude first."""
+        lon, lat = np.asarray(lonlat, dtype=np.float64).reshape(-1, 2).T
+        return np.column_stack(self._projection(lon, lat))
+
+    def to_lonlat(self, xy: ArrayLike) -> FloatArray:
+        """Positions, (n, 2) degrees, longitude first, of points, (n, 2) m."""
+        x, y = np.asarray(xy, dtype=np.float64).reshape(-1, 2).T
+        return np.column_stack(self._projection(x, y, inverse=True))
+
+    @cached_property
+    def _projection(self) -> Proj:
+        from pyproj import Proj
+
+        return Proj(proj="aeqd", lon_0=self.lon, lat_0=self.lat, ellps="WGS84")

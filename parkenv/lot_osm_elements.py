@@ -1,0 +1,391 @@
+"""OpenStreetMap elements in a file: nodes, ways and multipolygons with their tags and places.
+
+Three formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `out;`), Overpass
+JSON (`elements`, with node references or `out geom;`), and GeoJSON as overpass-turbo and osmtogeojson write
+it (an element's id in `id` or `@id`, its tags in `properties` or `properties.tags`).
+
+OSM XML has no document type, so a file that declares one is refused before its entities are read: none
+can be expanded into gigabytes or made to fetch other files.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+
+FloatArray = NDArray[np.float64]
+
+OSM_ID = re.compile(r"(node|way|relation)/-?\d+")
+MAPPED_KEYS = ("amenity", "highway", "building", "entrance")
+"""Keys that tell an element of OpenStreetMap from other GeoJSON."""
+
+
+@dataclass(frozen=True, eq=False)
+class OsmElement:
+    """Something on the map.
+
+    Attributes:
+        id: as the map's own addresses have it, `way/123`.
+        tags: what it is.
+        lines: (k, 2) degrees, longitude first: a node's one position, a way's line, a multipolygon's outer
+            rings. A closed line ends where it starts.
+        holes: a multipolygon's inner rings.
+    """
+
+    id: str
+    tags: Mapping[str, str]
+    lines: tuple[FloatArray, ...]
+    holes: tuple[FloatArray, ...] = ()
+
+    @property
+    def is_node(self) -> bool:
+        """Whether it is a single position."""
+        return len(self.lines[0]) == 1
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether all of its lines come back to where they start, round an area."""
+        return all(len(line) >= 4 and np.array_equal(line[0], line[-1]) for line in self.lines)
+
+
+def read_elements(path: Path) -> list[OsmElement]:
+    """All tagged nodes, ways and multipolygons of a file, in its order.
+
+    Raises:
+        InputError: the file cannot be read, is torn or of another kind, a position is none on the globe, or
+            a tagged way refers to a node that the file does not hold.
+    """
+    try:
+        if path.suffix.lower() in (".osm", ".xml"):
+            return _read_xml(path)
+        return elements_of_json(json.loads(path.read_text(encoding="utf-8-sig")))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
+    except json.JSONDecodeError as error:
+        raise InputError(
+            f"{path}: not JSON: line {error.lineno}, column {error.colno}: {error.msg}"
+        ) from error
+    except RecursionError as error:
+        raise InputError(f"{path}: not JSON of a map: nested too deeply") from error
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def holds_osm(document: object) -> bool:
+    """Whether parsed JSON is Overpass's or GeoJSON made from OpenStreetMap, not a native lot."""
+    if not isinstance(document, dict):
+        return False
+    if isinstance(document.get("elements"), list):
+        return True
+    features = document.get("features")
+    if not isinstance(features, list) or "parkenv" in document or "frame" in document:
+        return False
+    properties = [f["properties"] for f in features if isinstance(f, dict) and _is_object(f, "properties")]
+    return not any("kind" in p for p in properties) and any(
+        "@id" in p or _is_object(p, "tags") or any(key in p for key in MAPPED_KEYS) for p in properties
+    )
+
+
+# ---- what all formats share: references are put in place when everything has been read ----
+
+
+@dataclass
+class _Way:
+    tags: dict[str, str]
+    refs: list[int] = field(default_factory=list)
+    line: FloatArray | None = None
+
+
+@dataclass
+class _Relation:
+    tags: dict[str, str]
+    members: list[tuple[int, str, FloatArray | None]] = field(default_factory=list)
+
+
+@dataclass
+class _Raw:
+    """Elements as they stand in a file."""
+
+    positions: dict[int, tuple[float, float]] = field(default_factory=dict)
+    node_tags: dict[int, dict[str, str]] = field(default_factory=dict)
+    ways: dict[int, _Way] = field(default_factory=dict)
+    relations: dict[int, _Relation] = field(default_factory=dict)
+
+    def elements(self) -> list[OsmElement]:
+        nodes = [
+            OsmElement(f"node/{i}", tags, (np.array([self.positions[i]]),))
+            for i, tags in self.node_tags.items()
+            if i in self.positions
+        ]
+        ways = [
+            OsmElement(f"way/{i}", way.tags, (line,))
+            for i, way in self.ways.items()
+            if way.tags and len(line := self.line_of(i, way)) > 1
+        ]
+        return nodes + ways + [self._area(i, relation) for i, relation in self.relations.items()]
+
+    def line_of(self, number: int, way: _Way) -> FloatArray:
+        if way.line is not None:
+            return way.line
+        absent = next((ref for ref in way.refs if ref not in self.positions), None)
+        if absent is not None:
+            raise InputError(
+                f"way/{number}: its node {absent} is not in the file; export with complete ways "
+                "(Overpass: `out body; >; out skel qt;` or `out geom;`)"
+            )
+        return np.array([self.positions[ref] for ref in way.refs]).reshape(-1, 2)
+
+    def _area(self, number: int, relation: _Relation) -> OsmElement:
+        name = f"relation/{number}"
+        parts: dict[str, list[FloatArray]] = {"outer": [], "inner": []}
+        for ref, role, line in relation.members:
+            if line is None:
+                if ref not in self.ways:
+                    raise InputError(f"{name}: its member way {ref} is not in the file")
+                line = self.line_of(ref, self.ways[ref])
+            if len(line) < 2:
+                raise InputError(f"{name}: its member way {ref} has {len(line)} positions, want a line")
+            parts["inner" if role == "inner" else "outer"].append(line)
+        if not parts["outer"]:
+            raise InputError(f"{name}: a multipolygon without an outer way")
+        return OsmElement(name, relation.tags, _rings(name, parts["outer"]), _rings(name, parts["inner"]))
+
+
+def _rings(name: str, lines: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
+    """Closed rings of lines that meet end to end."""
+    if not lines:
+        return ()
+    joined = shapely.line_merge(shapely.MultiLineString([line.tolist() for line in lines]))
+    rings = tuple(shapely.get_coordinates(part) for part in shapely.get_parts(joined))
+    for ring in rings:
+        if len(ring) < 4 or not np.array_equal(ring[0], ring[-1]):
+            lon, lat = ring[-1]
+            raise InputError(f"{name}: its outline is open at {lat:.7f}, {lon:.7f}")
+    return rings
+
+
+def _position(name: str, lat: object, lon: object) -> tuple[float, float]:
+    values = []
+    for what, value, most in (("lat", lat, 90.0), ("lon", lon, 180.0)):
+        try:
+            number = float(value)  # type: ignore[arg-type]
+        except (TypeError, ValueError):
+            number = np.nan
+        if isinstance(value, bool) or not abs(number) <= most:
+            raise InputError(f"{name}: {what} is {value!r:.40}, want a number from {-most:g} to {most:g}")
+        values.append(number)
+    return values[1], values[0]
+
+
+def _is_area_relation(tags: Mapping[str, str]) -> bool:
+    return tags.get("type") == "multipolygon" and any(key in tags for key in ("amenity", "building"))
+
+
+# ---- OSM XML ----
+
+
+class _XmlReader:
+    """Gathers elements from an `ElementTree.XMLParser`, without a tree."""
+
+    def __init__(self) -> None:
+        self.raw = _Raw()
+        self._root = ""
+        self._tags: dict[str, str] = {}
+        self._way: _Way | None = None
+        self._relation: _Relation | None = None
+
+    def doctype(self, name: str, public_id: str | None, system: str | None) -> None:
+        del public_id, system
+        raise InputError(
+            f"declares the document type {name!r:.40}; OSM XML has none, and entities are not read"
+        )
+
+    def start(self, name: str, values: dict[str, str]) -> None:
+        if not self._root:
+            self._root = name
+            if name != "osm":
+                raise InputError(f"root is <{name:.40}>, want <osm>")
+        if values.get("visible") == "false" or values.get("action") == "delete":
+            self._tags = {}
+        elif name == "node":
+            number = self._number(name, values, "id")
+            self.raw.positions[number] = _position(f"node/{number}", values.get("lat"), values.get("lon"))
+            self._tags = self.raw.node_tags[number] = {}
+        elif name == "way":
+            self._tags = {}
+            self._way = self.raw.ways[self._number(name, values, "id")] = _Way(self._tags)
+        elif name == "relation":
+            self._tags = {}
+            self._relation = self.raw.relations[self._number(name, values, "id")] = _Relation(self._tags)
+        elif name == "tag" and "k" in values and "v" in values:
+            self._tags[values["k"]] = values["v"]
+        elif name == "nd" and self._way is not None:
+            self._way.refs.append(self._number(name, values, "ref"))
+        elif name == "member" and self._relation is not None and values.get("type") == "way":
+            member = (self._number(name, values, "ref"), values.get("role", ""), None)
+            self._relation.members.append(member)
+
+    def end(self, name: str) -> None:
+        if name == "way":
+            self._way = None
+        elif name == "relation":
+            self._relation = None
+
+    def close(self) -> None:
+        self.raw.node_tags = {i: tags for i, tags in self.raw.node_tags.items() if tags}
+        self.raw.relations = {i: r for i, r in self.raw.relations.items() if _is_area_relation(r.tags)}
+
+    @staticmethod
+    def _number(element: str, values: dict[str, str], key: str) -> int:
+        try:
+            return int(values[key])
+        except (KeyError, ValueError) as error:
+            raise InputError(f"<{element}>: {key} is {values.get(key)!r:.40}, want a whole number") from error
+
+
+def _read_xml(path: Path) -> list[OsmElement]:
+    reader = _XmlReader()
+    parser = ElementTree.XMLParser(target=reader)
+    try:
+        with path.open("rb") as file:
+            while block := file.read(1 << 20):
+                parser.feed(block)
+        parser.close()
+    except ElementTree.ParseError as error:
+        line, column = error.position
+        reason = str(error).split(":")[0]
+        raise InputError(f"not XML: line {line}, column {column}: {reason}") from error
+    return reader.raw.elements()
+
+
+# ---- JSON ----
+
+
+def elements_of_json(document: Any) -> list[OsmElement]:
+    """The elements of parsed Overpass JSON or GeoJSON.
+
+    Raises:
+        InputError: see `read_elements`; the message does not name the file.
+    """
+    if not isinstance(document, dict):
+        raise InputError(f"holds a {type(document).__name__}, want Overpass JSON or a FeatureCollection")
+    if isinstance(document.get("elements"), list):
+        return _overpass_elements(document["elements"])
+    if isinstance(document.get("features"), list):
+        return [e for i, f in enumerate(document["features"]) if (e := _feature_element(i, f)) is not None]
+    raise InputError("no elements and no features, want Overpass JSON or a GeoJSON FeatureCollection")
+
+
+def _overpass_elements(elements: Iterable[Any]) -> list[OsmElement]:
+    raw = _Raw()
+    for index, element in enumerate(elements):
+        kind = element.get("type") if isinstance(element, dict) else None
+        if kind not in ("node", "way", "relation"):
+            continue  # Overpass also lists counts, areas and timelines
+        number = element.get("id")
+        if type(number) is not int:
+            raise InputError(f"elements[{index}]: id is {number!r:.40}, want a whole number")
+        name, tags = f"{kind}/{number}", _tags(element.get("tags"))
+        if kind == "node":
+            raw.positions[number] = _position(name, element.get("lat"), element.get("lon"))
+            if tags:
+                raw.node_tags[number] = tags
+        elif kind == "way":
+            line = _geometry(name, element)
+            refs = element.get("nodes")
+            if line is None and tags and not refs:
+                raise InputError(f"{name}: neither nodes nor geometry, want `out geom;`")
+            if not isinstance(refs, list) or not all(type(ref) is int for ref in refs):
+                refs = []
+            raw.ways[number] = _Way(tags, refs, line)
+        elif _is_area_relation(tags):
+            listed = element.get("members")
+            members = [
+                (
+                    m["ref"] if type(m.get("ref")) is int else 0,
+                    str(m.get("role", "")),
+                    _geometry(f"{name}: way {m.get('ref')}", m),
+                )
+                for m in (listed if isinstance(listed, list) else ())
+                if isinstance(m, dict) and m.get("type") == "way"
+            ]
+            raw.relations[number] = _Relation(tags, members)
+    return raw.elements()
+
+
+def _geometry(name: str, holder: Mapping[str, Any]) -> FloatArray | None:
+    points = holder.get("geometry")
+    if points is None:
+        return None
+    if not isinstance(points, list) or not all(isinstance(p, dict) for p in points):
+        raise InputError(f"{name}: geometry has gaps, want whole ways: `out geom;` without a bounding box")
+    return np.array([_position(name, p.get("lat"), p.get("lon")) for p in points]).reshape(-1, 2)
+
+
+def _feature_element(index: int, feature: Any) -> OsmElement | None:
+    """A feature of GeoJSON; None for one without a geometry that a lot could be made of."""
+    if not isinstance(feature, dict):
+        raise InputError(f"features[{index}] is {feature!r:.40}, want a GeoJSON feature")
+    properties = feature["properties"] if _is_object(feature, "properties") else {}
+    name = next(
+        (
+            given
+            for given in (properties.get("@id"), feature.get("id"), properties.get("id"))
+            if isinstance(given, str) and OSM_ID.fullmatch(given)
+        ),
+        f"feature/{index}",
+    )
+    tags = _tags(properties["tags"] if _is_object(properties, "tags") else properties)
+    geometry = feature["geometry"] if _is_object(feature, "geometry") else {}
+    coordinates = geometry.get("coordinates")
+
+    def line(positions: Any) -> FloatArray:
+        if (
+            not isinstance(positions, list)
+            or not positions
+            or not all(isinstance(p, list) and len(p) >= 2 for p in positions)
+        ):
+            raise InputError(f"{name}: coordinates are {positions!r:.40}, want positions")
+        return np.array([_position(name, p[1], p[0]) for p in positions]).reshape(-1, 2)
+
+    match geometry.get("type"):
+        case "Point":
+            return OsmElement(name, tags, (line([coordinates]),))
+        case "LineString":
+            lines = (line(coordinates),)
+            return OsmElement(name, tags, lines) if len(lines[0]) > 1 else None
+        case "Polygon" | "MultiPolygon" as shape:
+            polygons = [coordinates] if shape == "Polygon" else coordinates
+            if (
+                not isinstance(polygons, list)
+                or not polygons
+                or not all(isinstance(p, list) and p for p in polygons)
+            ):
+                raise InputError(f"{name}: coordinates are {coordinates!r:.40}, want rings")
+            rings = [[line(ring) for ring in polygon] for polygon in polygons]
+            holes = tuple(hole for polygon in rings for hole in polygon[1:])
+            return OsmElement(name, tags, tuple(polygon[0] for polygon in rings), holes)
+    return None
+
+
+def _tags(values: object) -> dict[str, str]:
+    if not isinstance(values, dict):
+        return {}
+    return {str(key): str(value) for key, value in values.items() if isinstance(value, str | int | float)}
+
+
+def _is_object(holder: Mapping[str, Any], key: str) -> bool:
+    return isinstance(holder.get(key), dict)

@@ -1,0 +1,1008 @@
+"""Lots made from OpenStreetMap: what is read, what by rule, what is refused."""
+
+import copy
+import json
+import subprocess
+import sys
+from contextlib import suppress
+from dataclasses import dataclass, field
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from parkenv import ParkingLot, Scenario
+from parkenv.cli import app
+from parkenv.errors import InputError
+from parkenv.evaluation.compare import Case
+from parkenv.evaluation.import_picture import save_import_picture
+from parkenv.local_frame import LocalFrame
+from parkenv.lot import Mouth
+from parkenv.lot_check import check_lot
+from parkenv.lot_draft import Wishes
+from parkenv.lot_graph import SLOT_REACH
+from parkenv.lot_import import import_lot
+from parkenv.slot_polygons import nearest_on_lanes
+
+FREIBURG = LocalFrame(lon=7.85, lat=48.0)
+AISLE = {"highway": "service", "service": "parking_aisle"}
+SERVICE = {"highway": "service"}
+STREET = {"highway": "residential", "name": "Hauptstraße"}
+SPACE = {"amenity": "parking_space"}
+PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
+
+
+@dataclass
+class Map:
+    """A map drawn in metres, written in any of the formats. Equal points are one node."""
+
+    nodes: dict[tuple[float, float], dict[str, str]] = field(default_factory=dict)
+    ways: list[tuple[list[tuple[float, float]], dict[str, str]]] = field(default_factory=list)
+    areas: list[tuple[list[int], list[int], dict[str, str]]] = field(default_factory=list)
+
+    def node(self, x, y, **tags):
+        self.nodes.setdefault((x, y), {}).update(tags)
+        return self
+
+    def way(self, points, tags, **more):
+        for point in points:
+            self.node(*point)
+        self.ways.append((points, {**tags, **more}))
+        return self
+
+    def box(self, x0, y0, x1, y1, tags, **more):
+        return self.way([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)], tags, **more)
+
+    def area(self, outer, inner, **tags):
+        """A multipolygon of ways, by their numbers from 1."""
+        self.areas.append((outer, inner, {"type": "multipolygon", **tags}))
+        return self
+
+    def places(self):
+        lonlat = FREIBURG.to_lonlat(list(self.nodes)).round(7).tolist()
+        number = {point: i + 1 for i, point in enumerate(self.nodes)}
+        return number, {number[point]: at for point, at in zip(self.nodes, lonlat, strict=True)}
+
+    def xml(self):
+        number, at = self.places()
+
+        def tags(values):
+            return "".join(f"<tag k={quoteattr(k)} v={quoteattr(v)}/>" for k, v in values.items())
+
+        lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<osm version="0.6" generator="a test">']
+        for point, values in self.nodes.items():
+            lon, lat = at[number[point]]
+            lines.append(f'<node id="{number[point]}" lat="{lat}" lon="{lon}">{tags(values)}</node>')
+        for i, (points, values) in enumerate(self.ways):
+            refs = "".join(f'<nd ref="{number[point]}"/>' for point in points)
+            lines.append(f'<way id="{i + 1}">{refs}{tags(values)}</way>')
+        for i, (outer, inner, values) in enumerate(self.areas):
+            members = "".join(
+                f'<member type="way" ref="{way}" role="{role}"/>'
+                for role, ways in (("outer", outer), ("inner", inner))
+                for way in ways
+            )
+            lines.append(f'<relation id="{i + 1}">{members}{tags(values)}</relation>')
+        return "\n".join([*lines, "</osm>"])
+
+    def overpass(self, *, geometry):
+        number, at = self.places()
+
+        def position(i):
+            return {"lat": at[i][1], "lon": at[i][0]}
+
+        elements = [
+            {"type": "node", "id": number[point], **position(number[point]), "tags": tags}
+            for point, tags in self.nodes.items()
+        ]
+        way_nodes = {}
+        for i, (points, tags) in enumerate(self.ways):
+            refs = way_nodes[i + 1] = [number[point] for point in points]
+            way = {"type": "way", "id": i + 1, "nodes": refs, "tags": tags}
+            if geometry:
+                way["geometry"] = [position(ref) for ref in refs]
+            elements.append(way)
+        for i, (outer, inner, tags) in enumerate(self.areas):
+            members = [
+                {"type": "way", "ref": ref, "role": role}
+                | ({"geometry": list(map(position, way_nodes[ref]))} if geometry else {})
+                for role, refs in (("outer", outer), ("inner", inner))
+                for ref in refs
+            ]
+            elements.append({"type": "relation", "id": i + 1, "members": members, "tags": tags})
+        if geometry:
+            elements = [e for e in elements if e["type"] != "node" or e["tags"]]
+        return json.dumps({"version": 0.6, "generator": "Overpass API", "elements": elements})
+
+    def geojson(self, *, flat=True):
+        """As osmtogeojson writes it: closed ways are polygons unless they are roads."""
+        number, at = self.places()
+        features = []
+
+        def feature(name, tags, shape, coordinates):
+            kind, _, digits = name.partition("/")
+            own = {"@id": name, **tags} if flat else {"type": kind, "id": digits, "tags": tags}
+            geometry = {"type": shape, "coordinates": coordinates}
+            features.append({"type": "Feature", "id": name, "properties": own, "geometry": geometry})
+
+        for i, (points, tags) in enumerate(self.ways):
+            line = [at[number[point]] for point in points]
+            if points[0] == points[-1] and "highway" not in tags:
+                feature(f"way/{i + 1}", tags, "Polygon", [line])
+            else:
+                feature(f"way/{i + 1}", tags, "LineString", line)
+        for point, tags in self.nodes.items():
+            if tags:
+                feature(f"node/{number[point]}", tags, "Point", at[number[point]])
+        return json.dumps({"type": "FeatureCollection", "features": features})
+
+    def draft(self, tmp_path, **wishes):
+        path = tmp_path / "place.osm"
+        path.write_text(self.xml(), encoding="utf-8")
+        return import_lot(path, Wishes(**wishes))
+
+
+def car_park():
+    """Two rows on a one-way aisle that leaves a service road; a gate to the street; a shop."""
+    place = Map()
+    place.way([(-60, -20), (0, -20), (60, -20)], STREET)
+    place.way([(0, -20), (0, 0), (0, 20)], SERVICE)
+    place.way([(0, 0), (50, 0), (50, 20), (0, 20)], AISLE, oneway="yes")
+    for k in range(12):
+        x = 8 + 2.5 * k
+        place.box(x, 3, x + 2.5, 8, SPACE)
+        place.box(x, -8, x + 2.5, -3, SPACE, **({"parking_space": "disabled"} if k < 2 else {}))
+    place.box(-4, -9, 54, 24, {"amenity": "parking", "parking": "surface", "capacity": "24"})
+    place.box(10, 30, 40, 50, {"building": "retail"})
+    return place.node(10, 40, entrance="yes").node(25, 30, entrance="main")
+
+
+def outline_alone(half=8, **tags):
+    """A 16 m × 50 m area round a 50 m aisle: 20 slots of 2.5 m on either side of it."""
+    place = Map().way([(-60, -20), (0, -20), (60, -20)], STREET)
+    place.way([(0, -20), (0, 0)], SERVICE).way([(0, 0), (50, 0)], AISLE)
+    place.box(0, -half, 50, half, {"amenity": "parking", **tags})
+    return place.box(20, 20, 40, 40, {"building": "office"})
+
+
+def one_street(length=100.0, **tags):
+    """A street without crossings, and a house."""
+    place = Map().way([(0, 0), (length, 0)], {"highway": "residential"}, **tags)
+    return place.box(30, 20, 50, 30, {"building": "house"})
+
+
+def street_slots(tmp_path, **tags):
+    """Slots of a street, x along it from its west end."""
+    draft = one_street(**tags).draft(tmp_path)
+    west = FREIBURG.to_xy([[draft.frame.lon, draft.frame.lat]])[0]
+    return draft, draft.slots.xy + west
+
+
+def reasons(draft):
+    return {left.reason: left.ids for left in draft.left_out}
+
+
+def in_map_metres(draft, xy):
+    """Points of a draft in the metres that the map was drawn in."""
+    return FREIBURG.to_xy(draft.frame.to_lonlat(xy))
+
+
+# ---- formats ----
+
+
+def test_all_formats_give_the_same_lot(tmp_path):
+    texts = {
+        "a.osm": car_park().xml(),
+        "a.json": car_park().overpass(geometry=False),
+        "b.json": car_park().overpass(geometry=True),
+        "a.geojson": car_park().geojson(),
+        "b.geojson": car_park().geojson(flat=False),
+    }
+    lots = []
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        draft = import_lot(tmp_path / name)
+        lots.append((draft.lot(), reasons(draft)))
+    for lot, left in lots[1:]:
+        assert lot.slot_ids == lots[0][0].slot_ids
+        np.testing.assert_array_equal(lot.slot_xy, lots[0][0].slot_xy)
+        np.testing.assert_array_equal(lot.neighbors, lots[0][0].neighbors)
+        np.testing.assert_array_equal(lot.goals, lots[0][0].goals)
+        assert left == lots[0][1]
+
+
+def test_multipolygons_are_the_same_in_xml_and_json(tmp_path):
+    place = (
+        outline_alone().way([(0, -8), (25, -8), (50, -8)], {}).way([(50, -8), (50, 8), (0, 8), (0, -8)], {})
+    )
+    place.ways[3] = (place.ways[3][0], {})
+    # An outline of two ways that meet end to end.
+    place.area([6, 7], [], amenity="parking", capacity="30")
+    texts = {
+        "a.osm": place.xml(),
+        "a.json": place.overpass(geometry=False),
+        "b.json": place.overpass(geometry=True),
+    }
+    lots = []
+    for name, text in texts.items():
+        (tmp_path / name).write_text(text, encoding="utf-8")
+        lots.append(import_lot(tmp_path / name).lot())
+    assert lots[0].n_slots == 30
+    assert lots[0].slot_ids[0] == "relation/1-1"
+    for lot in lots[1:]:
+        np.testing.assert_array_equal(lot.slot_xy, lots[0].slot_xy)
+
+
+def test_native_lots_pass_through(tmp_path):
+    lot = ParkingLot.packaged("mini")
+    lot.to_file(tmp_path / "mini.geojson")
+    assert import_lot(tmp_path / "mini.geojson").lot() == lot
+    moved = import_lot(tmp_path / "mini.geojson", Wishes(goals=((3.0, 4.0),))).lot()
+    assert moved.goals.tolist() == [[3.0, 4.0]]
+    with pytest.raises(InputError, match="bounds go with OpenStreetMap"):
+        import_lot(tmp_path / "mini.geojson", Wishes(bounds=((0, 0), (9, 9))))
+
+
+def test_a_map_is_no_lot_and_the_error_says_what_makes_one_of_it(tmp_path):
+    for name, text in (("a.osm", car_park().xml()), ("a.json", car_park().overpass(geometry=True))):
+        (tmp_path / name).write_text(text)
+        with pytest.raises(InputError, match=r"`parkenv lot import .* makes a lot of it"):
+            ParkingLot.from_file(tmp_path / name)
+
+
+@given(st.floats(-179.9, 179.9), st.floats(-85, 85), st.floats(-3000, 3000), st.floats(-3000, 3000))
+def test_there_and_back_on_the_globe_is_less_than_a_centimetre(lon, lat, x, y):
+    frame = LocalFrame(lon=lon, lat=lat)
+    np.testing.assert_allclose(frame.to_xy(frame.to_lonlat([[x, y]])), [[x, y]], atol=0.01)
+
+
+# ---- mapped spaces ----
+
+
+def test_mapped_spaces_become_slots_at_their_place(tmp_path):
+    draft = car_park().draft(tmp_path)
+    lot = draft.lot()
+    assert lot.n_slots == 22
+    xy = in_map_metres(draft, lot.slot_xy)
+    first = lot.slot_ids.index("way/4")
+    np.testing.assert_allclose(xy[first], [9.25, 5.5], atol=0.05)
+    assert lot.slot_length[first] == pytest.approx(5.0, abs=0.05)
+    assert lot.slot_width[first] == pytest.approx(2.5, abs=0.05)
+    assert np.sin(lot.slot_yaw[first]) == pytest.approx(1.0, abs=1e-3)  # nose away from the aisle
+    assert set(lot.slot_mouth.tolist()) == {Mouth.REAR}
+
+
+def test_disabled_spaces_are_left_out_and_listed_unless_asked_for(tmp_path):
+    draft = car_park().draft(tmp_path)
+    assert reasons(draft) == {"spaces for disabled drivers": ("way/5", "way/7")}
+    asked = car_park().draft(tmp_path, with_disabled=True)
+    assert len(asked.slots) == 24
+    assert reasons(asked) == {}
+
+
+@pytest.mark.parametrize(
+    ("tags", "reason"),
+    [
+        ({"access": "private"}, "spaces with access=private"),
+        ({"access": "no"}, "spaces with access=no"),
+        ({"access": "private", "motorcar": "yes"}, None),
+        ({"access": "customers"}, None),
+        ({"parking_space": "motorcycle"}, "spaces with parking_space=motorcycle"),
+        ({"capacity:disabled": "1"}, "spaces for disabled drivers"),
+        ({"level": "-1"}, "spaces with level=-1"),
+        ({"layer": "-1"}, "spaces with layer=-1"),
+    ],
+)
+def test_spaces_that_not_everyone_may_use_are_left_out(tmp_path, tags, reason):
+    draft = car_park().box(42, 3, 44.5, 8, SPACE, **tags).draft(tmp_path)
+    number = "way/30"
+    assert (number in draft.slot_ids) == (reason is None)
+    if reason:
+        assert number in reasons(draft)[reason]
+
+
+def test_spaces_in_private_parking_are_private(tmp_path):
+    place = car_park()
+    place.ways[27] = (place.ways[27][0], {"amenity": "parking", "access": "private"})
+    draft = place.draft(tmp_path)
+    assert len(reasons(draft)["spaces in private parking"]) == 22
+    with pytest.raises(InputError, match="no slot: nothing that the file calls parking could be used"):
+        draft.lot()
+
+
+def test_a_space_for_several_cars_is_cut_along_its_aisle(tmp_path):
+    place = car_park().box(38, 3, 48, 8, SPACE, capacity="4").box(38, -8, 48, -3, SPACE)
+    draft = place.draft(tmp_path)
+    assert [i for i in draft.slot_ids if i.startswith("way/30")] == [f"way/30-{k}" for k in (1, 2, 3, 4)]
+    cut = [k for k, i in enumerate(draft.slot_ids) if i.startswith("way/30")]
+    np.testing.assert_allclose(
+        np.sort(in_map_metres(draft, draft.slots.xy[cut])[:, 0]), [39.25, 41.75, 44.25, 46.75], atol=0.05
+    )
+    assert reasons(draft)["spaces larger than 30 m² without a capacity"] == ("way/31",)
+
+
+def test_slanted_spaces_stand_slanted_and_clear_of_each_other(tmp_path):
+    place = Map().way([(-20, -9), (0, -9), (60, -9)], STREET).way([(0, -9), (0, 0)], SERVICE)
+    place.way([(0, 0), (50, 0)], AISLE).box(20, 20, 30, 30, {"building": "yes"})
+    for k in range(8):
+        x = 6 + 2.9 * k
+        place.way([(x, 3), (x + 2.9, 3), (x + 5.4, 7.33), (x + 2.5, 7.33), (x, 3)], SPACE)
+    draft = place.draft(tmp_path)
+    assert len(draft.slots) == 8
+    np.testing.assert_allclose(draft.slots.yaw, np.radians(60.0), atol=0.02)
+    np.testing.assert_allclose(draft.slots.width, 2.9 * np.sin(np.radians(60.0)), atol=0.05)
+    boxes = shapely.polygons(draft.lot().slot_corners())
+    assert shapely.area(shapely.union_all(boxes)) == pytest.approx(shapely.area(boxes).sum(), rel=0.02)
+
+
+def test_a_slot_opens_to_its_aisle_though_a_street_is_nearer(tmp_path):
+    place = car_park().way(
+        [(-60, 10), (-4, 10), (-4, 60)], {"highway": "residential"}, **{"parking:left": "lane"}
+    )
+    place.way([(-4, 10), (55, 10.0)], {"highway": "unclassified"})
+    draft = place.draft(tmp_path)
+    row = [
+        k
+        for k, i in enumerate(draft.slot_ids)
+        if in_map_metres(draft, draft.slots.xy[[k]])[0, 1] == pytest.approx(5.5, abs=0.1)
+    ]
+    assert len(row) == 12
+    np.testing.assert_allclose(np.sin(draft.slots.yaw[row]), 1.0, atol=1e-3)
+
+
+def test_slots_that_no_aisle_reaches_are_listed(tmp_path):
+    draft = car_park().box(8, 60, 10.5, 65, SPACE).draft(tmp_path)
+    assert reasons(draft)["slots that no aisle reaches within 8 m"] == ("way/30",)
+
+
+def test_slots_that_no_way_leads_to_are_listed(tmp_path):
+    place = car_park()
+    # A one-way aisle from the lot's far side to the service road: nobody gets onto it.
+    place.way([(-40, 20), (0, 20)], AISLE, oneway="yes").box(-20, 23, -17.5, 28, SPACE)
+    draft = place.draft(tmp_path)
+    assert reasons(draft)["slots that no way leads to from an entry"] == ("way/31",)
+    assert draft.lot().n_slots == 22
+
+
+def test_points_without_an_outline_are_listed(tmp_path):
+    draft = car_park().node(99, 9, amenity="parking").node(98, 9, amenity="parking_space").draft(tmp_path)
+    left = reasons(draft)
+    assert left["amenity=parking without an outline"] == (f"node/{len(car_park().nodes) + 1}",)
+    assert "amenity=parking_space without an outline" in left
+
+
+# ---- outlines filled by rule ----
+
+
+def test_an_outline_is_filled_with_rows_on_both_sides_of_its_aisle(tmp_path):
+    draft = outline_alone().draft(tmp_path)
+    xy = in_map_metres(draft, draft.slots.xy)
+    # The row at the service road's side begins beyond its carriageway: 80 % of 2.5 m.
+    assert 38 <= len(draft.slots) <= 40
+    np.testing.assert_allclose(np.abs(xy[:, 1]), 5.5, atol=0.02)
+    np.testing.assert_allclose(np.diff(np.sort(xy[xy[:, 1] > 0, 0])), 2.5, atol=0.01)
+    assert set(draft.slot_source) == {"amenity=parking, rows by rule"}
+
+
+@pytest.mark.parametrize(
+    ("tags", "count"),
+    [
+        ({"capacity": "12"}, 12),
+        ({"capacity": "12", "capacity:disabled": "2"}, 10),
+        ({"capacity": "dozens"}, None),
+    ],
+)
+def test_capacity_bounds_what_is_filled(tmp_path, tags, count):
+    assert len(outline_alone(**tags).draft(tmp_path).slots) == (
+        count or len(outline_alone().draft(tmp_path).slots)
+    )
+
+
+def test_too_great_a_capacity_is_not_believed_and_said(tmp_path):
+    draft = outline_alone(capacity="400").draft(tmp_path)
+    assert f"way/4: {len(draft.slots)} of the tagged 400 slots fit by the rule" in draft.found
+    assert len(draft.slots) == len(outline_alone().draft(tmp_path).slots)
+
+
+@pytest.mark.parametrize(
+    ("orientation", "most", "mouth"), [("parallel", 16, Mouth.LEFT), ("diagonal", 34, Mouth.REAR)]
+)
+def test_tagged_orientation_is_kept(tmp_path, orientation, most, mouth):
+    draft = outline_alone(half=9, orientation=orientation).draft(tmp_path)
+    assert most - 6 <= len(draft.slots) <= most
+    assert set(draft.slots.mouth.tolist()) == {mouth}
+
+
+def test_a_shallow_bay_beside_a_road_holds_cars_along_it(tmp_path):
+    place = outline_alone().box(10, -26, 40, -23.2, {"amenity": "parking", "parking": "street_side"})
+    draft = place.draft(tmp_path)
+    beside = [k for k, i in enumerate(draft.slot_ids) if i.startswith("way/6-")]
+    assert len(beside) == 5  # 30 m
+    assert set(draft.slots.mouth[beside].tolist()) == {Mouth.LEFT}
+    # Slots on the public street make it a lane.
+    assert any("1 streets" in line for line in draft.found)
+
+
+def test_slots_by_rule_keep_clear_of_buildings_and_holes(tmp_path):
+    place = outline_alone().box(10, 4, 20, 7, {"building": "kiosk"})
+    place.box(30, -7, 40, -4, {}).area([4], [7], amenity="parking")
+    place.ways[3] = (place.ways[3][0], {})
+    draft = place.draft(tmp_path)
+    boxes = shapely.polygons(
+        in_map_metres(draft, draft.lot().slot_corners().reshape(-1, 2)).reshape(-1, 4, 2)
+    )
+    assert 25 <= len(boxes) <= 34
+    for obstacle in (shapely.box(10, 4, 20, 7), shapely.box(30.5, -6.5, 39.5, -4.5)):
+        assert shapely.area(shapely.intersection(boxes, obstacle)).sum() < 0.3
+    assert {i.split("-")[0] for i in draft.slot_ids} == {"relation/1"}
+
+
+@pytest.mark.parametrize(
+    ("tags", "reason"),
+    [
+        ({"parking": "underground"}, "parking areas with parking=underground"),
+        ({"parking": "multi-storey"}, "parking areas with parking=multi-storey"),
+        ({"access": "private"}, "parking areas with access=private"),
+    ],
+)
+def test_areas_that_are_no_open_parking_are_listed(tmp_path, tags, reason):
+    draft = outline_alone(**tags).draft(tmp_path)
+    assert reasons(draft) == {reason: ("way/4",)}
+    assert len(draft.slots) == 0
+
+
+def test_an_area_without_an_aisle_is_listed(tmp_path):
+    draft = outline_alone().box(100, 100, 120, 120, {"amenity": "parking"}).draft(tmp_path)
+    assert reasons(draft)["parking areas without a road along which a slot fits"] == ("way/6",)
+
+
+# ---- kerbs ----
+
+
+def test_kerbs_hold_a_slot_every_six_metres_on_the_tagged_side(tmp_path):
+    for side, y in (("right", -4.05), ("left", 4.05)):
+        draft, xy = street_slots(tmp_path, **{f"parking:{side}": "lane"})
+        assert len(draft.slots) == 16  # 100 m
+        np.testing.assert_allclose(xy[:, 1], y, atol=0.01)
+        # Cars stand as traffic runs, on the right.
+        np.testing.assert_allclose(np.cos(draft.slots.yaw), 1.0 if side == "right" else -1.0, atol=1e-4)
+        assert set(draft.slots.mouth.tolist()) == {Mouth.LEFT}
+    both, _ = street_slots(tmp_path, **{"parking:both": "lane"})
+    assert len(both.slots) == 32
+
+
+@pytest.mark.parametrize(
+    ("new", "old"),
+    [
+        ({"parking:right": "lane"}, {"parking:lane:right": "parallel"}),
+        ({"parking:both": "lane"}, {"parking:lane:both": "inline"}),
+        (
+            {"parking:left": "street_side", "parking:left:orientation": "perpendicular"},
+            {"parking:lane:left": "perpendicular", "parking:lane:left:perpendicular": "street_side"},
+        ),
+        (
+            {"parking:both": "lane", "parking:both:orientation": "diagonal"},
+            {"parking:lane:both": "diagonal", "parking:lane:both:diagonal": "on_street"},
+        ),
+        (
+            {"parking:right": "half_on_kerb", "parking:right:capacity": "7", "width": "8"},
+            {
+                "parking:lane:right": "parallel",
+                "parking:lane:right:parallel": "half_on_kerb",
+                "parking:lane:right:capacity": "7",
+                "width": "8",
+            },
+        ),
+    ],
+)
+def test_the_old_tagging_says_the_same_as_the_new(tmp_path, new, old):
+    one, other = (street_slots(tmp_path, **tags)[0] for tags in (new, old))
+    assert len(one.slots) > 6
+    for name in ("xy", "yaw", "length", "width", "mouth"):
+        np.testing.assert_array_equal(getattr(one.slots, name), getattr(other.slots, name))
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        {"parking:right": "lane", "parking:right:restriction": "no_parking"},
+        {"parking:both": "lane", "parking:both:restriction": "no_stopping"},
+        {"parking:right": "lane", "parking:right:access": "private"},
+        {"parking:lane:right": "no_stopping"},
+        {"parking:lane:right": "parallel", "parking:condition:right": "no_parking"},
+        {"parking:right": "lane", "parking:right:orientation": "upright"},
+    ],
+)
+def test_forbidden_and_unknown_kerbs_are_listed(tmp_path, tags):
+    draft, _ = street_slots(tmp_path, **tags)
+    assert len(draft.slots) == 0
+    assert "way/1-right" in {i for left in draft.left_out for i in left.ids}
+
+
+@pytest.mark.parametrize("value", ["no", "separate"])
+def test_kerbs_without_parking_are_nothing_to_speak_of(tmp_path, value):
+    draft, _ = street_slots(tmp_path, **{"parking:right": value, "parking:left": "lane"})
+    assert len(draft.slots) == 16
+    assert draft.left_out == ()
+
+
+@pytest.mark.parametrize(("capacity", "count", "length"), [("5", 5, 6.0), ("18", 18, 5.55), ("50", 20, 5.0)])
+def test_tagged_capacity_spreads_or_tightens_the_row(tmp_path, capacity, count, length):
+    draft, xy = street_slots(tmp_path, **{"parking:right": "lane", "parking:right:capacity": capacity})
+    assert len(draft.slots) == count
+    np.testing.assert_allclose(draft.slots.length, length, atol=0.01)
+    np.testing.assert_allclose(np.diff(xy[:, 0]), 100.0 / count, atol=0.01)
+    assert any("of the tagged 50 slots" in line for line in draft.found) == (capacity == "50")
+
+
+@pytest.mark.parametrize(
+    ("tags", "edge"),
+    [
+        ({}, 3.0),
+        ({"lanes": "1"}, 1.5),
+        ({"lanes": "3"}, 4.5),
+        ({"highway": "primary"}, 3.5),
+        ({"highway": "living_street"}, 2.5),
+        ({"oneway": "yes"}, 2.0),
+        ({"width": "10", "parking:right": "lane"}, 2.9),
+        ({"width": "10 m", "parking:right": "on_kerb"}, 5.0),
+        ({"width": "wide"}, 3.0),
+    ],
+)
+def test_cars_stand_at_the_edge_of_what_the_street_measures(tmp_path, tags, edge):
+    draft, xy = street_slots(tmp_path, **{"parking:right": "lane", **tags})
+    np.testing.assert_allclose(-xy[:, 1], edge + 2.1 / 2, atol=0.02)
+    assert len(draft.slots) == 16
+
+
+def test_a_one_way_street_drawn_against_its_traffic_keeps_its_sides(tmp_path):
+    draft, xy = street_slots(tmp_path, oneway="-1", **{"parking:left": "lane"})
+    # Left of the way is north; traffic runs west, so these cars stand on its right.
+    np.testing.assert_allclose(xy[:, 1], 2.0 + 1.05, atol=0.01)
+    np.testing.assert_allclose(np.cos(draft.slots.yaw), -1.0, atol=1e-4)
+    assert set(draft.slots.mouth.tolist()) == {Mouth.LEFT}
+    assert draft.slot_ids[0] == "way/1-left-1"
+    lane = draft.lanes[0]
+    assert lane.oneway
+    assert lane.points[0, 0] > lane.points[-1, 0]
+
+
+def crossing_streets(**second):
+    place = Map().way([(0, 0), (50, 0), (100, 0)], STREET, **{"parking:both": "lane"})
+    return place.way([(50, 0), (50, 60)], second).box(20, 20, 30, 30, {"building": "yes"})
+
+
+@pytest.mark.parametrize(
+    ("second", "clear_north", "clear_south"),
+    [
+        ({"highway": "residential"}, 3.0 + 2.1 + 5.0, 3.0 + 2.1 + 5.0),
+        ({"highway": "service"}, 2.5 + 1.0, 0.0),
+        ({"highway": "footway"}, 0.0, 0.0),
+    ],
+)
+def test_crossings_stay_clear(tmp_path, second, clear_north, clear_south):
+    draft = crossing_streets(**second).draft(tmp_path)
+    xy = in_map_metres(draft, draft.slots.xy)
+    for side, clear in ((1, clear_north), (-1, clear_south)):
+        gap = np.abs(xy[xy[:, 1] * side > 0, 0] - 50.0).min() - 3.0
+        assert gap >= clear - 0.05 if clear else gap < 3.0
+
+
+def test_pedestrian_crossings_stay_clear(tmp_path):
+    place = Map().way([(0, 0), (50, 0), (100, 0)], STREET, **{"parking:both": "lane"})
+    place.box(20, 20, 30, 30, {"building": "yes"}).node(50, 0, highway="crossing")
+    draft = place.draft(tmp_path)
+    xy = in_map_metres(draft, draft.slots.xy)
+    assert np.abs(xy[:, 0] - 50.0).min() >= 5.0 + 3.0 - 0.05
+    assert len(xy) == 4 * 7
+
+
+def test_a_street_tagged_in_pieces_keeps_no_gap_between_them(tmp_path):
+    place = Map().way([(0, 0), (48, 0)], STREET, **{"parking:both": "lane"})
+    place.way([(48, 0), (96, 0)], STREET, **{"parking:both": "lane"}).box(20, 20, 30, 30, {"building": "yes"})
+    assert len(place.draft(tmp_path).slots) == 32
+
+
+def test_rows_follow_bends_without_overlaps(tmp_path):
+    angle = np.linspace(0, np.pi / 2, 13)
+    arc = [(round(60 * np.sin(a), 3), round(60 - 60 * np.cos(a), 3)) for a in angle]
+    place = Map().way(arc, STREET, **{"parking:both": "lane"}).box(20, 40, 30, 50, {"building": "yes"})
+    draft = place.draft(tmp_path)
+    lot = draft.lot()
+    radius = np.hypot(*(in_map_metres(draft, lot.slot_xy) - [0, 60]).T)
+    np.testing.assert_allclose(np.abs(radius - 60), 4.05, atol=0.3)
+    boxes = shapely.polygons(lot.slot_corners())
+    overlap = shapely.area(boxes).sum() - shapely.area(shapely.union_all(boxes))
+    assert overlap < 0.1 * lot.n_slots
+    assert 26 <= lot.n_slots <= 32
+
+
+# ---- lanes, entries, goals ----
+
+
+def test_entries_are_where_service_roads_meet_the_street(tmp_path):
+    draft = car_park().draft(tmp_path)
+    np.testing.assert_allclose(in_map_metres(draft, draft.entries), [[0, -20]], atol=0.02)
+    assert "2 lanes: 1 parking aisles, 1 other service roads, 0 streets; 1 one-way" in draft.found
+
+
+def test_nobody_comes_in_by_a_one_way_exit(tmp_path):
+    place = car_park().way([(50, 0), (60, -20)], SERVICE, oneway="yes")
+    draft = place.draft(tmp_path)
+    np.testing.assert_allclose(in_map_metres(draft, draft.entries), [[0, -20]], atol=0.02)
+    place = car_park().way([(60, -20), (50, 0)], SERVICE, oneway="yes")
+    assert len(place.draft(tmp_path).entries) == 2
+
+
+def test_service_roads_that_lead_to_no_slot_are_dropped(tmp_path):
+    place = car_park().way([(0, 20), (-30, 20), (-30, 60)], SERVICE).way([(-30, 60), (-50, 60)], SERVICE)
+    place.way([(-50, -20), (-50, -60)], SERVICE, service="driveway")
+    assert len(place.draft(tmp_path).lanes) == 2
+
+
+def test_where_streets_are_lanes_cars_come_in_at_their_open_ends(tmp_path):
+    place = Map().way([(-500, 0), (0, 0), (100, 0)], STREET, **{"parking:right": "no"})
+    place.way([(0, 0), (0, 100)], {"highway": "residential", "oneway": "yes"}, **{"parking:both": "lane"})
+    place.box(20, 20, 30, 30, {"building": "yes"})
+    draft = place.draft(tmp_path)
+    ends = in_map_metres(draft, draft.entries)
+    # The long road is cut 60 m beyond the slots; the one-way street is left at its end only.
+    assert len(ends) == 2
+    np.testing.assert_allclose(ends[:, 1], 0.0, atol=0.02)
+    assert ends[:, 0].min() == pytest.approx(draft_low_x(draft) - 60.0, abs=0.1)
+
+
+def test_nobody_comes_in_by_a_blind_end(tmp_path):
+    kerbs = {"highway": "residential", "parking:both": "lane"}
+    place = Map().way([(0, 0), (60, 0)], kerbs).way([(60, 0), (60, 40)], kerbs).way([(60, 0), (90, 0)], kerbs)
+    place.node(60, 40, noexit="yes").node(90, 0, highway="turning_circle").box(
+        9, 9, 20, 20, {"building": "yes"}
+    )
+    draft = place.draft(tmp_path)
+    np.testing.assert_allclose(in_map_metres(draft, draft.entries), [[0, 0]], atol=0.02)
+    # An end at the edge of the map leaves no doubt about the others.
+    place = Map().way([(-500, 0), (60, 0)], kerbs | {"parking:both": "no"}).way([(60, 0), (60, 40)], kerbs)
+    place.box(9, 9, 20, 20, {"building": "yes"})
+    assert len(place.draft(tmp_path).entries) == 1
+
+
+def draft_low_x(draft):
+    return in_map_metres(draft, draft.slots.xy)[:, 0].min()
+
+
+def test_car_parks_apart_are_joined_by_the_street(tmp_path):
+    place = car_park().way([(60, -20), (60, -40)], SERVICE).way([(60, -40), (90, -40)], AISLE)
+    for k in range(4):
+        place.box(66 + 2.5 * k, -48, 68.5 + 2.5 * k, -43, SPACE)
+    draft = place.draft(tmp_path)
+    assert len(draft.slots) == 26
+    assert any("1 streets" in line for line in draft.found)
+    lot = draft.lot()
+    reached = np.isfinite(shortest(lot)[:, : lot.n_slots])
+    assert reached.all()
+
+
+def shortest(lot):
+    from scipy.sparse.csgraph import dijkstra
+
+    return dijkstra(lot.drive_matrix(), indices=lot.entry_vertices)
+
+
+def test_given_entries_and_goals_count_by_metres_or_degrees(tmp_path):
+    frame = car_park().draft(tmp_path).frame
+    lon, lat = FREIBURG.to_lonlat([[25.0, 25.0]])[0].tolist()
+    by_degrees = car_park().draft(tmp_path, goals=((lat, lon),), entries=((lat, lon),))
+    np.testing.assert_allclose(in_map_metres(by_degrees, by_degrees.goals), [[25.0, 25.0]], atol=0.01)
+    x, y = frame.to_xy([[lon, lat]])[0].tolist()
+    by_metres = car_park().draft(tmp_path, goals=((x, y),), entries=((x, y),))
+    np.testing.assert_allclose(by_metres.goals, by_degrees.goals, atol=1e-9)
+    np.testing.assert_allclose(by_metres.entries, by_degrees.entries, atol=1e-9)
+
+
+def test_goals_are_entrances_main_ones_first_else_the_nearest_building(tmp_path):
+    draft = car_park().draft(tmp_path)
+    np.testing.assert_allclose(in_map_metres(draft, draft.goals), [[25, 30], [10, 40]], atol=0.02)
+    place = car_park().box(100, 30, 120, 50, {"building": "yes"}).box(0, 26, 4, 28, {"building": "garage"})
+    for point in ((25, 30), (10, 40)):
+        place.nodes[point].clear()
+    draft = place.draft(tmp_path)
+    np.testing.assert_allclose(in_map_metres(draft, draft.goals), [[25, 40]], atol=0.02)
+
+
+def test_without_goal_or_entry_it_refuses_and_says_how_to_give_one(tmp_path):
+    place = Map().way([(0, 0), (50, 0)], AISLE).box(10, 3, 12.5, 8, SPACE).box(13, 3, 15.5, 8, SPACE)
+    draft = place.draft(tmp_path)
+    assert len(draft.slots) == 2
+    assert len(draft.missing) == 2
+    with pytest.raises(
+        InputError, match=r"no entry: .*--entry LAT,LON; lanes end at .*no goal: .*--goal LAT,LON"
+    ):
+        draft.lot()
+    problems = check_lot(tmp_path / "place.osm")
+    assert [p.message.split(":")[0] for p in problems if p.severity == "error"] == ["no entry", "no goal"]
+    ends = draft.missing[0].split("lanes end at ")[1].split(" and ")
+    entry = tuple(float(word) for word in ends[0].split(","))
+    lot = place.draft(tmp_path, entries=(entry,), goals=((30.0, 30.0),)).lot()
+    assert lot.n_slots == 2
+
+
+def test_buildings_are_walls_unless_they_stand_over_slots(tmp_path):
+    draft = car_park().box(7, 2, 24, 9, {"building": "roof"}).draft(tmp_path)
+    assert len(draft.walls) == 1
+    assert reasons(draft)["buildings over slots or lanes, which are no walls"] == ("way/30",)
+
+
+def test_bounds_cut_the_map(tmp_path):
+    south, west = FREIBURG.to_lonlat([[-10.0, -30.0]])[0][::-1].tolist()
+    north, east = FREIBURG.to_lonlat([[20.6, 60.0]])[0][::-1].tolist()
+    draft = car_park().draft(tmp_path, bounds=((south, west), (north, east)))
+    x = in_map_metres(draft, draft.slots.xy)[:, 0]
+    assert len(x) == 3 + 5
+    assert x.max() < 20.6
+    with pytest.raises(InputError, match="want an area"):
+        car_park().draft(tmp_path, bounds=((south, west), (south, east)))
+
+
+def test_a_crossing_of_six_lanes_can_be_driven(tmp_path):
+    place = outline_alone()
+    for x, y in ((-20, 10), (-20, -10), (-20, 0), (-10, 15)):
+        place.way([(0, 0), (x, y)], AISLE).box(x - 9, y - 1, x - 4, y + 1.5, SPACE)
+    draft = place.draft(tmp_path)
+    lot = draft.lot()
+    assert lot.n_slots >= 40
+    assert np.isfinite(shortest(lot)).all()
+
+
+# ---- faults ----
+
+
+def with_text(change):
+    return lambda: change(car_park().xml())
+
+
+PARKING_AREA = {"type": "multipolygon", "amenity": "parking"}
+NO_LINE = {"type": "way", "ref": 3, "role": "outer", "geometry": []}
+BOMB = (
+    '<?xml version="1.0"?><!DOCTYPE lolz [<!ENTITY a "aaaaaaaaaa">'
+    + "".join(f'<!ENTITY {chr(98 + k)} "{10 * f"&{chr(97 + k)};"}">' for k in range(9))
+    + "]><osm>&j;</osm>"
+)
+FAULTS = [
+    ("a.osm", with_text(lambda t: t[: len(t) // 2]), r"a\.osm: not XML: line \d+, column \d+"),
+    ("a.osm", lambda: "", "not XML: line 1, column 0: no element found"),
+    ("a.osm", lambda: "<gpx/>", "root is <gpx>, want <osm>"),
+    ("a.osm", lambda: BOMB, "declares the document type 'lolz'"),
+    ("a.osm", with_text(lambda t: t.replace('lat="', 'lat="1')), r"node/1: lat is '14\d[\d.]+', want"),
+    ("a.osm", with_text(lambda t: t.replace('lon="', 'lon="NaN', 1)), "node/1: lon is 'NaN7"),
+    ("a.osm", with_text(lambda t: t.replace('id="1"', 'id="one"', 1)), "<node>: id is 'one', want a whole number"),
+    ("a.osm", with_text(lambda t: t.replace('<nd ref="1"/>', '<nd ref="999"/>')), "way/1: its node 999 is not in"),
+    ("a.osm", lambda: "<osm version='0.6'/>", "no parking in it"),
+    ("a.osm", lambda: Map().way([(0, 0), (9, 0)], STREET).xml(), "no parking in it"),
+    (
+        "a.osm",
+        lambda: car_park().way([(1, 1), (4, 4), (4, 1), (1, 4), (1, 1)], SPACE).xml(),
+        "way/30: its outline is not a simple one: Self-intersection",
+    ),
+    (
+        "a.osm",
+        lambda: car_park().area([99], [], amenity="parking").xml(),
+        "relation/1: its member way 99 is not in the file",
+    ),
+    (
+        "a.osm",
+        lambda: car_park().area([1], [], amenity="parking").xml(),
+        r"relation/1: its outline is open at 4\d\.\d+, 7\.\d+",
+    ),
+    (
+        "a.json",
+        lambda: json.dumps({"elements": [{"type": "relation", "id": 7, "members": True, "tags": PARKING_AREA}]}),
+        "relation/7: a multipolygon without an outer way",
+    ),
+    (
+        "a.json",
+        lambda: json.dumps({"elements": [{"type": "relation", "id": 7, "members": [NO_LINE], "tags": PARKING_AREA}]}),
+        "relation/7: its member way 3 has 0 positions, want a line",
+    ),
+    (
+        "a.geojson",
+        lambda: car_park().geojson().replace('"Polygon", "coordinates": [[', '"Polygon", "coordinates": [[], [', 1),
+        r"way/4: coordinates are \[\], want positions",
+    ),
+    ("a.json", lambda: '{"elements": [', "not JSON: line 1, column 15"),
+    ("a.json", lambda: '{"elements": [{"type": "node", "id": "x"}]}', r"elements\[0\]: id is 'x'"),
+    (
+        "a.json",
+        lambda: json.dumps({"elements": [{"type": "way", "id": 3, "tags": {"highway": "service"}}]}),
+        "way/3: neither nodes nor geometry, want `out geom;`",
+    ),
+    (
+        "a.json",
+        lambda: '{"elements": [{"type": "way", "id": 3, "tags": {"highway": "x"}, "geometry": [null]}]}',
+        "way/3: geometry has gaps",
+    ),
+    (
+        "a.geojson",
+        lambda: car_park().geojson().replace('"coordinates": [[', '"coordinates": [[200, ', 1),
+        "way/1: lon is 200, want a number from -180 to 180",
+    ),
+    ("a.pbf", lambda: "", r"unknown kind of file '\.pbf', want \.osm"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "text", "message"), FAULTS, ids=map(str, range(len(FAULTS))))
+def test_faults_are_named_in_one_line(tmp_path, name, text, message):
+    path = tmp_path / name
+    path.write_text(text(), encoding="utf-8")
+    with pytest.raises(InputError, match=message) as caught:
+        import_lot(path)
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(str(path))
+    if name.endswith(".osm"):
+        (problem,) = check_lot(path)
+        assert problem.severity == "error"
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25)
+@given(data=st.data(), kind=st.sampled_from(["overpass", "geometry", "geojson"]))
+def test_no_content_brings_the_import_down(tmp_path, data, kind):
+    place = car_park().area([30], [], amenity="parking").box(60, 0, 80, 30, {})
+    document = json.loads(
+        place.geojson() if kind == "geojson" else place.overpass(geometry=kind == "geometry")
+    )
+    odd = [
+        None,
+        True,
+        0,
+        -1,
+        1e308,
+        float("nan"),
+        "x",
+        "way/1",
+        "yes",
+        [],
+        {},
+        [[]],
+        [7.85, 48.0],
+        [[7.8, 48.0]],
+    ]
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = document
+        while True:
+            key = data.draw(st.sampled_from(list(at) if isinstance(at, dict) else range(len(at))))
+            if isinstance(at[key], dict | list) and at[key] and data.draw(st.integers(0, 4)):
+                at = at[key]
+                continue
+            at[key] = copy.deepcopy(data.draw(st.sampled_from(odd)))
+            break
+    path = tmp_path / ("a.geojson" if kind == "geojson" else "a.json")
+    path.write_text(json.dumps(document), encoding="utf-8")
+    with suppress(InputError):
+        assert import_lot(path).lot().n_slots > 0
+    check_lot(path)
+
+
+def test_every_cut_of_a_map_is_refused(tmp_path):
+    whole = car_park().xml()
+    for length in range(0, len(whole), 397):
+        (tmp_path / "a.osm").write_text(whole[:length])
+        with pytest.raises(InputError, match=r"not XML: line \d+, column \d+"):
+            import_lot(tmp_path / "a.osm")
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        import_lot(tmp_path / "a.osm")
+
+
+def test_deleted_elements_are_not_there(tmp_path):
+    text = car_park().xml().replace('<way id="4">', '<way id="4" action="delete">')
+    (tmp_path / "a.osm").write_text(text, encoding="utf-8")
+    draft = import_lot(tmp_path / "a.osm")
+    assert len(draft.slots) == 21
+    assert "way/4" not in draft.slot_ids
+
+
+# ---- invariants ----
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25)
+@given(
+    turn=st.floats(-3.2, 3.2),
+    aisle=st.floats(5.0, 9.0),
+    n=st.integers(1, 9),
+    width=st.floats(2.2, 3.0),
+    tags=st.sampled_from([{}, {"oneway": "yes"}, {"oneway": "-1"}]),
+    kerb=st.sampled_from([{}, {"parking:both": "lane"}, {"parking:right": "on_kerb", "width": "7"}]),
+)
+def test_every_slot_is_tied_to_a_lane_before_its_mouth(tmp_path, turn, aisle, n, width, tags, kerb):
+    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    plain = Map().way([(-60, -30), (0, -30), (80, -30)], STREET, **kerb)
+    plain.way([(0, -30), (0, 0)], SERVICE).way([(0, 0), (40, 0)], AISLE, **tags)
+    plain.way([(40, 0), (40, -30), (0, -30)], SERVICE).box(10, 40, 20, 50, {"building": "yes"})
+    for k in range(n):
+        x = 5 + width * k
+        plain.box(x, aisle / 2, x + width, aisle / 2 + 5, SPACE)
+    plain.box(3, -aisle / 2 - 5, 37, -aisle / 2 + 0.5, {"amenity": "parking"})
+    place = Map()
+    for points, own in plain.ways:
+        place.way([tuple((matrix @ p).round(6).tolist()) for p in points], own)
+    draft, again = place.draft(tmp_path), place.draft(tmp_path)
+    lot = draft.lot()
+    assert lot == again.lot()
+    assert [str(left) for left in draft.left_out] == [str(left) for left in again.left_out]
+    # What is drawn is there but for slots that a one-way aisle leaves behind.
+    assert sum(i.count("/") == 1 and "-" not in i for i in lot.slot_ids) == n
+    mouth = lot.mouth_xy()
+    to_lane = nearest_on_lanes(lot.lanes, mouth)[0] - mouth
+    assert np.hypot(*to_lane.T).max() <= SLOT_REACH
+    outward = mouth - lot.slot_xy
+    assert ((outward * to_lane).sum(axis=1) > 0).all()
+    boxes = shapely.polygons(lot.slot_corners())
+    assert not shapely.intersects(
+        boxes, shapely.union_all([shapely.LineString(lane.points) for lane in lot.lanes])
+    ).any()
+
+
+# ---- a search there ----
+
+PLACES = {
+    "spaces": car_park,
+    "outline": outline_alone,
+    "kerbs": lambda: crossing_streets(highway="residential"),
+}
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_a_search_runs_on_what_was_imported(tmp_path, name):
+    PLACES[name]().draft(tmp_path).lot().to_file(tmp_path / "lot.geojson")
+    assert check_lot(tmp_path / "lot.geojson") == []
+    lot = ParkingLot.from_file(tmp_path / "lot.geojson")
+    scenario = Scenario.on_lot(lot)
+    for agent in ("mdp", "greedy-drive"):
+        rows = Case(scenario, agent).run(range(4))[0]
+        assert all(row["parked"] for row in rows)
+        assert all(row["drive_s"] > 0.0 and row["walk_s"] > 0.0 for row in rows)
+
+
+def test_the_command_line_imports_draws_and_checks(tmp_path):
+    place, lot, picture = tmp_path / "place.osm", tmp_path / "lot.geojson", tmp_path / "lot.png"
+    place.write_text(car_park().xml(), encoding="utf-8")
+
+    def run(*words):
+        return CliRunner().invoke(app, ["lot", *map(str, words)])
+
+    done = run("import", place, "--out", lot, "--picture", picture)
+    assert done.exit_code == 0, done.output
+    assert "22 slots from amenity=parking_space" in done.output
+    assert "left out: spaces for disabled drivers: 2 (way/5, way/7)" in done.output
+    assert ParkingLot.from_file(lot).n_slots == 22
+    assert picture.stat().st_size > 10_000
+    assert run("import", place, "--out", lot, "--disabled").exit_code == 0
+    assert ParkingLot.from_file(lot).n_slots == 24
+    refused = run("import", place, "--out", lot, "--goal", "48")
+    assert str(refused.exception) == "--goal is '48', want 2 numbers with commas between"
+
+
+def test_the_command_line_draws_what_it_refuses_and_writes_no_lot(tmp_path):
+    bare = Map().way([(0, 0), (50, 0)], AISLE).box(9, 3, 12, 8, SPACE)
+    (tmp_path / "bare.osm").write_text(bare.xml(), encoding="utf-8")
+    words = ["lot", "import", "bare.osm", "--out", "bare.geojson", "--picture", "bare.png"]
+    done = subprocess.run([*PARKENV, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith("parkenv: error: bare.osm: no entry")
+    assert done.stderr.count("\n") == 1
+    assert (tmp_path / "bare.png").exists()
+    assert not (tmp_path / "bare.geojson").exists()
+
+
+def test_pictures_are_drawn_of_whatever_was_found(tmp_path):
+    for name, draft in (
+        ("all", car_park().draft(tmp_path)),
+        ("nothing", outline_alone(access="private").draft(tmp_path)),
+    ):
+        save_import_picture(draft, tmp_path / f"{name}.png")
+        assert (tmp_path / f"{name}.png").stat().st_size > 5_000

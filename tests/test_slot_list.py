@@ -1,0 +1,291 @@
+"""Lots made from lists of slot centres: rows, aisles, and when not to guess."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.sparse.csgraph import connected_components
+
+from parkenv import ParkingLot, Scenario
+from parkenv.errors import InputError
+from parkenv.evaluation.compare import Case
+from parkenv.evaluation.import_picture import save_import_picture
+from parkenv.local_frame import LocalFrame
+from parkenv.lot import Mouth
+from parkenv.lot_check import check_lot
+from parkenv.lot_draft import Wishes
+from parkenv.lot_generators import BAY_SIZE, Slots, bay_row
+from parkenv.lot_import import import_lot
+from parkenv.slot_polygons import nearest_on_lanes
+
+DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"
+
+
+def listed(tmp_path, xy, *, yaw=None, ids=None, order=None, **wishes):
+    """The draft of a list of slots."""
+    ids = ids or [f"s{i}" for i in range(len(xy))]
+    lines = ["id,x,y" + ("" if yaw is None else ",yaw")]
+    for i in range(len(xy)) if order is None else order:
+        cells = [ids[i], *map(repr, map(float, xy[i])), *([] if yaw is None else [repr(float(yaw[i]))])]
+        lines.append(",".join(cells))
+    path = tmp_path / "slots.csv"
+    path.write_text("\n".join(lines), encoding="utf-8")
+    return import_lot(path, Wishes(**wishes))
+
+
+def of_lot(tmp_path, lot, *, with_yaw=False, **wishes):
+    yaw = lot.slot_yaw if with_yaw else None
+    return listed(tmp_path, lot.slot_xy, yaw=yaw, ids=list(lot.slot_ids), **wishes)
+
+
+def row(n, y, *, x=0.0, pitch=2.5):
+    return [(x + pitch * k, y) for k in range(n)]
+
+
+# ---- what follows from centres ----
+
+
+@pytest.mark.parametrize("with_yaw", [False, True])
+@pytest.mark.parametrize(("rows", "columns"), [(2, 4), (4, 8), (5, 6), (6, 20)])
+def test_a_grid_is_found_again(tmp_path, rows, columns, with_yaw):
+    lot = ParkingLot.grid(rows, columns)
+    draft = of_lot(
+        tmp_path, lot, with_yaw=with_yaw, entries=(tuple(lot.entries[0]),), goals=(tuple(lot.goals[0]),)
+    )
+    found = draft.lot()
+    assert found.slot_ids == lot.slot_ids
+    np.testing.assert_allclose(found.mouth_xy(), lot.mouth_xy(), atol=1e-6)
+    np.testing.assert_allclose(np.cos(found.slot_yaw - lot.slot_yaw), 1.0)
+    aisles = {round(float(lane.points[0, 1]), 6) for lane in found.lanes if np.ptp(lane.points[:, 1]) < 1e-6}
+    assert aisles == {round(float(lane.points[0, 1]), 6) for lane in lot.lanes[: (rows + 1) // 2]}
+    assert connected_components(found.drive_matrix(), connection="strong")[0] == 1
+
+
+@pytest.mark.skipif(not DRAGON_LAKE.exists(), reason="the Dragon Lake map is not beside this checkout")
+def test_dragon_lake_is_found_again_from_its_slots_alone(tmp_path):
+    lot = ParkingLot.from_file(DRAGON_LAKE)
+    draft = of_lot(tmp_path, lot, entries=(tuple(lot.entries[0]),), goals=((80.0, -4.0),))
+    found = draft.lot()
+    assert found.slot_ids == lot.slot_ids
+    assert np.abs(found.mouth_xy() - lot.mouth_xy()).max() < 0.6
+    np.testing.assert_allclose(np.cos(found.slot_yaw - lot.slot_yaw), 1.0)
+    # Aisles and the roads between them lie where the map's own waypoints are.
+    nearest, _, _ = nearest_on_lanes(found.lanes, lot.vertex_xy[: lot.n_slots])
+    assert np.hypot(*(nearest - lot.vertex_xy[: lot.n_slots]).T).max() < 3.0
+    scenario = Scenario.on_lot(found)
+    rows = Case(scenario, "greedy-drive").run(range(3))[0]
+    assert all(r["parked"] for r in rows)
+
+
+def test_angled_rows_need_a_yaw_and_keep_it(tmp_path):
+    angle = np.radians(60.0)
+    low, high = bay_row((0, 3), 0.0, 8, angle=angle), bay_row((40, -3), np.pi, 8, angle=angle)
+    slots = Slots.joined([low, high])
+    draft = listed(tmp_path, slots.xy, yaw=slots.yaw, entries=((-5.0, 0.0),), goals=((20.0, 20.0),))
+    lot = draft.lot()
+    np.testing.assert_allclose(lot.slot_yaw, slots.yaw)
+    np.testing.assert_allclose(lot.slot_width, BAY_SIZE[1], atol=1e-6)
+    np.testing.assert_allclose(lot.lanes[0].points[:, 1], 0.0, atol=0.05)
+
+
+def test_kerbside_rows_stand_as_traffic_runs(tmp_path):
+    xy = row(6, 4.0, pitch=6.2) + row(6, -4.0, pitch=6.2)
+    lot = listed(tmp_path, np.array(xy), entries=((-6.0, 0.0),), goals=((20.0, 20.0),)).lot()
+    np.testing.assert_allclose(np.cos(lot.slot_yaw), [-1.0] * 6 + [1.0] * 6)
+    assert set(lot.slot_mouth.tolist()) == {Mouth.LEFT}
+    np.testing.assert_allclose(lot.lanes[0].points[:, 1], 0.0, atol=1e-6)
+
+
+def test_a_road_leads_through_a_gap_in_the_rows(tmp_path):
+    xy = [p for y in (-5.5, 5.5, 10.5, 21.5) for p in row(6, y) + row(6, y, x=21.0)]
+    draft = listed(tmp_path, np.array(xy), entries=((-5.0, 0.0),), goals=((20.0, 40.0),))
+    crossing = [lane for lane in draft.lanes if np.ptp(lane.points[:, 0]) < 0.01]
+    assert sorted(round(float(lane.points[0, 0]), 2) for lane in crossing) == [-4.25, 16.75, 37.75]
+    assert len(draft.lot().lanes) == 5
+
+
+def test_latitudes_and_longitudes_are_metres_after_all(tmp_path):
+    lot = ParkingLot.grid(4, 8)
+    frame = LocalFrame(lon=-122.25, lat=37.87)
+    lines = ["LAT,LON"] + [f"{lat:.8f},{lon:.8f}" for lon, lat in frame.to_lonlat(lot.slot_xy)]
+    path = tmp_path / "slots.csv"
+    path.write_text("\n".join(lines))
+    lon, lat = frame.to_lonlat(lot.entries)[0].tolist()
+    draft = import_lot(path, Wishes(entries=((lat, lon),), goals=((lat, lon + 3e-4),)))
+    found = draft.lot()
+    assert found.slot_ids[0] == "2"  # the row in the file
+    back = frame.to_xy(draft.frame.to_lonlat(found.mouth_xy()))
+    np.testing.assert_allclose(back, lot.mouth_xy(), atol=0.02)
+
+
+def test_bounds_keep_a_part(tmp_path):
+    lot = ParkingLot.grid(4, 8)
+    draft = of_lot(tmp_path, lot, bounds=((-1.0, -20.0), (12.4, 50.0)))
+    assert len(draft.slots) == 20
+    with pytest.raises(InputError, match="no slot within the bounds"):
+        of_lot(tmp_path, lot, bounds=((1000.0, 0.0), (1010.0, 50.0)))
+
+
+def test_stray_slots_are_left_out_and_listed(tmp_path):
+    lot = ParkingLot.grid(4, 8)
+    xy = np.vstack([lot.slot_xy, [[60.0, 60.0]]])
+    draft = listed(tmp_path, xy, entries=((-3.0, 0.0),), goals=((9.0, 9.0),))
+    assert [str(left) for left in draft.left_out] == ["slots that stand in no row: 1 (s32)"]
+    assert draft.lot().n_slots == 32
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=40)
+@given(
+    turn=st.floats(-3.2, 3.2),
+    shift=st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4)),
+    rows=st.sampled_from([2, 4, 6]),
+    columns=st.integers(4, 12),
+    pitch=st.floats(2.2, 3.4),
+    aisle=st.floats(4.0, 8.5),
+    seed=st.integers(0, 1000),
+)
+def test_a_moved_list_gives_the_same_lot_moved(tmp_path, turn, shift, rows, columns, pitch, aisle, seed):
+    lot = ParkingLot.grid(rows, columns, pitch=pitch, aisle=aisle)
+    matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+
+    def moved(xy):
+        return np.asarray(xy) @ matrix.T + shift
+
+    plain = of_lot(tmp_path, lot)
+    order = np.random.default_rng(seed).permutation(lot.n_slots)
+    other = listed(tmp_path, moved(lot.slot_xy), ids=list(lot.slot_ids), order=order)
+    index = [other.slot_ids.index(name) for name in plain.slot_ids]
+    np.testing.assert_allclose(other.slots.xy[index], moved(plain.slots.xy), atol=1e-6)
+    np.testing.assert_allclose(np.cos(other.slots.yaw[index] - plain.slots.yaw - turn), 1.0)
+    np.testing.assert_allclose(other.slots.width[index], plain.slots.width)
+    ends = [np.concatenate([lane.points for lane in draft.lanes]) for draft in (plain, other)]
+    assert len(plain.lanes) == len(other.lanes)
+    for xy in moved(ends[0]):
+        assert np.hypot(*(ends[1] - xy).T).min() < 1e-5
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25)
+@given(seed=st.integers(0, 10_000))
+def test_inexact_lists_give_lots_in_which_every_slot_opens_to_a_lane(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    lot = ParkingLot.grid(4, int(rng.integers(6, 15)))
+    kept = np.sort(rng.permutation(lot.n_slots)[: lot.n_slots - 3])
+    xy = lot.slot_xy[kept] + rng.uniform(-0.15, 0.15, (len(kept), 2))
+    draft = listed(tmp_path, xy, yaw=lot.slot_yaw[kept], entries=((-3.0, 0.0),), goals=((50.0, 20.0),))
+    found = draft.lot()
+    assert found.n_slots + sum(len(left.ids) for left in draft.left_out) == len(kept)
+    mouth = found.mouth_xy()
+    to_lane = nearest_on_lanes(found.lanes, mouth)[0] - mouth
+    assert np.hypot(*to_lane.T).max() < 5.0
+    assert ((mouth - found.slot_xy) * to_lane).sum(axis=1).min() > 0.0
+
+
+# ---- when it is not sure ----
+
+UNSURE = {
+    "a lone row": (row(8, 0), "faces no other and could open to either side; give a yaw column"),
+    "between spacings": (row(8, 0, pitch=4.2) + row(8, 11, pitch=4.2), "a slot every 4.20 m, too wide"),
+    "millimetres": (row(8, 0, pitch=2500.0) + row(8, 11e3, pitch=2500.0), "2500.00 m apart, want 1.8 to 8 m"),
+    "three slots": (row(3, 0), "3 slots, want at least 4"),
+    "a bend": ([(30 * np.sin(a), 30 * np.cos(a)) for a in np.arange(8) * 0.085], "bends by"),
+    "aisles on both sides": (row(8, 0) + row(8, 11) + row(8, 22), "has room for an aisle on either side"),
+    "a way in nowhere": (row(8, 0) + row(8, 5) + row(8, 10), "close by on either side, and no way in"),
+    "apart": (row(8, 0) + row(8, 11) + row(8, 300) + row(8, 311), "2 aisles, of which 1 are joined"),
+    "scattered": (
+        [(7.5 * i + 1.5 * (j % 2), 7.5 * j) for i in range(5) for j in range(5)],
+        "most slots stand alone|stand in no row|either side",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", UNSURE)
+def test_it_refuses_where_it_is_not_sure_and_draws_what_it_saw(tmp_path, name):
+    xy, message = UNSURE[name]
+    draft = listed(tmp_path, np.array(xy), entries=((0.0, 5.0),), goals=((0.0, 5.0),))
+    with pytest.raises(InputError, match=message) as caught:
+        draft.lot()
+    assert str(caught.value).startswith("no aisles: ")
+    assert any("rows of" in line for line in draft.found)
+    save_import_picture(draft, tmp_path / "unsure.png")
+    assert (tmp_path / "unsure.png").stat().st_size > 5_000
+    problems = check_lot(tmp_path / "slots.csv")
+    assert [p.severity for p in problems] == ["error"]
+
+
+def test_a_yaw_settles_what_places_alone_leave_open(tmp_path):
+    for name in ("a lone row", "aisles on both sides"):
+        xy = np.array(UNSURE[name][0])
+        yaw = np.full(len(xy), np.pi / 2)
+        lot = listed(tmp_path, xy, yaw=yaw, entries=((-4.0, -5.5),), goals=((0.0, 5.0),)).lot()
+        assert lot.n_slots == len(xy)
+        np.testing.assert_allclose(lot.mouth_xy(), xy - [0.0, 2.5], atol=1e-9)
+
+
+def test_cars_that_would_drive_in_through_the_next_row_are_refused(tmp_path):
+    xy = np.array(row(8, 0) + row(8, 5) + row(8, 16))
+    yaw = np.repeat([np.pi / 2, np.pi / 2, np.pi / 2], 8)
+    with pytest.raises(InputError, match="would drive in through the next row"):
+        listed(tmp_path, xy, yaw=yaw).lot()
+
+
+def test_it_says_how_to_give_an_entry_and_a_goal(tmp_path):
+    draft = of_lot(tmp_path, ParkingLot.grid(2, 8))
+    with pytest.raises(InputError, match=r"give one by --entry X,Y, e\.g\. .*; no goal: .*--goal X,Y"):
+        draft.lot()
+    entry = draft.missing[0].split("e.g. ")[1].split(" or ")[0]
+    x, y = map(float, entry.split(","))
+    assert of_lot(tmp_path, ParkingLot.grid(2, 8), entries=((x, y),), goals=((9.0, 9.0),)).lot().n_slots == 16
+
+
+# ---- faults ----
+
+FAULTS = [
+    ("", r"columns are '', want x,y or lat,lon"),
+    ("x,y", "no slot below the line of columns"),
+    ("x,z\n1,2", "columns are 'x,z', want x,y or lat,lon"),
+    ("x\n1", "columns are 'x'"),
+    ("x,y,lat,lon\n1,2,3,4", "columns are 'x,y,lat,lon'"),
+    ("x,x,y\n1,1,2", "columns are 'x,x,y'"),
+    ("x,y\n1,2\n3", "row 3: 1 cells, want 2"),
+    ("x,y\n1,2\n3,nan", "row 3: y is 'nan', want a number"),
+    ("x,y\n1,2\n3,four", "row 3: y is 'four', want a number"),
+    ("x,y\n1,2\n3,inf", "row 3: y is 'inf', want a number"),
+    ("lat,lon\n91,2", "row 2: lat is '91', want a number from -90 to 90"),
+    ("lat,lon\n1,-181", "row 2: lon is '-181', want a number from -180 to 180"),
+    ("x,y,yaw\n1,2,", "row 2: yaw is '', want a number"),
+    ("id,x,y\na,1,2\na,9,2", "row 3: id 'a' stands already in row 2"),
+    ("id,x,y\n,1,2", "row 2: id '' is empty"),
+    ("x,y\n1,2\n9,9\n1.01,2", "row 4: slot '4' lies where slot '2' of row 2 does"),
+]
+
+
+@pytest.mark.parametrize(("text", "message"), FAULTS, ids=map(str, range(len(FAULTS))))
+def test_faults_are_named_in_one_line(tmp_path, text, message):
+    path = tmp_path / "slots.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        import_lot(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+    (problem,) = check_lot(path)
+    assert problem.severity == "error"
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path):
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        import_lot(tmp_path / "slots.csv")
+    (tmp_path / "slots.csv").write_bytes(b"x,y\n\xff,2")
+    with pytest.raises(InputError, match="not UTF-8 text"):
+        import_lot(tmp_path / "slots.csv")
+
+
+def test_a_search_runs_on_a_list_of_slots(tmp_path):
+    lot = ParkingLot.grid(4, 8)
+    draft = of_lot(tmp_path, lot, entries=(tuple(lot.entries[0]),), goals=(tuple(lot.goals[0]),))
+    draft.lot().to_file(tmp_path / "lot.geojson")
+    assert check_lot(tmp_path / "lot.geojson") == []
+    scenario = Scenario.on_lot(ParkingLot.from_file(tmp_path / "lot.geojson"))
+    rows = Case(scenario, "mdp").run(range(4))[0]
+    assert all(r["parked"] and r["walk_s"] > 0.0 for r in rows)
