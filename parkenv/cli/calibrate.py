@@ -158,8 +158,9 @@ def trip(
     from parkenv.evaluation.compare import unseen
     from parkenv.evaluation.driven_search import DrivenSearch
     from parkenv.evaluation.lot_driver import DrivingStyle
+    from parkenv.evaluation.picture_files import save_film
     from parkenv.evaluation.results import make_folder
-    from parkenv.evaluation.trip_pictures import film_trip, save_film
+    from parkenv.evaluation.trip_pictures import COLORS, FPS, film_trip
     from parkenv.scenario import Scenario
 
     if out.suffix.lower() != ".gif":
@@ -170,7 +171,7 @@ def trip(
     console = make_console()
     with console.status("Driving and drawing"):
         driven, frames = film_trip(search, seed)
-        save_film(frames, out)
+        save_film(frames, out, fps=FPS, colors=COLORS)
     _show(console, driven)
     console.print(f"The film is {out}")
 

@@ -62,7 +62,7 @@ def park(
         write_parkings,
     )
     from parkenv.evaluation.results import make_folder, write_summary
-    from parkenv.evaluation.sensor_pictures import save_animation
+    from parkenv.evaluation.picture_files import save_film
     from planners.parking import ParkingAgent
 
     kinds = None if kind == "all" else _chosen("--kind", kind, KINDS)

@@ -55,8 +55,9 @@ def preview(
     import numpy as np
     from scipy.spatial import cKDTree
 
+    from parkenv.evaluation.picture_files import save_film
     from parkenv.evaluation.results import make_folder
-    from parkenv.evaluation.sensor_pictures import save_animation, save_sensor_preview, with_boxes
+    from parkenv.evaluation.sensor_pictures import save_sensor_preview, with_boxes
     from parkenv.keyed_random import world_key
     from parkenv.lot_scene import LotScenes, slot_lot
     from parkenv.scenario import Scenario
@@ -110,5 +111,5 @@ def preview(
             scene = scenes.at(arrival.time + k * every / its.v_drive, pose)
             frame = camera.render(scene, eye, light, seed + k)
             frames.append(with_boxes(frame.image, vehicle_boxes(camera, scene, eye, frame)))
-        save_animation(frames, out / "drive.gif")
+        save_film(frames, out / "drive.gif", fps=8.0)
     console.print(f"Pictures are in {out}")

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
 
 from parkenv.whole_files import written_whole
 
@@ -46,3 +50,35 @@ def save_picture(figure: Figure, path: str | Path) -> None:
     """
     with written_whole(path) as beside:
         figure.savefig(beside, format="png", dpi=DPI)
+
+
+def save_film(
+    frames: Sequence[NDArray[np.uint8]], path: str | Path, *, fps: float, colors: int | None = None
+) -> None:
+    """Write an endless GIF, whole or not at all.
+
+    Args:
+        frames: (h, w, 3) RGB each.
+        path: of the file.
+        fps: frames a second.
+        colors: of one palette for all frames, the rare ones among them: for drawings. Where None, each frame has a
+            palette of its own: for photographs.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    pictures = [Image.fromarray(frame) for frame in frames]
+    if colors is not None:
+        some = np.concatenate([*frames[:: max(1, len(frames) // 6)], frames[-1]])
+        palette = Image.fromarray(some).quantize(colors, Image.Quantize.MAXCOVERAGE)
+        pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    with written_whole(path) as beside:
+        pictures[0].save(
+            beside,
+            format="GIF",
+            save_all=True,
+            append_images=pictures[1:],
+            duration=round(1000 / fps),
+            loop=0,
+            optimize=False,
+        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -12,14 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from PIL import Image as PillowImage
 
 from parkenv.envs.drawing import write_text
 from parkenv.evaluation.lot_picture import draw_lot
 from parkenv.evaluation.picture_files import STYLE, save_picture
 from parkenv.lot import ParkingLot
 from parkenv.perception.sweeps import disparity
-from parkenv.whole_files import written_whole
 from sim_sensors.ground_truth import VehicleBoxes, View
 from sim_sensors.rig import Capture, SensorRig
 
@@ -98,17 +95,3 @@ def save_sensor_preview(
         draw_scan(axes[3], lot, capture, rig)
         axes[3].set_title("270° scan at knee height")
         save_picture(figure, path)
-
-
-def save_animation(images: Sequence[Image], path: Path, *, fps: float = 8.0) -> None:
-    """Write frames, (h, w, 3) RGB each, as an endless GIF."""
-    pictures = [PillowImage.fromarray(image) for image in images]
-    with written_whole(path) as beside:
-        pictures[0].save(
-            beside,
-            format="GIF",
-            save_all=True,
-            append_images=pictures[1:],
-            duration=round(1000 / fps),
-            loop=0,
-        )

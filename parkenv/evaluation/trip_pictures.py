@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image as PillowImage
 
 from parkenv.driving.vehicle import SPEED
 from parkenv.envs.drawing import SUBPIXEL_BITS, Image, fill_disc, fixed_point, mixed_color, write_text
@@ -33,7 +29,6 @@ from parkenv.envs.search import SearchState
 from parkenv.evaluation.driven_search import DrivenSearch, Trip
 from parkenv.evaluation.lot_driver import LotDriver
 from parkenv.scenario import Scenario
-from parkenv.whole_files import written_whole
 
 FloatArray = NDArray[np.float64]
 
@@ -155,27 +150,6 @@ def film_trip(search: DrivenSearch, seed: int) -> tuple[Trip, list[Image]]:
     trip = search.run(seed, watch)
     take()
     return trip, frames + frames[-1:] * round(LAST_S * FPS)
-
-
-def save_film(frames: Sequence[Image], path: Path) -> None:
-    """Write pictures, (h, w, 3) uint8 each, as an endless GIF of few colours."""
-    shown = [*frames[:: max(1, len(frames) // 6)], frames[-1]]
-    method = PillowImage.Quantize.MAXCOVERAGE  # the rare colours count, too
-    palette = PillowImage.fromarray(np.concatenate(shown)).quantize(COLORS, method)
-    pictures = [
-        PillowImage.fromarray(frame).quantize(palette=palette, dither=PillowImage.Dither.NONE)
-        for frame in frames
-    ]
-    with written_whole(path) as beside:
-        pictures[0].save(
-            beside,
-            format="GIF",
-            save_all=True,
-            append_images=pictures[1:],
-            duration=round(1000 / FPS),
-            loop=0,
-            optimize=False,
-        )
 
 
 def _inset(near: Image, far: Image, low: int, high: int) -> Image:
