@@ -3,12 +3,10 @@
 Times are seconds since Monday 00:00 of the scenario's week; rates are 1/s.
 """
 
-import json
 import math
 import os
 import re
 from dataclasses import dataclass, field, fields
-from pathlib import Path
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -19,7 +17,7 @@ from scipy.optimize import brentq
 from parkenv.errors import InputError
 from parkenv.fading import fading
 from parkenv.keyed_random import ARRIVAL_STREAM, OCCUPANCY_STREAM, keyed_exponential, keyed_uniform
-from parkenv.whole_files import written_whole
+from parkenv.versioned_json import JsonFormat
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -39,8 +37,7 @@ MAX_PROBABILITY = 0.999
 MAX_RATE = 1e3
 _NEVER_WEEKS = 1e9
 _FORGOTTEN = 1e-17
-_FORMAT = "parkenv-occupancy-process"
-_VERSION = 1
+_FORMAT = JsonFormat("parkenv-occupancy-process", 1, "an occupancy process")
 
 
 @dataclass(frozen=True)
@@ -494,19 +491,8 @@ class OccupancyProcess:
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Self:
         """Read what `to_file` wrote; InputError names the file and what is wrong with it."""
-        try:
-            content = json.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(
-                f"{path}: {error.strerror or error}, wanted an occupancy process file"
-            ) from error
-        except ValueError as error:
-            raise InputError(f"{path}: not JSON ({error}), wanted an occupancy process file") from error
-        if not isinstance(content, dict) or content.get("format") != _FORMAT:
-            raise InputError(f'{path}: wanted a JSON object with "format": "{_FORMAT}"')
-        if content.get("version") != _VERSION:
-            raise InputError(f"{path}: version: got {content.get('version')!r}, wanted {_VERSION}")
-        wanted = {"format", "version", *_FIELDS}
+        content = _FORMAT.read(path)
+        wanted = set(_FIELDS)
         if content.keys() != wanted:
             odd = ", ".join(sorted(content.keys() ^ wanted))
             raise InputError(f"{path}: missing or unknown fields: {odd}; wanted {', '.join(sorted(wanted))}")
@@ -518,9 +504,7 @@ class OccupancyProcess:
     def to_file(self, path: str | os.PathLike[str]) -> None:
         """Write as JSON; a file that is there stays whole until the new one is complete."""
         rates = {name: getattr(self, name).tolist() for name in _FIELDS}
-        text = json.dumps({"format": _FORMAT, "version": _VERSION} | rates)
-        with written_whole(path) as part:
-            part.write_text(text, encoding="utf-8")
+        _FORMAT.write(path, rates)
 
     @property
     def n_slots(self) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from dataclasses import asdict, dataclass
@@ -13,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.whole_files import written_whole
+from parkenv.versioned_json import JsonFormat
 
 FloatArray = NDArray[np.float64]
 
 SIGHT_NAMES = ("laser", "stereo")
 """Rigs for which the package brings what their stack was measured to see."""
 _FOLDER = Path(__file__).parent / "sights"
-_FORMAT, _VERSION = "parkenv-sighting", 1
+_FORMAT = JsonFormat("parkenv-sighting", 1, "a sighting model")
 
 
 class SightRates(NamedTuple):
@@ -122,16 +121,7 @@ class SightingModel:
         Raises:
             InputError: it cannot be read; the message names the file and what is wrong with it.
         """
-        try:
-            content = json.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(f"{path}: {error.strerror or error}, want a sighting model") from error
-        except ValueError as error:
-            raise InputError(f"{path}: not JSON ({error}), want a sighting model") from error
-        if not isinstance(content, dict) or content.get("format") != _FORMAT:
-            raise InputError(f'{path}: want a JSON object with "format": "{_FORMAT}"')
-        if content.get("version") != _VERSION:
-            raise InputError(f"{path}: version is {content.get('version')!r}, want {_VERSION}")
+        content = _FORMAT.read(path)
         try:
             bands = tuple(SightBand(**band) for band in content["bands"])
             return cls(content["view_range"], content["hit_rate"], content["false_alarm_rate"], bands)
@@ -140,9 +130,7 @@ class SightingModel:
 
     def to_file(self, path: str | os.PathLike[str]) -> None:
         """Write the model as JSON."""
-        content = {"format": _FORMAT, "version": _VERSION, **asdict(self)}
-        with written_whole(path) as beside:
-            beside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        _FORMAT.write(path, asdict(self))
 
     @classmethod
     def blind(cls) -> Self:

@@ -267,7 +267,7 @@ def change(**fields):
     ("spoil", "message"),
     [
         (change(format="other"), '"format": "parkenv-occupancy-process"'),
-        (change(version=2), "version: got 2, wanted 1"),
+        (change(version=2), "version is 2, want 1"),
         (change(colour="red"), "missing or unknown fields: colour"),
         (
             lambda c: {k: v for k, v in c.items() if k != "arrival_factor"},
@@ -282,7 +282,7 @@ def change(**fields):
         (change(arrival_factor=[[1.0], 2.0]), "arrival_factor: .*wanted numbers"),
         (change(arrival_factor=[]), r"arrival_factor: got shape \(0,\)"),
         (change(arrival_factor=[1e12] * 20), "wanted factor .* profile <= 1000"),
-        (lambda c: [], "wanted a JSON object"),
+        (lambda c: [], "want an occupancy process, a JSON object"),
     ],
 )
 def test_a_bad_file_is_refused_by_name(tmp_path, spoil, message):

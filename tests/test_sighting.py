@@ -38,7 +38,7 @@ def test_files_bring_back_what_was_written(tmp_path):
     [
         (None, "want a sighting model"),
         ("{", "not JSON"),
-        ("[]", "want a JSON object"),
+        ("[]", "want a sighting model, a JSON object"),
         ('{"format": "parkenv-sighting", "version": 7}', "version is 7, want 1"),
         ('{"format": "parkenv-sighting", "version": 1, "bands": []}', "view_range"),
         (

@@ -30,6 +30,7 @@ from parkenv.evaluation.picture_files import INK, STYLE, save_picture
 from parkenv.evaluation.statistics import mean_interval
 from parkenv.evaluation.workers import HERE, Workers
 from parkenv.scenario import KMH, Scenario
+from parkenv.versioned_json import JsonFormat
 from parkenv.whole_files import written_whole
 
 FloatArray = NDArray[np.float64]
@@ -38,8 +39,7 @@ Row = dict[str, Any]
 SEEN, UNSEEN = "seen", "unseen"
 BLOCK = 5
 """Trips a task."""
-_FORMAT = "parkenv-calibration"
-_VERSION = 1
+_FORMAT = JsonFormat("parkenv-calibration", 1, "a calibration of `parkenv calibrate`")
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,7 @@ class Calibration:
 
     def to_file(self, path: Path) -> None:
         """Write it as JSON, whole or not at all."""
-        content = {"format": _FORMAT, "version": _VERSION, **dataclasses.asdict(self)}
-        with written_whole(path) as beside:
-            beside.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+        _FORMAT.write(path, dataclasses.asdict(self))
 
     @classmethod
     def from_file(cls, path: Path) -> Self:
@@ -91,16 +89,7 @@ class Calibration:
         Raises:
             InputError: the file cannot be read, or is no calibration.
         """
-        try:
-            content = json.loads(path.read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-        except ValueError as error:
-            raise InputError(f"{path}: not a calibration: {error}") from error
-        if not isinstance(content, dict) or content.get("format") != _FORMAT:
-            raise InputError(f"{path}: not a calibration, want what `parkenv calibrate` writes")
-        if content.get("version") != _VERSION:
-            raise InputError(f"{path}: version {content.get('version')!r}, want {_VERSION}")
+        content = _FORMAT.read(path)
         names = [f.name for f in dataclasses.fields(cls)]
         if missing := [name for name in names if name not in content]:
             raise InputError(f"{path}: has no {', '.join(missing)}")
