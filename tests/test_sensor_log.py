@@ -84,3 +84,21 @@ def test_without_the_viewer_it_says_how_to_get_it(
     rig = SearchPerceptionEnv(mini).rig
     with pytest.raises(InputError, match=r"parkenv\[viewer\]"), sensor_log(tmp_path / "a.rrd", mini.lot, rig):
         pass
+
+
+def test_compare_records_its_first_search_where_it_looks_through_sensors(tmp_path: Path) -> None:
+    parkenv = [sys.executable, "-c", "from parkenv.cli import main; main()"]
+    command = [*parkenv, "compare", "--scenario", "mini", "--agents", "mdp", "-n", "1", "--no-figures"]
+    command += [
+        "--occupancy-levels",
+        "none",
+        "--out",
+        str(tmp_path / "out"),
+        "--rerun",
+        str(tmp_path / "s.rrd"),
+    ]
+    refused = subprocess.run(command, capture_output=True, text=True)
+    assert refused.returncode == 2
+    assert "add --sensors laser" in refused.stderr
+    subprocess.run([*command, "--sensors", "laser", "--jobs", "1"], check=True, capture_output=True)
+    assert rows_of(tmp_path / "s.rrd")["/car/right/boxes"] > 1

@@ -6,7 +6,7 @@ import dataclasses
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -25,11 +25,18 @@ from parkenv.cli import arguments as args
 from parkenv.cli.tables import WIDE, make_console, make_table
 from parkenv.errors import InputError
 
+if TYPE_CHECKING:
+    from parkenv.evaluation.calibration import Calibration
+    from parkenv.evaluation.compare import Case
+    from parkenv.scenario import Scenario
+
 Row = dict[str, Any]
 
 ON_SIGHT = ("belief", "mdp-tuned", "exact")
 """Agents that refuse problems in which slots are seen only by trying."""
 DEFAULT_AGENTS = "mdp,mdp-static,mdp-tuned,belief,greedy-goal,greedy-drive,first-free,random,oracle"
+SWEEP = "sweep"
+"""The failure cost that stands for many."""
 MAP_SAYS = "-map-says-"
 """What stands between the names of scenarios with maps that are wrong on purpose and what these say."""
 LEVELS = "0.5,0.7,0.8,0.9,0.95,0.99"
@@ -57,7 +64,10 @@ def compare(
     agents: Annotated[
         str,
         typer.Option(
-            "--agents", metavar="NAME[,NAME...]", help="Who searches. Differences are to the first."
+            "--agents",
+            metavar="NAME[,NAME...]",
+            help="Who searches; a name, ALGORITHM:FILE for a trained model, or MODULE:CLASS for an agent of your own. "
+            "Differences are to the first.",
         ),
     ] = DEFAULT_AGENTS,
     episodes: Annotated[
@@ -131,6 +141,10 @@ def compare(
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results in --out.")] = False,
     figures: Annotated[bool, typer.Option(help="Draw figures.")] = True,
+    rerun: args.RerunOption = None,
+    report: Annotated[
+        bool, typer.Option("--report", help="Also write report.html, as `parkenv report` does.")
+    ] = False,
 ) -> None:
     """Compare agents over failure costs and speeds, all in the same worlds.
 
@@ -147,22 +161,166 @@ def compare(
 
     * `parkenv compare --lot lot.geojson --occupancy log.csv.gz --agents mdp,greedy-goal,oracle -n 300`
     """
-    from parkenv.evaluation.compare import (
-        UNSEEN,
-        Case,
-        at_occupancy,
-        check_worlds,
-        settings_of,
-        table,
-        unseen,
-    )
+    from parkenv.evaluation.compare import check_worlds, table
     from parkenv.evaluation.results import ResultFolder
+    from parkenv.scenario import KMH
+
+    if rerun is not None:
+        from parkenv.evaluation.sensor_log import require_viewer
+
+        if sensors is None:
+            raise InputError("--rerun records what sensors measure: add --sensors laser")
+        require_viewer()
+    asked = comparison_of(
+        scenario=scenario, lot=lot, occupancy=occupancy, mapping=mapping, goal=goal, arrival=arrival, days=days,
+        view_range=view_range, sight=sight, sensors=sensors, agents=agents, episodes=episodes,
+        failure_cost=failure_cost, v_walk_kmh=v_walk_kmh, v_drive_kmh=v_drive_kmh, calibrated=calibrated,
+        occupancy_levels=occupancy_levels, map_says=map_says, solver=solver, budget_ms=budget_ms, seed=seed,
+    )  # fmt: skip
+    cases, sweep, scenarios, maps, measured = (
+        asked.cases,
+        asked.sweep,
+        asked.scenarios,
+        asked.maps,
+        asked.measured,
+    )
+    sweeps = failure_cost == SWEEP
+    settings = {
+        "version": __version__,
+        "scenarios": [s.name for s in scenarios],
+        "lot": args.fingerprint(lot),
+        "occupancy": args.fingerprint(occupancy),
+        "mapping": args.fingerprint(mapping),
+        "goal": goal,
+        "arrival": arrival,
+        "days": days,
+        "view_range": view_range,
+        "sight": repr(scenarios[0].sighting),
+        "sensors": sensors,
+        "map_says": map_says,
+        "options": asked.options,
+        "calibrated": args.fingerprint(calibrated),
+    }
+    out = out or Path("results/compare")
+    for s in scenarios:
+        check_worlds(s, range(seed, seed + episodes))
+    console = make_console()
+    with args.workers_of(jobs, backend, address) as workers:
+        folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)
+        interrupted = run_with_bar(console, cases + sweep, folder, workers)
+
+    rows, sweep_rows = table(cases, folder), table(sweep, folder)
+    summary = {
+        "command": ["parkenv", *sys.argv[1:]],
+        "version": __version__,
+        "seed": seed,
+        "complete": not interrupted,
+        "rows": rows,
+        "occupancy_rows": sweep_rows,
+        "calibrated": None if measured is None else dataclasses.asdict(measured),
+    }
+    order = [case.key(s) for case, its_seeds in cases + sweep for s in its_seeds]
+    folder.finish(order, summary, complete=not interrupted)
+    # A sweep is to be looked at: it would print two tables for every cost.
+    for printed in [] if sweeps else result_tables(rows, console.width):
+        console.print(printed)
+    if measured is not None:
+        console.print(
+            f"Calibrated over {measured.trips} trips: failure cost {measured.failure_s:.4g} s, drive "
+            f"{measured.v_drive / KMH:.4g} km/h. Whoever parks needs {measured.manoeuvre_s:.1f} s more to get into the "
+            "slot, under either cost; the tables leave that out."
+        )
+    if interrupted:
+        console.print(f"Interrupted. What was finished is in {out}; the same command with --resume goes on.")
+        raise typer.Exit(130)
+    if figures:
+        with console.status("Drawing figures"):
+            if sweeps:
+                _draw_sweep(out, rows)
+            else:
+                drawn = [(case, its) for case, its in cases if case.scenario.name not in maps]
+                _draw(out, [r for r in rows if r["scenario"] not in maps], sweep_rows, drawn, folder, seed)
+            if maps:
+                _draw_maps(out, rows, {name: said for name, (_, said) in maps.items()})
+    console.print(f"Episodes, summary and figures are in {out}")
+    if rerun is not None:
+        with console.status(f"Searching the first search once more for {rerun}"):
+            _record(*cases[0], rerun)
+        console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
+    if report:
+        from parkenv.cli.report import make_report
+
+        make_report(out, jobs=jobs)
+
+
+def _record(case: Case, seeds: range, path: Path) -> None:
+    """The first search of a case, through its sensors."""
+    from parkenv.envs.perception import SearchPerceptionEnv
+    from parkenv.evaluation.sensor_log import record_search, sensor_log
+    from planners.agent import make_agent
+
+    env = SearchPerceptionEnv(case.scenario, rig=str(case.rig))
+    with sensor_log(path, case.scenario.lot, env.rig) as log:
+        record_search(env, make_agent(case.agent, env.scenario, **case.options), seeds[0], log)
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """What a comparison is to run.
+
+    Attributes:
+        cases: each with its seeds.
+        sweep: the same of lots made fuller and emptier.
+        scenarios: all that there are.
+        maps: scenarios whose maps are wrong on purpose, and what these say, by name.
+        measured: the calibration; None where none is given.
+        options: of the agents, by name.
+    """
+
+    cases: list[tuple[Case, range]]
+    sweep: list[tuple[Case, range]]
+    scenarios: list[Scenario]
+    maps: dict[str, tuple[Scenario, float]]
+    measured: Calibration | None
+    options: dict[str, dict[str, Any]]
+
+
+def comparison_of(
+    *,
+    scenario: str | None,
+    lot: Path | None,
+    occupancy: Path | None,
+    mapping: Path | None,
+    goal: str | None,
+    arrival: str,
+    days: str,
+    view_range: float | None,
+    sight: str | None,
+    sensors: str | None,
+    agents: str,
+    episodes: int,
+    failure_cost: str,
+    v_walk_kmh: str,
+    v_drive_kmh: str,
+    calibrated: Path | None,
+    occupancy_levels: str,
+    map_says: str | None,
+    solver: str,
+    budget_ms: float,
+    seed: int,
+) -> Comparison:
+    """What the options of `parkenv compare` ask for.
+
+    Raises:
+        InputError: options that cannot be used, by name.
+    """
+    from parkenv.evaluation.compare import UNSEEN, Case, at_occupancy, settings_of, unseen
     from parkenv.occupancy import OccupancyProcess
     from parkenv.scenario import KMH
     from planners.agent import make_agent
 
     names = args.words("--agents", agents)
-    sweeps = failure_cost == "sweep"
+    sweeps = failure_cost == SWEEP
     failure = list(args.SWEEP) if sweeps else args.costs("--failure-cost", failure_cost)
     walk = args.speeds("--v-walk-kmh", v_walk_kmh)
     drive = args.speeds("--v-drive-kmh", v_drive_kmh)
@@ -204,64 +362,7 @@ def compare(
         for setting in settings_of(at_occupancy(s, level), failure, walk[:1], drive[:1])
         for name in names
     ]
-    settings = {
-        "version": __version__,
-        "scenarios": [s.name for s in scenarios],
-        "lot": args.fingerprint(lot),
-        "occupancy": args.fingerprint(occupancy),
-        "mapping": args.fingerprint(mapping),
-        "goal": goal,
-        "arrival": arrival,
-        "days": days,
-        "view_range": view_range,
-        "sight": repr(scenarios[0].sighting),
-        "sensors": rig,
-        "map_says": map_says,
-        "options": options,
-        "calibrated": args.fingerprint(calibrated),
-    }
-    out = out or Path("results/compare")
-    for s in scenarios:
-        check_worlds(s, seeds)
-    console = make_console()
-    with args.workers_of(jobs, backend, address) as workers:
-        folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)
-        interrupted = run_with_bar(console, cases + sweep, folder, workers)
-
-    rows, sweep_rows = table(cases, folder), table(sweep, folder)
-    summary = {
-        "command": ["parkenv", *sys.argv[1:]],
-        "version": __version__,
-        "seed": seed,
-        "complete": not interrupted,
-        "rows": rows,
-        "occupancy_rows": sweep_rows,
-        "calibrated": None if measured is None else dataclasses.asdict(measured),
-    }
-    order = [case.key(s) for case, its_seeds in cases + sweep for s in its_seeds]
-    folder.finish(order, summary, complete=not interrupted)
-    # A sweep is to be looked at: it would print two tables for every cost.
-    for printed in [] if sweeps else result_tables(rows, console.width):
-        console.print(printed)
-    if measured is not None:
-        console.print(
-            f"Calibrated over {measured.trips} trips: failure cost {measured.failure_s:.4g} s, drive "
-            f"{measured.v_drive / KMH:.4g} km/h. Whoever parks needs {measured.manoeuvre_s:.1f} s more to get into the "
-            "slot, under either cost; the tables leave that out."
-        )
-    if interrupted:
-        console.print(f"Interrupted. What was finished is in {out}; the same command with --resume goes on.")
-        raise typer.Exit(130)
-    if figures:
-        with console.status("Drawing figures"):
-            if sweeps:
-                _draw_sweep(out, rows)
-            else:
-                drawn = [(case, its) for case, its in cases if case.scenario.name not in maps]
-                _draw(out, [r for r in rows if r["scenario"] not in maps], sweep_rows, drawn, folder, seed)
-            if maps:
-                _draw_maps(out, rows, {name: said for name, (_, said) in maps.items()})
-    console.print(f"Episodes, summary and figures are in {out}")
+    return Comparison(cases, sweep, scenarios, maps, measured, options)
 
 
 def _maps(text: str | None, scenarios: list[Any]) -> dict[str, tuple[Any, float]]:

@@ -15,6 +15,8 @@ from parkenv.cli.compare import result_tables
 from parkenv.cli.tables import make_console
 
 if TYPE_CHECKING:
+    from parkenv.evaluation.compare import Case
+    from parkenv.mapping.inference import SessionLog
     from parkenv.mapping.survey import SurveySettings
     from parkenv.scenario import Scenario
 
@@ -34,6 +36,9 @@ def demo(
     jobs: args.JobsOption = 0,
     rerun: args.RerunOption = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for everything.")] = Path("results/demo"),
+    report: Annotated[
+        bool, typer.Option("--report", help="Also write report.html, as `parkenv report` does.")
+    ] = False,
 ) -> None:
     """Survey a lot with simulated sensors, learn from it how often each slot is taken, and search there on other days.
 
@@ -47,25 +52,19 @@ def demo(
     Example:
     * `parkenv demo`
     """
-    from parkenv.evaluation.compare import Case, run_cases, table
+    from parkenv.evaluation.compare import run_cases, table
     from parkenv.evaluation.results import ResultFolder, make_folder
     from parkenv.evaluation.sensor_log import require_viewer
     from parkenv.evaluation.survey_pictures import save_detections, save_map, save_session
     from parkenv.evaluation.surveys import run_survey, summarize
     from parkenv.evaluation.time_figures import save_time_split
-    from parkenv.mapping.inference import MapPrior, predict
+    from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
-    from parkenv.mapping.survey import SurveySettings
-    from parkenv.occupancy import Arrival, ArrivalWindow
-    from parkenv.scenario import Scenario
-    from parkenv.sighting import SightingModel
-    from parkenv.traffic import Traffic
+    from parkenv.occupancy import Arrival
 
     if rerun is not None:
         require_viewer()
-    its = Scenario.named(scenario, traffic=Traffic(cars=3, pedestrians=5))
-    hours = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
-    settings = SurveySettings(every=every, windows=tuple(ArrivalWindow.parse(h) for h in hours), seed=seed)
+    its, settings = first_part(scenario, every, seed)
     make_folder(out)
     console = make_console()
     map_file = out / "map.sqlite"
@@ -92,10 +91,7 @@ def demo(
             save_session(its.lot, run.shown, out / "session.png")
         progress.advance(bar)
 
-        known = its.replace(prior=MapPrior(log), sighting=SightingModel.named("laser"))
-        # Worlds of the searches are others than those of the survey: their seeds lie far from its own.
-        seeds = range(seed + 1_000_000, seed + 1_000_000 + searches)
-        cases = [(Case(known, name, rig="laser"), seeds) for name in AGENTS]
+        cases = last_part(its, log, searches, seed)
         bar = progress.add_task("3/3 searching through the sensors", total=len(AGENTS) * searches)
         run_cases(
             cases, folder, workers=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n)
@@ -118,8 +114,38 @@ def demo(
     console.print(f"Pictures, the map, episodes.csv and summary.json are in {out}")
     if rerun is not None:
         with console.status(f"Driving the first survey and the first search once more for {rerun}"):
-            _record(known, settings, seeds[0], rerun)
+            case, seeds = cases[0]
+            _record(case.scenario, settings, seeds[0], rerun)
         console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
+    if report:
+        from parkenv.cli.report import make_report
+
+        make_report(out, jobs=jobs)
+
+
+def first_part(scenario: str, every: float, seed: int) -> tuple[Scenario, SurveySettings]:
+    """The world of the demo, and how it is surveyed."""
+    from parkenv.mapping.survey import SurveySettings
+    from parkenv.occupancy import ArrivalWindow
+    from parkenv.scenario import Scenario
+    from parkenv.traffic import Traffic
+
+    hours = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
+    windows = tuple(ArrivalWindow.parse(h) for h in hours)
+    its = Scenario.named(scenario, traffic=Traffic(cars=3, pedestrians=5))
+    return its, SurveySettings(every=every, windows=windows, seed=seed)
+
+
+def last_part(its: Scenario, log: SessionLog, searches: int, seed: int) -> list[tuple[Case, range]]:
+    """Who searches in it, knowing what the survey tells, with the seeds of the searches."""
+    from parkenv.evaluation.compare import Case
+    from parkenv.mapping.inference import MapPrior
+    from parkenv.sighting import SightingModel
+
+    known = its.replace(prior=MapPrior(log), sighting=SightingModel.named("laser"))
+    # Worlds of the searches are others than those of the survey: their seeds lie far from its own.
+    seeds = range(seed + 1_000_000, seed + 1_000_000 + searches)
+    return [(Case(known, name, rig="laser"), seeds) for name in AGENTS]
 
 
 def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:

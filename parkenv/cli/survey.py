@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import Progress
@@ -13,6 +13,10 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
+
+if TYPE_CHECKING:
+    from parkenv.mapping.survey import SurveySettings
+    from parkenv.scenario import Scenario
 
 MAP_FILE = "map.sqlite"
 
@@ -54,6 +58,9 @@ def survey(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder for map.sqlite, pictures, summary.json.")
     ] = Path("results/survey"),
+    report: Annotated[
+        bool, typer.Option("--report", help="Also write report.html, as `parkenv report` does.")
+    ] = False,
 ) -> None:
     """Drive past every slot with simulated sensors, find the parked cars, and keep what was seen in a map file.
 
@@ -80,24 +87,16 @@ def survey(
     from parkenv.evaluation.surveys import run_survey, slots_found, summarize
     from parkenv.mapping.discovery import score_discovery
     from parkenv.mapping.inference import predict
-    from parkenv.mapping.odometry import PoseNoise
     from parkenv.mapping.store import MapStore
-    from parkenv.mapping.survey import Survey, SurveySettings
-    from parkenv.occupancy import Arrival, ArrivalWindow
-    from parkenv.traffic import Traffic
+    from parkenv.mapping.survey import Survey
+    from parkenv.occupancy import Arrival
 
-    (its,) = args.scenarios_of(scenario, lot, occupancy, None, None, "08:00-13:00", days, None)
-    its = its.replace(traffic=Traffic(cars, pedestrians))
     if rerun is not None:
         require_viewer()
-    settings = SurveySettings(
-        rig=rig,
-        every=every,
-        weather=weather,
-        windows=tuple(ArrivalWindow.parse(h, days) for h in hours.split(",")),
-        pose_noise=PoseNoise(pose_noise, 0.02 * pose_noise),
-        seed=seed,
-    )
+    its, settings = surveyed_by(
+        scenario=scenario, lot=lot, occupancy=occupancy, rig=rig, hours=hours, days=days, weather=weather, every=every,
+        pose_noise=pose_noise, cars=cars, pedestrians=pedestrians, seed=seed,
+    )  # fmt: skip
     make_folder(out)
     console = make_console()
     with (
@@ -156,12 +155,53 @@ def survey(
     summary = {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "rows": [row]}
     write_summary(out, summary)
     console.print(f"Written: {out / MAP_FILE}, summary.json, sessions.csv and pictures")
+    if report:
+        from parkenv.cli.report import make_report
+
+        make_report(out, jobs=jobs)
     if rerun is not None:
         with console.status(f"Driving the first session once more for {rerun}"):
             first = Survey(its, settings)
             with sensor_log(rerun, its.lot, first.stack.rig) as recording:
                 record_session(first, 0, recording)
         console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
+
+
+def surveyed_by(
+    *,
+    scenario: str | None,
+    lot: Path | None,
+    occupancy: Path | None,
+    rig: str,
+    hours: str,
+    days: str,
+    weather: str | None,
+    every: float,
+    pose_noise: float,
+    cars: int,
+    pedestrians: int,
+    seed: int,
+) -> tuple[Scenario, SurveySettings]:
+    """The world and the way of driving that the options of `parkenv survey` ask for.
+
+    Raises:
+        InputError: options that cannot be used, by name.
+    """
+    from parkenv.mapping.odometry import PoseNoise
+    from parkenv.mapping.survey import SurveySettings
+    from parkenv.occupancy import ArrivalWindow
+    from parkenv.traffic import Traffic
+
+    (its,) = args.scenarios_of(scenario, lot, occupancy, None, None, "08:00-13:00", days, None)
+    settings = SurveySettings(
+        rig=rig,
+        every=every,
+        weather=weather,
+        windows=tuple(ArrivalWindow.parse(h, days) for h in hours.split(",")),
+        pose_noise=PoseNoise(pose_noise, 0.02 * pose_noise),
+        seed=seed,
+    )
+    return its.replace(traffic=Traffic(cars, pedestrians)), settings
 
 
 def show_map(

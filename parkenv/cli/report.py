@@ -1,0 +1,296 @@
+"""`parkenv report`: the results of a command as one page, with its searches and drives to watch again."""
+
+from __future__ import annotations
+
+import inspect
+import json
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from parkenv.cli import arguments as args
+from parkenv.cli.tables import make_console
+from parkenv.errors import InputError
+
+if TYPE_CHECKING:
+    from parkenv.evaluation.compare import Case
+    from parkenv.evaluation.report.run_folder import RunFolder
+    from parkenv.mapping.survey import Survey
+
+PAGE = "report.html"
+EPISODES, SENSED = 20, 4
+"""Searches that are replayed by default, and where every step goes through rendered sensors."""
+BESIDE_MODELS = 3
+"""Planners that are shown beside a trained model."""
+
+Cases = list[tuple["Case", Sequence[int]]]
+Surveys = tuple[Callable[[], "Survey"], int]
+
+
+def report(
+    folder: Annotated[
+        Path, typer.Argument(metavar="DIR", help="What compare, survey, demo, train or another command left.")
+    ],
+    episodes: Annotated[
+        int | None,
+        typer.Option(
+            "--episodes",
+            "-n",
+            min=0,
+            help=f"About how many searches to replay, all agents together.  [default: {EPISODES}; through sensors "
+            f"{SENSED}]",
+        ),
+    ] = None,
+    seeds: Annotated[
+        str | None, typer.Option("--seeds", metavar="N[,N...]", help="Replay the searches with these seeds.")
+    ] = None,
+    agents: Annotated[
+        str | None, typer.Option("--agents", metavar="NAME[,NAME...]", help="Replay only these agents.")
+    ] = None,
+    sessions: Annotated[int, typer.Option("--sessions", min=0, help="Survey drives to replay.")] = 1,
+    frames: Annotated[
+        int, typer.Option("--frames", min=2, max=250, help="Captures of them to keep, all drives together.")
+    ] = 120,
+    jobs: args.JobsOption = 0,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help=f"The HTML file.  [default: DIR/{PAGE}]")
+    ] = None,
+) -> None:
+    """Write one HTML file on a run: what was run, tables to sort, figures, and its searches and drives to watch again.
+
+    It needs no network, and no other file. Searches and drives are run again under their seeds, and each search must
+    come to the total that it was counted with; where it does not, the page says so.
+
+    Examples:
+    * `parkenv report results/compare`
+
+    * `parkenv report results/compare --seeds 3,17 --agents mdp,belief --out two_searches.html`
+
+    * `parkenv report results/survey --sessions 2`
+    """
+    make_report(
+        folder,
+        episodes=episodes,
+        seeds=seeds,
+        agents=agents,
+        sessions=sessions,
+        frames=frames,
+        jobs=jobs,
+        out=out,
+    )
+
+
+def make_report(
+    folder: Path,
+    *,
+    episodes: int | None = None,
+    seeds: str | None = None,
+    agents: str | None = None,
+    sessions: int = 1,
+    frames: int = 120,
+    jobs: int = 0,
+    out: Path | None = None,
+) -> None:
+    """Write the page; see `report` for the arguments.
+
+    Raises:
+        InputError: no finished run of this version in the folder, or a choice that is not in it.
+    """
+    from parkenv.evaluation.report.page import page_data, write_page
+    from parkenv.evaluation.report.run_folder import RunFolder
+    from parkenv.evaluation.report.search_recording import choose, record
+
+    run = RunFolder.read(folder)
+    console = make_console()
+    surveys: Surveys | None = None
+    cases: Cases = []
+    notes: list[str] = []
+    try:
+        surveys, cases = _run_again(run)
+    except (InputError, OSError) as error:
+        # Tables and figures are there all the same.
+        notes.append(f"There is no replay: {error}")
+    sensed = any(case.rig is not None for case, _ in cases)
+    wanted = episodes if episodes is not None else SENSED if sensed else EPISODES
+    cases, too_large = _small_enough(_chosen(cases, seeds, agents))
+    notes += too_large
+    encounters = choose(cases, wanted) if wanted else []
+    drives = range(min(sessions, surveys[1])) if surveys is not None else range(0)
+    counted = run.totals()
+    tasks: list[Callable[[], dict[str, Any]]] = []
+    for encounter in encounters:
+        keys = [case.key(encounter.seed) for case in encounter.cases]
+        tasks.append(partial(record, encounter, {k: counted[k] for k in keys if k in counted}))
+    if surveys is not None:
+        tasks += [
+            partial(_drive_again, surveys[0], number, frames // max(len(drives), 1)) for number in drives
+        ]
+    progress = Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), console=console,
+        disable=not console.is_terminal,
+    )  # fmt: skip
+    with args.workers_of(jobs, "loky", None) as workers, progress:
+        bar = progress.add_task("Running again", total=len(tasks))
+        done: list[dict[str, Any]] = []
+        for recorded in workers.in_order(tasks):
+            done.append(recorded)
+            progress.advance(bar)
+    watched = done[: len(encounters)]
+    notes += _differing(watched)
+    path = out or folder / PAGE
+    write_page(run, page_data(run, watched, done[len(encounters) :], notes), path)
+    for note in notes:
+        console.print(f"Note: {note}")
+    console.print(f"Written: {path}, {path.stat().st_size / 1e6:.1f} MB")
+
+
+def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
+    """What the command did: its survey, with the number of drives, and its searches.
+
+    Raises:
+        InputError, OSError: it cannot be done again.
+    """
+    if run.kind == "compare":
+        from parkenv.cli.compare import comparison_of
+
+        _require_same_files(run)
+        return None, [*comparison_of(**_options(run, comparison_of)).cases]
+    if run.kind == "survey":
+        from parkenv.cli.survey import surveyed_by
+
+        return (
+            partial(_survey, *surveyed_by(**_options(run, surveyed_by))),
+            len(run.table("sessions.csv")),
+        ), []
+    if run.kind == "demo":
+        from parkenv.cli.demo import first_part, last_part
+        from parkenv.cli.survey import MAP_FILE
+        from parkenv.mapping.store import MapStore
+
+        its, settings = first_part(**_options(run, first_part))
+        with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:
+            log = store.log()
+        numbers = {k: v for k, v in _parsed(run).items() if k in ("searches", "seed")}
+        return (partial(_survey, its, settings), len(log.time)), [*last_part(its, log, **numbers)]
+    if run.kind == "train":
+        return None, _trained(run)
+    return None, []
+
+
+def _options(run: RunFolder, function: Callable[..., Any]) -> dict[str, Any]:
+    """Those of the command's options that a function takes."""
+    names = inspect.signature(function).parameters
+    return {k: v for k, v in _parsed(run).items() if k in names}
+
+
+def _parsed(run: RunFolder) -> dict[str, Any]:
+    """The options that the command was called with, defaults included.
+
+    Raises:
+        InputError: they are no longer those of the command.
+    """
+    from parkenv.cli import app
+
+    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    try:
+        with commands[run.kind].make_context(run.kind, run.arguments) as context:
+            return dict(context.params)
+    except typer.TyperException as error:
+        raise InputError(f"{run.path}: its command cannot be read: {error.format_message()}") from error
+
+
+def _require_same_files(run: RunFolder) -> None:
+    """Refuse files that are no longer those that the comparison read."""
+    before = json.loads((run.path / "settings.json").read_text(encoding="utf-8"))
+    options = _parsed(run)
+    for name in ("lot", "occupancy", "mapping", "calibrated"):
+        if options[name] is not None and args.fingerprint(options[name]) != before.get(name):
+            raise InputError(f"--{name} {options[name]} has changed since the run")
+
+
+def _trained(run: RunFolder) -> Cases:
+    """The best model and the best planners, where the models were tested; none where that was no search."""
+    from parkenv.evaluation.compare import Case
+    from parkenv.scenario import SCENARIO_NAMES, Scenario
+
+    rows = [
+        r for r in run.summary["rows"] if r.get("scenario") in SCENARIO_NAMES and r.get("total_s") is not None
+    ]
+    if not rows or not run.summary.get("transfer"):
+        return []
+    from parkenv.cli.train import TESTED_FROM
+
+    best = min(rows, key=lambda row: float(row["total_s"]))
+    model = run.path / f"seed_{best['seed']}" / "model.zip"
+    cases: Cases = []
+    for name in dict.fromkeys(row["test_scenario"] for row in run.summary["transfer"]):
+        scenario = Scenario.named(name)
+        planners = [row for row in run.summary.get("planners", []) if row["scenario"] == name]
+        beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
+        seeds = range(TESTED_FROM, TESTED_FROM + int(run.summary["transfer"][0]["episodes"]))
+        names = [f"{best['agent']}:{model}", *(row["agent"] for row in beside)]
+        cases += [(Case(scenario, agent), seeds) for agent in names]
+    return cases
+
+
+def _chosen(cases: Cases, seeds: str | None, agents: str | None) -> Cases:
+    """The searches that were asked for."""
+    if agents is not None:
+        known = list(dict.fromkeys(case.agent for case, _ in cases))
+        for name in (names := args.words("--agents", agents)):
+            if name not in known:
+                raise InputError(f"--agents has {name!r}; in this run: {', '.join(known) or 'none'}")
+        cases = [(case, numbers) for case, numbers in cases if case.agent in names]
+    if seeds is not None:
+        its_seeds: Sequence[int] = cases[0][1] if cases else range(0)
+        theirs = f"{its_seeds[0]} to {its_seeds[-1]}" if its_seeds else "none"
+        wanted: list[int] = []
+        for number in args.numbers("--seeds", seeds):
+            if number not in its_seeds:
+                raise InputError(f"--seeds has {number:g}; this run's are {theirs}")
+            wanted.append(int(number))
+        cases = [(case, wanted) for case, _ in cases]
+    return cases
+
+
+def _small_enough(cases: Cases) -> tuple[Cases, list[str]]:
+    """The searches on lots that can be drawn, and a line on the others."""
+    from parkenv.evaluation.report.search_recording import MOST_SLOTS
+
+    large = {
+        case.scenario.name: case.scenario.lot.n_slots
+        for case, _ in cases
+        if case.scenario.lot.n_slots > MOST_SLOTS
+    }
+    notes = [
+        f"{name} has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"
+        for name, n in large.items()
+    ]
+    return [(case, its) for case, its in cases if case.scenario.name not in large], notes
+
+
+def _differing(watched: Sequence[dict[str, Any]]) -> list[str]:
+    """A line for every search that came to another total than it was counted with."""
+    return [
+        f"{search['agent']}, {e['world']['scenario']}, seed {e['world']['seed']}: run again it took "
+        f"{search['total_s']:.2f} s, episodes.csv says {search['counted_s']:.2f} s"
+        for e in watched
+        for search in e["searches"]
+        if search["agrees"] is False
+    ]
+
+
+def _survey(scenario: Any, settings: Any) -> Survey:
+    from parkenv.mapping.survey import Survey
+
+    return Survey(scenario, settings)
+
+
+def _drive_again(survey: Callable[[], Survey], number: int, frames: int) -> dict[str, Any]:
+    from parkenv.evaluation.report.drive_recording import record_drive
+
+    return record_drive(survey(), number, frames)

@@ -1,0 +1,177 @@
+"""Survey drives driven again and written down, capture by capture, for a page that shows them."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image as PillowImage
+
+from parkenv.evaluation.report.search_recording import describe_lot
+from parkenv.mapping.grid import OccupancyGrid
+from parkenv.mapping.survey import Survey, SurveyMoment
+from parkenv.perception.stack import View
+from sim_sensors.rig import poses_along
+
+PICTURE_WIDTH = 480
+"""px, of the camera's frames."""
+JPEG_QUALITY = 68
+SCAN_REACH = 16.0
+"""m; beams that end farther away are left out."""
+LEVELS = 15
+"""Shades of the occupancy grid."""
+
+Recording = dict[str, Any]
+
+
+def record_drive(survey: Survey, number: int, most_frames: int) -> Recording:
+    """Drive a session again.
+
+    Args:
+        survey: as it was driven.
+        number: of the session.
+        most_frames: captures that are kept, at equal distances; the last one is always among them.
+    """
+    captures = len(poses_along(survey.route.path, survey.settings.every))
+    step = max(1, math.ceil(captures / most_frames))
+    frames: list[Recording] = []
+    count, first_time = 0, 0.0
+    known = np.full(survey.scenario.lot.n_slots, -1)
+    taken = np.zeros(survey.scenario.lot.n_slots, dtype=np.bool_)
+
+    def watch(moment: SurveyMoment) -> None:
+        nonlocal count, first_time, known, taken
+        first_time = first_time if count else moment.time
+        if count % step == 0 or count == captures - 1:
+            states = moment.slots.states()
+            now = np.where(states.in_view, np.round(255 * states.p_occupied), -1).astype(np.int64)
+            frames.append(
+                {
+                    **_frame(moment, first_time),
+                    "belief": _changes(known, now),
+                    "truth": _changes(taken.astype(np.int64), moment.truth.astype(np.int64)),
+                }
+            )
+            known, taken = now, moment.truth.copy()
+        count += 1
+
+    result = survey.drive(number, on_moment=watch)
+    grid = result.grid
+    rows, columns = grid.log_odds.shape
+    return {
+        "lot": describe_lot(survey.scenario.lot),
+        "drive": {
+            "key": result.session.key,
+            "scenario": survey.scenario.name,
+            "weather": result.session.weather.replace("_", " "),
+            "rig": result.session.rig,
+            "day": result.arrival.day,
+            "time_s": round(float(result.arrival.time), 1),
+            "captures": captures,
+            "slot_accuracy": result.slot_accuracy,
+            "found": result.found,
+            "parked": result.parked,
+            "grid": {
+                "x": grid.low[0],
+                "y": grid.low[1],
+                "width": 2 * (columns // 2) * grid.cell,
+                "height": 2 * (rows // 2) * grid.cell,
+            },
+            "frames": frames,
+        },
+    }
+
+
+def _frame(moment: SurveyMoment, first_time: float) -> Recording:
+    look = moment.look
+    x, y, yaw = (round(float(v), 3) for v in look.vehicle)
+    view = look.views[0]
+    return {
+        "t": round(moment.time - first_time, 2),
+        "pose": [x, y, yaw],
+        "picture": _jpeg(view.image),
+        "boxes": _boxes(view),
+        "cars": [
+            [round(float(v), 2) for v in (*xy, yaw, *size)]
+            for its in look.views
+            for xy, yaw, size in zip(its.cars.xy, its.cars.yaw, its.cars.size, strict=True)
+        ],
+        "scan": _scan(moment),
+        "map": _grid_png(moment.grid),
+    }
+
+
+def _boxes(view: View) -> list[list[float]]:
+    """Left, top, right, bottom as shares of the picture; probability; whether it is an end; whether it is placed."""
+    height, width = view.image.shape[:2]
+    found = view.detections
+    made = []
+    for i in range(len(found)):
+        left, top, right, bottom = found.boxes[i].tolist()
+        box = (left / width, top / height, right / width, bottom / height, float(found.probability[i]))
+        placed = int(i in view.cars.detection)
+        made.append([*(round(v, 3) for v in box), int(found.ends[i]), placed])
+    return made
+
+
+def _scan(moment: SurveyMoment) -> list[int]:
+    """Where beams end, decimetres from the car, x and y in turns."""
+    x, y, _ = moment.look.vehicle
+    points = [
+        sweep.points(np.flatnonzero(np.nan_to_num(sweep.distance, nan=np.inf) < SCAN_REACH))[::2]
+        for sweep in moment.look.sweeps
+    ]
+    away = np.concatenate(points) - [x, y] if points else np.empty((0, 2))
+    whole: list[int] = np.round(10 * away).astype(np.int64).ravel().tolist()
+    return whole
+
+
+def _changes(before: NDArray[np.int64], now: NDArray[np.int64]) -> list[int]:
+    """Slot and value, in turns, of those that have changed."""
+    changed = np.flatnonzero(before != now)
+    pairs: list[int] = np.stack([changed, now[changed]], axis=1).ravel().tolist()
+    return pairs
+
+
+def _jpeg(image: NDArray[np.uint8]) -> str:
+    height = round(image.shape[0] * PICTURE_WIDTH / image.shape[1])
+    small = cv2.resize(image, (PICTURE_WIDTH, height), interpolation=cv2.INTER_AREA)
+    content = io.BytesIO()
+    PillowImage.fromarray(small).save(content, "JPEG", quality=JPEG_QUALITY, optimize=True)
+    return data_uri("image/jpeg", content.getvalue())
+
+
+def _grid_png(grid: OccupancyGrid) -> str:
+    """The grid with north up, half as fine as it is kept: 0 where nothing was seen, then from free to taken."""
+    rows, columns = (2 * (n // 2) for n in grid.log_odds.shape)
+    blocks = (rows // 2, 2, columns // 2, 2)
+    p = grid.probability[:rows, :columns].reshape(blocks).max(axis=(1, 3))
+    seen = grid.seen[:rows, :columns].reshape(blocks).any(axis=(1, 3))
+    shade = np.where(seen, 1 + np.round((LEVELS - 1) * p), 0).astype(np.uint8)[::-1]
+    picture = PillowImage.fromarray(shade)
+    picture.putpalette(_PALETTE)
+    content = io.BytesIO()
+    picture.save(content, "PNG", optimize=True, bits=4, transparency=_OPACITY)
+    return data_uri("image/png", content.getvalue())
+
+
+def _palette() -> list[int]:
+    """Nothing, then from a pale blue to a dark violet."""
+    share = np.linspace(0.0, 1.0, LEVELS)[:, None]
+    colors = np.array([[150, 190, 215]]) * (1 - share) + np.array([[112, 48, 170]]) * share
+    return [0, 0, 0, *np.round(colors).astype(int).ravel().tolist()]
+
+
+_PALETTE = _palette()
+_OPACITY = bytes([0, *np.round(np.linspace(50, 235, LEVELS)).astype(int).tolist()])
+"""Of each colour: where no car stands, slots are to be seen through it."""
+
+
+def data_uri(kind: str, content: bytes) -> str:
+    """A file's content as an address."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

@@ -1,0 +1,54 @@
+"""Learning curves of `parkenv train`, as a page draws them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from parkenv.evaluation.report.run_folder import RunFolder
+from parkenv.evaluation.results import Row
+
+
+def learning_of(run: RunFolder) -> list[dict[str, Any]]:
+    """A panel of curves for what is learnt: total time of searches, or success with each kind of slot.
+
+    Args:
+        run: any; one that is no training has no curves.
+    """
+    curve, lines = run.summary.get("curve"), run.summary.get("examined")
+    if run.kind != "train" or not curve or not isinstance(lines, Mapping):
+        return []
+    seeds = [run.table(f"seed_{row['seed']}/curve.csv") for row in run.summary["rows"]]
+    if isinstance(curve, Mapping):
+        return [
+            _panel(
+                kind,
+                f"{kind}_success",
+                its,
+                seeds,
+                {"planner": lines[kind]} if kind in lines else {},
+                share=True,
+            )
+            for kind, its in curve.items()
+        ]
+    return [_panel("total time, s", "total_s", curve, seeds, lines, share=False)]
+
+
+def _panel(
+    title: str,
+    column: str,
+    curve: Sequence[Row],
+    seeds: Sequence[Sequence[Row]],
+    lines: Mapping[str, float],
+    *,
+    share: bool,
+) -> dict[str, Any]:
+    """Points of the mean are decisions, mean, and the ends of its 95 % interval, which one seed has none of."""
+    names = (column, "low", "high") if share else (column, "low_s", "high_s")
+    return {
+        "title": title,
+        "share": share,
+        "mean": [[row["steps"], *(row.get(name) for name in names)] for row in curve],
+        "seeds": [[[row["steps"], row[column]] for row in its if column in row] for its in seeds],
+        "lines": [[name, value] for name, value in lines.items()],
+    }

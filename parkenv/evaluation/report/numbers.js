@@ -1,0 +1,59 @@
+// How numbers and words are written.
+
+const MINUS = "−";
+
+/** A number with so many digits; numbers from a thousand on need none. */
+function written(value, digits, signed = false) {
+  if (value === null || value === undefined) return "–";
+  const kept = Math.abs(value) >= 1000 ? 0 : digits;
+  const text = Math.abs(value).toFixed(kept);
+  const zero = Number(text) === 0;
+  return (value < 0 && !zero ? MINUS : signed && !zero ? "+" : "") + text;
+}
+
+/** A value as its column says. */
+function asColumn(column, value) {
+  if (value === null || value === undefined) return "–";
+  if (typeof value === "boolean") return value ? "yes" : "no";
+  if (typeof value === "string") return value;
+  if (column.share) return `${written(100 * value, column.digits, column.signed)} %`;
+  const digits = Number.isInteger(value) && column.digits > 1 ? 0 : column.digits;
+  // A cost of 2.5 s must not be rounded to a whole one, where whole ones are usual.
+  const text = column.digits === 0 && !Number.isInteger(value) ? String(Number(value.toPrecision(4))) : written(value, digits, column.signed);
+  return text;
+}
+
+const DAYS = ["Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun"];
+
+/** Seconds since Monday 00:00 as day and hour; a day of a record keeps its own name. */
+function moment(seconds, day) {
+  const minutes = Math.floor((seconds % 86400) / 60);
+  const name = typeof day === "string" && day !== "" ? day : DAYS[Math.floor(seconds / 86400) % 7];
+  return `${name} ${String(Math.floor(minutes / 60)).padStart(2, "0")}:${String(minutes % 60).padStart(2, "0")}`;
+}
+
+/** A made element: tag, attributes, children. */
+function make(tag, attributes = {}, ...children) {
+  const element = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) element.addEventListener(name.slice(2), value);
+    else if (value !== null && value !== undefined && value !== false) element.setAttribute(name, value === true ? "" : value);
+  }
+  element.append(...children.filter((child) => child !== null && child !== undefined));
+  return element;
+}
+
+function makeSvg(tag, attributes = {}, ...children) {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  element.append(...children);
+  return element;
+}
+
+/** A model's file is told from others by its last folders, not by where they lie. */
+function shortName(agent) {
+  const colon = agent.indexOf(":");
+  if (colon < 0) return agent;
+  const parts = agent.slice(colon + 1).split("/").filter((part) => part !== "model.zip");
+  return `${agent.slice(0, colon)} ${parts.slice(-1)[0].replace("_", " ")}`;
+}

@@ -1,0 +1,256 @@
+"""The page itself: data, figures, style and program in one HTML file that needs no network."""
+
+from __future__ import annotations
+
+import html
+import io
+import json
+import shlex
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from PIL import Image as PillowImage
+
+from parkenv.errors import InputError
+from parkenv.evaluation.report.drive_recording import data_uri
+from parkenv.evaluation.report.learning import learning_of
+from parkenv.evaluation.report.run_folder import RunFolder
+from parkenv.evaluation.report.tables import tables_of
+from parkenv.evaluation.results import Row
+from parkenv.whole_files import written_whole
+
+FORMAT, VERSION = "parkenv-report", 1
+SCHEMA = Path(__file__).with_name("report.schema.json")
+"""What the data in a page looks like."""
+SCRIPTS = (
+    "numbers.js", "tables.js", "time_chart.js", "learning_chart.js", "lot_view.js", "player.js", "search_replay.js",
+    "drive_replay.js", "page.js",
+)  # fmt: skip
+"""Parts of the program, in the order in which they need each other."""
+MOST_WIDTH = 1800
+"""px, to which figures are scaled down."""
+LOSSLESS = 150_000
+"""Bytes above which a figure is compressed with loss."""
+_QUALITY = 86
+_HERE = Path(__file__).parent
+_FIGURES = (
+    ("time_split_", "Where the time goes"),
+    ("time_against_occupancy_", "Time against how full the lot is"),
+    ("time_against_failure_cost_", "Time against the failure cost"),
+    ("time_against_map_", "Time against what the map says"),
+    ("searches_", "Searches in one world"),
+    ("session", "One survey drive: grid, sightings of cars, slots judged"),
+    ("detections", "Frames with what was detected"),
+    ("slots_found_", "Slots found without a map"),
+    ("reach_", "In which weather and how far away cars are missed"),
+    ("graph_", "The drive graph with what the map says"),
+    ("map", "What the map says of every slot"),
+    ("learning_curve", "Learning curves, and the planners in the same worlds"),
+)
+
+
+def page_data(
+    run: RunFolder,
+    encounters: Sequence[Mapping[str, Any]] = (),
+    drives: Sequence[Mapping[str, Any]] = (),
+    notes: Sequence[str] = (),
+) -> dict[str, Any]:
+    """All that a page shows but the figures; `report.schema.json` says how.
+
+    Args:
+        run: what was run.
+        encounters: from `search_recording.record`.
+        drives: from `drive_recording.record_drive`.
+        notes: lines for the reader, such as what could not be replayed.
+    """
+    lots: list[Any] = []
+
+    def lot(described: Any) -> int:
+        if described not in lots:
+            lots.append(described)
+        return lots.index(described)
+
+    kind, summary = run.kind, run.summary
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "run": {
+            "kind": kind,
+            "title": _title(kind, summary),
+            "findings": _findings(kind, summary),
+            "command": shlex.join(str(word) for word in summary["command"]),
+            "parkenv": summary["version"],
+            "seed": summary.get("seed"),
+            "notes": list(notes),
+        },
+        "learning": learning_of(run),
+        "tables": tables_of(kind, summary, run.table("sessions.csv")),
+        "lots": lots,
+        "worlds": [{**e["world"], "lot": lot(e["lot"]), "searches": e["searches"]} for e in encounters],
+        "drives": [{**d["drive"], "lot": lot(d["lot"])} for d in drives],
+    }
+
+
+def write_page(run: RunFolder, data: Mapping[str, Any], path: Path) -> None:
+    """Write the file, whole or not at all.
+
+    Args:
+        run: whose figures are shown.
+        data: from `page_data`.
+        path: of the HTML file.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    # A "<" within a string must not end the element that the data stands in.
+    embedded = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    text = Template((_HERE / "page.html").read_text(encoding="utf-8")).substitute(
+        title=html.escape(data["run"]["title"]),
+        style=(_HERE / "style.css").read_text(encoding="utf-8"),
+        figures="\n".join(_figure(f) for f in _in_order(run.figures)),
+        data=embedded,
+        program="\n".join((_HERE / name).read_text(encoding="utf-8") for name in SCRIPTS),
+    )
+    with written_whole(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
+def _in_order(figures: Sequence[Path]) -> list[Path]:
+    ranks = [prefix for prefix, _ in _FIGURES]
+
+    def rank(path: Path) -> int:
+        return next((i for i, prefix in enumerate(ranks) if path.name.startswith(prefix)), len(ranks))
+
+    return sorted(figures, key=rank)
+
+
+def _figure(path: Path) -> str:
+    caption = html.escape(_caption(path))
+    try:
+        with PillowImage.open(path) as opened:
+            picture = opened.convert("RGB")
+    except OSError as error:
+        raise InputError(f"{path}: is no picture that can be read: {error}") from error
+    if picture.width > MOST_WIDTH:
+        picture = picture.resize((MOST_WIDTH, round(picture.height * MOST_WIDTH / picture.width)))
+    source, (width, height) = _webp(picture), picture.size
+    return (
+        f'<figure><button type="button" class="enlarge" aria-label="Enlarge: {caption}">'
+        f'<img src="{source}" width="{width}" height="{height}" alt="{caption}"></button>'
+        f"<figcaption>{caption}</figcaption></figure>"
+    )
+
+
+def _webp(picture: PillowImage.Image) -> str:
+    """Lossless where that is small, as it is with charts."""
+    content = io.BytesIO()
+    picture.save(content, "WEBP", lossless=True)
+    if content.tell() > LOSSLESS:
+        content = io.BytesIO()
+        picture.save(content, "WEBP", quality=_QUALITY)
+    return data_uri("image/webp", content.getvalue())
+
+
+def _caption(path: Path) -> str:
+    """What a figure shows, from the name that its command gave it."""
+    for prefix, title in _FIGURES:
+        if path.name.startswith(prefix):
+            rest = path.stem.removeprefix(prefix).strip("_")
+            words = [_setting(word) for word in rest.split("_")] if rest else []
+            return f"{title}: {', '.join(words)}" if words else title
+    return path.stem.replace("_", " ")
+
+
+def _setting(word: str) -> str:
+    for name, said, unit in (
+        ("failure", "failure cost", "s"),
+        ("walk", "walk", "km/h"),
+        ("drive", "drive", "km/h"),
+    ):
+        if word.startswith(name) and (number := word.removeprefix(name)):
+            return f"{said} {number} {unit}"
+    return word
+
+
+def _title(kind: str, summary: Mapping[str, Any]) -> str:
+    named = [str(row["scenario"]).split(",") for row in summary["rows"] if "scenario" in row]
+    names = list(dict.fromkeys(name for its in named for name in its))
+    where = f" on {_listed(names)}" if names else ""
+    if kind == "compare":
+        return f"Agents compared{where}"
+    if kind == "survey":
+        return f"Survey{where}"
+    if kind == "demo":
+        return f"From a survey to a search{where}"
+    if kind == "train":
+        return f"{_listed(list(dict.fromkeys(str(r.get('agent', 'agent')) for r in summary['rows'])))} trained{where}"
+    return f"parkenv {kind}"
+
+
+def _listed(names: Sequence[str], most: int = 4) -> str:
+    if len(names) > most:
+        return f"{', '.join(names[:most])} and {len(names) - most} more"
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+
+
+def _findings(kind: str, summary: Mapping[str, Any]) -> list[str]:
+    """What the numbers say, in a sentence each."""
+    if kind == "compare":
+        return _quickest(summary["rows"])
+    if kind == "survey":
+        return [_surveyed(row) for row in summary["rows"]]
+    if kind == "demo":
+        return [_surveyed(summary["survey"]), *_quickest(summary["rows"])]
+    if kind == "train":
+        return _learnt(summary)
+    return []
+
+
+def _learnt(summary: Mapping[str, Any]) -> list[str]:
+    rows = [row for row in summary["rows"] if isinstance(row.get("total_s"), float)]
+    if not rows:
+        return []
+    times = sorted(row["total_s"] for row in rows)
+    name = rows[0]["scenario"]
+    between = f"{times[0]:.1f} s"
+    if len(times) > 1:
+        between = f"{times[0]:.1f} to {times[-1]:.1f} s over {len(times)} trainings"
+    told = f"Tested on {name} in worlds of no examination, the models take {between}"
+    planners = [row for row in summary.get("planners", []) if row["scenario"] == name]
+    if planners:
+        best = min(planners, key=lambda row: float(row["total_s"]))
+        told += f"; {best['agent']}, the best of the planners beside them, takes {best['total_s']:.1f} s"
+    return [f"{told}."]
+
+
+def _surveyed(row: Row) -> str:
+    return (
+        f"{row['sessions']} drive{'s' if row['sessions'] > 1 else ''} past {row['slots']} slots: "
+        f"{row['car_detection_rate']:.1%} of the parked cars were found, {row['slot_accuracy']:.1%} of the slots "
+        "judged right."
+    )
+
+
+def _quickest(rows: Sequence[Row]) -> list[str]:
+    settings: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        settings.setdefault(
+            (row["scenario"], row["failure_cost_s"], row["v_walk_kmh"], row["v_drive_kmh"]), []
+        ).append(row)
+    told = []
+    speeds = len({key[2:] for key in settings}) > 1
+    for (name, failure, walk, drive), its in settings.items():
+        agents = [row for row in its if row["agent"] != "oracle"]
+        if len(agents) < 2:
+            continue
+        best = min(agents, key=lambda row: float(row["total_s"]))
+        at = f", walking at {walk:g} and driving at {drive:g} km/h" if speeds else ""
+        interval = best["total_s_ci95"]
+        between = f" [{interval[0]:.1f}, {interval[1]:.1f}]" if None not in interval else ""
+        told.append(
+            f"{name}, failure cost {failure:g} s{at}: {best['agent']} was the quickest in the mean, "
+            f"{best['total_s']:.1f} s{between}; nobody could have been faster than {best['bound_s']:.1f} s."
+        )
+    return told

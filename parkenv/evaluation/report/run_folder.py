@@ -1,0 +1,119 @@
+"""What a command left in its folder: the summary, the figures, and the searches that it counted."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+from parkenv import __version__
+from parkenv.errors import InputError
+from parkenv.evaluation.results import SETTING_COLUMNS, SUMMARY, SUMMARY_PARTIAL, Row
+
+_TEXT = ("scenario", "agent")
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A finished run.
+
+    Attributes:
+        path: the folder.
+        summary: its `summary.json`.
+        figures: the PNG files in it, by name.
+    """
+
+    path: Path
+    summary: Mapping[str, Any]
+    figures: tuple[Path, ...]
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read it.
+
+        Raises:
+            InputError: no folder, no finished run in it, one of another version, or a torn summary.
+        """
+        if not path.is_dir():
+            raise InputError(f"{path}: no such folder; want one that a command with --out wrote")
+        file = path / SUMMARY
+        if not file.exists():
+            if (path / SUMMARY_PARTIAL).exists() or (path / "settings.json").exists():
+                raise InputError(
+                    f"{path}: holds a run that was interrupted; finish it (--resume), then report it"
+                )
+            raise InputError(f"{path}: holds no {SUMMARY}; want a folder that a command with --out wrote")
+        try:
+            summary = json.loads(file.read_text(encoding="utf-8"))
+        except (ValueError, UnicodeDecodeError) as error:
+            raise InputError(f"{file}: is torn: {error}") from error
+        missing = [
+            name
+            for name, kind in (("command", list), ("version", str), ("rows", list))
+            if not isinstance(summary, dict) or not isinstance(summary.get(name), kind)
+        ]
+        if missing or len(summary["command"]) < 2:
+            raise InputError(
+                f"{file}: want the summary of a command, with {', '.join(missing or ['command'])}"
+            )
+        if summary["version"] != __version__:
+            raise InputError(
+                f"{file}: was written by parkenv {summary['version']}, this is {__version__}, whose searches may "
+                "differ; run the command again, or report it with that version"
+            )
+        return cls(path, summary, tuple(sorted(path.glob("*.png"))))
+
+    @property
+    def kind(self) -> str:
+        """The command: compare, survey, demo, train, ..."""
+        return str(self.summary["command"][1])
+
+    @property
+    def arguments(self) -> list[str]:
+        """What the command was called with."""
+        return [str(word) for word in self.summary["command"][2:]]
+
+    def totals(self) -> dict[tuple[Any, ...], float]:
+        """Total time, s, of every search in `episodes.csv`, by `results.episode_key`; empty where there is none.
+
+        Raises:
+            InputError: the file is not what this version writes.
+        """
+        file = self.path / "episodes.csv"
+        if not file.exists():
+            return {}
+        columns = (*SETTING_COLUMNS, "seed")
+        with file.open(encoding="utf-8", newline="") as lines:
+            try:
+                return {
+                    tuple(_value(c, row[c]) for c in columns): float(row["total_s"])
+                    for row in csv.DictReader(lines)
+                }
+            except (KeyError, TypeError, ValueError) as error:
+                raise InputError(f"{file}: a line of it cannot be read ({error})") from error
+
+    def table(self, name: str) -> list[Row]:
+        """The rows of a CSV file in the folder, numbers as numbers; none where it is not there."""
+        file = self.path / name
+        if not file.exists():
+            return []
+        with file.open(encoding="utf-8", newline="") as lines:
+            return [{k: _number(v) for k, v in row.items()} for row in csv.DictReader(lines)]
+
+
+def _value(column: str, text: str) -> Any:
+    if column in _TEXT:
+        return text
+    if column == "seed":
+        return int(text)
+    return float(text) if text else None
+
+
+def _number(text: str) -> Any:
+    try:
+        return float(text)
+    except ValueError:
+        return text

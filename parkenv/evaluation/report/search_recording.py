@@ -1,0 +1,213 @@
+"""Searches run again and written down, step by step, for a page that shows them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.envs.search import SearchState
+from parkenv.evaluation.compare import Case
+from parkenv.evaluation.episodes import EpisodeRunner
+from parkenv.evaluation.report.intentions import Intentions
+from parkenv.lot import ParkingLot, is_building
+from parkenv.lot_generators import ONE_WAY_HALF_WIDTH, TWO_WAY_HALF_WIDTH
+from parkenv.occupancy import World
+from planners.agent import make_agent
+from planners.oracle import OracleAgent
+
+MOST_SLOTS = 20_000
+"""Lots with more are not drawn: a page with every slot of theirs would not load."""
+STEADY_S = 600.0
+"""s up to which the truth is written down second by second; later on at the decisions alone."""
+FULL = 255
+"""What a belief of 1 is written as."""
+AGREES_S = 1e-6
+
+Recording = dict[str, Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Encounter:
+    """Agents that meet the same world.
+
+    Attributes:
+        cases: one for each agent, of one setting.
+        seed: of the world.
+    """
+
+    cases: tuple[Case, ...]
+    seed: int
+
+
+def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[Encounter]:
+    """The first searches of every setting, in turns, until there are about so many; at least one world.
+
+    Args:
+        cases: with the seeds of their searches.
+        episodes: how many searches are wanted.
+    """
+    settings: dict[tuple[Any, ...], list[tuple[Case, Sequence[int]]]] = {}
+    for case, seeds in cases:
+        setting = tuple(v for k, v in case.columns.items() if k != "agent")
+        settings.setdefault(setting, []).append((case, seeds))
+    chosen: list[Encounter] = []
+    count = 0
+    for number in range(max((len(seeds) for _, seeds in cases), default=0)):
+        for its in settings.values():
+            there = tuple(case for case, seeds in its if number < len(seeds))
+            if not there or (chosen and count + len(there) > episodes):
+                continue
+            chosen.append(Encounter(there, its[0][1][number]))
+            count += len(there)
+    return chosen
+
+
+def describe_lot(lot: ParkingLot) -> Recording:
+    """A lot as the page draws it: m, to the centimetre."""
+    return {
+        "name": lot.name,
+        "bounds": _rounded(np.array(lot.bounds())),
+        "slot_ids": list(lot.slot_ids),
+        "slots": [_rounded(c.ravel()) for c in lot.slot_corners()],
+        "vertices": [_rounded(xy) for xy in lot.vertex_xy],
+        "yaw": [round(float(a), 3) for a in lot.vertex_yaw],
+        "lanes": [
+            {
+                "points": _rounded(lane.points.ravel()),
+                "half_width": ONE_WAY_HALF_WIDTH if lane.oneway else TWO_WAY_HALF_WIDTH,
+                "oneway": lane.oneway,
+            }
+            for lane in lot.lanes
+        ],
+        "walls": [{"points": _rounded(w.ravel()), "building": is_building(w)} for w in lot.walls],
+        "entries": [_rounded(xy) for xy in lot.entries],
+        "goals": [_rounded(xy) for xy in lot.goals],
+    }
+
+
+def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Recording:
+    """Run every agent of an encounter through its world again.
+
+    Args:
+        encounter: whom, and where.
+        counted: total time, s, that each search came to before, by `Case.key`; what is not there is not compared.
+    """
+    searches, moments = [], {0.0}
+    state: SearchState | None = None
+    for case in encounter.cases:
+        agent = make_agent(case.agent, case.scenario, **case.options)
+        runner = EpisodeRunner(case.scenario, case.agent, agent, case.rig)
+        search, state = _search(runner, encounter.seed)
+        before = counted.get(case.key(encounter.seed))
+        search["counted_s"] = before
+        search["agrees"] = None if before is None else abs(before - search["total_s"]) <= AGREES_S
+        searches.append(search)
+        moments |= {centiseconds / 100.0 for centiseconds in search["t"]}
+    assert state is not None
+    first = encounter.cases[0]
+    scenario, start = first.scenario, state.arrival.time
+    longest = max(moments)
+    moments |= set(np.arange(0.0, min(longest, STEADY_S), 1.0).tolist())
+    world = {
+        "scenario": scenario.name,
+        "setting": {k: v for k, v in first.columns.items() if k != "agent"},
+        "seed": encounter.seed,
+        "day": state.arrival.day,
+        "arrival_s": round(start, 3),
+        "goal": scenario.goal,
+        "view_range_m": round(float(scenario.sighting.view_range), 2),
+        "v_walk": round(float(scenario.v_walk), 4),
+        "sensors": first.rig,
+        "forecast": _bytes(state.belief.prior),
+        **_truth(state.world, scenario.lot.n_slots, start, sorted(moments)),
+    }
+    return {"lot": describe_lot(scenario.lot), "world": world, "searches": searches}
+
+
+def _truth(world: World, n_slots: int, start: float, moments: Sequence[float]) -> Recording:
+    """What stood in the slots at the arrival, and when that changed: [centiseconds, slot, ...]."""
+    everything = np.arange(n_slots)
+    taken = world.occupied(everything, start)
+    first, changes = taken, []
+    for moment in moments[1:]:
+        now = world.occupied(everything, start + moment)
+        if flipped := np.flatnonzero(now != taken).tolist():
+            changes.append([round(100 * moment), *flipped])
+        taken = now
+    return {"taken": np.flatnonzero(first).tolist(), "changes": changes}
+
+
+def _search(runner: EpisodeRunner, seed: int) -> tuple[Recording, SearchState]:
+    """One search; times in whole centiseconds since the arrival, beliefs in steps of 1/255."""
+    env, agent, scenario = runner.env, runner.agent, runner.scenario
+    intentions = Intentions(scenario.public(), agent)
+    observation, _ = env.reset(seed=seed)
+    hidden: SearchState = env.unwrapped.state  # type: ignore[attr-defined]
+    if isinstance(agent, OracleAgent):
+        agent.reveal(hidden.world, hidden.time)
+    start = hidden.time
+    known, seen = np.array(_bytes(hidden.belief.prior)), np.zeros(scenario.lot.n_slots, dtype=np.bool_)
+    rows: dict[str, list[Any]] = {
+        name: [] for name in ("t", "vertex", "failed", "belief", "seen", "action", "plan")
+    }
+    failed_s, planned = 0.0, [-1]
+    memory: Any = None
+    info: dict[str, Any] = {}
+
+    def look() -> None:
+        nonlocal known, seen
+        belief = hidden.belief
+        now = np.array(_bytes(belief.p_occupied))
+        changed = np.flatnonzero(now != known)
+        rows["t"].append(round(100 * (hidden.time - start)))
+        rows["vertex"].append(hidden.vertex)
+        rows["failed"].append(round(100 * failed_s))
+        rows["belief"].append(np.stack([changed, now[changed]], axis=1).ravel().tolist())
+        rows["seen"].append(np.flatnonzero(belief.seen & ~seen).tolist())
+        known, seen = now, seen | belief.seen
+
+    over = truncated = False
+    while not over:
+        look()
+        vertex = hidden.vertex
+        action, memory = agent.predict(observation, memory)
+        plan = intentions.ahead(observation, vertex, int(action), memory)
+        # Most plans are what is left of the last one.
+        rows["plan"].append(None if plan == planned[1:] else plan)
+        planned = plan
+        rows["action"].append(int(action))
+        observation, _, terminated, truncated, info = env.step(action)
+        failed_s = info["failed_s"]
+        if hidden.vertex == vertex:
+            planned = [-1, *plan]
+        over = terminated or truncated
+    look()
+    gave_up_s = info["gave_up_s"] + (scenario.give_up_s if truncated else 0.0)
+    parked = bool(info["parked"])
+    return {
+        "agent": runner.name,
+        **rows,
+        "parked": parked,
+        "slot": hidden.vertex if parked else None,
+        "truncated": bool(truncated),
+        "drive_s": info["drive_s"],
+        "failed_s": info["failed_s"],
+        "walk_s": info["walk_s"],
+        "gave_up_s": gave_up_s,
+        "total_s": info["total_s"] + (scenario.give_up_s if truncated else 0.0),
+        "failed_parks": int(info["failed_parks"]),
+        "replans": int(getattr(memory, "replans", 0)),
+    }, hidden
+
+
+def _bytes(p: NDArray[np.floating]) -> list[int]:
+    whole: list[int] = np.round(FULL * np.asarray(p, dtype=np.float64)).astype(np.int64).tolist()
+    return whole
+
+
+def _rounded(values: NDArray[np.float64]) -> list[float]:
+    return [round(float(v), 2) for v in values]

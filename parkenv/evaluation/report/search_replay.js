@@ -1,0 +1,358 @@
+// Searches: agents side by side in the same world, on one clock.
+
+const MOST_PANELS = 4;
+const PARK = 4;
+
+/** The first index whose value is above a limit, less one: the last moment that has come. */
+function lastUpTo(values, limit) {
+  let [low, high] = [0, values.length];
+  while (low < high) {
+    const middle = (low + high) >> 1;
+    if (values[middle] <= limit) low = middle + 1;
+    else high = middle;
+  }
+  return low - 1;
+}
+
+/** What stood in the slots of a world, moment by moment. */
+class Truth {
+  constructor(world, slots) {
+    this.world = world;
+    this.slots = slots;
+    this.times = world.changes.map((change) => change[0]);
+    this.rewind();
+  }
+
+  rewind() {
+    this.applied = 0;
+    this.taken = new Uint8Array(this.slots);
+    for (const slot of this.world.taken) this.taken[slot] = 1;
+  }
+
+  at(centiseconds) {
+    const wanted = lastUpTo(this.times, centiseconds) + 1;
+    if (wanted < this.applied) this.rewind();
+    for (; this.applied < wanted; this.applied += 1) {
+      for (const slot of this.world.changes[this.applied].slice(1)) this.taken[slot] ^= 1;
+    }
+    return this.taken;
+  }
+}
+
+/** One search, moment by moment. */
+class Track {
+  constructor(search, world, lot) {
+    this.search = search;
+    this.world = world;
+    this.lot = lot;
+    this.end = search.t[search.t.length - 1] / 100;
+    this.plans = [];
+    let plan = [];
+    search.plan.forEach((next, k) => {
+      if (next !== null) plan = next;
+      else if (k > 0 && search.vertex[k] !== search.vertex[k - 1]) plan = plan.slice(1);
+      this.plans.push(plan);
+    });
+    this.rewind();
+  }
+
+  rewind() {
+    this.applied = 0;
+    this.belief = Uint8Array.from(this.world.forecast);
+    this.seen = new Uint8Array(this.lot.slots.length);
+  }
+
+  /** The last moment at or before a time, with belief and seen brought there. */
+  at(seconds) {
+    const k = Math.max(0, lastUpTo(this.search.t, Math.round(100 * seconds + 1e-6)));
+    if (k + 1 < this.applied) this.rewind();
+    for (; this.applied <= k; this.applied += 1) {
+      const changes = this.search.belief[this.applied];
+      for (let i = 0; i < changes.length; i += 2) this.belief[changes[i]] = changes[i + 1];
+      for (const slot of this.search.seen[this.applied]) this.seen[slot] = 1;
+    }
+    return k;
+  }
+
+  /** Where the car is and looks, at a time. */
+  pose(seconds, k) {
+    const { search, lot } = this;
+    const [x, y] = lot.vertices[search.vertex[k]];
+    if (k + 1 < search.vertex.length && search.vertex[k + 1] !== search.vertex[k]) {
+      const [bx, by] = lot.vertices[search.vertex[k + 1]];
+      const [from, to] = [search.t[k] / 100, search.t[k + 1] / 100];
+      const share = to > from ? Math.min((seconds - from) / (to - from), 1) : 1;
+      return [x + share * (bx - x), y + share * (by - y), Math.atan2(by - y, bx - x)];
+    }
+    for (let i = k; i > 0; i -= 1) {
+      if (search.vertex[i] !== search.vertex[i - 1]) {
+        const [ax, ay] = lot.vertices[search.vertex[i - 1]];
+        return [x, y, Math.atan2(y - ay, x - ax)];
+      }
+    }
+    return [x, y, lot.yaw[search.vertex[k]] ?? 0];
+  }
+
+  /** The parts of the time that have gone by, s. */
+  split(seconds, k) {
+    const { search } = this;
+    let failed = search.failed[k] / 100;
+    const now = Math.min(seconds, this.end);
+    if (k + 1 < search.t.length && search.failed[k + 1] > search.failed[k]) failed += now - search.t[k] / 100;
+    const after = Math.max(0, seconds - this.end);
+    const walk = Math.min(after, search.walk_s);
+    return { drive: now - failed, failed, walk, gave_up: Math.min(Math.max(0, after - search.walk_s), search.gave_up_s) };
+  }
+
+  status(seconds, k) {
+    const { search, lot } = this;
+    const name = (slot) => lot.slot_ids[slot];
+    if (seconds >= search.total_s - 0.005) return search.parked ? `at the goal; parked in ${name(search.slot)}` : search.truncated ? "cut off" : "lot full, gone elsewhere";
+    if (seconds >= this.end) return search.parked ? `parked in ${name(search.slot)}, walking` : search.truncated ? "cut off" : "lot is full: going elsewhere";
+    const here = search.vertex[k];
+    if (search.action[k] === PARK) return here < lot.slots.length && search.failed[k + 1] > search.failed[k] ? `${name(here)} is taken: failed` : "waiting";
+    if (search.vertex[k + 1] === here) return "waiting";
+    const plan = this.plans[k];
+    const end = plan[plan.length - 1];
+    return plan.length && end < lot.slots.length ? `driving, toward ${name(end)}` : "driving";
+  }
+}
+
+function seconds2(value) {
+  return value >= 1000 ? value.toFixed(0) : value.toFixed(1);
+}
+
+class SearchReplay {
+  constructor(root, data) {
+    this.data = data;
+    const { worlds } = data;
+    this.worldChoice = make("select", { id: "world" }, ...worlds.map((world, i) => make("option", { value: i }, this.worldName(world))));
+    this.worldChoice.addEventListener("change", () => this.open(Number(this.worldChoice.value)));
+    this.chips = make("div", { class: "chips", role: "group", "aria-label": `Agents, at most ${MOST_PANELS}` });
+    this.followKey = make("button", { type: "button", class: "chip", "aria-pressed": "false" }, "Follow the car");
+    this.followKey.addEventListener("click", () => {
+      this.follow = !this.follow;
+      this.layOut();
+      this.player.goTo(this.player.seconds);
+    });
+    this.panels = make("div", { class: "panels" });
+    this.strips = make("div", { class: "strips" });
+    const transport = make("div", { class: "card transport" });
+    this.player = new Player(root, {
+      name: "search", speeds: [1, 2, 5, 10, 20, 50], speed: 5,
+      show: (seconds) => this.show(seconds),
+      told: (seconds) => `${seconds2(seconds)} of ${seconds2(this.player.duration)} s`,
+    });
+    transport.append(this.strips, this.player.keys);
+    const world = make("label", {}, "World ", this.worldChoice);
+    root.append(
+      make("p", { class: "quiet" }, "The same worlds, run again: every agent meets the same cars at the same times. Fill: what the agent believes. Dark cars: what is really there, which agents do not see until they come near."),
+      make("div", { class: "controls" }, world, this.chips, this.followKey),
+      this.panels, transport, lotLegend(),
+    );
+    // Where a whole lot would come out too small, the car is followed.
+    const lot = data.lots[worlds[0].lot];
+    this.follow = Math.min(root.clientWidth, 1280) / (lot.bounds[2] - lot.bounds[0]) < 2.6;
+    this.open(0);
+    let width = root.clientWidth;
+    new ResizeObserver(() => {
+      if (root.clientWidth === width) return;
+      width = root.clientWidth;
+      this.redraw();
+    }).observe(root);
+  }
+
+  worldName(world) {
+    const setting = world.setting;
+    const its = this.data.worlds.map((other) => other.setting);
+    const varies = (key) => new Set(its.map((s) => s[key])).size > 1;
+    const parts = [world.scenario, moment(world.arrival_s, world.day)];
+    if (varies("failure_cost_s")) parts.push(`failure cost ${setting.failure_cost_s} s`);
+    if (varies("v_walk_kmh")) parts.push(`walk ${setting.v_walk_kmh} km/h`);
+    if (varies("v_drive_kmh")) parts.push(`drive ${setting.v_drive_kmh} km/h`);
+    parts.push(`seed ${world.seed}`);
+    return parts.join(" · ");
+  }
+
+  open(number) {
+    this.world = this.data.worlds[number];
+    this.lot = this.data.lots[this.world.lot];
+    this.truth = new Truth(this.world, this.lot.slots.length);
+    const names = this.world.searches.map((search) => search.agent);
+    const kept = (this.chosen ?? []).filter((name) => names.includes(name));
+    this.chosen = kept.length ? kept : names.slice(0, window.innerWidth < 720 ? 1 : 2);
+    this.chips.replaceChildren(
+      ...names.map((name) => make("button", { type: "button", class: "chip", "data-agent": name, onclick: () => this.toggleAgent(name), title: name }, shortName(name))),
+    );
+    this.layOut();
+    this.reload(0);
+  }
+
+  toggleAgent(name) {
+    const there = this.chosen.includes(name);
+    if (there && this.chosen.length === 1) return;
+    if (!there && this.chosen.length === MOST_PANELS) return;
+    const names = this.world.searches.map((search) => search.agent);
+    this.chosen = names.filter((other) => (other === name ? !there : this.chosen.includes(other)));
+    const seconds = this.player.seconds;
+    this.layOut();
+    this.reload(seconds);
+  }
+
+  reload(seconds) {
+    const tracks = this.shown.map(({ track }) => track);
+    const duration = Math.max(...tracks.map((track) => track.search.total_s));
+    const stops = tracks.flatMap((track) => [...track.search.t.map((t) => t / 100), track.search.total_s]);
+    this.player.load(duration, stops);
+    this.layStrips(duration);
+    this.player.goTo(seconds);
+  }
+
+  layOut() {
+    const [x0, y0, x1, y1] = this.lot.bounds;
+    const n = this.chosen.length;
+    const wide = (x1 - x0) / (y1 - y0) > 1.9;
+    const columns = window.innerWidth < 720 || n === 1 ? 1 : n === 3 && !wide ? 3 : 2;
+    this.panels.style.setProperty("--columns", columns);
+    this.followKey.setAttribute("aria-pressed", String(this.follow));
+    for (const chip of this.chips.children) {
+      const on = this.chosen.includes(chip.dataset.agent);
+      chip.setAttribute("aria-pressed", String(on));
+      chip.disabled = !on && n === MOST_PANELS;
+    }
+    this.shown = this.chosen.map((name) => {
+      const search = this.world.searches.find((other) => other.agent === name);
+      const canvas = make("canvas", { role: "img" });
+      const status = make("span", { class: "status" });
+      const clock = make("span", { class: "clock" });
+      const split = make("div", { class: "split" });
+      const panel = make("article", { class: "card panel", "data-agent": name }, make("header", {}, make("h3", { title: name }, shortName(name)), status, clock), canvas, split);
+      return { track: new Track(search, this.world, this.lot), canvas, status, clock, split, panel };
+    });
+    this.panels.replaceChildren(...this.shown.map(({ panel }) => panel));
+    for (const its of this.shown) {
+      its.view = new LotView(its.canvas, this.lot);
+      its.view.follow = this.follow;
+      its.view.resize();
+    }
+  }
+
+  layStrips(duration) {
+    const rows = this.shown.flatMap(({ track }) => {
+      const { search } = track;
+      const strip = make("div", { class: "strip", title: "drive, failed tries, walk" });
+      const part = (from, to, color) => {
+        if (to > from) strip.append(make("span", { style: `left: ${(100 * from) / duration}%; width: ${(100 * (to - from)) / duration}%; background: var(${color})` }));
+      };
+      let from = 0;
+      let failing = false;
+      search.t.forEach((t, k) => {
+        const fails = k + 1 < search.t.length && search.failed[k + 1] > search.failed[k];
+        if (k === search.t.length - 1 || fails !== failing) {
+          part(from, t / 100, failing ? "--failed" : "--drive");
+          [from, failing] = [t / 100, fails];
+        }
+      });
+      part(track.end, track.end + search.walk_s, "--walk");
+      part(track.end + search.walk_s, search.total_s, "--gave-up");
+      if (search.replans && search.t.length < 500) {
+        search.plan.forEach((plan, k) => {
+          if (plan !== null && k > 0 && plan.length) strip.append(make("span", { class: "replan", style: `left: ${search.t[k] / duration}%` }));
+        });
+      }
+      const total = make("span", { class: "total" }, `${seconds2(search.total_s)} s`);
+      return [make("span", { class: "who", title: search.agent }, shortName(search.agent)), strip, total];
+    });
+    // On a phone the name and the total stand above the strip.
+    if (window.innerWidth < 720) for (let i = 0; i < rows.length; i += 3) [rows[i + 1], rows[i + 2]] = [rows[i + 2], rows[i + 1]];
+    this.playhead = make("div", { class: "playhead" });
+    this.strips.replaceChildren(...rows, this.player.time, this.playhead);
+  }
+
+  /** A line through all strips, at the time. */
+  movePlayhead(seconds) {
+    const strips = this.strips.querySelectorAll(".strip");
+    if (!strips.length || !this.playhead) return;
+    const [first, last] = [strips[0], strips[strips.length - 1]];
+    const left = first.offsetLeft + (first.offsetWidth * seconds) / this.player.duration;
+    const top = first.offsetTop - 3;
+    this.playhead.style.cssText = `left: ${left}px; top: ${top}px; height: ${last.offsetTop + last.offsetHeight + 3 - top}px`;
+  }
+
+  redraw() {
+    const seconds = this.player.seconds;
+    this.layOut();
+    this.layStrips(this.player.duration);
+    this.player.goTo(seconds);
+  }
+
+  show(seconds) {
+    if (!this.shown) return;
+    this.movePlayhead(seconds);
+    const taken = this.truth.at(Math.round(100 * seconds));
+    for (const { track, view, canvas, status, clock, split, panel } of this.shown) {
+      const { search } = track;
+      const k = track.at(seconds);
+      const [x, y, yaw] = track.pose(Math.min(seconds, track.end), k);
+      const parked = search.parked && seconds >= track.end - 0.005;
+      const over = seconds >= search.total_s - 0.005;
+      const goal = this.lot.goals[this.world.goal];
+      const slot = search.parked ? view.slots[search.slot] : null;
+      const walked = parked ? Math.min((seconds - track.end) / Math.max(search.walk_s, 0.01), 1) : 0;
+      const walker = parked ? [slot.x + walked * (goal[0] - slot.x), slot.y + walked * (goal[1] - slot.y)] : null;
+      view.begin(walker ?? [x, y]);
+      if (!parked) view.drawView(x, y, this.world.view_range_m);
+      view.drawSlots((i) => track.belief[i], (i) => track.seen[i], (i) => taken[i] && !(parked && i === search.slot));
+      const trail = search.vertex.slice(0, k + 1).map((v) => this.lot.vertices[v]);
+      if (!parked) trail.push([x, y]);
+      else trail.push([slot.x, slot.y]);
+      view.drawLine(trail, palette.car, 3);
+      if (!parked && k < track.plans.length && seconds < track.end) {
+        const plan = track.plans[k];
+        const end = plan[plan.length - 1];
+        view.drawPlan([[x, y], ...plan.map((v) => this.lot.vertices[v])], end < view.slots.length ? end : null);
+      }
+      if (parked) view.drawLine([[slot.x, slot.y], goal], palette.goal, 2, [5, 4]);
+      view.drawGoal(...goal);
+      if (parked) {
+        view.drawCar(slot.x, slot.y, slot.yaw);
+        if (!over) view.drawDot(...walker, 5, palette.goal);
+      } else view.drawCar(x, y, yaw);
+      view.drawScale();
+
+      const parts = track.split(seconds, k);
+      const told = track.status(seconds, k);
+      status.textContent = told;
+      clock.replaceChildren(seconds2(Math.min(seconds, search.total_s)), make("small", {}, " s"));
+      panel.classList.toggle("done", over);
+      panel.dataset.vertex = search.vertex[k];
+      panel.dataset.total = search.total_s;
+      canvas.setAttribute("aria-label", `${search.agent} after ${seconds2(seconds)} s: ${told}`);
+      const words = [["drive", "--drive"], ["failed", "--failed"], ["walk", "--walk"], ["gave_up", "--gave-up"]]
+        .filter(([name]) => name !== "gave_up" || search.gave_up_s > 0)
+        .map(([name, color]) => make("span", {}, make("i", { style: `background: var(${color})` }), `${name.replace("_", " ")} `, make("b", {}, seconds2(parts[name]))));
+      if (over && search.agrees !== null) {
+        words.push(make("span", { class: search.agrees ? "check" : "check bad", title: "Whether this search, run again, came to the total that it was counted with" }, search.agrees ? "✓ as counted" : `counted as ${seconds2(search.counted_s)} s`));
+      }
+      split.replaceChildren(...words);
+    }
+  }
+}
+
+/** What the marks on a lot mean. */
+function lotLegend() {
+  const key = (mark, text) => make("span", { class: "key" }, mark, text);
+  const svg = (width, ...children) => makeSvg("svg", { width, height: 16, viewBox: `0 0 ${width} 16`, "aria-hidden": "true" }, ...children);
+  const scale = make("span", { class: "scale", style: "background: linear-gradient(90deg, var(--belief))" });
+  const pale = make("span", { class: "scale", style: "background: linear-gradient(90deg, var(--belief)); opacity: 0.42" });
+  const car = svg(26, makeSvg("rect", { x: 2, y: 3, width: 22, height: 10, rx: 3, style: "fill: var(--parked); stroke: var(--faint); stroke-width: 0.8" }), makeSvg("rect", { x: 15, y: 5, width: 3, height: 6, style: "fill: var(--glass)" }));
+  const mine = svg(26, makeSvg("rect", { x: 2, y: 3, width: 22, height: 10, rx: 3, style: "fill: var(--car); stroke: #1c2126; stroke-width: 1.4" }));
+  const plan = svg(34, makeSvg("path", { d: "M1 8H33", style: "stroke: var(--ink); stroke-width: 1.6" }), makeSvg("path", { d: "M21 8l-8-4.5 2.5 4.5-2.5 4.5z", style: "fill: var(--ink)" }));
+  const walk = svg(34, makeSvg("path", { d: "M1 8H33", style: "stroke: var(--goal); stroke-width: 2; stroke-dasharray: 5 4" }));
+  const goal = svg(18, makeSvg("circle", { cx: 9, cy: 8, r: 7, style: "fill: var(--goal)" }), makeSvg("circle", { cx: 9, cy: 8, r: 2.6, style: "fill: var(--halo)" }));
+  return make(
+    "div", { class: "legend lot" },
+    key(make("span", {}, "free ", scale), "taken: belief in slots seen"), key(pale, "forecast, not seen yet"),
+    key(car, "a car is there"), key(mine, "the searching car"), key(plan, "its plan"), key(walk, "the walk"), key(goal, "goal"),
+  );
+}

@@ -1,0 +1,145 @@
+// Tables: every number of the summary, sorted by a click or by Enter on a heading.
+
+const SETTING = ["scenario", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh"];
+
+function sortValue(value) {
+  if (Array.isArray(value)) return value[0];
+  return value;
+}
+
+function compareValues(a, b) {
+  const [x, y] = [sortValue(a), sortValue(b)];
+  // What is missing comes last, whichever way.
+  if (x === null || x === undefined) return y === null || y === undefined ? 0 : Infinity;
+  if (y === null || y === undefined) return -Infinity;
+  if (typeof x === "string" || typeof y === "string") return String(x).localeCompare(String(y), "en", { numeric: true });
+  return x - y;
+}
+
+function fillCell(cell, column, value) {
+  cell.dataset.key = column.key;
+  if (Array.isArray(value)) {
+    cell.dataset.value = JSON.stringify(value);
+    cell.append(asColumn(column, value[0]));
+    if (value[1] !== null && value[2] !== null) {
+      const ends = value.slice(1).map((end) => asColumn(column, end).replace(" %", "")).join(", ");
+      cell.append(make("span", { class: "interval" }, `[${ends}]`));
+    }
+  } else {
+    cell.dataset.value = JSON.stringify(value);
+    cell.append(asColumn(column, value));
+  }
+  return cell;
+}
+
+/** "failure cost 10 s, walk 4 km/h" */
+function settingInWords(columns, values) {
+  return columns
+    .map((column, i) => {
+      if (values[i] === null) return null;
+      const text = asColumn(column, values[i]) + (column.unit ? ` ${column.unit}` : "");
+      return column.key === "scenario" ? text : `${column.label} ${text}`;
+    })
+    .filter((text) => text !== null)
+    .join(", ");
+}
+
+function factsTable(table) {
+  const body = make("tbody");
+  table.columns.forEach((column, i) => {
+    const cell = fillCell(make("td", { role: "cell" }), column, table.rows[0][i]);
+    if (column.unit && typeof table.rows[0][i] === "number") cell.append(` ${column.unit}`);
+    body.append(make("tr", { role: "row", "data-row": 0, title: column.help }, make("th", { role: "rowheader", scope: "row" }, column.label), cell));
+  });
+  // The style sheet sets it in columns, which would take its being a table from those who listen to the page.
+  return make("table", { role: "table", class: "facts", "data-table": table.name, "aria-label": table.title }, body);
+}
+
+function sortableTable(table) {
+  const { columns, rows } = table;
+  const body = make("tbody");
+  const classOf = (k) => [isWord[k] ? "word" : "", k === lead || k === agent ? "lead" : "", settings.includes(k) ? "setting" : ""].join(" ").trim() || null;
+  const isWord = columns.map((_, i) => rows.every((row) => row[i] === null || typeof row[i] === "string"));
+  const lead = columns.findIndex((column) => column.key === "total_s");
+  const settings = columns.map((column, i) => (SETTING.includes(column.key) ? i : -1)).filter((i) => i >= 0);
+  const agent = columns.findIndex((column) => column.key === "agent");
+  const settingOf = (row) => JSON.stringify(settings.map((i) => row[i]));
+  const least = new Map();
+  if (lead >= 0 && agent >= 0) {
+    rows.forEach((row, i) => {
+      const best = least.get(settingOf(row));
+      if (row[agent] !== "oracle" && (best === undefined || sortValue(row[lead]) < sortValue(rows[best][lead]))) least.set(settingOf(row), i);
+    });
+  }
+  const lines = rows.map((row, i) => {
+    const line = make("tr", { "data-row": i, class: [...least.values()].includes(i) ? "least" : null });
+    columns.forEach((column, k) => {
+      const value = column.key === "agent" || column.key === "model" ? shortName(String(row[k])) : row[k];
+      const cell = make("td", { class: classOf(k) });
+      fillCell(cell, column, value);
+      cell.dataset.value = JSON.stringify(row[k]);
+      if (value !== row[k]) cell.title = row[k];
+      line.append(cell);
+    });
+    return line;
+  });
+  body.append(...lines);
+
+  const headings = columns.map((column, k) => {
+    const arrow = make("span", { class: "arrow", "aria-hidden": "true" });
+    const button = make("button", { type: "button", title: column.help }, column.label);
+    if (column.unit) button.append(make("span", { class: "unit" }, ` ${column.unit}`));
+    button.append(arrow);
+    const heading = make("th", { scope: "col", class: classOf(k), "aria-sort": "none", "data-key": column.key }, button);
+    button.addEventListener("click", () => {
+      const down = heading.getAttribute("aria-sort") === "ascending";
+      headings.forEach((other) => {
+        other.setAttribute("aria-sort", "none");
+        other.querySelector(".arrow").textContent = "";
+      });
+      heading.setAttribute("aria-sort", down ? "descending" : "ascending");
+      arrow.textContent = down ? "↓" : "↑";
+      const order = rows.map((_, i) => i);
+      order.sort((a, b) => {
+        const way = compareValues(rows[a][k], rows[b][k]);
+        if (!Number.isFinite(way)) return way > 0 ? 1 : -1;
+        return (down ? -way : way) || a - b;
+      });
+      body.append(...order.map((i) => lines[i]));
+    });
+    return heading;
+  });
+  const element = make("table", { "data-table": table.name, "aria-label": table.title }, make("thead", {}, make("tr", {}, ...headings)), body);
+
+  const groups = [...new Set(rows.map(settingOf))];
+  if (agent < 0 || groups.length < 2 || groups.length > 24) return [element, null];
+  const names = [["All", null], ...groups.map((group) => [settingInWords(settings.map((i) => columns[i]), JSON.parse(group)), group])];
+  const chips = make("div", { class: "chips", role: "group", "aria-label": "Setting" });
+  for (const [name, group] of names) {
+    chips.append(
+      make("button", {
+        type: "button", class: "chip", "aria-pressed": String(group === null),
+        onclick: (event) => {
+          for (const chip of chips.children) chip.setAttribute("aria-pressed", String(chip === event.currentTarget));
+          // What the choice says need not stand in every row.
+          element.classList.toggle("one-setting", group !== null);
+          lines.forEach((line, i) => { line.hidden = group !== null && settingOf(rows[i]) !== group; });
+        },
+      }, name),
+    );
+  }
+  if (window.innerWidth < 720) chips.children[1].click();
+  return [element, chips];
+}
+
+function showTables(root, tables) {
+  for (const table of tables) {
+    if (!table.rows.length) continue;
+    if (tables.length > 1) root.append(make("h3", {}, table.title));
+    const same = settingInWords(table.same, table.same.map((column) => column.value));
+    if (same) root.append(make("p", { class: "quiet" }, `In all rows: ${same}.`));
+    const [element, chips] = table.facts ? [factsTable(table), null] : sortableTable(table);
+    if (chips) root.append(chips);
+    root.append(make("div", { class: "card scroll", tabindex: 0, role: "region", "aria-label": table.title }, element));
+  }
+}

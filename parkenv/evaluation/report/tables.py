@@ -1,0 +1,225 @@
+"""The tables of a page: which columns, what they are called, and how their numbers are written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from parkenv.evaluation.results import Row
+
+Cell = float | int | str | bool | None | list[float | None]
+
+
+class Column(NamedTuple):
+    """How a column is shown.
+
+    Attributes:
+        key: as the summary has it.
+        label: as people say it.
+        unit: behind the numbers; empty for none.
+        digits: after the point.
+        share: whether it is a fraction, to be written as a percentage.
+        signed: whether a plus is written.
+        help: what it means.
+    """
+
+    key: str
+    label: str
+    unit: str = ""
+    digits: int = 1
+    share: bool = False
+    signed: bool = False
+    help: str = ""
+
+
+_KNOWN = {
+    column.key: column
+    for column in (
+        Column("scenario", "scenario"),
+        Column("test_scenario", "tested on"),
+        Column("occupancy_level", "fullness", share=True, digits=0, help="Mean occupancy that the lot was set to"),
+        Column("agent", "agent"),
+        Column("failure_cost_s", "failure cost", "s", 0, help="What a try at a taken slot costs"),
+        Column("v_walk_kmh", "walk", "km/h", 0),
+        Column("v_drive_kmh", "drive", "km/h", 0),
+        Column("episodes", "searches", digits=0),
+        Column("seed", "seed", digits=0),
+        Column("total_s", "total time", "s", help="Drive, failed tries and walk: mean and 95 % interval"),
+        Column("difference_s", "to the first agent", "s", signed=True, help="Paired by world; 95 % interval"),
+        Column("regret_s", "regret", "s", help="How much longer than one who knows every slot's future"),
+        Column("drive_s", "drive", "s", help="Seconds driven, waits included"),
+        Column("failed_s", "failed tries", "s", help="Seconds lost by tries at taken slots"),
+        Column("walk_s", "walk", "s"),
+        Column("gave_up_s", "gave up", "s", help="Seconds charged for lots found full, and for searches cut off"),
+        Column("bound_s", "bound", "s", help="The least time in these worlds of one who knows it all"),
+        Column("parked_fraction", "parked", share=True, digits=0),
+        Column("failed_parks", "tries failed", digits=2),
+        Column("replans", "re-plans", help="How often an agent changed its plan in a search"),
+        Column("driven_m", "driven", "m", 0),
+        Column("walked_m", "walked", "m", 0),
+        Column("slots_passed", "slots passed"),
+        Column("occupancy", "occupied", share=True, digits=0, help="Share of the slots that is taken at the arrival"),
+        Column("decision_ms", "decision", "ms", 2, help="Median wall time of a decision"),
+        Column("decision_ms_p99", "p99", "ms", 2, help="99th percentile of the wall time of a decision"),
+        Column("gap_to_exact", "over exact", share=True, digits=2, signed=True),
+        Column("steps", "decisions in training", digits=0),
+        Column("steps_per_s", "decisions/s", digits=0),
+        Column("model", "model"),
+        Column("sessions", "drives", digits=0),
+        Column("slots", "slots", digits=0),
+        Column("car_detection_rate", "parked cars found", share=True, help="Detected at least once"),
+        Column("detection_precision", "detections that are cars", share=True),
+        Column("range_abs_error_m.median", "distance of a car, median error", "m", 3),
+        Column("range_abs_error_m.p95", "distance of a car, 95th percentile", "m", 2),
+        Column("slot_accuracy", "slots judged right", share=True, help="A slot never in view counts as wrong"),
+        Column("slot_accuracy_seen", "slots judged right, of those seen", share=True),
+        Column("unknown_fraction", "slots never in view", share=True),
+        Column("occupancy_mae", "map against the true probabilities", digits=3, help="Mean absolute error of P(taken)"),
+        Column("occupancy_mae_expected", "the same of counts alone", digits=3, help="Of as many drives at that hour"),
+        Column("seconds_per_frame", "time to understand a frame", "s", 3),
+        Column("slots_found.precision", "slots found without a map that are true", share=True),
+        Column("slots_found.recall", "true slots found without a map", share=True),
+        Column("slots_found.error", "place of a slot found, mean error", "m", 2),
+        Column("slots_found.yaw_error", "heading of a slot found, mean error", "rad", 3),
+        Column("distance_m", "distance", "m", 0),
+        Column("rate", "share detected", share=True, help="In frames in which a car stands clear"),
+        Column("in_frame", "cars in frames", digits=0),
+        Column("detected", "detected", digits=0),
+        Column("success", "parkings that succeed", share=True),
+        Column("parked", "parked", digits=0),
+        Column("found", "found", digits=0),
+        Column("detections", "detections", digits=0),
+        Column("right", "right", digits=0),
+        Column("occupied_fraction", "occupied", share=True, digits=0),
+        Column("key", "drive"),
+        Column("weather", "weather"),
+        Column("rig", "rig"),
+    )
+}  # fmt: skip
+_ORDER = (
+    "scenario", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh", "agent", "seed",
+    "total_s", "difference_s", "gap_to_exact", "regret_s", "drive_s", "failed_s", "walk_s", "gave_up_s",
+    "parked_fraction",
+)  # fmt: skip
+"""Columns that come first, in this order; others follow as they come."""
+_TABLES_OF_THEIR_OWN = ("by_weather",)
+_UNITS = (("_kmh", "km/h"), ("_ms", "ms"), ("_s", "s"), ("_m", "m"), ("_deg", "°"), ("_rad", "rad"))
+
+
+def column_of(key: str) -> Column:
+    """How a column is shown; one that nobody has described is named after its key.
+
+    Example:
+        >>> column_of("total_s").label, column_of("brake_distance_m")[:3]
+        ('total time', ('brake_distance_m', 'brake distance', 'm'))
+    """
+    if key in _KNOWN:
+        return _KNOWN[key]
+    for ending, unit in _UNITS:
+        if key.endswith(ending):
+            return Column(key, key.removesuffix(ending).replace("_", " ").replace(".", ", "), unit, 3)
+    return Column(key, key.replace("_", " ").replace(".", ", "), digits=3)
+
+
+def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False) -> dict[str, Any]:
+    """A table of the page's data.
+
+    Intervals (`NAME_ci95`) stand in the column of what they belong to. Columns that are the same in all rows are put
+    into words beside the table, in `same`.
+
+    Args:
+        name: what the page calls it.
+        title: above it.
+        rows: with equal keys, more or less.
+        facts: whether it is one row that is better read from top to bottom.
+    """
+    flat = [_flat(row) for row in rows]
+    keys = list(dict.fromkeys(key for row in flat for key in row))
+    keys = [k for k in _ORDER if k in keys] + [k for k in keys if k not in _ORDER]
+    values = {key: [row.get(key) for row in flat] for key in keys}
+    same = []
+    if len(rows) > 1:
+        same = [k for k in keys if len({repr(v) for v in values[k]}) == 1]
+        # What is compared stays, even where it comes out equal.
+        same = [
+            k for k in same if values[k][0] is None or k in _ORDER[:6] or k in ("episodes", "rig", "slots")
+        ]
+    shown = [k for k in keys if k not in same]
+    return {
+        "name": name,
+        "title": title,
+        "facts": facts,
+        "columns": [_described(key) for key in shown],
+        "rows": [[values[key][i] for key in shown] for i in range(len(rows))],
+        "same": [{**_described(key), "value": values[key][0]} for key in same if values[key][0] is not None],
+    }
+
+
+def _described(key: str) -> dict[str, Any]:
+    return {k: v for k, v in column_of(key)._asdict().items() if v != "" and v is not False}
+
+
+def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Cell]:
+    """One level, intervals folded in; lists of rows are left out, they are tables of their own."""
+    made: dict[str, Cell] = {}
+    for key, value in row.items():
+        name = prefix + key
+        if isinstance(value, Mapping):
+            if key not in _TABLES_OF_THEIR_OWN:
+                made |= _flat(value, f"{name}.")
+        elif key.endswith("_ci95"):
+            base = name.removesuffix("_ci95")
+            made[base] = [made.get(base), *value]  # type: ignore[list-item]
+        elif isinstance(value, (list, tuple)):
+            if len(value) == 2 and not any(isinstance(v, (Mapping, list)) for v in value):
+                made[name] = f"{value[0]:g} to {value[1]:g}"
+        else:
+            made[name] = value
+    return made
+
+
+def tables_of(kind: str, summary: Mapping[str, Any], sessions: Sequence[Row]) -> list[dict[str, Any]]:
+    """The tables of a command's summary.
+
+    Args:
+        kind: the command.
+        summary: what it wrote.
+        sessions: of a survey, the rows of `sessions.csv`.
+    """
+    rows = summary["rows"]
+    surveyed = rows[0] if kind == "survey" and rows else summary.get("survey")
+    tables = []
+    if kind != "survey":
+        title = {"train": "Models that were trained", "demo": "Searches through the sensors"}.get(
+            kind, "Results"
+        )
+        tables.append(table_of("rows", title, rows))
+    if summary.get("transfer"):
+        tables.append(table_of("transfer", "In worlds of no examination", summary["transfer"]))
+    if summary.get("planners"):
+        tables.append(table_of("planners", "Planners in the same worlds", summary["planners"]))
+    if summary.get("occupancy_rows"):
+        tables.append(table_of("occupancy_rows", "Against how full the lot is", summary["occupancy_rows"]))
+    if surveyed:
+        tables.append(table_of("survey", "The survey", [surveyed], facts=True))
+        if by_weather := surveyed.get("by_weather"):
+            its = [{"weather": _plain(w), **row} for w, row in by_weather.items()]
+            tables.append(table_of("by_weather", "By weather", its))
+        if found := surveyed.get("detection_by_distance"):
+            its = [{**row, "weather": _plain(row["weather"])} for row in found]
+            tables.append(table_of("detection_by_distance", "How far away cars are found", its))
+    if sessions:
+        kept = [c for c in _SESSION if c in sessions[0]]
+        its = [{c: _plain(row[c]) if c == "weather" else row[c] for c in kept} for row in sessions]
+        tables.append(table_of("sessions", "Drive by drive", its))
+    return tables
+
+
+_SESSION = (
+    "key", "weather", "occupied_fraction", "parked", "found", "detections", "right", "slot_accuracy",
+    "slot_accuracy_seen", "unknown_fraction", "place_error_m", "heading_error_deg", "seconds_per_frame",
+)  # fmt: skip
+
+
+def _plain(word: Any) -> str:
+    return str(word).replace("_", " ")

@@ -1,0 +1,352 @@
+"""`parkenv report`: the page's data are the run's, its replays the run's searches."""
+
+import itertools
+import json
+import re
+import shutil
+import subprocess
+import sys
+
+import jsonschema
+import numpy as np
+import pytest
+
+from parkenv import InputError, ParkingLot, Scenario
+from parkenv.cli.report import make_report
+from parkenv.evaluation.compare import Case
+from parkenv.evaluation.report.intentions import Intentions
+from parkenv.evaluation.report.page import SCHEMA, page_data
+from parkenv.evaluation.report.run_folder import RunFolder
+from parkenv.evaluation.report.search_recording import Encounter, choose, record
+from parkenv.evaluation.report.tables import table_of
+from parkenv.evaluation.results import episode_key
+from parkenv.lot import PARK
+from planners import make_agent
+
+PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
+
+
+def parkenv(*arguments):
+    return subprocess.run(
+        [*PARKENV, *map(str, arguments)], capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+def data_of(page):
+    text = page.read_text(encoding="utf-8")
+    return json.loads(re.search(r'id="report-data">(.*?)</script>', text, flags=re.DOTALL)[1])
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A small comparison, with its report."""
+    out = tmp_path_factory.mktemp("report") / "compare"
+    done = parkenv(
+        "compare", "--scenario", "mini", "--agents", "mdp,belief,mdp-static,oracle", "--failure-cost", "10,30", "-n", 4,
+        "--occupancy-levels", "none", "--seed", 7, "--jobs", 1, "--out", out, "--report",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_the_data_keep_to_the_schema(run):
+    schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+    jsonschema.validate(data_of(run / "report.html"), schema)
+
+
+def test_the_tables_hold_every_number_of_the_summary(run):
+    rows = json.loads((run / "summary.json").read_text())["rows"]
+    (table,) = [t for t in data_of(run / "report.html")["tables"] if t["name"] == "rows"]
+    keys = [column["key"] for column in table["columns"]]
+    same = {column["key"]: column["value"] for column in table["same"]}
+    assert len(table["rows"]) == len(rows)
+    for row, cells in zip(rows, table["rows"], strict=True):
+        shown = same | dict(zip(keys, cells, strict=True))
+        for key, value in row.items():
+            if key.endswith("_ci95"):
+                base = key.removesuffix("_ci95")
+                assert shown[base] == [row[base], *value]
+            elif f"{key}_ci95" not in row and value is not None:
+                assert shown[key] == value
+
+
+def test_every_replayed_search_comes_to_the_total_that_was_counted(run):
+    counted = RunFolder.read(run).totals()
+    worlds = data_of(run / "report.html")["worlds"]
+    searches = [(world, search) for world in worlds for search in world["searches"]]
+    assert len(searches) == 20
+    for world, search in searches:
+        setting = world["setting"] | {"agent": search["agent"], "seed": world["seed"]}
+        key = episode_key(setting)
+        assert search["total_s"] == counted[key] == search["counted_s"]
+        assert search["agrees"] is True
+        parts = sum(search[name] for name in ("drive_s", "failed_s", "walk_s", "gave_up_s"))
+        assert parts == pytest.approx(search["total_s"])
+        assert search["t"][-1] == pytest.approx(100 * (search["drive_s"] + search["failed_s"]), abs=1)
+        assert (
+            len(search["t"]) == len(search["action"]) + 1 == len(search["belief"]) == len(search["plan"]) + 1
+        )
+        assert search["t"] == sorted(search["t"])
+
+
+def test_agents_in_one_world_meet_the_same_cars(run):
+    for world in data_of(run / "report.html")["worlds"]:
+        for search in world["searches"]:
+            if search["parked"]:
+                taken = set(world["taken"])
+                for moment, *slots in world["changes"]:
+                    if moment <= search["t"][-1]:
+                        taken ^= set(slots)
+                assert search["slot"] not in taken
+
+
+def test_a_page_is_one_small_file_that_needs_nothing_else(run):
+    page = run / "report.html"
+    text = page.read_text(encoding="utf-8")
+    assert page.stat().st_size < 10e6
+    without_data = re.sub(r"data:[a-z/+-]+;base64,[A-Za-z0-9+/=]+", "", text)
+    assert not re.findall(r"""(?:src|href)\s*=\s*["'](?!data:|#)[^"']""", without_data)
+    assert re.findall(r"https?://[^\s\"'<>]+", without_data.replace("http://www.w3.org/2000/svg", "")) == []
+    assert text.count("<figure>") == len(list(run.glob("*.png")))
+
+
+def test_the_same_folder_gives_the_same_page(run, tmp_path):
+    made = tmp_path / "again.html"
+    make_report(run, out=made, jobs=2)
+    assert made.read_bytes() == (run / "report.html").read_bytes()
+
+
+def test_searches_can_be_chosen(run, tmp_path):
+    made = tmp_path / "chosen.html"
+    make_report(run, seeds="9,8", agents="belief,oracle", jobs=1, out=made)
+    worlds = data_of(made)["worlds"]
+    assert [w["seed"] for w in worlds] == [9, 9, 8, 8]
+    assert {s["agent"] for w in worlds for s in w["searches"]} == {"belief", "oracle"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"seeds": "99"}, "--seeds has 99; this run's are 7 to 10"),
+        ({"agents": "belief,exact"}, "--agents has 'exact'; in this run: mdp, belief, mdp-static, oracle"),
+    ],
+)
+def test_what_is_not_in_the_run_cannot_be_chosen(run, tmp_path, options, message):
+    with pytest.raises(InputError, match=re.escape(message)):
+        make_report(run, out=tmp_path / "x.html", **options)
+    assert not list(tmp_path.iterdir())
+
+
+def summary_in(folder, **changes):
+    content = {"command": ["parkenv", "bench"], "version": "0.1.0", "seed": 0, "rows": []} | changes
+    (folder / "summary.json").write_text(json.dumps(content))
+    return folder
+
+
+def test_the_command_says_in_one_line_what_is_wrong(tmp_path):
+    done = parkenv("report", tmp_path)
+    assert done.returncode == 2
+    assert (
+        done.stderr
+        == f"parkenv: error: {tmp_path}: holds no summary.json; want a folder that a command with --out wrote\n"
+    )
+
+
+def test_folders_that_hold_no_finished_run_are_refused_in_words(tmp_path):
+    with pytest.raises(InputError, match="no such folder"):
+        RunFolder.read(tmp_path / "nothing")
+    with pytest.raises(InputError, match=r"holds no summary\.json"):
+        RunFolder.read(tmp_path)
+    with pytest.raises(InputError, match=r"written by parkenv 0\.0\.9"):
+        RunFolder.read(summary_in(tmp_path, version="0.0.9"))
+    with pytest.raises(InputError, match="want the summary of a command, with rows"):
+        RunFolder.read(summary_in(tmp_path, rows=None))
+    (tmp_path / "summary.json").write_text('{"command": [')
+    with pytest.raises(InputError, match="is torn"):
+        RunFolder.read(tmp_path)
+    (tmp_path / "summary.json").rename(tmp_path / "summary.partial.json")
+    with pytest.raises(InputError, match="was interrupted; finish it"):
+        RunFolder.read(tmp_path)
+
+
+def test_a_total_that_differs_is_told(run, tmp_path, capsys):
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    lines = (copy / "episodes.csv").read_text().splitlines()
+    column = lines[0].split(",").index("total_s")
+    cells = lines[1].split(",")
+    cells[column] = "1.0"
+    (copy / "episodes.csv").write_text("\n".join([lines[0], ",".join(cells), *lines[2:]]) + "\n")
+    make_report(copy, jobs=1)
+    assert "episodes.csv says 1.00 s" in " ".join(capsys.readouterr().out.split())
+    data = data_of(copy / "report.html")
+    assert len(data["run"]["notes"]) == 1
+    assert sum(s["agrees"] is False for w in data["worlds"] for s in w["searches"]) == 1
+
+
+def test_a_world_that_has_changed_since_is_not_replayed_but_told(tmp_path):
+    lot = tmp_path / "lot.geojson"
+    ParkingLot.packaged("mini").to_file(lot)
+    out = tmp_path / "compare"
+    done = parkenv(
+        "compare", "--lot", lot, "--agents", "mdp,oracle", "-n", 2, "--occupancy-levels", "none", "--no-figures",
+        "--jobs", 1, "--out", out,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    make_report(out, jobs=1)
+    assert len(data_of(out / "report.html")["worlds"]) == 2
+    lot.write_text(lot.read_text() + "\n")
+    make_report(out, jobs=1)
+    data = data_of(out / "report.html")
+    assert data["run"]["notes"] == [f"There is no replay: --lot {lot} has changed since the run"]
+    assert data["worlds"] == []
+    assert len(data["tables"][0]["rows"]) == 2
+
+
+def test_other_commands_get_tables_and_figures(tmp_path):
+    rows = [
+        {"part": "env", "case": "steps", "value": 3.5, "unit": "1/s"},
+        {"part": "env", "case": "resets", "value": None, "unit": "1/s"},
+    ]
+    summary_in(tmp_path, rows=rows)
+    make_report(tmp_path, jobs=1)
+    (table,) = data_of(tmp_path / "report.html")["tables"]
+    assert [row[2] for row in table["rows"]] == [3.5, None]
+
+
+@pytest.mark.parametrize("drives", [False, True])
+def test_learning_curves_are_those_of_the_training(tmp_path, drives):
+    """Of searches one panel, of driving one for each kind of slot."""
+    names = ["oblique_success", "parallel_success"] if drives else ["total_s"]
+    (tmp_path / "seed_3").mkdir()
+    examinations = [["steps", *names], ["0", *("0.25" for _ in names)], ["500", *("0.5" for _ in names)]]
+    (tmp_path / "seed_3" / "curve.csv").write_text("\n".join(",".join(row) for row in examinations) + "\n")
+    ends = ("low", "high") if drives else ("low_s", "high_s")
+    curves = [
+        [
+            {"steps": steps, name: value, ends[0]: None, ends[1]: None}
+            for steps, value in ((0.0, 0.25), (500.0, 0.5))
+        ]
+        for name in names
+    ]
+    kinds = [name.removesuffix("_success") for name in names]
+    summary_in(
+        tmp_path,
+        command=["parkenv", "train"],
+        rows=[{"agent": "ppo", "scenario": "campus,street", "seed": 3, "success": 0.5}],
+        examined=dict.fromkeys(kinds, 1.0) if drives else {"mdp": 80.0, "clairvoyant bound": 60.0},
+        curve=dict(zip(kinds, curves, strict=True)) if drives else curves[0],
+    )
+    data = page_data(RunFolder.read(tmp_path))
+    jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
+    assert data["run"]["title"] == "ppo trained on campus and street"
+    assert [panel["title"] for panel in data["learning"]] == (kinds if drives else ["total time, s"])
+    for panel in data["learning"]:
+        assert panel["mean"] == [[0.0, 0.25, None, None], [500.0, 0.5, None, None]]
+        assert panel["seeds"] == [[[0.0, 0.25], [500.0, 0.5]]]
+        assert panel["lines"] == (
+            [["planner", 1.0]] if drives else [["mdp", 80.0], ["clairvoyant bound", 60.0]]
+        )
+
+
+def test_text_in_the_data_cannot_end_its_element(tmp_path):
+    nasty = "</script><script>alert(1)</script>"
+    summary_in(tmp_path, rows=[{"case": nasty}, {"case": "b"}], command=["parkenv", "bench", nasty])
+    make_report(tmp_path, jobs=1)
+    assert nasty not in (tmp_path / "report.html").read_text()
+    assert data_of(tmp_path / "report.html")["tables"][0]["rows"] == [[nasty], ["b"]]
+
+
+def test_searches_are_chosen_in_turns_over_settings():
+    mini = Scenario.named("mini")
+    cases = [
+        (Case(mini.replace(failure_s=cost), agent), range(5, 9))
+        for cost in (1.0, 2.0)
+        for agent in ("mdp", "oracle")
+    ]
+    chosen = choose(cases, 7)
+    assert [(e.cases[0].scenario.failure_s, e.seed) for e in chosen] == [(1.0, 5), (2.0, 5), (1.0, 6)]
+    assert len(choose(cases, 1)) == 1
+
+
+@pytest.mark.parametrize(
+    "name", ["mdp", "mdp-tuned", "belief", "greedy-goal", "first-free", "oracle", "random"]
+)
+def test_plans_are_ways_that_can_be_driven_and_begin_with_what_is_done(name):
+    scenario = Scenario.named("campus")
+    recorded = record(Encounter((Case(scenario, name),), 3), {})
+    (search,), neighbors = recorded["searches"], scenario.lot.neighbors
+    assert search["agrees"] is None
+    plan, planned = [], 0
+    for k, (action, vertex) in enumerate(zip(search["action"], search["vertex"], strict=False)):
+        if search["plan"][k] is not None:
+            plan = search["plan"][k]
+        elif k and vertex != search["vertex"][k - 1]:
+            plan = plan[1:]
+        way = [vertex, *plan]
+        assert all(b in neighbors[a] for a, b in itertools.pairwise(way))
+        if plan and action < PARK:
+            assert plan[0] == neighbors[vertex, action]
+        planned += bool(plan)
+    assert planned == 0 if name == "random" else planned > len(search["action"]) / 2
+
+
+def test_asking_belief_for_its_plan_changes_nothing():
+    scenario = Scenario.named("mini")
+    case = Case(scenario, "belief")
+    recorded = record(Encounter((case,), 11), {})["searches"][0]
+    assert recorded["total_s"] == case.run([11])[0][0]["total_s"]
+
+    agent = make_agent("belief", scenario)
+    observation = {
+        "vertex": np.int64(scenario.lot.entry_vertices[0]), "time": np.array([3e4, 0.0], dtype=np.float32),
+        "p_occupied": np.full(10, 0.5, dtype=np.float32),
+    }  # fmt: skip
+    action, memory = agent.predict(observation)
+    before = [np.array(v) for v in (memory.kind, memory.p_occupied, memory.targets)]
+    ahead = Intentions(scenario.public(), agent).ahead(
+        observation, int(observation["vertex"]), int(action), memory
+    )
+    assert ahead
+    for old, new in zip(before, (memory.kind, memory.p_occupied, memory.targets), strict=True):
+        np.testing.assert_array_equal(old, new)
+
+
+def test_intervals_and_nested_figures_become_cells():
+    table = table_of(
+        "x", "X", [{"a_s": 1.0, "a_s_ci95": [0.5, 2.0], "error_m": {"median": 0.1, "p95": 0.3}, "list": [{}]}]
+    )
+    assert [c["key"] for c in table["columns"]] == ["a_s", "error_m.median", "error_m.p95"]
+    assert table["rows"] == [[[1.0, 0.5, 2.0], 0.1, 0.3]]
+
+
+@pytest.mark.slow
+def test_a_survey_is_driven_again(tmp_path):
+    out = tmp_path / "survey"
+    done = parkenv(
+        "survey", "--scenario", "mini", "-n", 2, "--every", 4, "--weather", "sunny", "--jobs", 1, "--out", out,
+        "--report",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    data = data_of(out / "report.html")
+    jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
+    (drive,), sessions = data["drives"], RunFolder.read(out).table("sessions.csv")
+    assert drive["key"] == sessions[0]["key"]
+    assert drive["slot_accuracy"] == sessions[0]["slot_accuracy"]
+    assert (drive["found"], drive["parked"]) == (sessions[0]["found"], sessions[0]["parked"])
+    assert drive["captures"] == len(drive["frames"])
+    judged = {}
+    for frame in drive["frames"]:
+        judged |= dict(zip(frame["belief"][::2], frame["belief"][1::2], strict=True))
+    assert np.mean([value >= 0 for value in judged.values()]) > 0.5
+    assert (out / "report.html").stat().st_size < 10e6
+
+    made = tmp_path / "short.html"
+    make_report(out, frames=6, sessions=2, jobs=1, out=made)
+    assert [len(d["frames"]) <= 4 for d in data_of(made)["drives"]] == [True, True]
+
+
+def test_data_without_replays_are_valid_too(tmp_path):
+    run = RunFolder.read(summary_in(tmp_path))
+    jsonschema.validate(page_data(run, notes=["a"]), json.loads(SCHEMA.read_text(encoding="utf-8")))

@@ -1,0 +1,286 @@
+"""The report in a real browser: it loads without a complaint, plays, steps, sorts, and shows the summary's numbers."""
+
+import json
+import shutil
+import subprocess
+import sys
+import time
+
+import pytest
+
+webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed (extra dev)")
+
+from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
+from selenium.webdriver.common.by import By  # noqa: E402
+from selenium.webdriver.common.keys import Keys  # noqa: E402
+
+from parkenv.cli.report import make_report  # noqa: E402
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+DRIVER = shutil.which("chromedriver")
+pytestmark = [
+    pytest.mark.skipif(
+        not (CHROMIUM and DRIVER), reason="chromium or its driver (Debian: chromium-driver) is not here"
+    ),
+    # The browser's driver talks through sockets that its library leaves to be closed by the collector.
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+]
+FLAGS = (
+    "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--no-first-run", "--disable-dev-shm-usage",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A comparison in two settings."""
+    out = tmp_path_factory.mktemp("browser") / "compare"
+    command = [
+        "compare", "--scenario", "mini", "--agents", "mdp,first-free,greedy-goal,oracle", "--failure-cost", "10,30",
+        "-n", "6", "--occupancy-levels", "none", "--jobs", "1", "--out", str(out),
+    ]  # fmt: skip
+    subprocess.run(
+        [sys.executable, "-c", "from parkenv.cli import main; main()", *command],
+        check=True,
+        capture_output=True,
+    )
+    make_report(out, jobs=1)
+    return out
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    yield driver
+    driver.quit()
+
+
+def screen(browser, width, height=900, *, dark=False):
+    """The size of the window, and what the reader's system prefers."""
+    size = {"width": width, "height": height, "deviceScaleFactor": 2, "mobile": width < 500}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+    # Without motion a page that scrolls is where it is going at once.
+    still = {"name": "prefers-reduced-motion", "value": "reduce"}
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [scheme, still]})
+
+
+@pytest.fixture
+def page(browser, run):
+    screen(browser, 1400)
+    browser.get((run / "report.html").as_uri())
+    yield browser
+    assert browser.get_log("browser") == []
+
+
+def one(page, css):
+    return page.find_element(By.CSS_SELECTOR, css)
+
+
+def every(page, css):
+    return page.find_elements(By.CSS_SELECTOR, css)
+
+
+def seconds(page):
+    return float(one(page, "#replay input[type=range]").get_attribute("value"))
+
+
+def cells(page, key):
+    """Values of a column of the results, from top to bottom as they stand."""
+    found = every(page, f'table[data-table="rows"] td[data-key="{key}"]')
+    return [json.loads(cell.get_attribute("data-value")) for cell in found if cell.is_displayed()]
+
+
+def painted(page, css):
+    """How many colours there are on a canvas."""
+    script = """
+    const c = document.querySelector(arguments[0]);
+    const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+    const seen = new Set();
+    for (let i = 0; i < d.length; i += 16) seen.add(d[i] * 65536 + d[i + 1] * 256 + d[i + 2]);
+    return seen.size;
+    """
+    return page.execute_script(script, css)
+
+
+def test_its_numbers_are_those_of_the_summary(page, run):
+    rows = json.loads((run / "summary.json").read_text())["rows"]
+    assert cells(page, "agent") == [row["agent"] for row in rows]
+    assert cells(page, "total_s") == [[row["total_s"], *row["total_s_ci95"]] for row in rows]
+    assert cells(page, "difference_s") == [[row["difference_s"], *row["difference_s_ci95"]] for row in rows]
+    assert cells(page, "walk_s") == [row["walk_s"] for row in rows]
+    shown = [cell.text for cell in every(page, 'table[data-table="rows"] td[data-key="total_s"]')]
+    for text, row in zip(shown, rows, strict=True):
+        low, high = row["total_s_ci95"]
+        assert text == f"{row['total_s']:.1f}[{low:.1f}, {high:.1f}]"
+    labels = [svg.get_attribute("aria-label") for svg in every(page, "#chart .grid svg")]
+    assert ", ".join(labels) == ", ".join(f"{row['agent']} {row['total_s']:.1f} s" for row in rows)
+
+
+def test_tables_sort_by_click_and_by_enter(page):
+    before = cells(page, "total_s")
+    heading = one(page, 'table[data-table="rows"] th[data-key="total_s"]')
+    heading.find_element(By.TAG_NAME, "button").click()
+    assert heading.get_attribute("aria-sort") == "ascending"
+    assert cells(page, "total_s") == sorted(before)
+    heading.find_element(By.TAG_NAME, "button").send_keys(Keys.ENTER)
+    assert heading.get_attribute("aria-sort") == "descending"
+    assert cells(page, "total_s") == sorted(before, reverse=True)
+    word = one(page, 'table[data-table="rows"] th[data-key="agent"]')
+    word.find_element(By.TAG_NAME, "button").send_keys(Keys.SPACE)
+    assert cells(page, "agent") == sorted(cells(page, "agent"))
+    assert heading.get_attribute("aria-sort") == "none"
+
+
+def test_a_setting_can_be_looked_at_alone(page):
+    chips = every(page, "#tables .chips button")
+    assert len(chips) == 3
+    chips[2].click()
+    assert len(cells(page, "agent")) == 4
+    chips[0].click()
+    assert len(cells(page, "agent")) == 8
+
+
+def test_it_plays_and_pauses(page):
+    assert seconds(page) == 0.0
+    play = one(page, "#replay .play")
+    play.click()
+    time.sleep(0.8)
+    play.click()
+    stopped = seconds(page)
+    assert stopped > 0.5
+    time.sleep(0.3)
+    assert seconds(page) == stopped
+
+
+def test_the_keyboard_plays_and_steps(page, run):
+    data = json.loads(one(page, "#report-data").get_attribute("textContent"))
+    shown = {panel.get_attribute("data-agent") for panel in every(page, "#replay .panel")}
+    searches = [s for s in data["worlds"][0]["searches"] if s["agent"] in shown]
+    moments = sorted({t / 100 for s in searches for t in s["t"]} | {s["total_s"] for s in searches})
+    keys = ActionChains(page)
+    for expected in moments[1:6]:
+        keys.send_keys(Keys.ARROW_RIGHT).perform()
+        assert seconds(page) == pytest.approx(expected, abs=0.006)
+    keys.send_keys(Keys.ARROW_LEFT).perform()
+    assert seconds(page) == pytest.approx(moments[4], abs=0.006)
+    keys.send_keys(Keys.SPACE).perform()
+    assert one(page, "#replay .play").get_attribute("aria-label") == "Pause"
+    keys.send_keys(Keys.SPACE).perform()
+    assert one(page, "#replay .play").get_attribute("aria-label") == "Play"
+
+
+def test_the_end_of_a_replay_is_the_end_of_the_search(page):
+    data = json.loads(one(page, "#report-data").get_attribute("textContent"))
+    slider = one(page, "#replay input[type=range]")
+    page.execute_script(
+        "arguments[0].value = arguments[0].max; arguments[0].dispatchEvent(new Event('input'))", slider
+    )
+    panels = every(page, "#replay .panel")
+    assert len(panels) == 2
+    for panel in panels:
+        agent = panel.get_attribute("data-agent")
+        (search,) = [s for s in data["worlds"][0]["searches"] if s["agent"] == agent]
+        assert int(panel.get_attribute("data-vertex")) == search["vertex"][-1]
+        assert panel.find_element(By.CSS_SELECTOR, ".clock").text == f"{search['total_s']:.1f} s"
+        assert "at the goal" in panel.find_element(By.CSS_SELECTOR, ".status").text
+        parts = [float(b.text) for b in panel.find_elements(By.CSS_SELECTOR, ".split b")]
+        assert sum(parts) == pytest.approx(search["total_s"], abs=0.2)
+        assert panel.find_element(By.CSS_SELECTOR, ".check").text == "✓ as counted"
+    # Back at the start, everything is as it was before.
+    ActionChains(page).send_keys(Keys.ARROW_LEFT).perform()
+    one(page, "#replay button[aria-label='To the start']").click()
+    assert all(
+        int(p.get_attribute("data-vertex")) == data["worlds"][0]["searches"][0]["vertex"][0] for p in panels
+    )
+
+
+def test_one_to_four_agents_stand_side_by_side(page):
+    names = ["mdp", "first-free", "greedy-goal", "oracle"]
+    for name in names[2:]:
+        one(page, f'#replay .chip[data-agent="{name}"]').click()
+    assert [p.get_attribute("data-agent") for p in every(page, "#replay .panel")] == names
+    assert painted(page, "#replay .panel canvas") > 20
+    for name in names:
+        one(page, f'#replay .chip[data-agent="{name}"]').click()
+    # The last one stays.
+    assert [p.get_attribute("data-agent") for p in every(page, "#replay .panel")] == ["oracle"]
+
+
+def test_another_world_can_be_chosen(page):
+    data = json.loads(one(page, "#report-data").get_attribute("textContent"))
+    last = len(data["worlds"]) - 1
+    choice = one(page, "#world")
+    choice.find_elements(By.TAG_NAME, "option")[last].click()
+    panel = one(page, "#replay .panel")
+    (search,) = [
+        s for s in data["worlds"][last]["searches"] if s["agent"] == panel.get_attribute("data-agent")
+    ]
+    assert float(panel.get_attribute("data-total")) == search["total_s"]
+
+
+@pytest.mark.slow
+def test_a_survey_drive_is_shown_in_step(browser, tmp_path):
+    command = [
+        "survey",
+        "--scenario",
+        "mini",
+        "-n",
+        "1",
+        "--every",
+        "4",
+        "--jobs",
+        "1",
+        "--report",
+        "--out",
+        str(tmp_path),
+    ]
+    subprocess.run(
+        [sys.executable, "-c", "from parkenv.cli import main; main()", *command],
+        check=True,
+        capture_output=True,
+    )
+    screen(browser, 1400)
+    browser.get((tmp_path / "report.html").as_uri())
+    (drive,) = json.loads(one(browser, "#report-data").get_attribute("textContent"))["drives"]
+    slider = one(browser, "#drive input[type=range]")
+    for k in range(1, len(drive["frames"])):
+        one(browser, "#drive .step-on").click()
+        assert float(slider.get_attribute("value")) == pytest.approx(drive["frames"][k]["t"], abs=0.006)
+    facts = [b.text for b in every(browser, "#drive .facts b")]
+    judged = {}
+    for frame in drive["frames"]:
+        judged |= dict(zip(frame["belief"][::2], frame["belief"][1::2], strict=True))
+    assert int(facts[1]) == sum(value >= 0 for value in judged.values())
+    time.sleep(0.5)
+    # The camera's frame has been decoded and drawn; so have three pictures of the lot.
+    assert painted(browser, "#drive .panel canvas") > 500
+    assert len(every(browser, "#drive canvas")) == 4
+    (row,) = json.loads((tmp_path / "summary.json").read_text())["rows"]
+    cell = one(browser, 'table[data-table="survey"] td[data-key="car_detection_rate"]')
+    assert json.loads(cell.get_attribute("data-value")) == row["car_detection_rate"]
+    assert browser.get_log("browser") == []
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_it_fits_a_phone_and_follows_the_theme(browser, run, dark):
+    screen(browser, 390, 844, dark=dark)
+    browser.get((run / "report.html").as_uri())
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
+    assert browser.execute_script("return document.documentElement.dataset.theme") == (
+        "dark" if dark else "light"
+    )
+    paper = browser.execute_script("return getComputedStyle(document.body).backgroundColor")
+    red = int(paper.removeprefix("rgb(").split(",")[0])
+    assert red < 60 if dark else red > 200
+    assert len(every(browser, "#replay .panel")) == 1
+    assert painted(browser, "#replay .panel canvas") > 20
+    before = browser.execute_script("return document.documentElement.dataset.theme")
+    one(browser, "#theme").click()
+    assert browser.execute_script("return document.documentElement.dataset.theme") != before
+    assert browser.get_log("browser") == []
