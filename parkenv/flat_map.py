@@ -21,7 +21,7 @@ class FlatMap:
     Raises:
         InputError: no probability.
 
-    Example:
+    Examples:
         >>> from parkenv import Scenario
         >>> mini = Scenario.named("mini")
         >>> FlatMap(1.0, mini.occupancy).forecast(Arrival(0.0)).p_occupied[:2].tolist()

@@ -28,7 +28,7 @@ class LocalFrame:
     Raises:
         InputError: no place on the globe.
 
-    Example:
+    Examples:
         >>> frame = LocalFrame(lon=7.85, lat=48.0)
         >>> frame.to_xy([[7.85, 48.0]]).round(3).tolist()
         [[0.0, 0.0]]

@@ -101,7 +101,7 @@ class ParkingLot:
         InputError: a wrong shape, a value that is not finite, a repeated id, no slot, entry or goal.
         GraphError: slots or entries that no lane serves, or more than four lanes out of one junction.
 
-    Example:
+    Examples:
         >>> lot = ParkingLot.packaged("mini")
         >>> lot.n_slots
         10

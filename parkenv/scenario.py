@@ -177,7 +177,7 @@ class Scenario(SearchProblem):
         Raises:
             InputError: an unknown name; the message lists the known ones.
 
-        Example:
+        Examples:
             >>> scenario = Scenario.named("campus", failure_s=90.0)
             >>> scenario.lot.name, scenario.failure_s
             ('campus', 90.0)

@@ -106,7 +106,7 @@ class SightingModel:
         Raises:
             InputError: another name.
 
-        Example:
+        Examples:
             >>> SightingModel.named("laser").view_range
             16.0
         """

@@ -76,7 +76,7 @@ class ExactSolution:
     Raises:
         InputError: more than `MOST_SLOTS` slots or `most_states` states, or looks that may err.
 
-    Example:
+    Examples:
         >>> from parkenv import ParkingLot
         >>> problem = SearchProblem(lot=ParkingLot.packaged("mini"), give_up_s=300.0)
         >>> entry = int(problem.lot.entry_vertices[0])

@@ -34,7 +34,7 @@ def expected_time(agent: Agent, problem: SearchProblem, p_occupied: ArrayLike, v
     Raises:
         InputError: looks that may err, or a forecast that is not one.
 
-    Example:
+    Examples:
         >>> from parkenv import ParkingLot
         >>> from planners import make_agent
         >>> from planners.exact import ExactSolution

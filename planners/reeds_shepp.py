@@ -241,7 +241,7 @@ def reeds_shepp(
     Returns:
         (k,) signed lengths in m, below 0 backward, and (k,) turns, `LEFT`, `STRAIGHT` or `RIGHT`.
 
-    Example:
+    Examples:
         >>> length, turn = reeds_shepp(np.zeros(3), np.array([0.0, 2.0, np.pi]), radius=1.0)
         >>> bool(np.isclose(np.abs(length).sum(), np.pi))
         True

@@ -104,7 +104,7 @@ class SensorRig:
     Raises:
         SensorError: no sensor at all, or a name that stands twice.
 
-    Example:
+    Examples:
         >>> rig = SensorRig.thesis()
         >>> [name for name, _, _ in rig.cameras], [name for name, _, _ in rig.lasers]
         (['right'], ['laser'])

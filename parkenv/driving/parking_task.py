@@ -118,7 +118,7 @@ class ParkingTasks:
         InputError: a value out of its range; a slot that is not there, or that the car does not fit into; no slot of
             these kinds that it fits into.
 
-    Example:
+    Examples:
         >>> task = ParkingTasks(ParkingLot.packaged("campus"), kinds=("oblique",)).draw(7)
         >>> task.kind, task.slot_id[0], task.size
         ('oblique', 'F', (5.0, 2.5))

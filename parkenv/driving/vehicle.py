@@ -43,7 +43,7 @@ class VehicleParameters:
         InputError: a value that is not a finite number above 0, axles outside the car, steering of a right angle
             or more, or a speed that carries the car over more than half its length in a step of the physics.
 
-    Example:
+    Examples:
         >>> round(VehicleParameters().turning_radius, 2)
         4.0
     """
@@ -205,7 +205,7 @@ def drive(
         steering: -1 to 1, of the greatest angle.
         steps: of the physics.
 
-    Example:
+    Examples:
         >>> path = drive(VehicleParameters(), np.zeros(6), 1.0, 0.0, steps=40)
         >>> round(float(path[-1, X]), 1), round(float(path[-1, SPEED]), 1)
         (3.8, 3.9)

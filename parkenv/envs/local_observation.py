@@ -180,7 +180,7 @@ class LocalObservation(
         TypeError: another environment.
         InputError: k is not a whole number of at least 1.
 
-    Example:
+    Examples:
         >>> import gymnasium as gym
         >>> import parkenv
         >>> env = LocalObservation(gym.make("parkenv/Search-v0", scenario="mini"), k=5)

@@ -108,7 +108,7 @@ def clock(time: float) -> str:
     Args:
         time: s since Monday 00:00.
 
-    Example:
+    Examples:
         >>> clock(86400.0 + 34867.0)
         'Tue 09:41:07'
     """

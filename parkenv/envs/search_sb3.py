@@ -37,7 +37,7 @@ class SearchVecEnv(VecEnv):  # type: ignore[misc]
     Raises:
         InputError: an argument out of its range, by name.
 
-    Example:
+    Examples:
         >>> venv = SearchVecEnv(4, "mini")
         >>> venv.seed(0)
         [0, 1, 2, 3]

@@ -15,7 +15,7 @@ class ThesisReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
     It differs from the environment's by the constant r_max, the walk from the farthest slot, paid on
     success. `info["reward_terms"]` gains the term `r_max`, so that the terms still add up.
 
-    Example:
+    Examples:
         >>> import gymnasium as gym
         >>> import parkenv
         >>> env = ThesisReward(gym.make("parkenv/Search-v0", scenario="mini"))

@@ -95,7 +95,7 @@ class Suite:
         Raises:
             InputError: there is none of that name; the message lists those there are.
 
-        Example:
+        Examples:
             >>> suite = Suite.named("v1")
             >>> suite.tasks[0].name, len(suite.seeds)
             ('campus', 1000)

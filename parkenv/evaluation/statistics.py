@@ -23,7 +23,7 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, f
         Mean, lower and upper end. The ends equal the mean where all values are the same, and are NaN
         where there are fewer than two. The resampling has a fixed seed: equal samples, equal intervals.
 
-    Example:
+    Examples:
         >>> mean_interval([1.0, 1.0, 1.0])
         (1.0, 1.0, 1.0)
     """

@@ -43,7 +43,7 @@ class Workers:
     Raises:
         InputError: an unknown backend, an extra that is not installed, or nobody listens at the address.
 
-    Example:
+    Examples:
         >>> with Workers(jobs=1) as workers:
         ...     sorted(workers.results([int, float]))
         [(0, 0), (1, 0.0)]

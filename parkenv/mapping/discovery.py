@@ -65,7 +65,7 @@ def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSl
     Raises:
         InputError: a wrong shape, a number that is not finite, a reach that is not above 0, or no least car.
 
-    Example:
+    Examples:
         >>> found = discover(np.array([[0.0, 0.1, 1.6], [0.1, 0.0, 4.7], [-0.1, 0.0, 1.5], [2.5, 0.0, 1.6]]))
         >>> found.xy.round(1).tolist(), found.cars.tolist()
         ([[0.0, 0.0]], [3])

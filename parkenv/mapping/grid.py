@@ -39,7 +39,7 @@ class OccupancyGrid:
     Raises:
         InputError: an area or a cell without size.
 
-    Example:
+    Examples:
         >>> grid = OccupancyGrid((0.0, 0.0), (15.0, 4.0), 0.5)
         >>> grid.update((0.25, 2.25), 0.0, math.radians(20.0), np.array([[0.0, 6.0]]))
         >>> [round(float(grid.probability[4, column]), 2) for column in (4, 13, 22)]

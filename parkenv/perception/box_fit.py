@@ -61,7 +61,7 @@ def fit_box(
     Raises:
         InputError: no point, or one that is not finite.
 
-    Example:
+    Examples:
         >>> front = np.stack([np.linspace(-0.9, 0.9, 30), np.full(30, 4.0)], axis=1)
         >>> car = fit_box(front, np.zeros(2), end_on=True)
         >>> round(car.x, 6), round(car.y, 6), round(math.degrees(car.yaw)), round(car.seen_width, 6)

@@ -48,7 +48,7 @@ class Descriptor:
     Raises:
         InputError: a size that is not whole cells, or an unknown normalization.
 
-    Example:
+    Examples:
         >>> Descriptor(128, 64).size, Descriptor(128, 128).size, Descriptor(128, 64, "blocks").size
         (1152, 2304, 3780)
     """

@@ -109,7 +109,7 @@ _UNITS = (("_kmh", "km/h"), ("_ms", "ms"), ("_s", "s"), ("_m", "m"), ("_deg", "Â
 def column_of(key: str) -> Column:
     """How a column is shown; one that nobody has described is named after its key.
 
-    Example:
+    Examples:
         >>> column_of("total_s").label, column_of("brake_distance_m")[:3]
         ('total time', ('brake_distance_m', 'brake distance', 'm'))
     """
