@@ -132,6 +132,7 @@ def test_lines_against_occupancy_are_labelled_where_they_end(tmp_path):
 @pytest.mark.parametrize(
     ("places", "want"),
     [
+        ([], []),
         ([0.5], [0.5]),
         ([0.2, 0.5], [0.2, 0.5]),
         ([0.5, 0.5], [0.5, 0.6]),

@@ -272,7 +272,7 @@ def spread(places: Sequence[float], gap: float) -> FloatArray:
     spread = np.array(places, dtype=np.float64)
     for i in range(1, len(spread)):
         spread[i] = max(spread[i], spread[i - 1] + gap)
-    spread[-1] = min(spread[-1], max(1.0, gap * (len(spread) - 1)))
+    spread[-1:] = np.minimum(spread[-1:], max(1.0, gap * (len(spread) - 1)))
     for i in range(len(spread) - 2, -1, -1):
         spread[i] = min(spread[i], spread[i + 1] - gap)
     return spread
