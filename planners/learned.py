@@ -26,10 +26,14 @@ ALGORITHMS = {
     "ppo": ("stable_baselines3", "PPO"),
     "maskable-ppo": ("sb3_contrib", "MaskablePPO"),
     "recurrent-ppo": ("sb3_contrib", "RecurrentPPO"),
+    "sac": ("stable_baselines3", "SAC"),
+    "tqc": ("sb3_contrib", "TQC"),
 }
 """Names of algorithms, and where they are."""
 OBSERVATION = "local-1"
 """Of `parkenv.envs.local_observation`: a model of another layout would read nonsense."""
+TASKS = {"search": "parkenv compare", "drive": "parkenv park"}
+"""What models are trained for, and which command runs them."""
 _CARD = "parkenv.json"
 _FORMAT = "parkenv-model"
 _VERSION = 1
@@ -41,13 +45,14 @@ class ModelCard:
 
     Args:
         algorithm: one of `ALGORITHMS`.
-        scenarios: names of those it was trained on.
-        k: how many slots its observation tells of.
+        scenarios: names of those it was trained on; of lots, if it drives.
+        k: how many slots its observation tells of; 0, if it drives.
         observation: the layout of that.
         seed: of the training.
         steps: decisions made in training.
         settings: of the algorithm, as its recipe states them.
         parkenv: version of the package that trained it.
+        task: one of `TASKS`.
     """
 
     algorithm: str
@@ -58,6 +63,7 @@ class ModelCard:
     steps: int
     settings: Mapping[str, Any]
     parkenv: str
+    task: str = "search"
 
     @classmethod
     def of_file(cls, path: str | os.PathLike[str]) -> Self:
@@ -104,6 +110,37 @@ def algorithm_class(name: str) -> Any:
         raise InputError(f'{name} needs the extra rl: pip install "parkenv[rl]"') from error
 
 
+def load_model(
+    algorithm: str, path: str | os.PathLike[str], task: str, observation: str
+) -> tuple[ModelCard, Any]:
+    """What a file says of its model, and the model.
+
+    Args:
+        algorithm: that made it.
+        path: the model file.
+        task: one of `TASKS`.
+        observation: the layout that is observed.
+
+    Raises:
+        InputError: a file that is no model, of another algorithm, another task or another observation.
+    """
+    card = ModelCard.of_file(path)
+    if card.algorithm != algorithm:
+        raise InputError(f"{path}: is a model of {card.algorithm}, not of {algorithm}")
+    if card.task != task:
+        raise InputError(
+            f"{path}: was trained to {card.task}, not to {task}; `{TASKS.get(card.task, 'another parkenv')}` runs it"
+        )
+    if card.observation != observation:
+        raise InputError(
+            f"{path}: observes {card.observation!r}, this version of parkenv gives {observation!r}; "
+            f"it was trained with parkenv {card.parkenv}"
+        )
+    # A model that learns no more needs no memory, and hindsight none of an environment's goals.
+    unneeded: dict[str, Any] = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
+    return card, algorithm_class(algorithm).load(Path(path), device="cpu", custom_objects=unneeded)
+
+
 class LearnedAgent:
     """A trained model as an agent; it observes what `parkenv.envs.local_observation` says, on any lot.
 
@@ -113,7 +150,7 @@ class LearnedAgent:
         path: the model file.
 
     Raises:
-        InputError: a file that is no model, of another algorithm or another observation.
+        InputError: a file that is no model, of another algorithm, another task or another observation.
 
     Attributes:
         card: what the file says of itself.
@@ -125,16 +162,8 @@ class LearnedAgent:
     ) -> None:
         self.name = f"{algorithm}:{path}"
         self.problem = problem.public() if isinstance(problem, Scenario) else problem
-        self.card = ModelCard.of_file(path)
-        if self.card.algorithm != algorithm:
-            raise InputError(f"{path}: is a model of {self.card.algorithm}, not of {algorithm}")
-        if self.card.observation != OBSERVATION:
-            raise InputError(
-                f"{path}: observes {self.card.observation!r}, this version of parkenv gives {OBSERVATION!r}; "
-                f"it was trained with parkenv {self.card.parkenv}"
-            )
+        self.card, self.model = load_model(algorithm, path, "search", OBSERVATION)
         self.local_k = self.card.k
-        self.model = algorithm_class(algorithm).load(Path(path), device="cpu")
 
     def predict(
         self,

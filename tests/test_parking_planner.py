@@ -280,7 +280,7 @@ def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
     from parkenv.evaluation import parking_runs
 
     no_room = SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0)
-    monkeypatch.setattr(parking_runs, "ParkingAgent", lambda: ParkingAgent(search=no_room))
+    monkeypatch.setattr(parking_runs, "make_driver", lambda name: ParkingAgent(search=no_room))
     out = tmp_path / "park"
     options = ["--lot", "mini", "--way", "back-in", "--episodes", "2", "--slack", "0", "--out", str(out)]
     result = CliRunner().invoke(app, ["park", "--seed", "3", *options])

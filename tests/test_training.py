@@ -24,8 +24,9 @@ from parkenv.errors import InputError
 from parkenv.evaluation.cloning import Demonstrations, clone
 from parkenv.evaluation.compare import Case
 from parkenv.evaluation.learning_curves import across_seeds, save_learning_curves
-from parkenv.evaluation.recipes import MAX_STEPS, RECIPES
-from parkenv.evaluation.rl_training import Training, examined, read_curve, search_times, train_one
+from parkenv.evaluation.recipes import DRIVE_RECIPES, MAX_STEPS, RECIPES
+from parkenv.evaluation.rl_training import read_curve, train_one
+from parkenv.evaluation.search_training import SearchTraining, examined, search_times
 from parkenv.scenario import Scenario
 from planners.agent import make_agent
 from planners.learned import ALGORITHMS, LearnedAgent, ModelCard
@@ -39,7 +40,7 @@ EXAMINED = range(2_000_000, 2_000_020)
 def trained(tmp_path_factory):
     """A short training in a folder."""
     folder = tmp_path_factory.mktemp("trained")
-    training = Training("maskable-ppo", (SCENARIO,), EXAMINED, 80_000, 32_768)
+    training = SearchTraining("maskable-ppo", 80_000, 32_768, (SCENARIO,), EXAMINED)
     train_one(training, 0, folder)
     return folder
 
@@ -124,7 +125,7 @@ def test_a_model_learns_to_park_and_evaluate_policy_agrees_with_compare(trained)
 
 
 def test_equal_seeds_give_equal_trainings_and_another_seed_another(trained, tmp_path):
-    training = Training("maskable-ppo", (SCENARIO,), EXAMINED, 80_000, 32_768)
+    training = SearchTraining("maskable-ppo", 80_000, 32_768, (SCENARIO,), EXAMINED)
     again, other = (train_one(training, seed, tmp_path / str(seed)).curve for seed in (0, 1))
     before = read_curve(trained / "curve.csv")
     assert [row["total_s"] for row in again] == [row["total_s"] for row in before]
@@ -136,7 +137,7 @@ def test_a_training_goes_on_from_its_checkpoint(trained, tmp_path):
     folder = tmp_path / "gone_on"
     shutil.copytree(trained, folder)
     before = read_curve(folder / "curve.csv")
-    longer = Training("maskable-ppo", (SCENARIO,), EXAMINED, 110_000, 32_768)
+    longer = SearchTraining("maskable-ppo", 110_000, 32_768, (SCENARIO,), EXAMINED)
     curve = longer.train(0, folder)
     assert curve[: len(before)] == before
     assert curve[-1]["steps"] >= 110_000
@@ -163,11 +164,12 @@ def test_imitation_begins_near_the_planner():
 def test_what_cannot_imitate_says_so():
     shown = Demonstrations.collect("mdp", SCENARIO, range(5_000_000, 5_000_002))
     with pytest.raises(InputError, match="dqn cannot begin by imitation"):
-        Training("dqn", (SCENARIO,), EXAMINED, 10, 10, demonstrations=shown)
+        SearchTraining("dqn", 10, 10, (SCENARIO,), EXAMINED, demonstrations=shown)
 
 
 def test_a_model_runs_on_lots_that_it_was_not_trained_on(trained):
-    row = search_times("maskable-ppo", trained / "model.zip", Scenario.named("campus"), range(4))
+    campus = Scenario.named("campus")
+    row = search_times(LearnedAgent(campus, "maskable-ppo", trained / "model.zip"), campus, range(4))
     assert row["episodes"] == 4
 
 
@@ -212,7 +214,7 @@ def test_a_mask_that_allows_nothing_is_refused(trained):
 
 
 def test_every_algorithm_has_a_recipe():
-    assert RECIPES.keys() == ALGORITHMS.keys()
+    assert RECIPES.keys() | DRIVE_RECIPES.keys() == ALGORITHMS.keys()
 
 
 def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
@@ -232,7 +234,7 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", sorted(ALGORITHMS))
+@pytest.mark.parametrize("algorithm", sorted(RECIPES))
 def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp_path, algorithm):
     out = tmp_path / "out"
     arguments = [
@@ -270,6 +272,14 @@ def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp
     ("arguments", "wanted"),
     [
         (["sarsa"], "ALGORITHM is 'sarsa', want one of"),
+        (["sac"], "ALGORITHM is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn for search"),
+        (["dqn", "--env", "drive"], "ALGORITHM is 'dqn', want one of ppo, sac, tqc for drive"),
+        (["ppo", "--env", "fly"], "--env is 'fly', want one of search, drive"),
+        (["ppo", "--env", "drive", "--imitate", "mdp"], "--imitate goes with --env search"),
+        (["ppo", "--env", "drive", "--scenario", "campus"], "--scenario goes with --env search"),
+        (["ppo", "--lot", "campus"], "--lot goes with --env drive"),
+        (["sac", "--env", "drive", "--lot", "nowhere"], "nowhere: no such file, nor a packaged lot"),
+        (["sac", "--env", "drive", "--planners", "mdp"], "--planners is 'mdp', want planner or none"),
         (["ppo", "--resume"], "holds no training to go on with"),
         (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
     ],

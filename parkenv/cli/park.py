@@ -1,10 +1,10 @@
-"""`parkenv park`: the planner parks, again and again."""
+"""`parkenv park`: the planner parks, and who has learned to, again and again."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -14,10 +14,23 @@ from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
 
+if TYPE_CHECKING:
+    from parkenv.evaluation.parking_runs import Parking, ParkingCase
+    from planners.agent import Agent
+
 SHOWN_FAILURES = 6
+SHOWN_ROWS = 20
 
 
 def park(
+    agents: Annotated[
+        str,
+        typer.Option(
+            "--agents",
+            metavar="NAME[,NAME...]",
+            help="Who parks, in the same tasks: planner, or ALGORITHM:FILE for a model of `parkenv train --env drive`.",
+        ),
+    ] = "planner",
     lot: Annotated[
         str,
         typer.Option("--lot", help="Packaged lots (campus, jam, street, mini) or lot files, with commas."),
@@ -40,30 +53,23 @@ def park(
         Path, typer.Option("--out", "-o", help="Folder for pictures, episodes.csv and summary.json.")
     ] = Path("results/park"),
 ) -> None:
-    """Let the planner park in `parkenv/Drive-v0`: how often it does, how long it plans and drives.
+    """Let drivers park in `parkenv/Drive-v0`: how often they do, how long they plan and drive.
 
     Writes a picture of one parking for each kind of slot and way of standing in it, an animation of one, and
-    pictures of failures where there are any.
+    pictures of failures where there are any; of several agents, into a folder for each.
 
     Examples:
     * `parkenv park --episodes 250 --lot campus,street,jam --jobs 2`
+
+    * `parkenv park --agents planner,sac:results/drive-sac/seed_0/model.zip`
 
     * `parkenv park --lot parking_map.yml --way back-in`
     """
     from parkenv.driving.parking_task import KINDS, WAYS
     from parkenv.envs.drive import lot_named
-    from parkenv.evaluation.parking_pictures import save_parkings
-    from parkenv.evaluation.parking_runs import (
-        Parking,
-        ParkingCase,
-        park_all,
-        park_once,
-        parking_table,
-        write_parkings,
-    )
+    from parkenv.evaluation.parking_runs import ParkingCase, park_all, parking_table, write_parkings
     from parkenv.evaluation.results import make_folder, write_summary
-    from parkenv.evaluation.picture_files import save_film
-    from planners.parking import ParkingAgent
+    from planners.drivers import make_driver
 
     kinds = None if kind == "all" else _chosen("--kind", kind, KINDS)
     ways = WAYS if way == "both" else _chosen("--way", way, WAYS)
@@ -72,6 +78,8 @@ def park(
         case = ParkingCase(lot_named(name), kinds, ways, occupancy, slack)
         case.environment().close()  # complains before anything is driven
         cases.append(case)
+    labels = _labels(args.words("--agents", agents))
+    drivers = {label: make_driver(name) for label, name in labels.items()}
     make_folder(out)
     console = make_console()
     progress = Progress(
@@ -82,41 +90,82 @@ def park(
         console=console,
     )
     seeds = range(seed, seed + episodes)
-    parkings: list[Parking] = []
+    parkings: dict[str, list[Parking]] = {label: [] for label in labels}
     with progress, args.workers_of(jobs, "loky", None) as workers:
-        bar = progress.add_task("Parking", total=len(cases) * episodes)
-        for some in park_all(cases, seeds, workers):
-            parkings += some
-            progress.advance(bar, len(some))
+        for label, name in labels.items():
+            what = "Parking" if len(labels) == 1 else f"{label} parks"
+            bar = progress.add_task(what, total=len(cases) * episodes)
+            for some in park_all(cases, seeds, workers, name):
+                parkings[label] += some
+                progress.advance(bar, len(some))
 
-    rows = [parking.row for parking in parkings]
-    table = parking_table(rows)
+    rows = [{"agent": label, **p.row} for label, its in parkings.items() for p in its]
+    table = [
+        {"agent": label, **row}
+        for label, its in parkings.items()
+        for row in parking_table([p.row for p in its])
+    ]
     names = [case.lot.name for case in cases]
     write_parkings(rows, out / "episodes.csv")
     summary = {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "lots": names}
-    write_summary(out, summary | {"rows": table})
-
-    lots = {case.lot.name: case.lot for case in cases}
-    kept = {(p.row["kind"], p.row["way"]): p for p in reversed(parkings) if p.row["parked"]}
-    ends = [(lots[p.row["lot"]], p.state) for _, p in sorted(kept.items())]
-    if ends:
-        save_parkings(ends, out / "parkings.png")
-        shown = max(kept.values(), key=lambda p: p.row["direction_changes"])
-        case = next(c for c in cases if c.lot.name == shown.row["lot"])
-        film = park_once(case.environment("rgb_array"), ParkingAgent(), shown.row["seed"], every=2)
-        save_animation(film.frames, out / "parking.gif", fps=10.0)
-    failures = [p for p in parkings if not p.row["parked"]]
-    if failures:
-        save_parkings(
-            [(lots[p.row["lot"]], p.state) for p in failures[:SHOWN_FAILURES]], out / "failures.png"
-        )
+    write_summary(out, summary | {"agents": labels, "rows": table})
+    film = _to_film(next(iter(parkings.values())))
+    for label, its in parkings.items():
+        folder = out if len(labels) == 1 else out / label
+        make_folder(folder)
+        _picture(its, cases, drivers[label], film, folder)
     _show(console, f"{', '.join(names)}: {episodes} parkings on each", table)
-    for failure in failures:
-        row = failure.row
+    for row in [row for row in rows if not row["parked"]][:SHOWN_ROWS]:
+        who = f"{row['agent']}, " if len(labels) > 1 else ""
         console.print(
-            f"failed: {row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
+            f"failed: {who}{row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
         )
     console.print(f"Episodes, summary and pictures are in {out}")
+
+
+def _labels(names: list[str]) -> dict[str, str]:
+    """A word for each agent that can name a folder, and its name."""
+    labels: dict[str, str] = {}
+    for name in names:
+        word = name.partition(":")[0]
+        alike = sum(known.partition(":")[0] == word for known in labels.values())
+        labels[f"{word}-{alike + 1}" if alike else word] = name
+    return labels
+
+
+def _to_film(parkings: list[Parking]) -> dict[str, Any] | None:
+    """The row of the parking that is the most of a manoeuvre; None where nothing is parked."""
+    parked = [p.row for p in _one_of_each(parkings)]
+    return max(parked, key=lambda row: row["direction_changes"], default=None)
+
+
+def _one_of_each(parkings: list[Parking]) -> list[Parking]:
+    """The first that succeeded, of each kind of slot and way of standing in it."""
+    kept = {(p.row["kind"], p.row["way"]): p for p in reversed(parkings) if p.row["parked"]}
+    return [kept[key] for key in sorted(kept)]
+
+
+def _picture(
+    parkings: list[Parking],
+    cases: list[ParkingCase],
+    driver: Agent,
+    film: dict[str, Any] | None,
+    folder: Path,
+) -> None:
+    """Pictures of parkings and failures, and an animation of the task to film."""
+    from parkenv.evaluation.parking_pictures import save_parkings
+    from parkenv.evaluation.parking_runs import park_once
+    from parkenv.evaluation.picture_files import save_film
+
+    lots = {case.lot.name: case.lot for case in cases}
+    failures = [p for p in parkings if not p.row["parked"]][:SHOWN_FAILURES]
+    for shown, name in ((_one_of_each(parkings), "parkings.png"), (failures, "failures.png")):
+        if shown:
+            save_parkings([(lots[p.row["lot"]], p.state) for p in shown], folder / name)
+    if film is not None:
+        case = next(case for case in cases if case.lot.name == film["lot"])
+        frames = park_once(case.environment("rgb_array"), driver, film["seed"], every=2).frames
+        save_film(frames, folder / "parking.gif", fps=10.0)
 
 
 def _chosen(option: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
@@ -129,21 +178,32 @@ def _chosen(option: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
 
 def _show(console: Any, title: str, table: list[dict[str, Any]]) -> None:
     headings = (
-        "slot", "parked", "success [95 %]", "contacts", "plan ms (p95)", "drive s (p95)", "changes (p95)",
+        "agent", "slot", "parked", "success [95 %]", "contacts", "plan ms (p95)", "drive s (p95)", "changes (p95)",
         "driven m", "turned rad",
     )  # fmt: skip
     printed = make_table(title, headings)
     for row in table:
         low, high = row["success_ci95"]
         printed.add_row(
+            row["agent"],
             f"{row['kind']} {row['way']}".strip(),
             f"{row['parked']}/{row['episodes']}",
             f"{row['success']:.1%} [{low:.1%}, {high:.1%}]",
             str(row["contacts"]),
-            f"{row['planning_ms']:.0f} ({row['planning_ms_p95']:.0f})",
-            f"{row['time_s']:.1f} ({row['time_s_p95']:.1f})",
-            f"{row['direction_changes']:.0f} ({row['direction_changes_p95']:.0f})",
-            f"{row['driven_m']:.1f}",
-            f"{row['turned_rad']:.1f}",
+            _pair(row, "planning_ms", 0),
+            _pair(row, "time_s", 1),
+            _pair(row, "direction_changes", 0),
+            _known(row["driven_m"], 1),
+            _known(row["turned_rad"], 1),
         )
     console.print(printed)
+
+
+def _pair(row: dict[str, Any], name: str, digits: int) -> str:
+    """A median and its 95th percentile; nothing for who has none, as who does not plan."""
+    median, p95 = (_known(row[key], digits) for key in (name, f"{name}_p95"))
+    return median and f"{median} ({p95})"
+
+
+def _known(value: float, digits: int) -> str:
+    return "" if value != value else f"{value:.{digits}f}"

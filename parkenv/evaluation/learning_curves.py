@@ -1,4 +1,4 @@
-"""Total time against decisions made in training, with the planners for comparison."""
+"""What agents achieve against decisions made in training, with the planners for comparison."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, PercentFormatter
 
 from parkenv.evaluation.picture_files import INK, STYLE, save_picture
 from parkenv.evaluation.statistics import mean_interval
@@ -20,37 +21,35 @@ OFF_SCALE = 2.0
 """Times above this many times the least one are off the figure."""
 _APART = 0.045  # of the axis, the least distance of two words beside the lines
 
+Curves = Sequence[Sequence[Mapping[str, Any]]]
 
-def across_seeds(curves: Sequence[Sequence[Mapping[str, Any]]]) -> list[dict[str, float]]:
+
+def across_seeds(curves: Curves, measure: str = "total_s") -> list[dict[str, float]]:
     """Mean over seeds, with its 95 % interval, at the examinations that all seeds have.
 
     Args:
         curves: of each seed, the rows of its `curve.csv`.
+        measure: which column.
+
+    Returns:
+        Rows of steps, `measure`, and the interval's ends, low_s and high_s for times, low and high for shares.
     """
+    low_name, high_name = ("low_s", "high_s") if measure.endswith("_s") else ("low", "high")
     rows = []
     for examinations in zip(*curves, strict=False):
-        mean, low, high = mean_interval([row["total_s"] for row in examinations])
-        rows.append(
-            {
-                "steps": float(np.mean([r["steps"] for r in examinations])),
-                "total_s": mean,
-                "low_s": low,
-                "high_s": high,
-            }
-        )
+        mean, low, high = mean_interval([row[measure] for row in examinations])
+        steps = float(np.mean([r["steps"] for r in examinations]))
+        rows.append({"steps": steps, measure: mean, low_name: low, high_name: high})
     return rows
 
 
 def save_learning_curves(
-    curves: Mapping[str, Sequence[Sequence[Mapping[str, Any]]]],
-    planners: Mapping[str, float],
-    title: str,
-    path: Path,
+    curves: Mapping[str, Curves], planners: Mapping[str, float], title: str, path: Path
 ) -> None:
-    """Draw each algorithm's mean over seeds in its interval, single seeds thinly, and planners as horizontal lines.
+    """Draw each algorithm's mean total time over seeds, and planners as horizontal lines.
 
     Args:
-        curves: of each algorithm and seed, examinations.
+        curves: of each algorithm, of each seed, the rows of its `curve.csv`.
         planners: mean total time, s, of each planner in the same worlds.
         title: of the figure.
         path: of the PNG.
@@ -60,29 +59,8 @@ def save_learning_curves(
         axes = figure.subplots()
         highest = 0.0
         for (name, its), color in zip(curves.items(), COLORS, strict=False):
-            rows = across_seeds(its)
-            steps = [row["steps"] for row in rows]
-            for single in its:
-                axes.plot(
-                    [r["steps"] for r in single],
-                    [r["total_s"] for r in single],
-                    color=color,
-                    lw=0.5,
-                    alpha=0.35,
-                )
-            if len(its) > 1:
-                axes.fill_between(
-                    steps,
-                    [r["low_s"] for r in rows],
-                    [r["high_s"] for r in rows],
-                    color=color,
-                    alpha=0.2,
-                    lw=0,
-                )
-            axes.plot(
-                steps, [r["total_s"] for r in rows], color=color, lw=2.0, label=f"{name}, {len(its)} seeds"
-            )
-            highest = max(highest, *(r["total_s"] for r in rows[len(rows) // 10 :]))
+            means = _draw(axes, name, its, "total_s", color)
+            highest = max(highest, *means[len(means) // 10 :])
         low = min(*planners.values(), *(r["total_s"] for its in curves.values() for c in its for r in c))
         # An untrained policy drives in circles; where it ends is what is to be seen.
         high = min(max([highest, *planners.values()]), OFF_SCALE * low)
@@ -93,14 +71,72 @@ def save_learning_curves(
         bottom, top = axes.get_ylim()
         heights = spread([(seconds - bottom) / (top - bottom) for _, seconds in ascending], _APART)
         for (name, seconds), height in zip(ascending, heights, strict=True):
-            axes.axhline(seconds, color=INK, lw=0.8, ls=(0, (4, 3)), zorder=1)
-            axes.annotate(
-                f"{name}  {seconds:.1f}", (1.0, height), xycoords="axes fraction", xytext=(5, 0),
-                textcoords="offset points", va="center", fontsize=8, color=INK,
-            )  # fmt: skip
-        axes.set_xlim(left=0.0)
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x / 1e6:g} M" if x else "0"))
+            _mark(axes, seconds, f"{name}  {seconds:.1f}", height)
         axes.set(xlabel="decisions in training", ylabel="mean total time, s", title=title)
-        axes.grid(axis="y")
         axes.legend(loc="upper right", frameon=True, facecolor="white", edgecolor="none", framealpha=1.0)
         save_picture(figure, path)
+
+
+def save_success_curves(
+    curves: Mapping[str, Curves], kinds: Sequence[str], planner: Mapping[str, float], title: str, path: Path
+) -> None:
+    """Draw each algorithm's share of parkings that succeed, a panel for each kind of slot, beside the planner's.
+
+    Args:
+        curves: of each algorithm, of each seed, the rows of its `curve.csv`; see `DriveTraining.examine`.
+        kinds: of slots.
+        planner: share of the same parkings that the planner brings to an end, by kind; empty to draw none.
+        title: of the figure.
+        path: of the PNG.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(2.4 + 2.8 * len(kinds), 3.4), layout="constrained")
+        panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
+        for axes, kind in zip(panels, kinds, strict=True):
+            for (name, its), color in zip(curves.items(), COLORS, strict=False):
+                _draw(axes, name, its, f"{kind}_success", color)
+            if kind in planner:
+                share = planner[kind]
+                axes.axhline(share, color=INK, lw=0.8, ls=(0, (4, 3)), zorder=1)
+                axes.annotate(
+                    f"planner {share:.0%}", (0.0, share), xycoords=("axes fraction", "data"), xytext=(4, 3),
+                    textcoords="offset points", fontsize=8, color=INK,
+                )  # fmt: skip
+            axes.set(title=kind, xlabel="decisions in training", ylim=(-0.03, 1.1))
+            axes.set_yticks(np.linspace(0.0, 1.0, 6))
+            axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+        panels[0].set_ylabel("parkings that succeed")
+        panels[-1].legend(
+            loc="lower right", frameon=True, facecolor="white", edgecolor="none", framealpha=0.8
+        )
+        figure.suptitle(title, x=0.01, ha="left", fontsize=9.0)
+        save_picture(figure, path)
+
+
+def _draw(axes: Axes, name: str, curves: Curves, measure: str, color: str) -> list[float]:
+    """Draw the mean over seeds in its interval, single seeds thinly; returns the means."""
+    rows = across_seeds(curves, measure)
+    steps, means = [row["steps"] for row in rows], [row[measure] for row in rows]
+    for single in curves:
+        axes.plot([r["steps"] for r in single], [r[measure] for r in single], color=color, lw=0.5, alpha=0.35)
+    if len(curves) > 1:
+        low, high = ([row[end] for row in rows] for end in list(rows[0])[2:])
+        axes.fill_between(steps, low, high, color=color, alpha=0.2, lw=0)
+    axes.plot(steps, means, color=color, lw=2.0, label=f"{name}, {len(curves)} seeds")
+    axes.set_xlim(left=0.0)
+    axes.xaxis.set_major_formatter(FuncFormatter(_count))
+    axes.grid(axis="y")
+    return means
+
+
+def _mark(axes: Axes, value: float, words: str, height: float) -> None:
+    """A horizontal line, with words beside the axes at a height, a share of theirs."""
+    axes.axhline(value, color=INK, lw=0.8, ls=(0, (4, 3)), zorder=1)
+    axes.annotate(
+        words, (1.0, height), xycoords="axes fraction", xytext=(5, 0),
+        textcoords="offset points", va="center", fontsize=8, color=INK,
+    )  # fmt: skip
+
+
+def _count(x: float, _: Any) -> str:
+    return f"{x / 1e6:g} M" if x >= 1e6 else f"{x / 1e3:g} k" if x >= 1e3 else f"{x:g}"

@@ -20,7 +20,8 @@ from parkenv.evaluation.workers import HERE, Workers
 from parkenv.lot import ParkingLot
 from parkenv.whole_files import written_whole
 from planners.agent import Agent
-from planners.parking import ParkingAgent, ParkingMemory
+from planners.drivers import PLANNER, make_driver
+from planners.parking import ParkingMemory
 
 CHUNK = 25
 """Parkings that one worker drives at a time."""
@@ -139,18 +140,24 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
 
 
 def park_all(
-    cases: Sequence[ParkingCase], seeds: Sequence[int], workers: Workers = HERE
+    cases: Sequence[ParkingCase], seeds: Sequence[int], workers: Workers = HERE, driver: str = PLANNER
 ) -> Iterator[list[Parking]]:
-    """Every seed in every case by the planner, some at a time and in order.
+    """Every seed in every case by one driver, some at a time and in order.
 
     What is measured in wall time differs from run to run; nothing else does, on any number of workers.
+
+    Args:
+        cases: where is parked.
+        seeds: of the tasks.
+        workers: who runs it.
+        driver: a name for `planners.drivers.make_driver`.
     """
     parts = [seeds[i : i + CHUNK] for i in range(0, len(seeds), CHUNK)]
-    yield from workers.in_order([partial(_park_some, case, part) for case in cases for part in parts])
+    yield from workers.in_order([partial(_park_some, case, part, driver) for case in cases for part in parts])
 
 
-def _park_some(case: ParkingCase, seeds: Sequence[int]) -> list[Parking]:
-    env, agent = case.environment(), ParkingAgent()
+def _park_some(case: ParkingCase, seeds: Sequence[int], driver: str) -> list[Parking]:
+    env, agent = case.environment(), make_driver(driver)
     return [park_once(env, agent, seed) for seed in seeds]
 
 

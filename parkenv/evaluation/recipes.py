@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
+
+from parkenv.errors import InputError
 
 REWARD_SCALE = 0.01
 """Returns of some -100 s become about -1."""
@@ -68,4 +70,119 @@ RECIPES: dict[str, Recipe] = {
         0.1,
     ),
 }
-"""Of each algorithm that `parkenv train` knows."""
+"""Of each algorithm that learns to search."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """How hard the tasks of a level are; see `parkenv.driving.parking_task.ParkingTasks`.
+
+    Args:
+        starts: way-out or lane.
+        distance: m, least and greatest.
+        slack: m that are kept clear around the slot.
+    """
+
+    starts: str
+    distance: tuple[float, float]
+    slack: float
+
+
+CURRICULUM = (
+    Stage("way-out", (0.3, 1.5), 1.0),
+    Stage("way-out", (1.0, 4.0), 1.0),
+    Stage("way-out", (2.0, 8.0), 0.5),
+    Stage("way-out", (4.0, 14.0), 0.5),
+    Stage("lane", (4.0, 14.0), 0.5),
+    Stage("lane", (4.0, 14.0), 0.0),
+)
+"""From a step before the slot, with nobody beside it, to the task itself: that of `parkenv/Drive-v0` as it is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriveRecipe(Recipe):
+    """Settings of one algorithm that learns to drive into slots.
+
+    Args:
+        reward: `sparse`, with goals of hindsight; or `dense`.
+        reward_scale: rewards are seconds times this.
+        contact_cost: s, what a contact costs in training.
+        steps: decisions of a training, unless another number is asked for.
+        curriculum: levels, from the easiest to the task itself.
+    """
+
+    reward: str
+    reward_scale: float
+    contact_cost: float
+    steps: int
+    curriculum: tuple[Stage, ...] = CURRICULUM
+
+
+_OFF_POLICY: dict[str, Any] = {
+    "learning_rate": 1e-3,
+    "buffer_size": 300_000,
+    "learning_starts": 3_000,
+    "batch_size": 256,
+    "train_freq": 1,
+    "gradient_steps": 4,
+    "gamma": 0.98,
+    "tau": 0.005,
+    # From 1, its default, entropy counts for more than parking does, for thousands of updates: who parks gets no more.
+    "ent_coef": "auto_0.02",
+    "replay_buffer_kwargs": {"n_sampled_goal": 4, "goal_selection_strategy": "future"},
+    "policy_kwargs": {"net_arch": [128, 128]},
+}
+_HINDSIGHT = DriveRecipe(
+    16,
+    "MultiInputPolicy",
+    _OFF_POLICY,
+    0.1,
+    reward="sparse",
+    reward_scale=0.2,
+    contact_cost=30.0,
+    steps=300_000,
+)
+
+# A contact has to cost more than to stand still for ever, which is 0.4 s / (1 - gamma) in sparse rewards, and about
+# twice that in dense ones: for less, who does not know how to park yet runs into something to have it over.
+DRIVE_RECIPES: dict[str, DriveRecipe] = {
+    "ppo": DriveRecipe(
+        256,
+        "MultiInputPolicy",
+        {
+            "learning_rate": 1e-3,
+            "n_steps": 64,
+            "batch_size": 2048,
+            "n_epochs": 6,
+            "gamma": 0.99,
+            "gae_lambda": 0.95,
+            "policy_kwargs": {"net_arch": [128, 128], "log_std_init": -0.5},
+        },
+        0.05,
+        reward="dense",
+        reward_scale=0.05,
+        contact_cost=100.0,
+        steps=15_000_000,
+    ),
+    "sac": _HINDSIGHT,
+    "tqc": _HINDSIGHT,
+}
+"""Of each algorithm that learns to drive."""
+
+AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)
+
+
+def recipe_of(algorithm: str, recipes: Mapping[str, AnyRecipe], task: str) -> AnyRecipe:
+    """The recipe of an algorithm.
+
+    Args:
+        algorithm: its name.
+        recipes: those of the task.
+        task: search or drive.
+
+    Raises:
+        InputError: there is none for it.
+    """
+    if algorithm not in recipes:
+        raise InputError(f"ALGORITHM is {algorithm!r}, want one of {', '.join(recipes)} for {task}")
+    return recipes[algorithm]

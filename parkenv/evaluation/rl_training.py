@@ -1,85 +1,110 @@
-"""Training of one agent under one seed: learn, be examined in worlds that were never trained on, leave checkpoints."""
+"""Training of one agent under one seed: learn, be examined in worlds that were never trained on, leave checkpoints.
+
+What is learned, and how well it is, says a subclass of `Training`: `parkenv.evaluation.search_training`, and
+`parkenv.evaluation.drive_training`.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
 import time
+import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
-from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from parkenv import __version__
-from parkenv.envs.search_sb3 import SearchVecEnv
-from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
-from parkenv.evaluation.cloning import Demonstrations, clone
-from parkenv.evaluation.recipes import MAX_STEPS, RECIPES, REWARD_SCALE
-from parkenv.evaluation.statistics import mean_interval
-from parkenv.scenario import Scenario
+from parkenv.evaluation.recipes import Recipe
 from parkenv.whole_files import written_whole
-from planners.learned import OBSERVATION, LearnedAgent, ModelCard, algorithm_class
+from planners.learned import ModelCard, algorithm_class
 
 TRAINING_SEEDS = 10_000_000
 """Worlds of seed s begin here, times s + 1: far from those of comparisons, examinations and benchmark suites."""
-MODEL, CHECKPOINT, CURVE = "model.zip", "checkpoint.zip", "curve.csv"
-CURVE_COLUMNS = ("steps", "total_s", "low_s", "high_s", "parked_fraction", "wall_s")
+MODEL, CHECKPOINT, REPLAY, CURVE = "model.zip", "checkpoint.zip", "replay.pkl", "curve.csv"
 
 Row = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
-class Training:
-    """What is to be trained, where, and how it is examined.
+class Training(ABC):
+    """What is to be trained, for how long, and how it is examined.
 
     Args:
-        algorithm: one of `RECIPES`.
-        scenarios: worlds to learn in, in turns.
-        examined_on: seeds of the worlds of the examinations, of the first scenario.
+        algorithm: one of those that have a recipe.
         steps: decisions to make.
         examine_every: decisions between examinations.
-        k: slots that the observation tells of.
-        demonstrations: to imitate first; None to begin from nothing.
-        tensorboard: whether to keep a log for TensorBoard.
 
     Raises:
         InputError: an unknown algorithm, or a number out of its range.
     """
 
     algorithm: str
-    scenarios: tuple[Scenario, ...]
-    examined_on: range
     steps: int
     examine_every: int
-    k: int = 5
-    demonstrations: Demonstrations | None = None
-    tensorboard: bool = False
 
     def __post_init__(self) -> None:
-        if self.algorithm not in RECIPES:
-            raise InputError(f"algorithm is {self.algorithm!r}, want one of {', '.join(RECIPES)}")
+        _ = self.recipe
         for name in ("steps", "examine_every"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}, want at least 1")
-        if self.demonstrations is not None and self.algorithm not in ("ppo", "maskable-ppo"):
-            raise InputError(f"{self.algorithm} cannot begin by imitation; take ppo or maskable-ppo")
 
+    @property
+    @abstractmethod
+    def recipe(self) -> Recipe:
+        """Settings of the algorithm.
+
+        Raises:
+            InputError: there are none for it.
+        """
+
+    @property
+    @abstractmethod
+    def scores(self) -> tuple[str, ...]:
+        """What an examination finds out; columns of `curve.csv`."""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """All columns of `curve.csv`."""
+        return ("steps", *self.scores, "wall_s")
+
+    @abstractmethod
+    def practice(self, seed: int, curve: Sequence[Row]) -> VecEnv:
+        """Where to learn.
+
+        Args:
+            seed: of its worlds.
+            curve: examinations so far; none at the beginning.
+        """
+
+    @abstractmethod
+    def examine(self, model: Any, practice: VecEnv) -> Row:
+        """Examine a model, always in the same worlds; returns `scores`."""
+
+    @abstractmethod
+    def merit(self, row: Row) -> tuple[float, ...]:
+        """How good an examination was: the more, the better."""
+
+    @abstractmethod
     def card(self, seed: int, steps: int) -> ModelCard:
         """What the model file is to say."""
-        recipe = RECIPES[self.algorithm]
-        settings = {"n_envs": recipe.n_envs, "policy": recipe.policy, **recipe.settings}
-        settings["imitated"] = None if self.demonstrations is None else self.demonstrations.agent
-        names = tuple(s.name for s in self.scenarios)
-        return ModelCard(self.algorithm, names, self.k, OBSERVATION, seed, steps, settings, __version__)
 
-    def train(self, seed: int, folder: Path) -> list[Row]:
+    def settings(self) -> dict[str, Any]:
+        """Of the algorithm's constructor, by its own names; without the learning rate."""
+        return {name: value for name, value in self.recipe.settings.items() if name != "learning_rate"}
+
+    def prepare(self, model: Any, seed: int) -> None:
+        """What happens to a fresh model before it learns: nothing, unless a subclass says so."""
+        del model, seed
+
+    def train(self, seed: int, folder: Path, *, tensorboard: bool = False) -> list[Row]:
         """Learn under one seed; go on from the folder's checkpoint where there is one.
 
         `model.zip` is the checkpoint that did best in the examinations, `curve.csv` has them all.
@@ -87,44 +112,50 @@ class Training:
         Args:
             seed: of the network and of the worlds.
             folder: made where it is not there.
+            tensorboard: whether to keep a log for TensorBoard.
 
         Returns:
             The rows of `curve.csv`.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        recipe = RECIPES[self.algorithm]
-        env = SearchVecEnv(recipe.n_envs, self.scenarios, REWARD_SCALE, self.k, max_episode_steps=MAX_STEPS)
-        env.seed(TRAINING_SEEDS * (seed + 1))
         curve = read_curve(folder / CURVE)
         checkpoint, kind = folder / CHECKPOINT, algorithm_class(self.algorithm)
-        log = str(folder / "tensorboard") if self.tensorboard else None
+        log = str(folder / "tensorboard") if tensorboard else None
+        first = TRAINING_SEEDS * (seed + 1)
         if curve and checkpoint.exists():
             done = ModelCard.of_file(checkpoint).steps
             curve = [row for row in curve if row["steps"] <= done]
-            model = kind.load(checkpoint, env=env, device="cpu", tensorboard_log=log)
             # Not the worlds of the beginning again.
-            env.seed(TRAINING_SEEDS * (seed + 1) + done)
+            env = self.practice(first + done, curve)
+            model = kind.load(checkpoint, env=env, device="cpu", tensorboard_log=log)
+            if (folder / REPLAY).exists():
+                with warnings.catch_warnings():
+                    # Drives under way end where they were left, of which hindsight would tell.
+                    warnings.filterwarnings("ignore", message="The last trajectory", category=UserWarning)
+                    model.load_replay_buffer(folder / REPLAY)
+            elif hasattr(model, "learning_starts"):
+                model.learning_starts += done
         else:
-            curve, settings = [], dict(recipe.settings)
-            rate = settings.pop("learning_rate")
-            schedule = LinearSchedule(rate, rate * recipe.final_learning_rate, 1.0)
+            curve, env = [], self.practice(first, ())
+            rate = self.recipe.settings["learning_rate"]
+            schedule = LinearSchedule(rate, rate * self.recipe.final_learning_rate, 1.0)
             model = kind(
-                recipe.policy,
+                self.recipe.policy,
                 env,
                 learning_rate=schedule,
                 seed=seed,
                 device="cpu",
                 tensorboard_log=log,
-                **settings,
+                **self.settings(),
             )
-            if self.demonstrations is not None:
-                clone(model, self.demonstrations, seed)
+            self.prepare(model, seed)
         examiner = _Examiner(self, seed, folder, curve)
         left = self.steps - model.num_timesteps
         if left > 0:
             model.learn(left, callback=examiner, reset_num_timesteps=False, tb_log_name="run")
             if examiner.curve[-1]["steps"] < model.num_timesteps:
                 examiner.examine(model, model.num_timesteps)
+        (folder / REPLAY).unlink(missing_ok=True)
         return examiner.curve
 
 
@@ -148,26 +179,13 @@ class Trained:
             beside.write_bytes(self.model)
 
 
-def train_one(training: Training, seed: int, folder: Path) -> Trained:
+def train_one(training: Training, seed: int, folder: Path, tensorboard: bool = False) -> Trained:
     """Train under one seed, on one thread: as many as there are cores may run side by side."""
     import torch
 
     torch.set_num_threads(1)
-    curve = training.train(seed, folder)
+    curve = training.train(seed, folder, tensorboard=tensorboard)
     return Trained(curve, (folder / MODEL).read_bytes())
-
-
-def search_times(algorithm: str, path: Path, scenario: Scenario, seeds: Sequence[int]) -> Row:
-    """How long the searches of a model take, in the words of `parkenv compare`."""
-    agent = LearnedAgent(scenario, algorithm, path)
-    times, parked = examined(agent.model, scenario, seeds, agent.local_k)
-    mean, low, high = mean_interval(times)
-    return {
-        "episodes": len(times),
-        "parked_fraction": float(parked.mean()),
-        "total_s": mean,
-        "total_s_ci95": [low, high],
-    }
 
 
 class _Examiner(BaseCallback):  # type: ignore[misc]
@@ -175,7 +193,7 @@ class _Examiner(BaseCallback):  # type: ignore[misc]
 
     def __init__(self, training: Training, seed: int, folder: Path, curve: list[Row]) -> None:
         super().__init__()
-        self.training, self.seed, self.folder, self.curve = training, seed, folder, curve
+        self.subject, self.seed, self.folder, self.curve = training, seed, folder, curve
         self._start = time.monotonic() - (curve[-1]["wall_s"] if curve else 0.0)
         self._due = training.examine_every * (1 + len(curve[1:]))
 
@@ -186,72 +204,29 @@ class _Examiner(BaseCallback):  # type: ignore[misc]
     def _on_rollout_start(self) -> None:
         # Between rollouts, so that a checkpoint loses nothing that was gathered.
         if self.num_timesteps >= self._due:
-            self._due += self.training.examine_every
+            self._due += self.subject.examine_every
             self.examine(self.model, self.num_timesteps)
 
     def _on_step(self) -> bool:
         return True
 
     def examine(self, model: Any, steps: int) -> None:
-        """Search in the examination's worlds; write the curve, a checkpoint, and the model if it is the best yet."""
-        training = self.training
-        times, parked = examined(model, training.scenarios[0], training.examined_on, training.k)
-        mean, low, high = mean_interval(times)
-        row = dict(
-            zip(
-                CURVE_COLUMNS,
-                (steps, mean, low, high, float(parked.mean()), time.monotonic() - self._start),
-                strict=True,
-            )
-        )
-        self.logger.record("examination/total_s", mean)
-        best = min((r["total_s"] for r in self.curve), default=np.inf)
+        """Examine; write the curve, a checkpoint, and the model if it is the best yet."""
+        subject = self.subject
+        scores = subject.examine(model, self.training_env)
+        row = {"steps": steps, **scores, "wall_s": time.monotonic() - self._start}
+        for name, value in scores.items():
+            self.logger.record(f"examination/{name}", value)
+        best = max((subject.merit(r) for r in self.curve), default=(-np.inf,))
         self.curve.append(row)
-        save_model(model, training.card(self.seed, steps), self.folder / CHECKPOINT)
-        if mean <= best:
-            save_model(model, training.card(self.seed, steps), self.folder / MODEL)
+        card = subject.card(self.seed, steps)
+        if steps and hasattr(model, "save_replay_buffer"):
+            with written_whole(self.folder / REPLAY) as beside:
+                model.save_replay_buffer(beside)
+        save_model(model, card, self.folder / CHECKPOINT)
+        if subject.merit(row) >= best:
+            save_model(model, card, self.folder / MODEL)
         write_curve(self.folder / CURVE, self.curve)
-
-
-def examined(
-    model: Any, scenario: Scenario, seeds: Sequence[int], k: int
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Total times of a model's searches, (n,) s, and whether it parked, (n,) bool.
-
-    A search that is not over after `MAX_STEPS` decisions is charged `give_up_s`, as in `parkenv compare`.
-
-    Args:
-        model: of stable-baselines3 or sb3-contrib, over the `local` observation.
-        scenario: the world.
-        seeds: a search for each.
-        k: slots that the observation tells of.
-    """
-    n = len(seeds)
-    batch = ParkSearchVectorEnv(
-        n,
-        scenario,
-        observation="local",
-        k=k,
-        max_episode_steps=MAX_STEPS,
-        autoreset_mode=AutoresetMode.NEXT_STEP,
-    )
-    observation, _ = batch.reset(seed=list(seeds))
-    times, parked = np.full(n, np.nan), np.zeros(n, dtype=np.bool_)
-    state, start = None, np.ones(n, dtype=np.bool_)
-    masked = "action_masks" in model.predict.__code__.co_varnames
-    while np.isnan(times).any():
-        masks = {"action_masks": observation["action_mask"]} if masked else {}
-        actions, state = model.predict(
-            observation, state=state, episode_start=start, deterministic=True, **masks
-        )
-        observation, _, terminated, truncated, info = batch.step(actions)
-        start = terminated | truncated
-        first = start & np.isnan(times)
-        if first.any():
-            late = truncated & ~terminated
-            times[first] = (info["total_s"] + late * scenario.give_up_s)[first]
-            parked[first] = info["parked"][first]
-    return times, parked
 
 
 def save_model(model: Any, card: ModelCard, path: Path) -> None:
@@ -265,7 +240,7 @@ def save_model(model: Any, card: ModelCard, path: Path) -> None:
 def write_curve(path: Path, curve: Sequence[Mapping[str, Any]]) -> None:
     """Write examinations as CSV."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, CURVE_COLUMNS, lineterminator="\n")
+    writer = csv.DictWriter(text, list(curve[0]) if curve else [], lineterminator="\n")
     writer.writeheader()
     writer.writerows(curve)
     with written_whole(path) as beside:

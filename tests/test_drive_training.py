@@ -1,0 +1,533 @@
+"""Drivers that learn: they practise on what the environment is, trainings can be stopped, and their models drive."""
+
+import dataclasses
+import json
+import math
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from parkenv.cli import app
+from parkenv.driving.vehicle import SPEED, STATE_SIZE, YAW, VehicleParameters
+from parkenv.envs.drive import DriveEnv
+from parkenv.errors import InputError
+from parkenv.evaluation.drive_batch import CONTACT, LEFT, PARKED, UNDER_WAY, DriveBatch, PreparedTask
+from parkenv.evaluation.drive_hindsight import EndingGoals
+from parkenv.evaluation.drive_practice import MASTERED, TRIED, DrivePractice, places_of
+from parkenv.evaluation.drive_training import DriveTraining, parked_by, parked_on
+from parkenv.evaluation.learning_curves import across_seeds, save_success_curves
+from parkenv.evaluation.recipes import DRIVE_RECIPES
+from parkenv.evaluation.rl_training import read_curve, train_one
+from parkenv.evaluation.workers import HERE
+from parkenv.lot import ParkingLot
+from parkenv.scenario import Scenario
+from planners.driver_view import BEAMS, FARTHEST_M, HOLD, DriverView, Outlines, command, see
+from planners.drivers import make_driver
+from planners.learned import ModelCard
+
+PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
+MINI, STREET = ParkingLot.packaged("mini"), ParkingLot.packaged("street")
+EXAMINED = range(2_000_000, 2_000_006)
+STEPS = {"ppo": 2_000, "sac": 1_000, "tqc": 1_000}
+
+
+class Always:
+    """A model that decides the same, whatever it sees."""
+
+    def __init__(self, *action):
+        self.action = np.array(action, dtype=np.float32)
+
+    def predict(self, observation, **_):
+        return np.tile(self.action, (len(observation["observation"]), 1)), None
+
+
+def training_of(algorithm, steps, every=None, lots=(MINI,)):
+    return DriveTraining(algorithm, steps, every or steps // 2, lots, EXAMINED)
+
+
+FULL_SIZE = dict(DRIVE_RECIPES)
+SMALL = {
+    "ppo": {"n_steps": 32, "batch_size": 256, "n_epochs": 2},
+    "sac": {"learning_starts": 800, "batch_size": 32, "gradient_steps": 1},
+    "tqc": {"learning_starts": 800, "batch_size": 32, "gradient_steps": 1},
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small():
+    """The recipes, with networks and batches that are fast to train."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, recipe in DRIVE_RECIPES.items():
+            changed = {**recipe.settings, **SMALL[name], "policy_kwargs": {"net_arch": [16]}}
+            patch.setitem(DRIVE_RECIPES, name, dataclasses.replace(recipe, n_envs=16, settings=changed))
+        yield
+
+
+@pytest.fixture(scope="module", params=sorted(STEPS))
+def trained(request, tmp_path_factory):
+    """A short training of each algorithm, and its folder."""
+    folder = tmp_path_factory.mktemp(request.param)
+    train_one(training_of(request.param, STEPS[request.param]), 0, folder)
+    return request.param, folder
+
+
+# What is practised on
+
+
+@pytest.mark.parametrize("lot", [MINI, STREET, ParkingLot.packaged("campus")], ids=lambda lot: lot.name)
+def test_the_batch_drives_as_the_environment_does(lot):
+    n, rng = 8, np.random.default_rng(0)
+    envs = [DriveEnv(lot=lot, obstacle_map=True, reward="dense") for _ in range(n)]
+    batch, pedals = DriveBatch(n), DriverView(VehicleParameters()).pedals
+    for i, env in enumerate(envs):
+        env.tasks = envs[0].tasks
+        env.reset(seed=i)
+        batch.start(i, PreparedTask(env.task))
+    bias = rng.normal(0.0, 0.6, (n, 2))
+    compared = 0
+    for _ in range(60):
+        actions = np.clip(bias + rng.normal(0.0, 0.5, (n, 2)), -1.0, 1.0).astype(np.float32)
+        before = batch.status.copy()
+        batch.drive(actions)
+        seen = batch.observation()
+        for i in np.flatnonzero(before == UNDER_WAY):
+            env, reward = envs[i], 0.0
+            for _ in range(HOLD):
+                pedal = command(actions[i], env.state.vehicle[SPEED], pedals)
+                observation, seconds, over, _, info = env.step([pedal, actions[i, 1]])
+                reward += seconds
+                if over:
+                    break
+            failed = LEFT if info["contact"] == "left the area" else CONTACT
+            wanted = PARKED if info["is_success"] else failed if info["contact"] else UNDER_WAY
+            assert batch.status[i] == wanted
+            assert batch.time[i] == pytest.approx(info["time_s"])
+            np.testing.assert_allclose(seen["achieved_goal"][i], observation["achieved_goal"], atol=1e-4)
+            np.testing.assert_array_equal(seen["desired_goal"][i], observation["desired_goal"])
+            assert -batch.took[i] - batch.approach[i] - 200.0 * (wanted >= CONTACT) == pytest.approx(reward)
+            compared += 1
+    assert compared > 100
+    assert (batch.status >= CONTACT).sum() >= 3
+
+
+def test_a_drive_that_stands_in_its_slot_has_parked():
+    env = DriveEnv(lot=MINI, obstacle_map=True)
+    env.reset(seed=0)
+    task = PreparedTask(env.task)
+    task.start = np.zeros(STATE_SIZE)
+    task.start[2] = math.atan2(task.desired[3], task.desired[2])
+    task.start[:2] = -env.vehicle.middle * task.desired[2:4]
+    batch = DriveBatch(1)
+    batch.start(0, task)
+    batch.drive(np.zeros((1, 2), np.float32))
+    assert batch.status[0] == PARKED
+    assert batch.took[0] == 0.0
+
+
+# What is seen and done
+
+
+@given(
+    x=st.floats(-3, 3), y=st.floats(-3, 3), yaw=st.floats(-4, 4), gap=st.floats(0.0, 8.0), turned=st.floats(-4, 4)
+)  # fmt: skip
+@settings(max_examples=60, deadline=None)
+def test_room_is_measured_from_the_cars_outline_wherever_it_stands(x, y, yaw, gap, turned):
+    """A long wall across the way, `gap` before the car's front; the car and the wall are moved and turned together."""
+    view = DriverView(VehicleParameters())
+    front = view.half[0] + gap
+    wall = np.array([[front, -50.0, front, 50.0]])
+    c, s = math.cos(yaw), math.sin(yaw)
+    turn = np.array([[c, s], [-s, c]])
+    edges = (wall.reshape(2, 2) @ turn + (x, y)).reshape(1, 4)
+    circle = np.array([[*edges.reshape(2, 2).mean(axis=0), 50.1]])
+    state = np.zeros(STATE_SIZE)
+    state[YAW] = yaw
+    seen = np.empty(8 + BEAMS, np.float32)
+    see(np.array([x, y]), state, (edges, np.array([0, 1]), circle), view.body, np.zeros(5), seen)
+    room = 1.0 / seen[8:] - 1.0
+    angle = 2.0 * math.pi / BEAMS * np.arange(BEAMS)
+    with np.errstate(divide="ignore"):
+        expected = np.where(np.cos(angle) > 1e-6, front / np.cos(angle), np.inf) - view.body
+    np.testing.assert_allclose(room, np.clip(expected, 0.0, FARTHEST_M), rtol=1e-4, atol=1e-4)
+
+
+def test_outlines_are_those_of_the_map():
+    env = DriveEnv(lot=STREET, obstacle_map=True)
+    observation, _ = env.reset(seed=3)
+    outlines = Outlines.of_map(observation["cars"], observation["lines"])
+    obstacles = env.task.obstacles
+    assert len(outlines.circle) == len(obstacles)
+    closed = np.where(obstacles.n_corners > 2, obstacles.n_corners, 1)
+    assert len(outlines.edges) == closed.sum() == outlines.first[-1]
+    for i, (start, end) in enumerate(zip(outlines.first, outlines.first[1:], strict=False)):
+        ends = outlines.edges[start:end].reshape(-1, 2)
+        reach = np.hypot(*(ends - outlines.circle[i, :2]).T)
+        assert reach.max() == pytest.approx(outlines.circle[i, 2])
+
+
+@pytest.mark.parametrize(("asked", "reached"), [(1.0, 2.0), (-1.0, -1.5), (0.19, 0.0), (0.6, 1.0)])
+def test_a_decision_asks_for_a_speed_and_gets_it(asked, reached):
+    task = DriveEnv(lot=MINI).tasks.draw(0)
+    batch = DriveBatch(1)
+    batch.start(0, PreparedTask(task))
+    batch._things[0] = 0  # nothing in the way
+    batch.state[0, SPEED] = 0.7
+    for _ in range(6):
+        batch.drive(np.array([[asked, 0.0]], np.float32))
+    assert batch.state[0, SPEED] == pytest.approx(reached, abs=0.02)
+
+
+# Practice
+
+
+def practice_of(algorithm, n=4, lots=(MINI, STREET), levels=None):
+    return DrivePractice(n, places_of(lots), DRIVE_RECIPES[algorithm], levels)
+
+
+def test_places_are_the_kinds_of_slots_that_there_are():
+    lots = (STREET, ParkingLot.packaged("campus"), MINI)
+    assert [(p.lot.name, p.kind) for p in places_of(lots)] == [
+        ("campus", "perpendicular"), ("mini", "perpendicular"), ("campus", "oblique"), ("street", "parallel"),
+    ]  # fmt: skip
+
+
+def test_equal_seeds_give_equal_practice_and_ends_are_told():
+    several = [practice_of("ppo", 6) for _ in range(2)]
+    rng, ends = np.random.default_rng(1), 0
+    for env in several:
+        env.seed(5)
+    first, second = (env.reset() for env in several)
+    for _ in range(160):
+        for name in first:
+            np.testing.assert_array_equal(first[name], second[name])
+        actions = rng.uniform(-1.0, 1.0, (6, 2)).astype(np.float32)
+        (first, rewards, done, infos), (second, *_) = (env.step(actions) for env in several)
+        assert (rewards < 0.0).sum() >= 6 - done.sum()
+        for i in np.flatnonzero(done):
+            ends += 1
+            end = infos[i]["terminal_observation"]
+            assert not np.array_equal(end["achieved_goal"], first["achieved_goal"][i])
+            assert infos[i]["TimeLimit.truncated"] != (infos[i]["is_success"] or infos[i]["contact"])
+        assert all(not infos[i] for i in np.flatnonzero(~done))
+    assert ends > 6
+
+
+def test_a_level_is_mastered_by_parking_and_by_nothing_else():
+    env = practice_of("ppo")
+    for _ in range(TRIED):
+        env._note("parallel", 0, True)
+        env._note("perpendicular", 5, True)  # of another level
+    assert env.levels == {"perpendicular": 0, "parallel": 1}
+    for k in range(3 * TRIED):
+        env._note("parallel", 1, k % 100 < 100 * MASTERED - 1)
+    assert env.levels["parallel"] == 1
+    for _ in range(TRIED * 20):
+        env._note("parallel", env.levels["parallel"], True)
+    assert env.levels["parallel"] == len(DRIVE_RECIPES["ppo"].curriculum) - 1
+
+
+def test_levels_make_tasks_harder():
+    """At the first level the car is in its slot or just before it; at the last one it is on the lane."""
+    away = []
+    for level in (0, len(DRIVE_RECIPES["ppo"].curriculum) - 1):
+        env = practice_of("ppo", 64, levels=dict.fromkeys(("perpendicular", "parallel"), level))
+        env.seed(0)
+        seen = env.reset()
+        away.append(np.median(np.hypot(*seen["achieved_goal"][:, :2].T)))
+    assert away[0] < 2.0 < 5.0 < away[1]
+
+
+@pytest.mark.parametrize(
+    ("make", "wanted"),
+    [
+        (lambda: practice_of("ppo", 0), "num_envs is 0"),
+        (lambda: practice_of("ppo", levels={"parallel": 9}), "level of parallel slots is 9, want 0 to 5"),
+        (lambda: DrivePractice(2, (), DRIVE_RECIPES["sac"]), "at least one kind of slots"),
+        (
+            lambda: DriveTraining("dqn", 10, 10, (MINI,), EXAMINED),
+            "'dqn', want one of ppo, sac, tqc for drive",
+        ),
+        (lambda: DriveTraining("sac", 0, 10, (MINI,), EXAMINED), "steps is 0, want at least 1"),
+    ],
+)
+def test_bad_settings_are_refused_in_words(make, wanted):
+    with pytest.raises(InputError, match=wanted):
+        make()
+
+
+# Hindsight
+
+
+def test_rewards_of_hindsight_are_those_of_the_drive():
+    env = practice_of("sac", 32, levels=dict.fromkeys(("perpendicular", "parallel"), 0))
+    env.seed(2)
+    before = env.reset()
+    rng, parked, contacts, given = np.random.default_rng(0), 0, 0, []
+    for _ in range(300):
+        actions = rng.uniform(-0.6, 0.6, (32, 2)).astype(np.float32)
+        after, rewards, done, infos = env.step(actions)
+        achieved = after["achieved_goal"].copy()
+        for i in np.flatnonzero(done):
+            achieved[i] = infos[i]["terminal_observation"]["achieved_goal"]
+        again = env.env_method("compute_reward", achieved, before["desired_goal"], infos, indices=[0])[0]
+        np.testing.assert_array_equal(again, rewards)
+        given.append(rewards)
+        parked += sum(info.get("is_success", False) for info in infos)
+        contacts += sum(info.get("contact", False) for info in infos)
+        before = after
+    assert parked > 5
+    assert contacts > 5
+    recipe = DRIVE_RECIPES["sac"]
+    wanted = [recipe.reward_scale * seconds for seconds in (-0.4 - recipe.contact_cost, -0.4, 0.0)]
+    assert np.unique(np.concatenate(given)) == pytest.approx(wanted)
+
+
+def test_a_goal_of_hindsight_ends_the_drive_unless_something_was_touched():
+    env = practice_of("sac", 2, lots=(MINI,))
+    env.seed(0)
+    buffer = EndingGoals(
+        2_000, env.observation_space, env.action_space, env, n_envs=2, device="cpu", copy_info_dict=True
+    )
+    rng, seen = np.random.default_rng(0), env.reset()
+    for _ in range(600):
+        actions = rng.uniform(-1.0, 1.0, (2, 2)).astype(np.float32)
+        after, rewards, done, infos = env.step(actions)
+        told = {name: values.copy() for name, values in after.items()}
+        for i in np.flatnonzero(done):
+            for name in told:
+                told[name][i] = infos[i]["terminal_observation"][name]
+        buffer.add(seen, told, actions, rewards, done, infos)
+        seen = after
+    np.random.seed(0)  # noqa: NPY002  (stable-baselines3 draws from it)
+    batch = buffer.sample(4_000)
+    rewards, done = batch.rewards.numpy().ravel(), batch.dones.numpy().ravel()
+    achieved, desired = (
+        batch.next_observations[f"{which}_goal"].numpy() for which in ("achieved", "desired")
+    )
+    reached = (achieved == desired).all(axis=1)
+    recipe = DRIVE_RECIPES["sac"]
+    contact = np.float32(-recipe.reward_scale * (0.4 + recipe.contact_cost))
+    assert (rewards == 0.0).sum() > 100
+    assert done[rewards == 0.0].all()
+    assert (rewards[reached] == 0.0).any()
+    assert set(np.unique(rewards[reached])) <= {0.0, contact}, "a contact is no success"
+    assert (rewards[reached] == contact).any()
+
+
+# Trainings
+
+
+def test_a_model_is_trained_examined_and_driven(trained):
+    algorithm, folder = trained
+    training = training_of(algorithm, STEPS[algorithm])
+    curve = read_curve(folder / "curve.csv")
+    assert list(curve[0]) == list(training.columns)
+    assert curve[0]["steps"] == 0
+    assert curve[-1]["steps"] >= STEPS[algorithm]
+    assert {path.name for path in folder.iterdir()} == {"curve.csv", "model.zip", "checkpoint.zip"}
+    card = ModelCard.of_file(folder / "checkpoint.zip")
+    assert (card.task, card.algorithm, card.scenarios) == ("drive", algorithm, ("mini",))
+    assert card.settings["contact_cost"] == DRIVE_RECIPES[algorithm].contact_cost
+    rows = parked_on([MINI], EXAMINED, HERE, f"{algorithm}:{folder / 'checkpoint.zip'}")
+    assert len(rows) == len(EXAMINED)
+    assert np.mean([row["parked"] for row in rows]) == curve[-1]["success"]
+
+
+def test_equal_seeds_give_equal_trainings_and_another_seed_another(trained, tmp_path):
+    algorithm, folder = trained
+    again, other = (
+        train_one(training_of(algorithm, STEPS[algorithm]), seed, tmp_path / str(seed)).model
+        for seed in (0, 1)
+    )
+    assert weights_of(folder / "model.zip") == weights_of(tmp_path / "0" / "model.zip")
+    assert again != other
+    assert weights_of(tmp_path / "1" / "model.zip") != weights_of(tmp_path / "0" / "model.zip")
+
+
+def weights_of(path):
+    """All weights of a model in a file, as bytes."""
+    algorithm = ModelCard.of_file(path).algorithm
+    parameters = make_driver(f"{algorithm}:{path}").model.policy.state_dict()
+    return b"".join(values.numpy().tobytes() for values in parameters.values())
+
+
+def test_a_training_goes_on_from_its_checkpoint(trained, tmp_path):
+    algorithm, folder = trained
+    gone_on = tmp_path / "gone_on"
+    shutil.copytree(folder, gone_on)
+    before = (gone_on / "curve.csv").read_text()
+    steps = STEPS[algorithm] + 400
+    curve = training_of(algorithm, steps, STEPS[algorithm] // 2).train(0, gone_on)
+    assert (gone_on / "curve.csv").read_text().startswith(before)
+    assert curve[-1]["steps"] >= steps
+    assert ModelCard.of_file(gone_on / "checkpoint.zip").steps == curve[-1]["steps"]
+
+
+def test_levels_and_memory_outlive_an_interruption(tmp_path, monkeypatch):
+    """Stopped after its third examination, a training goes on with the drives that it remembers."""
+    training = training_of("sac", STEPS["sac"], 300)
+    examine, examinations = DriveTraining.examine, []
+
+    def stopping(self, model, practice):
+        if len(examinations) == 3:
+            raise KeyboardInterrupt
+        examinations.append(model.num_timesteps)
+        practice.levels["perpendicular"] = 2
+        return examine(self, model, practice)
+
+    monkeypatch.setattr(DriveTraining, "examine", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        training.train(0, tmp_path)
+    assert (tmp_path / "replay.pkl").exists()
+    sizes, levels = [], []
+
+    def looking(self, model, practice):
+        sizes.append(model.replay_buffer.size() * model.n_envs)
+        levels.append(practice.levels["perpendicular"])
+        return examine(self, model, practice)
+
+    monkeypatch.setattr(DriveTraining, "examine", looking)
+    training.train(0, tmp_path)
+    assert sizes[-1] >= STEPS["sac"]
+    assert levels[0] >= 2
+    assert not (tmp_path / "replay.pkl").exists()
+
+
+@pytest.mark.parametrize("name", ["model.zip", "checkpoint.zip"])
+def test_models_of_another_task_are_refused(trained, name):
+    algorithm, folder = trained
+    from planners.agent import make_agent
+
+    with pytest.raises(InputError, match=r"was trained to drive, not to search; `parkenv park` runs it"):
+        make_agent(f"{algorithm}:{folder / name}", Scenario.named("mini"))
+    other = "ppo" if algorithm != "ppo" else "sac"
+    with pytest.raises(InputError, match=f"is a model of {algorithm}, not of {other}"):
+        make_driver(f"{other}:{folder / name}")
+    with pytest.raises(InputError, match="unknown driver 'mdp'; known: planner"):
+        make_driver("mdp")
+
+
+def test_a_driver_wants_the_obstacle_map_and_serves_many_episodes(trained):
+    algorithm, folder = trained
+    driver = make_driver(f"{algorithm}:{folder / 'model.zip'}")
+    blind = DriveEnv(lot=MINI)
+    with pytest.raises(InputError, match="obstacle_map=True"):
+        driver.predict(blind.reset(seed=0)[0])
+    envs = gym.vector.SyncVectorEnv([lambda: DriveEnv(lot=MINI, obstacle_map=True) for _ in range(3)])
+    single = DriveEnv(lot=MINI, obstacle_map=True)
+    together, _ = envs.reset(seed=[4, 5, 6])
+    alone, _ = single.reset(seed=5)
+    state = memory = None
+    for _ in range(10):
+        actions, state = driver.predict(together, state)
+        action, memory = driver.predict(alone, memory)
+        np.testing.assert_allclose(actions[1], action, atol=1e-5)
+        together, *_ = envs.step(actions)
+        alone, *_ = single.step(action)
+    envs.close()
+
+
+def test_the_examination_is_the_environments_own_tasks():
+    """Who drives blindly ahead ends in the batch as in the environment."""
+    training = training_of("ppo", 10, lots=(STREET,))
+    status, times = parked_by(Always(0.5, 0.1), training._tasks["parallel"])
+    view = DriverView(VehicleParameters())
+    env = DriveEnv(lot=STREET, kinds=("parallel",))
+    for k, seed in enumerate(EXAMINED):
+        env.reset(seed=seed)
+        over = False
+        while not over:
+            pedal = command(np.float32([0.5, 0.1]), env.state.vehicle[SPEED], view.pedals)
+            *_, over, _, info = env.step([pedal, np.float32(0.1)])
+        assert status[k] >= CONTACT
+        assert times[k] == pytest.approx(info["time_s"])
+
+
+def test_success_is_drawn_by_kind(tmp_path):
+    curves = [
+        [{"steps": s, "oblique_success": 0.1 * s + 0.01 * k, "parallel_success": 0.0} for s in (0, 5, 9)]
+        for k in range(3)
+    ]
+    rows = across_seeds(curves, "oblique_success")
+    assert rows[1]["oblique_success"] == pytest.approx(0.51)
+    assert rows[1]["low"] < 0.51 < rows[1]["high"]
+    save_success_curves(
+        {"sac": curves}, ("oblique", "parallel"), {"oblique": 1.0}, "a title", tmp_path / "curve.png"
+    )
+    assert (tmp_path / "curve.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", sorted(DRIVE_RECIPES))
+def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algorithm):
+    out = tmp_path / "out"
+    steps = 40_000 if algorithm == "ppo" else 4_000
+    every = steps // 4
+    arguments = [
+        *PARKENV, "train", algorithm, "--env", "drive", "--lot", "mini", "--steps", str(steps),
+        "--seeds", "2", "--examine-every", str(every), "--examined-on", "4", "--jobs", "2", "--out", str(out),
+    ]  # fmt: skip
+    process = subprocess.Popen(
+        arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+    )
+    deadline = time.monotonic() + 240
+    while time.monotonic() < deadline and len(read_curve(out / "seed_0" / "curve.csv")) < 2:
+        time.sleep(0.2)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    survived = (out / "seed_0" / "curve.csv").read_text()
+    refused = subprocess.run(arguments, capture_output=True, text=True)
+    assert (refused.returncode, "--resume" in refused.stderr) == (2, True)
+    subprocess.run([*arguments, "--resume"], check=True, capture_output=True)
+    assert (out / "seed_0" / "curve.csv").read_text().startswith(survived)
+    summary = json.loads((out / "summary.json").read_text())
+    assert [row["seed"] for row in summary["rows"]] == [0, 1]
+    assert all(row["steps"] >= steps for row in summary["rows"])
+    assert summary["examined"] == {"perpendicular": 1.0, "all": 1.0}
+    assert (out / "learning_curve.png").stat().st_size > 10_000
+    model = f"{algorithm}:{out / 'seed_1' / 'model.zip'}"
+    parked = subprocess.run(
+        [*PARKENV, "park", "--agents", f"planner,{model}", "--lot", "mini", "--episodes", "4", "--out",
+         str(tmp_path / "parked")],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert parked.returncode == 0, parked.stderr
+    rows = json.loads((tmp_path / "parked" / "summary.json").read_text())["rows"]
+    assert {row["agent"] for row in rows} == {"planner", algorithm}
+    assert (tmp_path / "parked" / algorithm / "parking.gif").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_a_short_training_learns_to_park_from_nearby(tmp_path, monkeypatch):
+    """In a minute of training, from a few metres away and with nobody beside the slot."""
+    monkeypatch.setitem(DRIVE_RECIPES, "ppo", FULL_SIZE["ppo"])
+    curve = training_of("ppo", 800_000, 400_000).train(0, tmp_path)
+    assert curve[-1]["perpendicular_level"] >= 2.0
+    near = places_of((MINI,))[0].tasks(slack=1.0, distance=(1.0, 6.0), starts="way-out")
+    tasks = [PreparedTask(near.draw(7_000 + k)) for k in range(60)]
+    standing, trained = (
+        (parked_by(driver, tasks)[0] == PARKED).mean()
+        for driver in (Always(0.0, 0.0), make_driver(f"ppo:{tmp_path / 'checkpoint.zip'}").model)
+    )
+    assert trained > standing + 0.3
+
+
+@pytest.mark.parametrize(
+    ("agents", "wanted"),
+    [("robot", "unknown driver 'robot'; known: planner"), ("sac:nowhere.zip", "nowhere.zip: no model file")],
+)
+def test_park_refuses_who_cannot_drive(tmp_path, agents, wanted):
+    result = CliRunner().invoke(app, ["park", "--agents", agents, "--out", str(tmp_path / "p")])
+    assert isinstance(result.exception, InputError)
+    assert wanted in str(result.exception)
+    assert not (tmp_path / "p").exists()
