@@ -417,7 +417,7 @@ def test_words_for_sight_are_checked(tmp_path):
     (tmp_path / "odd.json").write_text("{}")
     for words, message in (
         (("--sight", "keen"), "--sight is 'keen', want perfect, laser, stereo, or a file that is there"),
-        (("--sight", tmp_path / "odd.json"), "odd.json: want a JSON object"),
+        (("--sight", tmp_path / "odd.json"), "odd.json: want a sighting model, a JSON object"),
         (("--sensors", "radar"), "--sensors is 'radar', want one of laser, stereo, both_sides"),
         (("--solver", "guess"), "solver is 'guess', want one of"),
         (("--budget-ms", "-1"), "budget_ms is -1"),
