@@ -196,12 +196,12 @@ def train(
         training = course.training(console)
         numbers = range(seed, seed + seeds)
         curves = _train_all(console, course, training, numbers, out, workers, tensorboard)
-        report = course.report(
+        outcome = course.report(
             console, workers, curves, {n: out / f"seed_{n}" / "model.zip" for n in numbers}, out
         )
     command = ["parkenv", *sys.argv[1:]]
     write_summary(
-        out, {"command": command, "version": __version__, "seed": seed, "settings": settings, **report}
+        out, {"command": command, "version": __version__, "seed": seed, "settings": settings, **outcome}
     )
     console.print(f"Models, curves, summary and figure are in {out}")
     if report:
