@@ -37,7 +37,10 @@ from parkenv.evaluation.lot_driver import (
     GraphDriver,
     LotDriver,
 )
+from parkenv.evaluation.sensor_log import record_trip
 from parkenv.keyed_random import world_key
+from parkenv.lot_scene import LotScenes
+from parkenv.occupancy import OccupancyProcess
 from planners.agent import make_agent
 from planners.hybrid_astar import CarPath
 from planners.lane_keeping import LaneKeeper, joined, rounded
@@ -221,6 +224,101 @@ def test_equal_seeds_give_equal_trips_whatever_was_driven_before():
     assert DrivenSearch(search.scenario).run(7) == first
 
 
+@lru_cache
+def with_sensors(captures=2):
+    return DrivenSearch(MINI, rig="laser", weather="sunny", captures=captures)
+
+
+def test_with_sensors_equal_seeds_give_equal_trips_and_captures_are_where_the_car_was():
+    search = with_sensors()
+    env, driver = search.env, search.driver
+    poses, told = [], []
+
+    def keep(observation):
+        track = {spot.time: spot for spot in driver.track}
+        looks = env.watcher.looks
+        # (ends of edges are no captures of their own where nothing was driven)
+        assert len(looks) <= 2
+        assert bool(looks) == bool(track) or env.state.parked
+        for moment, look in looks:
+            np.testing.assert_array_equal(look.vehicle, track[moment.time].pose)
+            poses.append((moment.time, *look.vehicle))
+        driven = [track[moment.time].driven_m for moment, _ in looks]
+        assert len(driven) < 2 or np.diff(driven).min() > 1.25 - 0.3
+        told.append(observation["p_occupied"].copy())
+
+    first = search.run(2, on_step=keep)
+    assert first.parked
+    assert first.contacts == 0
+    times = np.array([pose[0] for pose in poses])
+    assert len(times) > len(first.legs) / 2
+    assert (np.diff(times) > 0.0).all()
+    offset = np.abs([y for _, _, y, _ in poses])
+    assert offset.max() > 0.0
+    assert offset.max() < 1.5, "on the lane, right of its middle, and not on the graph's vertices"
+    before, poses[:], told[:] = list(poses), [], []
+    search.run(3)
+    assert search.run(2, on_step=keep) == first
+    assert poses == before
+
+
+def test_with_sensors_the_belief_is_what_the_stack_sees_and_not_what_is_so(monkeypatch):
+    """A car whose sensors are shown an empty lot believes it, however full the lot is."""
+    search = with_sensors(captures=1)
+    env, lookout, lot = search.env, search.env.watcher.lookout, MINI.lot
+    measure, scene = lookout.measure, LotScenes.at
+
+    def emptied(self, time, ego=None):
+        seen = scene(self, time, ego)
+        for slot in seen.present.tolist():
+            seen = seen.without_vehicle(slot)
+        return seen
+
+    def measured(state, stations):
+        with monkeypatch.context() as patch:
+            patch.setattr(LotScenes, "at", emptied)
+            return measure(state, stations)
+
+    for show_all in (True, False):
+        if not show_all:
+            monkeypatch.setattr(lookout, "measure", measured)
+        env.reset(seed=1)
+        truth = env.state.world.occupied(np.arange(lot.n_slots), env.state.time)
+        for _ in range(3):
+            observation, *_ = env.step(int(np.flatnonzero(lot.neighbors[env.state.vertex] >= 0)[-1]))
+        seen = env.state.belief.seen
+        believed = observation["p_occupied"] > 0.5
+        assert (seen & truth).sum() >= 2, "or nothing is shown"
+        assert ((believed == truth) if show_all else ~believed)[seen & truth].mean() >= 0.75
+
+
+@pytest.mark.slow
+def test_with_sensors_what_was_never_captured_changes_nothing():
+    """Other cars in slots out of reach of every capture so far: the same beliefs, decisions and times."""
+    campus = Scenario.named("campus")
+    lot, taken = campus.lot, np.arange(campus.lot.n_slots) % 2 == 0
+    entry = lot.vertex_xy[int(lot.entry_vertices[0])]
+    away = np.hypot(*(lot.slot_xy - entry).T)
+    far, near = away > 75.0, away < 45.0
+    assert min(far.sum(), near.sum()) > 10
+    told = []
+    for swapped in (np.zeros_like(far), far, near):
+        demand = np.where(taken ^ swapped, 25.0, -25.0)
+        world = OccupancyProcess.from_demand(demand, np.zeros(168), 1e9)
+        scenario = campus.replace(occupancy=world, prior=campus.occupancy)
+        search = DrivenSearch(scenario, rig="laser", weather="sunny", captures=1)
+        agent, env = make_agent("mdp", search.scenario), search.env
+        observation, memory, steps = env.reset(seed=0)[0], None, []
+        for _ in range(4):
+            action, memory = agent.predict(observation, memory)
+            observation, *_ = env.step(int(action))
+            assert np.hypot(*(lot.vertex_xy[env.state.vertex] - entry)) < 40.0
+            steps.append((int(action), env.state.time, observation["p_occupied"].tolist()))
+        told.append(steps)
+    assert told[0] == told[1]
+    assert told[0] != told[2], "what is near is seen"
+
+
 def test_straight_on_the_car_drives_at_the_limit_and_slower_where_that_is_lower():
     fast, _, _ = started("campus", style=DrivingStyle(speed=4.0))
     slow, _, _ = started("campus", style=DrivingStyle(speed=2.0))
@@ -339,6 +437,17 @@ def test_bad_input_is_one_clear_error():
         DrivenSearch(MINI, style=DrivingStyle(speed=30.0))
     with pytest.raises(InputError, match="unknown agent 'nobody'"):
         DrivenSearch(MINI, "nobody")
+    with pytest.raises(InputError, match="rig is 'sonar', want a SensorRig or one of laser"):
+        DrivenSearch(MINI, rig="sonar")
+    with pytest.raises(InputError, match="this one has none: give it a rig"):
+        record_trip(searched("mini"), 0, None)
+    for words, message in (
+        (["--rerun", "trip.rrd"], "add --sensors laser"),
+        (["--unseen", "--sensors", "laser"], "--unseen and --sensors"),
+    ):
+        result = CliRunner().invoke(app, ["trip", "--scenario", "mini", *words])
+        assert isinstance(result.exception, InputError)
+        assert message in str(result.exception)
     with pytest.raises(InputError, match="seed is -1"):
         searched("mini").run(-1)
     with pytest.raises(InputError, match=r"seed is 1\.5"):
@@ -481,3 +590,8 @@ def test_the_commands_calibrate_compare_and_film(tmp_path):
     with Image.open(film) as picture:
         assert picture.size == (640, 480)
         assert picture.n_frames > 40
+    recording = tmp_path / "trip.rrd"
+    words = ["trip", "--scenario", "mini", "--seed", "3", "--sensors", "laser", "--rerun", str(recording)]
+    result = run(app, [*words, "--out", str(film)])
+    assert result.exit_code == 0, result.output
+    assert recording.stat().st_size > 50_000

@@ -44,6 +44,7 @@ def calibrate(
     agent: AgentOption = "mdp",
     notice_m: NoticeOption = 2.0,
     v_drive_kmh: SpeedOption = None,
+    sensors: args.SensorsOption = None,
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 1,
     backend: args.BackendOption = "loky",
@@ -82,10 +83,12 @@ def calibrate(
     its = Scenario.named(scenario)
     speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
     style = DrivingStyle(speed=speed, notice_m=notice_m)
-    DrivenSearch(its, agent, style=style)  # complains before anything is driven
+    rig = args.rig_of(sensors)
+    DrivenSearch(its, agent, style=style, rig=rig)  # complains before anything is driven
     make_folder(out)
     settings = {
         "version": __version__, "scenario": scenario, "agent": agent, "style": dataclasses.asdict(style),
+        "sensors": rig,
     }  # fmt: skip
     folder = TripFolder(out, settings, resume=resume)
     console = make_console()
@@ -101,7 +104,7 @@ def calibrate(
     with progress, args.workers_of(jobs, backend, address) as workers:
         bar = progress.add_task("Driving", total=2 * trips)
         rows = drive_trips(
-            TripPlan(its, agent, style), seeds, folder, workers, lambda n: progress.advance(bar, n)
+            TripPlan(its, agent, style, rig), seeds, folder, workers, lambda n: progress.advance(bar, n)
         )
     made, table = calibration_of(rows, its, speed)
     made.to_file(out / "calibrated.json")
@@ -148,25 +151,38 @@ def trip(
         bool, typer.Option("--unseen", help="Let no slot be seen before a try, so that tries fail.")
     ] = False,
     notice_m: NoticeOption = 2.0,
+    sensors: args.SensorsOption = None,
     seed: args.SeedOption = 0,
     out: Annotated[Path, typer.Option("--out", "-o", help="The film, a GIF.")] = Path("results/trip.gif"),
+    rerun: args.RerunOption = None,
 ) -> None:
     """Drive one trip from the entry into a slot, and film it from above, five times as fast as in life.
 
-    Example: `parkenv trip --scenario campus --seed 7 --unseen --out trip.gif`
+    Examples:
+    * `parkenv trip --scenario campus --seed 7 --unseen --out trip.gif`
+
+    * `parkenv trip --scenario campus --sensors laser --rerun trip.rrd`
     """
     from parkenv.evaluation.compare import unseen
     from parkenv.evaluation.driven_search import DrivenSearch
     from parkenv.evaluation.lot_driver import DrivingStyle
     from parkenv.evaluation.picture_files import save_film
     from parkenv.evaluation.results import make_folder
+    from parkenv.evaluation.sensor_log import record_trip, require_viewer, sensor_log
     from parkenv.evaluation.trip_pictures import COLORS, FPS, film_trip
     from parkenv.scenario import Scenario
 
     if out.suffix.lower() != ".gif":
         raise InputError(f"--out is {out}, want a file that ends in .gif")
+    if blind and sensors is not None:
+        raise InputError("--unseen and --sensors: what no one sees needs no sensors; name one of the two")
+    if rerun is not None:
+        if sensors is None:
+            raise InputError("--rerun records what sensors measure: add --sensors laser")
+        require_viewer()
     its = Scenario.named(scenario)
-    search = DrivenSearch(unseen(its) if blind else its, agent, style=DrivingStyle(notice_m=notice_m))
+    style = DrivingStyle(notice_m=notice_m)
+    search = DrivenSearch(unseen(its) if blind else its, agent, style=style, rig=args.rig_of(sensors))
     make_folder(out.parent)
     console = make_console()
     with console.status("Driving and drawing"):
@@ -174,6 +190,14 @@ def trip(
         save_film(frames, out, fps=FPS, colors=COLORS)
     _show(console, driven)
     console.print(f"The film is {out}")
+    if rerun is not None:
+        assert search.env.watcher is not None
+        with (
+            console.status(f"Driving once more for {rerun}"),
+            sensor_log(rerun, its.lot, search.env.watcher.lookout.rig) as recording,
+        ):
+            record_trip(search, seed, recording)
+        console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
 
 
 def _show(console: Any, driven: Any) -> None:

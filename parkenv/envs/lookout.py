@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -80,14 +81,42 @@ class Lookout:
         Returns:
             1 to `captures` moments, the newest last.
         """
+        return self.measure(state, self._stations(state, since))
+
+    def measure(self, state: SearchState, stations: Sequence[tuple[float, FloatArray]]) -> list[Moment]:
+        """Measure at some places.
+
+        Args:
+            state: of the search, whose world it is.
+            stations: time, s, and pose of the vehicle, (3,) x, y in m and yaw in rad, of each; oldest first.
+
+        Returns:
+            A moment for each.
+        """
         scenes, weather = self._world(state)
         moments = []
-        for time, pose in self._stations(state, since):
+        for time, pose in stations:
             # By the millisecond: the same look has the same noise.
             noise = np.random.SeedSequence([int(state.key), int(time * 1000.0)]).generate_state(1)
             scene = scenes.at(time, pose)
             moments.append(Moment(time, self.rig.capture(scene, pose, weather, int(noise[0]))))
         return moments
+
+    def chosen(self, driven: FloatArray) -> NDArray[np.int64]:
+        """Where on a way to measure: evenly, `every` m apart at least, at most `captures` times, and where it ends.
+
+        Args:
+            driven: (k,) m, how far the car had come at each of the places it could be, ascending; k at least 1.
+
+        Returns:
+            Indices of 1 to `captures` of them, ascending.
+        """
+        n = self._n_on(float(driven[-1] - driven[0]))
+        wanted = np.linspace(driven[0], driven[-1], n + 1)[1:-1]
+        return np.unique(np.r_[np.searchsorted(driven, wanted), len(driven) - 1])
+
+    def _n_on(self, metres: float) -> int:
+        return min(max(int(metres / self._every), 1), self.captures)
 
     def _world(self, state: SearchState) -> tuple[LotScenes, Weather]:
         if self._seen_world is None or self._seen_world[0] != state.key:
@@ -107,7 +136,7 @@ class Lookout:
             return [stop]
         start, begun = self._lot.vertex_xy[since[0]], since[1]
         way = here - start
-        n = min(max(int(np.hypot(*way) / self._every), 1), self.captures)
+        n = self._n_on(float(np.hypot(*way)))
         yaw = math.atan2(way[1], way[0])
         shares = [k / n for k in range(1, n)]
         passing = [(begun + s * (state.time - begun), np.array([*(start + s * way), yaw])) for s in shares]

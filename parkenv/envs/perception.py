@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from parkenv.envs.lookout import Lookout, Moment
 from parkenv.envs.search import SearchEnv, SearchState
-from parkenv.envs.search_step import drive_or_park, renew, settle, take_in, tell_time
+from parkenv.envs.search_step import VERTEX, Search, drive_or_park, renew, settle, take_in, tell_time
 from parkenv.envs.sensors import beside_the_lot
 from parkenv.mapping.slots import SlotFilter
 from parkenv.perception.detector import Detector
@@ -32,6 +33,72 @@ class Report(NamedTuple):
 
 
 _NOTHING = Report(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.bool_))
+
+
+class Watcher:
+    """A rig, the stack behind it, and what both tell a belief.
+
+    Args:
+        scenario: the world; where its sighting is perfect, what was measured of the rig takes its place.
+        rig, weather, captures, every: as in `Lookout`.
+        detector: the shipped models where None.
+
+    Attributes:
+        scenario: with what the car takes its eyes to be worth.
+        lookout: what measures.
+        stack: what sees.
+        looks: what was captured last, oldest first, and what the stack made of it.
+        report: what that said of the slots.
+
+    Raises:
+        InputError: an unknown rig or weather, a rig that cannot see or range, a number out of its range.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        rig: str | SensorRig,
+        weather: str | None = None,
+        captures: int = 2,
+        every: float = 1.25,
+        detector: Detector | None = None,
+    ) -> None:
+        self.lookout = Lookout(scenario, rig, weather, captures, every)
+        self.stack = PerceptionStack(self.lookout.rig, detector)
+        if scenario.sighting.perfect:
+            measured = SightingModel.named("laser" if self.lookout.rig.lasers else "stereo")
+            scenario = scenario.replace(sighting=measured)
+        self.scenario = scenario
+        self._view_starts, self._view_slots = scenario.slots_in_view
+        self._rates = scenario.sight_rates
+        self.forget()
+
+    def forget(self) -> None:
+        """Nothing has been captured."""
+        self.looks: list[tuple[Moment, Look]] = []
+        self.report = _NOTHING
+
+    def tell(self, search: Search, moments: Sequence[Moment]) -> None:
+        """See what was captured on the way to the vertex where the car is, and take it into the belief.
+
+        Args:
+            search: of this scenario, under way; its first.
+            moments: oldest first.
+        """
+        self.looks = [(moment, self.stack.look(moment.capture)) for moment in moments]
+        slots = SlotFilter(self.scenario.lot)
+        for _, look in self.looks:
+            for sweep in look.sweeps:
+                slots.see_through(sweep)
+            for view in look.views:
+                slots.see_cars(view.cars)
+        states = slots.states()
+        vertex = search.counts[0, VERTEX]
+        rows = slice(self._view_starts[vertex], self._view_starts[vertex + 1])
+        near, rates = self._view_slots[rows], self._rates.of(rows)
+        told = states.in_view[near] & (states.p_occupied[near] != 0.5)
+        self.report = Report(near[told], states.occupied[near[told]])
+        take_in(search, 0, *self.report, rates.hit[told], rates.false_alarm[told])
 
 
 class SearchPerceptionEnv(SearchEnv):
@@ -95,40 +162,31 @@ class SearchPerceptionEnv(SearchEnv):
         detector: Detector | None = None,
         **changes: Any,
     ) -> None:
-        super().__init__(scenario, render_mode, **changes)
-        self._lookout = Lookout(self.scenario, rig, weather, captures, every)
-        self._stack = PerceptionStack(self._lookout.rig, detector)
-        if self.scenario.sighting.perfect:
-            measured = SightingModel.named("laser" if self.rig.lasers else "stereo")
-            self.scenario = self.scenario.replace(sighting=measured)
-            self._make_search()
-        self._view_starts, self._view_slots = self.scenario.slots_in_view
-        self._rates = self.scenario.sight_rates
+        self.watcher = Watcher(Scenario.of(scenario, **changes), rig, weather, captures, every, detector)
+        super().__init__(self.watcher.scenario, render_mode)
         self._before: tuple[int, float] | None = None
-        self._looks: list[tuple[Moment, Look]] = []
-        self._report = _NOTHING
 
     @property
     def rig(self) -> SensorRig:
         """The sensors, where they sit, and how they are built."""
-        return self._lookout.rig
+        return self.watcher.lookout.rig
 
     @property
     def report(self) -> Report:
         """What the stack said of the slots after the last step."""
-        return self._report
+        return self.watcher.report
 
     @property
     def looks(self) -> list[tuple[Moment, Look]]:
         """What was captured on the way of the last step, oldest first, and what the stack made of it."""
-        return list(self._looks)
+        return list(self.watcher.looks)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start a search; see the class."""
-        self._before, self._looks = None, []
-        self._report = _NOTHING
+        self._before = None
+        self.watcher.forget()
         return super().reset(seed=seed, options=options)
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -141,27 +199,11 @@ class SearchPerceptionEnv(SearchEnv):
         drive_or_park(self.search, 0, action)
         self._state.come_along()
         if not self._state.parked:
-            self._look(self._state)
+            self.watcher.tell(self.search, self.watcher.lookout.look(self._state, self._before))
         settle(self.search, 0)
         renew(self.search, 0)
         tell_time(self.search, 0, self._clock)
 
-    def _look(self, state: SearchState) -> None:
-        moments = self._lookout.look(state, self._before)
-        self._looks = [(moment, self._stack.look(moment.capture)) for moment in moments]
-        slots = SlotFilter(self.scenario.lot)
-        for _, look in self._looks:
-            for sweep in look.sweeps:
-                slots.see_through(sweep)
-            for view in look.views:
-                slots.see_cars(view.cars)
-        states = slots.states()
-        rows = slice(self._view_starts[state.vertex], self._view_starts[state.vertex + 1])
-        near, rates = self._view_slots[rows], self._rates.of(rows)
-        told = states.in_view[near] & (states.p_occupied[near] != 0.5)
-        self._report = Report(near[told], states.occupied[near[told]])
-        take_in(self.search, 0, *self._report, rates.hit[told], rates.false_alarm[told])
-
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
         """The lot from above, and beside it the newest pictures."""
-        return beside_the_lot(super()._frame(state), [moment for moment, _ in self._looks], self.rig)
+        return beside_the_lot(super()._frame(state), [moment for moment, _ in self.watcher.looks], self.rig)

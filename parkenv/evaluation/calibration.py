@@ -104,16 +104,18 @@ class TripPlan:
         scenario: the scenario.
         agent: who decides.
         style: how is driven.
+        rig: whose sensors see the slots, by name; None where the scenario's sighting model stands for them.
     """
 
     scenario: Scenario
     agent: str
     style: DrivingStyle
+    rig: str | None = None
 
     def run(self, sight: str, seeds: Sequence[int]) -> list[Row]:
         """Drive some trips: a row each, as `trip_row` has it."""
-        scenario = self.scenario if sight == SEEN else unseen(self.scenario)
-        search = DrivenSearch(scenario, self.agent, style=self.style)
+        scenario, rig = (self.scenario, self.rig) if sight == SEEN else (unseen(self.scenario), None)
+        search = DrivenSearch(scenario, self.agent, style=self.style, rig=rig)
         return [trip_row(search.run(seed), sight) for seed in seeds]
 
 

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import VehicleParameters
+from parkenv.envs.perception import Watcher
 from parkenv.envs.search import SearchEnv
 from parkenv.envs.search_step import (
     DRIVEN_M,
@@ -31,6 +33,9 @@ from parkenv.lot import PARK
 from parkenv.scenario import Scenario
 from planners.agent import Agent, make_agent
 from planners.oracle import OracleAgent
+from sim_sensors.rig import SensorRig
+
+Observation = dict[str, Any]
 
 MOST_STEPS = 2000
 """Decisions, after which a trip is given up, as in `parkenv/Search-v0`."""
@@ -46,11 +51,14 @@ class DrivenSearchEnv(SearchEnv):
     Args:
         scenario: the scenario.
         driver: who drives; with a `GraphDriver` this is `parkenv/Search-v0` itself.
+        watcher: sensors that ride along, whose scenario this is: then the belief is what they make of what they measure
+            where the car really was, as in `parkenv/SearchPerception-v0`. Without, slots are seen from the vertices,
+            as the scenario's sighting model has it.
     """
 
-    def __init__(self, scenario: Scenario, driver: Driver) -> None:
+    def __init__(self, scenario: Scenario, driver: Driver, watcher: Watcher | None = None) -> None:
         super().__init__(scenario)
-        self.driver = driver
+        self.driver, self.watcher = driver, watcher
         self._refused: set[int] = set()
         self.manoeuvre: Try | None = None
 
@@ -58,6 +66,8 @@ class DrivenSearchEnv(SearchEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start a search, and the car at the entry."""
+        if self.watcher is not None:
+            self.watcher.forget()
         result = super().reset(seed=seed, options=options)
         state = self.state
         self._refused.clear()
@@ -81,13 +91,27 @@ class DrivenSearchEnv(SearchEnv):
             self.driver.wait(self.scenario.wait_s)
             drive_or_park(search, 0, action)
         if not state.parked:
-            look(search, 0)
+            self._see(on_the_way=possible and action != PARK)
             for slot in self._refused:
                 # It looks free, and is of no use to this car.
                 learn(search, 0, touched(search, 0, slot), True, 1.0)
         settle(search, 0)
         renew(search, 0)
         self._clock[:] = state.time, state.time - state.arrival.time
+
+    def _see(self, *, on_the_way: bool) -> None:
+        """Tell the belief what the slots look like from where the car is, and from where it has been on its way."""
+        watcher = self.watcher
+        if watcher is None:
+            look(self.search, 0)
+            return
+        # After a try, or a wait, the car looks around once more; what it saw from amid the manoeuvre is of no use.
+        track = self.driver.track if on_the_way else self.driver.track[-1:]
+        stations: list[tuple[float, NDArray[np.float64]]] = []
+        if track:
+            chosen = watcher.lookout.chosen(np.array([spot.driven_m for spot in track]))
+            stations = [(track[i].time, track[i].pose) for i in chosen.tolist()]
+        watcher.tell(self.search, watcher.lookout.measure(self._state, stations))
 
     def _park(self, slot: int, before: float) -> None:
         search, state = self.search, self._state
@@ -166,9 +190,14 @@ class DrivenSearch:
         agent: who decides: a name that `make_agent` knows.
         vehicle: the car.
         style: how it is driven.
+        rig: sensors that ride along and tell the car which slots are taken: laser, stereo, both_sides, or a
+            `sim_sensors.rig.SensorRig`; None where the scenario's sighting model stands for them.
+        weather: as of `parkenv/SearchPerception-v0`.
+        captures: how many there are at most on an edge.
 
     Raises:
-        InputError: an unknown agent; a speed that the car does not have; or a lot in which the car fits nowhere.
+        InputError: an unknown agent, rig or weather; a speed that the car does not have; or a lot in which the car fits
+            nowhere.
 
     Example:
         >>> import math
@@ -184,18 +213,29 @@ class DrivenSearch:
         agent: str = "mdp",
         vehicle: VehicleParameters | None = None,
         style: DrivingStyle | None = None,
+        rig: str | SensorRig | None = None,
+        weather: str | None = None,
+        captures: int = 2,
     ) -> None:
-        self.scenario, self.agent = scenario, agent
-        self._agent: Agent = make_agent(agent, scenario)
-        self.driver = LotDriver(scenario, vehicle, style)
-        self.env = DrivenSearchEnv(scenario, self.driver)
+        watcher = None if rig is None else Watcher(scenario, rig, weather, captures)
+        self.scenario = scenario if watcher is None else watcher.scenario
+        self.agent = agent
+        self._agent: Agent = make_agent(agent, self.scenario)
+        self.driver = LotDriver(self.scenario, vehicle, style)
+        self.env = DrivenSearchEnv(self.scenario, self.driver, watcher)
 
-    def run(self, seed: int, watch: Callable[[], None] | None = None) -> Trip:
+    def run(
+        self,
+        seed: int,
+        watch: Callable[[], None] | None = None,
+        on_step: Callable[[Observation], None] = lambda _: None,
+    ) -> Trip:
         """The trip in the world of a seed.
 
         Args:
             seed: 0 or more.
             watch: called after every 0.1 s of driving; `driver` and `env` say where things stand.
+            on_step: called with what the agent observes at first, and after every decision that was carried out.
 
         Raises:
             InputError: a seed that is no whole number of 0 or more.
@@ -210,9 +250,11 @@ class DrivenSearch:
         memory: Any = None
         info: dict[str, Any] = {}
         over = False
+        on_step(observation)
         for _ in range(MOST_STEPS):
             action, memory = self._agent.predict(observation, memory)
             observation, _, over, _, info = env.step(action)
+            on_step(observation)
             if over:
                 break
         gave_up_s = float(info["gave_up_s"]) + (0.0 if over else scenario.give_up_s)

@@ -127,8 +127,23 @@ class Try(NamedTuple):
     onward_m: float = 0.0
 
 
+class Spot(NamedTuple):
+    """Where the car was: s since Monday 00:00, m that it had driven, and (3,) x, y, yaw of its footprint's middle."""
+
+    time: float
+    driven_m: float
+    pose: FloatArray
+
+
 class Driver(Protocol):
-    """Who carries out what is decided on the drive graph, and says how long that took."""
+    """Who carries out what is decided on the drive graph, and says how long that took.
+
+    Attributes:
+        track: where the car has been since the last decision, every 0.1 s; empty if it has not moved on in time, or if
+            there is no car.
+    """
+
+    track: list[Spot]
 
     def begin(self, key: np.uint64, world: World, vertex: int, time: float) -> None:
         """Start at a vertex at a time, s, in the world of a key."""
@@ -152,6 +167,7 @@ class GraphDriver:
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
+        self.track: list[Spot] = []
 
     def begin(self, key: np.uint64, world: World, vertex: int, time: float) -> None:
         """Nothing to prepare."""
@@ -209,6 +225,7 @@ class LotDriver:
         state: (6,) of the vehicle, see `parkenv.driving.vehicle`.
         time: now, s.
         doing: what the car is about, in a word or two.
+        track: where it has been since the last decision, every 0.1 s.
         watch: called after every step of the control, 0.1 s, for pictures.
     """
 
@@ -233,6 +250,7 @@ class LotDriver:
         self._turns: dict[tuple[int, int, int, int], CarPath | None] = {}
         self.watch: Callable[[], None] = lambda: None
         self.log = DriveLog()
+        self.track: list[Spot] = []
         self.doing = ""
         self.state = np.zeros(STATE_SIZE)
         self.time = 0.0
@@ -241,6 +259,7 @@ class LotDriver:
         """Start at a vertex at a time, s, in the world of a key; at full speed, as who comes from a street."""
         self._around.begin(key, world)
         self.log = DriveLog()
+        self.track = []
         self.state = np.zeros(STATE_SIZE)
         self.time = time
         self._keeper: PathTracker | None = None
@@ -255,7 +274,7 @@ class LotDriver:
         lot = self.scenario.lot
         target, length = int(lot.neighbors[source, column]), float(lot.edge_length[source, column])
         edge = self._lines.edge(source, target, length)
-        began = self.time
+        began, self.track = self.time, []
         if not self._placed:
             self._place(edge)
         self.doing = "searching"
@@ -278,6 +297,7 @@ class LotDriver:
             taken: whether a car stands in it. The car finds out when it is about to drive into it.
         """
         lot, vehicle, began = self.scenario.lot, self.vehicle, self.time
+        self.track = []
         self.doing = f"parking in {lot.slot_ids[slot]}"
         self._halt(self.style.braking)
         center = 0.5 * (lot.slot_xy[slot] + self.state[:2])
@@ -301,7 +321,7 @@ class LotDriver:
 
     def wait(self, seconds: float) -> float:
         """Brake, and stay for some time; s."""
-        until = self.time + seconds
+        until, self.track = self.time + seconds, []
         self._refresh()
         while self.time < until - 1e-9:
             self._brake(self.style.braking)
@@ -585,6 +605,7 @@ class LotDriver:
                 self.log.contacts.append(Thing(touched).words)
             self._touches = bool(touched)
             self.time += PHYSICS_S
+        self.track.append(Spot(self.time, self.log.driven_m, self.vehicle.at_middle(self.state[:3])))
         self.watch()
         if np.abs(self.state[:2] - self._space_at).max() > REACH_M - 10.0:
             self._refresh()

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import rerun as rr
 
     from parkenv.envs.perception import SearchPerceptionEnv
+    from parkenv.evaluation.driven_search import DrivenSearch, Observation, Trip
     from parkenv.mapping.grid import OccupancyGrid
     from parkenv.mapping.survey import Survey, SurveyMoment
     from parkenv.perception.stack import Look
@@ -283,6 +284,30 @@ def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: Sensor
         action, memory = agent.predict(observation, memory)
         observation, _, terminated, truncated, _ = env.step(int(action))
         over = terminated or truncated
+
+
+def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
+    """Drive a trip with sensors, and record it.
+
+    Args:
+        search: with a rig.
+        seed: of the world.
+        log: where to; of the lot and the rig of `search`.
+
+    Raises:
+        InputError: a search without a rig.
+    """
+    watcher, env = search.env.watcher, search.env
+    if watcher is None:
+        raise InputError("a trip is recorded as its sensors see it, and this one has none: give it a rig")
+    log.begin()
+
+    def keep(observation: Observation) -> None:
+        for moment, look in watcher.looks:
+            log.moment(moment.time - env.state.arrival.time, look)
+        log.slots(observation["p_occupied"].astype(np.float64))
+
+    return search.run(seed, on_step=keep)
 
 
 def _jpeg(image: NDArray[np.uint8]) -> bytes:
