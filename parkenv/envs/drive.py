@@ -446,7 +446,7 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def _judge(self, observation: dict[str, Any]) -> bool:
         achieved, desired = observation["achieved_goal"], observation["desired_goal"]
-        distance, angle, success = _goal_error(achieved, desired, self._half)
+        distance, angle, success = goal_error(achieved, desired, self._half)
         self._errors = distance, angle
         return bool(success)
 
@@ -503,14 +503,12 @@ def goal_errors(
     Returns:
         (n,) distance, m; (n,) angle, rad; (n,) whether it counts as parked.
     """
-    errors = np.array([_goal_error(a, d, half) for a, d in zip(achieved, desired, strict=True)]).reshape(
-        -1, 3
-    )
+    errors = np.array([goal_error(a, d, half) for a, d in zip(achieved, desired, strict=True)]).reshape(-1, 3)
     return errors[:, 0], errors[:, 1], errors[:, 2] > 0.5
 
 
 @njit(cache=True, error_model="numpy")
-def _goal_error(
+def goal_error(
     achieved: NDArray[np.float32], desired: NDArray[np.float32], half: FloatArray
 ) -> tuple[float, float, float]:
     """Distance, m, angle, rad, and 1 or 0 for whether the car is parked, of one pair of goals."""

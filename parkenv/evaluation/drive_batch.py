@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from parkenv.driving.parking_task import AREA, KINDS, ParkingTask
 from parkenv.driving.vehicle import SPEED, YAW, VehicleParameters, advance
-from parkenv.envs.drive import CONTROL_S, MOST_CARS, MOST_LINES, SUBSTEPS, _goal_error, obstacle_map
+from parkenv.envs.drive import CONTROL_S, MOST_CARS, MOST_LINES, SUBSTEPS, goal_error, obstacle_map
 from planners.driver_view import HOLD, N_SEEN, DriverView, Outlines, command, see
 
 FloatArray = NDArray[np.float64]
@@ -158,7 +158,7 @@ def _drive(
                     status[i] = CONTACT
                     break
             _achieve(state, about[i], middle, achieved)
-            distance, angle, success = _goal_error(achieved, desired[i], half)
+            distance, angle, success = goal_error(achieved, desired[i], half)
             c, s = math.cos(slot_yaw[i]), math.sin(slot_yaw[i])
             east, north = c * achieved[0] - s * achieved[1], s * achieved[0] + c * achieved[1]
             if status[i] == UNDER_WAY and max(abs(east), abs(north)) > AREA:
