@@ -56,6 +56,8 @@ OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "
 """Values of `parking` whose slots do not lie open on the ground."""
 LARGEST_SPACE = 30.0
 """m²; a larger space without a capacity stands for several."""
+FARTHEST = 100_000.0
+"""How far from the middle of a map its parking and roads may lie, m."""
 STREETS_AROUND = 60.0
 """How far beyond the slots streets are lanes, m, where no bounds are given."""
 ENTRANCE_REACH = 100.0
@@ -76,7 +78,8 @@ def osm_draft(path: str | Path, wishes: Wishes | None = None) -> LotDraft:
         wishes: what the user says of the place.
 
     Raises:
-        InputError: the file is torn or of another kind, holds no parking, or an outline crosses itself.
+        InputError: the file is torn or of another kind, holds no parking, an outline crosses itself, or what it holds
+            lies too far apart.
     """
     path = Path(path)
     wishes = wishes or Wishes()
@@ -131,6 +134,7 @@ class _Place:
                 f"{path}: no parking in it: no amenity=parking_space, no amenity=parking, no street with "
                 "parking:left, parking:right or parking:both"
             )
+        _refuse_far_away(path, [e for e in elements if _is_parking(e) or "highway" in e.tags])
         self.frame = LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
         self.box = wishes.box(self.frame)
         box = None if self.box is None else shapely.box(*self.box)
@@ -541,6 +545,24 @@ def _is_parking(element: OsmElement) -> bool:
     return tags.get("amenity") in ("parking", "parking_space") or (
         "highway" in tags and any(key.startswith(("parking:", "parking:lane:")) for key in tags)
     )
+
+
+def _refuse_far_away(path: Path, elements: Sequence[OsmElement]) -> None:
+    """A map of one place is wanted: no plane holds the distances of a continent."""
+    positions = np.concatenate([line for e in elements for line in e.lines])
+    order = len(positions) // 2
+    lon, lat = (float(np.partition(degrees, order)[order]) for degrees in positions.T)
+    frame = LocalFrame(lon, lat)
+    for element in elements:
+        for line in element.lines:
+            away = np.hypot(*frame.to_xy(line).T)
+            if away.max() > FARTHEST:
+                there_lon, there_lat = line[away.argmax()]
+                raise InputError(
+                    f"{path}: {element.id} is at {there_lat:.4f}, {there_lon:.4f} and most of the map "
+                    f"{away.max() / 1e3:,.0f} km away at {lat:.4f}, {lon:.4f}, want a map no larger than "
+                    f"{FARTHEST / 1e3:.0f} km around its middle (are latitude and longitude swapped?)"
+                )
 
 
 def _is_blind_end(element: OsmElement) -> bool:

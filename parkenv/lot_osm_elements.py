@@ -64,7 +64,7 @@ def read_elements(path: Path) -> list[OsmElement]:
 
     Raises:
         InputError: the file cannot be read, is torn or of another kind, a position is none on the globe, or
-            a tagged way refers to a node that the file does not hold.
+            a tagged way refers to a node that the file does not hold, or an element stands twice and differs.
     """
     try:
         if path.suffix.lower() in (".osm", ".xml"):
@@ -123,6 +123,26 @@ class _Raw:
     node_tags: dict[int, dict[str, str]] = field(default_factory=dict)
     ways: dict[int, _Way] = field(default_factory=dict)
     relations: dict[int, _Relation] = field(default_factory=dict)
+
+    def add_node(self, number: int, position: tuple[float, float], tags: dict[str, str]) -> None:
+        """Take in a node. It may stand in a file again, with or without its tags, as Overpass writes it."""
+        before = self.positions.setdefault(number, position)
+        if before != position:
+            raise InputError(
+                f"node/{number} stands twice, at {before[1]}, {before[0]} and at {position[1]}, {position[0]}"
+            )
+        if tags:
+            self.node_tags[number] = tags
+
+    def add_way(self, number: int, way: _Way) -> None:
+        """Take in a way, which may stand in a file again, too."""
+        before = self.ways.get(number)
+        if before is not None:
+            if before.refs and way.refs and before.refs != way.refs:
+                raise InputError(f"way/{number} stands twice, with other nodes")
+            line = before.line if way.line is None else way.line
+            way = _Way(way.tags or before.tags, way.refs or before.refs, line)
+        self.ways[number] = way
 
     def elements(self) -> list[OsmElement]:
         nodes = [
@@ -204,7 +224,8 @@ class _XmlReader:
         self.raw = _Raw()
         self._root = ""
         self._tags: dict[str, str] = {}
-        self._way: _Way | None = None
+        self._node: tuple[int, tuple[float, float]] | None = None
+        self._way: tuple[int, _Way] | None = None
         self._relation: _Relation | None = None
 
     def doctype(self, name: str, public_id: str | None, system: str | None) -> None:
@@ -222,30 +243,33 @@ class _XmlReader:
             self._tags = {}
         elif name == "node":
             number = self._number(name, values, "id")
-            self.raw.positions[number] = _position(f"node/{number}", values.get("lat"), values.get("lon"))
-            self._tags = self.raw.node_tags[number] = {}
+            self._tags = {}
+            self._node = number, _position(f"node/{number}", values.get("lat"), values.get("lon"))
         elif name == "way":
             self._tags = {}
-            self._way = self.raw.ways[self._number(name, values, "id")] = _Way(self._tags)
+            self._way = self._number(name, values, "id"), _Way(self._tags)
         elif name == "relation":
             self._tags = {}
             self._relation = self.raw.relations[self._number(name, values, "id")] = _Relation(self._tags)
         elif name == "tag" and "k" in values and "v" in values:
             self._tags[values["k"]] = values["v"]
         elif name == "nd" and self._way is not None:
-            self._way.refs.append(self._number(name, values, "ref"))
+            self._way[1].refs.append(self._number(name, values, "ref"))
         elif name == "member" and self._relation is not None and values.get("type") == "way":
             member = (self._number(name, values, "ref"), values.get("role", ""), None)
             self._relation.members.append(member)
 
     def end(self, name: str) -> None:
-        if name == "way":
+        if name == "node" and self._node is not None:
+            self.raw.add_node(*self._node, self._tags)
+            self._node = None
+        elif name == "way" and self._way is not None:
+            self.raw.add_way(*self._way)
             self._way = None
         elif name == "relation":
             self._relation = None
 
     def close(self) -> None:
-        self.raw.node_tags = {i: tags for i, tags in self.raw.node_tags.items() if tags}
         self.raw.relations = {i: r for i, r in self.raw.relations.items() if _is_area_relation(r.tags)}
 
     @staticmethod
@@ -300,9 +324,7 @@ def _overpass_elements(elements: Iterable[Any]) -> list[OsmElement]:
             raise InputError(f"elements[{index}]: id is {number!r:.40}, want a whole number")
         name, tags = f"{kind}/{number}", _tags(element.get("tags"))
         if kind == "node":
-            raw.positions[number] = _position(name, element.get("lat"), element.get("lon"))
-            if tags:
-                raw.node_tags[number] = tags
+            raw.add_node(number, _position(name, element.get("lat"), element.get("lon")), tags)
         elif kind == "way":
             line = _geometry(name, element)
             refs = element.get("nodes")
@@ -310,7 +332,7 @@ def _overpass_elements(elements: Iterable[Any]) -> list[OsmElement]:
                 raise InputError(f"{name}: neither nodes nor geometry, want `out geom;`")
             if not isinstance(refs, list) or not all(type(ref) is int for ref in refs):
                 refs = []
-            raw.ways[number] = _Way(tags, refs, line)
+            raw.add_way(number, _Way(tags, refs, line))
         elif _is_area_relation(tags):
             listed = element.get("members")
             members = [

@@ -50,6 +50,7 @@ def test_the_ten_lines_run_as_printed():
 @pytest.mark.parametrize("name", [name for name in PAGES if name != "README.md"])
 def test_the_code_of_a_page_runs_from_top_to_bottom(name, tmp_path):
     """Blocks of `python` and `bash` are run; those of `sh` need data, an installation or hours."""
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
     program = ["import os, subprocess, sys"]
     parkenv = f"{sys.executable} -c 'from parkenv.cli import main; main()'"
     for language, block in blocks(PAGES[name], "python|bash"):

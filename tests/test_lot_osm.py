@@ -2,6 +2,7 @@
 
 import copy
 import json
+import re
 import subprocess
 import sys
 from contextlib import suppress
@@ -780,6 +781,21 @@ FAULTS = [
     ("a.osm", with_text(lambda t: t.replace('lon="', 'lon="NaN', 1)), "node/1: lon is 'NaN7"),
     ("a.osm", with_text(lambda t: t.replace('id="1"', 'id="one"', 1)), "<node>: id is 'one', want a whole number"),
     ("a.osm", with_text(lambda t: t.replace('<nd ref="1"/>', '<nd ref="999"/>')), "way/1: its node 999 is not in"),
+    (
+        "a.osm",
+        with_text(lambda t: t.replace("<way", '<node id="1" lat="48.1" lon="7.8"/><way', 1)),
+        r"node/1 stands twice, at 4\d\.\d+, 7\.\d+ and at 48\.1, 7\.8",
+    ),
+    (
+        "a.osm",
+        with_text(lambda t: t.replace("</osm>", '<way id="1"><nd ref="2"/><nd ref="1"/></way></osm>')),
+        "way/1 stands twice, with other nodes",
+    ),
+    (
+        "a.osm",
+        with_text(lambda t: re.sub(r'(<node id="1" )lat="(.*?)" lon="(.*?)"', r'\1lat="\3" lon="\2"', t)),
+        r"way/\d+ is at 7\.8\d+, 4\d\.\d+ and most of the map 5,\d+ km away .* swapped",
+    ),
     ("a.osm", lambda: "<osm version='0.6'/>", "no parking in it"),
     ("a.osm", lambda: Map().way([(0, 0), (9, 0)], STREET).xml(), "no parking in it"),
     (
@@ -896,6 +912,18 @@ def test_every_cut_of_a_map_is_refused(tmp_path):
 def test_a_file_that_is_not_there_is_named(tmp_path):
     with pytest.raises(InputError, match="cannot be read: No such file"):
         import_lot(tmp_path / "a.osm")
+
+
+def test_elements_may_stand_twice_with_and_without_tags(tmp_path):
+    """As Overpass writes them for `out body; >; out skel qt;`."""
+    text = car_park().xml()
+    again = re.sub(r"<tag [^>]*/>", "", text[text.index("<node") : text.index("</osm>")])
+    path = tmp_path / "twice.osm"
+    path.write_text(text.replace("</osm>", again + "</osm>"))
+    (tmp_path / "once.osm").write_text(text)
+    once, twice = import_lot(tmp_path / "once.osm").lot(), import_lot(path).lot()
+    assert twice.slot_ids == once.slot_ids
+    assert np.array_equal(twice.slot_xy, once.slot_xy)
 
 
 def test_deleted_elements_are_not_there(tmp_path):
