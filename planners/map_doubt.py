@@ -3,7 +3,7 @@
 Forecasts err together: on the day of an event every slot near the goal is likelier to be taken than the map
 says, and a map may be plain wrong. Each hypothesis of how the map is off gives every slot a probability of its own,
 and given the hypothesis slots are independent. First looks tell of the hypotheses by Bayes's rule, and so may looks
-that are only imagined: on a path on which all was taken so far, the next slot is likelier to be taken, too.
+that are only imagined: on a path on which nowhere was parked so far, the next slot is likelier to be taken, too.
 
 The hypotheses are: the map is right; the log-odds of the slots nearest to the goal, a fifth of the lot to all of it,
 are shifted alike; an event has filled the slots nearest to the goal, six tenths of the lot or more; or the map knows

@@ -104,8 +104,10 @@ class Path(NamedTuple):
         times: (most,) float64, s from now.
         starts: (most + 1,) int64, which looks are made at each vertex: `starts[k]` to `starts[k + 1]`.
         slots: (most_looks,) int64, the slots looked at, in order.
-        chances: (most_looks,) float64, P(free) at the look, if all so far were taken.
+        chances: (most_looks,) float64, P(free) at the look, if the search has come so far.
         found: (most_looks,) float64, s from now, when the look is made.
+        first_look: (most_looks,) bool, whether the slot has not been seen before, really or along the path.
+        taken_up: (most_looks,) bool, whether the car parks in the slot if the look shows it free.
         looked: (n_slots,) float64, s from now, when the path last looked at a slot; -1 where it has not yet, -inf
             where it need not since the slot is known to be free.
         again: (n_slots,) float64, scratch of going round.
@@ -122,6 +124,8 @@ class Path(NamedTuple):
     slots: IntArray
     chances: FloatArray
     found: FloatArray
+    first_look: NDArray[np.bool_]
+    taken_up: NDArray[np.bool_]
     looked: FloatArray
     again: FloatArray
     values: FloatArray
@@ -142,6 +146,8 @@ def new_path(n_slots: int, n_vertices: int) -> Path:
         np.zeros(most_looks, np.int64),
         np.zeros(most_looks),
         np.zeros(most_looks),
+        np.zeros(most_looks, np.bool_),
+        np.zeros(most_looks, np.bool_),
         np.zeros(n_slots),
         np.zeros(n_slots),
         np.zeros(most_looks),
@@ -221,8 +227,9 @@ def lay(
             s = ground.view_slots[i]
             if path.looked[s] == -np.inf or looks == len(path.slots):
                 continue
-            if outlook.kind[s] == UNSEEN and path.looked[s] < 0.0:
-                chance = _foreseen(weights, outlook.free_if[s])
+            path.first_look[looks] = outlook.kind[s] == UNSEEN and path.looked[s] < 0.0
+            if path.first_look[looks]:
+                chance = _foreseen(weights, outlook.free_if[s], True)
                 unproven -= 1
                 unseen -= 1
             else:
@@ -352,15 +359,15 @@ def _next_target(
 
 
 @njit(cache=True)
-def _foreseen(weights: FloatArray, free_if: FloatArray) -> float:
-    """P(free) of a slot at its first look; the hypotheses are left as they are once it was seen taken."""
+def _foreseen(weights: FloatArray, free_if: FloatArray, telling: bool) -> float:
+    """P(free) of a slot at its first look; where it tells, the hypotheses are left as a taken slot makes them."""
     free, taken = 0.0, 0.0
     for h in range(len(weights)):
         free += weights[h] * free_if[h]
-        weights[h] *= 1.0 - free_if[h]
-        taken += weights[h]
-    for h in range(len(weights)):
-        weights[h] /= taken
+        taken += weights[h] * (1.0 - free_if[h])
+    if telling:
+        for h in range(len(weights)):
+            weights[h] *= (1.0 - free_if[h]) / taken
     return free / (free + taken)
 
 
@@ -417,6 +424,11 @@ def worth(
 ) -> float:
     """Least expected time, s, of going on along a laid path and stopping at will.
 
+    What a look tells of the map depends on what it leads to. Where the car would park in a slot if it is free, going
+    on means that it was taken; where it drives past in any case, the look may show either, and tells nothing on
+    average. So the path is valued twice: as if no look told anything, which shows where the car would park, and with
+    what the looks there tell.
+
     Args:
         n_path: its vertices.
         left_s: s, left at its end if nothing was found.
@@ -432,6 +444,37 @@ def worth(
     """
     if n_path < 2:
         return np.inf
+    path.taken_up[: path.starts[n_path]] = False
+    _foresee(n_path, outlook, path)
+    value: float = _stop_at_best(n_path, left_s, options, n_options, late_s, ground, outlook, path)
+    if len(outlook.weights) > 1:
+        _foresee(n_path, outlook, path)
+        value = _stop_at_best(n_path, left_s, options, n_options, late_s, ground, outlook, path)
+    return value
+
+
+@njit(cache=True)
+def _foresee(n_path: int, outlook: Outlook, path: Path) -> None:
+    """Write down P(free) of the first looks along a path, each given that those before led to no parking."""
+    weights = path.weights[: len(outlook.weights)]
+    weights[:] = outlook.weights
+    for j in range(path.starts[n_path]):
+        if path.first_look[j]:
+            path.chances[j] = _foreseen(weights, outlook.free_if[path.slots[j]], path.taken_up[j])
+
+
+@njit(cache=True)
+def _stop_at_best(
+    n_path: int,
+    left_s: float,
+    options: IntArray,
+    n_options: int,
+    late_s: FloatArray,
+    ground: Ground,
+    outlook: Outlook,
+    path: Path,
+) -> float:
+    """`worth` of a path on which the chances of all looks are known."""
     values, offers, slots, times, until = path.values, path.offers, path.slots, path.times, path.until
     # What any look still to come can offer, at each vertex, is bounded from below. A slot that is better than that
     # is taken at once; others are kept in mind for a while, in which they grow no better.
@@ -459,10 +502,10 @@ def worth(
                 continue
             since = times[k] - path.found[j]
             offers[j] = min(stop, offer(vertex, slots[j], 1.0, since, late_s[slots[j]], ground, outlook))
-            if offers[j] <= path.ahead[k]:
-                values[j] = offers[j]
-            else:
-                values[j] = min(offers[j], onward + (nothing if until[j] == k else values[j]))
+            later = onward + (nothing if until[j] == k else values[j])
+            # The vertex where the slot is seen comes last, and has the last word.
+            path.taken_up[j] = offers[j] <= max(path.ahead[k], later)
+            values[j] = offers[j] if path.taken_up[j] else later
         nothing = min(stop, onward + nothing)
         # Now back to before the looks at this vertex: the best slot that they show replaces a worse one.
         _best_first(first, last, path)
@@ -493,6 +536,8 @@ def _best_first(first: int, last: int, path: Path) -> None:
         while j > first and path.offers[j] < path.offers[j - 1]:
             for values in (path.offers, path.values, path.chances):
                 values[j], values[j - 1] = values[j - 1], values[j]
+            for flags in (path.first_look, path.taken_up):
+                flags[j], flags[j - 1] = flags[j - 1], flags[j]
             path.slots[j], path.slots[j - 1] = path.slots[j - 1], path.slots[j]
             j -= 1
 
@@ -666,7 +711,7 @@ def best_path(
                 n_path, left = lay(vertex, trial, n_before + 1, base, ground, outlook, path)
                 value = worth(n_path, left, options, n_options, late, ground, outlook, path)
                 looks = path.starts[n_path]
-                work += 15 * (n_path + looks) + n
+                work += 30 * (n_path + looks) + n
                 if value < best - 1e-6:
                     best, n_kept, following, improved = value, n_before + 1, path.vertices[1], True
                     for j in range(n_kept):

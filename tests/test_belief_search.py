@@ -108,6 +108,18 @@ def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong():
     assert ours.mean() < 92.0
 
 
+@pytest.mark.parametrize("level", [0.3, 0.7])
+def test_doubt_costs_nothing_where_cars_drive_past_what_is_free(level):
+    """A free slot far from the goal is driven past, so having come so far does not mean that it was taken."""
+    scenario = at_occupancy(Scenario.named("campus"), level)
+    observation, _ = gym.make("parkenv/Search-v0", scenario=scenario).reset(seed=5)
+    expected = []
+    for trusting in (True, False):
+        _, memory = make_agent("belief", scenario, trusting=trusting).predict(observation)
+        expected.append(memory.expected_s)
+    assert expected[1] == pytest.approx(expected[0], rel=0.02)
+
+
 def test_what_it_saw_tells_how_long_cars_stay():
     """The rate is not observed; the way in which a sighting fades is."""
     scenario = Scenario.named("street")

@@ -125,7 +125,8 @@ def survey(
         f"{its.name} after {row['sessions']} sessions", out / f"map_{its.name}.png",
     )  # fmt: skip
     title = f"{its.name}, rig {rig}, {row['sessions']} sessions"
-    save_detection_reach(row["detection_by_distance"], title, out / f"reach_{its.name}.png")
+    if row["detection_by_distance"]:
+        save_detection_reach(row["detection_by_distance"], title, out / f"reach_{its.name}.png")
     if run.shown is not None:
         save_detections(run.shown, out / f"detections_{its.name}.png")
         save_session(its.lot, run.shown, out / f"session_{its.name}.png")

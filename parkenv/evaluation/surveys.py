@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -260,7 +261,9 @@ def _drive(scenario: Scenario, settings: SurveySettings, number: int, pictures: 
 
 
 def _mean(rows: Sequence[Row], column: str) -> float:
-    return float(np.nanmean([r[column] for r in rows]))
+    """The mean over the sessions that could tell; NaN where none could."""
+    told = [r[column] for r in rows if np.isfinite(r[column])]
+    return float(np.mean(told)) if told else math.nan
 
 
 def _read_rows(path: Path) -> list[Row]:
