@@ -76,6 +76,8 @@ for _name, _entry_point, _vector_entry_point in (
             entry_point=_entry_point,
             vector_entry_point=_vector_entry_point,
             max_episode_steps=2000,
+            # They themselves refuse to step or to render what has not begun.
+            order_enforce=False,
         )
 if "parkenv/Drive-v0" not in registry:
     register(id="parkenv/Drive-v0", entry_point="parkenv.envs.drive:DriveEnv", max_episode_steps=600)

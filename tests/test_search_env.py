@@ -13,10 +13,12 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numba.core.errors import TypingError
 
 import parkenv
 from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightBand, SightingModel
 from parkenv.belief import after_look, relaxed
+from parkenv.envs.search_alone import held
 from parkenv.envs.wrappers import ThesisReward
 from parkenv.fading import fading
 from parkenv.lot import PARK
@@ -224,6 +226,13 @@ def test_the_mask_tells_what_the_graph_has():
         assert observation["action_mask"][PARK] == (vertex < lot.n_slots)
         np.testing.assert_array_equal(env.action_masks(), observation["action_mask"] == 1)
         observation, *_ = env.step(int(np.flatnonzero(observation["action_mask"][:PARK])[-1]))
+
+
+def test_arrays_of_other_types_are_not_held():
+    search = gym.make("parkenv/Search-v0", scenario="mini").unwrapped.search
+    other = search._replace(place=search.place.astype(np.int64))
+    with pytest.raises(TypingError):
+        held(other, np.zeros(2, dtype=np.float32))
 
 
 def test_state_deepcopy_and_pickle_bring_an_episode_back():

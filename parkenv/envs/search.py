@@ -11,6 +11,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.belief import SlotBelief
+from parkenv.envs.search_alone import begin_alone, held, step_alone
 from parkenv.envs.search_step import (
     ARRIVAL,
     CHOICE,
@@ -31,10 +32,8 @@ from parkenv.envs.search_step import (
     VERTEX,
     WHO,
     Search,
-    begin,
     belief,
     foresee,
-    step_alone,
 )
 from parkenv.envs.search_tables import SearchTables
 from parkenv.errors import InputError
@@ -56,10 +55,13 @@ _REBUILT = (
     "_counts",
     "_p_occupied",
     "_clock",
+    "_held",
     "_seeded_with",
     "_begun",
     "_over",
 )
+_USUAL = (np.int64, int)
+"""Types that actions mostly have."""
 REWARD_TERMS = ("drive", "failed", "walk", "gave_up")
 
 
@@ -268,8 +270,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self._counts = self.search.counts[0, : VERTEX + 1]
         self._p_occupied = self.search.p_occupied[0]
         self._clock = np.zeros(2, dtype=np.float32)
+        self._held = held(self.search, self._clock)
         self._seeded_with: int | None = None
-        self._begun = self._over = False
+        self._begun, self._over = False, True
 
     @property
     def state(self) -> SearchState:
@@ -320,12 +323,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if self._seeded_with != self.np_random_seed:
             self._seeded_with = self.np_random_seed
             counts.view(np.uint64)[0, SEED_STATE] = seed_state(self.np_random_seed)
-        begin(self.search, 0)
+        begin_alone(self._held)
         if len(self.search.asked):
             forecast = self.scenario.forecast(self._state.arrival)
             self.search.asked[0] = forecast.p_occupied, forecast.relaxation_rate
             foresee(self.search, 0)
-        self._clock[:] = self._state.time, 0.0
         self._begun, self._over = True, False
         self._state.path = [self._state.vertex]
         if self.render_mode == "human":
@@ -334,13 +336,16 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Drive along an edge, or try to park; see the class."""
-        state = self.state
         if self._over:
-            raise gym.error.ResetNeeded("the search is over: call reset()")
+            raise gym.error.ResetNeeded("the search has not begun, or is over: call reset()")
         self._advance(_action_number(action))
-        drive_s, failed_s, walk_s, gave_up_s, driven_m, walked_m, *terms = self._numbers.tolist()
-        drive, failed, walk, gave_up = terms
+        # Taken as Python's numbers all at once: one by one, numpy's take most of a step's time.
+        (
+            drive_s, failed_s, walk_s, gave_up_s, driven_m, walked_m,
+            drive, failed, walk, gave_up,
+        ) = self._numbers.tolist()  # fmt: skip
         failed_parks, slots_passed, parked, over, vertex = self._counts.tolist()
+        state = self._state
         if vertex != state.path[-1]:
             state.path.append(vertex)
         # A time limit ends the episode from outside, so the metrics are there at every step.
@@ -364,7 +369,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     def _advance(self, action: int) -> None:
         """Act, and look around."""
-        step_alone(*self.search, action, self._clock)
+        step_alone(self._held, action)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """(5,) bool, which actions the graph has here; the name that sb3-contrib looks for."""
@@ -439,8 +444,9 @@ def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
 
 def _action_number(action: Any) -> int:
     """The action as an int; arrays of one element will do, as models return them."""
-    if (type(action) is int or type(action) is np.int64) and 0 <= action <= PARK:
-        return int(action)
+    # Compared as Python's: numpy's take longer.
+    if type(action) in _USUAL and 0 <= (usual := int(action)) <= PARK:
+        return usual
     number = np.asarray(action)
     if number.size != 1 or not np.issubdtype(number.dtype, np.integer) or not 0 <= number.item() <= PARK:
         raise InputError(f"action is {action!r}, want a whole number from 0 to {PARK} ({', '.join(ACTIONS)})")

@@ -246,33 +246,6 @@ def step_one(search: Search, e: int, action: int) -> None:
     settle(search, e)
 
 
-@compiled
-def step_alone(
-    at: IntArray,
-    ints: NDArray[np.int32],
-    reals: FloatArray,
-    kept: FloatArray,
-    numbers: FloatArray,
-    counts: IntArray,
-    memory: FloatArray,
-    marks: NDArray[np.int32],
-    place: NDArray[np.int32],
-    asked: FloatArray,
-    p_occupied: NDArray[np.float32],
-    action: int,
-    clock: NDArray[np.float32],
-) -> None:
-    """`step_one`, `renew` and `tell_time` for the only search there is.
-
-    It takes the arrays of `Search` one by one: to look through a tuple from Python takes several times as long as the
-    step itself.
-    """
-    search = Search(at, ints, reals, kept, numbers, counts, memory, marks, place, asked, p_occupied)
-    step_one(search, 0, action)
-    renew(search, 0)
-    tell_time(search, 0, clock)
-
-
 @inlined
 def tell_time(search: Search, e: int, clock: NDArray[np.float32]) -> None:
     """Write the time, s since Monday 00:00, and since the search began, into a clock, (2,)."""
@@ -459,8 +432,12 @@ def relax_touched(search: Search, e: int) -> None:
 
 @inlined
 def relax_block(memory: FloatArray, at: int, time: float) -> None:
-    """`relaxed` for the columns of a block that begins at `at`; a loop of its own, so that it becomes vector code."""
-    for i in range(at, at + BLOCK):
+    """`relaxed` for the columns of a block that begins at `at`.
+
+    A loop of its own, and of a length that is known beforehand, so that it becomes vector code.
+    """
+    for column in range(BLOCK):
+        i = at + column
         prior, elapsed = memory[i + PRIOR], time - memory[i + LOOKED]
         memory[i + BELIEF] = relaxed(prior, memory[i + RATE], memory[i + SAID], elapsed)
 

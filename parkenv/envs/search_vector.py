@@ -33,7 +33,6 @@ from parkenv.envs.search_step import (
     arrive,
     compiled,
     foresee,
-    inlined,
     renew,
     step_one,
     tell_time,
@@ -107,13 +106,13 @@ def step_full(
     wrong: int = _first_wrong(actions)
     if wrong >= 0:
         return wrong
-    _step_all(search, actions, fresh, idle)
     for e in range(len(actions)):
         if idle[e]:
             continue
         if fresh[e]:
             foresee(search, e)
         else:
+            step_one(search, e, actions[e])
             renew(search, e)
         _report(search, e, fresh[e], limit, steps, mask)
         vertex[e] = search.counts[e, VERTEX]
@@ -137,20 +136,14 @@ def step_local(
     wrong: int = _first_wrong(actions)
     if wrong >= 0:
         return wrong
-    _step_all(search, actions, fresh, idle)
     for e in range(len(actions)):
         if idle[e]:
             continue
+        if not fresh[e]:
+            step_one(search, e, actions[e])
         _report(search, e, fresh[e], limit, steps, mask)
         observe_surroundings(search, around, e, local[e])
     return -1
-
-
-@inlined
-def _step_all(search: Search, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
-    for e in range(len(actions)):
-        if not (idle[e] or fresh[e]):
-            step_one(search, e, actions[e])
 
 
 @compiled
