@@ -139,7 +139,7 @@ class Scenario(SearchProblem):
             from the world is a map that is out of date.
         arrival: when searches start.
         entry: index into `lot.entries`; None draws one for each search.
-        traffic: what else moves in the lot, for those who look through sensors.
+        traffic: what else moves in the lot, for those who look through sensors, and on driven trips.
     """
 
     name: str

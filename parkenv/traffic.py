@@ -38,7 +38,8 @@ _HALF_PERSON = np.array([0.35, 0.3])
 class Traffic:
     """How much moves in a lot besides the car that searches.
 
-    It takes no slot and blocks no way: it is there to be seen.
+    It takes no slot. On the slot graph it blocks no way, and is there to be seen. Where the car really drives, on whole
+    trips and in `parkenv/Drive-v0`, each waits for the other.
 
     Args:
         cars: how many drive about, along the lanes in rounds.

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.driving.encounters import WATCHED_S, encounters
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
 from planners.hybrid_astar import CarPath, SearchSettings, plan_path
@@ -24,16 +25,13 @@ MOST_PLANS = 12
 STRAYED_M, STRAYED_RAD = 0.20, math.radians(12.0)
 """How far from its path a car may come before another is planned."""
 
-WATCHED_S = (0.0, 0.4, 0.8, 1.2, 1.6, 2.0)
-"""How far ahead, s, the driver looks for others on the way."""
-KEPT_M, KEPT_STANDING_M = 0.5, 0.05
-"""m that the driver keeps from others who move, and from those who have stopped to wait for it."""
 PATIENCE_S = 3.0
 """After so long a wait for somebody who stands, s, the driver looks for a way around."""
 
 _CONTROL_S = 0.1
 _NOWHERE = 999.0  # m; unused rows of the obstacle map lie beyond
 _STANDS = 0.01
+_SLOWEST = 0.7  # m/s, at which a car that stands is taken to set off
 
 
 @dataclass
@@ -184,24 +182,9 @@ class ParkingAgent:
         before, memory.others = memory.others, at
         velocity = np.zeros_like(at) if before is None else (at - before) / _CONTROL_S
         assert memory.tracker is not None
-        times = np.array(WATCHED_S)
-        own = memory.tracker.poses_ahead(times * max(abs(speed), 0.7))
-        near = np.hypot(*(at - own[0, :2]).T) < 15.0
-        half = np.array([self.vehicle.length, self.vehicle.width]) * 0.5
-        middle = self.vehicle.at_middle(own)
-        for i in np.flatnonzero(near).tolist():
-            margin = half + (KEPT_M if np.hypot(*velocity[i]) > 0.1 else KEPT_STANDING_M)
-            moved = outlines[i] + times[:, None, None] * velocity[i]
-            # In the frame of the car as it will be: who overlaps its box, grown by what is to be kept.
-            offset = moved - middle[:, None, :2]
-            c, s = np.cos(middle[:, 2, None]), np.sin(middle[:, 2, None])
-            local = np.stack(
-                [c * offset[..., 0] + s * offset[..., 1], c * offset[..., 1] - s * offset[..., 0]], -1
-            )
-            low, high = local.min(axis=1), local.max(axis=1)
-            if ((low < margin) & (high > -margin)).all(axis=1).any():
-                return True
-        return False
+        own = memory.tracker.poses_ahead(WATCHED_S * max(abs(speed), _SLOWEST))
+        when = encounters(self.vehicle, self.vehicle.at_middle(own), list(outlines), velocity)
+        return bool(np.isfinite(when).any())
 
 
 def _pose(goal: NDArray[np.float32]) -> FloatArray:

@@ -14,6 +14,9 @@ from typer.testing import CliRunner
 from parkenv import InputError, ParkingLot, Scenario
 from parkenv.cli import app
 from parkenv.driving.driven_lines import KEPT_RIGHT_M, DrivenLines
+from parkenv.driving.encounters import WATCHED_S
+from parkenv.driving.lot_space import Thing
+from parkenv.driving.road_users import ROOM_M, RoadUsers
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
 from parkenv.evaluation.calibration import (
@@ -41,10 +44,12 @@ from parkenv.evaluation.sensor_log import record_trip
 from parkenv.keyed_random import world_key
 from parkenv.lot_scene import LotScenes
 from parkenv.occupancy import OccupancyProcess
+from parkenv.traffic import Traffic
 from planners.agent import make_agent
 from planners.hybrid_astar import CarPath
 from planners.lane_keeping import LaneKeeper, joined, rounded
 from planners.path_tracking import TrackingSettings
+from sim_sensors.rig import SensorRig
 
 CAR = VehicleParameters()
 MINI = Scenario.named("mini")
@@ -319,6 +324,109 @@ def test_with_sensors_what_was_never_captured_changes_nothing():
     assert told[0] != told[2], "what is near is seen"
 
 
+def busy(name, cars, pedestrians):
+    return Scenario.named(name, traffic=Traffic(cars, pedestrians))
+
+
+@pytest.mark.parametrize(
+    ("name", "cars", "pedestrians", "seeds"),
+    [
+        ("mini", 2, 2, range(2)),
+        pytest.param("mini", 2, 3, range(20), marks=pytest.mark.slow),
+        pytest.param("campus", 8, 10, range(30), marks=pytest.mark.slow),
+    ],
+)
+def test_among_others_trips_take_longer_and_end_parked_without_a_contact(name, cars, pedestrians, seeds):
+    alone, among = searched(name), DrivenSearch(busy(name, cars, pedestrians))
+    waited = lost = 0.0
+    for seed in seeds:
+        trip, quiet = among.run(seed), alone.run(seed)
+        assert trip.parked
+        assert among.driver.log.contacts == []
+        assert quiet.waited_s == 0.0
+        if trip.waited_s == 0.0:
+            assert trip == quiet
+        waited += trip.waited_s
+        lost += trip.lanes_s + trip.manoeuvre_s + trip.failed_s
+        lost -= quiet.lanes_s + quiet.manoeuvre_s + quiet.failed_s
+    assert waited > 0.0
+    assert lost > 0.0
+
+
+def test_among_others_equal_seeds_give_equal_trips():
+    scenario = busy("mini", 1, 2)
+    search = DrivenSearch(scenario)
+    first = search.run(1)
+    search.run(2)
+    assert search.run(1) == first
+    assert DrivenSearch(scenario).run(1) == first
+
+
+class StandingTraffic:
+    """One car across the lane of a car that drives east from the origin, which waits for that for ever."""
+
+    outlines = ((Thing.MOVING_CAR, np.array([[2.0, 0.9], [-2.0, 0.9], [-2.0, -0.9], [2.0, -0.9]])),)
+
+    def __init__(self, x):
+        self.at = np.array([[x, 0.0, 0.5 * math.pi]])
+
+    def poses(self, clocks):
+        return np.repeat(self.at, len(clocks), axis=0)
+
+    def onward(self, clocks, seconds, car):
+        del seconds, car
+        return clocks
+
+
+def test_who_gives_way_is_out_of_sight_until_the_car_has_gone():
+    others = RoadUsers(StandingTraffic(5.0), CAR)
+    own = np.column_stack(
+        [np.linspace(0.0, 3.0, len(WATCHED_S)), np.zeros(len(WATCHED_S)), np.zeros(len(WATCHED_S))]
+    )
+    when = others.in_way(own)
+    reached = own[:, 0] + 0.5 * CAR.length > 5.0 - 0.9 - 0.05
+    assert when[0] == WATCHED_S[reached.argmax()]
+    assert np.isinf(others.in_way(own - np.array([1.2, 0.0, 0.0]))), "it would stop short of it"
+    assert np.isinf(others.in_way(own + np.array([9.0, 0.0, 0.0]))), "it has passed it"
+    others.give_way(np.array([True]))
+    assert np.isinf(others.in_way(own))
+    assert np.isnan(others.clocks).all()
+    seen = []
+    for x in np.arange(0.0, 30.0, 0.5):
+        others.onward(0.1, CAR.corners(np.array([x, 0.0, 0.0])))
+        middle = x + CAR.middle
+        there = bool(np.isfinite(others.clocks).all())
+        assert there == (np.abs(others.poses[0, 0]) < 100.0)
+        seen.append((there, abs(middle - 5.0)))
+    assert all(there == (away >= ROOM_M) for there, away in seen)
+    assert {there for there, _ in seen} == {True, False}
+
+
+@pytest.mark.slow
+def test_others_are_in_the_pictures_where_the_car_meets_them(monkeypatch):
+    search = DrivenSearch(busy("mini", 1, 1), rig="laser", weather="sunny", captures=1)
+    driver, met = search.driver, []
+    capture = SensorRig.capture
+
+    def seen(self, scene, pose, weather, noise):
+        met.append((scene.movers.vehicle_pose, scene.movers.walker_pose))
+        return capture(self, scene, pose, weather, noise)
+
+    monkeypatch.setattr(SensorRig, "capture", seen)
+    checked = 0
+
+    def keep(observation):
+        nonlocal checked
+        if met:
+            poses = np.concatenate(met.pop())
+            now = driver.others.poses[np.isfinite(driver.others.clocks)]
+            np.testing.assert_allclose(poses, now)
+            checked += len(now)
+
+    search.run(1, on_step=keep)
+    assert checked > 0
+
+
 def test_straight_on_the_car_drives_at_the_limit_and_slower_where_that_is_lower():
     fast, _, _ = started("campus", style=DrivingStyle(speed=4.0))
     slow, _, _ = started("campus", style=DrivingStyle(speed=2.0))
@@ -583,8 +691,10 @@ def test_the_commands_calibrate_compare_and_film(tmp_path):
     assert isinstance(result.exception, InputError)
     assert "was measured on 'mini'" in str(result.exception)
     film = tmp_path / "trip.gif"
-    result = run(app, ["trip", "--scenario", "mini", "--seed", "1", "--out", str(film)])
+    others = ["--cars", "2", "--pedestrians", "2"]
+    result = run(app, ["trip", "--scenario", "mini", "--seed", "1", *others, "--out", str(film)])
     assert result.exit_code == 0, result.output
+    assert "behind and before others; 0 contacts" in result.output
     from PIL import Image
 
     with Image.open(film) as picture:

@@ -35,6 +35,13 @@ SpeedOption = Annotated[
     ),
 ]
 
+CarsOption = Annotated[
+    int, typer.Option("--cars", metavar="N", min=0, help="Other cars that drive about in the lot.")
+]
+PedestriansOption = Annotated[
+    int, typer.Option("--pedestrians", metavar="M", min=0, help="People who walk there.")
+]
+
 
 def calibrate(
     scenario: ScenarioOption = "campus",
@@ -45,6 +52,8 @@ def calibrate(
     notice_m: NoticeOption = 2.0,
     v_drive_kmh: SpeedOption = None,
     sensors: args.SensorsOption = None,
+    cars: CarsOption = 0,
+    pedestrians: PedestriansOption = 0,
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 1,
     backend: args.BackendOption = "loky",
@@ -79,8 +88,9 @@ def calibrate(
     from parkenv.evaluation.lot_driver import DrivingStyle
     from parkenv.evaluation.results import make_folder, write_summary
     from parkenv.scenario import KMH, Scenario
+    from parkenv.traffic import Traffic
 
-    its = Scenario.named(scenario)
+    its = Scenario.named(scenario, traffic=Traffic(cars, pedestrians))
     speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
     style = DrivingStyle(speed=speed, notice_m=notice_m)
     rig = args.rig_of(sensors)
@@ -89,6 +99,7 @@ def calibrate(
     settings = {
         "version": __version__, "scenario": scenario, "agent": agent, "style": dataclasses.asdict(style),
         "sensors": rig,
+        "traffic": dataclasses.asdict(its.traffic),
     }  # fmt: skip
     folder = TripFolder(out, settings, resume=resume)
     console = make_console()
@@ -152,6 +163,8 @@ def trip(
     ] = False,
     notice_m: NoticeOption = 2.0,
     sensors: args.SensorsOption = None,
+    cars: CarsOption = 0,
+    pedestrians: PedestriansOption = 0,
     seed: args.SeedOption = 0,
     out: Annotated[Path, typer.Option("--out", "-o", help="The film, a GIF.")] = Path("results/trip.gif"),
     rerun: args.RerunOption = None,
@@ -162,6 +175,8 @@ def trip(
     * `parkenv trip --scenario campus --seed 7 --unseen --out trip.gif`
 
     * `parkenv trip --scenario campus --sensors laser --rerun trip.rrd`
+
+    * `parkenv trip --scenario campus --cars 6 --pedestrians 8`
     """
     from parkenv.evaluation.compare import unseen
     from parkenv.evaluation.driven_search import DrivenSearch
@@ -171,6 +186,7 @@ def trip(
     from parkenv.evaluation.sensor_log import record_trip, require_viewer, sensor_log
     from parkenv.evaluation.trip_pictures import COLORS, FPS, film_trip
     from parkenv.scenario import Scenario
+    from parkenv.traffic import Traffic
 
     if out.suffix.lower() != ".gif":
         raise InputError(f"--out is {out}, want a file that ends in .gif")
@@ -180,7 +196,7 @@ def trip(
         if sensors is None:
             raise InputError("--rerun records what sensors measure: add --sensors laser")
         require_viewer()
-    its = Scenario.named(scenario)
+    its = Scenario.named(scenario, traffic=Traffic(cars, pedestrians))
     style = DrivingStyle(notice_m=notice_m)
     search = DrivenSearch(unseen(its) if blind else its, agent, style=style, rig=args.rig_of(sensors))
     make_folder(out.parent)
@@ -206,6 +222,8 @@ def _show(console: Any, driven: Any) -> None:
         f"{end}: {driven.total_s:.1f} s = {driven.lanes_s:.1f} s on the lanes + {driven.manoeuvre_s:.1f} s manoeuvre + "
         f"{driven.failed_s:.1f} s failed tries + {driven.walk_s:.1f} s walk + {driven.gave_up_s:.1f} s elsewhere"
     )
+    if driven.waited_s or driven.contacts:
+        console.print(f"  {driven.waited_s:.1f} s of it behind and before others; {driven.contacts} contacts")
     for t in driven.tries:
         console.print(
             f"  {t.slot} ({t.kind}{', ' + t.way if t.way else ''}): {t.seconds:.1f} s, {t.reason or 'parked'}"

@@ -31,12 +31,15 @@ class LotSurroundings:
 
     Args:
         scenario: whose lot it is.
+
+    Attributes:
+        slots: of the lot, as the sensors see it.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         lot = scenario.lot
-        self._slots = slot_lot(lot)
+        self.slots = slot_lot(lot)
         self._area = DrivableArea(lot)
         legs = np.array([leg for wall in lot.walls for leg in pairwise(wall)]).reshape(-1, 2, 2)
         self._walls = shapely.STRtree(np.asarray(shapely.linestrings(legs))), legs
@@ -48,7 +51,7 @@ class LotSurroundings:
 
     def begin(self, key: np.uint64, world: World) -> None:
         """Turn to the world of a key."""
-        self._scenes = LotScenes(self._slots, self._scenario, key, world)
+        self._scenes = LotScenes(self.slots, self._scenario, key, world)
 
     def taken(self, center: FloatArray, time: float) -> list[int]:
         """The slots within `REACH_M` of a point, (2,) m, that are taken at a time, s; ascending."""

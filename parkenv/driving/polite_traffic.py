@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 import numpy as np
 import shapely
 from numpy.typing import NDArray
@@ -12,6 +15,9 @@ from parkenv.lot import ParkingLot
 from parkenv.traffic import LotTraffic, Traffic
 from sim_sensors.scenery import pedestrian_footprint
 from sim_sensors.slot_scenes import SlotLot
+
+if TYPE_CHECKING:
+    from sim_sensors.movers import Movers
 
 FloatArray = NDArray[np.float64]
 
@@ -55,6 +61,29 @@ class PoliteTraffic:
     def poses(self, clocks: FloatArray) -> FloatArray:
         """(n, 3) x, y in m and yaw in rad at clocks, (n,) s."""
         return self._rounds.poses_at(clocks)
+
+    def movers(self, clocks: FloatArray) -> Movers | None:
+        """Who is where at clocks, (n,) s, for those who look through sensors; None where nobody is about.
+
+        Whose clock is no number is left out.
+        """
+        there = np.isfinite(clocks)
+        known = np.where(there, clocks, 0.0)
+        at = [self._rounds.at(clock) for clock in known.tolist()]
+        seen = [movers for movers in at if movers is not None]
+        if not seen:
+            return None
+        poses, n = self.poses(known), seen[0].n_vehicles
+        stride = np.array([movers.walker_stride[k] for k, movers in enumerate(seen[n:])])
+        drives, walks = there[:n], there[n:]
+        return replace(
+            seen[0],
+            vehicle_pose=poses[:n][drives],
+            vehicle_model=seen[0].vehicle_model[drives],
+            walker_pose=poses[n:][walks],
+            walker_stride=stride[walks],
+            walker_look=seen[0].walker_look[walks],
+        )
 
     def started(self, car: FloatArray) -> FloatArray:
         """Clocks, (n,) s, at which nobody is near a car with these corners, (4, 2) m."""

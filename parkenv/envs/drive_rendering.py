@@ -120,13 +120,13 @@ class DriveRenderer:
         view = self._shown
         _draw_trail(image, view, state)
         if len(state.movers):
-            _draw_movers(image, view, state.movers, outlines)
+            draw_movers(image, view, state.movers, outlines)
         draw_car(image, view, task.vehicle, state.vehicle, CAR)
         _draw_hud(image, state)
         return image
 
 
-def _draw_movers(image: Image, view: View, poses: FloatArray, outlines: Sequence[FloatArray]) -> None:
+def draw_movers(image: Image, view: View, poses: FloatArray, outlines: Sequence[FloatArray]) -> None:
     """Who moves: cars and people, told apart by their size."""
     for outline, pose in zip(outlines, poses, strict=False):
         size = np.ptp(outline, axis=0)

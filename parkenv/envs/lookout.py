@@ -17,6 +17,7 @@ from sim_sensors.weather import PRESETS, Weather
 
 if TYPE_CHECKING:
     from parkenv.envs.search import SearchState
+    from sim_sensors.movers import Movers
 
 FloatArray = NDArray[np.float64]
 
@@ -28,6 +29,20 @@ class Moment(NamedTuple):
 
     time: float
     capture: Capture
+
+
+class Station(NamedTuple):
+    """Where to measure.
+
+    Attributes:
+        time: s since Monday 00:00.
+        pose: (3,) x, y in m, yaw in rad, of the vehicle.
+        movers: who moves around it; None for the scenario's traffic as it is then where nobody waits for anybody.
+    """
+
+    time: float
+    pose: FloatArray
+    movers: Movers | None = None
 
 
 class Lookout:
@@ -83,22 +98,24 @@ class Lookout:
         """
         return self.measure(state, self._stations(state, since))
 
-    def measure(self, state: SearchState, stations: Sequence[tuple[float, FloatArray]]) -> list[Moment]:
+    def measure(self, state: SearchState, stations: Sequence[Station]) -> list[Moment]:
         """Measure at some places.
 
         Args:
             state: of the search, whose world it is.
-            stations: time, s, and pose of the vehicle, (3,) x, y in m and yaw in rad, of each; oldest first.
+            stations: where, oldest first.
 
         Returns:
             A moment for each.
         """
         scenes, weather = self._world(state)
         moments = []
-        for time, pose in stations:
+        for time, pose, movers in stations:
             # By the millisecond: the same look has the same noise.
             noise = np.random.SeedSequence([int(state.key), int(time * 1000.0)]).generate_state(1)
             scene = scenes.at(time, pose)
+            if movers is not None:
+                scene = scene.with_movers(movers)
             moments.append(Moment(time, self.rig.capture(scene, pose, weather, int(noise[0]))))
         return moments
 
@@ -126,12 +143,10 @@ class Lookout:
             self._seen_world = state.key, scenes, Weather.draw(preset, seed)
         return self._seen_world[1:]
 
-    def _stations(
-        self, state: SearchState, since: tuple[int, float] | None
-    ) -> list[tuple[float, FloatArray]]:
+    def _stations(self, state: SearchState, since: tuple[int, float] | None) -> list[Station]:
         """Time and pose of each capture."""
         here = self._lot.vertex_xy[state.vertex]
-        stop = (state.time, np.array([*here, self._heading(state)]))
+        stop = Station(state.time, np.array([*here, self._heading(state)]))
         if since is None or since[0] == state.vertex:
             return [stop]
         start, begun = self._lot.vertex_xy[since[0]], since[1]
@@ -139,7 +154,9 @@ class Lookout:
         n = self._n_on(float(np.hypot(*way)))
         yaw = math.atan2(way[1], way[0])
         shares = [k / n for k in range(1, n)]
-        passing = [(begun + s * (state.time - begun), np.array([*(start + s * way), yaw])) for s in shares]
+        passing = [
+            Station(begun + s * (state.time - begun), np.array([*(start + s * way), yaw])) for s in shares
+        ]
         return [*passing, stop]
 
     def _heading(self, state: SearchState) -> float:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import VehicleParameters
+from parkenv.envs.lookout import Station
 from parkenv.envs.perception import Watcher
 from parkenv.envs.search import SearchEnv
 from parkenv.envs.search_step import (
@@ -107,10 +107,11 @@ class DrivenSearchEnv(SearchEnv):
             return
         # After a try, or a wait, the car looks around once more; what it saw from amid the manoeuvre is of no use.
         track = self.driver.track if on_the_way else self.driver.track[-1:]
-        stations: list[tuple[float, NDArray[np.float64]]] = []
+        stations: list[Station] = []
         if track:
             chosen = watcher.lookout.chosen(np.array([spot.driven_m for spot in track]))
-            stations = [(track[i].time, track[i].pose) for i in chosen.tolist()]
+            spots = [track[i] for i in chosen.tolist()]
+            stations = [Station(s.time, s.pose, self.driver.movers_at(s)) for s in spots]
         watcher.tell(self.search, watcher.lookout.measure(self._state, stations))
 
     def _park(self, slot: int, before: float) -> None:
@@ -153,6 +154,7 @@ class Trip:
         contacts: how often it touched something.
         strays: how often it was off its way.
         rescues: how often it was stuck and put back on the lane.
+        waited_s: s of braking and standing for others who were in the way.
         legs: the edges, in order.
         tries: the tries to park, in order.
     """
@@ -173,6 +175,7 @@ class Trip:
     contacts: int
     strays: int
     rescues: int
+    waited_s: float
     legs: tuple[Leg, ...]
     tries: tuple[Try, ...]
 
@@ -186,7 +189,7 @@ class DrivenSearch:
     """Drives trips in one scenario.
 
     Args:
-        scenario: the scenario.
+        scenario: the scenario, whose traffic moves through the lot.
         agent: who decides: a name that `make_agent` knows.
         vehicle: the car.
         style: how it is driven.
@@ -283,6 +286,7 @@ class DrivenSearch:
             contacts=len(log.contacts),
             strays=log.strays,
             rescues=log.rescues,
+            waited_s=log.waited_s,
             legs=tuple(log.legs),
             tries=tuple(log.tries),
         )

@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
 from parkenv.driving.driven_lines import DrivenEdge, DrivenLine, DrivenLines
+from parkenv.driving.encounters import WATCHED_S
 from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
 from parkenv.driving.lot_surroundings import REACH_M, LotSurroundings
 from parkenv.driving.parking_task import KINDS, ParkingTasks
+from parkenv.driving.polite_traffic import PoliteTraffic
+from parkenv.driving.road_users import RoadUsers
 from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
 from parkenv.envs.drive import ANGLE_TOLERANCE, CONTROL_S, POSITION_TOLERANCE, SUBSTEPS
 from parkenv.errors import InputError
@@ -24,6 +27,9 @@ from planners.hybrid_astar import CarPath, SearchSettings, plan_path
 from planners.lane_keeping import LaneKeeper, joined, rounded
 from planners.parking import STRAYED_M, STRAYED_RAD
 from planners.path_tracking import PathTracker, TrackingSettings
+
+if TYPE_CHECKING:
+    from sim_sensors.movers import Movers
 
 FloatArray = NDArray[np.float64]
 
@@ -36,6 +42,8 @@ TAKEN, NO_ROOM, NO_WAY = "taken", "too narrow", "no way in"
 
 RESCUE_S = 60.0
 """s that pass until a car that is stuck is back on the lane."""
+PATIENCE_S = 3.0
+"""s for which the car stands before somebody who waits, too, until those give way."""
 TURN_IN_M = 9.0
 """m, from the rear axle to the middle of a junction where the driver decides where to go on."""
 
@@ -57,6 +65,9 @@ _LEAST_NOTICE = 0.8
 _WAITS_M = 7.0
 _BEND_M = 8.0
 _LONGEST_S = 240.0
+_SLOWEST = 0.7  # m/s, at which a car that stands is taken to set off
+_SOON_S = 0.8  # brake hard for who is in the way by then
+_NOBODY: NDArray[np.float64] = np.empty(0)
 
 
 @dataclass(frozen=True)
@@ -128,11 +139,19 @@ class Try(NamedTuple):
 
 
 class Spot(NamedTuple):
-    """Where the car was: s since Monday 00:00, m that it had driven, and (3,) x, y, yaw of its footprint's middle."""
+    """Where the car was, and everybody else.
+
+    Attributes:
+        time: s since Monday 00:00.
+        driven_m: m that it had driven.
+        pose: (3,) x, y in m, yaw in rad, of its footprint's middle.
+        clocks: (n,) s, of those who move, as `RoadUsers` has it.
+    """
 
     time: float
     driven_m: float
     pose: FloatArray
+    clocks: FloatArray
 
 
 class Driver(Protocol):
@@ -156,6 +175,9 @@ class Driver(Protocol):
 
     def wait(self, seconds: float) -> float:
         """Stay where it is; s."""
+
+    def movers_at(self, spot: Spot) -> Movers | None:
+        """Who else was where when the car was at a spot; None where nobody is about."""
 
 
 class GraphDriver:
@@ -185,6 +207,11 @@ class GraphDriver:
         """As long as that, s."""
         return seconds
 
+    def movers_at(self, spot: Spot) -> Movers | None:
+        """Nobody."""
+        del spot
+        return None
+
 
 @dataclass
 class DriveLog:
@@ -197,6 +224,7 @@ class DriveLog:
         contacts: what was touched, by name, once each time.
         strays: how often the car was off its way and sought another.
         rescues: how often there was none, and it was put back on the lane.
+        waited_s: s of braking and standing for others who were in the way.
     """
 
     legs: list[Leg] = field(default_factory=list)
@@ -205,6 +233,7 @@ class DriveLog:
     contacts: list[str] = field(default_factory=list)
     strays: int = 0
     rescues: int = 0
+    waited_s: float = 0.0
 
 
 class LotDriver:
@@ -215,8 +244,11 @@ class LotDriver:
     are planned among the cars that really stand there. Who comes during a manoeuvre waits until the car is
     out of the way.
 
+    The scenario's traffic moves about meanwhile. The car brakes for who is, or will be, in its way; they wait for it
+    likewise; and where both have stood for `PATIENCE_S`, the others give way, see `RoadUsers`.
+
     Args:
-        scenario: whose lot and cars they are.
+        scenario: whose lot, cars and traffic they are.
         vehicle: the car.
         style: how it is driven.
 
@@ -226,6 +258,7 @@ class LotDriver:
         time: now, s.
         doing: what the car is about, in a word or two.
         track: where it has been since the last decision, every 0.1 s.
+        others: everybody else who moves; None where nobody does.
         watch: called after every step of the control, 0.1 s, for pictures.
     """
 
@@ -251,6 +284,7 @@ class LotDriver:
         self.watch: Callable[[], None] = lambda: None
         self.log = DriveLog()
         self.track: list[Spot] = []
+        self.others: RoadUsers | None = None
         self.doing = ""
         self.state = np.zeros(STATE_SIZE)
         self.time = 0.0
@@ -267,6 +301,12 @@ class LotDriver:
         self._placed = False
         self._touches = False
         self._knew: set[int] | None = None
+        self._stood_s = 0.0
+        self.others = None
+        traffic = self.scenario.traffic
+        if traffic.cars or traffic.pedestrians:
+            rounds = PoliteTraffic(self.scenario.lot, traffic, key, self._around.slots)
+            self.others = RoadUsers(rounds, self.vehicle)
         self._enter(self._standing(self.scenario.lot.vertex_xy[vertex]))
 
     def drive(self, source: int, column: int) -> float:
@@ -327,6 +367,10 @@ class LotDriver:
             self._brake(self.style.braking)
         return seconds
 
+    def movers_at(self, spot: Spot) -> Movers | None:
+        """Who else was where when the car was at a spot of its `track`."""
+        return None if self.others is None else self.others.movers(spot.clocks)
+
     # --- Lanes
 
     def _place(self, edge: DrivenEdge) -> None:
@@ -335,6 +379,7 @@ class LotDriver:
         self.state[:3] = line.pose(edge.start - self.vehicle.middle)
         self.state[SPEED] = self._on_lane.speed
         self._placed = True
+        self._make_room()
 
     def _take(self, edge: DrivenEdge) -> str:
         """Lay the way along an edge from where the car is; the edge's kind."""
@@ -458,7 +503,8 @@ class LotDriver:
             assert self._line is not None
             self._turn_onto(self._lines.lines[self._line])
             return True
-        self._step(*command)
+        if not self._lets_go_first(self._keeper):
+            self._step(*command)
         return True
 
     def _arrived(self, edge: DrivenEdge, target: int) -> bool:
@@ -535,7 +581,8 @@ class LotDriver:
             if abs(tracker.offset) > STRAYED_M or abs(tracker.askew) > STRAYED_RAD:
                 self._halt(self.style.braking, tracker)
                 return True
-            self._step(*command)
+            if not self._lets_go_first(tracker):
+                self._step(*command)
 
     def _back(self, slot: int) -> float:
         """Drive back on the lane, in the direction of the slot or of before, whichever is sooner; `onward_m`."""
@@ -578,6 +625,31 @@ class LotDriver:
         self.time += RESCUE_S
         pose = line.pose(line.station_of(self.state[:2]))
         self.state = np.r_[pose, np.zeros(STATE_SIZE - 3)]
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Have nobody stand where the car was put."""
+        if self.others is not None:
+            self.others.make_room(self.vehicle.corners(self.state[:3]))
+
+    def _lets_go_first(self, tracker: PathTracker) -> bool:
+        """Brake, or stand, for a step if somebody is in the way along a path; whether so."""
+        if self.others is None:
+            return False
+        speed = abs(float(self.state[SPEED]))
+        ahead = tracker.poses_ahead(WATCHED_S * max(speed, _SLOWEST))
+        when = self.others.in_way(self.vehicle.at_middle(ahead))
+        if np.isinf(when).all():
+            self._stood_s = 0.0
+            return False
+        if speed == 0.0:
+            self._stood_s += CONTROL_S
+            if self._stood_s >= PATIENCE_S:
+                self.others.give_way(np.isfinite(when))
+                self._stood_s = 0.0
+        self.log.waited_s += CONTROL_S
+        self._brake(self.vehicle.max_braking if when.min() < _SOON_S else self.style.braking, tracker)
+        return True
 
     def _halt(self, braking: float, tracker: PathTracker | None = None) -> None:
         """Brake until the car stands."""
@@ -597,7 +669,12 @@ class LotDriver:
 
     def _step(self, acceleration: float, steering: float) -> None:
         """Drive for a step of the control."""
-        for _ in range(SUBSTEPS):
+        others = self.others
+        if others is not None:
+            others.onward(CONTROL_S, self.vehicle.corners(self.state[:3]))
+        for step in range(SUBSTEPS):
+            if others is not None:
+                self._space.move(others.between((step + 1) / SUBSTEPS))
             way = advance(self.state, acceleration, steering, self.vehicle.limits)
             self.log.driven_m += abs(way)
             touched = self._space.touched(*self.state[:3].tolist())
@@ -605,7 +682,8 @@ class LotDriver:
                 self.log.contacts.append(Thing(touched).words)
             self._touches = bool(touched)
             self.time += PHYSICS_S
-        self.track.append(Spot(self.time, self.log.driven_m, self.vehicle.at_middle(self.state[:3])))
+        clocks = _NOBODY if others is None else others.clocks
+        self.track.append(Spot(self.time, self.log.driven_m, self.vehicle.at_middle(self.state[:3]), clocks))
         self.watch()
         if np.abs(self.state[:2] - self._space_at).max() > REACH_M - 10.0:
             self._refresh()
@@ -626,7 +704,11 @@ class LotDriver:
 
     def _enter(self, there: Obstacles) -> None:
         """Drive among these."""
-        self._space = LotSpace(self.vehicle, there)
+        if self.others is None:
+            self._space = LotSpace(self.vehicle, there)
+        else:
+            self._space = LotSpace(self.vehicle, there, self.others.outlines)
+            self._space.move(self.others.poses)
         self._space_at = self.state[:2].copy()
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import SPEED
 from parkenv.envs.drawing import SUBPIXEL_BITS, Image, fill_disc, fixed_point, mixed_color, write_text
-from parkenv.envs.drive_rendering import draw_car
+from parkenv.envs.drive_rendering import draw_car, draw_movers
 from parkenv.envs.rendering import (
     ASPHALT,
     CAR,
@@ -95,6 +95,9 @@ class TripRenderer(SearchRenderer):
 
     def _draw_car(self, image: Image, view: View, state: SearchState) -> None:
         del state
+        others = self._driver.others
+        if others is not None:
+            draw_movers(image, view, others.poses, [outline for _, outline in others.outlines])
         if self._near:
             draw_car(image, view, self._driver.vehicle, self._driver.state, CAR)
             return
