@@ -14,7 +14,7 @@ from parkenv.errors import InputError
 from parkenv.lot import Lane, ParkingLot, corner_points, mouth_heading, mouth_points
 from parkenv.lot_geojson import LotContents, LotProblem, graph_errors, read_contents
 from parkenv.lot_graph import places
-from parkenv.lot_import import import_lot, is_place
+from parkenv.places.lot_import import import_lot, is_place
 from parkenv.slot_polygons import nearest_on_lanes
 
 LANE_GAP = 1.0

@@ -11,7 +11,7 @@ from parkenv.errors import InputError
 from parkenv.lot import ParkingLot
 from parkenv.lot_geojson import graph_errors, read_contents
 from parkenv.lot_graph import GraphError
-from parkenv.lot_import import is_place
+from parkenv.places.lot_import import is_place
 
 LotT = TypeVar("LotT", bound=ParkingLot)
 

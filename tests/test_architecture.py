@@ -17,6 +17,7 @@ PLANNERS_MAY_SEE = {
     "parkenv.sighting",
     "parkenv.errors",
     "parkenv.driving.vehicle",  # the car's size and limits, and how it moves
+    "parkenv.driving.encounters",  # who will be in whose way, of outlines that it is given
 }
 
 

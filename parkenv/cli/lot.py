@@ -116,8 +116,8 @@ def import_place(
     * `parkenv lot import map.osm --out lot.geojson --picture lot.png`
     * `parkenv lot import slots.csv --out lot.geojson --entry 0,0 --goal 40,25`
     """
-    from parkenv.lot_draft import Wishes
-    from parkenv.lot_import import import_lot
+    from parkenv.places.lot_draft import Wishes
+    from parkenv.places.lot_import import import_lot
 
     corners = None if bounds is None else _numbers("--bounds", bounds, 4)
     wishes = Wishes(

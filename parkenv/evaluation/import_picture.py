@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from parkenv.evaluation.lot_picture import BUILDING, ENTRY, GOAL, GROUND, INK, WALL
 from parkenv.evaluation.picture_files import save_picture
 from parkenv.lot import Lane, corner_points, is_building, mouth_points
-from parkenv.lot_draft import LotDraft
+from parkenv.places.lot_draft import LotDraft
 from parkenv.slot_polygons import nearest_on_lanes
 
 FloatArray = NDArray[np.float64]

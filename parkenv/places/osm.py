@@ -4,7 +4,7 @@ What becomes a slot:
 
 - `amenity=parking_space` areas, by their outlines; one with a `capacity` is cut into as many along its road;
 - `amenity=parking` areas that hold no such space, filled by the rule of `fill_outline`;
-- kerbside parking tagged on streets, see `lot_osm_kerbs`.
+- kerbside parking tagged on streets, see `osm_kerbs`.
 
 Spaces for disabled drivers are left out unless asked for, and taken off a tagged capacity; so is what
 is private, closed, below the ground or on a deck, and spaces for other than cars. Everything left out is
@@ -37,15 +37,15 @@ from scipy.sparse.csgraph import connected_components
 from parkenv.errors import InputError
 from parkenv.local_frame import LocalFrame
 from parkenv.lot import Lane, mouth_points
-from parkenv.lot_draft import LeftOut, LotDraft, Wishes, points_in
 from parkenv.lot_generators import Slots
 from parkenv.lot_graph import SLOT_REACH, places
-from parkenv.lot_osm_elements import OsmElement, read_elements
-from parkenv.lot_osm_junctions import uncrowded
-from parkenv.lot_osm_kerbs import Junctions, kerb_of, kerb_slots
-from parkenv.lot_osm_outlines import CORRIDOR, fill_outline
-from parkenv.lot_osm_roads import Rank, Road, closed_to_cars, off_the_ground, road_of, whole_number
-from parkenv.lot_osm_rows import ARRANGEMENTS, NO_SLOTS, boxes_of, without_overlaps
+from parkenv.places.lot_draft import LeftOut, LotDraft, Wishes, points_in
+from parkenv.places.osm_elements import OsmElement, read_elements
+from parkenv.places.osm_junctions import uncrowded
+from parkenv.places.osm_kerbs import Junctions, kerb_of, kerb_slots
+from parkenv.places.osm_outlines import CORRIDOR, fill_outline
+from parkenv.places.osm_roads import Rank, Road, closed_to_cars, off_the_ground, road_of, whole_number
+from parkenv.places.osm_rows import ARRANGEMENTS, NO_SLOTS, boxes_of, without_overlaps
 from parkenv.slot_polygons import nearest_on_lanes, slots_from_polygons
 
 FloatArray = NDArray[np.float64]

@@ -9,10 +9,10 @@ from pathlib import Path
 from parkenv.dragon_lake import is_dragon_lake
 from parkenv.errors import InputError
 from parkenv.lot import ParkingLot
-from parkenv.lot_draft import LotDraft, Wishes, points_in
-from parkenv.lot_osm import osm_draft
-from parkenv.lot_osm_elements import holds_osm
-from parkenv.slot_list import slot_list_draft
+from parkenv.places.lot_draft import LotDraft, Wishes, points_in
+from parkenv.places.osm import osm_draft
+from parkenv.places.osm_elements import holds_osm
+from parkenv.places.slot_list import slot_list_draft
 
 
 def is_place(path: Path) -> bool:
@@ -30,7 +30,7 @@ def import_lot(path: str | Path, wishes: Wishes | None = None) -> LotDraft:
     """The lot that a file describes, as far as it does.
 
     Read are OpenStreetMap (`.osm`, `.xml`, Overpass JSON, GeoJSON of overpass-turbo; see
-    `parkenv.lot_osm`), lists of slot centres (`.csv`; see `parkenv.slot_list`), Dragon Lake's map and native
+    `parkenv.places.osm`), lists of slot centres (`.csv`; see `parkenv.places.slot_list`), Dragon Lake's map and native
     lots. Lots by latitude and longitude get metres east and north of their middle.
 
     Args:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from parkenv.lot import mouth_heading, mouth_points
 from parkenv.lot_generators import Slots
 from parkenv.lot_graph import SLOT_REACH
-from parkenv.lot_osm_roads import Road
-from parkenv.lot_osm_rows import (
+from parkenv.places.osm_roads import Road
+from parkenv.places.osm_rows import (
     ARRANGEMENTS,
     DRAWN,
     NO_SLOTS,

@@ -24,9 +24,9 @@ from parkenv.evaluation.import_picture import save_import_picture
 from parkenv.local_frame import LocalFrame
 from parkenv.lot import Mouth
 from parkenv.lot_check import check_lot
-from parkenv.lot_draft import Wishes
 from parkenv.lot_graph import SLOT_REACH
-from parkenv.lot_import import import_lot
+from parkenv.places.lot_draft import Wishes
+from parkenv.places.lot_import import import_lot
 from parkenv.slot_polygons import nearest_on_lanes
 
 FREIBURG = LocalFrame(lon=7.85, lat=48.0)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from parkenv.lot_generators import KERB_SIZE, Slots
 from parkenv.lot_graph import places as same_places
-from parkenv.lot_osm_roads import Rank, Road, metres, whole_number
-from parkenv.lot_osm_rows import ARRANGEMENTS, DRAWN, NO_SLOTS, Side, crowding, places_along, row_at
+from parkenv.places.osm_roads import Rank, Road, metres, whole_number
+from parkenv.places.osm_rows import ARRANGEMENTS, DRAWN, NO_SLOTS, Side, crowding, places_along, row_at
 
 FloatArray = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.local_frame import LocalFrame
-from parkenv.lot_draft import LeftOut, LotDraft, Wishes, points_in
-from parkenv.lot_osm_rows import NO_SLOTS
-from parkenv.slot_rows import UnsureError, lay_out
+from parkenv.places.lot_draft import LeftOut, LotDraft, Wishes, points_in
+from parkenv.places.osm_rows import NO_SLOTS
+from parkenv.places.slot_rows import UnsureError, lay_out
 
 FloatArray = NDArray[np.float64]
 
@@ -117,7 +117,7 @@ def _require_apart(path: Path, xy: FloatArray, ids: tuple[str, ...], rows: tuple
 def slot_list_draft(path: str | Path, wishes: Wishes | None = None) -> LotDraft:
     """The lot that a list of slots tells of.
 
-    Rows and aisles are found as `parkenv.slot_rows` says. Where that is not sure the draft has no slots'
+    Rows and aisles are found as `parkenv.places.slot_rows` says. Where that is not sure the draft has no slots'
     shapes and says so; it draws nevertheless. A list tells neither where cars come in nor where people
     walk to.
 

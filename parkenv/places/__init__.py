@@ -1,0 +1,1 @@
+"""Lots of real places: maps and lists of slots that others made."""
