@@ -222,7 +222,7 @@ def _trained(run: RunFolder) -> Cases:
     ]
     if not rows or not run.summary.get("transfer"):
         return []
-    from parkenv.cli.train import TESTED_FROM
+    from parkenv.cli.training_course import TESTED_FROM
 
     best = min(rows, key=lambda row: float(row["total_s"]))
     model = run.path / f"seed_{best['seed']}" / "model.zip"

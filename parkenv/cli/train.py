@@ -5,12 +5,8 @@ from __future__ import annotations
 import json
 import sys
 import threading
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -18,23 +14,18 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
-from parkenv.cli.tables import make_console, make_table
+from parkenv.cli.drive_course import DriveCourse
+from parkenv.cli.search_course import SearchCourse
+from parkenv.cli.tables import make_console
+from parkenv.cli.training_course import Course, Row
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.drive_training import DriveTraining
     from parkenv.evaluation.rl_training import Training
-    from parkenv.evaluation.search_training import SearchTraining
     from parkenv.evaluation.workers import Workers
-    from parkenv.lot import ParkingLot
-    from parkenv.scenario import Scenario
 
 PLANNERS = "belief,mdp-tuned,mdp,first-free,greedy-drive,greedy-goal"
-EXAMINED_FROM, TESTED_FROM, SHOWN_FROM = 2_000_000, 3_000_000, 5_000_000
-"""First seeds of the worlds in which models are examined, tested at the end, and shown what to imitate."""
 ENVS = ("search", "drive")
-
-Row = dict[str, Any]
 
 
 def train(
@@ -172,16 +163,16 @@ def train(
 
     if env not in ENVS:
         raise InputError(f"--env is {env!r}, want one of {', '.join(ENVS)}")
-    course: _Course
+    course: Course
     if env == "search":
         _refuse("drive", {"--lot": lot})
-        course = _SearchCourse(
+        course = SearchCourse(
             algorithm or "maskable-ppo", scenario or "campus", test_on, steps or 2_000_000, imitate, shown, k or 5,
             examine_every or 100_000, examined_on or 256, planners or PLANNERS,
         )  # fmt: skip
     else:
         _refuse("search", {"--scenario": scenario, "--imitate": imitate, "--k": k})
-        course = _DriveCourse(
+        course = DriveCourse(
             algorithm or "ppo", lot or "campus,street", test_on, steps, examine_every, examined_on or 64,
             planners or "planner",
         )  # fmt: skip
@@ -216,260 +207,6 @@ def _refuse(env: str, options: Row) -> None:
             raise InputError(f"{name} goes with --env {env}")
 
 
-class _Course(ABC):
-    """What is trained, and what the command tells of it."""
-
-    algorithm: str
-
-    @property
-    @abstractmethod
-    def folder(self) -> str:
-        """Where results go by default."""
-
-    @abstractmethod
-    def recipe(self) -> Any:
-        """The algorithm's, or an `InputError`."""
-
-    @abstractmethod
-    def settings(self) -> Row:
-        """What a training that is gone on with must have in common with this one."""
-
-    @abstractmethod
-    def training(self, console: Console) -> Training:
-        """Made when it is sure that there will be one."""
-
-    @abstractmethod
-    def told(self, row: Row) -> str:
-        """An examination in a word."""
-
-    @abstractmethod
-    def report(
-        self, console: Console, workers: Workers, curves: list[list[Row]], models: dict[int, Path], out: Path
-    ) -> Row:
-        """Test the models, draw the figure, print the table; what goes into the summary."""
-
-
-@dataclass(eq=False)
-class _SearchCourse(_Course):
-    algorithm: str
-    scenario: str
-    test_on: str | None
-    steps: int
-    imitate: str | None
-    shown: int
-    k: int
-    examine_every: int
-    examined_on: int
-    planners: str
-
-    @property
-    def folder(self) -> str:
-        return self.algorithm
-
-    def recipe(self) -> Any:
-        from parkenv.evaluation.recipes import RECIPES, recipe_of
-
-        return recipe_of(self.algorithm, RECIPES, "search")
-
-    @cached_property
-    def worlds(self) -> list[Scenario]:
-        from parkenv.scenario import Scenario
-
-        return [Scenario.named(name) for name in args.words("--scenario", self.scenario)]
-
-    @cached_property
-    def tested(self) -> list[Scenario]:
-        from parkenv.scenario import Scenario
-
-        return [Scenario.named(name) for name in args.words("--test-on", self.test_on or self.scenario)]
-
-    @property
-    def examined(self) -> range:
-        return range(EXAMINED_FROM, EXAMINED_FROM + self.examined_on)
-
-    def settings(self) -> Row:
-        _ = self.tested
-        return {
-            "algorithm": self.algorithm, "scenario": [w.name for w in self.worlds], "steps": self.steps,
-            "imitate": self.imitate, "shown": self.shown if self.imitate else None, "k": self.k,
-            "examine_every": self.examine_every, "examined_on": self.examined_on,
-        }  # fmt: skip
-
-    def training(self, console: Console) -> SearchTraining:
-        from parkenv.evaluation.search_training import SearchTraining
-
-        demonstrations = None
-        if self.imitate is not None:
-            from parkenv.evaluation.cloning import Demonstrations
-
-            with console.status(f"Watching {self.imitate} search {self.shown} times"):
-                demonstrations = Demonstrations.collect(
-                    self.imitate, self.worlds[0], range(SHOWN_FROM, SHOWN_FROM + self.shown), self.k
-                )
-        return SearchTraining(
-            self.algorithm, self.steps, self.examine_every, tuple(self.worlds), self.examined, self.k, demonstrations
-        )  # fmt: skip
-
-    def told(self, row: Row) -> str:
-        return f"{row['total_s']:.1f} s"
-
-    def report(
-        self, console: Console, workers: Workers, curves: list[list[Row]], models: dict[int, Path], out: Path
-    ) -> Row:
-        from parkenv.evaluation.learning_curves import across_seeds, save_learning_curves
-        from parkenv.evaluation.search_training import search_times
-        from planners.learned import LearnedAgent
-
-        names = [] if self.planners == "none" else args.words("--planners", self.planners)
-        at_test = range(TESTED_FROM, TESTED_FROM + 2 * self.examined_on)
-        lines, tables = _planner_times(
-            console, workers, names, self.worlds[0], self.tested, self.examined, at_test
-        )
-        rows, transfer = [], []
-        with console.status("Testing"):
-            for (number, model), curve in zip(models.items(), curves, strict=True):
-                for world in self.tested:
-                    row = search_times(LearnedAgent(world, self.algorithm, model), world, at_test)
-                    transfer.append(
-                        {"agent": self.algorithm, "seed": number, "test_scenario": world.name, **row}
-                    )
-                tested = transfer[-len(self.tested)]
-                own = {c: tested[c] for c in ("total_s", "total_s_ci95")}
-                rows.append(_row_of(self.algorithm, self.worlds[0].name, number, curve, own, model))
-        title = f"{self.worlds[0].name}: {self.examined_on} searches in worlds that were not trained on"
-        save_learning_curves({self.algorithm: curves}, lines, title, out / "learning_curve.png")
-        _print(
-            console,
-            "Mean total time, s, in worlds of no examination",
-            self.algorithm,
-            transfer,
-            tables,
-            _interval,
-        )
-        return {
-            "rows": rows, "transfer": transfer, "planners": tables, "examined": lines, "curve": across_seeds(curves),
-        }  # fmt: skip
-
-
-@dataclass(eq=False)
-class _DriveCourse(_Course):
-    algorithm: str
-    lot: str
-    test_on: str | None
-    asked_steps: int | None
-    asked_every: int | None
-    examined_on: int
-    planners: str
-
-    @property
-    def folder(self) -> str:
-        return f"drive-{self.algorithm}"
-
-    def recipe(self) -> Any:
-        from parkenv.evaluation.recipes import DRIVE_RECIPES, recipe_of
-
-        return recipe_of(self.algorithm, DRIVE_RECIPES, "drive")
-
-    @property
-    def steps(self) -> int:
-        return self.asked_steps or int(self.recipe().steps)
-
-    @property
-    def examine_every(self) -> int:
-        return self.asked_every or max(1, self.steps // 20)
-
-    @cached_property
-    def lots(self) -> list[ParkingLot]:
-        from parkenv.envs.drive import lot_named
-
-        return [lot_named(name) for name in args.words("--lot", self.lot)]
-
-    @cached_property
-    def tested(self) -> list[ParkingLot]:
-        from parkenv.envs.drive import lot_named
-
-        return [lot_named(name) for name in args.words("--test-on", self.test_on or self.lot)]
-
-    def settings(self) -> Row:
-        from parkenv.evaluation.drive_practice import places_of
-        from planners.drivers import PLANNER
-
-        places_of(self.tested)  # complains before anything is trained
-        if self.planners not in (PLANNER, "none"):
-            raise InputError(f"--planners is {self.planners!r}, want {PLANNER} or none with --env drive")
-        return {
-            "algorithm": self.algorithm, "env": "drive", "lot": [lot.name for lot in self.lots], "steps": self.steps,
-            "examine_every": self.examine_every, "examined_on": self.examined_on,
-        }  # fmt: skip
-
-    def training(self, console: Console) -> DriveTraining:
-        del console
-        from parkenv.evaluation.drive_training import DriveTraining
-
-        examined = range(EXAMINED_FROM, EXAMINED_FROM + self.examined_on)
-        return DriveTraining(self.algorithm, self.steps, self.examine_every, tuple(self.lots), examined)
-
-    def told(self, row: Row) -> str:
-        return f"{row['success']:.0%} parked"
-
-    def report(
-        self, console: Console, workers: Workers, curves: list[list[Row]], models: dict[int, Path], out: Path
-    ) -> Row:
-        from parkenv.evaluation.drive_training import parked_on
-        from parkenv.evaluation.learning_curves import across_seeds, save_success_curves
-        from parkenv.evaluation.parking_runs import parking_table
-        from planners.drivers import PLANNER
-
-        examined = range(EXAMINED_FROM, EXAMINED_FROM + self.examined_on)
-        at_test = range(TESTED_FROM, TESTED_FROM + 2 * self.examined_on)
-        names = " and ".join(lot.name for lot in self.lots)
-        lines: dict[str, float] = {}
-        tables: list[Row] = []
-        if self.planners != "none":
-            with console.status("The planner parks in the same tasks"):
-                parkings = parked_on(self.lots, examined, workers, PLANNER)
-                lines = {row["kind"]: row["success"] for row in parking_table(parkings)}
-                for lot in self.tested:
-                    table = parking_table(parked_on([lot], at_test, workers, PLANNER))
-                    tables += [{"agent": PLANNER, "scenario": lot.name, **row} for row in table]
-        rows, transfer = [], []
-        with console.status("Testing"):
-            for (number, model), curve in zip(models.items(), curves, strict=True):
-                parkings = []
-                for lot in self.tested:
-                    some = parked_on([lot], at_test, workers, f"{self.algorithm}:{model}")
-                    parkings += some
-                    transfer += [
-                        {"agent": self.algorithm, "seed": number, "test_scenario": lot.name, **row}
-                        for row in parking_table(some)
-                    ]
-                tested = parking_table(parkings)[-1]
-                own = {c: tested[c] for c in ("success", "success_ci95", "contacts", "time_s")}
-                rows.append(
-                    _row_of(
-                        self.algorithm, ",".join(lot.name for lot in self.tested), number, curve, own, model
-                    )
-                )
-        kinds = [name.removesuffix("_success") for name in curves[0][0] if name.endswith("_success")]
-        title = f"{names}: {self.examined_on} parkings of each kind that were not trained on"
-        save_success_curves({self.algorithm: curves}, kinds, lines, title, out / "learning_curve.png")
-        heading = "Parkings that succeed, contacts, median s of those, in tasks of no examination"
-        _print(console, heading, self.algorithm, transfer, tables, _parkings, "kind")
-        return {
-            "rows": rows, "transfer": transfer, "planners": tables, "examined": lines,
-            "curve": {kind: across_seeds(curves, f"{kind}_success") for kind in kinds},
-        }  # fmt: skip
-
-
-def _row_of(agent: str, scenario: str, number: int, curve: list[Row], own: Row, model: Path) -> Row:
-    """A row of the summary for one training."""
-    last = curve[-1]
-    return {
-        "agent": agent, "scenario": scenario, "seed": number, "steps": last["steps"], **own,
-        "steps_per_s": last["steps"] / max(last["wall_s"], 1e-9), "model": str(model),
-    }  # fmt: skip
-
-
 def _claim(out: Path, settings: Row, resume: bool, overwrite: bool) -> None:
     """Make sure that what is in the folder may be used, or replaced."""
     import shutil
@@ -499,30 +236,9 @@ def _claim(out: Path, settings: Row, resume: bool, overwrite: bool) -> None:
         beside.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
 
 
-def _planner_times(
-    console: Console,
-    workers: Workers,
-    names: Sequence[str],
-    first: Any,
-    tested: Sequence[Any],
-    examined: range,
-    at_test: range,
-) -> tuple[dict[str, float], list[Row]]:
-    """Mean times of planners in the worlds of the examinations, and rows of those of the test."""
-    from parkenv.evaluation.compare import rows_of
-
-    if not names:
-        return {}, []
-    with console.status("Planners search in the same worlds"):
-        rows = rows_of(names, first, examined, workers)
-        tables = [row for world in tested for row in rows_of(names, world, at_test, workers)]
-    lines = {row["agent"]: row["total_s"] for row in rows}
-    return {**lines, "clairvoyant bound": rows[0]["bound_s"]}, tables
-
-
 def _train_all(
     console: Console,
-    course: _Course,
+    course: Course,
     training: Training,
     seeds: range,
     out: Path,
@@ -565,37 +281,3 @@ def _train_all(
             over.set()
             watcher.join()
     return [curves[i] for i in range(len(seeds))]
-
-
-def _print(
-    console: Console,
-    title: str,
-    algorithm: str,
-    transfer: list[Row],
-    planners: list[Row],
-    told: Callable[[Row], str],
-    *further: str,
-) -> None:
-    """A column for each world, and for what else tells rows apart; a line for each model and planner."""
-    columns = list(
-        dict.fromkeys((row["test_scenario"], *(row[name] for name in further)) for row in transfer)
-    )
-    table = make_table(title, ["", *(" ".join(column) for column in columns)])
-    agents = {f"{algorithm}, seed {n}": n for n in dict.fromkeys(row["seed"] for row in transfer)}
-    for agent, number in agents.items():
-        its = {(r["test_scenario"], *(r[f] for f in further)): r for r in transfer if r["seed"] == number}
-        table.add_row(agent, *(told(its[column]) for column in columns))
-    for agent in dict.fromkeys(row["agent"] for row in planners):
-        its = {(r["scenario"], *(r[f] for f in further)): r for r in planners if r["agent"] == agent}
-        table.add_row(agent, *(told(its[column]) for column in columns))
-    console.print(table)
-
-
-def _interval(row: Row) -> str:
-    low, high = row["total_s_ci95"]
-    return f"{row['total_s']:.1f} [{low:.1f}, {high:.1f}]"
-
-
-def _parkings(row: Row) -> str:
-    low, high = row["success_ci95"]
-    return f"{row['success']:.1%} [{low:.1%}, {high:.1%}], {row['contacts']}, {row['time_s']:.1f}"

@@ -1,0 +1,173 @@
+"""The course in which `parkenv train` teaches to search."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from parkenv.cli import arguments as args
+from parkenv.cli.training_course import EXAMINED_FROM, TESTED_FROM, Course, Row, print_tests, row_of
+
+if TYPE_CHECKING:
+    from parkenv.evaluation.search_training import SearchTraining
+    from parkenv.evaluation.workers import Workers
+    from parkenv.scenario import Scenario
+
+SHOWN_FROM = 5_000_000
+"""First seed of the worlds in which a planner shows what to imitate."""
+
+
+@dataclass(eq=False)
+class SearchCourse(Course):
+    """Searches in some scenarios.
+
+    Args:
+        algorithm: by name.
+        scenario, test_on: names of scenarios, divided by commas, to train and to test in; None to test in the same.
+        steps: decisions of a training.
+        imitate: name of a planner to begin by imitating, or None.
+        shown: searches of it.
+        k: slots that an observation tells of.
+        examine_every: decisions between examinations.
+        examined_on: searches an examination, and half as many as in the test.
+        planners: names, divided by commas, or none.
+    """
+
+    algorithm: str
+    scenario: str
+    test_on: str | None
+    steps: int
+    imitate: str | None
+    shown: int
+    k: int
+    examine_every: int
+    examined_on: int
+    planners: str
+
+    @property
+    def folder(self) -> str:
+        """See `Course`."""
+        return self.algorithm
+
+    def recipe(self) -> Any:
+        """See `Course`."""
+        from parkenv.evaluation.recipes import RECIPES, recipe_of
+
+        return recipe_of(self.algorithm, RECIPES, "search")
+
+    @cached_property
+    def worlds(self) -> list[Scenario]:
+        """Where it is trained."""
+        from parkenv.scenario import Scenario
+
+        return [Scenario.named(name) for name in args.words("--scenario", self.scenario)]
+
+    @cached_property
+    def tested(self) -> list[Scenario]:
+        """Where it is tested."""
+        from parkenv.scenario import Scenario
+
+        return [Scenario.named(name) for name in args.words("--test-on", self.test_on or self.scenario)]
+
+    @property
+    def examined(self) -> range:
+        """Seeds of the worlds of the examinations."""
+        return range(EXAMINED_FROM, EXAMINED_FROM + self.examined_on)
+
+    def settings(self) -> Row:
+        """See `Course`."""
+        _ = self.tested
+        return {
+            "algorithm": self.algorithm, "scenario": [w.name for w in self.worlds], "steps": self.steps,
+            "imitate": self.imitate, "shown": self.shown if self.imitate else None, "k": self.k,
+            "examine_every": self.examine_every, "examined_on": self.examined_on,
+        }  # fmt: skip
+
+    def training(self, console: Console) -> SearchTraining:
+        """See `Course`."""
+        from parkenv.evaluation.search_training import SearchTraining
+
+        demonstrations = None
+        if self.imitate is not None:
+            from parkenv.evaluation.cloning import Demonstrations
+
+            with console.status(f"Watching {self.imitate} search {self.shown} times"):
+                demonstrations = Demonstrations.collect(
+                    self.imitate, self.worlds[0], range(SHOWN_FROM, SHOWN_FROM + self.shown), self.k
+                )
+        return SearchTraining(
+            self.algorithm, self.steps, self.examine_every, tuple(self.worlds), self.examined, self.k, demonstrations
+        )  # fmt: skip
+
+    def told(self, row: Row) -> str:
+        """See `Course`."""
+        return f"{row['total_s']:.1f} s"
+
+    def report(
+        self, console: Console, workers: Workers, curves: list[list[Row]], models: dict[int, Path], out: Path
+    ) -> Row:
+        """See `Course`."""
+        from parkenv.evaluation.learning_curves import across_seeds, save_learning_curves
+        from parkenv.evaluation.search_training import search_times
+        from planners.learned import LearnedAgent
+
+        names = [] if self.planners == "none" else args.words("--planners", self.planners)
+        at_test = range(TESTED_FROM, TESTED_FROM + 2 * self.examined_on)
+        lines, tables = _planner_times(
+            console, workers, names, self.worlds[0], self.tested, self.examined, at_test
+        )
+        rows, transfer = [], []
+        with console.status("Testing"):
+            for (number, model), curve in zip(models.items(), curves, strict=True):
+                for world in self.tested:
+                    row = search_times(LearnedAgent(world, self.algorithm, model), world, at_test)
+                    transfer.append(
+                        {"agent": self.algorithm, "seed": number, "test_scenario": world.name, **row}
+                    )
+                tested = transfer[-len(self.tested)]
+                own = {c: tested[c] for c in ("total_s", "total_s_ci95")}
+                rows.append(row_of(self.algorithm, self.worlds[0].name, number, curve, own, model))
+        title = f"{self.worlds[0].name}: {self.examined_on} searches in worlds that were not trained on"
+        save_learning_curves({self.algorithm: curves}, lines, title, out / "learning_curve.png")
+        print_tests(
+            console,
+            "Mean total time, s, in worlds of no examination",
+            self.algorithm,
+            transfer,
+            tables,
+            _interval,
+        )
+        return {
+            "rows": rows, "transfer": transfer, "planners": tables, "examined": lines, "curve": across_seeds(curves),
+        }  # fmt: skip
+
+
+def _planner_times(
+    console: Console,
+    workers: Workers,
+    names: Sequence[str],
+    first: Any,
+    tested: Sequence[Any],
+    examined: range,
+    at_test: range,
+) -> tuple[dict[str, float], list[Row]]:
+    """Mean times of planners in the worlds of the examinations, and rows of those of the test."""
+    from parkenv.evaluation.compare import rows_of
+
+    if not names:
+        return {}, []
+    with console.status("Planners search in the same worlds"):
+        rows = rows_of(names, first, examined, workers)
+        tables = [row for world in tested for row in rows_of(names, world, at_test, workers)]
+    lines = {row["agent"]: row["total_s"] for row in rows}
+    return {**lines, "clairvoyant bound": rows[0]["bound_s"]}, tables
+
+
+def _interval(row: Row) -> str:
+    low, high = row["total_s_ci95"]
+    return f"{row['total_s']:.1f} [{low:.1f}, {high:.1f}]"
