@@ -18,15 +18,16 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from parkenv.cli import app
+from parkenv.driving.lot_space import LotSpace
 from parkenv.driving.vehicle import SPEED, STATE_SIZE, YAW, VehicleParameters
 from parkenv.envs.drive import DriveEnv
 from parkenv.errors import InputError
 from parkenv.evaluation.drive_batch import CONTACT, LEFT, PARKED, UNDER_WAY, DriveBatch, PreparedTask
 from parkenv.evaluation.drive_hindsight import EndingGoals
-from parkenv.evaluation.drive_practice import MASTERED, TRIED, DrivePractice, places_of
+from parkenv.evaluation.drive_practice import MASTERED, STOOD, TRIED, DrivePractice, places_of, way_in
 from parkenv.evaluation.drive_training import DriveTraining, parked_by, parked_on
 from parkenv.evaluation.learning_curves import across_seeds, save_success_curves
-from parkenv.evaluation.recipes import DRIVE_RECIPES
+from parkenv.evaluation.recipes import DRIVE_RECIPES, WAY_IN
 from parkenv.evaluation.rl_training import read_curve, train_one
 from parkenv.evaluation.workers import HERE
 from parkenv.lot import ParkingLot
@@ -247,11 +248,73 @@ def test_levels_make_tasks_harder():
     assert away[0] < 2.0 < 5.0 < away[1]
 
 
+@pytest.mark.parametrize("place", places_of((MINI, STREET)), ids=lambda place: place.kind)
+def test_the_way_in_leads_from_the_slot_back_to_the_start_and_touches_nothing(place):
+    for key in range(4):
+        task = place.tasks().draw(key)
+        way, space = way_in(task), LotSpace(task.vehicle, task.obstacles)
+        desired = PreparedTask(task).desired
+        middle = task.vehicle.at_middle(way[0])
+        assert np.hypot(*(middle[:2] - desired[:2])) < 0.05
+        assert math.cos(middle[2] - math.atan2(desired[3], desired[2])) > 0.999
+        np.testing.assert_allclose(way[-1, :2], task.in_slot_frame(task.start[:2]), atol=1e-9)
+        assert np.hypot(*np.diff(way[:, :2], axis=0).T).max() < 0.1 + 1e-9
+        c, s = math.cos(task.slot[2]), math.sin(task.slot[2])
+        for x, y, yaw in way.tolist():
+            east, north = task.slot[0] + c * x - s * y, task.slot[1] + s * x + c * y
+            assert not space.touched(east, north, yaw + task.slot[2])
+
+
+def test_drives_on_the_way_in_begin_as_far_from_its_end_as_the_level_says():
+    curriculum = DRIVE_RECIPES["ppo"].curriculum
+    level = next(i for i, stage in enumerate(curriculum) if stage.starts == WAY_IN)
+    env = practice_of("ppo", 64, lots=(STREET,), levels={"parallel": level})
+    env.seed(1)
+    env.reset()
+    ways = [exercise.way for exercise in env._at_hand[env._places["parallel"][0], level]]
+    low, high = curriculum[level].distance
+    checked = 0
+    for i in np.flatnonzero([at == ("parallel", level) for at in env._at]):
+        pose = env.batch.state[i, :3]
+        left = [np.flatnonzero((way == pose).all(axis=1)) for way in ways]
+        (index,) = np.concatenate(left)
+        assert low - 0.06 <= 0.1 * index <= high + 0.06
+        checked += 1
+    assert checked > 10
+
+
+def test_who_stands_for_too_long_is_cut_off():
+    env = practice_of("ppo", 8)
+    env.seed(0)
+    env.reset()
+    stand, creep = np.zeros((8, 2), np.float32), np.tile(np.float32([0.4, 0.0]), (8, 1))
+    for _ in range(STOOD - 1):
+        assert not env.step(stand)[2].any()
+    _, _, done, infos = env.step(stand)
+    assert done.all()
+    assert all(info["TimeLimit.truncated"] and not info["is_success"] for info in infos)
+    for _ in range(STOOD - 1):
+        env.step(stand)
+    _, _, done, infos = env.step(creep)
+    assert not any(info.get("TimeLimit.truncated", False) for info in infos)
+    for _ in range(STOOD - 2):
+        assert not any(info.get("TimeLimit.truncated", False) for info in env.step(stand)[3])
+
+
+def test_the_kind_that_lags_is_practised_most():
+    last = len(DRIVE_RECIPES["ppo"].curriculum) - 1
+    env = practice_of("ppo", 400, levels={"perpendicular": last, "parallel": last - 3})
+    env.seed(0)
+    env.reset()
+    parallel = sum(kind == "parallel" for kind, _ in env._at)
+    assert 0.72 < parallel / 400 < 0.88, "four times as often"
+
+
 @pytest.mark.parametrize(
     ("make", "wanted"),
     [
         (lambda: practice_of("ppo", 0), "num_envs is 0"),
-        (lambda: practice_of("ppo", levels={"parallel": 9}), "level of parallel slots is 9, want 0 to 5"),
+        (lambda: practice_of("ppo", levels={"parallel": 10}), "level of parallel slots is 10, want 0 to 9"),
         (lambda: DrivePractice(2, (), DRIVE_RECIPES["sac"]), "at least one kind of slots"),
         (
             lambda: DriveTraining("dqn", 10, 10, (MINI,), EXAMINED),
@@ -511,7 +574,7 @@ def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algo
 def test_a_short_training_learns_to_park_from_nearby(tmp_path, monkeypatch):
     """In a minute of training it masters two levels: it parks in 60 of the last 100 drives of each."""
     monkeypatch.setitem(DRIVE_RECIPES, "ppo", FULL_SIZE["ppo"])
-    curve = training_of("ppo", 800_000, 400_000).train(0, tmp_path)
+    curve = train_one(training_of("ppo", 800_000, 400_000), 0, tmp_path).curve
     assert curve[-1]["perpendicular_level"] >= 2.0
     near = places_of((MINI,))[0].tasks(slack=1.0, distance=(1.0, 6.0), starts="way-out")
     tasks = [PreparedTask(near.draw(7_000 + k)) for k in range(60)]

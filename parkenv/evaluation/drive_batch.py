@@ -59,10 +59,12 @@ class DriveBatch:
         self._things = np.zeros(n, dtype=np.int64)
         self._limits, self._half, self._body = vehicle.limits, self.view.half, self.view.body
 
-    def start(self, i: int, task: PreparedTask) -> None:
-        """Let drive i begin anew, with a task."""
+    def start(self, i: int, task: PreparedTask, pose: FloatArray | None = None) -> None:
+        """Let drive i begin anew, with a task; standing at its start, or at a pose of the rear axle, slot frame."""
         outlines = task.outlines
         self.state[i], self._desired[i], self._about[i] = task.start, task.desired, task.about
+        if pose is not None:
+            self.state[i, :3] = pose
         self._slot_yaw[i] = task.slot_yaw
         self._edges[i, : len(outlines.edges)] = outlines.edges
         self._first[i, : len(outlines.first)] = outlines.first

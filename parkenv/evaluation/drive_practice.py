@@ -5,39 +5,45 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices
 
-from parkenv.driving.parking_task import KINDS, ParkingTasks
-from parkenv.driving.vehicle import VehicleParameters
-from parkenv.envs.drive import CONTROL_S, goal_errors
+from parkenv.driving.parking_task import KINDS, ParkingTask, ParkingTasks
+from parkenv.driving.vehicle import SPEED, VehicleParameters
+from parkenv.envs.drive import CONTROL_S, STANDING, goal_errors
 from parkenv.errors import InputError
 from parkenv.evaluation.drive_batch import CONTACT, PARKED, UNDER_WAY, DriveBatch, PreparedTask
-from parkenv.evaluation.recipes import DriveRecipe
+from parkenv.evaluation.recipes import WAY_IN, DriveRecipe
 from parkenv.lot import ParkingLot
 from planners.driver_view import HOLD, N_SEEN
+from planners.hybrid_astar import plan_path
 
 FloatArray = NDArray[np.float64]
 Observations = dict[str, NDArray[np.float32]]
 
 DECISION_S = HOLD * CONTROL_S
 """s, from one decision to the next."""
-MOST_DECISIONS = 150
-"""In one drive: a minute, as in the environment."""
+MOST_DECISIONS = 80
+"""In one drive: half a minute, in which whoever knows how parks from anywhere."""
+STOOD = 5
+"""Decisions, one after another, with which a drive ends after which the car stands: who has learned little as yet
+stops where it knows no way on, and would not move again."""
 TRIED = 100
 """Drives at a level by which is judged whether it is mastered."""
-MASTERED = 0.6
+MASTERED = 0.7
 """Share of them that must have parked."""
-SHARES = (0.6, 0.2, 0.2)
+SHARES = (0.5, 0.25, 0.25)
 """How often a drive is of the level that is being learned, of any up to it, and of the last one."""
 TIMES_DRIVEN = 20
 """How often a task is driven, on the average: to draw one takes as long as to drive it a few times."""
 KEPT = 128
 """Tasks of each kind, lot and level that are at hand."""
+
+_STEP_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,12 +75,36 @@ def places_of(lots: Sequence[ParkingLot]) -> tuple[Place, ...]:
     return tuple(sorted(places, key=lambda place: KINDS.index(place.kind)))
 
 
+class Exercise(NamedTuple):
+    """A task, and where to begin with it.
+
+    Attributes:
+        task: as a batch takes it.
+        way: (n, 3) x, y in m and yaw in rad of the rear axle, slot frame: along the planner's way into the slot, from
+            its end backward, a pose every 0.1 m or less; None to begin at the task's own start.
+    """
+
+    task: PreparedTask
+    way: FloatArray | None
+
+
+def way_in(task: ParkingTask) -> FloatArray:
+    """The `way` of an exercise; the task's start alone where the planner finds none."""
+    around, target = task.obstacles, task.vehicle.at_rear_axle(task.target)
+    path = plan_path(task.vehicle, around.corners, around.n_corners, task.start[:3], target)
+    way = task.start[None, :3].copy() if path is None else path.sampled(_STEP_M)[0][::-1].copy()
+    way[:, :2] = task.in_slot_frame(way[:, :2])
+    way[:, 2] -= task.slot[2]
+    return way
+
+
 class DrivePractice(VecEnv):  # type: ignore[misc]
     """Drives with decisions as in `planners.driver_view`, at the levels of a recipe's curriculum.
 
     Each kind of slot is at a level of its own, and begins at the first. A level is mastered when of the last `TRIED`
     drives at it `MASTERED` parked. `SHARES` of the drives are of the level, of easier ones, and of the last one, which
-    is the task of `parkenv/Drive-v0` itself.
+    is the task of `parkenv/Drive-v0` itself. The more levels a kind has before it, the more often it is driven into.
+    A drive that is not over after `MOST_DECISIONS`, or in which the car has stood for `STOOD` of them, is cut off.
 
     With the `sparse` reward, a decision costs its 0.4 s, whole, unless it ends in the slot, so that `compute_reward`
     can tell it from the goals and from whether there was a contact. With the `dense` one it costs what the environment
@@ -111,7 +141,7 @@ class DrivePractice(VecEnv):  # type: ignore[misc]
                 raise InputError(f"level of {kind} slots is {level}, want 0 to {self._last}")
         self._lately: dict[str, deque[bool]] = {kind: deque(maxlen=TRIED) for kind in self._places}
         self._tasks: dict[tuple[Place, int], ParkingTasks] = {}
-        self._at_hand: dict[tuple[Place, int], list[PreparedTask]] = {}
+        self._at_hand: dict[tuple[Place, int], list[Exercise]] = {}
         self.batch = DriveBatch(num_envs)
         goal = spaces.Box(-np.inf, np.inf, (7,), np.float32)
         seen = spaces.Box(-np.inf, np.inf, (N_SEEN,), np.float32)
@@ -125,6 +155,7 @@ class DrivePractice(VecEnv):  # type: ignore[misc]
         self._actions = np.zeros((num_envs, 2), dtype=np.float32)
         self._at = [("", 0)] * num_envs
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, dtype=np.int64)
+        self._stood = np.zeros(num_envs, dtype=np.int64)
 
     def seed(self, seed: int | None = None) -> list[int | None]:
         """Fix the tasks that are drawn from now on."""
@@ -156,8 +187,9 @@ class DrivePractice(VecEnv):  # type: ignore[misc]
             rewards = self._scaled(batch.took + batch.approach, failed)
         self._returns += rewards
         self._lengths += 1
+        self._stood = np.where(np.abs(batch.state[:, SPEED]) <= STANDING, self._stood + 1, 0)
         over = batch.status != UNDER_WAY
-        done = over | (self._lengths >= MOST_DECISIONS)
+        done = over | (self._lengths >= MOST_DECISIONS) | (self._stood >= STOOD)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(done).tolist():
             parked = bool(batch.status[i] == PARKED)
@@ -208,30 +240,40 @@ class DrivePractice(VecEnv):  # type: ignore[misc]
 
     def _begin(self, i: int) -> None:
         rng = self._rng
-        kind = list(self._places)[rng.integers(len(self._places))]
+        ahead = np.array([1.0 + self._last - self.levels[kind] for kind in self._places])
+        kind = list(self._places)[rng.choice(len(ahead), p=ahead / ahead.sum())]
         places = self._places[kind]
         place = places[rng.integers(len(places))]
         now = self.levels[kind]
         level = (now, int(rng.integers(now + 1)), self._last)[rng.choice(3, p=SHARES)]
-        self.batch.start(i, self._task(place, level))
+        task, way = self._exercise(place, level)
+        pose = None
+        if way is not None:
+            left = rng.uniform(*self.recipe.curriculum[level].distance)
+            pose = way[min(round(left / _STEP_M), len(way) - 1)]
+        self.batch.start(i, task, pose)
         self._at[i] = kind, level
-        self._returns[i], self._lengths[i] = 0.0, 0
+        self._returns[i], self._lengths[i], self._stood[i] = 0.0, 0, 0
 
-    def _task(self, place: Place, level: int) -> PreparedTask:
+    def _exercise(self, place: Place, level: int) -> Exercise:
         key, rng = (place, level), self._rng
+        stage = self.recipe.curriculum[level]
+        inward = stage.starts == WAY_IN
         if key not in self._tasks:
-            stage = self.recipe.curriculum[level]
-            self._tasks[key] = place.tasks(stage.slack, stage.distance, stage.starts)
+            self._tasks[key] = (
+                place.tasks(stage.slack) if inward else place.tasks(stage.slack, stage.distance, stage.starts)
+            )
             self._at_hand[key] = []
         at_hand = self._at_hand[key]
         if at_hand and rng.random() * TIMES_DRIVEN >= 1.0:
             return at_hand[rng.integers(len(at_hand))]
-        task = PreparedTask(self._tasks[key].draw(int(rng.integers(1 << 62))))
+        task = self._tasks[key].draw(int(rng.integers(1 << 62)))
+        exercise = Exercise(PreparedTask(task), way_in(task) if inward else None)
         if len(at_hand) < KEPT:
-            at_hand.append(task)
+            at_hand.append(exercise)
         else:
-            at_hand[rng.integers(KEPT)] = task
-        return task
+            at_hand[rng.integers(KEPT)] = exercise
+        return exercise
 
     def close(self) -> None:
         """Nothing is held open."""

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from parkenv import __version__
 from parkenv.evaluation.drive_batch import CONTACT, PARKED, UNDER_WAY, DriveBatch, PreparedTask
-from parkenv.evaluation.drive_practice import MOST_DECISIONS, DrivePractice, Place, places_of
+from parkenv.evaluation.drive_practice import DECISION_S, DrivePractice, Place, places_of
 from parkenv.evaluation.parking_runs import ParkingCase, park_all
 from parkenv.evaluation.recipes import DRIVE_RECIPES, DriveRecipe, recipe_of
 from parkenv.evaluation.rl_training import Row, Training
@@ -24,6 +24,8 @@ from parkenv.keyed_random import world_key
 from parkenv.lot import ParkingLot
 from planners.driver_view import VIEW
 from planners.learned import ModelCard
+
+_MOST_DECISIONS = round(60.0 / DECISION_S)  # a minute, as in the environment
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +155,7 @@ def parked_by(model: Any, tasks: Sequence[PreparedTask]) -> tuple[NDArray[np.int
     batch = DriveBatch(len(tasks))
     for i, task in enumerate(tasks):
         batch.start(i, task)
-    for _ in range(MOST_DECISIONS):
+    for _ in range(_MOST_DECISIONS):
         actions, _ = model.predict(batch.observation(), deterministic=True)
         batch.drive(actions)
         if not (batch.status == UNDER_WAY).any():
