@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.driving.encounters import WATCHED_S, encounters
+from parkenv.driving.encounters import SLOWEST, WATCHED_S, encounters
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
 from planners.hybrid_astar import CarPath, SearchSettings, plan_path
@@ -31,7 +31,6 @@ PATIENCE_S = 3.0
 _CONTROL_S = 0.1
 _NOWHERE = 999.0  # m; unused rows of the obstacle map lie beyond
 _STANDS = 0.01
-_SLOWEST = 0.7  # m/s, at which a car that stands is taken to set off
 
 
 @dataclass
@@ -182,7 +181,7 @@ class ParkingAgent:
         before, memory.others = memory.others, at
         velocity = np.zeros_like(at) if before is None else (at - before) / _CONTROL_S
         assert memory.tracker is not None
-        own = memory.tracker.poses_ahead(WATCHED_S * max(abs(speed), _SLOWEST))
+        own = memory.tracker.poses_ahead(WATCHED_S * max(abs(speed), SLOWEST))
         when = encounters(self.vehicle, self.vehicle.at_middle(own), list(outlines), velocity)
         return bool(np.isfinite(when).any())
 

@@ -83,6 +83,10 @@ SightOption = Annotated[
         rich_help_panel=WORLD,
     ),
 ]
+CarsOption = Annotated[int, typer.Option("--cars", metavar="N", min=0, help="Other cars that drive about.")]
+PedestriansOption = Annotated[
+    int, typer.Option("--pedestrians", metavar="M", min=0, help="People who walk about.")
+]
 SensorsOption = Annotated[
     str | None,
     typer.Option(

@@ -35,13 +35,6 @@ SpeedOption = Annotated[
     ),
 ]
 
-CarsOption = Annotated[
-    int, typer.Option("--cars", metavar="N", min=0, help="Other cars that drive about in the lot.")
-]
-PedestriansOption = Annotated[
-    int, typer.Option("--pedestrians", metavar="M", min=0, help="People who walk there.")
-]
-
 
 def calibrate(
     scenario: ScenarioOption = "campus",
@@ -52,8 +45,8 @@ def calibrate(
     notice_m: NoticeOption = 2.0,
     v_drive_kmh: SpeedOption = None,
     sensors: args.SensorsOption = None,
-    cars: CarsOption = 0,
-    pedestrians: PedestriansOption = 0,
+    cars: args.CarsOption = 0,
+    pedestrians: args.PedestriansOption = 0,
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 1,
     backend: args.BackendOption = "loky",
@@ -163,8 +156,8 @@ def trip(
     ] = False,
     notice_m: NoticeOption = 2.0,
     sensors: args.SensorsOption = None,
-    cars: CarsOption = 0,
-    pedestrians: PedestriansOption = 0,
+    cars: args.CarsOption = 0,
+    pedestrians: args.PedestriansOption = 0,
     seed: args.SeedOption = 0,
     out: Annotated[Path, typer.Option("--out", "-o", help="The film, a GIF.")] = Path("results/trip.gif"),
     rerun: args.RerunOption = None,

@@ -35,8 +35,8 @@ def preview(
     seed: args.SeedOption = 0,
     drive: Annotated[float, typer.Option("--drive", min=0.0, help="Metres of the video; 0 for none.")] = 20.0,
     every: Annotated[float, typer.Option("--every", min=0.05, help="Metres between its frames.")] = 0.5,
-    cars: Annotated[int, typer.Option("--cars", min=0, help="Other cars that drive about.")] = 3,
-    pedestrians: Annotated[int, typer.Option("--pedestrians", min=0, help="People who walk about.")] = 5,
+    cars: args.CarsOption = 3,
+    pedestrians: args.PedestriansOption = 5,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures and drive.gif.")] = Path(
         "results/sensors"
     ),

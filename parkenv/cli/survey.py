@@ -48,8 +48,8 @@ def survey(
     pose_noise: Annotated[
         float, typer.Option("--pose-noise", min=0.0, help="How wrong the car is about where it is, m.")
     ] = 0.0,
-    cars: Annotated[int, typer.Option("--cars", min=0, help="Other cars that drive about.")] = 3,
-    pedestrians: Annotated[int, typer.Option("--pedestrians", min=0, help="People who walk about.")] = 5,
+    cars: args.CarsOption = 3,
+    pedestrians: args.PedestriansOption = 5,
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 0,
     backend: args.BackendOption = "loky",

@@ -17,6 +17,8 @@ KEPT_M, KEPT_STANDING_M = 0.5, 0.05
 """m that the driver keeps from others who move, and from those who have stopped to wait for it."""
 MOVES = 0.1
 """m/s above which somebody moves."""
+SLOWEST = 0.7
+"""m/s at which a car that stands is taken to set off."""
 
 _NEAR_M = 20.0
 

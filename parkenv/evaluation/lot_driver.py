@@ -12,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.driving.driven_lines import DrivenEdge, DrivenLine, DrivenLines
-from parkenv.driving.encounters import WATCHED_S
+from parkenv.driving.encounters import SLOWEST, WATCHED_S
 from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
 from parkenv.driving.lot_surroundings import REACH_M, LotSurroundings
 from parkenv.driving.parking_task import KINDS, ParkingTasks
@@ -65,7 +65,6 @@ _LEAST_NOTICE = 0.8
 _WAITS_M = 7.0
 _BEND_M = 8.0
 _LONGEST_S = 240.0
-_SLOWEST = 0.7  # m/s, at which a car that stands is taken to set off
 _SOON_S = 0.8  # brake hard for who is in the way by then
 _NOBODY: NDArray[np.float64] = np.empty(0)
 
@@ -637,7 +636,7 @@ class LotDriver:
         if self.others is None:
             return False
         speed = abs(float(self.state[SPEED]))
-        ahead = tracker.poses_ahead(WATCHED_S * max(speed, _SLOWEST))
+        ahead = tracker.poses_ahead(WATCHED_S * max(speed, SLOWEST))
         when = self.others.in_way(self.vehicle.at_middle(ahead))
         if np.isinf(when).all():
             self._stood_s = 0.0
