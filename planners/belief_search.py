@@ -13,19 +13,11 @@ from parkenv.errors import InputError
 from parkenv.lot import PARK
 from parkenv.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent, require_sight
+from planners.best_path import NOWHERE, TRY, Budget, best_path
 from planners.map_doubt import MapDoubt
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.routes import DriveRoutes
-from planners.search_paths import (
-    LOOKS_FREE,
-    LOOKS_TAKEN,
-    UNSEEN,
-    Budget,
-    Outlook,
-    Path,
-    best_path,
-    new_path,
-)
+from planners.search_ground import LOOKS_FREE, LOOKS_TAKEN, UNSEEN, Outlook, Path, new_path
 
 FloatArray = NDArray[np.float64]
 
@@ -37,7 +29,12 @@ WORK_PER_MS = 50_000
 """Steps of the path search that take about a millisecond."""
 USUAL_STAY = 7200.0
 """How long a car is thought to stay, s, until ageing sightings tell."""
+WORTH_PASSING_S = 1.0
+"""s that driving on must promise over a free slot at hand, unless the map is taken at its word.
 
+Where the map is right, next to nothing is lost by not driving on for less than that; where it is wrong, the slot passed
+may have been the last one for long.
+"""
 STALE_S = 60.0
 """s without a slot that was not seen before, after which it is time to look beyond the part of the lot."""
 
@@ -53,6 +50,7 @@ class Search:
         doubt: how far the forecast is thought to be off.
         kind: (n_slots,) int8, UNSEEN, LOOKS_FREE or LOOKS_TAKEN at the last look.
         looked_at: (n_slots,) float64, s, when each slot was last in view.
+        missed: (n_slots,) float64, the greatest rate of a view from which each slot was not made out.
         p_occupied: (n_slots,) float32, the last observation's.
         time: s since the search began, of the last observation.
         news: s, when a slot of that part was last seen for the first time, or the part was chosen.
@@ -60,8 +58,9 @@ class Search:
         targets: (DEPTH,) int64, what the path of the last decision goes past first, as the part numbers it.
         path: room for one.
         gate: the vertex that the car drives to before it plans, or -1.
-        n_targets: how many those are.
+        n_targets: how many targets there are.
         cost: s, the failure cost with which that path goes on.
+        promise_s: s, what that path was expected to leave by now, unless something has been seen since; else inf.
         replans: how often the path ahead has changed.
         expected_s: s, what the search is expected to take from here.
     """
@@ -72,6 +71,7 @@ class Search:
     doubt: MapDoubt
     kind: NDArray[np.int8]
     looked_at: FloatArray
+    missed: FloatArray
     p_occupied: NDArray[np.float32]
     time: float
     news: float
@@ -81,6 +81,7 @@ class Search:
     gate: int = -1
     n_targets: int = 0
     cost: float = COSTS[1]
+    promise_s: float = math.inf
     replans: int = 0
     expected_s: float = math.nan
 
@@ -93,7 +94,7 @@ class BeliefAgent(SearchAgent[Search]):
     decays as a two-state chain, so a free slot may be gone on arrival and a taken one may come free. At each
     decision candidate paths are laid: as the thesis's planner would go on if all that it sees were taken, at several
     failure costs, and past up to three vertices put in before. Each is valued by optimal stopping with recall
-    (`search_paths`), so whatever lies on the way counts, and so does that taken slots make the map more doubtful; the
+    (`path_worth`), so whatever lies on the way counts, and so does that taken slots make the map more doubtful; the
     best one's first step is taken, and its targets are where the next decision starts from. Where a path ends, a part
     of it is driven again and again, or what it found so far is extrapolated where enough slots are left to see; and
     where one more look may prove the lot full, the look may be left out.
@@ -109,7 +110,9 @@ class BeliefAgent(SearchAgent[Search]):
 
     What it may know: rates are not observed, so the rate at which cars leave is read off the way in which a slot's
     belief decays once it is out of view; until then stays of two hours are assumed, and no look
-    is left out in the hope that a car leaves.
+    is left out in the hope that a car leaves. Where sight is imperfect, a slot that was in view and not made out is
+    looked for only from where it is likelier than not to be seen then; one that does not show from its own vertex
+    either is tried, and a path is kept to until something is seen.
 
     Args:
         problem: lot, goal, speeds and costs.
@@ -160,6 +163,7 @@ class BeliefAgent(SearchAgent[Search]):
             doubt=MapDoubt(p.astype(np.float64), near.walk_s, self.trusting),
             kind=np.full(n, UNSEEN, dtype=np.int8),
             looked_at=np.zeros(n),
+            missed=np.zeros(n),
             p_occupied=p,
             time=time,
             news=time,
@@ -192,23 +196,31 @@ class BeliefAgent(SearchAgent[Search]):
         """What the best path begins with, or None where there is none."""
         near = memory.near
         before = memory.targets[: memory.n_targets].tolist(), memory.cost
-        onward_s, at_hand_s, slot, following, memory.n_targets, memory.cost = best_path(
+        choice = best_path(
             here,
             memory.targets,
             memory.n_targets,
             memory.cost,
+            memory.promise_s,
             self._budget,
             near.ground(self.problem, self._failure_s),
             self._outlook(here, memory),
             memory.path,
         )
-        memory.expected_s = min(onward_s, at_hand_s)
+        memory.n_targets, memory.cost = choice.n_targets, choice.cost
+        # Where sight is perfect something is seen soon, and the later estimate is the better one.
+        memory.promise_s = math.inf if self.problem.sighting.perfect else choice.then_s
+        memory.expected_s = min(choice.onward_s, choice.at_hand_s)
         memory.replans += before != (memory.targets[: memory.n_targets].tolist(), memory.cost)
-        if slot >= 0 and at_hand_s <= onward_s:
-            return PARK if slot == here else near.table.move(here, slot)
-        if following < 0:
+        worth_passing_s = 0.0 if self.trusting else WORTH_PASSING_S
+        if choice.slot >= 0 and choice.at_hand_s <= choice.onward_s + worth_passing_s:
+            memory.promise_s = math.inf
+            return PARK if choice.slot == here else near.table.move(here, choice.slot)
+        if choice.following == TRY:
+            return PARK
+        if choice.following == NOWHERE:
             return None
-        return self._wait(vertex) if following == here else near.table.move_to(here, following)
+        return self._wait(vertex) if choice.following == here else near.table.move_to(here, choice.following)
 
     def _move_on(self, observation: Observation, vertex: int, memory: Search) -> None:
         """Plan for the part of the lot around the car from now on, and take along what is known of it."""
@@ -217,10 +229,11 @@ class BeliefAgent(SearchAgent[Search]):
         near = self._neighborhoods.around(vertex, taken)
         new = self._search(near, memory.forecast, memory.time)
         _, ours, theirs = np.intersect1d(old.slots, near.slots, assume_unique=True, return_indices=True)
-        new.looked_at[theirs], new.leaving[theirs] = memory.looked_at[ours], memory.leaving[ours]
-        for f in ("near", "news", "doubt", "kind", "looked_at", "p_occupied", "leaving", "targets", "path"):
-            setattr(memory, f, getattr(new, f))
-        memory.n_targets = 0
+        for known in ("looked_at", "missed", "leaving"):
+            getattr(new, known)[theirs] = getattr(memory, known)[ours]
+        new.cost, new.replans = memory.cost, memory.replans
+        # The caller holds on to `memory`.
+        vars(memory).update(vars(new))
         memory.gate = -1 if near.gate == vertex else near.gate
         self._take_in(observation, vertex, memory)
         memory.n_unseen = _n_unseen(memory.kind)
@@ -228,19 +241,24 @@ class BeliefAgent(SearchAgent[Search]):
     def _take_in(self, observation: Observation, vertex: int, memory: Search) -> None:
         p, time = np.asarray(observation["p_occupied"])[memory.near.slots], float(observation["time"][1])
         forecast = memory.forecast[memory.near.slots]
-        in_view = np.zeros(len(p), dtype=np.bool_)
-        here = memory.near.place(vertex)
-        if here >= 0:
-            starts = memory.near.view_starts
-            in_view[memory.near.view_slots[starts[here] : starts[here + 1]]] = True
+        near, in_view, here = memory.near, np.zeros(len(p), dtype=np.bool_), memory.near.place(vertex)
+        view = slice(0, 0) if here < 0 else slice(*near.view_starts[here : here + 2])
+        in_view[near.view_slots[view]] = True
         self._watch_ageing(p, forecast, time, in_view, memory)
         kind = np.where(p < forecast, LOOKS_FREE, np.where(p > forecast, LOOKS_TAKEN, UNSEEN))
         first = np.flatnonzero((kind != UNSEEN) & (memory.kind == UNSEEN))
         memory.news = time if len(first) else memory.news
         memory.doubt.look(first, kind[first] == LOOKS_TAKEN)
         # A sighting that has quite faded leaves the slot as good as unseen, but it was a first look once.
-        memory.kind = np.where(kind == UNSEEN, memory.kind, kind).astype(np.int8)
+        kind = np.where(kind == UNSEEN, memory.kind, kind).astype(np.int8)
+        if (kind != memory.kind).any():
+            memory.promise_s = math.inf
+        memory.kind = kind
         memory.looked_at[in_view] = time
+        if time > memory.time:
+            # Who has just arrived has not looked yet.
+            hidden = np.where(memory.kind[near.view_slots[view]] == UNSEEN, near.view_rates[view], 0.0)
+            np.maximum.at(memory.missed, near.view_slots[view], hidden)
         memory.p_occupied, memory.time = p, time
 
     def _watch_ageing(
@@ -280,7 +298,16 @@ class BeliefAgent(SearchAgent[Search]):
         odds = np.divide(1.0 - there, there, out=np.full(len(free), np.inf), where=there > 0.0)
         of_slots = np.ascontiguousarray(free_if.T)
         return Outlook(
-            memory.kind, free, weights, of_slots, usual, rate, odds, 1.0 / usual - 1.0, len(told) > 0
+            memory.kind,
+            free,
+            weights,
+            of_slots,
+            usual,
+            rate,
+            odds,
+            1.0 / usual - 1.0,
+            memory.missed,
+            len(told) > 0,
         )
 
     def _wait(self, vertex: int) -> int:

@@ -79,8 +79,12 @@ class ModelCard:
                 if _CARD not in archive.namelist():
                     raise InputError(f"{path}: no model of `parkenv train`: {_CARD} is missing in it")
                 content = json.loads(archive.read(_CARD))
-        except (OSError, zipfile.BadZipFile) as error:
+        except (OSError, ValueError, zipfile.BadZipFile) as error:
             raise InputError(f"{path}: no model file, or a torn one ({error})") from error
+        if not isinstance(content, dict):
+            raise InputError(
+                f"{path}: {_CARD} in it holds a {type(content).__name__}, want what it was trained for"
+            )
         if content.pop("format", None) != _FORMAT or content.pop("version", None) != _VERSION:
             raise InputError(f"{path}: want a {_FORMAT} of version {_VERSION}; train it anew")
         try:
@@ -138,7 +142,11 @@ def load_model(
         )
     # A model that learns no more needs no memory, and hindsight none of an environment's goals.
     unneeded: dict[str, Any] = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
-    return card, algorithm_class(algorithm).load(Path(path), device="cpu", custom_objects=unneeded)
+    kind = algorithm_class(algorithm)
+    try:
+        return card, kind.load(Path(path), device="cpu", custom_objects=unneeded)
+    except Exception as error:  # whatever a damaged network makes torch stumble over
+        raise InputError(f"{path}: its network cannot be read ({type(error).__name__}: {error})") from error
 
 
 class LearnedAgent:
@@ -175,8 +183,18 @@ class LearnedAgent:
         """stable-baselines3's interface, over `LocalObservation`.
 
         Raises:
-            InputError: nothing can be done, says the mask.
+            InputError: another observation, or nothing can be done, says the mask.
         """
+        if "local" not in observation:
+            raise InputError(
+                f"{self.name} observes what parkenv.envs.local_observation.LocalObservation says, got "
+                f"{', '.join(observation)}"
+            )
+        given, wanted = observation["local"].shape[-1:], self.model.observation_space["local"].shape
+        if given != wanted:
+            raise InputError(
+                f"{self.name} observes {wanted[0]} numbers, got {given[0]} for its k = {self.local_k}"
+            )
         if not np.any(observation["action_mask"], axis=-1).all():
             raise InputError("action_mask allows nothing; a search that goes on allows at least one action")
         masks = {"action_masks": observation["action_mask"]} if self.card.algorithm == "maskable-ppo" else {}

@@ -15,7 +15,7 @@ from planners.heap import pop, push
 from planners.label_setting import StoppingGraph, settle
 from planners.mdp import ParkingMDP
 from planners.road_table import RoadTable
-from planners.search_paths import Ground
+from planners.search_ground import Ground
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -38,6 +38,8 @@ class Neighborhood:
         table: the drives.
         view_starts: (k + 1,) int64, rows of `view_slots`.
         view_slots: int64, slots of the neighbourhood in view of each vertex.
+        view_rates: float64, P(each of them is made out).
+        own_rates: (n_slots,) float64, the same of each slot from its own vertex.
         walk_s: (n_slots,) float64, s.
     """
 
@@ -48,6 +50,8 @@ class Neighborhood:
     table: RoadTable
     view_starts: IntArray
     view_slots: IntArray
+    view_rates: FloatArray
+    own_rates: FloatArray
     walk_s: FloatArray
 
     @classmethod
@@ -55,7 +59,7 @@ class Neighborhood:
         """That of some vertices, (k,) ascending."""
         lot = problem.lot
         whole, n_slots = len(vertices) == lot.n_vertices, int(np.searchsorted(vertices, lot.n_slots))
-        neighbors, (starts, slots) = lot.neighbors, problem.slots_in_view
+        neighbors, (starts, slots), rates = lot.neighbors, problem.slots_in_view, problem.sight_rates.seen
         if not whole:
             neighbors = _numbered(vertices, lot.neighbors[vertices]).astype(np.int32)
             first, last = starts[vertices], starts[vertices + 1]
@@ -63,9 +67,12 @@ class Neighborhood:
             row = np.arange(len(viewer)) - np.repeat(np.cumsum(last - first) - last, last - first)
             seen = _numbered(vertices, slots[row])
             starts = np.searchsorted(viewer[seen >= 0], np.arange(len(vertices) + 1)).astype(np.int64)
-            slots = seen[seen >= 0]
-        table = RoadTable.over(neighbors, problem.move_s[vertices])
-        return cls(vertices, n_slots, whole, gate, table, starts, slots, problem.walk_s[vertices[:n_slots]])
+            slots, rates = seen[seen >= 0], rates[row][seen >= 0]
+        table, own_rates = RoadTable.over(neighbors, problem.move_s[vertices]), np.zeros(n_slots)
+        own = slots == np.repeat(np.arange(len(vertices)), np.diff(starts))
+        own_rates[slots[own]] = rates[own]
+        walk_s = problem.walk_s[vertices[:n_slots]]
+        return cls(vertices, n_slots, whole, gate, table, starts, slots, rates, own_rates, walk_s)
 
     @property
     def slots(self) -> IntArray:
@@ -84,6 +91,8 @@ class Neighborhood:
             self.table.following,
             self.view_starts,
             self.view_slots,
+            self.view_rates,
+            self.own_rates,
             self.walk_s,
             problem.wait_s,
             problem.give_up_s,

@@ -22,7 +22,7 @@ from planners.agent import Observation, SearchAgent, require_sight
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.replanning import Plan, ReplanningAgent
 from planners.routes import DriveRoutes
-from planners.search_paths import Ground
+from planners.search_ground import Ground
 
 FloatArray = NDArray[np.float64]
 

@@ -84,7 +84,7 @@ def test_the_summary_is_what_the_episodes_say_and_jobs_do_not_matter(tmp_path):
 
 def test_a_killed_run_leaves_what_was_done_and_resumes(tmp_path):
     out, whole = tmp_path / "killed", tmp_path / "whole"
-    arguments = small(out, "--jobs", "2", agents="greedy-goal,mdp", episodes=400)
+    arguments = small(out, "--jobs", "2", agents="greedy-goal,mdp", episodes=2000)
     process = subprocess.Popen(
         [*PARKENV, *map(str, arguments)],
         stdout=subprocess.DEVNULL,
@@ -99,7 +99,7 @@ def test_a_killed_run_leaves_what_was_done_and_resumes(tmp_path):
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     survived = episodes_of(out)
-    assert 60 <= len(survived) < 800
+    assert 60 <= len(survived) < 4000
     assert not (out / "summary.json").exists()
 
     refused = parkenv(*arguments)
@@ -111,7 +111,7 @@ def test_a_killed_run_leaves_what_was_done_and_resumes(tmp_path):
     with (out / "episodes.csv").open("a") as file:
         file.write("mini,,mdp,10.0,4.0")
     assert parkenv(*arguments, "--resume").returncode == 0
-    assert parkenv(*small(whole, agents="greedy-goal,mdp", episodes=400)).returncode == 0
+    assert parkenv(*small(whole, agents="greedy-goal,mdp", episodes=2000)).returncode == 0
     assert (out / "episodes.csv").read_bytes() == (whole / "episodes.csv").read_bytes()
     assert rows_without_times(out) == rows_without_times(whole)
 
@@ -127,6 +127,8 @@ def test_interrupting_writes_what_is_done(tmp_path):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        # A shell's background jobs, and what they start, ignore the signal.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline:
@@ -195,8 +197,7 @@ def test_agents_may_be_given_maps_that_are_wrong(tmp_path):
 def test_where_the_optimum_is_known_the_table_says_how_far_off_others_are(tmp_path):
     done = parkenv(*small(tmp_path, agents="exact,greedy-drive", episodes=6))
     assert done.returncode == 0, done.stderr
-    # Slow decisions need wide columns, and then the heading has two lines.
-    assert re.search(r"over\b", done.stdout)
+    assert re.search(r"over exact", done.stdout)
     exact, greedy = rows_without_times(tmp_path)
     assert exact["gap_to_exact"] == 0.0
     assert greedy["gap_to_exact"] == pytest.approx(greedy["total_s"] / exact["total_s"] - 1.0)
@@ -425,6 +426,16 @@ def test_words_for_sight_are_checked(tmp_path):
         (("--budget-ms", "-1"), "budget_ms is -1"),
     ):
         assert_one_line_and_exit_2(parkenv(*small(tmp_path / "x", *words, agents="mdp,belief")), message)
+
+
+def test_agents_are_checked_in_every_world_before_the_first_search(tmp_path):
+    out = tmp_path / "x"
+    refused = parkenv("compare", "--scenario", "mini,campus", "--agents", "exact", "-n", 2, "--out", out)
+    assert_one_line_and_exit_2(refused, "lot 'campus' has 189 slots")
+    assert not out.exists()
+    sweep = ("--agents", "belief,mdp-tuned", "--failure-cost", "sweep")
+    refused = parkenv("compare", "--scenario", "mini", *sweep, "-n", 2, "--out", out)
+    assert_one_line_and_exit_2(refused, "belief, mdp-tuned goes by sight; add an agent that does not")
 
 
 def test_help_names_every_command():

@@ -217,15 +217,16 @@ def test_other_commands_get_tables_and_figures(tmp_path):
 
 @pytest.mark.parametrize("drives", [False, True])
 def test_learning_curves_are_those_of_the_training(tmp_path, drives):
-    """Of searches one panel, of driving one for each kind of slot."""
+    """Of searches one panel, of driving one for each kind of slot; other trainings are told of by their medians."""
     names = ["oblique_success", "parallel_success"] if drives else ["total_s"]
     (tmp_path / "seed_3").mkdir()
     examinations = [["steps", *names], ["0", *("0.25" for _ in names)], ["500", *("0.5" for _ in names)]]
     (tmp_path / "seed_3" / "curve.csv").write_text("\n".join(",".join(row) for row in examinations) + "\n")
     ends = ("low", "high") if drives else ("low_s", "high_s")
+    median = "median" if drives else "median_s"
     curves = [
         [
-            {"steps": steps, name: value, ends[0]: None, ends[1]: None}
+            {"steps": steps, name: value, ends[0]: None, ends[1]: None, median: value - 0.125}
             for steps, value in ((0.0, 0.25), (500.0, 0.5))
         ]
         for name in names
@@ -237,6 +238,7 @@ def test_learning_curves_are_those_of_the_training(tmp_path, drives):
         rows=[{"agent": "ppo", "scenario": "campus,street", "seed": 3, "success": 0.5}],
         examined=dict.fromkeys(kinds, 1.0) if drives else {"mdp": 80.0, "clairvoyant bound": 60.0},
         curve=dict(zip(kinds, curves, strict=True)) if drives else curves[0],
+        beside={"dqn": dict(zip(kinds, curves, strict=True)) if drives else curves[0]},
     )
     data = page_data(RunFolder.read(tmp_path))
     jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
@@ -245,6 +247,7 @@ def test_learning_curves_are_those_of_the_training(tmp_path, drives):
     for panel in data["learning"]:
         assert panel["mean"] == [[0.0, 0.25, None, None], [500.0, 0.5, None, None]]
         assert panel["seeds"] == [[[0.0, 0.25], [500.0, 0.5]]]
+        assert panel["beside"] == [["dqn", [[0.0, 0.125], [500.0, 0.375]]]]
         assert panel["lines"] == (
             [["planner", 1.0]] if drives else [["mdp", 80.0], ["clairvoyant bound", 60.0]]
         )

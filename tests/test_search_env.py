@@ -320,6 +320,15 @@ def test_the_belief_in_a_slot_left_behind_grows_old():
     assert len(last) > 5
 
 
+def test_a_seed_holds_after_going_on_from_another_search():
+    one, other = (gym.make("parkenv/Search-v0", scenario="mini").unwrapped for _ in range(2))
+    wanted, _ = one.reset(seed=1)
+    other.reset(seed=2)
+    one.set_state(other.get_state())
+    again, _ = one.reset(seed=1)
+    np.testing.assert_array_equal(again["time"], wanted["time"])
+
+
 def test_noisy_sight_errs_as_often_as_stated():
     lot = ParkingLot.grid(4, 25)
     taken = np.arange(lot.n_slots) % 2 == 0

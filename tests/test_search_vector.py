@@ -287,6 +287,41 @@ def test_a_sequence_of_seeds_and_resets_without_one():
     assert kept["time"][0, 0] != first["time"][0, 0]
 
 
+def test_without_a_seed_every_search_has_a_world_of_its_own():
+    worlds = set()
+    for _ in range(2):
+        envs = make_batch(3, "mini")
+        first, _ = envs.reset(seed=[None, 5, None])
+        worlds |= set(first["time"][:, 0].tolist())
+    assert len(worlds) == 5
+
+
+def test_a_generator_that_was_set_by_hand_is_drawn_from():
+    times = []
+    for make in (
+        lambda: make_batch(2, "mini"),
+        lambda: gym.make("parkenv/Search-v0", scenario="mini").unwrapped,
+    ):
+        for k in (3, 3, 4):
+            env = make()
+            env.np_random = np.random.default_rng(k)
+            times.append(env.reset()[0]["time"].tolist())
+    assert times[0] == times[1] != times[2]
+    assert times[3] == times[4] != times[5]
+
+
+def test_a_refused_action_skips_no_world():
+    single = gym.make("parkenv/Search-v0", scenario="mini")
+    single.reset(seed=0)
+    envs = make_batch(1, "mini", max_episode_steps=1)
+    envs.reset(seed=0)
+    envs.step(np.zeros(1, dtype=int))
+    with pytest.raises(InputError, match="is 9, want"):
+        envs.step(np.array([9]))
+    observation, *_ = envs.step(np.zeros(1, dtype=int))
+    np.testing.assert_array_equal(observation["time"][0], single.reset()[0]["time"])
+
+
 def test_what_is_handed_out_is_not_live_unless_asked():
     for copy in (True, False):
         envs = make_batch(4, "mini", copy=copy)

@@ -17,6 +17,8 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
+from parkenv.cli.search_course import SearchCourse
+from parkenv.cli.training_course import curves_beside
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
@@ -25,7 +27,7 @@ from parkenv.evaluation.cloning import Demonstrations, clone
 from parkenv.evaluation.compare import Case
 from parkenv.evaluation.learning_curves import across_seeds, save_learning_curves
 from parkenv.evaluation.recipes import DRIVE_RECIPES, MAX_STEPS, RECIPES
-from parkenv.evaluation.rl_training import read_curve, train_one
+from parkenv.evaluation.rl_training import read_curve, train_one, write_curve
 from parkenv.evaluation.search_training import SearchTraining, examined, search_times
 from parkenv.scenario import Scenario
 from planners.agent import make_agent
@@ -133,7 +135,6 @@ def test_equal_seeds_give_equal_trainings_and_another_seed_another(trained, tmp_
 
 
 def test_a_training_goes_on_from_its_checkpoint(trained, tmp_path):
-
     folder = tmp_path / "gone_on"
     shutil.copytree(trained, folder)
     before = read_curve(folder / "curve.csv")
@@ -142,6 +143,47 @@ def test_a_training_goes_on_from_its_checkpoint(trained, tmp_path):
     assert curve[: len(before)] == before
     assert curve[-1]["steps"] >= 110_000
     assert ModelCard.of_file(folder / "checkpoint.zip").steps == curve[-1]["steps"]
+
+
+def test_a_training_gone_on_with_is_examined_when_one_without_a_stop_is(tmp_path):
+    # A rollout is longer than the time between examinations.
+    stopped, whole = (
+        SearchTraining("maskable-ppo", n, 8_000, (SCENARIO,), EXAMINED) for n in (16_384, 40_000)
+    )
+    first = stopped.train(0, tmp_path)
+    assert [row["steps"] for row in first] == [0, 16_384]
+    curve = whole.train(0, tmp_path)
+    assert [row["steps"] for row in curve] == [0, 16_384, 32_768, 49_152]
+    assert whole.train(0, tmp_path) == curve
+
+
+def test_a_kill_between_the_last_checkpoint_and_its_examination_loses_neither(tmp_path, monkeypatch):
+    training = SearchTraining("maskable-ppo", 32_768, 16_384, (SCENARIO,), EXAMINED)
+    with monkeypatch.context() as patch:
+
+        def killed(path, curve):
+            if curve[-1]["steps"] == 32_768:
+                raise KeyboardInterrupt
+            write_curve(path, curve)
+
+        patch.setattr("parkenv.evaluation.rl_training.write_curve", killed)
+        with pytest.raises(KeyboardInterrupt):
+            training.train(0, tmp_path)
+    assert ModelCard.of_file(tmp_path / "checkpoint.zip").steps == 32_768
+    assert [row["steps"] for row in training.train(0, tmp_path)] == [0, 16_384, 32_768]
+
+
+class Waits:
+    """Goes nowhere."""
+
+    def predict(self, observation, state=None):
+        return int(np.flatnonzero(observation["action_mask"] == 0)[0]), state
+
+
+def test_a_planner_that_finishes_nothing_cannot_be_imitated(monkeypatch):
+    monkeypatch.setattr("parkenv.evaluation.cloning.make_agent", lambda *_: Waits())
+    with pytest.raises(InputError, match="finished none of 1 searches on mini: nothing to imitate"):
+        Demonstrations.collect("waits", SCENARIO, [5_000_000])
 
 
 @pytest.mark.slow
@@ -188,10 +230,27 @@ def of_another_layout(path):
         archive.writestr("parkenv.json", json.dumps({**content, "observation": "local-0"}))
 
 
+def with_card(text):
+    def spoil(path):
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("parkenv.json", text)
+
+    return spoil
+
+
+def without_network(path):
+    card = zipfile.ZipFile(path).read("parkenv.json")
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("parkenv.json", card)
+
+
 @pytest.mark.parametrize(
     ("spoil", "algorithm", "wanted"),
     [
         (torn, "maskable-ppo", "no model file, or a torn one"),
+        (with_card("{"), "maskable-ppo", "no model file, or a torn one"),
+        (with_card("[]"), "maskable-ppo", "holds a list, want what it was trained for"),
+        (without_network, "maskable-ppo", "its network cannot be read"),
         (without_card, "maskable-ppo", "parkenv.json is missing"),
         (of_another_layout, "maskable-ppo", "observes 'local-0', this version of parkenv gives 'local-1'"),
         (lambda _: None, "dqn", "is a model of maskable-ppo, not of dqn"),
@@ -204,6 +263,16 @@ def test_models_that_do_not_fit_are_refused(trained, tmp_path, spoil, algorithm,
     spoil(path)
     with pytest.raises(InputError, match=wanted):
         make_agent(f"{algorithm}:{path}", SCENARIO)
+
+
+def test_observations_of_another_kind_are_refused(trained):
+    agent = LearnedAgent(SCENARIO, "maskable-ppo", trained / "model.zip")
+    env = gym.make("parkenv/Search-v0", scenario=SCENARIO)
+    plain, _ = env.reset(seed=0)
+    with pytest.raises(InputError, match=r"observes what .*LocalObservation says, got vertex, time"):
+        agent.predict(plain)
+    with pytest.raises(InputError, match="observes 86 numbers, got 102 for its k = 5"):
+        agent.predict(LocalObservation(env, k=7).reset(seed=0)[0])
 
 
 def test_a_mask_that_allows_nothing_is_refused(trained):
@@ -228,7 +297,7 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
     ]
     rows = across_seeds([*curves[:2], curves[2][:2]])
     assert [row["steps"] for row in rows] == [0, 10]
-    assert rows[1]["total_s"] == pytest.approx(91.0)
+    assert rows[1]["total_s"] == rows[1]["median_s"] == pytest.approx(91.0)
     save_learning_curves({"ppo": curves}, {"mdp": 85.0, "belief": 84.9}, "a title", tmp_path / "curve.png")
     assert (tmp_path / "curve.png").stat().st_size > 10_000
 
@@ -257,15 +326,110 @@ def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp
     subprocess.run([*arguments, "--resume"], check=True, capture_output=True)
     curve = read_curve(out / "seed_0" / "curve.csv")
     assert curve[: len(survived)] == survived
+    assert [row["steps"] for row in curve] == sorted({row["steps"] for row in curve})
     summary = json.loads((out / "summary.json").read_text())
     assert [row["seed"] for row in summary["rows"]] == [0, 1]
     assert all(row["steps"] >= 40_000 for row in summary["rows"])
+    beside = [*arguments[:-1], str(tmp_path / "longer"), "--beside", str(out)]
+    subprocess.run([*beside, "--seeds", "1"], check=True, capture_output=True)
+    summary = json.loads((tmp_path / "longer" / "summary.json").read_text())
+    (means,) = summary["beside"].values()
+    assert [row["steps"] for row in means] == [row["steps"] for row in curve]
     compared = subprocess.run(
         [*PARKENV, "compare", "--scenario", "mini", "--agents", f"mdp,{algorithm}:{out / 'seed_1' / 'model.zip'}",
          "-n", "10", "--occupancy-levels", "none", "--out", str(tmp_path / "compared")],
         capture_output=True, text=True,
     )  # fmt: skip
     assert compared.returncode == 0, compared.stderr
+
+
+def training_in(folder, **changed):
+    settings = {"algorithm": "dqn", "scenario": ["mini"], "examined_on": 16, "imitate": None, **changed}
+    (folder / "seed_0").mkdir(parents=True)
+    (folder / "seed_0" / "curve.csv").write_text("steps,total_s\n0,300.0\n10,90.0\n")
+    (folder / "settings.json").write_text(json.dumps(settings))
+    return str(folder)
+
+
+def course_of(algorithm="ppo", imitate=None):
+    return SearchCourse(algorithm, "mini", None, 10, imitate, 2, 5, 10, 16, "none")
+
+
+def test_trainings_are_set_beside_each_other_by_what_tells_them_apart(tmp_path):
+    folders = [
+        training_in(tmp_path / "dqn"),
+        training_in(tmp_path / "again", algorithm="ppo"),
+        training_in(tmp_path / "cloned", algorithm="ppo", imitate="mdp"),
+        training_in(tmp_path / "two", algorithm="ppo", scenario=["mini", "street"]),
+    ]
+    beside = curves_beside(folders, tmp_path / "own", course_of())
+    assert list(beside) == ["dqn", f"ppo ({folders[1]})", "ppo after imitating mdp", "ppo on mini, street"]
+    assert beside["dqn"] == [[{"steps": 0, "total_s": 300.0}, {"steps": 10, "total_s": 90.0}]]
+
+
+def torn_settings(folder):
+    (folder / "settings.json").write_text("{")
+
+
+def settings_of_another_kind(folder):
+    (folder / "settings.json").write_text("[]")
+
+
+def torn_curve(folder):
+    (folder / "seed_0" / "curve.csv").write_text("steps,total_s\n0\n")
+
+
+def curve_of_another_kind(folder):
+    (folder / "seed_0" / "curve.csv").write_text("steps,success\n0,0.5\n")
+
+
+@pytest.mark.parametrize(
+    ("changed", "spoil", "wanted"),
+    [
+        ({"scenario": ["jam", "mini"]}, None, "scenario is 'jam' in .* and 'mini' here; their examinations"),
+        ({"examined_on": 8}, None, "examined_on is 8 in .* and 16 here"),
+        ({}, lambda folder: shutil.rmtree(folder / "seed_0"), "holds no training"),
+        ({}, torn_settings, "settings.json: is torn"),
+        ({}, settings_of_another_kind, "want the settings of a command"),
+        ({}, torn_curve, "curve.csv: want numbers in every column"),
+        ({}, curve_of_another_kind, "was not written by this version"),
+    ],
+)
+def test_trainings_that_cannot_be_compared_are_refused(tmp_path, changed, spoil, wanted):
+    folder = training_in(tmp_path / "other", **changed)
+    if spoil is not None:
+        spoil(tmp_path / "other")
+    with pytest.raises(InputError, match=wanted):
+        curves_beside([folder], tmp_path / "own", course_of())
+
+
+def test_a_training_is_drawn_once(tmp_path):
+    folder = training_in(tmp_path / "other")
+    for folders, own in (([folder, f"{folder}/../other"], "own"), ([folder], "other")):
+        with pytest.raises(InputError, match="is drawn already"):
+            curves_beside(folders, tmp_path / own, course_of())
+
+
+def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
+    out = tmp_path / "out"
+    training_in(out)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    wrong = (
+        ["dqn", "--imitate", "mdp", "--overwrite"],
+        ["ppo", "--imitate", "nobody", "--overwrite"],
+        ["ppo", "--planners", "belif", "--overwrite"],
+        ["ppo", "--resume", "--overwrite"],
+        ["ppo"],
+    )
+    for arguments in wrong:
+        done = subprocess.run(
+            [*PARKENV, "train", *arguments, "--scenario", "mini", "--out", str(out)], check=False
+        )
+        assert done.returncode == 2
+    assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+    done = subprocess.run([*PARKENV, "train", "dqn", "--imitate", "mdp", "--out", str(tmp_path / "new")])
+    assert done.returncode == 2
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize(
@@ -282,6 +446,10 @@ def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp
         (["sac", "--env", "drive", "--planners", "mdp"], "--planners is 'mdp', want planner or none"),
         (["ppo", "--resume"], "holds no training to go on with"),
         (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
+        (["ppo", "--planners", "mdp,belif"], "unknown agent 'belif'"),
+        (["ppo", "--imitate", "oracle"], "oracle cannot be imitated"),
+        (["ppo", "--shown", "5"], "--shown goes with --imitate"),
+        (["ppo", "--env", "drive", "--shown", "5"], "--shown goes with --env search"),
     ],
 )
 def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):

@@ -30,16 +30,8 @@ from parkenv.evaluation.calibration import (
 )
 from parkenv.evaluation.compare import unseen
 from parkenv.evaluation.driven_search import DrivenSearch, DrivenSearchEnv
-from parkenv.evaluation.lot_driver import (
-    ACROSS,
-    ALONG,
-    NO_ROOM,
-    TAKEN,
-    TURN,
-    DrivingStyle,
-    GraphDriver,
-    LotDriver,
-)
+from parkenv.evaluation.driver import ACROSS, ALONG, NO_ROOM, TAKEN, TURN, GraphDriver
+from parkenv.evaluation.lot_driver import DrivingStyle, LotDriver
 from parkenv.evaluation.sensor_log import record_trip
 from parkenv.keyed_random import world_key
 from parkenv.lot_scene import LotScenes
@@ -632,7 +624,7 @@ def test_trips_are_gone_on_with_where_they_were_left(tmp_path):
     assert (tmp_path / "trips.jsonl").read_text() == text
     with pytest.raises(InputError, match="add --resume"):
         TripFolder(tmp_path, settings_row)
-    with pytest.raises(InputError, match="other settings"):
+    with pytest.raises(InputError, match="agent was 'mdp' in"):
         TripFolder(tmp_path, {"agent": "belief"}, resume=True)
 
 

@@ -63,6 +63,25 @@ def test_workers_that_die_again_and_again_end_the_run_with_a_word():
         list(workers.results([killed_once.die]))
 
 
+def wrapped_interruption():
+    """As numba's loader of compiled code lets one through."""
+    try:
+        raise KeyboardInterrupt
+    except KeyboardInterrupt as error:
+        raise SystemError("returned a result with an exception set") from error
+
+
+def other_error():
+    raise SystemError("of another kind")
+
+
+def test_an_interruption_is_one_whatever_it_is_wrapped_in():
+    with pytest.raises(KeyboardInterrupt):
+        list(HERE.results([wrapped_interruption]))
+    with pytest.raises(SystemError, match="of another kind"):
+        list(HERE.results([other_error]))
+
+
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [

@@ -83,8 +83,9 @@ def check(
 ) -> None:
     """Make sure that results are complete and of the suite's own worlds, and put them side by side.
 
-    Every search has to be there; means and scores are computed anew, and so are the clairvoyant bounds of the first
-    searches of each task: a run in other worlds, or at other costs and speeds, has others.
+    Every search has to be there; means and scores are computed anew, and so are the clairvoyant bounds of all
+    searches: a run in other worlds, or at other costs and speeds, has others. That an agent took what the file says
+    only a run of the agent can tell.
     """
     from parkenv.evaluation.benchmark import check_result
 
@@ -94,7 +95,7 @@ def check(
     if len({result["suite"] for result in results}) > 1:
         raise InputError("the results are of different suites; check those of one at a time")
     _print(console, results)
-    console.print(f"{'Complete and unaltered' if len(files) == 1 else 'All complete and unaltered'}.")
+    console.print(f"{'Complete and consistent' if len(files) == 1 else 'All complete and consistent'}.")
 
 
 @app.command("show")

@@ -331,8 +331,14 @@ def comparison_of(
     options: dict[str, dict[str, Any]] = {
         "mdp": {"solver": solver}, "mdp-static": {"solver": solver}, "belief": {"budget_ms": budget_ms},
     }  # fmt: skip
-    for name in names:
-        make_agent(name, scenarios[0], **options.get(name, {}))
+    for s in scenarios:
+        for name in names:
+            make_agent(name, s, **options.get(name, {}))
+    if sweeps and not set(names) - set(ON_SIGHT):
+        raise InputError(
+            f"--failure-cost sweep draws searches without sight, too, and {', '.join(names)} goes by sight; add an "
+            "agent that does not, such as mdp"
+        )
     maps = _maps(map_says, scenarios)
     scenarios += [flat for flat, _ in maps.values()]
     if sweeps:

@@ -174,4 +174,6 @@ def _settings(its: Scenario, settings: SurveySettings, sessions: int, seed: int)
 
 def _goes_on(out: Path) -> bool:
     """Whether an unfinished demo is in the folder."""
-    return (out / "settings.json").exists() and not (out / "summary.json").exists()
+    from parkenv.evaluation.results import SETTINGS, SUMMARY
+
+    return (out / SETTINGS).exists() and not (out / SUMMARY).exists()

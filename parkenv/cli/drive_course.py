@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from parkenv.cli import arguments as args
-from parkenv.cli.training_course import EXAMINED_FROM, TESTED_FROM, Course, Row, print_tests, row_of
+from parkenv.cli.training_course import EXAMINED_FROM, FIGURE, TESTED_FROM, Course, Row, print_tests, row_of
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ class DriveCourse(Course):
         algorithm: by name.
         lot, test_on: names or files of lots, divided by commas, to train and to test on; None to test on the same.
         asked_steps, asked_every: decisions of a training, and between examinations; None for what the recipe says.
-        examined_on: drives into each lot's slots of each kind an examination, and half as many as in the test.
+        examined_on: drives into each lot's slots of each kind an examination; the test has twice as many.
         planners: planner or none.
     """
 
@@ -74,18 +74,34 @@ class DriveCourse(Course):
 
         return [lot_named(name) for name in args.words("--test-on", self.test_on or self.lot)]
 
-    def settings(self) -> Row:
+    def check(self) -> None:
         """See `Course`."""
         from parkenv.evaluation.drive_practice import places_of
         from planners.drivers import PLANNER
 
-        places_of(self.tested)  # complains before anything is trained
+        super().check()
+        for lots in (self.lots, self.tested):
+            places_of(lots)
         if self.planners not in (PLANNER, "none"):
             raise InputError(f"--planners is {self.planners!r}, want {PLANNER} or none with --env drive")
+
+    def settings(self) -> Row:
+        """See `Course`."""
         return {
             "algorithm": self.algorithm, "env": "drive", "lot": [lot.name for lot in self.lots], "steps": self.steps,
             "examine_every": self.examine_every, "examined_on": self.examined_on,
         }  # fmt: skip
+
+    def examination(self, settings: Row) -> Row:
+        """See `Course`."""
+        return {name: settings.get(name) for name in ("env", "lot", "examined_on")}
+
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """See `Course`."""
+        from parkenv.evaluation.drive_practice import places_of
+
+        return tuple(f"{place.kind}_success" for place in places_of(self.lots))
 
     def training(self, console: Console) -> DriveTraining:
         """See `Course`."""
@@ -100,7 +116,13 @@ class DriveCourse(Course):
         return f"{row['success']:.0%} parked"
 
     def report(
-        self, console: Console, workers: Workers, curves: list[list[Row]], models: dict[int, Path], out: Path
+        self,
+        console: Console,
+        workers: Workers,
+        curves: list[list[Row]],
+        models: dict[int, Path],
+        out: Path,
+        beside: dict[str, list[list[Row]]],
     ) -> Row:
         """See `Course`."""
         from parkenv.evaluation.drive_training import parked_on
@@ -140,12 +162,15 @@ class DriveCourse(Course):
                 )
         kinds = [name.removesuffix("_success") for name in curves[0][0] if name.endswith("_success")]
         title = f"{names}: {self.examined_on} parkings of each kind that were not trained on"
-        save_success_curves({self.algorithm: curves}, kinds, lines, title, out / "learning_curve.png")
+        save_success_curves({self.algorithm: curves, **beside}, kinds, lines, title, out / FIGURE)
         heading = "Parkings that succeed, contacts, median s of those, in tasks of no examination"
         print_tests(console, heading, self.algorithm, transfer, tables, _parkings, "kind")
         return {
             "rows": rows, "transfer": transfer, "planners": tables, "examined": lines,
             "curve": {kind: across_seeds(curves, f"{kind}_success") for kind in kinds},
+            "beside": {
+                name: {kind: across_seeds(its, f"{kind}_success") for kind in kinds} for name, its in beside.items()
+            },
         }  # fmt: skip
 
 

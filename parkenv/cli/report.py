@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -205,7 +204,9 @@ def _parsed(run: RunFolder) -> dict[str, Any]:
 
 def _require_same_files(run: RunFolder) -> None:
     """Refuse files that are no longer those that the comparison read."""
-    before = json.loads((run.path / "settings.json").read_text(encoding="utf-8"))
+    from parkenv.evaluation.results import read_settings
+
+    before = read_settings(run.path) or {}
     options = _parsed(run)
     for name in ("lot", "occupancy", "mapping", "calibrated"):
         if options[name] is not None and args.fingerprint(options[name]) != before.get(name):

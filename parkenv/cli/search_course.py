@@ -11,7 +11,16 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from parkenv.cli import arguments as args
-from parkenv.cli.training_course import EXAMINED_FROM, TESTED_FROM, Course, Row, print_tests, row_of
+from parkenv.cli.training_course import (
+    EXAMINED_FROM,
+    FIGURE,
+    TESTED_FROM,
+    Course,
+    Row,
+    name_of,
+    print_tests,
+    row_of,
+)
 
 if TYPE_CHECKING:
     from parkenv.evaluation.search_training import SearchTraining
@@ -34,7 +43,7 @@ class SearchCourse(Course):
         shown: searches of it.
         k: slots that an observation tells of.
         examine_every: decisions between examinations.
-        examined_on: searches an examination, and half as many as in the test.
+        examined_on: searches an examination; the test has twice as many.
         planners: names, divided by commas, or none.
     """
 
@@ -79,14 +88,40 @@ class SearchCourse(Course):
         """Seeds of the worlds of the examinations."""
         return range(EXAMINED_FROM, EXAMINED_FROM + self.examined_on)
 
+    @property
+    def compared(self) -> list[str]:
+        """Planners that are drawn for comparison."""
+        return [] if self.planners == "none" else args.words("--planners", self.planners)
+
+    def check(self) -> None:
+        """See `Course`."""
+        from parkenv.evaluation.cloning import require_imitable
+        from planners.agent import make_agent
+
+        super().check()
+        if self.imitate is not None:
+            require_imitable(self.algorithm, self.imitate, self.worlds[0])
+        for world in (self.worlds[0], *self.tested):
+            for name in self.compared:
+                make_agent(name, world)
+
     def settings(self) -> Row:
         """See `Course`."""
-        _ = self.tested
         return {
             "algorithm": self.algorithm, "scenario": [w.name for w in self.worlds], "steps": self.steps,
             "imitate": self.imitate, "shown": self.shown if self.imitate else None, "k": self.k,
             "examine_every": self.examine_every, "examined_on": self.examined_on,
         }  # fmt: skip
+
+    def examination(self, settings: Row) -> Row:
+        """See `Course`."""
+        first, *_ = settings.get("scenario") or [None]
+        return {"scenario": first, "examined_on": settings.get("examined_on")}
+
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """See `Course`."""
+        return ("total_s",)
 
     def training(self, console: Console) -> SearchTraining:
         """See `Course`."""
@@ -109,17 +144,22 @@ class SearchCourse(Course):
         return f"{row['total_s']:.1f} s"
 
     def report(
-        self, console: Console, workers: Workers, curves: list[list[Row]], models: dict[int, Path], out: Path
+        self,
+        console: Console,
+        workers: Workers,
+        curves: list[list[Row]],
+        models: dict[int, Path],
+        out: Path,
+        beside: dict[str, list[list[Row]]],
     ) -> Row:
         """See `Course`."""
         from parkenv.evaluation.learning_curves import across_seeds, save_learning_curves
         from parkenv.evaluation.search_training import search_times
         from planners.learned import LearnedAgent
 
-        names = [] if self.planners == "none" else args.words("--planners", self.planners)
         at_test = range(TESTED_FROM, TESTED_FROM + 2 * self.examined_on)
         lines, tables = _planner_times(
-            console, workers, names, self.worlds[0], self.tested, self.examined, at_test
+            console, workers, self.compared, self.worlds[0], self.tested, self.examined, at_test
         )
         rows, transfer = [], []
         with console.status("Testing"):
@@ -131,9 +171,9 @@ class SearchCourse(Course):
                     )
                 tested = transfer[-len(self.tested)]
                 own = {c: tested[c] for c in ("total_s", "total_s_ci95")}
-                rows.append(row_of(self.algorithm, self.worlds[0].name, number, curve, own, model))
+                rows.append(row_of(self.algorithm, tested["test_scenario"], number, curve, own, model))
         title = f"{self.worlds[0].name}: {self.examined_on} searches in worlds that were not trained on"
-        save_learning_curves({self.algorithm: curves}, lines, title, out / "learning_curve.png")
+        save_learning_curves({name_of(self.settings()): curves, **beside}, lines, title, out / FIGURE)
         print_tests(
             console,
             "Mean total time, s, in worlds of no examination",
@@ -144,6 +184,7 @@ class SearchCourse(Course):
         )
         return {
             "rows": rows, "transfer": transfer, "planners": tables, "examined": lines, "curve": across_seeds(curves),
+            "beside": {name: across_seeds(its) for name, its in beside.items()},
         }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-WIDE = 140
+WIDE = 200
 """Columns of text that are assumed where output goes to a file or a pipe."""
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import threading
 from pathlib import Path
@@ -15,9 +14,10 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.drive_course import DriveCourse
+from parkenv.cli.report import PAGE
 from parkenv.cli.search_course import SearchCourse
 from parkenv.cli.tables import make_console
-from parkenv.cli.training_course import Course, Row
+from parkenv.cli.training_course import FIGURE, Course, Row, curves_beside
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def train(
         typer.Option(
             "--scenario",
             metavar="NAME[,NAME...]",
-            help="Where to learn to search; several take turns.  [default: campus]",
+            help="Where to learn to search; several take turns, and examinations are on the first.  [default: campus]",
             rich_help_panel=args.WORLD,
         ),
     ] = None,
@@ -91,7 +91,10 @@ def train(
             help="Begin by imitating this planner (search; ppo, maskable-ppo).",
         ),
     ] = None,
-    shown: Annotated[int, typer.Option("--shown", min=1, help="Searches of the planner to imitate.")] = 2000,
+    shown: Annotated[
+        int | None,
+        typer.Option("--shown", min=1, help="Searches of the planner to imitate.  [default: 2000]"),
+    ] = None,
     k: Annotated[
         int | None,
         typer.Option("--k", min=1, help="Slots that an observation tells of (search).  [default: 5]"),
@@ -136,6 +139,14 @@ def train(
             help="Folder for models, curves and figures.  [default: results/ALGORITHM, results/drive-ALGORITHM]",
         ),
     ] = None,
+    beside: Annotated[
+        str | None,
+        typer.Option(
+            "--beside",
+            metavar="DIR[,DIR...]",
+            help="Folders of other trainings with the same examinations, to draw in the same figure.",
+        ),
+    ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoints in --out.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the training in --out.")] = False,
     report: Annotated[
@@ -154,42 +165,47 @@ def train(
 
     * `parkenv train ppo --imitate mdp-tuned --test-on campus,street,jam --out results/cloned`
 
+    * `parkenv train ppo --beside results/maskable-ppo,results/dqn`
+
     * `parkenv train sac --env drive --lot campus,street --seeds 3`
 
     * `parkenv compare --agents mdp,maskable-ppo:results/maskable-ppo/seed_0/model.zip`
     """  # fmt: skip
     from parkenv.evaluation.results import make_folder, write_summary
-    from planners.learned import algorithm_class
 
     if env not in ENVS:
         raise InputError(f"--env is {env!r}, want one of {', '.join(ENVS)}")
     course: Course
     if env == "search":
         _refuse("drive", {"--lot": lot})
+        if shown is not None and imitate is None:
+            raise InputError("--shown goes with --imitate")
         course = SearchCourse(
-            algorithm or "maskable-ppo", scenario or "campus", test_on, steps or 2_000_000, imitate, shown, k or 5,
-            examine_every or 100_000, examined_on or 256, planners or PLANNERS,
+            algorithm or "maskable-ppo", scenario or "campus", test_on, steps or 2_000_000, imitate, shown or 2000,
+            k or 5, examine_every or 100_000, examined_on or 256, planners or PLANNERS,
         )  # fmt: skip
     else:
-        _refuse("search", {"--scenario": scenario, "--imitate": imitate, "--k": k})
+        _refuse("search", {"--scenario": scenario, "--imitate": imitate, "--shown": shown, "--k": k})
         course = DriveCourse(
             algorithm or "ppo", lot or "campus,street", test_on, steps, examine_every, examined_on or 64,
             planners or "planner",
         )  # fmt: skip
-    course.recipe()
-    algorithm_class(course.algorithm)
+    course.check()
+    from parkenv.evaluation.rl_training import MODEL
+
     settings = {"version": __version__, **course.settings()}
     out = out or Path("results") / course.folder
+    others = curves_beside(args.words("--beside", beside) if beside else (), out, course)
     make_folder(out)
-    _claim(out, settings, resume, overwrite)
+    _require_free(out, settings, resume, overwrite)
     console = make_console()
     with args.workers_of(jobs, backend, address) as workers:
         training = course.training(console)
+        _claim(out, settings, overwrite)
         numbers = range(seed, seed + seeds)
         curves = _train_all(console, course, training, numbers, out, workers, tensorboard)
-        outcome = course.report(
-            console, workers, curves, {n: out / f"seed_{n}" / "model.zip" for n in numbers}, out
-        )
+        models = {n: out / f"seed_{n}" / MODEL for n in numbers}
+        outcome = course.report(console, workers, curves, models, out, others)
     command = ["parkenv", *sys.argv[1:]]
     write_summary(
         out, {"command": command, "version": __version__, "seed": seed, "settings": settings, **outcome}
@@ -207,33 +223,34 @@ def _refuse(env: str, options: Row) -> None:
             raise InputError(f"{name} goes with --env {env}")
 
 
-def _claim(out: Path, settings: Row, resume: bool, overwrite: bool) -> None:
+def _require_free(out: Path, settings: Row, resume: bool, overwrite: bool) -> None:
     """Make sure that what is in the folder may be used, or replaced."""
+    from parkenv.evaluation.results import read_settings, require_same_settings
+
+    if resume and overwrite:
+        raise InputError("--resume and --overwrite exclude each other")
+    if resume:
+        require_same_settings(out, settings, "training")
+    elif not overwrite and read_settings(out) is not None:
+        raise InputError(
+            f"--out {out}: holds a training; add --resume to go on with it, --overwrite to replace it, or name "
+            "another folder"
+        )
+
+
+def _claim(out: Path, settings: Row, overwrite: bool) -> None:
+    """Write down what is trained in the folder from now on, in place of what was."""
     import shutil
 
-    from parkenv.whole_files import written_whole
+    from parkenv.evaluation.results import SUMMARY, write_settings
 
-    file = out / "settings.json"
-    if file.exists() and not overwrite:
-        if not resume:
-            raise InputError(
-                f"--out {out}: holds a training; add --resume to go on with it, --overwrite to replace it, or name "
-                "another folder"
-            )
-        before = json.loads(file.read_text(encoding="utf-8"))
-        for name, value in settings.items():
-            if before.get(name) != value:
-                raise InputError(
-                    f"--resume: {name} was {before.get(name)!r} in {out}, now it is {value!r}; use the same settings, "
-                    "or another folder"
-                )
-    elif resume:
-        raise InputError(f"--resume: {out} holds no training to go on with")
+    # Whoever finds no summary knows that the training is not finished.
+    for outcome in (SUMMARY, PAGE, FIGURE):
+        (out / outcome).unlink(missing_ok=True)
     if overwrite:
         for folder in out.glob("seed_*"):
             shutil.rmtree(folder)
-    with written_whole(file) as beside:
-        beside.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
+    write_settings(out, settings)
 
 
 def _train_all(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
 from parkenv.cli.tables import make_table
+from parkenv.errors import InputError
 
 if TYPE_CHECKING:
     from parkenv.evaluation.rl_training import Training
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 
 EXAMINED_FROM, TESTED_FROM = 2_000_000, 3_000_000
 """First seeds of the worlds in which models are examined, and tested at the end."""
+
+FIGURE = "learning_curve.png"
 
 Row = dict[str, Any]
 
@@ -35,9 +38,29 @@ class Course(ABC):
     def recipe(self) -> Any:
         """The algorithm's, or an `InputError`."""
 
+    def check(self) -> None:
+        """Refuse now what could not be trained, tested or drawn later.
+
+        Raises:
+            InputError: an option that cannot be used, or a package that is not there.
+        """
+        from planners.learned import algorithm_class
+
+        self.recipe()
+        algorithm_class(self.algorithm)
+
     @abstractmethod
     def settings(self) -> Row:
         """What a training that is gone on with must have in common with this one."""
+
+    @abstractmethod
+    def examination(self, settings: Row) -> Row:
+        """What examinations are of, by the settings of a training: equal where curves can be set side by side."""
+
+    @property
+    @abstractmethod
+    def measures(self) -> tuple[str, ...]:
+        """Columns of `curve.csv` that are drawn."""
 
     @abstractmethod
     def training(self, console: Console) -> Training:
@@ -49,9 +72,72 @@ class Course(ABC):
 
     @abstractmethod
     def report(
-        self, console: Console, workers: Workers, curves: list[list[Row]], models: dict[int, Path], out: Path
+        self,
+        console: Console,
+        workers: Workers,
+        curves: list[list[Row]],
+        models: dict[int, Path],
+        out: Path,
+        beside: dict[str, list[list[Row]]],
     ) -> Row:
         """Test the models, draw the figure, print the table; what goes into the summary."""
+
+
+def name_of(settings: Row) -> str:
+    """What a training is called beside others."""
+    name, imitated, scenarios = (
+        str(settings["algorithm"]),
+        settings.get("imitate"),
+        settings.get("scenario", ()),
+    )
+    if len(scenarios) > 1:
+        name += f" on {', '.join(scenarios)}"
+    return f"{name} after imitating {imitated}" if imitated else name
+
+
+def curves_beside(folders: Sequence[str], out: Path, course: Course) -> dict[str, list[list[Row]]]:
+    """Curves of other trainings, by name, of each seed the rows of its `curve.csv`.
+
+    Args:
+        folders: that `parkenv train` wrote to; `--beside`.
+        out: the folder of the training that they are to be drawn beside.
+        course: of that training.
+
+    Raises:
+        InputError: a folder without a training, or with one that was examined otherwise; the same one twice; or too
+            many to tell apart.
+    """
+    from parkenv.evaluation.learning_curves import COLORS
+    from parkenv.evaluation.results import read_settings
+    from parkenv.evaluation.rl_training import CURVE, read_curve
+
+    if len(folders) >= len(COLORS):
+        raise InputError(f"--beside names {len(folders)} folders, want at most {len(COLORS) - 1}")
+    own, known = course.settings(), {out.resolve()}
+    beside: dict[str, list[list[Row]]] = {}
+    for folder in map(Path, folders):
+        if folder.resolve() in known:
+            raise InputError(f"--beside: {folder} is drawn already")
+        known.add(folder.resolve())
+        settings = read_settings(folder)
+        curves = [read_curve(its) for its in sorted(folder.glob(f"seed_*/{CURVE}"))]
+        curves = [curve for curve in curves if curve]
+        if settings is None or not curves:
+            raise InputError(f"--beside: {folder} holds no training")
+        theirs = course.examination(settings)
+        for name, value in course.examination(own).items():
+            if theirs[name] != value:
+                raise InputError(
+                    f"--beside: {name} is {theirs[name]!r} in {folder} and {value!r} here; their examinations cannot "
+                    "be compared"
+                )
+        if not {"steps", *course.measures} <= {*curves[0][0]} or "algorithm" not in settings:
+            raise InputError(f"--beside: {folder} was not written by this version of parkenv")
+        name = name_of(settings)
+        if name == name_of(own) or name in beside:
+            name = f"{name} ({folder})"
+        beside[name] = curves
+    return beside
 
 
 def row_of(agent: str, scenario: str, number: int, curve: list[Row], own: Row, model: Path) -> Row:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -19,6 +18,7 @@ from parkenv.driving.lot_space import LotSpace, Thing
 from parkenv.driving.parking_task import AREA, KINDS, REACH, ParkingTask, ParkingTasks
 from parkenv.driving.polite_traffic import PoliteTraffic
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters, advance, placed
+from parkenv.envs.drive_state import DriveState
 from parkenv.errors import InputError
 from parkenv.keyed_random import world_key
 from parkenv.lot import ParkingLot
@@ -51,34 +51,6 @@ REWARD_TERMS = ("time", "approach", "contact")
 _CORNERS = 24
 _BOUND = 2.0 * REACH
 _GOAL = 7
-
-
-@dataclass
-class DriveState:
-    """Everything that changes during an episode; `DriveEnv.get_state` hands out a copy."""
-
-    key: np.uint64
-    task: ParkingTask
-    vehicle: FloatArray
-    rng: np.random.Generator
-    time: float = 0.0
-    driven_m: float = 0.0
-    direction: int = 0
-    direction_changes: int = 0
-    contact: str = ""
-    parked: bool = False
-    over: bool = False
-    clocks: FloatArray = field(default_factory=lambda: np.empty(0))
-    movers: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
-    trail: list[tuple[float, float, float]] = field(default_factory=list)
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> DriveState:
-        twin = copy.copy(self)  # a task never changes
-        twin.vehicle = self.vehicle.copy()
-        twin.rng = copy.deepcopy(self.rng, memo)
-        twin.trail = list(self.trail)
-        twin.clocks, twin.movers = self.clocks.copy(), self.movers.copy()
-        return twin
 
 
 class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):

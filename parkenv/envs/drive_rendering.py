@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -25,6 +24,7 @@ from parkenv.envs.drawing import (
     text_width,
     write_text,
 )
+from parkenv.envs.drive_state import DriveState
 from parkenv.envs.rendering import (
     ASPHALT,
     BELIEF_ANCHORS,
@@ -46,9 +46,6 @@ from parkenv.envs.rendering import (
 )
 from parkenv.envs.window import Window
 from parkenv.lot import ParkingLot, is_building
-
-if TYPE_CHECKING:
-    from parkenv.envs.drive import DriveState
 
 FloatArray = NDArray[np.float64]
 

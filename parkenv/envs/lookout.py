@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.envs.search_state import SearchState
 from parkenv.errors import InputError
 from parkenv.lot_scene import LotScenes, slot_lot
 from parkenv.scenario import Scenario
@@ -16,7 +17,6 @@ from sim_sensors.rig import RIG_NAMES, Capture, SensorRig
 from sim_sensors.weather import PRESETS, Weather
 
 if TYPE_CHECKING:
-    from parkenv.envs.search import SearchState
     from sim_sensors.movers import Movers
 
 FloatArray = NDArray[np.float64]

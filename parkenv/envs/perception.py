@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.envs.lookout import Lookout, Moment
-from parkenv.envs.search import SearchEnv, SearchState
+from parkenv.envs.search import SearchEnv
+from parkenv.envs.search_state import SearchState
 from parkenv.envs.search_step import VERTEX, Search, drive_or_park, renew, settle, take_in, tell_time
 from parkenv.envs.sensors import beside_the_lot
 from parkenv.mapping.slots import SlotFilter

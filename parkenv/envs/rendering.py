@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import cv2
 import numpy as np
@@ -26,13 +26,11 @@ from parkenv.envs.drawing import (
     write_label,
     write_text,
 )
+from parkenv.envs.search_state import SearchState
 from parkenv.envs.window import Window
 from parkenv.lot import ParkingLot, is_building
 from parkenv.occupancy import DAY_NAMES, DAY_S
 from parkenv.scenario import Scenario
-
-if TYPE_CHECKING:
-    from parkenv.envs.search import SearchState
 
 WIDTH, HEIGHT = 640, 480
 HUD = 34

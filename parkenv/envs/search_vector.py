@@ -13,7 +13,8 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
 from parkenv.envs.local_observation import Surroundings, local_space, observe_surroundings
-from parkenv.envs.search import REWARD_TERMS, arrival_of, search_space
+from parkenv.envs.search import REWARD_TERMS, search_space
+from parkenv.envs.search_state import arrival_of
 from parkenv.envs.search_step import (
     DRIVE_S,
     DRIVEN_M,
@@ -101,11 +102,8 @@ def step_full(
     vertex: IntArray,
     time: NDArray[np.float32],
     mask: NDArray[np.int8],
-) -> int:
-    """Step all searches but the idle and the fresh ones, and observe; the first wrong action's index, or -1."""
-    wrong: int = _first_wrong(actions)
-    if wrong >= 0:
-        return wrong
+) -> None:
+    """Step all searches but the idle and the fresh ones, and observe."""
     for e in range(len(actions)):
         if idle[e]:
             continue
@@ -117,7 +115,6 @@ def step_full(
         _report(search, e, fresh[e], limit, steps, mask)
         vertex[e] = search.counts[e, VERTEX]
         tell_time(search, e, time[e])
-    return -1
 
 
 @compiled
@@ -131,11 +128,8 @@ def step_local(
     steps: Steps,
     local: NDArray[np.float32],
     mask: NDArray[np.int8],
-) -> int:
+) -> None:
     """As `step_full`, observing the cars' surroundings."""
-    wrong: int = _first_wrong(actions)
-    if wrong >= 0:
-        return wrong
     for e in range(len(actions)):
         if idle[e]:
             continue
@@ -143,11 +137,11 @@ def step_local(
             step_one(search, e, actions[e])
         _report(search, e, fresh[e], limit, steps, mask)
         observe_surroundings(search, around, e, local[e])
-    return -1
 
 
 @compiled
-def _first_wrong(actions: IntArray) -> int:
+def first_wrong(actions: IntArray) -> int:
+    """The first action's index that is none, or -1."""
     for e in range(len(actions)):
         if not 0 <= actions[e] < N_ACTIONS:
             return e
@@ -335,16 +329,19 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         which = self._chosen(options)
         if seed is None or isinstance(seed, (int, np.integer)):
             super().reset(seed=None if seed is None else int(seed))
-        if seed is None and not self._begun:
-            _ = self.np_random  # draws a seed where none was ever given
-            seed = self.np_random_seed
-        if isinstance(seed, (int, np.integer)):
-            seed = [int(seed) + i for i in range(self.num_envs)]
-        seeds = [None] * self.num_envs if seed is None else list(seed)
+        seeds = [seed] * self.num_envs if seed is None or isinstance(seed, (int, np.integer)) else list(seed)
         if len(seeds) != self.num_envs:
             raise InputError(
                 f"seed holds {len(seeds)} numbers, want {self.num_envs}, one for each environment"
             )
+        if isinstance(seed, (int, np.integer)):
+            seeds = [int(seed) + i for i in range(self.num_envs)]
+        elif not self._begun and None in seeds:
+            # Nobody ever gave these a seed. Where `np_random` was set by hand, its own is not known.
+            _ = self.np_random
+            known = self.np_random_seed
+            first = int(self.np_random.integers(1 << 62)) if known is None or known < 0 else known
+            seeds = [first + i if one is None else one for i, one in enumerate(seeds)]
         counts = self._search.counts
         for i in np.flatnonzero(which):
             one = seeds[i]
@@ -368,6 +365,12 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             raise InputError(
                 f"actions have shape {actions.shape} and type {actions.dtype}, want ({self.num_envs},) whole numbers"
             )
+        actions = actions.astype(np.int64, copy=False)
+        wrong = first_wrong(actions)
+        if wrong >= 0:
+            raise InputError(
+                f"actions[{wrong}] is {actions[wrong]}, want a number from 0 to {PARK} ({', '.join(ACTIONS)})"
+            )
         fresh = self._nobody
         if self._mode is AutoresetMode.NEXT_STEP:
             fresh = self._done
@@ -375,7 +378,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
                 self._arrive(fresh)
         elif self._mode is AutoresetMode.DISABLED and self._done.any():
             raise gym.error.ResetNeeded(f"search {int(np.argmax(self._done))} is over: reset it")
-        self._step(actions.astype(np.int64, copy=False), fresh, self._nobody)
+        self._step(actions, fresh, self._nobody)
         steps = self._steps
         self._done = done = steps.terminated | steps.truncated
         info: dict[str, Any] = {}
@@ -389,7 +392,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             results = steps.rewards.copy(), steps.terminated.copy(), steps.truncated.copy()
         if self._mode is AutoresetMode.SAME_STEP and done.any():
             self._arrive(done)
-            self._step(actions.astype(np.int64, copy=False), done, ~done)
+            self._step(actions, done, ~done)
             self._done = self._nobody
         return self._observations(), *results, info
 
@@ -397,19 +400,15 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         """Begin the searches that are fresh, leave the idle ones alone, step the others."""
         seen, steps = self._seen, self._steps
         if self._surroundings is None:
-            wrong = step_full(
+            step_full(
                 self._search, actions, fresh, idle, self._limit, steps,
                 seen["vertex"], seen["time"], seen["action_mask"],
             )  # fmt: skip
         else:
-            wrong = step_local(
+            step_local(
                 self._search, self._surroundings, actions, fresh, idle, self._limit, steps,
                 seen["local"], seen["action_mask"],
             )  # fmt: skip
-        if wrong >= 0:
-            raise InputError(
-                f"actions[{wrong}] is {actions[wrong]}, want a number from 0 to {PARK} ({', '.join(ACTIONS)})"
-            )
 
     def _arrive(self, which: BoolArray) -> None:
         """Put some of the cars at the entries of their next worlds."""

@@ -10,7 +10,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from parkenv.envs.lookout import Lookout, Moment
-from parkenv.envs.search import LATEST, SearchEnv, SearchState
+from parkenv.envs.search import LATEST, SearchEnv
+from parkenv.envs.search_state import SearchState
 from parkenv.scenario import Scenario
 from sim_sensors.rig import SensorRig
 

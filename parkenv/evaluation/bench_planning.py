@@ -1,14 +1,18 @@
-"""How fast plans are made and mended, beside general solvers of Markov decision processes."""
+"""How fast plans are made and mended, beside general solvers of Markov decision processes, and cities are searched."""
 
 from __future__ import annotations
 
+import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from importlib import import_module
 from importlib.util import find_spec
+from multiprocessing import get_context
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
@@ -16,6 +20,7 @@ from scipy.sparse import csr_matrix, vstack
 from parkenv.evaluation.bench_rows import BenchRow, duration, seconds_each
 from parkenv.lot import PARK, ParkingLot
 from parkenv.scenario import Scenario
+from planners.agent import make_agent
 from planners.label_repair import repair
 from planners.label_setting import Labels, StoppingGraph, best_move, by_policy_iteration, settle, with_p_free
 from planners.mdp import ParkingMDP
@@ -24,6 +29,10 @@ from planners.policy_iteration import policy_iteration
 Solver = Callable[[], NDArray[np.int64]]
 
 SIZES = (200, 2_000, 20_000, 200_000, 2_000_000)
+CITY = 1_000_000
+"""Slots of the city in which agents search."""
+CITY_SEARCHES = 3
+"""Searches of each agent there."""
 PATIENCE_S = 60.0
 """A peer that is expected to take longer than this on a lot is not measured there."""
 MDPTOOLBOX_STATES = 5_000
@@ -43,12 +52,14 @@ def planning_rows(
         seed: of the cities and of what is found on the way.
         seconds: how long each figure is measured.
         lot: where re-planning is measured; the packaged campus where None.
-        largest: slots of the largest city that is planned.
+        largest: slots of the largest city that is planned, and of the one that is driven in at most.
     """
     sizes = [n for n in SIZES if n <= largest]
-    return solving_rows(sizes, seed, seconds) + repair_rows(
-        lot or ParkingLot.packaged("campus"), seed, seconds
-    )
+    return [
+        *solving_rows(sizes, seed, seconds),
+        *repair_rows(lot or ParkingLot.packaged("campus"), seed, seconds),
+        *city_rows_apart(min(CITY, largest), seed),
+    ]
 
 
 def solving_rows(sizes: list[int], seed: int, seconds: float) -> list[BenchRow]:
@@ -113,6 +124,61 @@ def repair_rows(lot: ParkingLot, seed: int, seconds: float) -> list[BenchRow]:
         *duration("plan again", f"{case}: median", 1e6 * float(np.median(times)), "µs", **peers),
         *duration("plan again", f"{case}: 99 %", 1e6 * float(np.quantile(times, 0.99)), "µs", **peers),
     ]
+
+
+def city_rows_apart(n_slots: int, seed: int) -> list[BenchRow]:
+    """`city_rows` in a process of its own, so that the memory is that of the searches."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as apart:
+        return apart.submit(city_rows, n_slots, seed).result()
+
+
+def city_rows(
+    n_slots: int, seed: int, agents: Sequence[str] = ("mdp", "mdp-tuned", "belief")
+) -> list[BenchRow]:
+    """Searches through a city: what an agent takes to set out and to decide, and the memory of the process at its peak.
+
+    Args:
+        n_slots: of the city.
+        seed: of the city and of the worlds.
+        agents: who searches, by name.
+    """
+    scenario = Scenario.on_lot(ParkingLot.city(n_slots, seed))
+    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    rows: list[BenchRow] = []
+    for name in agents:
+        first, decisions = [], []
+        agent = make_agent(name, scenario)
+        for episode in range(CITY_SEARCHES):
+            observation, _ = env.reset(seed=seed + episode)
+            memory, over, times = None, False, []
+            while not over:
+                start = time.perf_counter()
+                action, memory = agent.predict(observation, memory)
+                times.append(time.perf_counter() - start)
+                observation, _, terminated, truncated, _ = env.step(action)
+                over = terminated or truncated
+            first.append(times[0])
+            decisions += times[1:]
+        case = f"{name}, city, {n_slots:,} slots"
+        rows += duration("search", f"{case}: the first plan", float(np.median(first)), "s")
+        rows += duration("search", f"{case}: a decision, median", 1e3 * float(np.median(decisions)), "ms")
+        rows += duration(
+            "search", f"{case}: a decision, 99 %", 1e3 * float(np.quantile(decisions, 0.99)), "ms"
+        )
+    if memory_gib := peak_memory_gib():
+        rows += duration("search", f"city, {n_slots:,} slots: memory at most", memory_gib, "GiB")
+    return rows
+
+
+def peak_memory_gib() -> float | None:
+    """The most memory that this process has had so far; None where the system does not tell."""
+    if find_spec("resource") is None:
+        return None
+    import resource
+
+    # Kilobytes, but for macOS.
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
 
 
 def drive(

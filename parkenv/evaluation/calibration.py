@@ -25,8 +25,10 @@ from parkenv.driving.parking_task import KINDS
 from parkenv.errors import InputError
 from parkenv.evaluation.compare import unseen
 from parkenv.evaluation.driven_search import DrivenSearch, Trip
-from parkenv.evaluation.lot_driver import EDGE_KINDS, DrivingStyle, Leg, Try
+from parkenv.evaluation.driver import EDGE_KINDS, Leg, Try
+from parkenv.evaluation.lot_driver import DrivingStyle
 from parkenv.evaluation.picture_files import INK, STYLE, save_picture
+from parkenv.evaluation.results import require_same_settings, write_settings
 from parkenv.evaluation.statistics import mean_interval
 from parkenv.evaluation.workers import HERE, Workers
 from parkenv.scenario import KMH, Scenario
@@ -148,23 +150,17 @@ class TripFolder:
     def __init__(self, path: Path, settings: Row, *, resume: bool = False) -> None:
         self._file = path / "trips.jsonl"
         self.rows: dict[tuple[str, int], Row] = {}
-        settings_file = path / "settings.json"
         if self._file.exists():
             if not resume:
                 raise InputError(
                     f"--out {path}: holds trips; add --resume to go on with them, or name another folder"
                 )
-            before = json.loads(settings_file.read_text(encoding="utf-8")) if settings_file.exists() else None
-            if before != json.loads(json.dumps(settings)):
-                raise InputError(
-                    f"--resume: the trips in {path} were driven with other settings; use another folder"
-                )
+            require_same_settings(path, settings, "trips")
             whole, _, _ = self._file.read_text(encoding="utf-8").rpartition("\n")
             for line in whole.splitlines():
                 row = json.loads(line)
                 self.rows[row["sight"], row["seed"]] = row
-        with written_whole(settings_file) as beside:
-            beside.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
+        write_settings(path, settings)
         self.put_in_order()
 
     def add(self, rows: Sequence[Row]) -> None:

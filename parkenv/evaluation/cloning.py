@@ -11,14 +11,30 @@ from numpy.typing import NDArray
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from parkenv.envs.local_observation import LocalObservation
+from parkenv.errors import InputError
 from parkenv.evaluation.recipes import MAX_STEPS, REWARD_SCALE
 from parkenv.scenario import Scenario
 from planners.agent import make_agent
+from planners.oracle import OracleAgent
 
 UPDATES = 3000
 """Steps of the optimizer, enough for a policy that seldom strays from what it was shown."""
+IMITATORS = ("ppo", "maskable-ppo")
+"""Algorithms whose policies can be fitted to what was shown."""
 BATCH = 512
 LEARNING_RATE = 1e-3
+
+
+def require_imitable(algorithm: str, agent: str, scenario: Scenario) -> None:
+    """Refuse what cannot be imitated, before it is watched.
+
+    Raises:
+        InputError: an algorithm that does not imitate, no such agent, or the oracle.
+    """
+    if algorithm not in IMITATORS:
+        raise InputError(f"{algorithm} cannot begin by imitation; take {' or '.join(IMITATORS)}")
+    if isinstance(make_agent(agent, scenario), OracleAgent):
+        raise InputError(f"{agent} cannot be imitated: it goes by what nobody can observe")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +57,11 @@ class Demonstrations:
 
     @classmethod
     def collect(cls, agent: str, scenario: Scenario, seeds: Sequence[int], k: int = 5) -> Demonstrations:
-        """Watch an agent search, once for each seed; searches that it cannot finish are left out."""
+        """Watch an agent search, once for each seed; searches that it cannot finish are left out.
+
+        Raises:
+            InputError: it finished none.
+        """
         planner = make_agent(agent, scenario)
         env = gym.make("parkenv/Search-v0", scenario=scenario, max_episode_steps=MAX_STEPS)
         around = LocalObservation(env, k)
@@ -65,6 +85,10 @@ class Demonstrations:
                 del local[first:], masks[first:], actions[first:]
                 continue
             times.append(-np.cumsum(rewards[::-1])[::-1])
+        if not times:
+            raise InputError(
+                f"{agent} finished none of {len(seeds)} searches on {scenario.name}: nothing to imitate"
+            )
         return cls(agent, np.stack(local), np.stack(masks), np.array(actions), np.concatenate(times))
 
 

@@ -28,7 +28,8 @@ from parkenv.envs.search_step import (
     touched,
 )
 from parkenv.errors import InputError
-from parkenv.evaluation.lot_driver import Driver, DrivingStyle, Leg, LotDriver, Try
+from parkenv.evaluation.driver import Driver, Leg, Try
+from parkenv.evaluation.lot_driver import DrivingStyle, LotDriver
 from parkenv.lot import PARK
 from parkenv.scenario import Scenario
 from planners.agent import Agent, make_agent

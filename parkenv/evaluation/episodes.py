@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.envs.search import SearchState
+from parkenv.envs.search_state import SearchState
 from parkenv.scenario import Scenario
 from planners.agent import Agent
 from planners.oracle import OracleAgent, best_slot

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from parkenv.envs.drive import DriveState
 from parkenv.envs.drive_rendering import DriveRenderer
+from parkenv.envs.drive_state import DriveState
 from parkenv.lot import ParkingLot
 from parkenv.whole_files import written_whole
 

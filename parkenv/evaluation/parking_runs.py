@@ -15,7 +15,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from parkenv.driving.vehicle import STEERING
-from parkenv.envs.drive import DriveState
+from parkenv.envs.drive_state import DriveState
 from parkenv.evaluation.workers import HERE, Workers
 from parkenv.lot import ParkingLot
 from parkenv.whole_files import written_whole

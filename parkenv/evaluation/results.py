@@ -46,6 +46,7 @@ _TEXT = {"scenario", "agent", "day", "slot", "decisions_us"}
 _WHOLE = {"seed", "failed_parks", "slots_passed", "replans", "steps"}
 _BOOL = {"parked", "truncated"}
 
+SETTINGS = "settings.json"
 SUMMARY = "summary.json"
 SUMMARY_PARTIAL = "summary.partial.json"
 PICTURES = (
@@ -64,6 +65,52 @@ Key = tuple[Any, ...]
 def write_summary(folder: Path, summary: Mapping[str, Any], name: str = SUMMARY) -> None:
     """Write a command's summary as strict JSON; numbers that do not exist become null."""
     _write_text(folder / name, json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
+
+
+def read_settings(folder: Path) -> Row | None:
+    """What a run in a folder was asked for; None where there was none.
+
+    Raises:
+        InputError: the file is torn.
+    """
+    file = folder / SETTINGS
+    if not file.exists():
+        return None
+    try:
+        settings = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise InputError(f"{file}: is torn: {error}") from error
+    if not isinstance(settings, dict):
+        raise InputError(f"{file}: want the settings of a command, by name, got a {type(settings).__name__}")
+    return settings
+
+
+def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Write down what a run is asked for."""
+    _write_text(folder / SETTINGS, json.dumps(dict(settings), indent=2) + "\n")
+
+
+def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) -> None:
+    """Refuse to go on with a run that was asked for something else.
+
+    Args:
+        folder: of the run.
+        settings: what is asked for now.
+        kind: of run.
+
+    Raises:
+        InputError: there is no run, or one with other settings.
+    """
+    before = read_settings(folder)
+    if before is None:
+        raise InputError(f"--resume: {folder} holds no {kind} to go on with")
+    now = json.loads(json.dumps(dict(settings)))
+    for name in sorted(before.keys() | now.keys()):
+        if before.get(name) != now.get(name):
+            raise InputError(
+                f"--resume: {name} was {before.get(name)!r} in {folder}, now it is {now.get(name)!r}; "
+                "use the same settings, or another folder"
+            )
 
 
 def make_folder(path: Path) -> None:
@@ -110,9 +157,8 @@ class ResultFolder:
         self.path = path
         self.episodes: dict[Key, Row] = {}
         self._timings: dict[Key, Row] = {}
-        settings_file = path / "settings.json"
         if resume:
-            self._check_settings(settings_file, settings)
+            require_same_settings(path, settings, "comparison")
             self.episodes = {episode_key(r): r for r in _read(path / "episodes.csv", EPISODE_COLUMNS)}
             self._timings = {episode_key(r): r for r in _read(path / "timings.csv", TIMING_COLUMNS)}
         elif (path / "episodes.csv").exists() and not overwrite:
@@ -125,7 +171,7 @@ class ResultFolder:
             if picture.name.startswith(PICTURES):
                 picture.unlink()
         (path / SUMMARY).unlink(missing_ok=True)
-        _write_text(settings_file, json.dumps(dict(settings), indent=2) + "\n")
+        write_settings(path, settings)
         # Rewritten from what could be read: a line that a crash tore is gone, and its episode runs again.
         _write_text(path / "episodes.csv", _csv_text(EPISODE_COLUMNS, self.episodes.values(), header=True))
         _write_text(path / "timings.csv", _csv_text(TIMING_COLUMNS, self._timings.values(), header=True))
@@ -160,18 +206,6 @@ class ResultFolder:
         (self.path / SUMMARY_PARTIAL).unlink(missing_ok=True)
         write_summary(self.path, summary, SUMMARY if complete else SUMMARY_PARTIAL)
 
-    def _check_settings(self, file: Path, settings: Mapping[str, Any]) -> None:
-        if not file.exists():
-            raise InputError(f"--resume: {file.parent} holds no comparison to go on with")
-        before = json.loads(file.read_text(encoding="utf-8"))
-        now = json.loads(json.dumps(dict(settings)))
-        for name in sorted(before.keys() | now.keys()):
-            if before.get(name) != now.get(name):
-                raise InputError(
-                    f"--resume: {name} was {before.get(name)!r} in {file.parent}, now it is {now.get(name)!r}; "
-                    "use the same settings, or another folder"
-                )
-
 
 def _write_text(path: Path, text: str) -> None:
     with written_whole(path) as beside:
@@ -200,7 +234,7 @@ def _read(path: Path, columns: Sequence[str]) -> list[Row]:
         return []
     whole, _, _ = path.read_text(encoding="utf-8").rpartition("\n")
     rows = []
-    for raw in csv.DictReader(whole.splitlines()):
+    for raw in csv.DictReader(io.StringIO(whole, newline="")):
         if tuple(raw) != tuple(columns) or None in raw.values():
             raise InputError(f"{path}: not written by this version of parkenv; use another folder")
         rows.append({name: _parse(name, value) for name, value in raw.items()})

@@ -149,12 +149,12 @@ class Training(ABC):
                 **self.settings(),
             )
             self.prepare(model, seed)
-        examiner = _Examiner(self, seed, folder, curve)
+        examiner = _Examiner(self, seed, folder, env, curve)
         left = self.steps - model.num_timesteps
         if left > 0:
             model.learn(left, callback=examiner, reset_num_timesteps=False, tb_log_name="run")
-            if examiner.curve[-1]["steps"] < model.num_timesteps:
-                examiner.examine(model, model.num_timesteps)
+        if examiner.curve[-1]["steps"] < model.num_timesteps:
+            examiner.examine(model, model.num_timesteps)
         (folder / REPLAY).unlink(missing_ok=True)
         return examiner.curve
 
@@ -191,32 +191,41 @@ def train_one(training: Training, seed: int, folder: Path, tensorboard: bool = F
 class _Examiner(BaseCallback):  # type: ignore[misc]
     """Examines the model as it learns, and keeps it."""
 
-    def __init__(self, training: Training, seed: int, folder: Path, curve: list[Row]) -> None:
+    def __init__(
+        self, training: Training, seed: int, folder: Path, practice: VecEnv, curve: list[Row]
+    ) -> None:
         super().__init__()
         self.subject, self.seed, self.folder, self.curve = training, seed, folder, curve
+        self.practice = practice
         self._start = time.monotonic() - (curve[-1]["wall_s"] if curve else 0.0)
-        self._due = training.examine_every * (1 + len(curve[1:]))
+        self._due = self._due_after(curve[-1]["steps"] if curve else 0)
+
+    def _due_after(self, steps: int) -> int:
+        """Decisions at which the next examination is due; a function of those made, so that a stop changes nothing."""
+        return self.subject.examine_every * (1 + steps // self.subject.examine_every)
 
     def _on_training_start(self) -> None:
         if not self.curve:
-            self.examine(self.model, 0)
+            self._examine_and_log()
 
     def _on_rollout_start(self) -> None:
         # Between rollouts, so that a checkpoint loses nothing that was gathered.
         if self.num_timesteps >= self._due:
-            self._due += self.subject.examine_every
-            self.examine(self.model, self.num_timesteps)
+            self._due = self._due_after(self.num_timesteps)
+            self._examine_and_log()
 
     def _on_step(self) -> bool:
         return True
 
-    def examine(self, model: Any, steps: int) -> None:
-        """Examine; write the curve, a checkpoint, and the model if it is the best yet."""
-        subject = self.subject
-        scores = subject.examine(model, self.training_env)
-        row = {"steps": steps, **scores, "wall_s": time.monotonic() - self._start}
-        for name, value in scores.items():
+    def _examine_and_log(self) -> None:
+        for name, value in self.examine(self.model, self.num_timesteps).items():
             self.logger.record(f"examination/{name}", value)
+
+    def examine(self, model: Any, steps: int) -> Row:
+        """Examine; write the curve, a checkpoint, and the model if it is the best yet; returns the scores."""
+        subject = self.subject
+        scores = subject.examine(model, self.practice)
+        row = {"steps": steps, **scores, "wall_s": time.monotonic() - self._start}
         best = max((subject.merit(r) for r in self.curve), default=(-np.inf,))
         self.curve.append(row)
         card = subject.card(self.seed, steps)
@@ -227,6 +236,7 @@ class _Examiner(BaseCallback):  # type: ignore[misc]
         if subject.merit(row) >= best:
             save_model(model, card, self.folder / MODEL)
         write_curve(self.folder / CURVE, self.curve)
+        return scores
 
 
 def save_model(model: Any, card: ModelCard, path: Path) -> None:
@@ -248,11 +258,18 @@ def write_curve(path: Path, curve: Sequence[Mapping[str, Any]]) -> None:
 
 
 def read_curve(path: Path) -> list[Row]:
-    """Examinations from CSV; none where there is no file."""
+    """Examinations from CSV; none where there is no file.
+
+    Raises:
+        InputError: something else than numbers.
+    """
     if not path.exists():
         return []
     with path.open(encoding="utf-8", newline="") as file:
-        return [
-            {name: int(value) if name == "steps" else float(value) for name, value in row.items()}
-            for row in csv.DictReader(file)
-        ]
+        try:
+            return [
+                {name: int(value) if name == "steps" else float(value) for name, value in row.items()}
+                for row in csv.DictReader(file)
+            ]
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{path}: want numbers in every column of every line ({error})") from error

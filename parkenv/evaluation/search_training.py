@@ -14,8 +14,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 from parkenv import __version__
 from parkenv.envs.search_sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
-from parkenv.errors import InputError
-from parkenv.evaluation.cloning import Demonstrations, clone
+from parkenv.evaluation.cloning import Demonstrations, clone, require_imitable
 from parkenv.evaluation.recipes import MAX_STEPS, RECIPES, REWARD_SCALE, Recipe, recipe_of
 from parkenv.evaluation.rl_training import Row, Training
 from parkenv.evaluation.statistics import mean_interval
@@ -47,8 +46,8 @@ class SearchTraining(Training):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.demonstrations is not None and self.algorithm not in ("ppo", "maskable-ppo"):
-            raise InputError(f"{self.algorithm} cannot begin by imitation; take ppo or maskable-ppo")
+        if self.demonstrations is not None:
+            require_imitable(self.algorithm, self.demonstrations.agent, self.scenarios[0])
 
     @property
     def recipe(self) -> Recipe:

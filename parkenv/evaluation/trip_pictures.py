@@ -25,7 +25,7 @@ from parkenv.envs.rendering import (
     _lay_out,
     clock,
 )
-from parkenv.envs.search import SearchState
+from parkenv.envs.search_state import SearchState
 from parkenv.evaluation.driven_search import DrivenSearch, Trip
 from parkenv.evaluation.lot_driver import LotDriver
 from parkenv.scenario import Scenario

@@ -195,7 +195,16 @@ def core_count() -> int:
 
 
 def _numbered(number: int, task: Task[Result]) -> tuple[int, Result]:
-    return number, task()
+    try:
+        return number, task()
+    except SystemError as error:
+        # An interruption that comes while numba unpacks compiled code reaches us in a wrapping.
+        inner: BaseException | None = error
+        while inner is not None:
+            if isinstance(inner, KeyboardInterrupt):
+                raise inner from None
+            inner = inner.__cause__
+        raise
 
 
 def _require_listener(address: str) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from parkenv.evaluation.learning_curves import columns_of
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.results import Row
 
@@ -19,6 +20,7 @@ def learning_of(run: RunFolder) -> list[dict[str, Any]]:
     if run.kind != "train" or not curve or not isinstance(lines, Mapping):
         return []
     seeds = [run.table(f"seed_{row['seed']}/curve.csv") for row in run.summary["rows"]]
+    beside = run.summary.get("beside", {})
     if isinstance(curve, Mapping):
         return [
             _panel(
@@ -26,12 +28,13 @@ def learning_of(run: RunFolder) -> list[dict[str, Any]]:
                 f"{kind}_success",
                 its,
                 seeds,
+                {name: other[kind] for name, other in beside.items()},
                 {"planner": lines[kind]} if kind in lines else {},
                 share=True,
             )
             for kind, its in curve.items()
         ]
-    return [_panel("total time, s", "total_s", curve, seeds, lines, share=False)]
+    return [_panel("total time, s", "total_s", curve, seeds, beside, lines, share=False)]
 
 
 def _panel(
@@ -39,16 +42,21 @@ def _panel(
     column: str,
     curve: Sequence[Row],
     seeds: Sequence[Sequence[Row]],
+    beside: Mapping[str, Sequence[Row]],
     lines: Mapping[str, float],
     *,
     share: bool,
 ) -> dict[str, Any]:
-    """Points of the mean are decisions, mean, and the ends of its 95 % interval, which one seed has none of."""
-    names = (column, "low", "high") if share else (column, "low_s", "high_s")
+    """Points of the mean are decisions, mean, and the ends of its 95 % interval, which one seed has none of.
+
+    Of other trainings it is the median, as in the figure: there one search driven in circles would hide the rest.
+    """
+    low, high, median = columns_of(column)
     return {
         "title": title,
         "share": share,
-        "mean": [[row["steps"], *(row.get(name) for name in names)] for row in curve],
+        "mean": [[row["steps"], *(row.get(name) for name in (column, low, high))] for row in curve],
         "seeds": [[[row["steps"], row[column]] for row in its if column in row] for its in seeds],
+        "beside": [[name, [[row["steps"], row[median]] for row in its]] for name, its in beside.items()],
         "lines": [[name, value] for name, value in lines.items()],
     }

@@ -3,6 +3,9 @@
 /** What lies above this many times the least time is off the chart: an untrained policy drives in circles. */
 const OFF_CHART = 2;
 
+/** Of other trainings. */
+const BESIDE = ["#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#888888"];
+
 /** Positions at least so far apart, in order, as near to where they were as that allows. */
 function spread(positions, apart) {
   const placed = [...positions];
@@ -18,10 +21,12 @@ function spread(positions, apart) {
   return placed;
 }
 
-function learningPanel({ title, share, mean, seeds, lines }, width) {
+function learningPanel({ title, share, mean, seeds, beside, lines }, width) {
   const [height, left, right, top, bottom] = [340, 46, 150, 10, 34];
-  const steps = Math.max(...mean.map((point) => point[0]), 1);
-  const all = [...mean.map((point) => point[1]), ...seeds.flat().map((point) => point[1]), ...lines.map((line) => line[1])].filter((value) => value !== null);
+  const others = beside.map(([name, points], i) => ({ name, points, color: BESIDE[i % BESIDE.length] }));
+  const curves = [...seeds, ...others.map(({ points }) => points)].flat();
+  const steps = Math.max(...mean.map((point) => point[0]), ...curves.map((point) => point[0]), 1);
+  const all = [...mean.map((point) => point[1]), ...curves.map((point) => point[1]), ...lines.map((line) => line[1])].filter((value) => value !== null);
   let [low, high] = [share ? 0 : Math.min(...all), share ? 1 : Math.max(...all)];
   if (!share) high = Math.min(high, OFF_CHART * low);
   const margin = share ? 0.02 : 0.06 * (high - low);
@@ -51,16 +56,17 @@ function learningPanel({ title, share, mean, seeds, lines }, width) {
   const sure = mean.filter((point) => point[2] !== null && point[3] !== null && point[2] !== undefined);
   if (sure.length > 1) drawn.append(makeSvg("path", { d: `${path(sure.map((p) => [p[0], p[3]]))}${path([...sure].reverse().map((p) => [p[0], p[2]])).replace("M", "L")}Z`, style: "fill: var(--drive); opacity: 0.18" }));
   for (const its of seeds) drawn.append(makeSvg("path", { d: path(its), style: "fill: none; stroke: var(--drive); stroke-width: 1; opacity: 0.4" }));
+  for (const { points, color } of others) drawn.append(makeSvg("path", { d: path(points), style: `fill: none; stroke: ${color}; stroke-width: 2` }));
   drawn.append(makeSvg("path", { d: path(mean.map((p) => [p[0], p[1]])), style: "fill: none; stroke: var(--drive); stroke-width: 2.6; stroke-linejoin: round" }));
   svg.append(drawn);
   const last = mean[mean.length - 1][1];
-  const labels = [...lines.map(([name, value]) => ({ name, value })), { name: "trained", value: last, strong: true }].filter(({ value }) => value <= high && value >= low);
+  const labels = [...lines.map(([name, value]) => ({ name, value })), ...others.map(({ points, color }) => ({ name: "", value: points[points.length - 1][1], color })), { name: others.length ? "" : "trained", value: last, strong: true }].filter(({ value }) => value <= high && value >= low);
   labels.sort((a, b) => b.value - a.value);
   const heights = spread(labels.map(({ value }) => y(value)), 17);
-  labels.forEach(({ name, value, strong }, i) => {
-    if (!strong) svg.append(makeSvg("line", { class: "bound", x1: left, x2: width - right, y1: y(value), y2: y(value) }));
+  labels.forEach(({ name, value, strong, color }, i) => {
+    if (!strong && !color) svg.append(makeSvg("line", { class: "bound", x1: left, x2: width - right, y1: y(value), y2: y(value) }));
     svg.append(makeSvg("path", { d: `M${width - right + 2} ${y(value)}L${width - right + 12} ${heights[i]}`, style: "fill: none; stroke: var(--faint); stroke-width: 0.8" }));
-    text(`${name}  ${share ? `${written(100 * value, 0)} %` : written(value, 1)}`, { x: width - right + 16, y: heights[i] + 4, class: strong ? "lead" : "strong" });
+    text(`${name ? `${name}  ` : ""}${share ? `${written(100 * value, 0)} %` : written(value, 1)}`, { x: width - right + 16, y: heights[i] + 4, class: strong ? "lead" : "strong", style: color ? `fill: ${color}` : "" });
   });
   return svg;
 }
@@ -70,8 +76,11 @@ function showLearning(root, panels) {
   const grid = make("div", { class: panels.length > 1 ? "grid" : "single" });
   const width = Math.min(Math.max(root.clientWidth / Math.min(panels.length, 2) - 40, 420), 1200);
   for (const panel of panels) grid.append(make("div", {}, make("h3", {}, panel.title), learningPanel(panel, width)));
+  const beside = panels[0].beside.map(([name]) => name);
+  const key = (color, name) => make("span", { class: "key" }, make("span", { class: "swatch", style: `background: ${color}` }), name);
+  const keys = beside.length ? [key("var(--drive)", "this training"), ...beside.map((name, i) => key(BESIDE[i % BESIDE.length], name))] : [];
   root.append(
-    make("p", { class: "quiet" }, `Examinations in the course of training, in worlds that are not trained on: the mean over ${n} training${n > 1 ? "s with its 95 % interval, each training thin" : ""}. Dashed: others in the same worlds.`),
-    make("div", { class: "card chart" }, grid),
+    make("p", { class: "quiet" }, `Examinations in the course of training, in worlds that are not trained on: the mean over ${n} training${n > 1 ? "s with its 95 % interval, each training thin" : ""}${beside.length ? "; the medians of other trainings in their colours" : ""}. Dashed: others in the same worlds.`),
+    make("div", { class: "card chart" }, grid, make("div", { class: "legend" }, ...keys)),
   );
 }

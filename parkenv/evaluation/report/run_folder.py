@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from parkenv import __version__
 from parkenv.errors import InputError
-from parkenv.evaluation.results import SETTING_COLUMNS, SUMMARY, SUMMARY_PARTIAL, Row
+from parkenv.evaluation.results import SETTING_COLUMNS, SETTINGS, SUMMARY, SUMMARY_PARTIAL, Row
 
 _TEXT = ("scenario", "agent")
 
@@ -41,7 +41,7 @@ class RunFolder:
             raise InputError(f"{path}: no such folder; want one that a command with --out wrote")
         file = path / SUMMARY
         if not file.exists():
-            if (path / SUMMARY_PARTIAL).exists() or (path / "settings.json").exists():
+            if (path / SUMMARY_PARTIAL).exists() or (path / SETTINGS).exists():
                 raise InputError(
                     f"{path}: holds a run that was interrupted; finish it (--resume), then report it"
                 )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.envs.search import SearchState
+from parkenv.envs.search_state import SearchState
 from parkenv.evaluation.compare import Case
 from parkenv.evaluation.episodes import EpisodeRunner
 from parkenv.evaluation.report.intentions import Intentions
