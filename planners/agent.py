@@ -163,6 +163,24 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
     return agent(scenario, **options)
 
 
+def agent_file(name: str) -> Path | None:
+    """The file that an agent comes from: a trained model, or the module of an agent of your own.
+
+    Args:
+        name: as `make_agent` takes it, which has made an agent of it before.
+
+    Returns:
+        None for the agents that come with the package.
+    """
+    before, colon, after = name.partition(":")
+    if not colon:
+        return None
+    if before in ALGORITHMS:
+        return Path(after)
+    file = sys.modules[before].__file__
+    return None if file is None else Path(file)
+
+
 def _class_of(module: str, class_name: str) -> Callable[..., Agent]:
     """An agent's class from a user's module."""
     name = f"{module}:{class_name}"

@@ -85,8 +85,8 @@ class ParkingMDP:
         if not (np.isfinite(walk_s).all() and (move_s[neighbors >= 0] >= 0.0).all()):
             raise InputError("walk_s must be finite and move_s not negative")
         for name, least in (("failure_s", 0.0), ("wait_s", 0.0)):
-            if not getattr(self, name) >= least:
-                raise InputError(f"{name} is {getattr(self, name)}, want at least {least:g}")
+            if not least <= getattr(self, name) < np.inf:
+                raise InputError(f"{name} is {getattr(self, name)}, want a finite number, at least {least:g}")
         if not 0.0 < self.gamma <= 1.0:
             raise InputError(f"gamma is {self.gamma}, want a number in (0, 1]")
         object.__setattr__(self, "park_reward", walk_s.max() - walk_s)

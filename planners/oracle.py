@@ -84,7 +84,7 @@ class Foresight:
     """What the oracle remembers.
 
     Attributes:
-        slot: the one that it goes for, or -1.
+        slot: the one that it goes for; -1 where it wants to prove the lot full, or none ever comes free.
         waits: how many waits to make before it drives there.
         unseen: (n_slots,) bool, what is left to see of a lot that it wants to prove full; None otherwise.
     """
@@ -119,13 +119,15 @@ class OracleAgent(SearchAgent[Foresight]):
         """Choose the slot, or to give up."""
         if self._future is None:
             raise RuntimeError("the oracle was not shown the future: call reveal(world, time) after reset()")
-        vertex = int(observation["vertex"])
-        wait_s = self.problem.wait_s
-        choice = best_slot(self.problem, self.routes, self._future, vertex, self._time, wait_s)
+        vertex, time = int(observation["vertex"]), self._time
+        choice = best_slot(self.problem, self.routes, self._future, vertex, time, self.problem.wait_s)
         give_up_s = self.problem.give_up_s
         if choice.total_s > give_up_s and self._tour_s(vertex, choice.total_s - give_up_s) < np.inf:
             return Foresight(-1, 0, np.ones(self.problem.lot.n_slots, dtype=np.bool_))
-        waits = round(choice.wait_s / wait_s)
+        return self._going_for(choice, vertex)
+
+    def _going_for(self, choice: Choice, vertex: int) -> Foresight:
+        waits = round(choice.wait_s / self.problem.wait_s)
         return Foresight(choice.slot, waits + self._hidden_waits(vertex, choice.slot, waits) if waits else 0)
 
     def decide(self, observation: Observation, memory: Foresight) -> int:
@@ -137,7 +139,14 @@ class OracleAgent(SearchAgent[Foresight]):
         if memory.unseen is not None:
             memory.unseen[self._in_view(vertex)] = False
             target, seconds = self._nearest_unseen(vertex, memory.unseen)
-            return self.routes.move_toward(vertex, target) if np.isfinite(seconds) else wait
+            if np.isfinite(seconds):
+                return self.routes.move_toward(vertex, target)
+            # All was seen, and yet the lot is not proven full: a slot that nobody can drive to is free.
+            now = self._time + float(observation["time"][1])
+            choice = best_slot(self.problem, self.routes, self._future, vertex, now, self.problem.wait_s)
+            vars(memory).update(vars(self._going_for(choice, vertex)))
+        if memory.slot < 0:
+            return wait
         if memory.waits > 0 and len(missing):
             memory.waits -= 1
             return wait

@@ -1,16 +1,21 @@
-"""Random small lots on which the optimum is known exactly."""
+"""Small lots: random ones on which the optimum is known exactly, and one in two parts."""
 
 from dataclasses import fields
 
 import numpy as np
 
-from parkenv import ParkingLot, SightingModel
+from parkenv import Lane, ParkingLot, SightingModel
 from parkenv.scenario import SearchProblem
 
 SHAPES = ((1, 12), (2, 6), (4, 3), (2, 5), (3, 4), (1, 9))
 PITCHES = (2.5, 6.0, 15.0)
 VIEWS = (0.0, 6.0)
 MEAN_FREE = (0.1, 0.3, 0.6)
+
+
+def features(lot):
+    """What a lot is made of, by name."""
+    return {f.name: getattr(lot, f.name) for f in fields(lot) if f.init}
 
 
 def small_lot(seed: int, shapes=SHAPES):
@@ -22,9 +27,8 @@ def small_lot(seed: int, shapes=SHAPES):
     plain = ParkingLot.grid(*shapes[seed % len(shapes)], pitch=PITCHES[seed // 6 % 3])
     west, south, east, north = plain.bounds()
     goal = [[rng.uniform(west - 10.0, east + 10.0), rng.uniform(south - 10.0, north + 10.0)]]
-    features = {f.name: getattr(plain, f.name) for f in fields(plain) if f.init}
     problem = SearchProblem(
-        lot=ParkingLot(**{**features, "goals": np.array(goal)}),
+        lot=ParkingLot(**{**features(plain), "goals": np.array(goal)}),
         v_drive=rng.uniform(1.5, 4.0),
         v_walk=rng.uniform(0.8, 1.6),
         give_up_s=300.0,
@@ -39,3 +43,21 @@ def small_lot(seed: int, shapes=SHAPES):
     else:
         free = rng.beta(4.0 * mean, 4.0 * (1.0 - mean), n)
     return problem, 1.0 - np.clip(free, 0.01, 0.99), int(problem.lot.entry_vertices[0])
+
+
+def cut_in_two():
+    """Two lots side by side; the entry leads into the western one alone."""
+    west = ParkingLot.grid(2, 5)
+    f = features(west)
+    shift = np.array([200.0, 0.0])
+    n = west.n_slots
+    return ParkingLot(
+        **{
+            **f,
+            "slot_ids": tuple(map(str, range(2 * n))),
+            "slot_xy": np.concatenate([west.slot_xy, west.slot_xy + shift]),
+            **{k: np.tile(f[k], 2) for k in ("slot_yaw", "slot_length", "slot_width", "slot_mouth")},
+            "lanes": (*west.lanes, *(Lane(lane.points + shift, lane.oneway) for lane in west.lanes)),
+            "goals": west.goals + shift,
+        }
+    )

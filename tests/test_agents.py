@@ -5,6 +5,7 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
+from small_lots import cut_in_two
 
 from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightingModel
 from parkenv.evaluation.compare import Case, settings_of
@@ -257,6 +258,23 @@ def test_the_oracle_must_be_shown_the_future():
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     with pytest.raises(RuntimeError, match="reveal"):
         make_agent("oracle", scenario).predict(env.reset(seed=0)[0])
+
+
+def test_the_oracle_turns_to_a_slot_where_the_lot_cannot_be_proven_full():
+    """Every slot is in view from everywhere, and one that nobody can drive to is free."""
+    lot = cut_in_two()
+    half = lot.n_slots // 2
+    demand = np.where(np.arange(lot.n_slots) < half, 3.0, -25.0)
+    scenario = Scenario(
+        name="cut",
+        lot=lot,
+        occupancy=OccupancyProcess.from_demand(demand, np.zeros(168), 600.0),
+        sighting=SightingModel(view_range=1000.0),
+        give_up_s=60.0,
+    )
+    rows = episodes(scenario, "oracle", range(12))
+    assert any(row["bound_s"] == scenario.give_up_s for row in rows), "giving up would have been quicker"
+    assert all(row["parked"] and int(row["slot"]) < half for row in rows)
 
 
 def test_agents_meet_the_same_worlds():

@@ -3,9 +3,9 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from small_lots import small_lot
+from small_lots import cut_in_two, features, small_lot
 
-from parkenv import InputError, Lane, OccupancyProcess, ParkingLot, Scenario, SightingModel
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightingModel
 from parkenv.evaluation.compare import Case, at_occupancy
 from parkenv.evaluation.episodes import EpisodeRunner
 from parkenv.evaluation.statistics import mean_interval
@@ -200,30 +200,6 @@ def test_one_slot(taken):
     row = search(world(lot, np.array([taken]), give_up_s=50.0))
     assert row["parked"] != taken
     assert row["gave_up_s"] == (50.0 if taken else 0.0)
-
-
-def features(lot):
-    from dataclasses import fields
-
-    return {f.name: getattr(lot, f.name) for f in fields(lot) if f.init}
-
-
-def cut_in_two():
-    """Two lots side by side; the entry leads into the western one alone."""
-    west = ParkingLot.grid(2, 5)
-    f = features(west)
-    shift = np.array([200.0, 0.0])
-    n = west.n_slots
-    return ParkingLot(
-        **{
-            **f,
-            "slot_ids": tuple(map(str, range(2 * n))),
-            "slot_xy": np.concatenate([west.slot_xy, west.slot_xy + shift]),
-            **{k: np.tile(f[k], 2) for k in ("slot_yaw", "slot_length", "slot_width", "slot_mouth")},
-            "lanes": (*west.lanes, *(Lane(lane.points + shift, lane.oneway) for lane in west.lanes)),
-            "goals": west.goals + shift,
-        }
-    )
 
 
 def test_a_lot_cut_in_two_is_searched_where_a_way_leads():

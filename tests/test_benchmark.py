@@ -98,6 +98,7 @@ def test_the_command_tells_of_suites_and_refuses_what_is_none(tmp_path):
     assert "campus-full" in shown.stdout
     unknown = parkenv("run", "v7", "--out", tmp_path / "out")
     assert (unknown.returncode, "known: v1" in unknown.stderr) == (2, True)
-    (tmp_path / "torn.json").write_text('{"format": "park')
-    torn = parkenv("check", tmp_path / "torn.json")
-    assert (torn.returncode, "no benchmark result" in torn.stderr) == (2, True)
+    for content in ('{"format": "park', "[" * 100_000):
+        (tmp_path / "torn.json").write_text(content)
+        torn = parkenv("check", tmp_path / "torn.json")
+        assert (torn.returncode, "no benchmark result" in torn.stderr) == (2, True)

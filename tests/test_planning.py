@@ -149,6 +149,7 @@ def test_a_failure_cost_at_which_trying_in_vain_looks_best_is_warned_of():
         ({"gamma": 0.0}, "gamma"),
         ({"gamma": 1.1}, "gamma"),
         ({"failure_s": -1.0}, "failure_s"),
+        ({"failure_s": np.inf}, "failure_s"),
         ({"neighbors": [[-1, -1, -1, 7], [-1] * 4]}, "neighbors"),
         ({"walk_s": [np.nan, 1.0]}, "walk_s"),
     ],

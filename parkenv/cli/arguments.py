@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -313,3 +314,11 @@ def scenarios_of(
 def fingerprint(path: Path | None) -> str | None:
     """A short hash of a file's content, so that a resumed run notices a changed file."""
     return None if path is None else hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+
+
+def agent_fingerprints(names: Iterable[str]) -> dict[str, str]:
+    """Fingerprints, by name, of those agents that are read from files: trained models and agents of one's own."""
+    from planners.agent import agent_file
+
+    prints = {name: fingerprint(agent_file(name)) for name in names}
+    return {name: its for name, its in prints.items() if its is not None}

@@ -57,7 +57,12 @@ def run(
     its = Suite.named(suite)
     cases = its.cases(args.words("--agents", agents))
     out = out or Path("results") / suite
-    settings = {"version": __version__, "suite": its.name, "suite_sha256": its.fingerprint}
+    settings = {
+        "version": __version__,
+        "suite": its.name,
+        "suite_sha256": its.fingerprint,
+        "agent files": args.agent_fingerprints(case.agent for case, _ in cases),
+    }
     console = make_console()
     with args.workers_of(jobs, backend, address) as workers:
         folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)

@@ -200,6 +200,7 @@ def compare(
         "map_says": map_says,
         "options": asked.options,
         "calibrated": args.fingerprint(calibrated),
+        "agent files": args.agent_fingerprints(case.agent for case, _ in cases),
     }
     out = out or Path("results/compare")
     for s in scenarios:

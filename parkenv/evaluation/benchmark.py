@@ -169,7 +169,7 @@ def check_result(path: Path) -> Row:
     try:
         result: Row = json.loads(path.read_text(encoding="utf-8"))
         jsonschema.validate(result, json.loads(_file("result.schema.json")))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise InputError(f"{path}: no benchmark result ({error})") from error
     except jsonschema.ValidationError as error:
         raise InputError(f"{path}: {error.json_path} {error.message[:200]}") from error

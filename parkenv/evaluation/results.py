@@ -90,13 +90,18 @@ def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
     _write_text(folder / SETTINGS, json.dumps(dict(settings), indent=2) + "\n")
 
 
-def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) -> None:
+def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) -> Row:
     """Refuse to go on with a run that was asked for something else.
+
+    Settings that are mappings, such as the files of its agents, need to agree in the names that both have.
 
     Args:
         folder: of the run.
         settings: what is asked for now.
         kind: of run.
+
+    Returns:
+        What the run was asked for, then and now.
 
     Raises:
         InputError: there is no run, or one with other settings.
@@ -105,12 +110,24 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) 
     if before is None:
         raise InputError(f"--resume: {folder} holds no {kind} to go on with")
     now = json.loads(json.dumps(dict(settings)))
+    both = {}
     for name in sorted(before.keys() | now.keys()):
-        if before.get(name) != now.get(name):
-            raise InputError(
-                f"--resume: {name} was {before.get(name)!r} in {folder}, now it is {now.get(name)!r}; "
-                "use the same settings, or another folder"
-            )
+        was, its = before.get(name), now.get(name)
+        both[name] = {**was, **its} if isinstance(was, dict) and isinstance(its, dict) else its
+        for part, old, new in _parts(name, was, its):
+            if old != new:
+                raise InputError(
+                    f"--resume: {part} was {old!r} in {folder}, now it is {new!r}; "
+                    "use the same settings, or another folder"
+                )
+    return both
+
+
+def _parts(name: str, was: Any, its: Any) -> list[tuple[str, Any, Any]]:
+    """A setting then and now; one that is a mapping by each name that both have."""
+    if isinstance(was, dict) and isinstance(its, dict):
+        return [(f"{name}: {key}", was[key], its[key]) for key in sorted(was.keys() & its.keys())]
+    return [(name, was, its)]
 
 
 def make_folder(path: Path) -> None:
@@ -158,7 +175,7 @@ class ResultFolder:
         self.episodes: dict[Key, Row] = {}
         self._timings: dict[Key, Row] = {}
         if resume:
-            require_same_settings(path, settings, "comparison")
+            settings = require_same_settings(path, settings, "comparison")
             self.episodes = {episode_key(r): r for r in _read(path / "episodes.csv", EPISODE_COLUMNS)}
             self._timings = {episode_key(r): r for r in _read(path / "timings.csv", TIMING_COLUMNS)}
         elif (path / "episodes.csv").exists() and not overwrite:
