@@ -107,12 +107,14 @@ class BeliefAgent(SearchAgent[Search]):
     for then it is as near to the best path as this one is. Doubting the map costs a little on such days; where an
     event has filled a lot against the map, those who take the first free slot that they see still do better. What is
     valued is one path at a time, so it is not foreseen that the car leaves the path for another one after a sighting.
+    Estimates differ by where the car is, so that it could turn round between two paths for ever: until it sees
+    something, it keeps to its path unless another is better than what that one had promised.
 
     What it may know: rates are not observed, so the rate at which cars leave is read off the way in which a slot's
     belief decays once it is out of view; until then stays of two hours are assumed, and no look
     is left out in the hope that a car leaves. Where sight is imperfect, a slot that was in view and not made out is
     looked for only from where it is likelier than not to be seen then; one that does not show from its own vertex
-    either is tried, and a path is kept to until something is seen.
+    either is tried.
 
     Args:
         problem: lot, goal, speeds and costs.
@@ -208,8 +210,7 @@ class BeliefAgent(SearchAgent[Search]):
             memory.path,
         )
         memory.n_targets, memory.cost = choice.n_targets, choice.cost
-        # Where sight is perfect something is seen soon, and the later estimate is the better one.
-        memory.promise_s = math.inf if self.problem.sighting.perfect else choice.then_s
+        memory.promise_s = choice.then_s
         memory.expected_s = min(choice.onward_s, choice.at_hand_s)
         memory.replans += before != (memory.targets[: memory.n_targets].tolist(), memory.cost)
         worth_passing_s = 0.0 if self.trusting else WORTH_PASSING_S

@@ -33,7 +33,8 @@ class Choice(NamedTuple):
 
     Attributes:
         onward_s: expected s of the path.
-        then_s: expected s that are left after its first step, if that is a drive on which nothing is looked at; or inf.
+        then_s: expected s that are left after its first step for who goes on, if that step is a drive to where nothing
+            is looked at; or inf.
         at_hand_s: expected s of going to the best slot known now.
         slot: that slot, or -1.
         following: the vertex that comes next on the path, `TRY` or `NOWHERE`.
@@ -105,7 +106,7 @@ def best_path(
     late = np.zeros(n)
     for i in range(len(budget.costs)):
         n_path, left = lay(vertex, trial, 0, budget.costs[i], ground, outlook, path)
-        value = worth(n_path, left, options, 0, late, ground, outlook, path)
+        value, _ = worth(n_path, left, options, 0, late, ground, outlook, path)
         if value < late_s:
             late_s, base = value, budget.costs[i]
     late_s = min(late_s, ground.give_up_s)
@@ -153,12 +154,12 @@ def best_path(
         if i >= 0:
             cost = budget.costs[i]
         n_path, left = lay(vertex, targets, tried, cost, ground, outlook, path)
-        value = worth(n_path, left, options, n_options, late, ground, outlook, path)
-        if i < 0:
-            value = min(value, promise_s)
+        value, onward_s = worth(n_path, left, options, n_options, late, ground, outlook, path)
+        if i < 0 and promise_s < value:
+            value, onward_s = promise_s, promise_s - path.times[1]
         if value < best - 1e-9:
             best, base, n_kept = value, cost, tried
-            following, then_s = _first_step(value, path)
+            following, then_s = _first_step(onward_s, path)
             for j in range(tried):
                 kept[j] = targets[j]
     if best == np.inf:
@@ -191,12 +192,12 @@ def best_path(
                 for j in range(place, n_before):
                     trial[j + 1] = targets[j]
                 n_path, left = lay(vertex, trial, n_before + 1, base, ground, outlook, path)
-                value = worth(n_path, left, options, n_options, late, ground, outlook, path)
+                value, onward_s = worth(n_path, left, options, n_options, late, ground, outlook, path)
                 looks = path.starts[n_path]
                 work += 30 * (n_path + looks) + n
                 if value < best - 1e-6:
                     best, n_kept, improved = value, n_before + 1, True
-                    following, then_s = _first_step(value, path)
+                    following, then_s = _first_step(onward_s, path)
                     for j in range(n_kept):
                         kept[j] = trial[j]
         if not improved:
@@ -207,14 +208,14 @@ def best_path(
 
 
 @njit(cache=True)
-def _first_step(value: float, path: Path) -> tuple[int, float]:
-    """`following` and `then_s` of a laid path of some value."""
+def _first_step(onward_s: float, path: Path) -> tuple[int, float]:
+    """`following` and `then_s` of a laid path; `onward_s` as it would be if nothing were looked at."""
     if path.times[1] == 0.0 and path.starts[2] > 0:
         return TRY, np.inf  # nothing but a try takes no time
     following = int(path.vertices[1])
     if path.starts[2] > 0 or following == path.vertices[0]:
         return following, np.inf
-    return following, value - path.times[1]
+    return following, onward_s
 
 
 @njit(cache=True)

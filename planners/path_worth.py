@@ -60,7 +60,7 @@ def worth(
     ground: Ground,
     outlook: Outlook,
     path: Path,
-) -> float:
+) -> tuple[float, float]:
     """Least expected time, s, of going on along a laid path and stopping at will.
 
     What a look tells of the map depends on what it leads to. Where the car would park in a slot if it is free, going
@@ -79,17 +79,18 @@ def worth(
         path: the path.
 
     Returns:
-        The value of driving on to its second vertex; inf where it has none.
+        The value of driving on to its second vertex, and that of not stopping there either, counted from there; inf
+        where it has none.
     """
     if n_path < 2:
-        return np.inf
+        return np.inf, np.inf
     path.taken_up[: path.starts[n_path]] = False
     _foresee(n_path, outlook, path)
-    value: float = _stop_at_best(n_path, left_s, options, n_options, late_s, ground, outlook, path)
+    value, then_s = _stop_at_best(n_path, left_s, options, n_options, late_s, ground, outlook, path)
     if len(outlook.weights) > 1:
         _foresee(n_path, outlook, path)
-        value = _stop_at_best(n_path, left_s, options, n_options, late_s, ground, outlook, path)
-    return value
+        value, then_s = _stop_at_best(n_path, left_s, options, n_options, late_s, ground, outlook, path)
+    return value, then_s
 
 
 @njit(cache=True)
@@ -112,7 +113,7 @@ def _stop_at_best(
     ground: Ground,
     outlook: Outlook,
     path: Path,
-) -> float:
+) -> tuple[float, float]:
     """`worth` of a path on which the chances of all looks are known."""
     values, offers, slots, times, until = path.values, path.offers, path.slots, path.times, path.until
     # What any look still to come can offer, at each vertex, is bounded from below. A slot that is better than that
@@ -127,7 +128,7 @@ def _stop_at_best(
         for j in range(path.starts[k], path.starts[k + 1]):
             at_once = offer(path.vertices[k], slots[j], 1.0, 0.0, late_s[slots[j]], ground, outlook)
             until[j] = k if at_once <= path.ahead[k] else min(k + KEPT_IN_MIND, n_path - 1)
-    nothing, onward = left_s, 0.0
+    nothing, onward, then_s = left_s, 0.0, left_s
     for k in range(n_path - 1, 0, -1):
         # `values` and `nothing` hold what follows at the next vertex, and `onward` is the drive there.
         vertex, first, last = path.vertices[k], path.starts[k], path.starts[k + 1]
@@ -145,7 +146,8 @@ def _stop_at_best(
             # The vertex where the slot is seen comes last, and has the last word.
             path.taken_up[j] = offers[j] <= max(path.ahead[k], later)
             values[j] = offers[j] if path.taken_up[j] else later
-        nothing = min(stop, onward + nothing)
+        then_s = onward + nothing
+        nothing = min(stop, then_s)
         # Now back to before the looks at this vertex: the best slot that they show replaces a worse one.
         _best_first(first, last, path)
         for j in range(oldest, first):
@@ -164,7 +166,7 @@ def _stop_at_best(
             rest *= 1.0 - path.chances[i]
         nothing = expected + rest * nothing
         onward = times[k] - times[k - 1]
-    return onward + nothing
+    return onward + nothing, then_s
 
 
 @njit(cache=True)

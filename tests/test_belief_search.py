@@ -70,25 +70,28 @@ def test_equal_seeds_give_equal_searches():
     assert runner.run(3).row == runner.run(3).row == search(scenario, 3)
 
 
-def work_of_decisions(scenario, monkeypatch, **options):
-    """Steps that each search for a path took in one search."""
-    work = []
+def choices(scenario, monkeypatch, seed=1, **options):
+    """What each search for a path was promised and came to, in one search for a slot."""
+    made = []
 
-    def counted(*arguments):
+    def noted(*arguments):
         choice = best_path(*arguments)
-        work.append(choice.work)
+        made.append((arguments[4], choice))
         return choice
 
-    monkeypatch.setattr("planners.belief_search.best_path", counted)
-    search(scenario, 1, **options)
-    return np.array(work)
+    monkeypatch.setattr("planners.belief_search.best_path", noted)
+    search(scenario, seed, **options)
+    return made
 
 
 def test_decisions_keep_to_their_budget(monkeypatch):
     scenario = at_occupancy(Scenario.named("campus"), 0.95)
     n = scenario.lot.n_slots
     one_candidate = 30 * (MOST_STEPS + n + MOST_STEPS) + n
-    quick, usual, slow = (work_of_decisions(scenario, monkeypatch, budget_ms=ms) for ms in (0.2, 5.0, 50.0))
+    quick, usual, slow = (
+        np.array([choice.work for _, choice in choices(scenario, monkeypatch, budget_ms=ms)])
+        for ms in (0.2, 5.0, 50.0)
+    )
     for work, ms in (quick, 0.2), (usual, 5.0), (slow, 50.0):
         assert work.max() <= ms * WORK_PER_MS + one_candidate
     assert quick.max() < usual.max() < slow.max()
@@ -298,11 +301,15 @@ def test_hidden_slots_are_tried_where_nothing_better_is_left(seen_rate):
     assert max(row["failed_parks"] for row in ours) >= 2, "they are tried"
 
 
-def test_a_path_is_kept_to_while_nothing_is_seen():
+def test_a_path_is_kept_to_until_something_is_seen_unless_another_is_better_than_it_was(monkeypatch):
     """Paths are valued by estimates, which differ by where the car is: it could turn round between two for ever."""
-    row = Case(hidden_lots("campus", 0.3), "belief").run([36])[0][0]
-    assert row["parked"]
-    assert row["steps"] < 100
+    scenario = at_occupancy(Scenario.named("campus"), 0.95)
+    made = choices(scenario, monkeypatch, seed=442, budget_ms=10.0)
+    kept = [(promise_s, choice.onward_s) for promise_s, choice in made if promise_s < np.inf]
+    assert len(kept) > 10
+    assert all(onward_s <= promise_s for promise_s, onward_s in kept)
+    last = [choice.then_s for _, choice in made]
+    assert all(promise_s in (then_s, np.inf) for (promise_s, _), then_s in zip(made[1:], last, strict=False))
 
 
 def test_views_show_what_worse_ones_missed():

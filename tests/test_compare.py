@@ -31,7 +31,7 @@ def parkenv(*arguments, **options):
 def small(out, *more, agents="mdp,greedy-goal,oracle", episodes=12):
     return (
         "compare", "--scenario", "mini", "--agents", agents, "-n", episodes, "--occupancy-levels", "none",
-        "--no-figures", "--out", out, *more,
+        "--no-figures", "--jobs", 1, "--out", out, *more,
     )  # fmt: skip
 
 
@@ -84,9 +84,8 @@ def test_the_summary_is_what_the_episodes_say_and_jobs_do_not_matter(tmp_path):
 
 def test_a_killed_run_leaves_what_was_done_and_resumes(tmp_path):
     out, whole = tmp_path / "killed", tmp_path / "whole"
-    arguments = small(out, "--jobs", "2", agents="greedy-goal,mdp", episodes=2000)
     process = subprocess.Popen(
-        [*PARKENV, *map(str, arguments)],
+        [*PARKENV, *map(str, small(out, "--jobs", "2", agents="greedy-goal,mdp", episodes=5000))],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
@@ -99,9 +98,10 @@ def test_a_killed_run_leaves_what_was_done_and_resumes(tmp_path):
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     survived = episodes_of(out)
-    assert 60 <= len(survived) < 4000
+    assert 60 <= len(survived) < 10_000
     assert not (out / "summary.json").exists()
 
+    arguments = small(out, agents="greedy-goal,mdp", episodes=150)
     refused = parkenv(*arguments)
     assert refused.returncode == 2
     assert "add --resume" in refused.stderr
@@ -111,8 +111,8 @@ def test_a_killed_run_leaves_what_was_done_and_resumes(tmp_path):
     with (out / "episodes.csv").open("a") as file:
         file.write("mini,,mdp,10.0,4.0")
     assert parkenv(*arguments, "--resume").returncode == 0
-    assert parkenv(*small(whole, agents="greedy-goal,mdp", episodes=2000)).returncode == 0
-    assert (out / "episodes.csv").read_bytes() == (whole / "episodes.csv").read_bytes()
+    assert parkenv(*small(whole, agents="greedy-goal,mdp", episodes=150)).returncode == 0
+    assert episodes_of(out)[:300] == episodes_of(whole)
     assert rows_without_times(out) == rows_without_times(whole)
 
     other = parkenv(*small(out, "--resume", "--days", "weekend"))

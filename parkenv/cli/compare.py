@@ -122,8 +122,9 @@ def compare(
         ),
     ] = "label_setting",
     budget_ms: Annotated[
-        float, typer.Option("--budget-ms", help="About how long belief may take for a decision, ms.")
-    ] = 10.0,
+        float | None,
+        typer.Option("--budget-ms", help="About how long belief may take for a decision, ms.  [default: 5]"),
+    ] = None,
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 0,
     backend: args.BackendOption = "loky",
@@ -307,7 +308,7 @@ def comparison_of(
     occupancy_levels: str,
     map_says: str | None,
     solver: str,
-    budget_ms: float,
+    budget_ms: float | None,
     seed: int,
 ) -> Comparison:
     """What the options of `parkenv compare` ask for.
@@ -330,7 +331,8 @@ def comparison_of(
     sight = sight or ("perfect" if rig is None else "stereo" if rig == "stereo" else "laser")
     scenarios = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range, sight)
     options: dict[str, dict[str, Any]] = {
-        "mdp": {"solver": solver}, "mdp-static": {"solver": solver}, "belief": {"budget_ms": budget_ms},
+        "mdp": {"solver": solver}, "mdp-static": {"solver": solver},
+        "belief": {} if budget_ms is None else {"budget_ms": budget_ms},
     }  # fmt: skip
     for s in scenarios:
         for name in names:
