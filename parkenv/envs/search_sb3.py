@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
 from parkenv.envs.search_vector import ParkSearchVectorEnv
+from parkenv.envs.shared_vec_env import SharedVecEnv
 from parkenv.errors import InputError
 from parkenv.scenario import Scenario
 
@@ -20,7 +21,7 @@ METRICS = (
 )  # fmt: skip
 
 
-class SearchVecEnv(VecEnv):  # type: ignore[misc]
+class SearchVecEnv(SharedVecEnv):
     """`ParkSearchVectorEnv` for stable-baselines3 and sb3-contrib.
 
     Where a search ends, its `info` has `terminal_observation`, `TimeLimit.truncated`, `episode` (return in seconds, and
@@ -66,7 +67,6 @@ class SearchVecEnv(VecEnv):  # type: ignore[misc]
         )
         super().__init__(num_envs, self.batch.single_observation_space, self.batch.single_action_space)
         self.reward_scale = reward_scale
-        self._actions: NDArray[np.int64] = np.zeros(num_envs, dtype=np.int64)
         self._masks: NDArray[np.int8] = np.zeros((num_envs, 0), dtype=np.int8)
         self._returns = np.zeros(num_envs)
         self._lengths = np.zeros(num_envs, dtype=np.int64)
@@ -83,15 +83,11 @@ class SearchVecEnv(VecEnv):  # type: ignore[misc]
         self._masks = observations["action_mask"]
         return observations
 
-    def step_async(self, actions: NDArray[Any]) -> None:
-        """Take note of what to do."""
-        self._actions = np.asarray(actions)
-
     def step_wait(
         self,
     ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Do it; see the class for what `info` holds."""
-        observations, rewards, terminated, truncated, told = self.batch.step(self._actions)
+        observations, rewards, terminated, truncated, told = self.batch.step(self.actions)
         self._masks = observations["action_mask"]
         self._returns += rewards
         self._lengths += 1
@@ -112,24 +108,12 @@ class SearchVecEnv(VecEnv):  # type: ignore[misc]
         """(n_envs, 5) bool, what can be done now."""
         return self._masks.astype(np.bool_)
 
-    def close(self) -> None:
-        """Nothing is held open."""
-
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the batch, the same for every search."""
-        if attr_name == "render_mode":
-            value = None
-        else:
-            value = getattr(self if hasattr(type(self), attr_name) else self.batch, attr_name)
+        """An attribute of the adapter, or else of the batch."""
+        if attr_name == "render_mode" or hasattr(self, attr_name):
+            return super().get_attr(attr_name, indices)
+        value = getattr(self.batch, attr_name)
         return [value for _ in self._get_indices(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """The searches of a batch have no attributes of their own.
-
-        Raises:
-            NotImplementedError: always.
-        """
-        raise NotImplementedError(f"searches of a compiled batch share everything; {attr_name} cannot be set")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
@@ -140,13 +124,6 @@ class SearchVecEnv(VecEnv):  # type: ignore[misc]
             NotImplementedError: another method.
         """
         if method_name != "action_masks" or method_args or method_kwargs:
-            raise NotImplementedError(f"searches of a compiled batch have no method {method_name}")
+            raise NotImplementedError(f"searches of a batch have no method {method_name} of their own")
         masks = self.action_masks()
         return [masks[i] for i in self._get_indices(indices)]
-
-    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Nothing is wrapped, though episodes are told of as `Monitor` does."""
-        from stable_baselines3.common.monitor import Monitor
-
-        indices_: Iterable[int] = self._get_indices(indices)
-        return [issubclass(wrapper_class, Monitor) for _ in indices_]

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
-from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices
 
 from parkenv.driving.parking_task import KINDS, ParkingTask, ParkingTasks
 from parkenv.driving.vehicle import SPEED, VehicleParameters
 from parkenv.envs.drive import CONTROL_S, STANDING, goal_errors
+from parkenv.envs.shared_vec_env import SharedVecEnv
 from parkenv.errors import InputError
 from parkenv.evaluation.drive_batch import CONTACT, PARKED, UNDER_WAY, DriveBatch, PreparedTask
 from parkenv.evaluation.recipes import WAY_IN, DriveRecipe
@@ -98,7 +98,7 @@ def way_in(task: ParkingTask) -> FloatArray:
     return way
 
 
-class DrivePractice(VecEnv):  # type: ignore[misc]
+class DrivePractice(SharedVecEnv):
     """Drives with decisions as in `planners.driver_view`, at the levels of a recipe's curriculum.
 
     Each kind of slot is at a level of its own, and begins at the first. A level is mastered when of the last `TRIED`
@@ -152,7 +152,6 @@ class DrivePractice(VecEnv):  # type: ignore[misc]
         }
         super().__init__(num_envs, spaces.Dict(shown), spaces.Box(-1.0, 1.0, (2,), np.float32))
         self._rng = np.random.default_rng(0)
-        self._actions = np.zeros((num_envs, 2), dtype=np.float32)
         self._at = [("", 0)] * num_envs
         self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, dtype=np.int64)
         self._stood = np.zeros(num_envs, dtype=np.int64)
@@ -169,16 +168,12 @@ class DrivePractice(VecEnv):  # type: ignore[misc]
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         return self.batch.observation()
 
-    def step_async(self, actions: NDArray[Any]) -> None:
-        """Take note of what to do."""
-        self._actions = np.asarray(actions, dtype=np.float32)
-
     def step_wait(
         self,
     ) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Do it. Where a drive ends, `info` has what `Monitor` tells, `is_success` and `contact`."""
         batch = self.batch
-        batch.drive(self._actions)
+        batch.drive(np.asarray(self.actions, dtype=np.float32))
         observations = batch.observation()
         failed = batch.status >= CONTACT
         if self.recipe.reward == "sparse":
@@ -274,30 +269,3 @@ class DrivePractice(VecEnv):  # type: ignore[misc]
         else:
             at_hand[rng.integers(KEPT)] = exercise
         return exercise
-
-    def close(self) -> None:
-        """Nothing is held open."""
-
-    def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute, the same for every drive."""
-        value = None if attr_name == "render_mode" else getattr(self, attr_name)
-        return [value for _ in self._get_indices(indices)]
-
-    def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """The drives of a batch have no attributes of their own.
-
-        Raises:
-            NotImplementedError: always.
-        """
-        raise NotImplementedError(f"drives of a compiled batch share everything; {attr_name} cannot be set")
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
-    ) -> list[Any]:
-        """`compute_reward`, which hindsight asks for; the same for every drive."""
-        value = getattr(self, method_name)(*method_args, **method_kwargs)
-        return [value for _ in self._get_indices(indices)]
-
-    def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """As if by `Monitor`, whose records are in `info`, and nothing else."""
-        return [wrapper_class.__name__ == "Monitor" for _ in self._get_indices(indices)]
