@@ -1,6 +1,17 @@
-"""How tests are dealt out to processes."""
+"""How tests are run: by which process, and with which examples."""
 
+import hypothesis
 import pytest
+
+# The same examples on every machine, however slow it is just now; a test's files may serve all of its examples.
+hypothesis.settings.register_profile(
+    "parkenv",
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.function_scoped_fixture],
+)
+hypothesis.settings.load_profile("parkenv")
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -164,7 +164,7 @@ def plainly_parked(achieved, desired):
     room=st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 0.5)),
     backed=st.booleans(),
 )
-@settings(deadline=None, max_examples=400)
+@settings(max_examples=400)
 def test_success_is_inside_the_slot_near_its_middle_straight_and_standing(x, y, turn, speed, room, backed):
     base = math.pi if backed else 0.0
     yaw = base + turn
@@ -237,7 +237,7 @@ def test_leaving_the_area_terminates():
 
 
 @given(seed=st.integers(0, 500), lot=st.sampled_from(LOTS))
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 def test_a_state_brought_back_goes_on_the_same(seed, lot):
     env, other = drive_on(lot, 0), drive_on(lot, 1)
     random_drive(env, seed, 10)
@@ -254,7 +254,7 @@ def test_a_state_brought_back_goes_on_the_same(seed, lot):
 
 
 @given(seed=st.integers(0, 10_000), lot=st.sampled_from(LOTS))
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_tasks_are_what_they_say(seed, lot):
     """Nothing is touched at the start nor at the target, and the slot is as large as the room says."""
     tasks = tasks_on(lot)

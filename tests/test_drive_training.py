@@ -141,7 +141,7 @@ def test_a_drive_that_stands_in_its_slot_has_parked():
 @given(
     x=st.floats(-3, 3), y=st.floats(-3, 3), yaw=st.floats(-4, 4), gap=st.floats(0.0, 8.0), turned=st.floats(-4, 4)
 )  # fmt: skip
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_room_is_measured_from_the_cars_outline_wherever_it_stands(x, y, yaw, gap, turned):
     """A long wall across the way, `gap` before the car's front; the car and the wall are moved and turned together."""
     view = DriverView(VehicleParameters())

@@ -93,7 +93,7 @@ def test_ties_go_to_parking_and_then_to_the_first_move():
     wait_s=st.sampled_from([0.0, 1.0, 50.0]),
     two_way=st.booleans(),
 )
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_it_agrees_with_policy_iteration_on_any_graph(seed, gamma, failure, wait_s, two_way):
     mdp = random_process(seed, gamma, failure, wait_s=wait_s, two_way=two_way)
     ours, theirs = label_setting(mdp), policy_iteration(mdp)
@@ -105,14 +105,14 @@ def test_it_agrees_with_policy_iteration_on_any_graph(seed, gamma, failure, wait
 
 
 @given(seed=seeds, gamma=st.sampled_from([0.9, 0.99]), failure=st.sampled_from([0.0, 10.0]))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_it_agrees_with_value_iteration(seed, gamma, failure):
     mdp = random_process(seed, gamma, failure)
     expect_same_values(label_setting(mdp).values, value_iteration(mdp, tolerance=1e-10).values)
 
 
 @given(seed=seeds, failure=st.sampled_from([0.0, 5.0, 90.0]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_without_discount_it_is_the_shortest_way_on_any_graph(seed, failure):
     mdp = random_process(seed, 1.0, failure)
     n = mdp.n_states
@@ -129,7 +129,7 @@ def test_without_discount_it_is_the_shortest_way_on_any_graph(seed, failure):
 
 
 @given(seed=seeds, gamma=st.sampled_from([0.99, 0.9999, 1.0]), shortest=st.sampled_from([0.0, 1e-9, 1e-4]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_edges_of_no_length_or_hardly_any_are_no_obstacle(seed, gamma, shortest):
     mdp = random_process(seed, gamma, 5.0)
     rng = np.random.default_rng(seed)
@@ -174,7 +174,7 @@ def test_directed_lots_with_little_free_are_settled_in_one_pass():
 
 
 @given(seed=seeds, gamma=st.sampled_from([0.9, 0.99, 0.9999, 1.0]), failure=st.sampled_from([0.0, 5.0, 90.0]))
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 def test_a_mended_plan_equals_a_fresh_one(seed, gamma, failure):
     rng = np.random.default_rng(seed)
     lot = ParkingLot.grid(int(rng.integers(1, 5)), int(rng.integers(2, 9)))
@@ -188,7 +188,7 @@ def test_a_mended_plan_equals_a_fresh_one(seed, gamma, failure):
 
 
 @given(seed=seeds, gamma=st.sampled_from([0.9, 0.99, 1.0]))
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_a_mended_plan_equals_a_fresh_one_on_any_graph(seed, gamma):
     mdp = random_process(seed, gamma, 5.0)
     check_mending(mdp, mdp.n_states, np.random.default_rng(seed))

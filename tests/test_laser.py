@@ -70,7 +70,7 @@ def compare(scanner, plane, pose, exclude=None):
     return int(edge.sum())
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32),
     n=st.integers(0, 60),

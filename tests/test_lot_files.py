@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components, dijkstra
 
@@ -81,7 +81,6 @@ def test_unknown_packaged_lot_lists_the_known_ones():
         ParkingLot.packaged("camp")
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(
     rows=st.integers(1, 5),
     columns=st.integers(1, 5),
@@ -627,7 +626,7 @@ def test_lanes_that_share_a_point_are_not_warned_of(tmp_path):
     assert check_lot(written(tmp_path, doc)) == []
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=150)
+@settings(max_examples=150)
 @given(data=st.data())
 def test_no_content_makes_the_checker_raise(tmp_path, data):
     doc = copy.deepcopy(document())

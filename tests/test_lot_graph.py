@@ -2,7 +2,7 @@ import networkx as nx
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import connected_components, dijkstra
@@ -132,7 +132,6 @@ def test_points_closer_than_the_tolerance_are_one_junction_wherever_they_lie():
     assert len(apart.vertex_xy) == 4
 
 
-@settings(deadline=None)
 @given(
     bearings=st.lists(st.floats(0.0, 2 * np.pi), min_size=1, max_size=4, unique_by=lambda b: round(b, 2)),
 )

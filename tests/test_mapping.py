@@ -58,7 +58,7 @@ def test_looks_add_up_as_the_filter_says():
 
 
 @given(x=st.floats(-3, 15), y=st.floats(-8, 8), yaw=st.floats(-7, 7), half=st.floats(0.05, 1.5))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_looks_from_anywhere_stay_within_the_grid(x, y, yaw, half):
     grid = OccupancyGrid((0.0, -5.0), (12.0, 5.0), 0.5)
     grid.update((x, y), yaw, half, np.array([[0.1, 3.0]]), 6.0)

@@ -153,7 +153,7 @@ def test_without_rates_a_state_lasts_for_ever():
 # Same key, same world, whoever looks
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(
     queries=st.lists(
         st.tuples(st.lists(st.integers(0, 19), min_size=1, max_size=6), st.floats(0, 2e5)),
@@ -178,7 +178,7 @@ def test_answers_do_not_depend_on_the_order_of_looks(queries, data):
         assert [answers(twin, query) for query in queries] == expected
 
 
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 @given(after=st.floats(0, 2e5), key=st.integers(0, 2**64 - 1))
 def test_a_slot_is_free_from_next_free_on_and_not_before(after, key):
     world, slots, time = busy_process().world(np.uint64(key), NINE), np.arange(20), NINE.time + after

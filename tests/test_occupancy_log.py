@@ -168,7 +168,7 @@ def test_the_last_known_state_holds_and_in_a_long_gap_the_nearest_one():
     assert world.next_free([0], 11 * HOUR_S) == math.inf
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     looks=st.dictionaries(st.integers(0, 86_399), st.booleans(), min_size=1, max_size=8),
     time=st.floats(0, 9e4),

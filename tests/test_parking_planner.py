@@ -52,7 +52,7 @@ def polygon(rng, k):
 
 
 @given(seed=st.integers(0, 10**6), k=st.sampled_from([2, 3, 4, 8, 24]))
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_the_planners_check_and_pymunk_agree_on_what_is_touched(seed, k):
     """Where the footprint grown by a millimetre is free pymunk tells no contact, and likewise the other way."""
     rng = np.random.default_rng(seed)
@@ -81,7 +81,7 @@ def test_room_is_the_distance_to_what_is_nearest():
 
 
 @given(seed=st.integers(0, 10**6), lot=st.sampled_from(LOTS))
-@settings(deadline=None, max_examples=25)
+@settings(max_examples=25)
 def test_a_path_leads_from_start_to_target_touches_nothing_and_can_be_steered(seed, lot):
     task = tasks_on(lot).draw(seed)
     path = planned(task)

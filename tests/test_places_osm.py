@@ -12,7 +12,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import pytest
 import shapely
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
@@ -862,7 +862,7 @@ def test_faults_are_named_in_one_line(tmp_path, name, text, message):
         assert problem.severity == "error"
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(data=st.data(), kind=st.sampled_from(["overpass", "geometry", "geojson"]))
 def test_no_content_brings_the_import_down(tmp_path, data, kind):
     place = car_park().area([30], [], amenity="parking").box(60, 0, 80, 30, {})
@@ -937,7 +937,7 @@ def test_deleted_elements_are_not_there(tmp_path):
 # ---- invariants ----
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(
     turn=st.floats(-3.2, 3.2),
     aisle=st.floats(5.0, 9.0),

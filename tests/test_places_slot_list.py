@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 
@@ -136,7 +136,7 @@ def test_stray_slots_are_left_out_and_listed(tmp_path):
     assert draft.lot().n_slots == 32
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     turn=st.floats(-3.2, 3.2),
     shift=st.tuples(st.floats(-1e4, 1e4), st.floats(-1e4, 1e4)),
@@ -166,7 +166,7 @@ def test_a_moved_list_gives_the_same_lot_moved(tmp_path, turn, shift, rows, colu
         assert np.hypot(*(ends[1] - xy).T).min() < 1e-5
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 10_000))
 def test_inexact_lists_give_lots_in_which_every_slot_opens_to_a_lane(tmp_path, seed):
     rng = np.random.default_rng(seed)

@@ -61,7 +61,7 @@ graphs = st.integers(0, 2**32 - 1)
 
 
 @given(seed=graphs, gamma=st.sampled_from([0.9, 0.99, 0.995]), failure=st.sampled_from([0.0, 5.0, 90.0]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_policy_iteration_agrees_with_value_iteration(seed, gamma, failure):
     """Random directed graphs, dead ends and slots that are surely free or surely taken among them."""
     rng = np.random.default_rng(seed)
@@ -87,7 +87,7 @@ def test_policy_iteration_agrees_with_value_iteration(seed, gamma, failure):
 
 
 @given(seed=graphs)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_solvers_agree_on_random_lots(seed):
     rng = np.random.default_rng(seed)
     lot = ParkingLot.grid(int(rng.integers(1, 5)), int(rng.integers(2, 9)))

@@ -182,7 +182,7 @@ def test_sightings_are_checked():
     width=st.floats(1.6, 2.0),
     seed=st.integers(0, 9),
 )
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 def test_two_sides_tell_the_pose_from_anywhere(bearing, away, yaw, length, width, seed):
     x, y = away * math.cos(bearing), away * math.sin(bearing)
     ahead = abs(x * math.cos(yaw) + y * math.sin(yaw)) - 0.5 * length

@@ -91,7 +91,7 @@ def test_what_is_nearer_than_the_near_plane_is_not_drawn():
 
 
 @given(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5), st.floats(-3.0, 3.0))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_no_gap_where_triangles_meet(x, z, roll):
     # A finely split wall fills the view: every pixel must be on it.
     scene = toy_scene(

@@ -39,7 +39,7 @@ def same_pose(a, b, tolerance):
 
 
 @given(goal=poses)
-@settings(deadline=None, max_examples=300)
+@settings(max_examples=300)
 def test_every_word_leads_to_the_goal(goal):
     pieces, turns = np.zeros((MOST_WORDS, PIECES)), np.zeros((MOST_WORDS, PIECES), dtype=np.int64)
     counts = np.zeros(MOST_WORDS, dtype=np.int64)
@@ -65,7 +65,7 @@ def test_lengths_that_are_known(goal, expected):
 
 
 @given(start=poses, end=poses)
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 def test_the_way_back_is_as_long_and_so_are_the_mirror_images(start, end):
     there = distance(start, end)
     assert distance(end, start) == pytest.approx(there, abs=1e-6)
@@ -80,7 +80,7 @@ def test_the_way_back_is_as_long_and_so_are_the_mirror_images(start, end):
         st.tuples(st.floats(-2.5, 2.5), st.sampled_from([LEFT, STRAIGHT, RIGHT])), min_size=1, max_size=6
     )
 )
-@settings(deadline=None, max_examples=400)
+@settings(max_examples=400)
 def test_no_other_way_is_shorter(pieces):
     """Brute force: whatever pieces one drives, the word to the same place is at most as long."""
     lengths, turns = zip(*pieces, strict=True)
@@ -89,13 +89,13 @@ def test_no_other_way_is_shorter(pieces):
 
 
 @given(start=poses, via=poses, end=poses)
-@settings(deadline=None, max_examples=200)
+@settings(max_examples=200)
 def test_a_detour_is_not_shorter(start, via, end):
     assert distance(start, end) <= distance(start, via) + distance(via, end) + 1e-6
 
 
 @given(end=poses, radius=st.floats(0.5, 8.0))
-@settings(deadline=None, max_examples=100)
+@settings(max_examples=100)
 def test_lengths_grow_with_the_turning_circle(end, radius):
     scaled = end * [radius, radius, 1.0]
     length, turn = reeds_shepp(ORIGIN, scaled, radius)

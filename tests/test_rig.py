@@ -92,7 +92,7 @@ def test_beams_that_hit_a_vehicle_and_the_cameras_depth_agree(scene, pose, yaw):
     st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=2, max_size=6, unique=True),
     st.floats(0.3, 20.0),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_poses_lie_on_the_path_in_even_steps(points, every):
     path = np.array(points)
     if np.hypot(*np.diff(path, axis=0).T).min() < 1e-3:

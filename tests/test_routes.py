@@ -45,7 +45,7 @@ def test_ways_are_as_long_as_they_should_be(drives):
 
 
 @given(seed=st.integers(0, 2**32 - 1), chance=st.sampled_from([0.0, 0.01, 0.1, 1.0]))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_the_nearest_are_all_that_are_as_near(seed, chance):
     rng = np.random.default_rng(seed)
     lot = LOTS["grid"]

@@ -107,7 +107,7 @@ def test_resets_without_a_seed_go_through_other_worlds_of_the_same_seed():
 
 
 @given(seed=st.integers(0, 1000))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_the_world_does_not_depend_on_who_drives(seed):
     """Two cars that behave differently meet the same slot states at the same times."""
     scenario = Scenario.named("street")
@@ -293,7 +293,6 @@ def test_a_sighting_is_bayes_rule_and_relaxes_exponentially():
 
 
 @given(x=st.floats(0.0, 600.0))
-@settings(deadline=None)
 def test_fading_is_the_exponential(x):
     assert fading(x) == pytest.approx(np.exp(-x), rel=1e-14)
 

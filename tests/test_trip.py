@@ -110,7 +110,7 @@ def test_a_line_is_beside_its_lane_by_what_cars_keep_to_the_right():
     leg=st.floats(6.0, 20.0),
     radius=st.floats(1.0, 8.0),
 )
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 def test_a_rounded_polyline_ends_where_the_polyline_does_and_turns_no_tighter_than_asked(turns, leg, radius):
     yaw = np.cumsum([0.0, *turns])
     points = np.concatenate([[[0.0, 0.0]], np.cumsum(leg * np.stack([np.cos(yaw), np.sin(yaw)], 1), axis=0)])
@@ -136,7 +136,7 @@ def test_joined_paths_are_one_after_the_other():
 
 
 @given(speed=st.floats(0.0, 4.0), turn=st.floats(-1.4, 1.4))
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 def test_a_lane_keeper_stays_near_its_path_at_any_speed_and_slows_down_in_turns(speed, turn):
     points = np.array([[0.0, 0.0], [20.0, 0.0], [20.0 + 20.0 * math.cos(turn), 20.0 * math.sin(turn)]])
     path = rounded(points, 6.0)

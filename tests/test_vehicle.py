@@ -37,7 +37,6 @@ def driven(pairs, start=None):
 
 
 @given(steering=st.floats(0.05, 1.0), speed=st.floats(0.2, 3.0), side=st.sampled_from([-1.0, 1.0]))
-@settings(deadline=None)
 def test_the_rear_axle_runs_on_a_circle_of_wheelbase_over_tan_steering(steering, speed, side):
     angle = side * steering * CAR.max_steering
     radius = CAR.wheelbase / math.tan(angle)
@@ -53,7 +52,6 @@ def test_the_default_car_turns_within_eleven_metres_from_kerb_to_kerb():
 
 
 @given(steering=st.floats(-1.0, 1.0), steps=st.integers(1, 200))
-@settings(deadline=None)
 def test_a_car_at_rest_stays_where_it_is(steering, steps):
     """Turning the wheels moves nothing."""
     path = drive(CAR, np.array([3.0, -2.0, 0.7, 0.0, 0.0, 0.0]), 0.0, steering, steps)
@@ -62,7 +60,6 @@ def test_a_car_at_rest_stays_where_it_is(steering, steps):
 
 
 @given(pairs=commands)
-@settings(deadline=None)
 def test_all_limits_and_rates_are_kept(pairs):
     states = driven(pairs)
     change = np.abs(np.diff(states, axis=0))
@@ -80,7 +77,6 @@ def test_all_limits_and_rates_are_kept(pairs):
 
 
 @given(speed=st.floats(0.01, 8.0) | st.floats(-3.0, -0.01), brake=st.floats(0.05, 1.0))
-@settings(deadline=None)
 def test_brakes_take_energy_bring_the_car_to_rest_and_hold_it(speed, brake):
     path = drive(CAR, [0.0, 0.0, 0.0, speed, 0.0, 0.0], -math.copysign(brake, speed), 0.0, steps=1)
     states = [path[-1]]
@@ -101,7 +97,6 @@ def test_the_way_to_a_halt_is_that_of_constant_braking():
 
 
 @given(pairs=commands, speed=st.floats(-3.0, 3.0))
-@settings(deadline=None)
 def test_left_and_right_are_mirror_images(pairs, speed):
     left = driven(pairs, [0.0, 0.0, 0.0, speed, 0.0, 0.0])
     right = driven([(a, -s) for a, s in pairs], [0.0, 0.0, 0.0, speed, 0.0, 0.0])
@@ -109,7 +104,6 @@ def test_left_and_right_are_mirror_images(pairs, speed):
 
 
 @given(curvature=st.floats(-0.3, 0.3), way=st.floats(-4.0, 4.0), pieces=st.integers(2, 20))
-@settings(deadline=None)
 def test_an_arc_in_pieces_is_the_same_arc(curvature, way, pieces):
     """Exact integration: the step's length makes no difference."""
     there = (1.0, 2.0, 0.5)
@@ -140,7 +134,7 @@ def test_a_car_that_cannot_be_is_refused(change, message):
     phase=st.floats(0.0, 1.0),
     angle=st.floats(-1.2, 1.2),
 )
-@settings(deadline=None, max_examples=60)
+@settings(max_examples=60)
 def test_nothing_is_passed_through_at_any_allowed_speed(speed, offset, phase, angle):
     """A wall of no thickness and a pole across the way are touched, wherever a step ends."""
     along = np.array([math.sin(angle), math.cos(angle)])
