@@ -24,7 +24,7 @@ DATA = Path(__file__).parents[2] / "shared" / "data"
 
 def parkenv(*arguments, **options):
     return subprocess.run(
-        [*PARKENV, *map(str, arguments)], capture_output=True, text=True, timeout=300, check=False, **options
+        [*PARKENV, *map(str, arguments)], capture_output=True, text=True, timeout=600, check=False, **options
     )
 
 
@@ -90,7 +90,7 @@ def test_a_killed_run_leaves_what_was_done_and_resumes(tmp_path):
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     )
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
         if (out / "episodes.csv").exists() and len((out / "episodes.csv").read_text().splitlines()) > 60:
             break
@@ -130,13 +130,13 @@ def test_interrupting_writes_what_is_done(tmp_path):
         # A shell's background jobs, and what they start, ignore the signal.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    deadline = time.monotonic() + 120
+    deadline = time.monotonic() + 300
     while time.monotonic() < deadline:
         if (out / "episodes.csv").exists() and len((out / "episodes.csv").read_text().splitlines()) > 20:
             break
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=300)
     assert process.returncode == 130, errors
     assert "--resume goes on" in " ".join(output.split())
     summary = json.loads((out / "summary.partial.json").read_text())

@@ -13,7 +13,7 @@ def test_the_notebook_runs_and_shows_its_pictures(tmp_path):
     nbformat = pytest.importorskip("nbformat")
     client = pytest.importorskip("nbclient").NotebookClient
     notebook = nbformat.read(NOTEBOOK, 4)
-    client(notebook, timeout=600).execute(cwd=str(tmp_path))
+    client(notebook, timeout=1800).execute(cwd=str(tmp_path))
     shown = [
         output
         for cell in notebook.cells

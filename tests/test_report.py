@@ -28,7 +28,7 @@ PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 
 def parkenv(*arguments):
     return subprocess.run(
-        [*PARKENV, *map(str, arguments)], capture_output=True, text=True, timeout=300, check=False
+        [*PARKENV, *map(str, arguments)], capture_output=True, text=True, timeout=600, check=False
     )
 
 

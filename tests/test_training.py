@@ -313,7 +313,7 @@ def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp
     process = subprocess.Popen(
         arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
     )
-    deadline = time.monotonic() + 240
+    deadline = time.monotonic() + 600
     while time.monotonic() < deadline and len(read_curve(out / "seed_0" / "curve.csv")) < 2:
         time.sleep(0.2)
 

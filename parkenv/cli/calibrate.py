@@ -92,7 +92,7 @@ def calibrate(
     settings = {
         "version": __version__, "scenario": scenario, "agent": agent, "style": dataclasses.asdict(style),
         "sensors": rig,
-        "traffic": dataclasses.asdict(its.traffic),
+        "traffic": dataclasses.asdict(its.traffic), "agent files": args.agent_fingerprints([agent]),
     }  # fmt: skip
     folder = TripFolder(out, settings, resume=resume)
     console = make_console()
