@@ -320,5 +320,5 @@ def agent_fingerprints(names: Iterable[str]) -> dict[str, str]:
     """Fingerprints, by name, of those agents that are read from files: trained models and agents of one's own."""
     from planners.agent import agent_file
 
-    prints = {name: fingerprint(agent_file(name)) for name in names}
+    prints = {name: fingerprint(agent_file(name)) for name in dict.fromkeys(names)}
     return {name: its for name, its in prints.items() if its is not None}
