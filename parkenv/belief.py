@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.fading import fading
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -41,13 +41,13 @@ class SlotBelief:
         return self.n_known_taken == len(self.prior)
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def relaxed(prior: float, rate: float, said: float, elapsed: float) -> float:
     """The belief in a slot, `elapsed` s after a look that left it at `said`."""
     return float(prior + (said - prior) * fading(rate * elapsed))
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def after_look(p: float, looks_taken: bool, hit_rate: float, false_alarm_rate: float) -> float:
     """The belief `p` in a slot after one look at it; Bayes's rule.
 

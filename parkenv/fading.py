@@ -3,7 +3,8 @@
 import math
 
 import numpy as np
-from numba import njit
+
+from sim_sensors.compilation import compiled
 
 _LOG2_E = 1.4426950408889634
 # ln 2 in two parts, the first with trailing zeros, so that its products with small whole numbers are exact.
@@ -16,7 +17,7 @@ _ROUNDING = 1.5 * 2.0**_MANTISSA_BITS
 _2, _3, _4, _5, _6, _7, _8, _9, _10, _11, _12 = (1.0 / math.factorial(n) for n in range(2, 13))
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def fading(x: float) -> float:
     """exp(-x) for x >= 0, to the last place or two.
 

@@ -9,9 +9,9 @@ import math
 import operator
 
 import numpy as np
-from numba import njit
 
 from parkenv.errors import InputError
+from sim_sensors.compilation import compiled
 
 # What the numbers are for; two purposes must not share a stream.
 ARRIVAL_STREAM = 0
@@ -31,7 +31,7 @@ _SHIFT_31 = np.uint64(31)
 _SHIFT_12 = np.uint64(12)
 
 
-@njit(cache=True)
+@compiled
 def _mix64(word: np.uint64) -> np.uint64:
     z = np.uint64(word)
     z = (z ^ (z >> _SHIFT_30)) * _MIX_1
@@ -39,7 +39,7 @@ def _mix64(word: np.uint64) -> np.uint64:
     return z ^ (z >> _SHIFT_31)
 
 
-@njit(cache=True)
+@compiled
 def keyed_uniform(key: np.uint64, stream: int, slot: int, index: int) -> float:
     """Uniform float64 in the open interval (0, 1), callable from Python and from compiled code.
 
@@ -53,19 +53,19 @@ def keyed_uniform(key: np.uint64, stream: int, slot: int, index: int) -> float:
     return (float(h >> _SHIFT_12) + 0.5) * 2.0**-52
 
 
-@njit(cache=True)
+@compiled
 def keyed_exponential(key: np.uint64, stream: int, slot: int, index: int) -> float:
     """Exponential float64 with mean 1, always positive and finite; arguments as in `keyed_uniform`."""
     return -math.log(keyed_uniform(key, stream, slot, index))
 
 
-@njit(cache=True)
+@compiled
 def _absorbed(state: np.uint64, word: np.uint64) -> np.uint64:
     mixed: np.uint64 = _mix64(np.uint64(state) + _GOLDEN + np.uint64(word))
     return mixed
 
 
-@njit(cache=True)
+@compiled
 def episode_key(seed_state: np.uint64, episode: int) -> np.uint64:
     """Key of a world, from `seed_state` and an episode number below 2**64 (compiled; for batches too)."""
     # The number of words goes in first, so that no two (seed, episode) pairs spell the same words.

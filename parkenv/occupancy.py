@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Protocol, Self
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
@@ -18,6 +17,7 @@ from parkenv.errors import InputError
 from parkenv.fading import fading
 from parkenv.keyed_random import ARRIVAL_STREAM, OCCUPANCY_STREAM, keyed_exponential, keyed_uniform
 from parkenv.versioned_json import JsonFormat
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -158,7 +158,7 @@ class OccupancyModel(PriorModel, Protocol):
         """The world of the episode with this key."""
 
 
-@njit(cache=True)
+@compiled
 def hour_of_week(time: float) -> tuple[float, int, float]:
     """Week, hour of the week and second of the hour."""
     week = np.floor(time / WEEK_S)
@@ -167,7 +167,7 @@ def hour_of_week(time: float) -> tuple[float, int, float]:
     return week, hour, second - hour * HOUR_S
 
 
-@njit(cache=True)
+@compiled
 def _time_after(profile: FloatArray, table: FloatArray, since: float, hazard: float) -> float:
     """When the hazard that a unit slot has gathered since `since` reaches `hazard`; table[-1] must be > 0."""
     week, hour, second = hour_of_week(since)
@@ -183,7 +183,7 @@ def _time_after(profile: FloatArray, table: FloatArray, since: float, hazard: fl
     return end
 
 
-@njit(cache=True)
+@compiled
 def _marginal_at_hour(
     arrival_factor: float,
     departure_factor: float,
@@ -211,7 +211,7 @@ def _marginal_at_hour(
     return float(p / -math.expm1(-gathered)) if gathered > 0.0 else 0.5
 
 
-@njit(cache=True)
+@compiled
 def marginal_from(
     arrival_factor: float,
     departure_factor: float,
@@ -244,14 +244,14 @@ def marginal_from(
     return p
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def marginal_later(start: float, arrival: float, rate: float, second: float) -> float:
     """P(occupied) some seconds after it was `start`, by constant rates of arrival, and of arrival plus departure."""
     equilibrium = arrival / rate if rate > 0.0 else 0.0
     return float(equilibrium + (start - equilibrium) * fading(rate * second))
 
 
-@njit(cache=True)
+@compiled
 def _marginals(
     factors: FloatArray, profiles: FloatArray, hour: int, second: float, kept: FloatArray
 ) -> FloatArray:
@@ -264,7 +264,7 @@ def _marginals(
     return p
 
 
-@njit(cache=True)
+@compiled
 def holding_end(
     key: np.uint64, slot: int, flip: int, since: float, factor: float, profile: FloatArray, table: FloatArray
 ) -> float:
@@ -286,7 +286,7 @@ def holding_end(
     return end
 
 
-@njit(cache=True)
+@compiled
 def _seek(
     slot: int,
     time: float,
@@ -329,7 +329,7 @@ def _seek(
         )
 
 
-@njit(cache=True)
+@compiled
 def _look(
     slots: IntArray,
     time: float,

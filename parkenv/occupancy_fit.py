@@ -10,13 +10,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq, minimize
 from scipy.special import expit
 
 from parkenv.errors import InputError
 from parkenv.occupancy import HOUR_S, BoolArray, FloatArray, IntArray, OccupancyProcess
+from sim_sensors.compilation import compiled
 
 if TYPE_CHECKING:
     from parkenv.occupancy_log import OccupancyLog
@@ -105,7 +105,7 @@ def fit_constant_rates(dt: ArrayLike, start: ArrayLike, end: ArrayLike) -> tuple
     return float(arrival), float(departure)
 
 
-@njit(cache=True)
+@compiled
 def _score(
     slot: int,
     first_bin: int,
@@ -167,7 +167,7 @@ def _score(
     return math.log(seen), 2 * pieces + 2
 
 
-@njit(cache=True)
+@compiled
 def log_likelihood(
     theta: FloatArray,
     slot: IntArray,
@@ -203,7 +203,7 @@ def log_likelihood(
     return value, gradient
 
 
-@njit(cache=True)
+@compiled
 def _information(
     theta: FloatArray,
     slot: IntArray,

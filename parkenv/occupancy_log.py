@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self, TextIO
 
 import numpy as np
-from numba import njit
 
 from parkenv.errors import InputError
 from parkenv.occupancy import (
@@ -28,6 +27,7 @@ from parkenv.occupancy import (
     FloatArray,
     IntArray,
 )
+from sim_sensors.compilation import compiled
 
 DayClass = Literal["weekday", "weekend"]
 
@@ -258,7 +258,7 @@ class OccupancyLog:
         return hours
 
 
-@njit(cache=True)
+@compiled
 def _add_hours(hours: FloatArray, start: float, end: float) -> None:
     hour = int(start // HOUR_S)
     while start < end:
@@ -268,7 +268,7 @@ def _add_hours(hours: FloatArray, start: float, end: float) -> None:
         hour += 1
 
 
-@njit(cache=True)
+@compiled
 def _sum_hours(
     first: IntArray,
     from_s: FloatArray,

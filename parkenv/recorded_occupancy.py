@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike
 
 from parkenv.errors import InputError
@@ -28,6 +27,7 @@ from parkenv.occupancy import (
 )
 from parkenv.occupancy_fit import fit_constant_rates
 from parkenv.occupancy_log import DAY_HOURS, OccupancyLog, csv_columns, csv_rows, day_class, weekday_of
+from sim_sensors.compilation import compiled
 
 PRIOR_DAYS = 1.0
 """Weight, in days, of the lot's mean in a slot's forecast."""
@@ -72,7 +72,7 @@ def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log:
     return mapping
 
 
-@njit(cache=True)
+@compiled
 def _replay(
     slots: IntArray,
     second: float,
@@ -99,7 +99,7 @@ def _replay(
     return answer
 
 
-@njit(cache=True)
+@compiled
 def _changes(
     slots: IntArray, second: float, first: IntArray, stop: IntArray, from_s: FloatArray, taken: BoolArray
 ) -> IntArray:
@@ -167,7 +167,7 @@ class Layout(NamedTuple):
     relaxation_rate: float
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def recorded_forecast(
     log_slot: int, second: float, share: FloatArray, lot_share: FloatArray, n_days: FloatArray, n_records: int
 ) -> float:
@@ -182,7 +182,7 @@ def recorded_forecast(
     return float(min(max(p, MIN_PROBABILITY), MAX_PROBABILITY))
 
 
-@njit(cache=True)
+@compiled
 def _forecast(
     log_slots: IntArray,
     second: float,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from planners.path_laying import lay, worth_a_try
@@ -21,6 +20,7 @@ from planners.search_ground import (
     Path,
     hidden,
 )
+from sim_sensors.compilation import compiled
 
 MOST_OPTIONS = 12
 """Slots known to be free that are kept in mind, best first."""
@@ -67,7 +67,7 @@ class Budget(NamedTuple):
     depth: int
 
 
-@njit(cache=True)
+@compiled
 def best_path(
     vertex: int,
     targets: IntArray,
@@ -207,7 +207,7 @@ def best_path(
     return Choice(best, then_s, at_hand, slot, following, n_kept, base, work)
 
 
-@njit(cache=True)
+@compiled
 def _first_step(onward_s: float, path: Path) -> tuple[int, float]:
     """`following` and `then_s` of a laid path; `onward_s` as it would be if nothing were looked at."""
     if path.times[1] == 0.0 and path.starts[2] > 0:
@@ -218,7 +218,7 @@ def _first_step(onward_s: float, path: Path) -> tuple[int, float]:
     return following, onward_s
 
 
-@njit(cache=True)
+@compiled
 def _shows_news(vertex: int, ground: Ground, outlook: Outlook) -> bool:
     """Whether a slot is in view of a vertex that has not been seen yet, or may have come free."""
     for i in range(ground.view_starts[vertex], ground.view_starts[vertex + 1]):
@@ -230,7 +230,7 @@ def _shows_news(vertex: int, ground: Ground, outlook: Outlook) -> bool:
     return False
 
 
-@njit(cache=True)
+@compiled
 def _mark(
     on_way: NDArray[np.bool_],
     vertex: int,

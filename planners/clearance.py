@@ -6,11 +6,11 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from parkenv.driving.vehicle import VehicleParameters
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -82,7 +82,7 @@ def clearance(
     )
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _draw(outlines: FloatArray, n_corners: IntArray, low: FloatArray, taken: NDArray[np.bool_]) -> None:
     """Mark the cells that outlines run through, and those inside of them."""
     rows, columns = taken.shape
@@ -124,7 +124,7 @@ def _draw(outlines: FloatArray, n_corners: IntArray, low: FloatArray, taken: NDA
                     taken[row, column] = True
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def stands_free(space: Clearance, x: float, y: float, yaw: float, margin: float) -> bool:
     """Whether the car, with its rear axle at a pose and `margin` m wider on all sides, overlaps nothing."""
     rows, columns = space.field.shape
@@ -159,7 +159,7 @@ def stands_free(space: Clearance, x: float, y: float, yaw: float, margin: float)
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _overlap(
     corners: FloatArray,
     i: int,
@@ -197,7 +197,7 @@ def _overlap(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def room_at(space: Clearance, x: float, y: float, yaw: float, most: float) -> float:
     """The greatest margin, m, up to `most`, with which the car stands free at a pose; below 0 if with none."""
     if not stands_free(space, x, y, yaw, 0.0):

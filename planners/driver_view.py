@@ -12,10 +12,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import ACCELERATION, SPEED, STEERING, YAW, VehicleParameters
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -106,7 +106,7 @@ class DriverView:
         return np.array([self.vehicle.max_braking, self.vehicle.max_acceleration, *SPEEDS])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def command(action: Float32Array, speed: float, pedals: FloatArray) -> float:
     """The pedal, -1 to 1, that brings the car to the speed that a decision asks for.
 
@@ -122,7 +122,7 @@ def command(action: Float32Array, speed: float, pedals: FloatArray) -> float:
     return float(min(max(needed / (pedals[0] if needed * speed < 0.0 else pedals[1]), -1.0), 1.0))
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def see(
     middle: FloatArray,
     state: FloatArray,

@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
@@ -29,6 +28,7 @@ from parkenv.lot import MOVES, PARK
 from parkenv.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
 from planners.road_table import RoadTable
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -239,12 +239,12 @@ def _graph(
     )
 
 
-@njit(cache=True)
+@compiled
 def _key(seen: int, vertex: int, free: int, n: int) -> int:
     return (((seen << _POSITION_BITS) | vertex) << n) | free
 
 
-@njit(cache=True)
+@compiled
 def _popcount(bits: int) -> int:
     count = 0
     while bits:
@@ -253,7 +253,7 @@ def _popcount(bits: int) -> int:
     return count
 
 
-@njit(cache=True)
+@compiled
 def _popcounts(bits: IntArray) -> IntArray:
     counts = np.empty(len(bits), np.int64)
     for i in range(len(bits)):
@@ -261,7 +261,7 @@ def _popcounts(bits: IntArray) -> IntArray:
     return counts
 
 
-@njit(cache=True)
+@compiled
 def _without_needless(free: int, worse_than: IntArray) -> int:
     """Only the slots seen free that no other one makes needless."""
     kept = free
@@ -271,7 +271,7 @@ def _without_needless(free: int, worse_than: IntArray) -> int:
     return kept
 
 
-@njit(cache=True)
+@compiled
 def _within_known(
     vertex: int,
     seen: int,
@@ -317,7 +317,7 @@ def _within_known(
         reach[vertex] = again
 
 
-@njit(cache=True)
+@compiled
 def _best_known(free: int, reach: FloatArray, walk_s: FloatArray) -> float:
     best = np.inf
     for s in range(len(walk_s)):
@@ -326,7 +326,7 @@ def _best_known(free: int, reach: FloatArray, walk_s: FloatArray) -> float:
     return best
 
 
-@njit(cache=True)
+@compiled
 def _least_unseen(vertex: int, seen: int, seconds: FloatArray, walk_s: FloatArray) -> float:
     least = np.inf
     for s in range(len(walk_s)):
@@ -335,7 +335,7 @@ def _least_unseen(vertex: int, seen: int, seconds: FloatArray, walk_s: FloatArra
     return least
 
 
-@njit(cache=True)
+@compiled
 def _successors(
     keys: IntArray,
     n: int,
@@ -383,7 +383,7 @@ def _successors(
     return found[:count]
 
 
-@njit(cache=True)
+@compiled
 def _back_up(
     keys: IntArray,
     levels: IntArray,

@@ -16,13 +16,13 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
 from parkenv.lot import PARK
 from parkenv.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -146,7 +146,7 @@ class ChangingSolution:
         return int((np.asarray(codes) * (2 * self.memory_steps + 1) ** np.arange(len(codes))).sum())
 
 
-@njit(cache=True)
+@compiled
 def _iterate(
     values: FloatArray,
     choices: NDArray[np.int8],

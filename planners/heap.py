@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def push(keys: FloatArray, vertices: NDArray[np.int32], size: int, key: float, vertex: int) -> int:
     """Enter a vertex into a binary heap; its new size."""
     i = size
@@ -23,7 +24,7 @@ def push(keys: FloatArray, vertices: NDArray[np.int32], size: int, key: float, v
     return size + 1
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def pop(keys: FloatArray, vertices: NDArray[np.int32], size: int) -> int:
     """Take the first vertex, which the caller has read, out of a binary heap; its new size."""
     size -= 1

@@ -12,7 +12,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import VehicleParameters, move_along
@@ -20,6 +19,7 @@ from parkenv.errors import InputError
 from planners.clearance import CELL_M, Clearance, clearance, room_at, stands_free
 from planners.heap import pop, push
 from planners.reeds_shepp import MOST_WORDS, PIECES, distance_between, word_cost, words_between
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -206,7 +206,7 @@ def plan_path(
     return None
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def ways_left(space: Clearance, x: float, y: float, least: float) -> FloatArray:
     """Shortest ways, m, to a point for a disc of radius `least`, over a grid of `_COARSE` cells of the field."""
     step = CELL_M * _COARSE
@@ -239,7 +239,7 @@ def ways_left(space: Clearance, x: float, y: float, least: float) -> FloatArray:
     return left
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _arc_free(
     space: Clearance, x: float, y: float, yaw: float, curvature: float, way: float, margin: float
 ) -> bool:
@@ -252,7 +252,7 @@ def _arc_free(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _word_free(
     space: Clearance,
     x: float,
@@ -272,7 +272,7 @@ def _word_free(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _steering_cost(turn: IntArray, count: int, before: float, steer_m: float) -> float:
     """What turning the wheel counts along a word that follows a curvature of `before` times the sharpest."""
     cost = 0.0
@@ -282,7 +282,7 @@ def _steering_cost(turn: IntArray, count: int, before: float, steer_m: float) ->
     return cost
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _shot(
     space: Clearance,
     x: float,
@@ -324,7 +324,7 @@ def _shot(
         costs[best] = math.inf
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _search(
     space: Clearance,
     left: FloatArray,
@@ -450,7 +450,7 @@ def _search(
     return lengths, curvatures, opened
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _path_cost(
     lengths: FloatArray, curvatures: FloatArray, radius: float, change_m: float, steer_m: float
 ) -> float:
@@ -465,7 +465,7 @@ def _path_cost(
     return cost
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _shortened(
     space: Clearance,
     start: FloatArray,

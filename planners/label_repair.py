@@ -9,7 +9,6 @@ change reaches farther than a fixed part of the lot, a fresh pass is the faster 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from planners.heap import push
@@ -22,6 +21,7 @@ from planners.label_setting import (
     spread,
     stop_cost,
 )
+from sim_sensors.compilation import compiled
 
 REACH = 0.1
 """Part of the lot's vertices that a repair may touch before a fresh pass takes over."""
@@ -51,7 +51,7 @@ def repair(graph: StoppingGraph, labels: Labels, vertices: NDArray[np.int64], p_
     return touched
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _repair(
     graph: StoppingGraph,
     vertices: NDArray[np.int64],

@@ -30,13 +30,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.lot import PARK
 from planners.heap import pop, push
 from planners.mdp import ParkingMDP
 from planners.policy_iteration import Solution, policy_iteration
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -175,7 +175,7 @@ def with_p_free(mdp: ParkingMDP, p_free: FloatArray) -> ParkingMDP:
     return dataclasses.replace(mdp, p_free=p_free)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def stop_cost(graph: StoppingGraph, p_free: FloatArray, vertex: int) -> float:
     """h: the least cost, s, of staying at a vertex for good."""
     p = p_free[vertex]
@@ -186,7 +186,7 @@ def stop_cost(graph: StoppingGraph, p_free: FloatArray, vertex: int) -> float:
     return float(min(retry, graph.never_s[vertex]))
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def move_cost(graph: StoppingGraph, cost: FloatArray, vertex: int, move: int) -> float:
     """What it costs, s, to make a move and go on as the labels say; a missing move waits."""
     v = graph.neighbors[vertex, move]
@@ -195,7 +195,7 @@ def move_cost(graph: StoppingGraph, cost: FloatArray, vertex: int, move: int) ->
     return float(graph.move_s[vertex, move] + graph.gamma * cost[v])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def best_move(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, vertex: int) -> int:
     """An optimal action of one vertex, told from the costs alone, so that solvers which agree act alike.
 
@@ -222,7 +222,7 @@ def best_move(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, vertex
     return STOP
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def best_moves(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray) -> NDArray[np.int64]:
     """`best_move` of every vertex, (n,) int64."""
     moves = np.empty(len(cost), dtype=np.int64)
@@ -231,7 +231,7 @@ def best_moves(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray) -> ND
     return moves
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _is_source(graph: StoppingGraph, cost: FloatArray, u: int) -> bool:
     """Whether labels may have to start from a vertex: not where one hop to a cheaper stop beats stopping.
 
@@ -248,7 +248,7 @@ def _is_source(graph: StoppingGraph, cost: FloatArray, u: int) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _settle_by_buckets(
     graph: StoppingGraph, p_free: FloatArray, width: float, cost: FloatArray, move: NDArray[np.int8]
 ) -> bool:
@@ -339,7 +339,7 @@ def _settle_by_buckets(
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _settle_by_heap(
     graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, move: NDArray[np.int8]
 ) -> bool:
@@ -356,7 +356,7 @@ def _settle_by_heap(
     return bool(spread(graph, cost, move, keys, vertices, size) >= 0)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def spread(
     graph: StoppingGraph,
     cost: FloatArray,
@@ -396,7 +396,7 @@ def spread(
     return n_entered
 
 
-@njit(cache=True)
+@compiled
 def edges_in(
     neighbors: NDArray[np.int32], move_s: FloatArray
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int8], FloatArray]:
@@ -421,7 +421,7 @@ def edges_in(
     return start, source, move, seconds
 
 
-@njit(cache=True)
+@compiled
 def _never(neighbors: NDArray[np.int32], move_s: FloatArray, wait_s: float, gamma: float) -> FloatArray:
     """The cheaper of waiting for ever and shuttling along one edge for ever, (n,) s."""
     n, n_moves = neighbors.shape

@@ -6,7 +6,6 @@ from collections import OrderedDict
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
@@ -16,6 +15,7 @@ from planners.label_setting import StoppingGraph, settle
 from planners.mdp import ParkingMDP
 from planners.road_table import RoadTable
 from planners.search_ground import Ground
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -188,7 +188,7 @@ def _numbered(vertices: IntArray, numbers: NDArray[np.integer]) -> IntArray:
     return np.where(vertices[place] == numbers, place, -1).astype(np.int64)
 
 
-@njit(cache=True)
+@compiled
 def _in_order(
     start: int, least_s: FloatArray, neighbors: NDArray[np.int32], move_s: FloatArray, most: int
 ) -> NDArray[np.int32]:

@@ -8,7 +8,6 @@ almost full.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from planners.search_ground import (
     LOOKS_FREE,
@@ -23,6 +22,7 @@ from planners.search_ground import (
     hidden,
     must_try,
 )
+from sim_sensors.compilation import compiled
 
 LOST = 0.002
 """Chance of having found nothing worth stopping for at which a path ends; what remains is estimated."""
@@ -32,7 +32,7 @@ AGAIN_S = 10.0
 """s that must pass before a slot is looked at once more; a later look makes up for those left out."""
 
 
-@njit(cache=True)
+@compiled
 def lay(
     vertex: int,
     targets: IntArray,
@@ -141,7 +141,7 @@ def lay(
     return k + 1, min(left, _go_round(k, looks, outlook, ground, path), ground.give_up_s)
 
 
-@njit(cache=True)
+@compiled
 def _settled(target: int, vertex: int, time: float, ground: Ground, outlook: Outlook, path: Path) -> bool:
     """Whether a target cannot be driven to from a vertex, or nothing is left to do where the car has come to it."""
     if target != vertex:
@@ -149,7 +149,7 @@ def _settled(target: int, vertex: int, time: float, ground: Ground, outlook: Out
     return not _worth_a_try_now(vertex, time, ground, outlook, path)
 
 
-@njit(cache=True)
+@compiled
 def worth_a_try(vertex: int, time: float, looked: float, ground: Ground, outlook: Outlook) -> bool:
     """Whether to find out by a try, some time from now, if the slot before a vertex is free; `looked` as in `Path`."""
     if not must_try(vertex, ground, outlook):
@@ -159,7 +159,7 @@ def worth_a_try(vertex: int, time: float, looked: float, ground: Ground, outlook
     return bool(_free_again(vertex, time, looked, outlook) > 0.0)
 
 
-@njit(cache=True)
+@compiled
 def _worth_a_try_now(vertex: int, time: float, ground: Ground, outlook: Outlook, path: Path) -> bool:
     """The same of a path that has come to the vertex."""
     # Vertices past the slots have not been looked at.
@@ -168,7 +168,7 @@ def _worth_a_try_now(vertex: int, time: float, ground: Ground, outlook: Outlook,
     return bool(worth_a_try(vertex, time, path.looked[vertex], ground, outlook))
 
 
-@njit(cache=True)
+@compiled
 def _go_round(last: int, looks: int, outlook: Outlook, ground: Ground, path: Path) -> float:
     """Expected s from a vertex of a path on where nothing new is looked at: a part of it is driven again and again."""
     best, leaving, walk = np.inf, 0.0, 0.0
@@ -189,7 +189,7 @@ def _go_round(last: int, looks: int, outlook: Outlook, ground: Ground, path: Pat
     return best
 
 
-@njit(cache=True)
+@compiled
 def _round_again(first: int, last: int, looks: int, outlook: Outlook, ground: Ground, path: Path) -> float:
     """Expected s of driving a part of a path again and again until a slot on it has come free.
 
@@ -216,7 +216,7 @@ def _round_again(first: int, last: int, looks: int, outlook: Outlook, ground: Gr
     return period / found + walk / found if found > 0.0 else np.inf
 
 
-@njit(cache=True)
+@compiled
 def _as_before(last: int, looks: int, ground: Ground, path: Path) -> float:
     """Expected s of going on where slots are left to see, if they show up as often as on the path's second half."""
     first = last // 2
@@ -227,7 +227,7 @@ def _as_before(last: int, looks: int, ground: Ground, path: Path) -> float:
     return (path.times[last] - path.times[first]) / found + walk / found if found > 0.0 else np.inf
 
 
-@njit(cache=True)
+@compiled
 def _free_again(slot: int, time: float, looked: float, outlook: Outlook) -> float:
     """P(free) some time later of a slot seen taken, really or along the path; 0 where it is not worth a look."""
     usual = outlook.usual[slot]
@@ -241,7 +241,7 @@ def _free_again(slot: int, time: float, looked: float, outlook: Outlook) -> floa
     return chance if chance >= WORTH_A_LOOK * usual else 0.0
 
 
-@njit(cache=True)
+@compiled
 def _next_target(
     vertex: int, time: float, cost: float, ground: Ground, outlook: Outlook, path: Path
 ) -> tuple[int, float]:
@@ -267,7 +267,7 @@ def _next_target(
     return chosen, best
 
 
-@njit(cache=True)
+@compiled
 def foreseen(weights: FloatArray, free_if: FloatArray, telling: bool) -> float:
     """P(free) of a slot at its first look; where it tells, the hypotheses are left as a taken slot makes them."""
     free, taken = 0.0, 0.0
@@ -280,7 +280,7 @@ def foreseen(weights: FloatArray, free_if: FloatArray, telling: bool) -> float:
     return free / (free + taken)
 
 
-@njit(cache=True)
+@compiled
 def _unsatisfied(vertex: int, promise_s: float, looks: int, ground: Ground, path: Path) -> float:
     """Chance that none of the slots looked at is free and as good as what driving on promises."""
     chance = 1.0

@@ -11,12 +11,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import VehicleParameters, move_along
 from parkenv.errors import InputError
 from planners.hybrid_astar import CarPath
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -209,7 +209,7 @@ def _stretches(vehicle: VehicleParameters, path: CarPath, settings: TrackingSett
     return stretches
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _pace(
     station: FloatArray, wheels: FloatArray, fastest: float, rate: float, acceleration: float
 ) -> FloatArray:

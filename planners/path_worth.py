@@ -12,16 +12,16 @@ those that it knows to be free.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from planners.path_laying import foreseen
 from planners.search_ground import FloatArray, Ground, IntArray, Outlook, Path, decayed
+from sim_sensors.compilation import compiled
 
 KEPT_IN_MIND = 32
 """Vertices along which a free slot that was passed is kept in mind."""
 
 
-@njit(cache=True)
+@compiled
 def offer(
     vertex: int,
     slot: int,
@@ -50,7 +50,7 @@ def offer(
     return expected
 
 
-@njit(cache=True)
+@compiled
 def worth(
     n_path: int,
     left_s: float,
@@ -93,7 +93,7 @@ def worth(
     return value, then_s
 
 
-@njit(cache=True)
+@compiled
 def _foresee(n_path: int, outlook: Outlook, path: Path) -> None:
     """Write down P(free) of the first looks along a path, each given that those before led to no parking."""
     weights = path.weights[: len(outlook.weights)]
@@ -103,7 +103,7 @@ def _foresee(n_path: int, outlook: Outlook, path: Path) -> None:
             path.chances[j] = foreseen(weights, outlook.free_if[path.slots[j]], path.taken_up[j])
 
 
-@njit(cache=True)
+@compiled
 def _stop_at_best(
     n_path: int,
     left_s: float,
@@ -169,7 +169,7 @@ def _stop_at_best(
     return onward + nothing, then_s
 
 
-@njit(cache=True)
+@compiled
 def _best_first(first: int, last: int, path: Path) -> None:
     """Order the looks made at one vertex by what they offer."""
     for i in range(first + 1, last):

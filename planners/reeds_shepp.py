@@ -11,8 +11,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -26,13 +27,13 @@ _EDGE = 1e-9
 _HALF = 0.5 * math.pi
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _turned(angle: float) -> float:
     """The same direction in [-π, π)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _outer(u: float, v: float, xi: float, eta: float, phi: float) -> tuple[float, float]:
     """First and last turn of a word of four turns, whose inner ones are u and v (their section 8, τ and ω)."""
     delta = _turned(u - v)
@@ -44,7 +45,7 @@ def _outer(u: float, v: float, xi: float, eta: float, phi: float) -> tuple[float
     return tau, _turned(tau - u + v - phi)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, turn: IntArray) -> int:
     """One of the eight formulas: signed lengths and turns of a word from the origin to a pose; pieces, or 0.
 
@@ -147,7 +148,7 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
     return 5
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def words_between(
     x: float, y: float, phi: float, pieces: FloatArray, turns: IntArray, counts: IntArray
 ) -> int:
@@ -194,7 +195,7 @@ def words_between(
     return n
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def word_cost(piece: FloatArray, count: int, radius: float, change_m: float) -> float:
     """Length, m, of a word, and `change_m` for every change of direction within it."""
     cost, direction = 0.0, 0.0
@@ -208,7 +209,7 @@ def word_cost(piece: FloatArray, count: int, radius: float, change_m: float) -> 
     return cost
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def distance_between(
     x: float,
     y: float,

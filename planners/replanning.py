@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
@@ -23,6 +22,7 @@ from planners.label_setting import (
     with_p_free,
 )
 from planners.mdp import ParkingMDP
+from sim_sensors.compilation import compiled
 
 RELEVANT_CHANGE = 0.01
 """A probability that moved less than this since the last plan is the same one, grown a little older."""
@@ -168,7 +168,7 @@ _BLOCK = 1024
 """Slots compared at a time: a plain loop that finds most blocks unchanged runs at the memory's pace."""
 
 
-@njit(cache=True)
+@compiled
 def _news(
     p_occupied: NDArray[np.floating], planned: NDArray[np.float64], relevant: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

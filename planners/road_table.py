@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.errors import InputError
 from parkenv.scenario import SearchProblem
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -72,7 +72,7 @@ class RoadTable:
         return int(np.where(leads, self.move_s[vertex], np.inf).argmin())
 
 
-@njit(cache=True)
+@compiled
 def _follow(
     seconds: FloatArray,
     neighbors: NDArray[np.int32],

@@ -6,7 +6,6 @@ from collections import OrderedDict
 from collections.abc import Iterator
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
@@ -14,6 +13,7 @@ from parkenv.lot import MOVES
 from parkenv.scenario import SearchProblem
 from planners.heap import pop, push
 from planners.label_setting import edges_in
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -101,7 +101,7 @@ class DriveRoutes:
         return moves
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _search(
     start: NDArray[np.int32],
     leads_to: NDArray[np.int32],

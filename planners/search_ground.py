@@ -10,8 +10,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -144,7 +145,7 @@ def new_path(n_slots: int, n_vertices: int) -> Path:
     )
 
 
-@njit(cache=True)
+@compiled
 def decayed(rate: float, seconds: float) -> float:
     """1 - exp(-rate · seconds), quick where little happens."""
     x = rate * seconds
@@ -153,7 +154,7 @@ def decayed(rate: float, seconds: float) -> float:
     return 1.0 - math.exp(-x)
 
 
-@njit(cache=True)
+@compiled
 def shows(rate: float, missed: float) -> bool:
     """Whether a view is likelier than not to show a slot that another one has missed.
 
@@ -166,7 +167,7 @@ def shows(rate: float, missed: float) -> bool:
     return rate > missed and rate - missed >= 0.5 * (1.0 - missed)
 
 
-@njit(cache=True)
+@compiled
 def hidden(slot: int, rate: float, outlook: Outlook) -> bool:
     """Whether a view that makes a slot out with some rate is thought not to show it."""
     if outlook.kind[slot] == UNSEEN:
@@ -175,7 +176,7 @@ def hidden(slot: int, rate: float, outlook: Outlook) -> bool:
     return bool(rate <= outlook.missed[slot])
 
 
-@njit(cache=True)
+@compiled
 def must_try(vertex: int, ground: Ground, outlook: Outlook) -> bool:
     """Whether a vertex lies before a slot that is not known to be free, and that does not show from there either.
 

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
@@ -23,6 +22,7 @@ from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.replanning import Plan, ReplanningAgent
 from planners.routes import DriveRoutes
 from planners.search_ground import Ground
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ def tune_failure_cost(
     return Tuning(tried, _mean_times(here if here >= 0 else near.place(near.gate), taken, p, tried, ground))
 
 
-@njit(cache=True)
+@compiled
 def _mean_times(
     vertex: int, taken: NDArray[np.bool_], p_occupied: FloatArray, costs: FloatArray, ground: Ground
 ) -> FloatArray:
@@ -110,7 +110,7 @@ def _mean_times(
     return mean
 
 
-@njit(cache=True)
+@compiled
 def _search(
     vertex: int,
     taken: NDArray[np.bool_],
@@ -148,7 +148,7 @@ def _search(
     return total + ground.give_up_s
 
 
-@njit(cache=True)
+@compiled
 def _promise(vertex: int, cost: float, ground: Ground, odds: FloatArray) -> tuple[int, float]:
     """The slot that the thesis's planner drives to, and the time, s, that it expects.
 

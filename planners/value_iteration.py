@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from planners.mdp import ParkingMDP
 from planners.policy_iteration import Solution
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -45,7 +45,7 @@ def value_iteration(mdp: ParkingMDP, *, tolerance: float = 1e-9, max_iterations:
     return Solution(values, mdp.action_values(values).argmax(axis=1), sweeps)
 
 
-@njit(cache=True)
+@compiled
 def _sweep_until(
     values: FloatArray,
     rewards: FloatArray,

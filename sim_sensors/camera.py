@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from sim_sensors.compilation import compiled
 from sim_sensors.errors import SensorError
 from sim_sensors.ground_texture import ground_texture
 from sim_sensors.image_sensor import ImageSensor
@@ -317,7 +317,7 @@ def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
     return pose
 
 
-@njit(cache=True)
+@compiled
 def _geometry(
     visibility: Visibility, instance: NDArray[np.int32], ids: NDArray[np.int32]
 ) -> tuple[Float32Array, Float32Array, NDArray[np.int32]]:
@@ -338,7 +338,7 @@ def _geometry(
     return depth, glass, seen
 
 
-@njit(cache=True)
+@compiled
 def _halved(image: Float32Array) -> Float32Array:
     """Mean of every 2×2 pixels of an (h, w, 3) image."""
     height, width, _ = image.shape

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from sim_sensors.compilation import compiled
 from sim_sensors.light_maps import LightMaps, open_sky
 from sim_sensors.sky import look_up, sky_domes
 from sim_sensors.textures import LEAF
@@ -64,7 +64,7 @@ def daylight(weather: Weather) -> Light:
     )
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def mirrored(
     px: float, py: float, pz: float, rx: float, ry: float, rz: float, light: Light, maps: LightMaps
 ) -> Color:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from sim_sensors.compilation import compiled
 from sim_sensors.textures import LEAF, Tile, hash_unit, pixel_level, sample_tile
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def facade(
     along: float, z: float, nz: float, footprint: float, lit_windows: float, grain: Tile
 ) -> tuple[float, float, float]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
-
+from sim_sensors.compilation import compiled
 from sim_sensors.daylight import SHADOW_BIAS, Color, Light
 from sim_sensors.ground_texture import GroundTexture, sample_ground, sample_water
 from sim_sensors.light_maps import LightMaps, open_sky, sunlit
@@ -13,7 +12,7 @@ from sim_sensors.sky import look_up
 from sim_sensors.textures import LEAF, Tile, sample_tile
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def ground_level(row_z: float, height: float, focal: float, texel: float) -> float:
     """Pyramid level at which a texel of the ground is about a pixel, in the middle of a row.
 
@@ -29,7 +28,7 @@ def ground_level(row_z: float, height: float, focal: float, texel: float) -> flo
     return max(math.log2(footprint / texel) - 0.4, 0.0)
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def ground_radiance(
     px: float,
     py: float,

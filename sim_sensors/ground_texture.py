@@ -9,9 +9,9 @@ from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Ground
 from sim_sensors.textures import LEAF, fractal_noise
 
@@ -180,7 +180,7 @@ def _pyramid(image: NDArray[np.uint8], low: NDArray[np.float64], texel: float) -
     return GroundTexture(texels, start, shape, per_m, float(low[0]), float(low[1]), texel)
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def sample_ground(texture: GroundTexture, x: float, y: float, level: int) -> tuple[float, float, int, int]:
     """The ground at (x, y), m, bilinear: grey albedo, share of grass; and its texel and the one below."""
     level = min(max(level, 0), texture.shape.shape[0] - 1)
@@ -201,14 +201,14 @@ def sample_ground(texture: GroundTexture, x: float, y: float, level: int) -> tup
     return root * root, t[i, 1] / 255.0, i, j
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def sample_water(texture: GroundTexture, i: int, j: int) -> float:
     """How much water can stand between the texels i and j of `sample_ground`."""
     t = texture.texels
     return float(float(t[i, 2]) + t[i + 1, 2] + t[j, 2] + t[j + 1, 2]) / 1020.0
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def _mirrored(u: float, n: int) -> float:
     """`u` folded back into [0, n - 1)."""
     span = n - 1.001

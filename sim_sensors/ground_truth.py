@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from sim_sensors.camera import Drawable, Frame, PinholeCamera, checked_pose
+from sim_sensors.compilation import compiled
 from sim_sensors.projection import project
 from sim_sensors.rasterizer import edge_slope, sorted_by_row
 
@@ -93,7 +93,7 @@ def _views(offset: FloatArray, yaw: FloatArray) -> NDArray[np.int8]:
     return view
 
 
-@njit(cache=True)
+@compiled
 def _extents_alone(
     corners: NDArray[np.float32], instance: IntArray, n: int, width: int, height: int
 ) -> tuple[NDArray[np.int64], IntArray]:
@@ -126,7 +126,7 @@ def _extents_alone(
     return count, box
 
 
-@njit(cache=True)
+@compiled
 def _extents_seen(ids: IntArray, n: int) -> tuple[NDArray[np.int64], IntArray]:
     height, width = ids.shape
     count = np.zeros(n, dtype=np.int64)
@@ -146,7 +146,7 @@ def _extents_seen(ids: IntArray, n: int) -> tuple[NDArray[np.int64], IntArray]:
     return count, box
 
 
-@njit(cache=True)
+@compiled
 def _empty_boxes(n: int, width: int, height: int) -> IntArray:
     box = np.zeros((n, 4), dtype=np.int32)
     box[:, 0] = width

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from sim_sensors.compilation import compiled
 from sim_sensors.errors import SensorError
 from sim_sensors.rasterizer import BAND, interleaved
 from sim_sensors.textures import FAST
@@ -136,7 +137,7 @@ def _draw_rain(radiance: Float32Array, rain: float, generator: np.random.Generat
     _streaks(radiance, column, row, length, lean, strength)
 
 
-@njit(cache=True)
+@compiled
 def _streaks(
     radiance: Float32Array,
     column: NDArray[np.float64],
@@ -154,7 +155,7 @@ def _streaks(
                     radiance[y, x, channel] += strength[i]
 
 
-@njit(cache=True, parallel=True, fastmath=FAST)
+@compiled(parallel=True, fastmath=FAST)
 def _expose(
     radiance: Float32Array,
     noise: Float32Array,

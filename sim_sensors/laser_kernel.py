@@ -13,9 +13,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from sim_sensors.compilation import compiled
 from sim_sensors.footprints import LANES, LARGEST_IN_A_CELL_M, NO_RETURN, OCTAGON, QUAD, WALL
 
 Float32Array = NDArray[np.float32]
@@ -53,7 +53,7 @@ class BeamTable(NamedTuple):
     max_range: float
 
 
-@njit(inline="always")
+@compiled(inline="always")
 def _angle(x, y):  # type: ignore[no-untyped-def]
     """Direction of (x, y) without a branch, rad; atan on [0, 1] by a least-maximum polynomial, error below 4e-8."""
     f = np.float32
@@ -73,7 +73,7 @@ def _angle(x, y):  # type: ignore[no-untyped-def]
     return -p if y < f(0) else p
 
 
-@njit(forceinline=True, error_model="numpy", fastmath=_FAST)
+@compiled(forceinline=True, error_model="numpy", fastmath=_FAST)
 def _prepare_block(  # type: ignore[no-untyped-def]
     k, block, corners, xs, ys, radius, label,
     x0, y0, cos, sin, excluded, per_radian, middle, max_range, shapes,
@@ -137,7 +137,7 @@ def _prepare_block(  # type: ignore[no-untyped-def]
         shapes[np.uint64(6 * LANES) + i] = faces
 
 
-@njit(forceinline=True, error_model="numpy", fastmath=_FAST)
+@compiled(forceinline=True, error_model="numpy", fastmath=_FAST)
 def _visible_faces(k, place, corners, dx, dy, cos, sin, lines):  # type: ignore[no-untyped-def]
     """Write a and b of every visible face of one obstacle into `lines`, (2 · k,) float32; return how many."""
     f = np.float32
@@ -153,7 +153,7 @@ def _visible_faces(k, place, corners, dx, dy, cos, sin, lines):  # type: ignore[
     return n
 
 
-@njit(forceinline=True, error_model="numpy", fastmath=_FAST)
+@compiled(forceinline=True, error_model="numpy", fastmath=_FAST)
 def _draw_two_faces(a0, b0, a1, b1, low, high, begin, end, u, v, number, inverse, row):  # type: ignore[no-untyped-def]
     """Keep the greater inverse range, for beams from `low` to `high`, all of them among `begin` to `end`."""
     for i in range(np.uint64(begin), np.uint64(end)):
@@ -162,7 +162,7 @@ def _draw_two_faces(a0, b0, a1, b1, low, high, begin, end, u, v, number, inverse
         inverse[np.uint64(row) + i] = max(inverse[np.uint64(row) + i], here)
 
 
-@njit(forceinline=True, error_model="numpy", fastmath=_FAST)
+@compiled(forceinline=True, error_model="numpy", fastmath=_FAST)
 def _draw_four_faces(lines, n, low, high, begin, end, u, v, number, inverse, row):  # type: ignore[no-untyped-def]
     """As `_draw_two_faces` for three or four; the third counts twice where there is no fourth."""
     last = 2 * n - 2
@@ -175,7 +175,7 @@ def _draw_four_faces(lines, n, low, high, begin, end, u, v, number, inverse, row
         inverse[np.uint64(row) + i] = max(inverse[np.uint64(row) + i], here)
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
+@compiled(error_model="numpy", fastmath=_FAST)
 def _draw_lines(lines, n, low, high, begin, end, label, u, v, number, inverse, ids, row, here):  # type: ignore[no-untyped-def]
     """As `_draw_two_faces` for any number of faces, and with ids where somebody asks for them."""
     first, stop, start = np.uint64(begin), np.uint64(end), np.uint64(row)
@@ -195,7 +195,7 @@ def _draw_lines(lines, n, low, high, begin, end, label, u, v, number, inverse, i
         inverse[start + i] = max(inverse[start + i], here[i])
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
+@compiled(error_model="numpy", fastmath=_FAST)
 def _draw_table(  # type: ignore[no-untyped-def]
     corners, xs, ys, radius, label, cell_start, frame, k,
     poses, first_pose, last_pose, heading, excluded, u, v, number, n_beams, per_radian, middle, max_range,
@@ -287,7 +287,7 @@ def _draw_table(  # type: ignore[no-untyped-def]
                                 )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy", fastmath=_FAST)
+@compiled(error_model="numpy", fastmath=_FAST)
 def _add_noise(ranges, scan, max_range, table, offsets, sd, lost):  # type: ignore[no-untyped-def]
     """Noise and drop-outs of one scan, both read in `table` from random offsets on."""
     f, n = np.float32, ranges.shape[1]
@@ -301,7 +301,7 @@ def _add_noise(ranges, scan, max_range, table, offsets, sd, lost):  # type: igno
             part[i] = f(np.inf) if gone else noisy
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST)
+@compiled(nogil=True, error_model="numpy", fastmath=_FAST)
 def scan_all(quads, others, poses, heading, exclude, beams, table, offsets, sd, lost, ranges, ids):  # type: ignore[no-untyped-def]
     """Fill `ranges`, (b, n_beams) float32, and `ids`, the same or (0, n_beams) if nobody asks."""
     f, n, n_padded, with_ids = np.float32, beams.n, len(beams.u), len(ids) > 0

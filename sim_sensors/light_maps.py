@@ -8,9 +8,9 @@ from weakref import WeakKeyDictionary
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Instances, Material, MeshPool
 from sim_sensors.projection import ScreenTriangles
 from sim_sensors.rasterizer import rasterize
@@ -141,7 +141,7 @@ def _shadow_map(
     return seen.inverse_depth
 
 
-@njit(cache=True)
+@compiled
 def _seen_from_the_sun(
     vertices: Float32Array,
     triangles: NDArray[np.int32],
@@ -240,7 +240,7 @@ def bounding_boxes(pool: MeshPool) -> FloatArray:
     return _BOXES[pool]
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def sunlit(maps: LightMaps, x: float, y: float, z: float, bias: float) -> float:
     """Fraction of the sun that reaches a point, 0 to 1; bilinear between four texels."""
     m = maps.to_shadow
@@ -264,7 +264,7 @@ def sunlit(maps: LightMaps, x: float, y: float, z: float, bias: float) -> float:
     return float(above + b * (below - above))
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def open_sky(maps: LightMaps, x: float, y: float) -> float:
     """Fraction of the sky that the ground at (x, y) sees past the vehicles on it."""
     u = (x - maps.x) * maps.texels_per_m - 0.5

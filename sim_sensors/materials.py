@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from sim_sensors.compilation import compiled
 from sim_sensors.daylight import SHADOW_BIAS, Color, Light, mirrored
 from sim_sensors.facades import facade
 from sim_sensors.light_maps import LightMaps, open_sky, sunlit
@@ -65,7 +65,7 @@ class Materials(NamedTuple):
     linear: FloatArray
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def surface_radiance(
     t: int,
     triangles: ScreenTriangles,
@@ -171,7 +171,7 @@ def surface_radiance(
     return red + glow, green + 0.85 * glow, blue + 0.6 * glow
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def through_glass(
     red: float,
     green: float,

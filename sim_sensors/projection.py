@@ -12,9 +12,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Instances, Material, MeshPool
 from sim_sensors.textures import FAST, LEAF
 
@@ -140,7 +140,7 @@ def _visible_instances(
     return np.flatnonzero(seen).astype(np.int32)
 
 
-@njit(cache=True, fastmath=FAST, _nrt=False)
+@compiled(fastmath=FAST, _nrt=False)
 def _project(
     vertices: Float32Array,
     normals: Float32Array,
@@ -240,7 +240,7 @@ def _project(
     return count
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def _clip(
     a: FloatArray,
     b: FloatArray,
@@ -276,7 +276,7 @@ def _clip(
     return count
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def _covers_pixels(polygon: FloatArray, corners: int, width: int, height: int) -> bool:
     """Whether the bounding box of the polygon holds the centre of a pixel of the image."""
     left = right = polygon[0, 0]

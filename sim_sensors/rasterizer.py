@@ -10,9 +10,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Material
 from sim_sensors.projection import ScreenTriangles
 from sim_sensors.textures import FAST, LEAF
@@ -101,7 +102,7 @@ def interleaved(n: int) -> NDArray[np.int64]:
     return np.arange(n, dtype=np.int64) * step % n
 
 
-@njit(cache=True)
+@compiled
 def _sort_into_bands(corners: Float32Array, n_bands: int, height: int) -> tuple[NDArray[np.int64], IntArray]:
     """Which triangles touch which band, in their own order: members[start[b]:start[b + 1]]."""
     n = corners.shape[0]
@@ -126,13 +127,13 @@ def _sort_into_bands(corners: Float32Array, n_bands: int, height: int) -> tuple[
     return start, members
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def edge_slope(x0: float, y0: float, x1: float, y1: float) -> float:
     """Change of x per row along an edge; 0 for a level one, which no row crosses."""
     return (x1 - x0) / (y1 - y0) if y1 != y0 else 0.0
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def sorted_by_row(corners: Float32Array) -> tuple[float, float, float, float, float, float]:
     """The corners (x, y) of a triangle from top to bottom.
 
@@ -151,7 +152,7 @@ def sorted_by_row(corners: Float32Array) -> tuple[float, float, float, float, fl
     return ax, ay, bx, by, cx, cy
 
 
-@njit(cache=True, parallel=True, fastmath=FAST)
+@compiled(parallel=True, fastmath=FAST)
 def _rasterize(
     corners: Float32Array,
     planes: FloatArray,

@@ -9,9 +9,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
+from sim_sensors.compilation import compiled
 from sim_sensors.daylight import Color, Light, daylight
 from sim_sensors.ground_shading import ground_level, ground_radiance
 from sim_sensors.ground_texture import GroundTexture
@@ -71,7 +72,7 @@ def shade(
     return image
 
 
-@njit(cache=True, parallel=True, fastmath=FAST)
+@compiled(parallel=True, fastmath=FAST)
 def _shade(
     triangles: ScreenTriangles,
     visibility: Visibility,
@@ -94,7 +95,7 @@ def _shade(
             _shade_row(y, triangles, visibility, view, light, ground, maps, materials, image)
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def _shade_row(
     y: int,
     triangles: ScreenTriangles,
@@ -200,7 +201,7 @@ def _shade_row(
         image[y, x, 2] = blue
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def _normal(matrix: Float32Array, u: float, v: float) -> Color:
     x = matrix[0] * u + matrix[1] * v + matrix[2]
     y = matrix[3] * u + matrix[4] * v + matrix[5]

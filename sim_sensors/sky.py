@@ -6,9 +6,9 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from sim_sensors.compilation import compiled
 from sim_sensors.textures import LEAF, cloud_tile, fractal_noise
 from sim_sensors.weather import Weather
 
@@ -113,7 +113,7 @@ def _with_skyline(
     return blended
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def look_up(dome: Float32Array, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Bilinear radiance in the unit direction (x, y, z), z ≥ 0."""
     n = dome.shape[0]

@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
+from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Mesh
 
 FloatArray = NDArray[np.float64]
@@ -248,7 +248,7 @@ def _spots(points: FloatArray) -> IntArray:
     return np.asarray(np.unique(keys, return_inverse=True)[1])
 
 
-@njit(cache=True)
+@compiled
 def _corner_normals(
     corner: IntArray, face: FloatArray, area: FloatArray, smooth: NDArray[np.bool_]
 ) -> FloatArray:

@@ -6,8 +6,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
 
@@ -70,7 +71,7 @@ def cloud_tile() -> Tile:
     return make_tile(np.clip(image, 0.0, 1.0))
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def sample_tile(tile: Tile, u: float, v: float, level: int) -> float:
     """Bilinear value at (u, v), in periods of the tile, of one level of its pyramid."""
     level = min(max(level, 0), tile.start.shape[0] - 1)
@@ -91,7 +92,7 @@ def sample_tile(tile: Tile, u: float, v: float, level: int) -> float:
     return float(above * (1 - b) + below * b)
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def hash_unit(x: int, y: int) -> float:
     """A number in [0, 1) that looks random and is always the same for the same two integers."""
     h = (np.int64(x) * 374761393 + np.int64(y) * 668265263) & 0x7FFFFFFF
@@ -99,7 +100,7 @@ def hash_unit(x: int, y: int) -> float:
     return (h ^ (h >> 16)) / 2147483648.0
 
 
-@njit(**LEAF)
+@compiled(**LEAF)
 def pixel_level(texels: float) -> int:
     """Level of a 512-texel tile whose texels are as large as a pixel that spans `texels` periods."""
     level = 0

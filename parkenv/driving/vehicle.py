@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -140,7 +140,7 @@ def _shifted(pose: FloatArray, ahead: float) -> FloatArray:
     return moved
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def move_along(x: float, y: float, yaw: float, curvature: float, way: float) -> tuple[float, float, float]:
     """The pose at the end of an arc: `way` m forward, or backward where it is negative; exact."""
     turned = curvature * way
@@ -149,7 +149,7 @@ def move_along(x: float, y: float, yaw: float, curvature: float, way: float) -> 
     return x + chord * math.cos(yaw + half), y + chord * math.sin(yaw + half), yaw + turned
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def advance(state: FloatArray, acceleration: float, steering: float, limits: FloatArray) -> float:
     """Move a car by one step of the physics, `PHYSICS_S`.
 

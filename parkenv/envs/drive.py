@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.driving.lot_space import LotSpace, Thing
@@ -23,6 +22,7 @@ from parkenv.errors import InputError
 from parkenv.keyed_random import world_key
 from parkenv.lot import ParkingLot
 from parkenv.traffic import Traffic
+from sim_sensors.compilation import compiled
 from sim_sensors.footprints import ScanPlane
 from sim_sensors.laser import LaserScanner
 
@@ -479,7 +479,7 @@ def goal_errors(
     return errors[:, 0], errors[:, 1], errors[:, 2] > 0.5
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def goal_error(
     achieved: NDArray[np.float32], desired: NDArray[np.float32], half: FloatArray
 ) -> tuple[float, float, float]:
@@ -498,7 +498,7 @@ def goal_error(
     return distance, angle, 1.0 if (near and inside and stands) else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _observe(
     vehicle: FloatArray,
     slot: FloatArray,

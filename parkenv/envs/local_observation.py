@@ -42,7 +42,6 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.envs.search import SearchEnv
@@ -67,9 +66,9 @@ from parkenv.envs.search_step import (
     VERTEX,
     Search,
     begin_slot,
-    compiled,
     forecast,
     inlined,
+    kernel,
     relax_touched,
     spot,
 )
@@ -77,6 +76,7 @@ from parkenv.envs.search_tables import N_ACTIONS, TARGETS, VIEWED, VIEWS, WALK_S
 from parkenv.errors import InputError
 from parkenv.lot import MOVES
 from parkenv.scenario import SearchProblem
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -205,7 +205,7 @@ class LocalObservation(
         return {"local": local, "action_mask": observation["action_mask"]}
 
 
-@compiled
+@kernel
 def observe_surroundings(search: Search, around: Surroundings, e: int, local: NDArray[np.float32]) -> None:
     """Write what lies around the car of search `e`; to be called after each step and each beginning."""
     counts, numbers = search.counts, search.numbers
@@ -379,7 +379,7 @@ def _around(problem: SearchProblem, k: int) -> tuple[NDArray[Any], ...]:
     return count, fixed, slots, near_index, ahead_index, finite, crow_s, samples[None]
 
 
-@njit(cache=True)
+@compiled
 def _nearest(
     neighbors: NDArray[np.int32], move_s: FloatArray, n_slots: int, k: int
 ) -> tuple[NDArray[np.int32], FloatArray, NDArray[np.int32], NDArray[np.int32], FloatArray]:
@@ -422,7 +422,7 @@ def _nearest(
     return near, near_s, near_move, ahead, ahead_s
 
 
-@njit(cache=True)
+@compiled
 def _without_repeats(
     near: NDArray[np.int32], ahead: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
@@ -448,7 +448,7 @@ def _without_repeats(
     return count, slots[:size].copy(), index[:, :k].copy(), index[:, k:].copy().reshape(n, N_MOVES, k)
 
 
-@njit(cache=True)
+@compiled
 def _best_totals(neighbors: NDArray[np.int32], move_s: FloatArray, walk_s: FloatArray) -> FloatArray:
     """Least drive and walk from each vertex by way of any slot, (n,) s; inf where none can be reached."""
     best = np.full(len(neighbors), np.inf)

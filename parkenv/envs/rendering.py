@@ -8,7 +8,6 @@ from typing import Any, Self
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.envs.drawing import (
@@ -31,6 +30,7 @@ from parkenv.envs.window import Window
 from parkenv.lot import ParkingLot, is_building
 from parkenv.occupancy import DAY_NAMES, DAY_S
 from parkenv.scenario import Scenario
+from sim_sensors.compilation import compiled
 
 WIDTH, HEIGHT = 640, 480
 HUD = 34
@@ -179,7 +179,7 @@ class _Ground:
     car_cover: NDArray[np.float32]
 
 
-@njit(cache=True)
+@compiled
 def _paint_slots(
     flat: Image,
     pixel: NDArray[np.int64],

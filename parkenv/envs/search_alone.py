@@ -14,7 +14,7 @@ from numba.core.errors import TypingError
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from parkenv.envs.search_step import Search, begin, compiled, renew, step_one, tell_time
+from parkenv.envs.search_step import Search, begin, kernel, renew, step_one, tell_time
 from parkenv.occupancy import IntArray
 
 _SEARCH = types.NamedTuple(
@@ -40,7 +40,7 @@ def held(search: Search, clock: NDArray[np.float32]) -> IntArray:
     return room
 
 
-@compiled
+@kernel
 def begin_alone(room: IntArray) -> None:
     """Begin the search that `room` holds, and write the time into its clock."""
     search, clock = _read(room)
@@ -48,7 +48,7 @@ def begin_alone(room: IntArray) -> None:
     tell_time(search, 0, clock)
 
 
-@compiled
+@kernel
 def step_alone(room: IntArray, action: int) -> None:
     """Step the search that `room` holds, bring the full belief up to date, and write the time into its clock.
 
@@ -62,7 +62,7 @@ def step_alone(room: IntArray, action: int) -> None:
     tell_time(search, 0, clock)
 
 
-@compiled
+@kernel
 def _hold(room: IntArray, what: tuple[Search, NDArray[np.float32]]) -> None:
     _write(room, what)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.belief import SlotBelief
@@ -29,6 +28,7 @@ from parkenv.envs.search_step import (
 from parkenv.occupancy import Arrival, World
 from parkenv.recorded_occupancy import RecordedOccupancy
 from parkenv.scenario import Scenario
+from sim_sensors.compilation import compiled
 
 
 class SearchState:
@@ -115,7 +115,7 @@ class SearchState:
         return self._count(OVER) == 1
 
 
-@njit(cache=True)
+@compiled
 def _read_belief(search: Search, p: NDArray[np.float64], seen: NDArray[np.bool_]) -> None:
     for column in range(1, search.counts[0, N_TOUCHED] + 1):
         slot = search.marks[0, column, WHO]

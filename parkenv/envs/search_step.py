@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.belief import after_look, relaxed
@@ -78,6 +77,7 @@ from parkenv.occupancy import (
     marginal_later,
 )
 from parkenv.recorded_occupancy import recorded_forecast
+from sim_sensors.compilation import compiled
 
 # Columns of `Search.numbers`, a row a search: times in s, distances in m.
 (
@@ -121,8 +121,8 @@ _MOMENT = 1e-6
 
 
 # Without numba's reference counting, which would take most of a step's time: no kernel here allocates anything.
-compiled = njit(cache=True, error_model="numpy", _nrt=False)
-inlined = njit(cache=True, error_model="numpy", _nrt=False, inline="always")
+kernel = compiled(error_model="numpy", _nrt=False)
+inlined = compiled(error_model="numpy", _nrt=False, inline="always")
 
 
 @inlined
@@ -186,7 +186,7 @@ class Search(NamedTuple):
         return self.numbers, self.counts, self.memory, self.marks, self.place, self.asked, self.p_occupied
 
 
-@compiled
+@kernel
 def begin(search: Search, e: int) -> None:
     """`arrive`, and foresee what can be foreseen without Python."""
     arrive(search, e)
@@ -194,7 +194,7 @@ def begin(search: Search, e: int) -> None:
         foresee(search, e)
 
 
-@compiled
+@kernel
 def arrive(search: Search, e: int) -> None:
     """Begin search `e` in the world of its seed and episode; nothing has been seen."""
     at, ints, reals, counts, numbers = search.at, search.ints, search.reals, search.counts, search.numbers
@@ -221,7 +221,7 @@ def arrive(search: Search, e: int) -> None:
     counts[e, REMEMBERED] = -1
 
 
-@compiled
+@kernel
 def forget(search: Search, e: int) -> None:
     """Take the touched slots out of their columns."""
     marks, memory, place = search.marks[e], search.memory[e], search.place[e]
@@ -324,7 +324,7 @@ def see_anew(search: Search, e: int, slot: int) -> int:
     return column
 
 
-@compiled
+@kernel
 def look_badly(search: Search, e: int) -> None:
     """See some of what is there, and some of it wrongly."""
     at, ints, reals, counts = search.at, search.ints, search.reals, search.counts
@@ -351,7 +351,7 @@ def look_badly(search: Search, e: int) -> None:
         )
 
 
-@compiled
+@kernel
 def take_in(
     search: Search, e: int, slots: IntArray, looks_taken: BoolArray, hit: FloatArray, false_alarm: FloatArray
 ) -> None:
@@ -515,7 +515,7 @@ def _draw(search: Search, e: int, column: int) -> None:
     search.memory[e, spot(column) + UNTIL] = search.numbers[e, ARRIVAL] + lasts - _MOMENT
 
 
-@compiled
+@kernel
 def _flip(search: Search, e: int, column: int, time: float) -> None:
     """Let cars come and go at a slot until `time`, as `OccupancyProcess` has them."""
     marks, memory, reals = search.marks[e, column], search.memory[e], search.reals
@@ -542,7 +542,7 @@ def _flip(search: Search, e: int, column: int, time: float) -> None:
         )
 
 
-@compiled
+@kernel
 def _replay(search: Search, e: int, column: int, time: float) -> None:
     """Read a slot's state off the log, as `RecordedWorld` does."""
     ints, reals, counts = search.ints, search.reals, search.counts
@@ -591,7 +591,7 @@ def _process_marginal(search: Search, e: int, slot: int, model: int, kept: int) 
     return marginal_later(start, arrival, rate, search.numbers[e, SECOND_OF_HOUR]), rate
 
 
-@compiled
+@kernel
 def _marginal_at_hour(
     reals: FloatArray, kept: FloatArray, model: int, first: int, n: int, hour: int, slot: int
 ) -> float:
@@ -603,7 +603,7 @@ def _marginal_at_hour(
     return float(kept[row])
 
 
-@compiled
+@kernel
 def _log_forecast(search: Search, e: int, slot: int) -> tuple[float, float]:
     ints, reals, counts = search.ints, search.reals, search.counts
     row, choice = counts[e, SCENARIO], counts[e, CHOICE]
@@ -623,7 +623,7 @@ def _log_forecast(search: Search, e: int, slot: int) -> tuple[float, float]:
     return p, reals[day + 1]
 
 
-@compiled
+@kernel
 def foresee(search: Search, e: int) -> None:
     """Write the forecast of every slot into the full belief."""
     at, row, out = search.at, search.counts[e, SCENARIO], search.p_occupied[e]
@@ -652,7 +652,7 @@ def foresee(search: Search, e: int) -> None:
     )
 
 
-@compiled
+@kernel
 def _foresee_all(
     come: FloatArray,
     go: FloatArray,

@@ -32,8 +32,8 @@ from parkenv.envs.search_step import (
     WALKED_M,
     Search,
     arrive,
-    compiled,
     foresee,
+    kernel,
     renew,
     step_one,
     tell_time,
@@ -82,7 +82,7 @@ class Steps(NamedTuple):
         return cls(np.zeros(n), flags[0], flags[1], np.zeros((N_TERMS, n)), times, tallies, flags[2])
 
 
-@compiled
+@kernel
 def arrive_all(search: Search, which: BoolArray) -> None:
     """Put cars at the entries of their next worlds."""
     for e in range(len(which)):
@@ -91,7 +91,7 @@ def arrive_all(search: Search, which: BoolArray) -> None:
             arrive(search, e)
 
 
-@compiled
+@kernel
 def step_full(
     search: Search,
     actions: IntArray,
@@ -117,7 +117,7 @@ def step_full(
         tell_time(search, e, time[e])
 
 
-@compiled
+@kernel
 def step_local(
     search: Search,
     around: Surroundings,
@@ -139,7 +139,7 @@ def step_local(
         observe_surroundings(search, around, e, local[e])
 
 
-@compiled
+@kernel
 def first_wrong(actions: IntArray) -> int:
     """The first action's index that is none, or -1."""
     for e in range(len(actions)):
@@ -148,7 +148,7 @@ def first_wrong(actions: IntArray) -> int:
     return -1
 
 
-@compiled
+@kernel
 def _report(search: Search, e: int, fresh: bool, limit: int, steps: Steps, mask: NDArray[np.int8]) -> None:
     """Reward, ends, metrics where it ends, and what can be done next."""
     counts, numbers = search.counts, search.numbers

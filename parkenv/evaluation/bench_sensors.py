@@ -10,12 +10,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pymunk
-from numba import get_num_threads, njit
+from numba import get_num_threads
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from parkenv.evaluation.bench_rows import BenchRow, duration, rate, seconds_each
 from sim_sensors.camera import PinholeCamera, StereoCamera, camera_pose
+from sim_sensors.compilation import compiled
 from sim_sensors.footprints import ScanPlane
 from sim_sensors.ground_texture import ground_texture
 from sim_sensors.ground_truth import vehicle_boxes
@@ -249,7 +250,7 @@ def embree_scanner(plane: ScanPlane, laser: LaserScanner) -> Scans:
     return scans
 
 
-@njit(cache=True, fastmath=FAST)
+@compiled(fastmath=FAST)
 def _march(
     clearance: NDArray[np.float32],
     per_cell: float,

@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.driving.parking_task import AREA, KINDS, ParkingTask
 from parkenv.driving.vehicle import SPEED, YAW, VehicleParameters, advance
 from parkenv.envs.drive import CONTROL_S, MOST_CARS, MOST_LINES, SUBSTEPS, goal_error, obstacle_map
 from planners.driver_view import HOLD, N_SEEN, DriverView, Outlines, command, see
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -124,7 +124,7 @@ class PreparedTask:
         self.about = np.array([*task.room, *(float(kind == task.kind) for kind in KINDS)])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _drive(
     actions: Float32Array,
     states: FloatArray,
@@ -172,7 +172,7 @@ def _drive(
                 approach[i] += CONTROL_S * (distance / 10.0 + angle / math.pi)
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _observe(
     rows: IntArray,
     states: FloatArray,
@@ -194,7 +194,7 @@ def _observe(
         see(at, states[i], (edges[i], first[i, : m + 1], circle[i, :m]), body, about[i], seen[k])
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _achieve(state: FloatArray, about: FloatArray, middle: float, achieved: Float32Array) -> None:
     c, s = math.cos(state[YAW]), math.sin(state[YAW])
     achieved[0], achieved[1] = state[0] + middle * c, state[1] + middle * s
@@ -202,7 +202,7 @@ def _achieve(state: FloatArray, about: FloatArray, middle: float, achieved: Floa
     achieved[5], achieved[6] = about[0], about[1]
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _touches(
     state: FloatArray,
     edges: FloatArray,
@@ -228,7 +228,7 @@ def _touches(
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _crosses(px: float, py: float, qx: float, qy: float, half: FloatArray) -> bool:
     """Whether an edge from p to q, m, car frame about its middle, meets the box of `half`."""
     if max(px, qx) < -half[0] or min(px, qx) > half[0] or max(py, qy) < -half[1] or min(py, qy) > half[1]:

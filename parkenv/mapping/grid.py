@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.perception.ranging import CarSightings
 from parkenv.perception.sweeps import Sweep
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
@@ -145,7 +145,7 @@ class OccupancyGrid:
         _take_in(self.log_odds, self.seen, self._says, window, free, occupied, MOST_LOG_ODDS)
 
 
-@njit(cache=True)
+@compiled
 def _take_in(
     log_odds: Float32Array,
     seen: NDArray[np.bool_],
@@ -165,7 +165,7 @@ def _take_in(
             says[r, c] = _NOTHING
 
 
-@njit(cache=True)
+@compiled
 def _window(says: NDArray[np.uint8], x0: float, x1: float, y0: float, y1: float) -> tuple[int, int, int, int]:
     """First and last + 1 row, and column, of the cells that touch a rectangle."""
     rows, columns = says.shape
@@ -177,7 +177,7 @@ def _window(says: NDArray[np.uint8], x0: float, x1: float, y0: float, y1: float)
     )
 
 
-@njit(cache=True)
+@compiled
 def _look_as_the_thesis(
     says: NDArray[np.uint8],
     x: float,
@@ -229,7 +229,7 @@ def _look_as_the_thesis(
     return window
 
 
-@njit(cache=True)
+@compiled
 def _look_along_beams(
     says: NDArray[np.uint8],
     x: float,
@@ -266,7 +266,7 @@ def _look_along_beams(
     return window
 
 
-@njit(cache=True)
+@compiled
 def _ray(
     says: NDArray[np.uint8],
     x: float,

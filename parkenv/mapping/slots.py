@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -14,6 +13,7 @@ from parkenv.lot import Mouth, ParkingLot
 from parkenv.mapping.grid import P_FREE, P_OCCUPIED
 from parkenv.perception.ranging import CarSightings
 from parkenv.perception.sweeps import Sweep
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -146,7 +146,7 @@ def _logit(p: float) -> float:
     return math.log(p / (1.0 - p))
 
 
-@njit(cache=True)
+@compiled
 def _beams_on_slots(
     x: float,
     y: float,
@@ -184,7 +184,7 @@ def _beams_on_slots(
     return ended, passed
 
 
-@njit(cache=True)
+@compiled
 def _crossing(
     ox: float, oy: float, ux: float, uy: float, half_x: float, half_y: float
 ) -> tuple[float, float]:

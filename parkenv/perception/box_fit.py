@@ -6,10 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
@@ -104,7 +104,7 @@ def fit_box(
     )
 
 
-@njit(cache=True)
+@compiled
 def _direction(points: FloatArray) -> float:
     """The angle in [0, π/2) of the rectangle to whose nearer sides the points are closest."""
     best, answer = -1.0, 0.0

@@ -15,10 +15,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from sim_sensors.compilation import compiled
 
 Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
@@ -155,7 +155,7 @@ _FAST = {"nnan", "ninf", "nsz", "arcp", "contract", "afn"}
 _HALF = CELL // 2
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy")
 def _gradients(
     above: Image, row: Image, below: Image, magnitude: Float32Array, weighted_bin: Float32Array
 ) -> None:
@@ -183,13 +183,13 @@ def _gradients(
         weighted_bin[x] = m * (angle * one_bin - np.float32(0.5))
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy")
 def _share(m: np.float32, q: np.float32, k: np.float32) -> np.float32:
     """What a gradient gives to bin k: its magnitude, less for each bin that it is away."""
     return max(np.float32(0.0), m - abs(q - m * k))
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy")
 def _bin_rows(
     m: Float32Array, q: Float32Array, first: np.float32, upper: Float32Array, lower: Float32Array
 ) -> None:
@@ -232,7 +232,7 @@ def _bin_rows(
             b[_HALF + x] += down
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy")
 def _pool(sums: Float32Array, tent: Float32Array, out: Float32Array) -> None:
     """From columns of pixels to columns of cells, each cell with a tent two cells wide."""
     for k in range(ORIENTATIONS):
@@ -243,7 +243,7 @@ def _pool(sums: Float32Array, tent: Float32Array, out: Float32Array) -> None:
             out[k, c] = total
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy")
 def _histograms(padded: Image, rows: int, columns: int) -> Float32Array:
     """`cell_histograms` of an image with a border of one pixel."""
     width = columns * CELL
@@ -274,7 +274,7 @@ def _histograms(padded: Image, rows: int, columns: int) -> Float32Array:
     return out
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy")
 def _by_cell(cells: Float32Array) -> Float32Array:
     rows, values, columns = cells.shape
     out = np.empty_like(cells)
@@ -292,7 +292,7 @@ def _by_cell(cells: Float32Array) -> Float32Array:
     return out
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy")
 def _block_scales(cells: Float32Array) -> Float32Array:
     """(rows + 1, columns + 1): one over the norm of the 2×2 cells about each corner, the border's cells doubled."""
     rows, values, columns = cells.shape
@@ -313,7 +313,7 @@ def _block_scales(cells: Float32Array) -> Float32Array:
     return scale
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy")
 def _by_neighbors(cells: Float32Array) -> Float32Array:
     rows, values, columns = cells.shape
     scale = _block_scales(cells)
@@ -331,7 +331,7 @@ def _by_neighbors(cells: Float32Array) -> Float32Array:
     return out
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy")
 def _by_blocks(cells: Float32Array) -> Float32Array:
     rows, values, columns = cells.shape
     out = np.empty((max(rows - 1, 0), 4 * values, max(columns - 1, 0)), dtype=np.float32)
@@ -355,7 +355,7 @@ def _by_blocks(cells: Float32Array) -> Float32Array:
     return out
 
 
-@njit(cache=True, fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy")
 def correlate(features: Float32Array, weights: Float32Array) -> Float32Array:
     """The dot product of the weights with every window of the features.
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from sim_sensors.camera import StereoCamera, StereoFrame
+from sim_sensors.compilation import compiled
 from sim_sensors.laser import LaserScanner
 from sim_sensors.rig import Mount
 
@@ -128,7 +128,7 @@ def disparity(pair: StereoFrame, stereo: StereoCamera, nearest: float = _NEAREST
     return np.where(found > 0.0, found, np.nan).astype(np.float32)
 
 
-@njit(cache=True)
+@compiled
 def _column_depths(
     disparity_px: Float32Array,
     columns: int,

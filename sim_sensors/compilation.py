@@ -1,0 +1,295 @@
+"""Compile functions with numba, and keep the machine code until any source it was made from changes.
+
+Numba's own cache checks the file of the compiled function alone: after an edit of a function that it calls, or of a
+constant that it reads, in another file, callers would go on running the old code. Here the key is the content of the
+function's module and of every module of our packages that it imports, directly or not.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import logging
+import os
+import pickle
+import re
+import shutil
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, overload
+
+import numba
+from numba.core import event
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache, _CacheLocator
+from numba.core.serialize import dumps
+from platformdirs import user_cache_path
+
+_PACKAGES = ("sim_sensors", "parkenv", "planners")
+_KEPT_DAYS = 30
+"""Code of other versions of a module is deleted once it is older than this."""
+_LOGGER = logging.getLogger("parkenv")
+
+
+def cache_folder() -> Path:
+    """Return the folder that holds compiled code: `NUMBA_CACHE_DIR`, else one in the user's cache folder."""
+    configured = numba.config.CACHE_DIR
+    return Path(configured) if configured else user_cache_path("parkenv", appauthor=False) / "compiled"
+
+
+@overload
+def compiled(function: Callable[..., Any], /) -> Any: ...
+@overload
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]: ...
+def compiled(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
+    """Decorate a function to be compiled when it is first called, once for all processes and sessions.
+
+    Args:
+        function: the function, where the decorator has no options.
+        options: those of `numba.njit` but `cache`.
+
+    Examples:
+        >>> @compiled(error_model="numpy")
+        ... def half(x):
+        ...     return x / 2
+        >>> half.py_func(3.0)
+        1.5
+    """
+    if function is None:
+        return functools.partial(_compiled, options=options)
+    return _compiled(function, options)
+
+
+def _compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
+    dispatcher = numba.njit(**options)(function)
+    if numba.config.DISABLE_JIT:
+        return dispatcher
+    try:
+        dispatcher._cache = _SourceKeyedCache(function)
+    except (OSError, RuntimeError):
+        dispatcher._cache = NullCache()  # no folder can be written, or the function stands in no file
+    return dispatcher
+
+
+class _Clock:
+    """Seconds that this process has spent on compiling and on loading compiled code."""
+
+    def __init__(self) -> None:
+        self.total_s = 0.0
+        self._depth = 0
+        self._since = 0.0
+
+    def start(self) -> None:
+        if self._depth == 0:
+            self._since = time.perf_counter()
+        self._depth += 1
+
+    def stop(self) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self.total_s += time.perf_counter() - self._since
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        self.start()
+        try:
+            yield
+        finally:
+            self.stop()
+
+
+_CLOCK = _Clock()
+
+
+class _CompileListener(event.Listener):
+    def on_start(self, event: Any) -> None:  # noqa: ARG002 - numba's interface
+        _CLOCK.start()
+
+    def on_end(self, event: Any) -> None:  # noqa: ARG002
+        _CLOCK.stop()
+
+
+event.register("numba:compile", _CompileListener())
+
+
+def seconds_spent() -> float:
+    """Return the seconds that this process has spent so far on compiling and on loading compiled code.
+
+    Subtract the difference of two calls from a measured time to leave compilation out of it.
+    """
+    return _CLOCK.total_s
+
+
+@functools.cache
+def _announce() -> None:
+    """Say once that functions are being compiled, since the first call of many takes seconds."""
+    _LOGGER.warning("compiling for this machine, once; kept in %s", cache_folder())
+
+
+class _SourceKeyedLocator(_CacheLocator):
+    """Names the folder of a module's compiled code after the content of all the sources it is made from."""
+
+    def __init__(self, py_func: Any, py_file: str) -> None:
+        self._py_file = py_file
+        self._qualname = py_func.__qualname__
+        self._folder = cache_folder() / f"{py_func.__module__}-{source_key(py_file)}"
+
+    @classmethod
+    def from_function(cls, py_func: Any, py_file: str) -> _SourceKeyedLocator | None:
+        return cls(py_func, py_file) if Path(py_file).is_file() else None
+
+    def get_cache_path(self) -> str:
+        return str(self._folder)
+
+    def get_source_stamp(self) -> str:
+        return self._folder.name
+
+    def get_disambiguator(self) -> str:
+        # Two functions of one module may have the same name, one after the other.
+        return hashlib.sha256(self._qualname.encode()).hexdigest()[:8]
+
+    def ensure_cache_path(self) -> None:
+        if not self._folder.exists():
+            _delete_old_versions(self._folder)
+            self._folder.mkdir(parents=True, exist_ok=True)
+
+
+class _SourceKeyedImpl(CompileResultCacheImpl):  # type: ignore[misc]
+    _locator_classes = (_SourceKeyedLocator,)
+
+
+class _CodeFiles:
+    """One file for each signature, written whole: processes that compile at the same time cannot mix theirs."""
+
+    def __init__(self, folder: str, name: str) -> None:
+        self._folder, self._name = Path(folder), name
+
+    def _path(self, key: Any) -> Path:
+        return self._folder / f"{self._name}-{hashlib.sha256(str(key).encode()).hexdigest()[:16]}.nbc"
+
+    def load(self, key: Any) -> Any:
+        try:
+            saved_key, data = pickle.loads(self._path(key).read_bytes())
+        except (OSError, EOFError, pickle.UnpicklingError):
+            return None
+        return data if saved_key == key else None
+
+    def save(self, key: Any, data: Any) -> None:
+        path = self._path(key)
+        beside = path.with_name(f"{path.name}.{os.getpid()}.part")
+        try:
+            beside.write_bytes(dumps((key, data)))
+            beside.replace(path)
+        finally:
+            beside.unlink(missing_ok=True)
+
+    def flush(self) -> None:
+        for path in self._folder.glob(f"{self._name}-*.nbc"):
+            path.unlink(missing_ok=True)
+
+
+class _SourceKeyedCache(FunctionCache):  # type: ignore[misc]
+    _impl_class = _SourceKeyedImpl
+
+    def __init__(self, py_func: Any) -> None:
+        super().__init__(py_func)
+        self._cache_file = _CodeFiles(self._cache_path, self._impl.filename_base)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        with _CLOCK.running():
+            data = super().load_overload(sig, target_context)
+        if data is None:
+            _announce()
+        return data
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            with _CLOCK.running():
+                super().save_overload(sig, data)
+        except OSError as error:
+            _LOGGER.warning(
+                "compiled code cannot be kept in %s: %s", self._cache_path, error.strerror or error
+            )
+            self.disable()
+
+
+def _delete_old_versions(folder: Path) -> None:
+    """Delete code of earlier versions of the module that nothing has been added to for a month."""
+    oldest = time.time() - _KEPT_DAYS * 86_400
+    for other in folder.parent.glob(f"{folder.name.rpartition('-')[0]}-*"):
+        try:
+            if other.stat().st_mtime < oldest:
+                shutil.rmtree(other)
+        except OSError:
+            continue  # another process deletes it, too
+
+
+def source_key(file: str | os.PathLike[str]) -> str:
+    """Return the key of compiled code: of numba's version, a source file, and all that it imports of our packages."""
+    return _closure_key(Path(file).resolve())
+
+
+@functools.cache
+def _closure_key(file: Path) -> str:
+    digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
+    for path in sorted(_closure(file), key=str):
+        digest.update(_content(path)[0])
+    return digest.hexdigest()[:16]
+
+
+def _closure(file: Path) -> set[Path]:
+    """The file and all files of its own package and ours that it imports, directly or not."""
+    found = {file}
+    waiting = [file]
+    while waiting:
+        for module in _content(waiting.pop())[1]:
+            for path in _module_files(module):
+                if path not in found:
+                    found.add(path)
+                    waiting.append(path)
+    return found
+
+
+_IMPORT = re.compile(
+    rb"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]+))", re.M
+)
+_NAME = re.compile(rb"[\w.]+")
+
+
+@functools.cache
+def _content(file: Path) -> tuple[bytes, tuple[str, ...]]:
+    """Hash of a file, and the modules that it may import."""
+    content = file.read_bytes()
+    modules = []
+    for source, names, plain in _IMPORT.findall(content):
+        if source:
+            modules.append(source.decode())
+            modules += [f"{source.decode()}.{name.decode()}" for name in _NAME.findall(names)]
+        else:
+            modules += [name.decode() for name in _NAME.findall(plain)]
+    return hashlib.sha256(content).digest(), tuple(modules)
+
+
+@functools.cache
+def _module_files(module: str) -> tuple[Path, ...]:
+    """Where a module of a package is whose compiled code depends on others; nothing for libraries' modules."""
+    top, *rest = module.split(".")
+    package = sys.modules.get(top)
+    # Libraries carry their version in their metadata, not in sources that change under us; but for a user's own
+    # modules, and for ours, the content is what counts.
+    if package is None or not _is_followed(top, package):
+        return ()
+    places = [Path(folder).joinpath(*rest) for folder in getattr(package, "__path__", ())]
+    candidates = [place.with_suffix(".py") for place in places] + [place / "__init__.py" for place in places]
+    return tuple(path.resolve() for path in candidates if path.is_file())
+
+
+def _is_followed(top: str, package: Any) -> bool:
+    file = getattr(package, "__file__", None)
+    return top in _PACKAGES or (file is not None and "site-packages" not in file and not _is_standard(top))
+
+
+def _is_standard(top: str) -> bool:
+    return top in sys.stdlib_module_names
