@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from parkenv import Lane, Mouth, ParkingLot, Scenario
-from parkenv.evaluation.compare import Case
+from parkenv.evaluation.experiments.compare import Case
 
 # Twelve slots on either side of one aisle that runs east; cars stand nose-in, so they are entered at the rear.
 x = 6.0 + 2.5 * np.arange(12)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from parkenv import Scenario
-from parkenv.evaluation.episodes import EpisodeRunner
+from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from planners import make_agent
 
 scenario = Scenario.named("jam")

@@ -5,13 +5,13 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 
-from sim_sensors.camera import PinholeCamera
+from sim_sensors.camera.models import PinholeCamera
+from sim_sensors.camera.weather import Weather
 from sim_sensors.ground_truth import View, vehicle_boxes
-from sim_sensors.laser import LaserScanner
+from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import RIGHT, Mount, SensorRig
 from sim_sensors.scene import Scene
 from sim_sensors.surroundings import Surroundings
-from sim_sensors.weather import Weather
 
 mpl.use("agg")
 from matplotlib import pyplot as plt

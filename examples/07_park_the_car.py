@@ -3,7 +3,7 @@
 import gymnasium as gym
 
 import parkenv  # noqa: F401  registers the environments
-from planners.parking import ParkingAgent
+from planners.driving.parking import ParkingAgent
 
 driver = ParkingAgent()
 for kind in ("perpendicular", "oblique", "parallel"):

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from parkenv import ParkingLot, Scenario
-from parkenv.evaluation.compare import Case
-from parkenv.evaluation.statistics import mean_interval
-from parkenv.evaluation.surveys import run_survey, summarize
-from parkenv.flat_map import FlatMap
+from parkenv.evaluation.experiments.compare import Case
+from parkenv.evaluation.experiments.statistics import mean_interval
+from parkenv.evaluation.experiments.surveys import run_survey, summarize
 from parkenv.mapping.inference import MapPrior
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SurveySettings
-from parkenv.occupancy import ArrivalWindow
+from parkenv.world.flat_map import FlatMap
+from parkenv.world.occupancy import ArrivalWindow
 
 lot = ParkingLot.grid(4, 20)
 world = Scenario.on_lot(lot, arrival=ArrivalWindow.parse("11:00-13:00"))

@@ -12,30 +12,30 @@ from gymnasium.envs.registration import register, registry
 
 if TYPE_CHECKING:
     from parkenv.errors import InputError
-    from parkenv.lot import Lane, Mouth, ParkingLot
-    from parkenv.occupancy import ArrivalWindow, OccupancyProcess
-    from parkenv.occupancy_log import OccupancyLog
-    from parkenv.recorded_occupancy import RecordedOccupancy
-    from parkenv.scenario import Scenario, SearchProblem
-    from parkenv.sighting import SightBand, SightingModel
-    from parkenv.traffic import Traffic
+    from parkenv.world.lot import Lane, Mouth, ParkingLot
+    from parkenv.world.occupancy import ArrivalWindow, OccupancyProcess
+    from parkenv.world.occupancy_log import OccupancyLog
+    from parkenv.world.recorded_occupancy import RecordedOccupancy
+    from parkenv.world.scenario import Scenario, SearchProblem
+    from parkenv.world.sensor_model import SensorBand, SensorModel
+    from parkenv.world.traffic import Traffic
 
 __version__ = "0.1.0"
 
 _EXPORTS = {
-    "ArrivalWindow": "parkenv.occupancy",
+    "ArrivalWindow": "parkenv.world.occupancy",
     "InputError": "parkenv.errors",
-    "Lane": "parkenv.lot",
-    "Mouth": "parkenv.lot",
-    "OccupancyLog": "parkenv.occupancy_log",
-    "OccupancyProcess": "parkenv.occupancy",
-    "ParkingLot": "parkenv.lot",
-    "RecordedOccupancy": "parkenv.recorded_occupancy",
-    "Scenario": "parkenv.scenario",
-    "SearchProblem": "parkenv.scenario",
-    "SightBand": "parkenv.sighting",
-    "SightingModel": "parkenv.sighting",
-    "Traffic": "parkenv.traffic",
+    "Lane": "parkenv.world.lot",
+    "Mouth": "parkenv.world.lot",
+    "OccupancyLog": "parkenv.world.occupancy_log",
+    "OccupancyProcess": "parkenv.world.occupancy",
+    "ParkingLot": "parkenv.world.lot",
+    "RecordedOccupancy": "parkenv.world.recorded_occupancy",
+    "Scenario": "parkenv.world.scenario",
+    "SearchProblem": "parkenv.world.scenario",
+    "SensorBand": "parkenv.world.sensor_model",
+    "SensorModel": "parkenv.world.sensor_model",
+    "Traffic": "parkenv.world.traffic",
 }
 
 __all__ = [
@@ -49,8 +49,8 @@ __all__ = [
     "RecordedOccupancy",
     "Scenario",
     "SearchProblem",
-    "SightBand",
-    "SightingModel",
+    "SensorBand",
+    "SensorModel",
     "Traffic",
 ]
 

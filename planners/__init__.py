@@ -4,10 +4,10 @@ They know the lot and a belief, never what stands in the slots; the oracle alone
 """
 
 from planners.agent import AGENT_NAMES, Agent, SearchAgent, make_agent
-from planners.label_setting import label_setting
-from planners.mdp import CirclingWarning, ParkingMDP
-from planners.policy_iteration import Solution, policy_iteration
-from planners.value_iteration import value_iteration
+from planners.thesis.label_setting import label_setting
+from planners.thesis.mdp import CirclingWarning, ParkingMDP
+from planners.thesis.policy_iteration import Solution, policy_iteration
+from planners.thesis.value_iteration import value_iteration
 
 __all__ = [
     "AGENT_NAMES",

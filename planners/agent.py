@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.scenario import Scenario, SearchProblem
+from parkenv.world.scenario import Scenario, SearchProblem
 from planners.learned import ALGORITHMS
 
 Observation = Mapping[str, Any]
@@ -93,16 +93,16 @@ class SearchAgent(ABC, Generic[Memory]):
 
 # Modules are named, not imported: a strategy needs no sparse solver, and nobody pays for torch unasked.
 _AGENTS: dict[str, tuple[str, str]] = {
-    "mdp": ("planners.replanning", "ReplanningAgent"),
-    "mdp-static": ("planners.replanning", "StaticAgent"),
+    "mdp": ("planners.thesis.replanning", "ReplanningAgent"),
+    "mdp-static": ("planners.thesis.replanning", "StaticAgent"),
     "greedy-goal": ("planners.greedy", "GreedyGoalAgent"),
     "greedy-drive": ("planners.greedy", "GreedyDriveAgent"),
     "first-free": ("planners.greedy", "FirstFreeAgent"),
     "random": ("planners.greedy", "RandomAgent"),
-    "oracle": ("planners.oracle", "OracleAgent"),
-    "belief": ("planners.belief_search", "BeliefAgent"),
-    "mdp-tuned": ("planners.tuning", "TunedAgent"),
-    "exact": ("planners.exact", "ExactAgent"),
+    "oracle": ("planners.bounds.oracle", "OracleAgent"),
+    "belief": ("planners.belief.agent", "BeliefAgent"),
+    "mdp-tuned": ("planners.thesis.tuning", "TunedAgent"),
+    "exact": ("planners.bounds.exact", "ExactAgent"),
 }
 
 SMALL_LOTS_ONLY = ("exact",)
@@ -121,7 +121,7 @@ def require_sight(name: str, problem: SearchProblem) -> None:
     Raises:
         InputError: nothing is seen.
     """
-    if not problem.sight_rates.seen.any():
+    if not problem.sensor_rates.seen.any():
         raise InputError(
             f"{name} plans on what it sees from the lane, and here slots are seen only by trying; take mdp"
         )

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.lot import PARK
-from parkenv.scenario import SearchProblem
+from parkenv.world.lot import PARK
+from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
 from planners.routes import DriveRoutes
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.scenario import Scenario, SearchProblem
+from parkenv.world.scenario import Scenario, SearchProblem
 
 ALGORITHMS = {
     "dqn": ("stable_baselines3", "DQN"),

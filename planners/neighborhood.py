@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.scenario import SearchProblem
-from planners.heap import pop, push
-from planners.label_setting import StoppingGraph, settle
-from planners.mdp import ParkingMDP
-from planners.road_table import RoadTable
-from planners.search_ground import Ground
+from parkenv.world.scenario import SearchProblem
+from planners.belief.planning_graph import Ground
+from planners.driving.road_table import RoadTable
+from planners.thesis.heap import pop, push
+from planners.thesis.label_setting import StoppingGraph, settle
+from planners.thesis.mdp import ParkingMDP
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
@@ -59,7 +59,7 @@ class Neighborhood:
         """That of some vertices, (k,) ascending."""
         lot = problem.lot
         whole, n_slots = len(vertices) == lot.n_vertices, int(np.searchsorted(vertices, lot.n_slots))
-        neighbors, (starts, slots), rates = lot.neighbors, problem.slots_in_view, problem.sight_rates.seen
+        neighbors, (starts, slots), rates = lot.neighbors, problem.slots_in_view, problem.sensor_rates.seen
         if not whole:
             neighbors = _numbered(vertices, lot.neighbors[vertices]).astype(np.int32)
             first, last = starts[vertices], starts[vertices + 1]

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.lot import MOVES
-from parkenv.scenario import SearchProblem
-from planners.heap import pop, push
-from planners.label_setting import edges_in
+from parkenv.world.lot import MOVES
+from parkenv.world.scenario import SearchProblem
+from planners.thesis.heap import pop, push
+from planners.thesis.label_setting import edges_in
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from sim_sensors.camera.textures import LEAF, Tile, hash_unit, pixel_level, sample_tile
 from sim_sensors.compilation import compiled
-from sim_sensors.textures import LEAF, Tile, hash_unit, pixel_level, sample_tile
 
 
 @compiled(**LEAF)

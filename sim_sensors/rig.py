@@ -10,11 +10,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim_sensors.camera import Drawable, Frame, PinholeCamera, StereoCamera, StereoFrame, camera_pose
+from sim_sensors.camera.models import Drawable, Frame, PinholeCamera, StereoCamera, StereoFrame, camera_pose
+from sim_sensors.camera.weather import Weather
 from sim_sensors.errors import SensorError
-from sim_sensors.footprints import ScanPlane
-from sim_sensors.laser import LaserScanner
-from sim_sensors.weather import Weather
+from sim_sensors.laser.footprints import ScanPlane
+from sim_sensors.laser.scanner import LaserScanner
 
 FloatArray = NDArray[np.float64]
 

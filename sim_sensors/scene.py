@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
 from sim_sensors.errors import SensorError
-from sim_sensors.footprints import ScanPlane
+from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.mesh import Ground, Instances, Mesh, MeshPool
 from sim_sensors.movers import LOOKS, Movers, people_meshes
 from sim_sensors.scenery import GAITS, pedestrian_footprint
 from sim_sensors.surroundings import Surroundings, floats
-from sim_sensors.vehicles import COARSE, DETAILED, FOOTPRINT_CORNERS, VehicleModel
+from sim_sensors.vehicles.vehicle import COARSE, DETAILED, FOOTPRINT_CORNERS, VehicleModel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

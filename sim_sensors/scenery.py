@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim_sensors.camera.surfaces import ShapeBuilder
 from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Material, Mesh
-from sim_sensors.surfaces import ShapeBuilder
 
 FloatArray = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sim_sensors.errors import SensorError
 from sim_sensors.scene import NO_VEHICLE, Fleet, Scene
 from sim_sensors.surroundings import Surroundings, floats
-from sim_sensors.vehicles import VehicleModel
+from sim_sensors.vehicles.vehicle import VehicleModel
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -4,8 +4,8 @@ from dataclasses import fields
 
 import numpy as np
 
-from parkenv import Lane, ParkingLot, SightingModel
-from parkenv.scenario import SearchProblem
+from parkenv import Lane, ParkingLot, SensorModel
+from parkenv.world.scenario import SearchProblem
 
 SHAPES = ((1, 12), (2, 6), (4, 3), (2, 5), (3, 4), (1, 9))
 PITCHES = (2.5, 6.0, 15.0)
@@ -32,7 +32,7 @@ def small_lot(seed: int, shapes=SHAPES):
         v_drive=rng.uniform(1.5, 4.0),
         v_walk=rng.uniform(0.8, 1.6),
         give_up_s=300.0,
-        sighting=SightingModel(view_range=VIEWS[seed // 18 % 2]),
+        sensor_model=SensorModel(view_range=VIEWS[seed // 18 % 2]),
     )
     mean, walk, n = MEAN_FREE[seed // 36 % 3], problem.walk_s, problem.lot.n_slots
     if seed % 3 == 0:

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from small_lots import cut_in_two
 
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightingModel
-from parkenv.evaluation.compare import Case, settings_of
-from parkenv.evaluation.episodes import EpisodeRunner
-from parkenv.scenario import SCENARIO_NAMES, SearchProblem
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorModel
+from parkenv.evaluation.experiments.compare import Case, settings_of
+from parkenv.evaluation.experiments.episodes import EpisodeRunner
+from parkenv.world.scenario import SCENARIO_NAMES, SearchProblem
 from planners import AGENT_NAMES, make_agent
 
 SEEDS = range(12)
@@ -181,7 +181,7 @@ def test_a_full_lot_is_given_up_once_it_is_proven_full(agent):
 def test_a_search_cut_off_is_charged_like_one_that_gave_up():
     lot = ParkingLot.grid(2, 5)
     scenario = frozen_world(lot, np.ones(lot.n_slots, dtype=bool), failure_s=1.0, give_up_s=500.0)
-    scenario = scenario.replace(sighting=SightingModel(view_range=0.0))
+    scenario = scenario.replace(sensor_model=SensorModel(view_range=0.0))
     row = EpisodeRunner(scenario, "mdp-static", make_agent("mdp-static", scenario)).run(0).row
     assert row["truncated"]
     assert row["total_s"] == pytest.approx(row["drive_s"] + row["failed_s"] + 500.0)
@@ -194,7 +194,7 @@ def test_a_search_cut_off_is_charged_like_one_that_gave_up():
 def test_the_planner_plans_again_only_when_a_probability_changes():
     """Where the forecast is what is seen, nothing changes but that slots become certain."""
     lot = ParkingLot.grid(2, 20)
-    scenario = frozen_world(lot, np.arange(lot.n_slots) % 2 == 0, sighting=SightingModel(view_range=0.0))
+    scenario = frozen_world(lot, np.arange(lot.n_slots) % 2 == 0, sensor_model=SensorModel(view_range=0.0))
     agent = make_agent("mdp", scenario)
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     observation, _ = env.reset(seed=0)
@@ -214,7 +214,7 @@ def test_the_planner_plans_again_only_when_a_probability_changes():
 
 def test_the_static_planner_keeps_trying_its_taken_slot():
     lot = ParkingLot.grid(2, 8)
-    scenario = frozen_world(lot, np.ones(lot.n_slots, dtype=bool), sighting=SightingModel(view_range=0.0))
+    scenario = frozen_world(lot, np.ones(lot.n_slots, dtype=bool), sensor_model=SensorModel(view_range=0.0))
     row = EpisodeRunner(scenario, "mdp-static", make_agent("mdp-static", scenario)).run(0).row
     assert row["failed_parks"] > 100
     assert row["replans"] == 0
@@ -233,7 +233,7 @@ def test_the_planner_never_tries_a_slot_that_it_sees_taken():
 @pytest.mark.parametrize("name", SCENARIO_NAMES)
 def test_nobody_beats_the_bound_and_the_oracle_reaches_it(name):
     scenario = Scenario.named(
-        name, sighting=SightingModel(view_range=6.0, hit_rate=0.95, false_alarm_rate=0.05)
+        name, sensor_model=SensorModel(view_range=6.0, hit_rate=0.95, false_alarm_rate=0.05)
     )
     for agent in AGENT_NAMES:
         for row in episodes(scenario, agent, range(8)):
@@ -269,7 +269,7 @@ def test_the_oracle_turns_to_a_slot_where_the_lot_cannot_be_proven_full():
         name="cut",
         lot=lot,
         occupancy=OccupancyProcess.from_demand(demand, np.zeros(168), 600.0),
-        sighting=SightingModel(view_range=1000.0),
+        sensor_model=SensorModel(view_range=1000.0),
         give_up_s=60.0,
     )
     rows = episodes(scenario, "oracle", range(12))

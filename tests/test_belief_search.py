@@ -5,18 +5,18 @@ import numpy as np
 import pytest
 from small_lots import cut_in_two, features, small_lot
 
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightingModel
-from parkenv.evaluation.compare import Case, at_occupancy
-from parkenv.evaluation.episodes import EpisodeRunner
-from parkenv.evaluation.statistics import mean_interval
-from parkenv.sighting import SightBand
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorModel
+from parkenv.evaluation.experiments.compare import Case, at_occupancy
+from parkenv.evaluation.experiments.episodes import EpisodeRunner
+from parkenv.evaluation.experiments.statistics import mean_interval
+from parkenv.world.sensor_model import SensorBand
 from planners import make_agent
-from planners.belief_search import WORK_PER_MS
-from planners.best_path import best_path
-from planners.exact import ExactSolution
-from planners.expected_time import expected_time
-from planners.map_doubt import MapDoubt
-from planners.search_ground import MOST_STEPS, shows
+from planners.belief.agent import WORK_PER_MS
+from planners.belief.best_path import best_path
+from planners.belief.forecast_error import MapDoubt
+from planners.belief.planning_graph import MOST_STEPS, shows
+from planners.bounds.exact import ExactSolution
+from planners.thesis.expected_time import expected_time
 
 
 def gap(seed, **options):
@@ -79,7 +79,7 @@ def choices(scenario, monkeypatch, seed=1, **options):
         made.append((arguments[4], choice))
         return choice
 
-    monkeypatch.setattr("planners.belief_search.best_path", noted)
+    monkeypatch.setattr("planners.belief.agent.best_path", noted)
     search(scenario, seed, **options)
     return made
 
@@ -245,8 +245,8 @@ def test_it_expects_slots_that_it_saw_taken_to_come_free():
     """Half of the lot cannot be reached, so it is never proven full; the rest changes within minutes."""
     lot = cut_in_two()
     occupancy = OccupancyProcess.from_demand(np.full(lot.n_slots, 2.5), np.zeros(168), 300.0)
-    sighting = SightingModel(view_range=0.0)
-    scenario = Scenario(name="busy", lot=lot, occupancy=occupancy, give_up_s=1e4, sighting=sighting)
+    sighting = SensorModel(view_range=0.0)
+    scenario = Scenario(name="busy", lot=lot, occupancy=occupancy, give_up_s=1e4, sensor_model=sighting)
     agent, env = make_agent("belief", scenario), gym.make("parkenv/Search-v0", scenario=scenario)
     expected = []
     for seed in range(10):
@@ -265,7 +265,7 @@ def test_it_expects_slots_that_it_saw_taken_to_come_free():
 
 
 def test_looks_that_err_cost_tries_but_do_not_trap_it():
-    scenario = Scenario.named("campus", sighting=SightingModel(hit_rate=0.9, false_alarm_rate=0.1))
+    scenario = Scenario.named("campus", sensor_model=SensorModel(hit_rate=0.9, false_alarm_rate=0.1))
     rows = [search(scenario, seed) for seed in range(4)]
     assert all(row["parked"] for row in rows)
     assert max(row["failed_parks"] for row in rows) <= 5
@@ -278,8 +278,8 @@ def test_a_bad_budget_is_refused():
 
 def hidden_lots(name, seen_rate, occupancy=None):
     """From every view alike: so what is not made out once never is, however often the car comes back."""
-    bands = tuple(SightBand(6.0, beside, seen_rate, 1.0, 0.0) for beside in (False, True))
-    scenario = Scenario.named(name).replace(sighting=SightingModel(bands=bands))
+    bands = tuple(SensorBand(6.0, beside, seen_rate, 1.0, 0.0) for beside in (False, True))
+    scenario = Scenario.named(name).replace(sensor_model=SensorModel(bands=bands))
     return scenario if occupancy is None else at_occupancy(scenario, occupancy)
 
 

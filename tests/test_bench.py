@@ -8,9 +8,9 @@ from typer.testing import CliRunner
 
 from parkenv.cli import app
 from parkenv.errors import InputError
-from parkenv.evaluation import bench_sensors
-from parkenv.evaluation.bench_rows import duration, rate, seconds_each
-from parkenv.evaluation.bench_sensors import (
+from parkenv.evaluation.bench import sensors as bench_sensors
+from parkenv.evaluation.bench.rows import duration, rate, seconds_each
+from parkenv.evaluation.bench.sensors import (
     GRID_CELL,
     embree_scanner,
     laser_rows,
@@ -19,7 +19,7 @@ from parkenv.evaluation.bench_sensors import (
     pymunk_scanner,
     walled_lot,
 )
-from sim_sensors.laser import LaserScanner
+from sim_sensors.laser.scanner import LaserScanner
 
 
 def test_a_ratio_above_one_means_faster():
@@ -88,7 +88,7 @@ def test_an_unknown_part_is_named():
 
 
 def test_steps_are_measured_and_peers_that_are_not_there_are_named(monkeypatch):
-    from parkenv.evaluation import bench_env
+    from parkenv.evaluation.bench import env as bench_env
 
     monkeypatch.setattr(bench_env, "find_spec", lambda name: None)
     rows = bench_env.env_rows(seed=0, seconds=0.0, batch=4, large=300)

@@ -3,9 +3,9 @@
 import numpy as np
 
 from parkenv import ParkingLot
-from parkenv.evaluation.bench_planning import drive, forecast_process, planning_rows, transitions
-from planners.label_repair import repair
-from planners.label_setting import StoppingGraph, settle
+from parkenv.evaluation.bench.planning import drive, forecast_process, planning_rows, transitions
+from planners.thesis.label_repair import repair
+from planners.thesis.label_setting import StoppingGraph, settle
 
 
 def test_rows_have_the_keys_of_every_bench_and_stand_beside_the_thesis():

@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 
 from parkenv.errors import InputError
-from parkenv.evaluation import benchmark
-from parkenv.evaluation.benchmark import Suite, check_result, result_of
-from parkenv.evaluation.compare import run_cases
-from parkenv.evaluation.results import ResultFolder, write_summary
+from parkenv.evaluation.experiments import benchmark
+from parkenv.evaluation.experiments.benchmark import Suite, check_result, result_of
+from parkenv.evaluation.experiments.compare import run_cases
+from parkenv.evaluation.experiments.results import ResultFolder, write_summary
 
 PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 AGENTS = ("first-free", "greedy-goal")

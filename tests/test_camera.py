@@ -9,13 +9,13 @@ import pytest
 from toy_scene import ToyScene, box_mesh, parked_cars, random_boxes, toy_scene
 
 from parkenv.perception.sweeps import disparity
-from sim_sensors.camera import PinholeCamera, StereoCamera, camera_pose
+from sim_sensors.camera.image_sensor import ImageSensor
+from sim_sensors.camera.light_maps import light_maps, open_sky, sunlit
+from sim_sensors.camera.models import PinholeCamera, StereoCamera, camera_pose
+from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.errors import SensorError
 from sim_sensors.ground_truth import View, vehicle_boxes
-from sim_sensors.image_sensor import ImageSensor
-from sim_sensors.light_maps import light_maps, open_sky, sunlit
 from sim_sensors.mesh import Instances, Material
-from sim_sensors.weather import PRESETS, Weather
 
 CAMERA = PinholeCamera.from_field_of_view(320, 240)
 POSE = camera_pose(0.0, 0.0, 1.4, 0.4, -0.05)

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from parkenv import InputError, ParkingLot, SightingModel
-from parkenv.evaluation.results import EPISODE_COLUMNS, ResultFolder
-from parkenv.evaluation.statistics import mean_interval, summarize
+from parkenv import InputError, ParkingLot, SensorModel
+from parkenv.evaluation.experiments.results import EPISODE_COLUMNS, ResultFolder
+from parkenv.evaluation.experiments.statistics import mean_interval, summarize
 
 PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -212,11 +212,11 @@ def test_both_solvers_search_alike(tmp_path):
 
 
 def test_worse_sight_costs_time_and_the_stacks_is_nearly_perfect(tmp_path):
-    SightingModel(6.0, 0.8, 0.3).to_file(tmp_path / "poor.json")
+    SensorModel(6.0, 0.8, 0.3).to_file(tmp_path / "poor.json")
     total = {}
     for sight in ("perfect", "laser", tmp_path / "poor.json"):
         out = tmp_path / f"out{len(total)}"
-        done = parkenv(*small(out, "--sight", sight, agents="greedy-drive", episodes=40))
+        done = parkenv(*small(out, "--sensor-model", sight, agents="greedy-drive", episodes=40))
         assert done.returncode == 0, done.stderr
         total[sight] = rows_without_times(out)[0]
     perfect, laser, poor = total.values()
@@ -431,8 +431,11 @@ def test_columns_are_stable():
 def test_words_for_sight_are_checked(tmp_path):
     (tmp_path / "odd.json").write_text("{}")
     for words, message in (
-        (("--sight", "keen"), "--sight is 'keen', want perfect, laser, stereo, or a file that is there"),
-        (("--sight", tmp_path / "odd.json"), "odd.json: want a sighting model, a JSON object"),
+        (
+            ("--sensor-model", "keen"),
+            "--sensor-model is 'keen', want perfect, laser, stereo, or a file that is there",
+        ),
+        (("--sensor-model", tmp_path / "odd.json"), "odd.json: want a sighting model, a JSON object"),
         (("--sensors", "radar"), "--sensors is 'radar', want one of laser, stereo, both_sides"),
         (("--solver", "guess"), "solver is 'guess', want one of"),
         (("--budget-ms", "-1"), "budget_ms is -1"),

@@ -19,8 +19,8 @@ from parkenv.driving.lot_space import LotSpace, Thing
 from parkenv.driving.parking_task import AREA, ParkingTasks
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.envs.drive import CONTROL_S, DriveEnv, goal_errors
-from parkenv.lot import corner_points
-from sim_sensors.laser import LaserScanner
+from parkenv.world.lot import corner_points
+from sim_sensors.laser.scanner import LaserScanner
 
 ID = "parkenv/Drive-v0"
 LOTS = ("campus", "jam", "street", "mini")

@@ -22,18 +22,25 @@ from parkenv.driving.lot_space import LotSpace
 from parkenv.driving.vehicle import SPEED, STATE_SIZE, YAW, VehicleParameters
 from parkenv.envs.drive import DriveEnv
 from parkenv.errors import InputError
-from parkenv.evaluation.drive_batch import CONTACT, LEFT, PARKED, UNDER_WAY, DriveBatch, PreparedTask
-from parkenv.evaluation.drive_hindsight import EndingGoals
-from parkenv.evaluation.drive_practice import MASTERED, STOOD, TRIED, DrivePractice, places_of, way_in
-from parkenv.evaluation.drive_training import DriveTraining, parked_by, parked_on
-from parkenv.evaluation.learning_curves import across_seeds, save_success_curves
-from parkenv.evaluation.recipes import DRIVE_RECIPES, WAY_IN
-from parkenv.evaluation.rl_training import read_curve, train_one
-from parkenv.evaluation.workers import HERE
-from parkenv.lot import ParkingLot
-from parkenv.scenario import Scenario
-from planners.driver_view import BEAMS, FARTHEST_M, HOLD, DriverView, Outlines, command, see
-from planners.drivers import make_driver
+from parkenv.evaluation.experiments.workers import HERE
+from parkenv.evaluation.figures.learning_curves import across_seeds, save_success_curves
+from parkenv.evaluation.training.configs import DRIVE_RECIPES, WAY_IN
+from parkenv.evaluation.training.drive_batch import CONTACT, LEFT, PARKED, UNDER_WAY, DriveBatch, PreparedTask
+from parkenv.evaluation.training.drive_hindsight import EndingGoals
+from parkenv.evaluation.training.drive_practice import (
+    MASTERED,
+    STOOD,
+    TRIED,
+    DrivePractice,
+    places_of,
+    way_in,
+)
+from parkenv.evaluation.training.drive_training import DriveTraining, parked_by, parked_on
+from parkenv.evaluation.training.rl_training import read_curve, train_one
+from parkenv.world.lot import ParkingLot
+from parkenv.world.scenario import Scenario
+from planners.driving.driver_view import BEAMS, FARTHEST_M, HOLD, DriverView, Outlines, command, see
+from planners.driving.drivers import make_driver
 from planners.learned import ModelCard
 
 PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]

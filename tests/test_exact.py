@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from small_lots import small_lot
 
-from parkenv import InputError, Lane, Mouth, OccupancyProcess, ParkingLot, Scenario, SightingModel
-from parkenv.evaluation.episodes import EpisodeRunner
-from parkenv.scenario import SearchProblem
+from parkenv import InputError, Lane, Mouth, OccupancyProcess, ParkingLot, Scenario, SensorModel
+from parkenv.evaluation.experiments.episodes import EpisodeRunner
+from parkenv.world.scenario import SearchProblem
 from planners import make_agent
-from planners.exact import ExactSolution
-from planners.expected_time import expected_time
+from planners.bounds.exact import ExactSolution
+from planners.thesis.expected_time import expected_time
 
-BLIND = SightingModel(view_range=0.0)
+BLIND = SensorModel(view_range=0.0)
 
 
 def one_way_line(n, goal_x, pitch=10.0):
@@ -40,7 +40,7 @@ def one_way_line(n, goal_x, pitch=10.0):
 def test_parking_along_a_line_is_the_threshold_policy(p_free, goal_x):
     """The textbook case: without a way back V_k = p·min(walk_k, d + V_k+1) + (1 - p)·(d + V_k+1)."""
     n, pitch = 12, 10.0
-    problem = SearchProblem(lot=one_way_line(n, goal_x), sighting=BLIND, give_up_s=200.0)
+    problem = SearchProblem(lot=one_way_line(n, goal_x), sensor_model=BLIND, give_up_s=200.0)
     entry = int(problem.lot.entry_vertices[0])
     hop = pitch / problem.v_drive
     onward, takes = problem.give_up_s, []
@@ -161,7 +161,7 @@ def test_what_is_too_large_or_uncertain_is_refused_with_the_limit():
     with pytest.raises(InputError, match="at most 25 slots"):
         make_agent("exact", Scenario.named("campus"))
     with pytest.raises(InputError, match="seen without error"):
-        make_agent("exact", Scenario.named("mini", sighting=SightingModel(hit_rate=0.9)))
+        make_agent("exact", Scenario.named("mini", sensor_model=SensorModel(hit_rate=0.9)))
     problem, p, entry = small_lot(2)
     with pytest.raises(InputError, match="over 500 belief states, the limit"):
         ExactSolution(problem, p, entry, most_states=500)
@@ -169,7 +169,7 @@ def test_what_is_too_large_or_uncertain_is_refused_with_the_limit():
         ExactSolution(problem, p[:3], entry)
     with pytest.raises(InputError, match="seen without error"):
         expected_time(
-            make_agent("belief", problem), problem.replace(sighting=SightingModel(hit_rate=0.9)), p, entry
+            make_agent("belief", problem), problem.replace(sensor_model=SensorModel(hit_rate=0.9)), p, entry
         )
 
 

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightingModel
-from parkenv.evaluation.episodes import EpisodeRunner
-from parkenv.evaluation.statistics import mean_interval
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorModel
+from parkenv.evaluation.experiments.episodes import EpisodeRunner
+from parkenv.evaluation.experiments.statistics import mean_interval
 from planners import make_agent
-from planners.exact import ExactSolution
-from planners.exact_changing import ChangingAgent, ChangingSolution
+from planners.bounds.exact import ExactSolution
+from planners.bounds.exact_changing import ChangingAgent, ChangingSolution
 
 
 def busy(n_slots=3, stay_s=20.0, taken=(0.7, 0.85, 0.8), give_up_s=600.0):
@@ -21,7 +21,7 @@ def busy(n_slots=3, stay_s=20.0, taken=(0.7, 0.85, 0.8), give_up_s=600.0):
         v_drive=3.0,
         wait_s=2.0,
         give_up_s=give_up_s,
-        sighting=SightingModel(view_range=0.0),
+        sensor_model=SensorModel(view_range=0.0),
         entry=0,
     )
 
@@ -81,6 +81,6 @@ def test_what_it_cannot_solve_is_refused():
         ChangingSolution(scenario.public(), np.full(3, 0.5), np.zeros(3), 2.0, 4)
     with pytest.raises(InputError, match="memory_steps 1"):
         ChangingSolution(scenario.public(), np.full(3, 0.5), np.ones(3), 2.0, 1)
-    blind = scenario.replace(sighting=SightingModel(hit_rate=0.9))
+    blind = scenario.replace(sensor_model=SensorModel(hit_rate=0.9))
     with pytest.raises(InputError, match="without error"):
         ChangingSolution(blind.public(), np.full(3, 0.5), np.ones(3), 2.0, 4)

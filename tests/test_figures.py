@@ -6,14 +6,14 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
 from parkenv.errors import InputError
-from parkenv.evaluation import time_figures
-from parkenv.evaluation.episodes import EpisodeRunner, SearchTrace
-from parkenv.evaluation.rates_picture import save_rates
-from parkenv.evaluation.search_pictures import BELIEF_MAP, draw_search, save_searches
-from parkenv.evaluation.time_figures import AGENT_COLORS, save_time_against_occupancy, save_time_split
-from parkenv.lot import ParkingLot
-from parkenv.occupancy import OccupancyProcess
-from parkenv.scenario import Scenario
+from parkenv.evaluation.experiments.episodes import EpisodeRunner, SearchTrace
+from parkenv.evaluation.figures import time_figures
+from parkenv.evaluation.figures.rates_picture import save_rates
+from parkenv.evaluation.figures.search_pictures import BELIEF_MAP, draw_search, save_searches
+from parkenv.evaluation.figures.time_figures import AGENT_COLORS, save_time_against_occupancy, save_time_split
+from parkenv.world.lot import ParkingLot
+from parkenv.world.occupancy import OccupancyProcess
+from parkenv.world.scenario import Scenario
 from planners.agent import AGENT_NAMES, make_agent
 
 

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv import InputError, ParkingLot, Scenario
-from parkenv.lot import PARK
-from parkenv.scenario import SCENARIO_NAMES
+from parkenv.world.lot import PARK
+from parkenv.world.scenario import SCENARIO_NAMES
 from planners import ParkingMDP, label_setting, make_agent, policy_iteration, value_iteration
-from planners.label_repair import repair
-from planners.label_setting import TIE_S, StoppingGraph, best_moves, settle
+from planners.thesis.label_repair import repair
+from planners.thesis.label_setting import TIE_S, StoppingGraph, best_moves, settle
 
 seeds = st.integers(0, 2**32 - 1)
 

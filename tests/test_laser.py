@@ -4,16 +4,16 @@ import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
+import laser_reference
 import numpy as np
 import pymunk
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_sensors import laser_reference
 from sim_sensors.errors import SensorError
-from sim_sensors.footprints import NO_RETURN, WALL, ScanPlane
-from sim_sensors.laser import LaserScanner
+from sim_sensors.laser.footprints import NO_RETURN, WALL, ScanPlane
+from sim_sensors.laser.scanner import LaserScanner
 
 LASER = LaserScanner()
 WIDE = LaserScanner(n_beams=1440, start=1.0)

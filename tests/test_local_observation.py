@@ -11,8 +11,8 @@ from gymnasium.utils.env_checker import check_env
 import parkenv  # noqa: F401 - registers the ids
 from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario
 from parkenv.envs.local_observation import FIRST_NEAR, HERE, PER_MOVE, PER_NEAR, LocalObservation
-from parkenv.lot import MOVES, PARK
-from parkenv.scenario import SCENARIO_NAMES
+from parkenv.world.lot import MOVES, PARK
+from parkenv.world.scenario import SCENARIO_NAMES
 
 K = 4
 

@@ -7,10 +7,10 @@ import shapely
 from scipy.sparse.csgraph import connected_components
 
 from parkenv.errors import InputError
-from parkenv.evaluation.lot_picture import draw_lot, save_lot_picture
-from parkenv.lot import Lane, Mouth, ParkingLot
-from parkenv.lot_generators import CROSSING_CLEARANCE, KERB_SIZE, bay_row
-from parkenv.lot_graph import LANE_OFFSET
+from parkenv.evaluation.figures.lot_picture import draw_lot, save_lot_picture
+from parkenv.lots.generators import CROSSING_CLEARANCE, KERB_SIZE, bay_row
+from parkenv.world.drive_graph import LANE_OFFSET
+from parkenv.world.lot import Lane, Mouth, ParkingLot
 
 ONE_SLOT = {
     "name": "one",

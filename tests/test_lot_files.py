@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from parkenv.errors import InputError
-from parkenv.lot import Lane, Mouth, ParkingLot
-from parkenv.lot_check import check_lot
-from parkenv.lot_files import PACKAGED_LOTS
 from parkenv.lots.build import LOTS, build
+from parkenv.lots.checks import check_lot
+from parkenv.lots.lot_files import PACKAGED_LOTS
+from parkenv.world.lot import Lane, Mouth, ParkingLot
 
 DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"
 finite = st.floats(-1e6, 1e6)
@@ -71,7 +71,7 @@ def test_packaged_lots_are_what_their_script_makes(name, tmp_path):
     lot = ParkingLot.packaged(name)
     assert lot == LOTS[name]()
     build(tmp_path)
-    committed = Path(__file__).parents[1] / "parkenv" / "lots" / f"{name}.geojson"
+    committed = Path(__file__).parents[1] / "parkenv" / "lots" / "packaged" / f"{name}.geojson"
     assert (tmp_path / committed.name).read_text() == committed.read_text()
     assert check_lot(committed) == []
 
@@ -198,7 +198,9 @@ def test_kerbside_cars_stand_as_traffic_runs(tmp_path, y, oneway, mouth, yaw):
 
 @pytest.mark.parametrize("name", PACKAGED_LOTS)
 def test_outlines_alone_tell_the_same_lots(tmp_path, name):
-    doc = json.loads((Path(__file__).parents[1] / "parkenv" / "lots" / f"{name}.geojson").read_text())
+    doc = json.loads(
+        (Path(__file__).parents[1] / "parkenv" / "lots" / "packaged" / f"{name}.geojson").read_text()
+    )
     for f in doc["features"]:
         if f["properties"]["kind"] == "slot":
             f["properties"] = {"kind": "slot", "id": f["properties"]["id"]}

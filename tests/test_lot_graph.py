@@ -8,8 +8,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from parkenv.errors import InputError
-from parkenv.lot import MOVES, Lane, Mouth, ParkingLot
-from parkenv.lot_graph import (
+from parkenv.world.drive_graph import (
     ENTRY_REACH,
     LANE_OFFSET,
     NODE_TOLERANCE,
@@ -19,6 +18,7 @@ from parkenv.lot_graph import (
     GraphError,
     build_drive_graph,
 )
+from parkenv.world.lot import MOVES, Lane, Mouth, ParkingLot
 
 TWO_WAY, ONE_WAY = False, True
 

@@ -14,17 +14,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from parkenv import InputError, ParkingLot, Scenario
-from parkenv.lot_scene import slot_lot
 from parkenv.mapping.discovery import discover, score_discovery
 from parkenv.mapping.grid import P_FREE, P_OCCUPIED, OccupancyGrid
 from parkenv.mapping.inference import MapPrior, SessionLog, counted, predict
 from parkenv.mapping.odometry import PoseNoise
 from parkenv.mapping.slots import SlotFilter
 from parkenv.mapping.store import VERSION, MapStore, Session
-from parkenv.occupancy import Arrival
 from parkenv.perception.ranging import CarSightings
 from parkenv.perception.sweeps import laser_sweep
-from sim_sensors.laser import LaserScanner
+from parkenv.world.lot_scene import slot_lot
+from parkenv.world.occupancy import Arrival
+from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.movers import Movers
 from sim_sensors.rig import Mount
 
@@ -231,7 +231,7 @@ def test_a_map_is_a_prior_of_a_search():
     even = observation["p_occupied"][::2]
     assert even.min() > observation["p_occupied"][1::2].max()
     forecast = MapPrior(log).forecast(Arrival(40_000.0))
-    assert (forecast.relaxation_rate > 0).all()
+    assert (forecast.decay_rate > 0).all()
 
 
 def test_an_empty_map_predicts_nothing():

@@ -6,8 +6,8 @@ import pytest
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario
-from parkenv.evaluation.compare import at_occupancy
-from parkenv.evaluation.episodes import EpisodeRunner
+from parkenv.evaluation.experiments.compare import at_occupancy
+from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from planners import make_agent
 from planners.neighborhood import Neighborhoods
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from parkenv.errors import InputError
-from parkenv.keyed_random import keyed_exponential, keyed_uniform, world_key
-from parkenv.occupancy import HOUR_S, WEEK_S, Arrival, ArrivalWindow, OccupancyProcess
+from parkenv.world.keyed_random import keyed_exponential, keyed_uniform, world_key
+from parkenv.world.occupancy import HOUR_S, WEEK_S, Arrival, ArrivalWindow, OccupancyProcess
 
 NINE = Arrival(9 * HOUR_S)
 KEY = world_key(7, 0)
@@ -78,7 +78,7 @@ def test_world_key_refuses_negative_seeds():
 def test_a_constant_chain_rests_at_its_equilibrium():
     process = constant_process(3, 2e-4, 1e-4)
     assert process.marginal(12345.0) == pytest.approx(2 / 3)
-    assert process.forecast(NINE).relaxation_rate == pytest.approx(3e-4)
+    assert process.forecast(NINE).decay_rate == pytest.approx(3e-4)
 
 
 def test_the_marginal_relaxes_exponentially_after_the_rates_have_changed():
@@ -192,8 +192,8 @@ def test_a_slot_is_free_from_next_free_on_and_not_before(after, key):
 
 def test_two_processes_make_the_same_world():
     code = (
-        "import numpy as np; from parkenv.keyed_random import world_key;"
-        "from parkenv.occupancy import Arrival, OccupancyProcess;"
+        "import numpy as np; from parkenv.world.keyed_random import world_key;"
+        "from parkenv.world.occupancy import Arrival, OccupancyProcess;"
         "p = OccupancyProcess.from_demand(np.linspace(-2, 2, 9), np.zeros(168));"
         "print(p.world(world_key(3, 4), Arrival(0.0)).next_free(np.arange(9), 5e4).tolist())"
     )
@@ -365,7 +365,7 @@ def test_a_slot_that_is_not_there_is_an_index_error(slot):
 def test_a_process_is_laid_on_another_lot_fullest_nearest():
     process = OccupancyProcess.from_demand(np.array([-1.0, 2.0, 0.5]), np.zeros(168))
     walk = np.array([90.0, 10.0, 50.0, 70.0, 20.0, 30.0])
-    laid = process.laid_on(walk)
+    laid = process.mapped_to_lot(walk)
     fullness = laid.marginal(0.0)
     assert laid.n_slots == 6
     assert (np.diff(fullness[np.argsort(walk)]) <= 1e-12).all()

@@ -5,10 +5,10 @@ import pytest
 from scipy.optimize import check_grad
 
 from parkenv.errors import InputError
-from parkenv.keyed_random import world_key
-from parkenv.occupancy import DAY_S, HOUR_S, Arrival, OccupancyProcess
-from parkenv.occupancy_fit import fit_constant_rates, fit_process, log_likelihood
-from parkenv.occupancy_log import OccupancyLog
+from parkenv.world.keyed_random import world_key
+from parkenv.world.occupancy import DAY_S, HOUR_S, Arrival, OccupancyProcess
+from parkenv.world.occupancy_fit import fit_constant_rates, fit_process, log_likelihood
+from parkenv.world.occupancy_log import OccupancyLog
 
 REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
 FIRST_MONDAY = np.datetime64("2024-01-01")

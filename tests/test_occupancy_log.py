@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from parkenv.errors import InputError
-from parkenv.keyed_random import world_key
-from parkenv.occupancy import DAY_S, HOUR_S, Arrival, ArrivalWindow
-from parkenv.occupancy_log import OccupancyLog, day_class
-from parkenv.recorded_occupancy import RecordedOccupancy, read_mapping
+from parkenv.world.keyed_random import world_key
+from parkenv.world.occupancy import DAY_S, HOUR_S, Arrival, ArrivalWindow
+from parkenv.world.occupancy_log import OccupancyLog, day_class
+from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
 
 REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
 HEADER = "datetime,camera,slot_id,weather,occupied\n"
@@ -259,7 +259,7 @@ def test_the_forecast_knows_nothing_of_the_days_that_are_replayed(n, day):
     changed = RecordedOccupancy(random_log(change_days=held_out), walk)
     after = changed.forecast(arrival)
     assert np.array_equal(before.p_occupied, after.p_occupied)
-    assert np.array_equal(before.relaxation_rate, after.relaxation_rate)
+    assert np.array_equal(before.decay_rate, after.decay_rate)
     # The worlds themselves are exactly each other's opposite.
     slots = np.arange(n)
     assert np.array_equal(

@@ -18,14 +18,14 @@ from parkenv.cli import app
 from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
 from parkenv.driving.parking_task import ParkingTasks
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
-from parkenv.evaluation import bench_drive
-from parkenv.evaluation.bench_drive import bare_physics, environment_steps
-from parkenv.evaluation.parking_runs import ParkingCase, park_all, park_once, parking_table
-from parkenv.evaluation.workers import Workers
-from planners.clearance import clearance, room_at, stands_free
-from planners.hybrid_astar import CarPath, SearchSettings, plan_path
-from planners.parking import ParkingAgent
-from planners.path_tracking import PathTracker, TrackingSettings
+from parkenv.evaluation.bench import drive as bench_drive
+from parkenv.evaluation.bench.drive import bare_physics, environment_steps
+from parkenv.evaluation.experiments.workers import Workers
+from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
+from planners.driving.clearance import clearance, room_at, stands_free
+from planners.driving.hybrid_astar import CarPath, SearchSettings, plan_path
+from planners.driving.parking import ParkingAgent
+from planners.driving.path_tracking import PathTracker, TrackingSettings
 
 CAR = VehicleParameters()
 LOTS = ("campus", "street", "jam", "mini")
@@ -100,7 +100,7 @@ def test_a_path_leads_from_start_to_target_touches_nothing_and_can_be_steered(se
 
 
 def test_without_anything_in_the_way_the_path_is_as_good_as_the_word():
-    from planners.reeds_shepp import reeds_shepp
+    from planners.driving.reeds_shepp import reeds_shepp
 
     nothing = np.empty((0, 2, 2)), np.empty(0, dtype=np.int64)
     quick = SearchSettings(steer_m=0.0, change_m=0.0)
@@ -277,7 +277,7 @@ def test_where_no_path_is_the_car_stays_and_that_is_said():
 
 
 def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
-    from parkenv.evaluation import parking_runs
+    from parkenv.evaluation.trips import parking_runs
 
     no_room = SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0)
     monkeypatch.setattr(parking_runs, "make_driver", lambda name: ParkingAgent(search=no_room))

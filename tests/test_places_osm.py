@@ -19,15 +19,15 @@ from typer.testing import CliRunner
 from parkenv import ParkingLot, Scenario
 from parkenv.cli import app
 from parkenv.errors import InputError
-from parkenv.evaluation.compare import Case
-from parkenv.evaluation.import_picture import save_import_picture
-from parkenv.local_frame import LocalFrame
-from parkenv.lot import Mouth
-from parkenv.lot_check import check_lot
-from parkenv.lot_graph import SLOT_REACH
-from parkenv.places.lot_draft import Wishes
-from parkenv.places.lot_import import import_lot
-from parkenv.slot_polygons import nearest_on_lanes
+from parkenv.evaluation.experiments.compare import Case
+from parkenv.evaluation.figures.import_picture import save_import_picture
+from parkenv.lots.checks import check_lot
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.places.lot_draft import Wishes
+from parkenv.lots.places.lot_import import import_lot
+from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.world.drive_graph import SLOT_REACH
+from parkenv.world.lot import Mouth
 
 FREIBURG = LocalFrame(lon=7.85, lat=48.0)
 AISLE = {"highway": "service", "service": "parking_aisle"}

@@ -10,15 +10,15 @@ from scipy.sparse.csgraph import connected_components
 
 from parkenv import ParkingLot, Scenario
 from parkenv.errors import InputError
-from parkenv.evaluation.compare import Case
-from parkenv.evaluation.import_picture import save_import_picture
-from parkenv.local_frame import LocalFrame
-from parkenv.lot import Mouth
-from parkenv.lot_check import check_lot
-from parkenv.lot_generators import BAY_SIZE, Slots, bay_row
-from parkenv.places.lot_draft import Wishes
-from parkenv.places.lot_import import import_lot
-from parkenv.slot_polygons import nearest_on_lanes
+from parkenv.evaluation.experiments.compare import Case
+from parkenv.evaluation.figures.import_picture import save_import_picture
+from parkenv.lots.checks import check_lot
+from parkenv.lots.generators import BAY_SIZE, Slots, bay_row
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.places.lot_draft import Wishes
+from parkenv.lots.places.lot_import import import_lot
+from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.world.lot import Mouth
 
 DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"
 

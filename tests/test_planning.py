@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from parkenv import InputError, ParkingLot, Scenario
-from parkenv.lot import PARK
+from parkenv.world.lot import PARK
 from planners import CirclingWarning, ParkingMDP, label_setting, policy_iteration, value_iteration
 
 

@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from laser_drive import CAMERA, EYE, LASER, MOUNT, look, turned_off
 
 from parkenv import InputError, ParkingLot
-from parkenv.lot_scene import slot_lot
 from parkenv.mapping.route import survey_route
 from parkenv.perception.box_fit import fit_box
 from parkenv.perception.detector import Detections
@@ -26,8 +25,9 @@ from parkenv.perception.ranging import (
     median_distance,
 )
 from parkenv.perception.sweeps import Sweep, disparity, laser_sweep, stereo_sweep
-from sim_sensors.footprints import ScanPlane
+from parkenv.world.lot_scene import slot_lot
 from sim_sensors.ground_truth import View, vehicle_boxes
+from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.rig import Mount, SensorRig, poses_along
 
 ORIGIN = np.zeros(3)

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from toy_scene import box_mesh, random_boxes, ray_depth, toy_scene
 
-from sim_sensors.camera import PinholeCamera, camera_pose
+from sim_sensors.camera.models import PinholeCamera, camera_pose
+from sim_sensors.camera.projection import NEAR, project
+from sim_sensors.camera.rasterizer import FAR, interleaved
 from sim_sensors.mesh import Material
-from sim_sensors.projection import NEAR, project
-from sim_sensors.rasterizer import FAR, interleaved
 
 
 def plain_camera(width=160, height=120, horizontal=1.1):

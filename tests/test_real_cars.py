@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from parkenv.evaluation.detector_scores import score_on
+from parkenv.evaluation.experiments.detector_scores import score_on
 from parkenv.perception.car_datasets import LabelledImage, read_crop_folder, read_uiuc_training
 from parkenv.perception.cross_validation import FALSE_POSITIVES, cross_validated, score_on_crops
 from parkenv.perception.detector import CarModel

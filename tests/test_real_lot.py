@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from parkenv import OccupancyLog, ParkingLot, RecordedOccupancy, Scenario
-from parkenv.evaluation.compare import Case
-from parkenv.evaluation.statistics import mean_interval
+from parkenv.evaluation.experiments.compare import Case
+from parkenv.evaluation.experiments.statistics import mean_interval
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 MAP, LOG = DATA / "dlp" / "parking_map.yml", DATA / "cnr_ext" / "occupancy_15_days.csv.gz"

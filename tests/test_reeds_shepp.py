@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from parkenv.driving.vehicle import move_along
-from planners.reeds_shepp import (
+from planners.driving.reeds_shepp import (
     LEFT,
     MOST_WORDS,
     PIECES,

@@ -11,9 +11,9 @@ from parkenv.envs import rendering
 from parkenv.envs.rendering import SearchRenderer, belief_colors, clock
 from parkenv.envs.window import Window
 from parkenv.errors import InputError
-from parkenv.lot import PARK, Lane, ParkingLot
-from parkenv.occupancy import Arrival, OccupancyProcess
-from parkenv.scenario import Scenario
+from parkenv.world.lot import PARK, Lane, ParkingLot
+from parkenv.world.occupancy import Arrival, OccupancyProcess
+from parkenv.world.scenario import Scenario
 
 
 def row_lot(goal=(40.0, 0.0), vertical=False):

@@ -13,14 +13,14 @@ import pytest
 
 from parkenv import InputError, ParkingLot, Scenario
 from parkenv.cli.report import make_report
-from parkenv.evaluation.compare import Case
+from parkenv.evaluation.experiments.compare import Case
+from parkenv.evaluation.experiments.results import episode_key
 from parkenv.evaluation.report.intentions import Intentions
 from parkenv.evaluation.report.page import SCHEMA, page_data
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.report.search_recording import Encounter, choose, record
 from parkenv.evaluation.report.tables import table_of
-from parkenv.evaluation.results import episode_key
-from parkenv.lot import PARK
+from parkenv.world.lot import PARK
 from planners import make_agent
 
 PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from parkenv import ParkingLot
-from parkenv.lot_scene import slot_lot
-from sim_sensors.camera import PinholeCamera
+from parkenv.world.lot_scene import slot_lot
+from sim_sensors.camera.models import PinholeCamera
 from sim_sensors.errors import SensorError
-from sim_sensors.laser import LaserScanner
+from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import LEFT, RIGHT, Mount, SensorRig, poses_along
 
 

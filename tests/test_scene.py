@@ -7,7 +7,7 @@ import pytest
 from shapely.geometry import LineString, Polygon
 
 from sim_sensors.errors import SensorError
-from sim_sensors.footprints import ScanPlane
+from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.mesh import Material
 from sim_sensors.scene import OverlapWarning, Scene, overlapping
 from sim_sensors.scenery import (
@@ -21,7 +21,7 @@ from sim_sensors.scenery import (
 )
 from sim_sensors.slot_scenes import ParkingManners, SlotLot, scene_of_slots, vehicle_library
 from sim_sensors.surroundings import Surroundings
-from sim_sensors.vehicles import VehicleModel
+from sim_sensors.vehicles.vehicle import VehicleModel
 
 AROUND = {
     "buildings": [[[-5, 20], [40, 20], [40, 30], [-5, 30]]],

@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from numba.core.errors import TypingError
 
 import parkenv
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightBand, SightingModel
-from parkenv.belief import after_look, relaxed
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorBand, SensorModel
+from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.envs.search_alone import held
 from parkenv.envs.wrappers import ThesisReward
-from parkenv.fading import fading
-from parkenv.lot import PARK
-from parkenv.scenario import SCENARIO_NAMES
+from parkenv.world.decay import decay_factor
+from parkenv.world.lot import PARK
+from parkenv.world.scenario import SCENARIO_NAMES
 
 ENV_IDS = [name for name in gym.registry if name.startswith("parkenv/Search")]
 
@@ -188,7 +188,7 @@ def test_moves_tries_and_parking_cost_what_they_should():
 
 
 def test_a_lot_proven_full_ends_the_search_with_the_cost_of_going_elsewhere():
-    scenario = two_slots([True, True]).replace(give_up_s=300.0, sighting=SightingModel(view_range=0.0))
+    scenario = two_slots([True, True]).replace(give_up_s=300.0, sensor_model=SensorModel(view_range=0.0))
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     observation, _ = env.reset(seed=0)
     seen_before_the_end = set()
@@ -267,7 +267,7 @@ def test_observations_are_not_live_buffers():
 
 def test_only_slots_in_view_are_learnt_of():
     """The belief of a slot that was never in view stays at its forecast, whatever stands there."""
-    scenario = Scenario.named("campus", sighting=SightingModel(view_range=6.0))
+    scenario = Scenario.named("campus", sensor_model=SensorModel(view_range=6.0))
     env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
     observation, _ = env.reset(seed=0)
     lot, forecast = scenario.lot, env.state.belief.prior
@@ -282,25 +282,27 @@ def test_only_slots_in_view_are_learnt_of():
 
 
 def test_a_sighting_is_bayes_rule_and_relaxes_exponentially():
-    said = after_look(0.6, True, 0.9, 0.2)
+    said = bayes_update(0.6, True, 0.9, 0.2)
     assert said == pytest.approx(0.9 * 0.6 / (0.9 * 0.6 + 0.2 * 0.4))
-    assert relaxed(0.6, 1 / 600, said, 300.0) == pytest.approx(0.6 + (said - 0.6) * np.exp(-0.5), rel=1e-14)
-    assert relaxed(0.6, 1 / 600, said, 0.0) == pytest.approx(said, rel=1e-15)
+    assert decay_to_prior(0.6, 1 / 600, said, 300.0) == pytest.approx(
+        0.6 + (said - 0.6) * np.exp(-0.5), rel=1e-14
+    )
+    assert decay_to_prior(0.6, 1 / 600, said, 0.0) == pytest.approx(said, rel=1e-15)
     # What is certain stays so to the last bit until time passes.
-    assert [relaxed(0.3, 1 / 600, certain, 0.0) for certain in (0.0, 1.0)] == [0.0, 1.0]
-    assert relaxed(0.6, 1 / 600, said, 1e9) == 0.6
-    assert after_look(0.0, True, 1.0, 0.0) == 1.0, "a look that was held to be impossible is believed"
+    assert [decay_to_prior(0.3, 1 / 600, certain, 0.0) for certain in (0.0, 1.0)] == [0.0, 1.0]
+    assert decay_to_prior(0.6, 1 / 600, said, 1e9) == 0.6
+    assert bayes_update(0.0, True, 1.0, 0.0) == 1.0, "a look that was held to be impossible is believed"
 
 
 @given(x=st.floats(0.0, 600.0))
 def test_fading_is_the_exponential(x):
-    assert fading(x) == pytest.approx(np.exp(-x), rel=1e-14)
+    assert decay_factor(x) == pytest.approx(np.exp(-x), rel=1e-14)
 
 
 def test_the_belief_in_a_slot_left_behind_grows_old():
     lot = ParkingLot.grid(1, 12)
     process = OccupancyProcess.from_demand(np.zeros(12), np.zeros(168), 600.0)
-    scenario = Scenario(name="a", lot=lot, occupancy=process, sighting=SightingModel(view_range=0.0))
+    scenario = Scenario(name="a", lot=lot, occupancy=process, sensor_model=SensorModel(view_range=0.0))
     env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
     observation, _ = env.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -335,7 +337,7 @@ def test_noisy_sight_errs_as_often_as_stated():
         name="noisy",
         lot=lot,
         occupancy=always(lot, taken),
-        sighting=SightingModel(view_range=1e3, hit_rate=0.8, false_alarm_rate=0.3),
+        sensor_model=SensorModel(view_range=1e3, hit_rate=0.8, false_alarm_rate=0.3),
     )
     env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
     looks_taken = np.zeros(lot.n_slots)
@@ -352,18 +354,18 @@ def test_noisy_sight_errs_as_often_as_stated():
 def test_sight_differs_by_distance_and_side():
     lot = Scenario.named("mini").lot
     bands = (
-        SightBand(up_to=1.0, beside=True, seen_rate=1.0, hit_rate=1.0, false_alarm_rate=0.0),
-        SightBand(up_to=6.0, beside=True, seen_rate=0.5, hit_rate=0.9, false_alarm_rate=0.1),
-        SightBand(up_to=6.0, beside=False, seen_rate=0.25, hit_rate=0.8, false_alarm_rate=0.2),
+        SensorBand(up_to=1.0, beside=True, seen_rate=1.0, hit_rate=1.0, false_alarm_rate=0.0),
+        SensorBand(up_to=6.0, beside=True, seen_rate=0.5, hit_rate=0.9, false_alarm_rate=0.1),
+        SensorBand(up_to=6.0, beside=False, seen_rate=0.25, hit_rate=0.8, false_alarm_rate=0.2),
     )
     taken = np.arange(lot.n_slots) % 2 == 0
     scenario = Scenario(
-        name="bands", lot=lot, occupancy=always(lot, taken), sighting=SightingModel(6.0, bands=bands)
+        name="bands", lot=lot, occupancy=always(lot, taken), sensor_model=SensorModel(6.0, bands=bands)
     )
     starts, slots = scenario.slots_in_view
     rows = slice(starts[0], starts[1])
     own = slots[rows] == 0
-    rates = scenario.sight_rates.of(rows)
+    rates = scenario.sensor_rates.of(rows)
     np.testing.assert_array_equal(rates.hit[own], 1.0)
     across = lot.slot_yaw[slots[rows]] != lot.slot_yaw[0]
     assert across.any()
@@ -378,7 +380,7 @@ def test_sight_differs_by_distance_and_side():
         seen += env.state.belief.seen
         looked_taken += env.state.belief.p_occupied > env.state.belief.prior
     rows = slice(*starts[env.state.vertex : env.state.vertex + 2])
-    view, rates = slots[rows], scenario.sight_rates.of(rows)
+    view, rates = slots[rows], scenario.sensor_rates.of(rows)
     np.testing.assert_allclose(seen[view] / seeds, rates.seen, atol=0.08)
     expected = np.where(taken[view], rates.hit, rates.false_alarm)
     np.testing.assert_allclose((looked_taken / np.maximum(seen, 1))[view], expected, atol=0.12)
@@ -395,7 +397,7 @@ def test_sight_differs_by_distance_and_side():
 def test_wrong_bands_are_named(wrong, message):
     right = {"up_to": 1.0, "beside": True, "seen_rate": 1.0, "hit_rate": 0.9, "false_alarm_rate": 0.1}
     with pytest.raises(InputError, match=message):
-        SightBand(**right | wrong)
+        SensorBand(**right | wrong)
 
 
 @pytest.mark.parametrize(
@@ -409,7 +411,7 @@ def test_wrong_bands_are_named(wrong, message):
         ({"failure_cost": 3.0}, "no field 'failure_cost'; known: .*failure_s"),
         ({"goal": 9}, "goal is 9"),
         ({"entry": -1}, "entry"),
-        ({"sighting": 3}, "SightingModel"),
+        ({"sensor_model": 3}, "SensorModel"),
         ({"scenario": "moon"}, "unknown scenario 'moon'; known: campus"),
         ({"scenario": 3}, "want a Scenario"),
         ({"render_mode": "hologram"}, "render_mode"),
@@ -436,4 +438,4 @@ def test_wrong_use_is_refused():
         Scenario(name="x", lot=ParkingLot.grid(1, 3), occupancy=always(None, np.array([True])))
     for wrong in ({"hit_rate": 1.2}, {"view_range": -1.0}, {"hit_rate": 0.2, "false_alarm_rate": 0.3}):
         with pytest.raises(InputError, match=next(iter(wrong))):
-            SightingModel(**wrong)
+            SensorModel(**wrong)

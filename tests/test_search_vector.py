@@ -7,24 +7,24 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 import parkenv  # noqa: F401 - registers the ids
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SightBand, SightingModel
-from parkenv.belief import after_look
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorBand, SensorModel
+from parkenv.belief.slot_belief import bayes_update
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_vector import ParkSearchVectorEnv
-from parkenv.occupancy import Arrival, ArrivalWindow, Forecast
-from parkenv.occupancy_log import OccupancyLog
-from parkenv.recorded_occupancy import RecordedOccupancy
-from parkenv.scenario import SCENARIO_NAMES
+from parkenv.world.occupancy import Arrival, ArrivalWindow, Forecast
+from parkenv.world.occupancy_log import OccupancyLog
+from parkenv.world.recorded_occupancy import RecordedOccupancy
+from parkenv.world.scenario import SCENARIO_NAMES
 
 LIMIT = 40
 SIGHTS = {
-    "perfect": SightingModel(),
-    "noisy": SightingModel(8.0, hit_rate=0.9, false_alarm_rate=0.2),
-    "bands": SightingModel(
-        9.0, bands=(SightBand(4.0, True, 0.9, 0.95, 0.1), SightBand(9.0, False, 0.4, 0.8, 0.3))
+    "perfect": SensorModel(),
+    "noisy": SensorModel(8.0, hit_rate=0.9, false_alarm_rate=0.2),
+    "bands": SensorModel(
+        9.0, bands=(SensorBand(4.0, True, 0.9, 0.95, 0.1), SensorBand(9.0, False, 0.4, 0.8, 0.3))
     ),
-    "laser": SightingModel.named("laser"),
-    "blind": SightingModel.blind(),
+    "laser": SensorModel.named("laser"),
+    "blind": SensorModel.blind(),
 }
 
 
@@ -136,7 +136,7 @@ def test_a_batch_is_the_single_environment_many_times(scenario, observation):
 @pytest.mark.parametrize("observation", ["full", "local"])
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_whatever_is_seen(sight, observation):
-    assert_parity("mini", observation, sighting=SIGHTS[sight])
+    assert_parity("mini", observation, sensor_model=SIGHTS[sight])
 
 
 @pytest.mark.parametrize("observation", ["full", "local"])
@@ -413,4 +413,4 @@ def test_a_world_of_another_kind_is_refused():
 
 
 def test_looks_are_bayes_rule():
-    assert after_look(0.5, False, 0.9, 0.2) == pytest.approx(0.1 * 0.5 / (0.1 * 0.5 + 0.8 * 0.5))
+    assert bayes_update(0.5, False, 0.9, 0.2) == pytest.approx(0.1 * 0.5 / (0.1 * 0.5 + 0.8 * 0.5))

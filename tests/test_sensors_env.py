@@ -11,12 +11,12 @@ from gymnasium.utils.env_checker import data_equivalence
 import parkenv  # noqa: F401
 from parkenv import InputError, OccupancyProcess, Scenario, Traffic
 from parkenv.envs.lookout import Lookout
-from parkenv.lot_scene import LotScenes, slot_lot
-from parkenv.traffic import LotTraffic
-from sim_sensors.camera import PinholeCamera
+from parkenv.world.lot_scene import LotScenes, slot_lot
+from parkenv.world.traffic import LotTraffic
+from sim_sensors.camera.models import PinholeCamera
 from sim_sensors.errors import SensorError
 from sim_sensors.ground_truth import vehicle_boxes
-from sim_sensors.laser import LaserScanner
+from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.movers import Movers
 from sim_sensors.rig import LEFT, RIGHT, Mount, SensorRig
 

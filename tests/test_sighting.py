@@ -8,18 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from parkenv import InputError, Scenario, SightBand, SightingModel, Traffic
-from parkenv.evaluation.compare import Case
-from parkenv.evaluation.sight_fit import BAND_ENDS, LookCounts, count_looks
-from parkenv.lot import PARK
-from parkenv.sighting import SIGHT_NAMES
+from parkenv import InputError, Scenario, SensorBand, SensorModel, Traffic
+from parkenv.evaluation.experiments.compare import Case
+from parkenv.evaluation.experiments.sensor_model_fit import BAND_ENDS, LookCounts, count_looks
+from parkenv.world.lot import PARK
+from parkenv.world.sensor_model import SENSOR_MODEL_NAMES
 from planners import make_agent
 
-BANDS = (SightBand(3.0, True, 0.9, 0.99, 0.01), SightBand(9.0, True, 0.5, 0.9, 0.2))
+BANDS = (SensorBand(3.0, True, 0.9, 0.99, 0.01), SensorBand(9.0, True, 0.5, 0.9, 0.2))
 
 
 def test_the_nearest_band_that_reaches_holds():
-    rates = SightingModel(12.0, 0.8, 0.3, BANDS).rates(
+    rates = SensorModel(12.0, 0.8, 0.3, BANDS).rates(
         np.array([0.0, 3.0, 3.1, 9.0, 9.1, 1.0]), np.array([1, 1, 1, 1, 1, 0], dtype=bool)
     )
     assert rates.seen.tolist() == [0.9, 0.9, 0.5, 0.5, 1.0, 1.0]
@@ -28,9 +28,9 @@ def test_the_nearest_band_that_reaches_holds():
 
 
 def test_files_bring_back_what_was_written(tmp_path):
-    model = SightingModel(12.0, 0.8, 0.3, BANDS)
+    model = SensorModel(12.0, 0.8, 0.3, BANDS)
     model.to_file(tmp_path / "sight.json")
-    assert SightingModel.from_file(tmp_path / "sight.json") == model
+    assert SensorModel.from_file(tmp_path / "sight.json") == model
 
 
 @pytest.mark.parametrize(
@@ -39,10 +39,10 @@ def test_files_bring_back_what_was_written(tmp_path):
         (None, "want a sighting model"),
         ("{", "not JSON"),
         ("[]", "want a sighting model, a JSON object"),
-        ('{"format": "parkenv-sighting", "version": 7}', "version is 7, want 1"),
-        ('{"format": "parkenv-sighting", "version": 1, "bands": []}', "view_range"),
+        ('{"format": "parkenv-sensor-model", "version": 7}', "version is 7, want 1"),
+        ('{"format": "parkenv-sensor-model", "version": 1, "bands": []}', "view_range"),
         (
-            '{"format": "parkenv-sighting", "version": 1, "bands": [], "view_range": 3, "hit_rate": 2, '
+            '{"format": "parkenv-sensor-model", "version": 1, "bands": [], "view_range": 3, "hit_rate": 2, '
             '"false_alarm_rate": 0}',
             "hit_rate is 2",
         ),
@@ -53,25 +53,25 @@ def test_bad_files_are_named(tmp_path, text, message):
     if text is not None:
         file.write_text(text)
     with pytest.raises(InputError, match=message) as caught:
-        SightingModel.from_file(file)
+        SensorModel.from_file(file)
     assert str(file) in str(caught.value)
 
 
 def test_unknown_names_are_refused():
-    with pytest.raises(InputError, match="sighting is 'sonar', want one of laser, stereo"):
-        SightingModel.named("sonar")
+    with pytest.raises(InputError, match="sensor_model is 'sonar', want one of laser, stereo"):
+        SensorModel.named("sonar")
 
 
-@pytest.mark.parametrize("name", SIGHT_NAMES)
+@pytest.mark.parametrize("name", SENSOR_MODEL_NAMES)
 def test_the_stack_is_nearly_always_right_beside_the_car(name):
-    model = SightingModel.named(name)
+    model = SensorModel.named(name)
     rates = model.rates(np.array([0.0]), np.array([True]))
     assert rates.hit[0] > 0.95
     assert rates.false_alarm[0] < 0.05
 
 
 def test_unseen_slots_are_known_once_they_were_tried():
-    env = gym.make("parkenv/Search-v0", scenario="mini", sighting=SightingModel.blind()).unwrapped
+    env = gym.make("parkenv/Search-v0", scenario="mini", sensor_model=SensorModel.blind()).unwrapped
     prior = env.reset(seed=0)[0]["p_occupied"]
     lot = env.scenario.lot
     while True:
@@ -129,14 +129,14 @@ def test_looks_of_a_real_search_are_counted():
 
 
 def test_the_file_says_what_it_is(tmp_path):
-    SightingModel().to_file(tmp_path / "s.json")
-    assert json.loads((tmp_path / "s.json").read_text())["format"] == "parkenv-sighting"
+    SensorModel().to_file(tmp_path / "s.json")
+    assert json.loads((tmp_path / "s.json").read_text())["format"] == "parkenv-sensor-model"
 
 
 @pytest.mark.slow
 def test_the_fast_environment_stands_for_the_slow_one():
     """Through the sensors and with the model fitted to them: the same ranking, and means close to each other."""
-    scenario = Scenario.named("campus", sighting=SightingModel.named("laser"), traffic=Traffic(3, 5))
+    scenario = Scenario.named("campus", sensor_model=SensorModel.named("laser"), traffic=Traffic(3, 5))
     means = {}
     for rig in ("laser", None):
         for agent in ("first-free", "greedy-drive", "greedy-goal"):
@@ -153,4 +153,4 @@ def test_the_fast_environment_stands_for_the_slow_one():
 @pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
 def test_agents_that_plan_on_what_they_see_refuse_to_search_blindly(name):
     with pytest.raises(InputError, match="slots are seen"):
-        make_agent(name, Scenario.named("mini", sighting=SightingModel.blind()))
+        make_agent(name, Scenario.named("mini", sensor_model=SensorModel.blind()))

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from parkenv import InputError, OccupancyProcess, Scenario, Traffic
-from parkenv.evaluation.surveys import map_error, run_survey
+from parkenv.evaluation.experiments.surveys import map_error, run_survey
 from parkenv.mapping.inference import SessionLog
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import Survey, SurveySettings
 from parkenv.mapping.survey_score import WAYS
-from parkenv.occupancy import ArrivalWindow
 from parkenv.perception.stack import PerceptionStack
-from sim_sensors.laser import LaserScanner
+from parkenv.world.occupancy import ArrivalWindow
+from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount, SensorRig
 
 PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]

@@ -23,13 +23,13 @@ from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
-from parkenv.evaluation.cloning import Demonstrations, clone
-from parkenv.evaluation.compare import Case
-from parkenv.evaluation.learning_curves import across_seeds, save_learning_curves
-from parkenv.evaluation.recipes import DRIVE_RECIPES, MAX_STEPS, RECIPES
-from parkenv.evaluation.rl_training import read_curve, train_one, write_curve
-from parkenv.evaluation.search_training import SearchTraining, examined, search_times
-from parkenv.scenario import Scenario
+from parkenv.evaluation.experiments.compare import Case
+from parkenv.evaluation.figures.learning_curves import across_seeds, save_learning_curves
+from parkenv.evaluation.training.cloning import Demonstrations, clone
+from parkenv.evaluation.training.configs import DRIVE_RECIPES, MAX_STEPS, RECIPES
+from parkenv.evaluation.training.rl_training import read_curve, train_one, write_curve
+from parkenv.evaluation.training.search_training import SearchTraining, examined, search_times
+from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.learned import ALGORITHMS, LearnedAgent, ModelCard
 
@@ -166,7 +166,7 @@ def test_a_kill_between_the_last_checkpoint_and_its_examination_loses_neither(tm
                 raise KeyboardInterrupt
             write_curve(path, curve)
 
-        patch.setattr("parkenv.evaluation.rl_training.write_curve", killed)
+        patch.setattr("parkenv.evaluation.training.rl_training.write_curve", killed)
         with pytest.raises(KeyboardInterrupt):
             training.train(0, tmp_path)
     assert ModelCard.of_file(tmp_path / "checkpoint.zip").steps == 32_768
@@ -181,7 +181,7 @@ class Waits:
 
 
 def test_a_planner_that_finishes_nothing_cannot_be_imitated(monkeypatch):
-    monkeypatch.setattr("parkenv.evaluation.cloning.make_agent", lambda *_: Waits())
+    monkeypatch.setattr("parkenv.evaluation.training.cloning.make_agent", lambda *_: Waits())
     with pytest.raises(InputError, match="finished none of 1 searches on mini: nothing to imitate"):
         Demonstrations.collect("waits", SCENARIO, [5_000_000])
 

@@ -19,7 +19,8 @@ from parkenv.driving.lot_space import Thing
 from parkenv.driving.road_users import ROOM_M, RoadUsers
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
-from parkenv.evaluation.calibration import (
+from parkenv.evaluation.experiments.compare import unseen
+from parkenv.evaluation.trips.calibration import (
     SEEN,
     UNSEEN,
     Calibration,
@@ -28,19 +29,18 @@ from parkenv.evaluation.calibration import (
     calibrate,
     drive_trips,
 )
-from parkenv.evaluation.compare import unseen
-from parkenv.evaluation.driven_search import DrivenSearch, DrivenSearchEnv
-from parkenv.evaluation.driver import ACROSS, ALONG, NO_ROOM, TAKEN, TURN, GraphDriver
-from parkenv.evaluation.lot_driver import DrivingStyle, LotDriver
-from parkenv.evaluation.sensor_log import record_trip
-from parkenv.keyed_random import world_key
-from parkenv.lot_scene import LotScenes
-from parkenv.occupancy import OccupancyProcess
-from parkenv.traffic import Traffic
+from parkenv.evaluation.trips.driven_search import DrivenSearch, DrivenSearchEnv
+from parkenv.evaluation.trips.driver import ACROSS, ALONG, NO_ROOM, TAKEN, TURN, GraphDriver
+from parkenv.evaluation.trips.lot_driver import DrivingStyle, LotDriver
+from parkenv.evaluation.trips.sensor_log import record_trip
+from parkenv.world.keyed_random import world_key
+from parkenv.world.lot_scene import LotScenes
+from parkenv.world.occupancy import OccupancyProcess
+from parkenv.world.traffic import Traffic
 from planners.agent import make_agent
-from planners.hybrid_astar import CarPath
-from planners.lane_keeping import LaneKeeper, joined, rounded
-from planners.path_tracking import TrackingSettings
+from planners.driving.hybrid_astar import CarPath
+from planners.driving.lane_keeping import LaneKeeper, joined, rounded
+from planners.driving.path_tracking import TrackingSettings
 from sim_sensors.rig import SensorRig
 
 CAR = VehicleParameters()

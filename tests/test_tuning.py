@@ -6,10 +6,10 @@ import pytest
 from small_lots import small_lot
 
 from parkenv import InputError, OccupancyProcess, Scenario
-from parkenv.evaluation.episodes import EpisodeRunner
+from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from planners import make_agent
-from planners.expected_time import expected_time
-from planners.tuning import tune_failure_cost
+from planners.thesis.expected_time import expected_time
+from planners.thesis.tuning import tune_failure_cost
 
 COSTS = (1.0, 4.0, 16.0, 64.0)
 

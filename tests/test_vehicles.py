@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from shapely.geometry import MultiPoint, Polygon
 
+from sim_sensors.camera.surfaces import ShapeBuilder
 from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Material
-from sim_sensors.surfaces import ShapeBuilder
-from sim_sensors.vehicle_classes import BODIES, BODY_SHARE, PAINTS, SIZE_CLASSES
-from sim_sensors.vehicles import COARSE, DETAILED, FOOTPRINT_CORNERS, KNEE_M, VehicleModel
+from sim_sensors.vehicles.classes import BODIES, BODY_SHARE, PAINTS, SIZE_CLASSES
+from sim_sensors.vehicles.vehicle import COARSE, DETAILED, FOOTPRINT_CORNERS, KNEE_M, VehicleModel
 
 SEEDS = range(6)
 MIRRORS_M = 0.30  # both, beyond the body's sides

@@ -12,7 +12,7 @@ import killed_once
 import pytest
 
 from parkenv.errors import InputError
-from parkenv.evaluation.workers import HERE, Workers
+from parkenv.evaluation.experiments.workers import HERE, Workers
 
 CLUSTERS = ("ray", "dask")
 PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sim_sensors.camera.rasterizer import FAR
 from sim_sensors.mesh import Ground, Instances, Material, Mesh, MeshPool
-from sim_sensors.rasterizer import FAR
-from sim_sensors.vehicles import COARSE, DETAILED, VehicleModel
+from sim_sensors.vehicles.vehicle import COARSE, DETAILED, VehicleModel
 
 
 @dataclass(frozen=True, eq=False)

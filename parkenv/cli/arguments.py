@@ -12,13 +12,13 @@ import numpy as np
 import typer
 
 from parkenv.errors import InputError
-from parkenv.lot import ParkingLot
-from parkenv.occupancy import ArrivalWindow, OccupancyModel, OccupancyProcess
-from parkenv.scenario import Scenario
-from parkenv.sighting import SIGHT_NAMES, SightingModel
+from parkenv.world.lot import ParkingLot
+from parkenv.world.occupancy import ArrivalWindow, OccupancyModel, OccupancyProcess
+from parkenv.world.scenario import Scenario
+from parkenv.world.sensor_model import SENSOR_MODEL_NAMES, SensorModel
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.workers import Workers
+    from parkenv.evaluation.experiments.workers import Workers
 
 WORLD = "The world"
 COSTS = "Costs and speeds"
@@ -76,11 +76,11 @@ ViewRangeOption = Annotated[
 SightOption = Annotated[
     str | None,
     typer.Option(
-        "--sight",
+        "--sensor-model",
         metavar="perfect|laser|stereo|FILE",
         help="How slots are seen: without error within --view-range; as the detection and mapping stack was "
-        "measured to see with a rig; or as a file of `parkenv fit-sight` says.  [default: perfect; with --sensors "
-        "as measured of the rig]",
+        "measured to see with a rig; or as a file of `parkenv fit-sensor-model` says.  "
+        "[default: perfect; with --sensors as measured of the rig]",
         rich_help_panel=WORLD,
     ),
 ]
@@ -204,7 +204,7 @@ def workers_of(jobs: int, backend: str, address: str | None) -> Workers:
     Raises:
         InputError: options that do not go together.
     """
-    from parkenv.evaluation.workers import Workers
+    from parkenv.evaluation.experiments.workers import Workers
 
     return Workers(jobs or None, backend, address)
 
@@ -234,32 +234,32 @@ def occupancy_of(path: Path, lot: ParkingLot, mapping: Path | None) -> Occupancy
             raise InputError("--mapping goes with a recorded log, not with a process")
         process = OccupancyProcess.from_file(path)
         # A process carries no slot ids: one of the lot's size is taken to be the lot's own.
-        return process if process.n_slots == lot.n_slots else process.laid_on(lot.walk_m())
+        return process if process.n_slots == lot.n_slots else process.mapped_to_lot(lot.walk_m())
     if not path.name.endswith((".csv", ".csv.gz")):
         raise InputError(f"{path}: want a recorded log (.csv or .csv.gz) or a process (.json)")
-    from parkenv.occupancy_log import OccupancyLog
-    from parkenv.recorded_occupancy import RecordedOccupancy, read_mapping
+    from parkenv.world.occupancy_log import OccupancyLog
+    from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
 
     log = OccupancyLog.read(path)
     placed = None if mapping is None else read_mapping(mapping, lot.slot_ids, log)
     return RecordedOccupancy(log, lot.walk_m(), placed)
 
 
-def sighting_of(word: str) -> SightingModel:
+def sighting_of(word: str) -> SensorModel:
     """The sighting model that a word or a file stands for.
 
     Raises:
         InputError: neither a known word nor a file.
     """
     if word == "perfect":
-        return SightingModel()
-    if word in SIGHT_NAMES:
-        return SightingModel.named(word)
+        return SensorModel()
+    if word in SENSOR_MODEL_NAMES:
+        return SensorModel.named(word)
     if not Path(word).exists():
         raise InputError(
-            f"--sight is {word!r}, want perfect, {', '.join(SIGHT_NAMES)}, or a file that is there"
+            f"--sensor-model is {word!r}, want perfect, {', '.join(SENSOR_MODEL_NAMES)}, or a file that is there"
         )
-    return SightingModel.from_file(word)
+    return SensorModel.from_file(word)
 
 
 def rig_of(word: str | None) -> str | None:
@@ -307,7 +307,9 @@ def scenarios_of(
         ) from error
     changes: dict[str, Any] = {"arrival": window}
     seeing = sighting_of(sight)
-    changes["sighting"] = seeing if view_range is None else dataclasses.replace(seeing, view_range=view_range)
+    changes["sensor_model"] = (
+        seeing if view_range is None else dataclasses.replace(seeing, view_range=view_range)
+    )
     return [s.replace(**changes) for s in made]
 
 

@@ -14,35 +14,35 @@ from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.bench_rows import BenchRow
+    from parkenv.evaluation.bench.rows import BenchRow
 
 
 def _sensors(seed: int, seconds: float) -> list[BenchRow]:
-    from parkenv.evaluation.bench_sensors import sensor_rows
+    from parkenv.evaluation.bench.sensors import sensor_rows
 
     return sensor_rows(seed, seconds)
 
 
 def _perception(seed: int, seconds: float) -> list[BenchRow]:
-    from parkenv.evaluation.bench_perception import perception_rows
+    from parkenv.evaluation.bench.perception import perception_rows
 
     return perception_rows(seed, seconds)
 
 
 def _planning(seed: int, seconds: float) -> list[BenchRow]:
-    from parkenv.evaluation.bench_planning import planning_rows
+    from parkenv.evaluation.bench.planning import planning_rows
 
     return planning_rows(seed, seconds)
 
 
 def _drive(seed: int, seconds: float) -> list[BenchRow]:
-    from parkenv.evaluation.bench_drive import drive_rows
+    from parkenv.evaluation.bench.drive import drive_rows
 
     return drive_rows(seed, seconds)
 
 
 def _env(seed: int, seconds: float) -> list[BenchRow]:
-    from parkenv.evaluation.bench_env import env_rows
+    from parkenv.evaluation.bench.env import env_rows
 
     return env_rows(seed, seconds)
 
@@ -76,7 +76,7 @@ def bench(
 
     * `parkenv bench --seconds 2 --out results/bench`
     """
-    from parkenv.evaluation.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.results import make_folder, write_summary
 
     chosen = parts or list(PARTS)
     for part in chosen:

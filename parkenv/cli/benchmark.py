@@ -51,8 +51,8 @@ def run(
 
     * `parkenv benchmark check results/v1/result.json`
     """
-    from parkenv.evaluation.benchmark import Suite, result_of
-    from parkenv.evaluation.results import ResultFolder, write_summary
+    from parkenv.evaluation.experiments.benchmark import Suite, result_of
+    from parkenv.evaluation.experiments.results import ResultFolder, write_summary
 
     its = Suite.named(suite)
     cases = its.cases(args.words("--agents", agents))
@@ -92,7 +92,7 @@ def check(
     searches: a run in other worlds, or at other costs and speeds, has others. That an agent took what the file says
     only a run of the agent can tell.
     """
-    from parkenv.evaluation.benchmark import check_result
+    from parkenv.evaluation.experiments.benchmark import check_result
 
     console = make_console()
     with console.status("Checking"):
@@ -106,7 +106,7 @@ def check(
 @app.command("show")
 def show(suite: Annotated[str, typer.Argument(help="The suite.")] = "v1") -> None:
     """Tell what a suite asks for."""
-    from parkenv.evaluation.benchmark import Suite
+    from parkenv.evaluation.experiments.benchmark import Suite
 
     its = Suite.named(suite)
     console = make_console()

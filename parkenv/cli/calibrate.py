@@ -70,18 +70,18 @@ def calibrate(
 
     * `parkenv compare --calibrated results/calibrate/calibrated.json`
     """
-    from parkenv.evaluation.calibration import (
+    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.trips.calibration import (
         TripFolder,
         TripPlan,
         drive_trips,
         save_distributions,
     )
-    from parkenv.evaluation.calibration import calibrate as calibration_of
-    from parkenv.evaluation.driven_search import DrivenSearch
-    from parkenv.evaluation.lot_driver import DrivingStyle
-    from parkenv.evaluation.results import make_folder, write_summary
-    from parkenv.scenario import KMH, Scenario
-    from parkenv.traffic import Traffic
+    from parkenv.evaluation.trips.calibration import calibrate as calibration_of
+    from parkenv.evaluation.trips.driven_search import DrivenSearch
+    from parkenv.evaluation.trips.lot_driver import DrivingStyle
+    from parkenv.world.scenario import KMH, Scenario
+    from parkenv.world.traffic import Traffic
 
     its = Scenario.named(scenario, traffic=Traffic(cars, pedestrians))
     speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
@@ -171,15 +171,15 @@ def trip(
 
     * `parkenv trip --scenario campus --cars 6 --pedestrians 8`
     """
-    from parkenv.evaluation.compare import unseen
-    from parkenv.evaluation.driven_search import DrivenSearch
-    from parkenv.evaluation.lot_driver import DrivingStyle
-    from parkenv.evaluation.picture_files import save_film
-    from parkenv.evaluation.results import make_folder
-    from parkenv.evaluation.sensor_log import record_trip, require_viewer, sensor_log
-    from parkenv.evaluation.trip_pictures import COLORS, FPS, film_trip
-    from parkenv.scenario import Scenario
-    from parkenv.traffic import Traffic
+    from parkenv.evaluation.experiments.compare import unseen
+    from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.evaluation.figures.picture_files import save_film
+    from parkenv.evaluation.figures.trip_pictures import COLORS, FPS, film_trip
+    from parkenv.evaluation.trips.driven_search import DrivenSearch
+    from parkenv.evaluation.trips.lot_driver import DrivingStyle
+    from parkenv.evaluation.trips.sensor_log import record_trip, require_viewer, sensor_log
+    from parkenv.world.scenario import Scenario
+    from parkenv.world.traffic import Traffic
 
     if out.suffix.lower() != ".gif":
         raise InputError(f"--out is {out}, want a file that ends in .gif")

@@ -26,9 +26,9 @@ from parkenv.cli.tables import WIDE, make_console, make_table
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.calibration import Calibration
-    from parkenv.evaluation.compare import Case
-    from parkenv.scenario import Scenario
+    from parkenv.evaluation.experiments.compare import Case
+    from parkenv.evaluation.trips.calibration import Calibration
+    from parkenv.world.scenario import Scenario
 
 Row = dict[str, Any]
 
@@ -162,12 +162,12 @@ def compare(
 
     * `parkenv compare --lot lot.geojson --occupancy log.csv.gz --agents mdp,greedy-goal,oracle -n 300`
     """
-    from parkenv.evaluation.compare import check_worlds, table
-    from parkenv.evaluation.results import ResultFolder
-    from parkenv.scenario import KMH
+    from parkenv.evaluation.experiments.compare import check_worlds, table
+    from parkenv.evaluation.experiments.results import ResultFolder
+    from parkenv.world.scenario import KMH
 
     if rerun is not None:
-        from parkenv.evaluation.sensor_log import require_viewer
+        from parkenv.evaluation.trips.sensor_log import require_viewer
 
         if sensors is None:
             raise InputError("--rerun records what sensors measure: add --sensors laser")
@@ -196,7 +196,7 @@ def compare(
         "arrival": arrival,
         "days": days,
         "view_range": view_range,
-        "sight": repr(scenarios[0].sighting),
+        "sight": repr(scenarios[0].sensor_model),
         "sensors": sensors,
         "map_says": map_says,
         "options": asked.options,
@@ -258,7 +258,7 @@ def compare(
 def _record(case: Case, seeds: range, path: Path) -> None:
     """The first search of a case, through its sensors."""
     from parkenv.envs.perception import SearchPerceptionEnv
-    from parkenv.evaluation.sensor_log import record_search, sensor_log
+    from parkenv.evaluation.trips.sensor_log import record_search, sensor_log
     from planners.agent import make_agent
 
     env = SearchPerceptionEnv(case.scenario, rig=str(case.rig))
@@ -316,9 +316,9 @@ def comparison_of(
     Raises:
         InputError: options that cannot be used, by name.
     """
-    from parkenv.evaluation.compare import UNSEEN, Case, at_occupancy, settings_of, unseen
-    from parkenv.occupancy import OccupancyProcess
-    from parkenv.scenario import KMH
+    from parkenv.evaluation.experiments.compare import UNSEEN, Case, at_occupancy, settings_of, unseen
+    from parkenv.world.occupancy import OccupancyProcess
+    from parkenv.world.scenario import KMH
     from planners.agent import make_agent
 
     names = args.words("--agents", agents)
@@ -376,7 +376,7 @@ def comparison_of(
 
 def _maps(text: str | None, scenarios: list[Any]) -> dict[str, tuple[Any, float]]:
     """Scenarios with flat maps and what these say, by name."""
-    from parkenv.flat_map import FlatMap
+    from parkenv.world.flat_map import FlatMap
 
     made = {}
     for said in [] if text is None else sorted(args.numbers("--map-says", text)):
@@ -389,7 +389,7 @@ def _maps(text: str | None, scenarios: list[Any]) -> dict[str, tuple[Any, float]
 
 
 def _calibration(path: Path, scenarios: list[Any]) -> Any:
-    from parkenv.evaluation.calibration import Calibration
+    from parkenv.evaluation.trips.calibration import Calibration
 
     measured = Calibration.from_file(path)
     names = [s.name for s in scenarios]
@@ -411,7 +411,7 @@ def _levels(text: str) -> list[float]:
 
 def run_with_bar(console: Console, cases: list[Any], folder: Any, workers: Any) -> bool:
     """Run with a progress bar; whether Ctrl-C ended it."""
-    from parkenv.evaluation.compare import run_cases
+    from parkenv.evaluation.experiments.compare import run_cases
 
     progress = Progress(
         TextColumn("{task.description}"),
@@ -496,7 +496,7 @@ PICTURED = ("greedy-goal", "first-free", "oracle")
 
 
 def _draw_maps(out: Path, rows: list[Any], said: dict[str, float]) -> None:
-    from parkenv.evaluation.time_figures import save_time_against_map
+    from parkenv.evaluation.figures.time_figures import save_time_against_map
 
     # At the first of the costs and speeds, whatever else was asked for.
     setting = {c: rows[0][c] for c in ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")}
@@ -511,8 +511,8 @@ def _draw_maps(out: Path, rows: list[Any], said: dict[str, float]) -> None:
 
 
 def _draw_sweep(out: Path, rows: list[Any]) -> None:
-    from parkenv.evaluation.compare import UNSEEN
-    from parkenv.evaluation.time_figures import save_time_against_failure_cost
+    from parkenv.evaluation.experiments.compare import UNSEEN
+    from parkenv.evaluation.figures.time_figures import save_time_against_failure_cost
 
     for name in dict.fromkeys(row["scenario"].removesuffix(UNSEEN) for row in rows):
         seen, unseen = ([r for r in rows if r["scenario"] == n] for n in (name, name + UNSEEN))
@@ -522,9 +522,9 @@ def _draw_sweep(out: Path, rows: list[Any]) -> None:
 def _draw(
     out: Path, rows: list[Any], sweep_rows: list[Any], cases: list[Any], folder: Any, seed: int
 ) -> None:
-    from parkenv.evaluation.compare import against_occupancy
-    from parkenv.evaluation.search_pictures import save_searches
-    from parkenv.evaluation.time_figures import save_time_against_occupancy, save_time_split
+    from parkenv.evaluation.experiments.compare import against_occupancy
+    from parkenv.evaluation.figures.search_pictures import save_searches
+    from parkenv.evaluation.figures.time_figures import save_time_against_occupancy, save_time_split
 
     for name in dict.fromkeys(row["scenario"] for row in rows):
         save_time_split([r for r in rows if r["scenario"] == name], out / f"time_split_{name}.png")

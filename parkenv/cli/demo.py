@@ -15,10 +15,10 @@ from parkenv.cli.compare import result_tables
 from parkenv.cli.tables import make_console
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.compare import Case
+    from parkenv.evaluation.experiments.compare import Case
     from parkenv.mapping.inference import SessionLog
     from parkenv.mapping.survey import SurveySettings
-    from parkenv.scenario import Scenario
+    from parkenv.world.scenario import Scenario
 
 AGENTS = ("mdp", "greedy-goal", "greedy-drive", "first-free")
 
@@ -52,15 +52,15 @@ def demo(
     Example:
     * `parkenv demo`
     """
-    from parkenv.evaluation.compare import run_cases, table
-    from parkenv.evaluation.results import ResultFolder, make_folder
-    from parkenv.evaluation.sensor_log import require_viewer
-    from parkenv.evaluation.survey_pictures import save_detections, save_map, save_session
-    from parkenv.evaluation.surveys import run_survey, summarize
-    from parkenv.evaluation.time_figures import save_time_split
+    from parkenv.evaluation.experiments.compare import run_cases, table
+    from parkenv.evaluation.experiments.results import ResultFolder, make_folder
+    from parkenv.evaluation.experiments.surveys import run_survey, summarize
+    from parkenv.evaluation.figures.survey_pictures import save_detections, save_map, save_session
+    from parkenv.evaluation.figures.time_figures import save_time_split
+    from parkenv.evaluation.trips.sensor_log import require_viewer
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
-    from parkenv.occupancy import Arrival
+    from parkenv.world.occupancy import Arrival
 
     if rerun is not None:
         require_viewer()
@@ -126,9 +126,9 @@ def demo(
 def first_part(scenario: str, every: float, seed: int) -> tuple[Scenario, SurveySettings]:
     """The world of the demo, and how it is surveyed."""
     from parkenv.mapping.survey import SurveySettings
-    from parkenv.occupancy import ArrivalWindow
-    from parkenv.scenario import Scenario
-    from parkenv.traffic import Traffic
+    from parkenv.world.occupancy import ArrivalWindow
+    from parkenv.world.scenario import Scenario
+    from parkenv.world.traffic import Traffic
 
     hours = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
     windows = tuple(ArrivalWindow.parse(h) for h in hours)
@@ -138,11 +138,11 @@ def first_part(scenario: str, every: float, seed: int) -> tuple[Scenario, Survey
 
 def last_part(its: Scenario, log: SessionLog, searches: int, seed: int) -> list[tuple[Case, range]]:
     """Who searches in it, knowing what the survey tells, with the seeds of the searches."""
-    from parkenv.evaluation.compare import Case
+    from parkenv.evaluation.experiments.compare import Case
     from parkenv.mapping.inference import MapPrior
-    from parkenv.sighting import SightingModel
+    from parkenv.world.sensor_model import SensorModel
 
-    known = its.replace(prior=MapPrior(log), sighting=SightingModel.named("laser"))
+    known = its.replace(prior=MapPrior(log), sensor_model=SensorModel.named("laser"))
     # Worlds of the searches are others than those of the survey: their seeds lie far from its own.
     seeds = range(seed + 1_000_000, seed + 1_000_000 + searches)
     return [(Case(known, name, rig="laser"), seeds) for name in AGENTS]
@@ -151,7 +151,7 @@ def last_part(its: Scenario, log: SessionLog, searches: int, seed: int) -> list[
 def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:
     """The first survey drive and the first search, on one time line."""
     from parkenv.envs.perception import SearchPerceptionEnv
-    from parkenv.evaluation.sensor_log import record_search, record_session, sensor_log
+    from parkenv.evaluation.trips.sensor_log import record_search, record_session, sensor_log
     from parkenv.mapping.survey import Survey
     from planners.agent import make_agent
 
@@ -174,6 +174,6 @@ def _settings(its: Scenario, settings: SurveySettings, sessions: int, seed: int)
 
 def _goes_on(out: Path) -> bool:
     """Whether an unfinished demo is in the folder."""
-    from parkenv.evaluation.results import SETTINGS, SUMMARY
+    from parkenv.evaluation.experiments.results import SETTINGS, SUMMARY
 
     return (out / SETTINGS).exists() and not (out / SUMMARY).exists()

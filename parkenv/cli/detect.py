@@ -46,11 +46,11 @@ def detect(
     """
     import cv2
 
-    from parkenv.evaluation.results import make_folder, write_summary
-    from parkenv.evaluation.survey_pictures import draw_detections
+    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.figures.survey_pictures import draw_detections
+    from parkenv.files.atomic_write import atomic_write
     from parkenv.perception.detector import Detector
     from parkenv.perception.image_files import images_in, read_image
-    from parkenv.whole_files import written_whole
 
     detector = Detector.load(*(model or ()), threshold=threshold, least_height=least_height)
     chosen = [f for path in files for f in (images_in(path) if path.is_dir() else [path])]
@@ -72,7 +72,7 @@ def detect(
             drawn = draw_detections(
                 image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), found
             )
-            with written_whole(out / f"{file.stem}_cars.png") as beside:
+            with atomic_write(out / f"{file.stem}_cars.png") as beside:
                 beside.write_bytes(cv2.imencode(".png", drawn[..., ::-1])[1].tobytes())
     console.print(table)
     console.print(f"{len(rows)} cars in {len(chosen)} images")
@@ -203,8 +203,8 @@ def evaluate_detector(
     Example:
     * `parkenv evaluate-detector --uiuc CarData --model side`
     """
-    from parkenv.evaluation.detector_scores import save_curves, score_on_uiuc
-    from parkenv.evaluation.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.detector_scores import save_curves, score_on_uiuc
+    from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.perception.detector import CarModel
 
     loaded = CarModel.load(model)

@@ -14,9 +14,9 @@ from parkenv.cli.training_course import EXAMINED_FROM, FIGURE, TESTED_FROM, Cour
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.drive_training import DriveTraining
-    from parkenv.evaluation.workers import Workers
-    from parkenv.lot import ParkingLot
+    from parkenv.evaluation.experiments.workers import Workers
+    from parkenv.evaluation.training.drive_training import DriveTraining
+    from parkenv.world.lot import ParkingLot
 
 
 @dataclass(eq=False)
@@ -46,7 +46,7 @@ class DriveCourse(Course):
 
     def recipe(self) -> Any:
         """See `Course`."""
-        from parkenv.evaluation.recipes import DRIVE_RECIPES, recipe_of
+        from parkenv.evaluation.training.configs import DRIVE_RECIPES, recipe_of
 
         return recipe_of(self.algorithm, DRIVE_RECIPES, "drive")
 
@@ -76,8 +76,8 @@ class DriveCourse(Course):
 
     def check(self) -> None:
         """See `Course`."""
-        from parkenv.evaluation.drive_practice import places_of
-        from planners.drivers import PLANNER
+        from parkenv.evaluation.training.drive_practice import places_of
+        from planners.driving.drivers import PLANNER
 
         super().check()
         for lots in (self.lots, self.tested):
@@ -99,14 +99,14 @@ class DriveCourse(Course):
     @property
     def measures(self) -> tuple[str, ...]:
         """See `Course`."""
-        from parkenv.evaluation.drive_practice import places_of
+        from parkenv.evaluation.training.drive_practice import places_of
 
         return tuple(f"{place.kind}_success" for place in places_of(self.lots))
 
     def training(self, console: Console) -> DriveTraining:
         """See `Course`."""
         del console
-        from parkenv.evaluation.drive_training import DriveTraining
+        from parkenv.evaluation.training.drive_training import DriveTraining
 
         examined = range(EXAMINED_FROM, EXAMINED_FROM + self.examined_on)
         return DriveTraining(self.algorithm, self.steps, self.examine_every, tuple(self.lots), examined)
@@ -125,10 +125,10 @@ class DriveCourse(Course):
         beside: dict[str, list[list[Row]]],
     ) -> Row:
         """See `Course`."""
-        from parkenv.evaluation.drive_training import parked_on
-        from parkenv.evaluation.learning_curves import across_seeds, save_success_curves
-        from parkenv.evaluation.parking_runs import parking_table
-        from planners.drivers import PLANNER
+        from parkenv.evaluation.figures.learning_curves import across_seeds, save_success_curves
+        from parkenv.evaluation.training.drive_training import parked_on
+        from parkenv.evaluation.trips.parking_runs import parking_table
+        from planners.driving.drivers import PLANNER
 
         examined = range(EXAMINED_FROM, EXAMINED_FROM + self.examined_on)
         at_test = range(TESTED_FROM, TESTED_FROM + 2 * self.examined_on)

@@ -11,13 +11,13 @@ from rich.console import Console
 
 from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
-from parkenv.lot import ParkingLot
+from parkenv.world.lot import ParkingLot
 
 app = typer.Typer(help="Show, check, import and convert lots.", no_args_is_help=True)
 
 
 def _load(lot: str) -> ParkingLot:
-    from parkenv.lot_files import PACKAGED_LOTS
+    from parkenv.lots.lot_files import PACKAGED_LOTS
 
     if lot in PACKAGED_LOTS:
         return ParkingLot.packaged(lot)
@@ -33,7 +33,7 @@ def show(
     graph: Annotated[bool, typer.Option("--graph", help="Draw the drive graph, too.")] = False,
 ) -> None:
     """Draw a lot, and say what is in it."""
-    from parkenv.evaluation.lot_picture import save_lot_picture
+    from parkenv.evaluation.figures.lot_picture import save_lot_picture
 
     its_lot = _load(lot)
     picture = out or Path(f"{its_lot.name}.png")
@@ -55,7 +55,7 @@ def check(
 
     Exit code 2 where there are errors; warnings alone leave it at 0.
     """
-    from parkenv.lot_check import check_lot
+    from parkenv.lots.checks import check_lot
 
     console = Console(highlight=False, soft_wrap=True)
     problems = check_lot(file)
@@ -116,8 +116,8 @@ def import_place(
     * `parkenv lot import map.osm --out lot.geojson --picture lot.png`
     * `parkenv lot import slots.csv --out lot.geojson --entry 0,0 --goal 40,25`
     """
-    from parkenv.places.lot_draft import Wishes
-    from parkenv.places.lot_import import import_lot
+    from parkenv.lots.places.lot_draft import Wishes
+    from parkenv.lots.places.lot_import import import_lot
 
     corners = None if bounds is None else _numbers("--bounds", bounds, 4)
     wishes = Wishes(
@@ -133,7 +133,7 @@ def import_place(
     for left in draft.left_out:
         console.print(f"left out: {left}", style="yellow", markup=False)
     if picture is not None:
-        from parkenv.evaluation.import_picture import save_import_picture
+        from parkenv.evaluation.figures.import_picture import save_import_picture
 
         save_import_picture(draft, picture)
         console.print(f"Drawn in {picture}", markup=False)

@@ -39,10 +39,10 @@ def fit(
     counted in. The result, process.json, is an --occupancy for `parkenv compare`: on a lot of as many slots
     as it is, on any other lot with the fullest slots nearest to the goal.
     """
-    from parkenv.evaluation.rates_picture import save_rates
-    from parkenv.evaluation.results import make_folder, write_summary
-    from parkenv.occupancy_fit import fit_process
-    from parkenv.occupancy_log import OccupancyLog
+    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.figures.rates_picture import save_rates
+    from parkenv.world.occupancy_fit import fit_process
+    from parkenv.world.occupancy_log import OccupancyLog
 
     make_folder(out)
     console = make_console()

@@ -15,7 +15,7 @@ from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.parking_runs import Parking, ParkingCase
+    from parkenv.evaluation.trips.parking_runs import Parking, ParkingCase
     from planners.agent import Agent
 
 SHOWN_FAILURES = 6
@@ -67,9 +67,9 @@ def park(
     """
     from parkenv.driving.parking_task import KINDS, WAYS
     from parkenv.envs.drive import lot_named
-    from parkenv.evaluation.parking_runs import ParkingCase, park_all, parking_table, write_parkings
-    from parkenv.evaluation.results import make_folder, write_summary
-    from planners.drivers import make_driver
+    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, parking_table, write_parkings
+    from planners.driving.drivers import make_driver
 
     kinds = None if kind == "all" else _chosen("--kind", kind, KINDS)
     ways = WAYS if way == "both" else _chosen("--way", way, WAYS)
@@ -153,9 +153,9 @@ def _picture(
     folder: Path,
 ) -> None:
     """Pictures of parkings and failures, and an animation of the task to film."""
-    from parkenv.evaluation.parking_pictures import save_parkings
-    from parkenv.evaluation.parking_runs import park_once
-    from parkenv.evaluation.picture_files import save_film
+    from parkenv.evaluation.figures.parking_pictures import save_parkings
+    from parkenv.evaluation.figures.picture_files import save_film
+    from parkenv.evaluation.trips.parking_runs import park_once
 
     lots = {case.lot.name: case.lot for case in cases}
     failures = [p for p in parkings if not p.row["parked"]][:SHOWN_FAILURES]

@@ -51,11 +51,11 @@ def plan(
     """
     import numpy as np
 
-    from parkenv.evaluation.compare import Case, settings_of
-    from parkenv.evaluation.results import make_folder, write_summary
-    from parkenv.evaluation.search_pictures import save_searches
+    from parkenv.evaluation.experiments.compare import Case, settings_of
+    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.figures.search_pictures import save_searches
     from planners.agent import make_agent
-    from planners.replanning import StaticAgent
+    from planners.thesis.replanning import StaticAgent
 
     failure = args.costs("--failure-cost", failure_cost)
     walk = args.speeds("--v-walk-kmh", v_walk_kmh)

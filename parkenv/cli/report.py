@@ -16,7 +16,7 @@ from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.compare import Case
+    from parkenv.evaluation.experiments.compare import Case
     from parkenv.evaluation.report.run_folder import RunFolder
     from parkenv.mapping.survey import Survey
 
@@ -204,7 +204,7 @@ def _parsed(run: RunFolder) -> dict[str, Any]:
 
 def _require_same_files(run: RunFolder) -> None:
     """Refuse files that are no longer those that the comparison read."""
-    from parkenv.evaluation.results import read_settings
+    from parkenv.evaluation.experiments.results import read_settings
 
     before = read_settings(run.path) or {}
     options = _parsed(run)
@@ -215,8 +215,8 @@ def _require_same_files(run: RunFolder) -> None:
 
 def _trained(run: RunFolder) -> Cases:
     """The best model and the best planners, where the models were tested; none where that was no search."""
-    from parkenv.evaluation.compare import Case
-    from parkenv.scenario import SCENARIO_NAMES, Scenario
+    from parkenv.evaluation.experiments.compare import Case
+    from parkenv.world.scenario import SCENARIO_NAMES, Scenario
 
     rows = [
         r for r in run.summary["rows"] if r.get("scenario") in SCENARIO_NAMES and r.get("total_s") is not None

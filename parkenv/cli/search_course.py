@@ -23,9 +23,9 @@ from parkenv.cli.training_course import (
 )
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.search_training import SearchTraining
-    from parkenv.evaluation.workers import Workers
-    from parkenv.scenario import Scenario
+    from parkenv.evaluation.experiments.workers import Workers
+    from parkenv.evaluation.training.search_training import SearchTraining
+    from parkenv.world.scenario import Scenario
 
 SHOWN_FROM = 5_000_000
 """First seed of the worlds in which a planner shows what to imitate."""
@@ -65,21 +65,21 @@ class SearchCourse(Course):
 
     def recipe(self) -> Any:
         """See `Course`."""
-        from parkenv.evaluation.recipes import RECIPES, recipe_of
+        from parkenv.evaluation.training.configs import RECIPES, recipe_of
 
         return recipe_of(self.algorithm, RECIPES, "search")
 
     @cached_property
     def worlds(self) -> list[Scenario]:
         """Where it is trained."""
-        from parkenv.scenario import Scenario
+        from parkenv.world.scenario import Scenario
 
         return [Scenario.named(name) for name in args.words("--scenario", self.scenario)]
 
     @cached_property
     def tested(self) -> list[Scenario]:
         """Where it is tested."""
-        from parkenv.scenario import Scenario
+        from parkenv.world.scenario import Scenario
 
         return [Scenario.named(name) for name in args.words("--test-on", self.test_on or self.scenario)]
 
@@ -95,7 +95,7 @@ class SearchCourse(Course):
 
     def check(self) -> None:
         """See `Course`."""
-        from parkenv.evaluation.cloning import require_imitable
+        from parkenv.evaluation.training.cloning import require_imitable
         from planners.agent import make_agent
 
         super().check()
@@ -125,11 +125,11 @@ class SearchCourse(Course):
 
     def training(self, console: Console) -> SearchTraining:
         """See `Course`."""
-        from parkenv.evaluation.search_training import SearchTraining
+        from parkenv.evaluation.training.search_training import SearchTraining
 
         demonstrations = None
         if self.imitate is not None:
-            from parkenv.evaluation.cloning import Demonstrations
+            from parkenv.evaluation.training.cloning import Demonstrations
 
             with console.status(f"Watching {self.imitate} search {self.shown} times"):
                 demonstrations = Demonstrations.collect(
@@ -153,8 +153,8 @@ class SearchCourse(Course):
         beside: dict[str, list[list[Row]]],
     ) -> Row:
         """See `Course`."""
-        from parkenv.evaluation.learning_curves import across_seeds, save_learning_curves
-        from parkenv.evaluation.search_training import search_times
+        from parkenv.evaluation.figures.learning_curves import across_seeds, save_learning_curves
+        from parkenv.evaluation.training.search_training import search_times
         from planners.learned import LearnedAgent
 
         at_test = range(TESTED_FROM, TESTED_FROM + 2 * self.examined_on)
@@ -198,7 +198,7 @@ def _planner_times(
     at_test: range,
 ) -> tuple[dict[str, float], list[Row]]:
     """Mean times of planners in the worlds of the examinations, and rows of those of the test."""
-    from parkenv.evaluation.compare import rows_of
+    from parkenv.evaluation.experiments.compare import rows_of
 
     if not names:
         return {}, []

@@ -55,17 +55,17 @@ def preview(
     import numpy as np
     from scipy.spatial import cKDTree
 
-    from parkenv.evaluation.picture_files import save_film
-    from parkenv.evaluation.results import make_folder
-    from parkenv.evaluation.sensor_pictures import save_sensor_preview, with_boxes
-    from parkenv.keyed_random import world_key
-    from parkenv.lot_scene import LotScenes, slot_lot
-    from parkenv.scenario import Scenario
-    from parkenv.traffic import Traffic
+    from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.evaluation.figures.picture_files import save_film
+    from parkenv.evaluation.figures.sensor_pictures import save_sensor_preview, with_boxes
+    from parkenv.world.keyed_random import world_key
+    from parkenv.world.lot_scene import LotScenes, slot_lot
+    from parkenv.world.scenario import Scenario
+    from parkenv.world.traffic import Traffic
     from planners.routes import DriveRoutes
+    from sim_sensors.camera.weather import PRESETS, Weather
     from sim_sensors.ground_truth import vehicle_boxes
     from sim_sensors.rig import SensorRig, poses_along
-    from sim_sensors.weather import PRESETS, Weather
 
     names = list(PRESETS) if weather == "all" else args.words("--weather", weather)
     for name in names:

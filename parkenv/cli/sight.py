@@ -1,4 +1,4 @@
-"""`parkenv fit-sight`: how well the stack sees, as a model for the environment without sensors."""
+"""`parkenv fit-sensor-model`: how well the stack sees, as a model for the environment without sensors."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def fit_sight(
 ) -> None:
     """Search through the sensors, and count how often the stack is right about slots, by distance and side.
 
-    The rates become a sighting model: `parkenv compare --sight FILE` then sees as the stack does, at a thousandth of
-    the cost.
+    The rates become a sensor model: `parkenv compare --sensor-model FILE` then sees as the stack does, at a thousandth
+    of the cost.
 
     Example:
-    * `parkenv fit-sight --rig stereo --out stereo.json`
+    * `parkenv fit-sensor-model --rig stereo --out stereo.json`
     """
-    from parkenv.evaluation.sight_fit import DRIVERS, measure_sight
-    from parkenv.traffic import Traffic
+    from parkenv.evaluation.experiments.sensor_model_fit import DRIVERS, measure_sight
+    from parkenv.world.traffic import Traffic
 
     scenarios = [
         its.replace(traffic=Traffic(cars=3, pedestrians=5))

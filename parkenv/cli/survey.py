@@ -16,7 +16,7 @@ from parkenv.errors import InputError
 
 if TYPE_CHECKING:
     from parkenv.mapping.survey import SurveySettings
-    from parkenv.scenario import Scenario
+    from parkenv.world.scenario import Scenario
 
 MAP_FILE = "map.sqlite"
 
@@ -74,9 +74,9 @@ def survey(
 
     * `parkenv survey --scenario mini --sessions 1 --rerun drive.rrd`
     """
-    from parkenv.evaluation.results import make_folder, write_summary
-    from parkenv.evaluation.sensor_log import record_session, require_viewer, sensor_log
-    from parkenv.evaluation.survey_pictures import (
+    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.surveys import run_survey, slots_found, summarize
+    from parkenv.evaluation.figures.survey_pictures import (
         save_detection_reach,
         save_detections,
         save_found_slots,
@@ -84,12 +84,12 @@ def survey(
         save_map,
         save_session,
     )
-    from parkenv.evaluation.surveys import run_survey, slots_found, summarize
+    from parkenv.evaluation.trips.sensor_log import record_session, require_viewer, sensor_log
     from parkenv.mapping.discovery import score_discovery
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
     from parkenv.mapping.survey import Survey
-    from parkenv.occupancy import Arrival
+    from parkenv.world.occupancy import Arrival
 
     if rerun is not None:
         require_viewer()
@@ -190,8 +190,8 @@ def surveyed_by(
     """
     from parkenv.mapping.odometry import PoseNoise
     from parkenv.mapping.survey import SurveySettings
-    from parkenv.occupancy import ArrivalWindow
-    from parkenv.traffic import Traffic
+    from parkenv.world.occupancy import ArrivalWindow
+    from parkenv.world.traffic import Traffic
 
     (its,) = args.scenarios_of(scenario, lot, occupancy, None, None, "08:00-13:00", days, None)
     settings = SurveySettings(
@@ -233,12 +233,12 @@ def show_map(
     import csv
     import io
 
-    from parkenv.evaluation.results import make_folder, write_summary
-    from parkenv.evaluation.survey_pictures import save_map
+    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.figures.survey_pictures import save_map
+    from parkenv.files.atomic_write import atomic_write
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
-    from parkenv.occupancy import DAY_NAMES, DAY_S, HOUR_S
-    from parkenv.whole_files import written_whole
+    from parkenv.world.occupancy import DAY_NAMES, DAY_S, HOUR_S
 
     (its,) = args.scenarios_of(scenario, lot, None, None, None, "08:00-13:00", "weekdays", None)
     if weekday is not None and weekday not in DAY_NAMES:
@@ -284,7 +284,7 @@ def show_map(
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
-    with written_whole(out / "slots.csv") as beside:
+    with atomic_write(out / "slots.csv") as beside:
         beside.write_text(text.getvalue(), encoding="utf-8")
     write_summary(
         out, {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": None, "rows": rows}

@@ -21,8 +21,8 @@ from parkenv.cli.training_course import FIGURE, Course, Row, curves_beside
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.rl_training import Training
-    from parkenv.evaluation.workers import Workers
+    from parkenv.evaluation.experiments.workers import Workers
+    from parkenv.evaluation.training.rl_training import Training
 
 PLANNERS = "belief,mdp-tuned,mdp,first-free,greedy-drive,greedy-goal"
 ENVS = ("search", "drive")
@@ -158,7 +158,7 @@ def train(
     They learn to search, with minus the seconds as rewards, and observe what is near the car, so that they run on any
     lot. Or they learn to drive into slots, from goals of hindsight (sac, tqc) or the dense reward (ppo), beginning a
     step before the slot. They are examined as they learn, in worlds that are not trained on; each seed's best model is
-    kept, and tested in the end in worlds of no examination. Settings are in parkenv/evaluation/recipes.py.
+    kept, and tested in the end in worlds of no examination. Settings are in parkenv/evaluation/training/configs.py.
 
     Examples:
     * `parkenv train maskable-ppo --scenario campus`
@@ -171,7 +171,7 @@ def train(
 
     * `parkenv compare --agents mdp,maskable-ppo:results/maskable-ppo/seed_0/model.zip`
     """  # fmt: skip
-    from parkenv.evaluation.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.results import make_folder, write_summary
 
     if env not in ENVS:
         raise InputError(f"--env is {env!r}, want one of {', '.join(ENVS)}")
@@ -191,7 +191,7 @@ def train(
             planners or "planner",
         )  # fmt: skip
     course.check()
-    from parkenv.evaluation.rl_training import MODEL
+    from parkenv.evaluation.training.rl_training import MODEL
 
     settings = {"version": __version__, **course.settings()}
     out = out or Path("results") / course.folder
@@ -225,7 +225,7 @@ def _refuse(env: str, options: Row) -> None:
 
 def _require_free(out: Path, settings: Row, resume: bool, overwrite: bool) -> None:
     """Make sure that what is in the folder may be used, or replaced."""
-    from parkenv.evaluation.results import read_settings, require_same_settings
+    from parkenv.evaluation.experiments.results import read_settings, require_same_settings
 
     if resume and overwrite:
         raise InputError("--resume and --overwrite exclude each other")
@@ -242,7 +242,7 @@ def _claim(out: Path, settings: Row, overwrite: bool) -> None:
     """Write down what is trained in the folder from now on, in place of what was."""
     import shutil
 
-    from parkenv.evaluation.results import SUMMARY, write_settings
+    from parkenv.evaluation.experiments.results import SUMMARY, write_settings
 
     # Whoever finds no summary knows that the training is not finished.
     for outcome in (SUMMARY, PAGE, FIGURE):
@@ -265,7 +265,7 @@ def _train_all(
     """Train all seeds; a bar each, fed by the curves that the trainings write."""
     from functools import partial
 
-    from parkenv.evaluation.rl_training import CURVE, read_curve, train_one
+    from parkenv.evaluation.training.rl_training import CURVE, read_curve, train_one
 
     progress = Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[told]}"), TimeElapsedColumn(),

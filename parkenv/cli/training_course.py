@@ -13,8 +13,8 @@ from parkenv.cli.tables import make_table
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.rl_training import Training
-    from parkenv.evaluation.workers import Workers
+    from parkenv.evaluation.experiments.workers import Workers
+    from parkenv.evaluation.training.rl_training import Training
 
 EXAMINED_FROM, TESTED_FROM = 2_000_000, 3_000_000
 """First seeds of the worlds in which models are examined, and tested at the end."""
@@ -107,9 +107,9 @@ def curves_beside(folders: Sequence[str], out: Path, course: Course) -> dict[str
         InputError: a folder without a training, or with one that was examined otherwise; the same one twice; or too
             many to tell apart.
     """
-    from parkenv.evaluation.learning_curves import COLORS
-    from parkenv.evaluation.results import read_settings
-    from parkenv.evaluation.rl_training import CURVE, read_curve
+    from parkenv.evaluation.experiments.results import read_settings
+    from parkenv.evaluation.figures.learning_curves import COLORS
+    from parkenv.evaluation.training.rl_training import CURVE, read_curve
 
     if len(folders) >= len(COLORS):
         raise InputError(f"--beside names {len(folders)} folders, want at most {len(COLORS) - 1}")

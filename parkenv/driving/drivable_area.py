@@ -8,8 +8,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from parkenv.lot import ParkingLot, mouth_heading
-from parkenv.lot_graph import SLOT_REACH, linestrings
+from parkenv.world.drive_graph import SLOT_REACH, linestrings
+from parkenv.world.lot import ParkingLot, mouth_heading
 
 FloatArray = NDArray[np.float64]
 

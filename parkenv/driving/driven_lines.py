@@ -11,8 +11,8 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.lot import ParkingLot
-from parkenv.lot_graph import LANE_OFFSET, NODE_TOLERANCE
+from parkenv.world.drive_graph import LANE_OFFSET, NODE_TOLERANCE
+from parkenv.world.lot import ParkingLot
 
 FloatArray = NDArray[np.float64]
 

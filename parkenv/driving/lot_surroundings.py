@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from parkenv.driving.drivable_area import DrivableArea
 from parkenv.driving.lot_space import Obstacles, Thing
-from parkenv.lot import Mouth
-from parkenv.lot_scene import LotScenes, slot_lot
-from parkenv.occupancy import World
-from parkenv.scenario import Scenario
+from parkenv.world.lot import Mouth
+from parkenv.world.lot_scene import LotScenes, slot_lot
+from parkenv.world.occupancy import World
+from parkenv.world.scenario import Scenario
 
 FloatArray = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ OVERHANG_M = 0.25
 class LotSurroundings:
     """Everything that a car may run into in one world of a scenario.
 
-    The cars are those that the sensors would see there (`parkenv.lot_scene`).
+    The cars are those that the sensors would see there (`parkenv.world.lot_scene`).
 
     Args:
         scenario: whose lot it is.

@@ -15,8 +15,8 @@ from parkenv.driving.drivable_area import DrivableArea
 from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
 from parkenv.driving.vehicle import STATE_SIZE, VehicleParameters, move_along, placed
 from parkenv.errors import InputError
-from parkenv.lot import Mouth, ParkingLot
-from parkenv.lot_graph import LANE_OFFSET, linestrings
+from parkenv.world.drive_graph import LANE_OFFSET, linestrings
+from parkenv.world.lot import Mouth, ParkingLot
 from sim_sensors.slot_scenes import ParkingManners, SlotLot
 from sim_sensors.surroundings import Surroundings
 

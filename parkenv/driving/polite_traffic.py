@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from parkenv.driving.lot_space import Thing
 from parkenv.driving.vehicle import placed
-from parkenv.lot import ParkingLot
-from parkenv.traffic import LotTraffic, Traffic
+from parkenv.world.lot import ParkingLot
+from parkenv.world.traffic import LotTraffic, Traffic
 from sim_sensors.scenery import pedestrian_footprint
 from sim_sensors.slot_scenes import SlotLot
 

@@ -19,12 +19,12 @@ from parkenv.driving.polite_traffic import PoliteTraffic
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters, advance, placed
 from parkenv.envs.drive_state import DriveState
 from parkenv.errors import InputError
-from parkenv.keyed_random import world_key
-from parkenv.lot import ParkingLot
-from parkenv.traffic import Traffic
+from parkenv.world.keyed_random import world_key
+from parkenv.world.lot import ParkingLot
+from parkenv.world.traffic import Traffic
 from sim_sensors.compilation import compiled
-from sim_sensors.footprints import ScanPlane
-from sim_sensors.laser import LaserScanner
+from sim_sensors.laser.footprints import ScanPlane
+from sim_sensors.laser.scanner import LaserScanner
 
 if TYPE_CHECKING:
     from parkenv.envs.drive_rendering import DriveRenderer
@@ -449,7 +449,7 @@ def lot_named(lot: ParkingLot | str | Path) -> ParkingLot:
     Raises:
         InputError: neither a lot, nor a packaged name, nor a file that holds one.
     """
-    from parkenv.lot_files import PACKAGED_LOTS
+    from parkenv.lots.lot_files import PACKAGED_LOTS
 
     if isinstance(lot, ParkingLot):
         return lot

@@ -45,7 +45,7 @@ from parkenv.envs.rendering import (
     View,
 )
 from parkenv.envs.window import Window
-from parkenv.lot import ParkingLot, is_building
+from parkenv.world.lot import ParkingLot, is_building
 
 FloatArray = NDArray[np.float64]
 

@@ -74,8 +74,8 @@ from parkenv.envs.search_step import (
 )
 from parkenv.envs.search_tables import N_ACTIONS, TARGETS, VIEWED, VIEWS, WALK_S
 from parkenv.errors import InputError
-from parkenv.lot import MOVES
-from parkenv.scenario import SearchProblem
+from parkenv.world.lot import MOVES
+from parkenv.world.scenario import SearchProblem
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]

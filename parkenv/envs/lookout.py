@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from parkenv.envs.search_state import SearchState
 from parkenv.errors import InputError
-from parkenv.lot_scene import LotScenes, slot_lot
-from parkenv.scenario import Scenario
+from parkenv.world.lot_scene import LotScenes, slot_lot
+from parkenv.world.scenario import Scenario
+from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.rig import RIG_NAMES, Capture, SensorRig
-from sim_sensors.weather import PRESETS, Weather
 
 if TYPE_CHECKING:
     from sim_sensors.movers import Movers
@@ -54,7 +54,7 @@ class Lookout:
     Args:
         scenario: the world, with its traffic.
         rig: laser, stereo, both_sides, or any rig.
-        weather: one of `sim_sensors.weather.PRESETS`; None draws one for each world.
+        weather: one of `sim_sensors.camera.weather.PRESETS`; None draws one for each world.
         captures: how many there are at most on an edge.
         every: m; captures on an edge are at least so far apart, but for the one where it ends.
 

@@ -16,8 +16,8 @@ from parkenv.envs.sensors import beside_the_lot
 from parkenv.mapping.slots import SlotFilter
 from parkenv.perception.detector import Detector
 from parkenv.perception.stack import Look, PerceptionStack
-from parkenv.scenario import Scenario
-from parkenv.sighting import SightingModel
+from parkenv.world.scenario import Scenario
+from parkenv.world.sensor_model import SensorModel
 from sim_sensors.rig import SensorRig
 
 
@@ -40,7 +40,7 @@ class Watcher:
     """A rig, the stack behind it, and what both tell a belief.
 
     Args:
-        scenario: the world; where its sighting is perfect, what was measured of the rig takes its place.
+        scenario: the world; where its sensor_model is perfect, what was measured of the rig takes its place.
         rig, weather, captures, every: as in `Lookout`.
         detector: the shipped models where None.
 
@@ -66,12 +66,12 @@ class Watcher:
     ) -> None:
         self.lookout = Lookout(scenario, rig, weather, captures, every)
         self.stack = PerceptionStack(self.lookout.rig, detector)
-        if scenario.sighting.perfect:
-            measured = SightingModel.named("laser" if self.lookout.rig.lasers else "stereo")
-            scenario = scenario.replace(sighting=measured)
+        if scenario.sensor_model.perfect:
+            measured = SensorModel.named("laser" if self.lookout.rig.lasers else "stereo")
+            scenario = scenario.replace(sensor_model=measured)
         self.scenario = scenario
         self._view_starts, self._view_slots = scenario.slots_in_view
-        self._rates = scenario.sight_rates
+        self._rates = scenario.sensor_rates
         self.forget()
 
     def forget(self) -> None:
@@ -129,7 +129,7 @@ class SearchPerceptionEnv(SearchEnv):
     ## Arguments
     - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v0`. Its `sighting` is what the
       car takes its eyes to be worth, and how far away slots may be of which it takes note; where that is perfect,
-      what was measured of the rig (`SightingModel.named`).
+      what was measured of the rig (`SensorModel.named`).
     - `rig`: laser (the thesis's: a camera and a 270° laser), stereo, both_sides, or a `sim_sensors.rig.SensorRig`
       that can see and range.
     - `weather`: sunny, overcast, low_sun, dusk or rain; None draws one.

@@ -27,9 +27,9 @@ from parkenv.envs.drawing import (
 )
 from parkenv.envs.search_state import SearchState
 from parkenv.envs.window import Window
-from parkenv.lot import ParkingLot, is_building
-from parkenv.occupancy import DAY_NAMES, DAY_S
-from parkenv.scenario import Scenario
+from parkenv.world.lot import ParkingLot, is_building
+from parkenv.world.occupancy import DAY_NAMES, DAY_S
+from parkenv.world.scenario import Scenario
 from sim_sensors.compilation import compiled
 
 WIDTH, HEIGHT = 640, 480
@@ -374,7 +374,7 @@ class SearchRenderer:
         at = view(xy)
         if not state.parked:
             center = fixed_point(at)
-            radius = round(self.scenario.sighting.view_range * view.scale * 2**SUBPIXEL_BITS)
+            radius = round(self.scenario.sensor_model.view_range * view.scale * 2**SUBPIXEL_BITS)
             cv2.circle(image, tuple(center), radius, WHITE, 1, cv2.LINE_AA, SUBPIXEL_BITS)
         heading = np.array([np.cos(yaw), np.sin(yaw)]) @ view.turn
         turn = rotation(float(np.arctan2(heading[1], heading[0])))

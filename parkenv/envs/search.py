@@ -21,9 +21,9 @@ from parkenv.envs.search_step import (
 )
 from parkenv.envs.search_tables import SearchTables
 from parkenv.errors import InputError
-from parkenv.keyed_random import seed_state
-from parkenv.lot import ACTIONS, PARK
-from parkenv.scenario import Scenario
+from parkenv.world.keyed_random import seed_state
+from parkenv.world.lot import ACTIONS, PARK
+from parkenv.world.scenario import Scenario
 
 if TYPE_CHECKING:
     from parkenv.envs.rendering import SearchRenderer
@@ -218,7 +218,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         begin_alone(self._held)
         if len(self.search.asked):
             forecast = self.scenario.forecast(self._state.arrival)
-            self.search.asked[0] = forecast.p_occupied, forecast.relaxation_rate
+            self.search.asked[0] = forecast.p_occupied, forecast.decay_rate
             foresee(self.search, 0)
         self._begun, self._over = True, False
         self._state.path = [self._state.vertex]

@@ -15,7 +15,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from parkenv.envs.search_step import Search, begin, kernel, renew, step_one, tell_time
-from parkenv.occupancy import IntArray
+from parkenv.world.occupancy import IntArray
 
 _SEARCH = types.NamedTuple(
     (

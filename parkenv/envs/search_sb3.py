@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.envs.shared_vec_env import SharedVecEnv
 from parkenv.errors import InputError
-from parkenv.scenario import Scenario
+from parkenv.world.scenario import Scenario
 
 METRICS = (
     "drive_s", "failed_s", "walk_s", "gave_up_s", "total_s", "driven_m", "walked_m", "failed_parks",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief import SlotBelief
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.envs.search_step import (
     ARRIVAL,
     CHOICE,
@@ -25,9 +25,9 @@ from parkenv.envs.search_step import (
     Search,
     belief,
 )
-from parkenv.occupancy import Arrival, World
-from parkenv.recorded_occupancy import RecordedOccupancy
-from parkenv.scenario import Scenario
+from parkenv.world.occupancy import Arrival, World
+from parkenv.world.recorded_occupancy import RecordedOccupancy
+from parkenv.world.scenario import Scenario
 from sim_sensors.compilation import compiled
 
 
@@ -77,7 +77,7 @@ class SearchState:
         forecast = self._scenario.forecast(self.arrival)
         p, seen = forecast.p_occupied.copy(), np.zeros(len(forecast.p_occupied), dtype=np.bool_)
         _read_belief(self._search, p, seen)
-        return SlotBelief(forecast.p_occupied, forecast.relaxation_rate, p, seen, self._count(N_KNOWN_TAKEN))
+        return SlotBelief(forecast.p_occupied, forecast.decay_rate, p, seen, self._count(N_KNOWN_TAKEN))
 
     @property
     def vertex(self) -> int:

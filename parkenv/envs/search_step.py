@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief import after_look, relaxed
+from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.envs.search_tables import (
     ARRIVAL_WEEKDAYS,
     ASKED,
@@ -52,7 +52,7 @@ from parkenv.envs.search_tables import (
     WORLD_REALS,
     SearchTables,
 )
-from parkenv.keyed_random import (
+from parkenv.world.keyed_random import (
     ARRIVAL_STREAM,
     ENTRY_STREAM,
     OCCUPANCY_STREAM,
@@ -61,8 +61,8 @@ from parkenv.keyed_random import (
     episode_key,
     keyed_uniform,
 )
-from parkenv.lot import PARK
-from parkenv.occupancy import (
+from parkenv.world.lot import PARK
+from parkenv.world.occupancy import (
     DAY_S,
     HOUR_S,
     MAX_PROBABILITY,
@@ -76,7 +76,7 @@ from parkenv.occupancy import (
     marginal_from,
     marginal_later,
 )
-from parkenv.recorded_occupancy import recorded_forecast
+from parkenv.world.recorded_occupancy import recorded_forecast
 from sim_sensors.compilation import compiled
 
 # Columns of `Search.numbers`, a row a search: times in s, distances in m.
@@ -347,7 +347,7 @@ def look_badly(search: Search, e: int) -> None:
             e,
             column,
             looks_taken,
-            after_look(belief(search, e, column), looks_taken, hit, false_alarm),
+            bayes_update(belief(search, e, column), looks_taken, hit, false_alarm),
         )
 
 
@@ -359,7 +359,7 @@ def take_in(
     pass_by(search, e)
     for i in range(slots.size):
         column = touched(search, e, slots[i])
-        said = after_look(belief(search, e, column), looks_taken[i], hit[i], false_alarm[i])
+        said = bayes_update(belief(search, e, column), looks_taken[i], hit[i], false_alarm[i])
         learn(search, e, column, looks_taken[i], said)
 
 
@@ -407,7 +407,7 @@ def belief(search: Search, e: int, column: int) -> float:
     """The belief in a touched slot, now."""
     memory, at = search.memory[e], spot(column)
     elapsed = search.numbers[e, TIME] - memory[at + LOOKED]
-    return float(relaxed(memory[at + PRIOR], memory[at + RATE], memory[at + SAID], elapsed))
+    return float(decay_to_prior(memory[at + PRIOR], memory[at + RATE], memory[at + SAID], elapsed))
 
 
 @inlined
@@ -432,14 +432,14 @@ def relax_touched(search: Search, e: int) -> None:
 
 @inlined
 def relax_block(memory: FloatArray, at: int, time: float) -> None:
-    """`relaxed` for the columns of a block that begins at `at`.
+    """`decay_to_prior` for the columns of a block that begins at `at`.
 
     A loop of its own, and of a length that is known beforehand, so that it becomes vector code.
     """
     for column in range(BLOCK):
         i = at + column
         prior, elapsed = memory[i + PRIOR], time - memory[i + LOOKED]
-        memory[i + BELIEF] = relaxed(prior, memory[i + RATE], memory[i + SAID], elapsed)
+        memory[i + BELIEF] = decay_to_prior(prior, memory[i + RATE], memory[i + SAID], elapsed)
 
 
 @inlined

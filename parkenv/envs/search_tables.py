@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
-from parkenv.lot import MOVES, PARK
-from parkenv.occupancy import DAY_S, WEEK_HOURS, OccupancyProcess
-from parkenv.occupancy_log import weekday_of
-from parkenv.recorded_occupancy import RecordedOccupancy
-from parkenv.scenario import Scenario
+from parkenv.world.lot import MOVES, PARK
+from parkenv.world.occupancy import DAY_S, WEEK_HOURS, OccupancyProcess
+from parkenv.world.occupancy_log import weekday_of
+from parkenv.world.recorded_occupancy import RecordedOccupancy
+from parkenv.world.scenario import Scenario
 
 # Columns of `SearchTables.at`, a row a scenario: counts, kinds, and where in the pools its arrays begin.
 (
@@ -116,8 +116,8 @@ def _lay_out_search(row: NDArray[np.int64], scenario: Scenario, ints: _Pool, rea
     seconds[: lot.n_slots, PARK] = 0.0
     entries = lot.entry_vertices if scenario.entry is None else lot.entry_vertices[[scenario.entry]]
     views, viewed = scenario.slots_in_view
-    rates = scenario.sight_rates
-    row[N_SLOTS], row[PERFECT] = lot.n_slots, scenario.sighting.perfect
+    rates = scenario.sensor_rates
+    row[N_SLOTS], row[PERFECT] = lot.n_slots, scenario.sensor_model.perfect
     row[ENTRIES], row[N_ENTRIES] = ints.add(entries), len(entries)
     row[TARGETS], row[VIEWS], row[VIEWED] = ints.add(targets), ints.add(views), ints.add(viewed)
     row[MASKS] = ints.add(masks @ (1 << np.arange(N_ACTIONS)))
@@ -181,7 +181,7 @@ def _add_log(occupancy: RecordedOccupancy, days: list[str], ints: _Pool, reals: 
     ints.add(log.occupied)
     first = reals.add([])
     for day, layout in zip(days, layouts, strict=True):
-        reals.add([weekday_of(day) * DAY_S, layout.relaxation_rate, layout.n_records])
+        reals.add([weekday_of(day) * DAY_S, layout.decay_rate, layout.n_records])
         reals.add(layout.lot_share)
         reals.add(layout.share)
         reals.add(layout.n_days)

@@ -40,10 +40,10 @@ from parkenv.envs.search_step import (
 )
 from parkenv.envs.search_tables import MASKS, N_ACTIONS, SearchTables
 from parkenv.errors import InputError
-from parkenv.keyed_random import seed_state
-from parkenv.lot import ACTIONS, PARK
-from parkenv.occupancy import BoolArray, FloatArray, IntArray
-from parkenv.scenario import Scenario
+from parkenv.world.keyed_random import seed_state
+from parkenv.world.lot import ACTIONS, PARK
+from parkenv.world.occupancy import BoolArray, FloatArray, IntArray
+from parkenv.world.scenario import Scenario
 
 OBSERVATIONS = ("full", "local")
 TIME_METRICS = ("drive_s", "failed_s", "walk_s", "gave_up_s", "total_s", "driven_m", "walked_m")
@@ -420,7 +420,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             scenario = self.scenarios[i % len(self.scenarios)]
             forecast = scenario.forecast(arrival_of(scenario, search, int(i)))
             n = len(forecast.p_occupied)
-            search.asked[i, :, :n] = forecast.p_occupied, forecast.relaxation_rate
+            search.asked[i, :, :n] = forecast.p_occupied, forecast.decay_rate
 
     def _observations(self) -> dict[str, NDArray[Any]]:
         return {name: a.copy() for name, a in self._seen.items()} if self._copy else dict(self._seen)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from parkenv.envs.lookout import Lookout, Moment
 from parkenv.envs.search import LATEST, SearchEnv
 from parkenv.envs.search_state import SearchState
-from parkenv.scenario import Scenario
+from parkenv.world.scenario import Scenario
 from sim_sensors.rig import SensorRig
 
 FARTHEST = 1e7

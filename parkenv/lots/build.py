@@ -15,8 +15,8 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from parkenv.lot import Lane, ParkingLot, corner_points
-from parkenv.lot_generators import BAY_SIZE, BUILDING_SETBACK, Slots, StreetGrid, bay_row
+from parkenv.lots.generators import BAY_SIZE, BUILDING_SETBACK, Slots, StreetGrid, bay_row
+from parkenv.world.lot import Lane, ParkingLot, corner_points
 
 FloatArray = NDArray[np.float64]
 
@@ -216,4 +216,4 @@ def build(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    build(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent)
+    build(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "packaged")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from parkenv.errors import InputError
-from parkenv.lot import ParkingLot
+from parkenv.world.lot import ParkingLot
 
 FloatArray = NDArray[np.float64]
 

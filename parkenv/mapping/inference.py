@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.stats import beta
 
 from parkenv.errors import InputError
-from parkenv.occupancy import DAY_S, HOUR_S, MAX_PROBABILITY, MIN_PROBABILITY, Arrival, Forecast
+from parkenv.world.occupancy import DAY_S, HOUR_S, MAX_PROBABILITY, MIN_PROBABILITY, Arrival, Forecast
 
 FloatArray = NDArray[np.float64]
 

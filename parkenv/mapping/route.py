@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.lot import ParkingLot
+from parkenv.world.lot import ParkingLot
 
 FloatArray = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from parkenv.lot import Mouth, ParkingLot
 from parkenv.mapping.grid import P_FREE, P_OCCUPIED
 from parkenv.perception.ranging import CarSightings
 from parkenv.perception.sweeps import Sweep
+from parkenv.world.lot import Mouth, ParkingLot
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]

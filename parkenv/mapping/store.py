@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.lot import ParkingLot
 from parkenv.mapping.inference import SessionLog
+from parkenv.world.lot import ParkingLot
 
 FloatArray = NDArray[np.float64]
 

@@ -11,20 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.keyed_random import world_key
-from parkenv.lot_scene import LotScenes, slot_lot
 from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.odometry import PoseNoise
 from parkenv.mapping.route import SurveyRoute, survey_route
 from parkenv.mapping.slots import SlotFilter, SlotStates
 from parkenv.mapping.store import Session
 from parkenv.mapping.survey_score import SurveyScore
-from parkenv.occupancy import Arrival, ArrivalWindow
 from parkenv.perception.ranging import CarSightings
 from parkenv.perception.stack import Look, PerceptionStack
-from parkenv.scenario import Scenario
+from parkenv.world.keyed_random import world_key
+from parkenv.world.lot_scene import LotScenes, slot_lot
+from parkenv.world.occupancy import Arrival, ArrivalWindow
+from parkenv.world.scenario import Scenario
+from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.rig import RIG_NAMES, Capture, SensorRig, poses_along
-from sim_sensors.weather import PRESETS, Weather
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from parkenv.perception.ranging import CarSightings
 from parkenv.perception.stack import Look, View
 from sim_sensors.ground_truth import VehicleBoxes, vehicle_boxes
-from sim_sensors.laser import LaserScanner
+from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Capture
 from sim_sensors.scene import Scene
 

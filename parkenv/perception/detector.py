@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
 from parkenv.perception.hog import CELL, Descriptor, correlate
-from parkenv.whole_files import written_whole
 
 Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
@@ -97,7 +97,7 @@ class CarModel:
             "settings": np.frombuffer(json.dumps(settings, sort_keys=True).encode(), dtype=np.uint8),
             "weights": self.weights,
         }
-        with written_whole(path) as beside, zipfile.ZipFile(beside, "w", zipfile.ZIP_DEFLATED) as archive:
+        with atomic_write(path) as beside, zipfile.ZipFile(beside, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, array in parts.items():
                 data = io.BytesIO()
                 np.save(data, array, allow_pickle=False)

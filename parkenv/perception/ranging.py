@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from parkenv.errors import InputError
 from parkenv.perception.box_fit import CAR_LENGTH, CAR_WIDTH, LONG_SIDE, fit_box
 from parkenv.perception.sweeps import Sweep
-from sim_sensors.camera import PinholeCamera, StereoCamera
+from sim_sensors.camera.models import PinholeCamera, StereoCamera
 from sim_sensors.rig import Mount
 
 if TYPE_CHECKING:

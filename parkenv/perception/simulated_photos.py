@@ -14,9 +14,9 @@ from parkenv.perception.backdrops import with_backdrop
 from parkenv.perception.car_datasets import LabelledImage
 from parkenv.perception.detector import as_grey
 from parkenv.perception.simulated_streets import Street
-from sim_sensors.camera import PinholeCamera, camera_pose
+from sim_sensors.camera.models import PinholeCamera, camera_pose
+from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.ground_truth import VehicleBoxes, View, vehicle_boxes
-from sim_sensors.weather import PRESETS, Weather
 
 Image = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim_sensors.scene import Fleet, Scene
 from sim_sensors.surroundings import Surroundings
-from sim_sensors.vehicles import VehicleModel
+from sim_sensors.vehicles.vehicle import VehicleModel
 
 FloatArray = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from parkenv.errors import InputError
 from parkenv.perception.detector import Detections, Detector
 from parkenv.perception.ranging import CarSightings, locate, locate_by_disparity, locate_plainly
 from parkenv.perception.sweeps import Sweep, disparity, laser_sweep, stereo_sweep
-from sim_sensors.camera import PinholeCamera
+from sim_sensors.camera.models import PinholeCamera
 from sim_sensors.rig import Capture, Mount, SensorRig
 
 FloatArray = NDArray[np.float64]

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.lot import PARK
-from parkenv.scenario import SearchProblem
+from parkenv.world.lot import PARK
+from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation
-from planners.belief_search import BeliefAgent, Search
+from planners.belief.agent import BeliefAgent, Search
 from planners.routes import DriveRoutes
-from planners.tuning import TunedPlan
+from planners.thesis.tuning import TunedPlan
 
 MOST_HOPS = 400
 """Vertices ahead that a plan is followed."""

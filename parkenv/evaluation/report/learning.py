@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from parkenv.evaluation.learning_curves import columns_of
+from parkenv.evaluation.experiments.results import Row
+from parkenv.evaluation.figures.learning_curves import columns_of
 from parkenv.evaluation.report.run_folder import RunFolder
-from parkenv.evaluation.results import Row
 
 
 def learning_of(run: RunFolder) -> list[dict[str, Any]]:

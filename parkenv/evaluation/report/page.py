@@ -14,12 +14,12 @@ from typing import Any
 from PIL import Image as PillowImage
 
 from parkenv.errors import InputError
+from parkenv.evaluation.experiments.results import Row
 from parkenv.evaluation.report.drive_recording import data_uri
 from parkenv.evaluation.report.learning import learning_of
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.report.tables import tables_of
-from parkenv.evaluation.results import Row
-from parkenv.whole_files import written_whole
+from parkenv.files.atomic_write import atomic_write
 
 FORMAT, VERSION = "parkenv-report", 1
 SCHEMA = Path(__file__).with_name("report.schema.json")
@@ -113,7 +113,7 @@ def write_page(run: RunFolder, data: Mapping[str, Any], path: Path) -> None:
         data=embedded,
         program="\n".join((_HERE / name).read_text(encoding="utf-8") for name in SCRIPTS),
     )
-    with written_whole(path) as beside:
+    with atomic_write(path) as beside:
         beside.write_text(text, encoding="utf-8")
 
 

@@ -11,7 +11,7 @@ from typing import Any, Self
 
 from parkenv import __version__
 from parkenv.errors import InputError
-from parkenv.evaluation.results import SETTING_COLUMNS, SETTINGS, SUMMARY, SUMMARY_PARTIAL, Row
+from parkenv.evaluation.experiments.results import SETTING_COLUMNS, SETTINGS, SUMMARY, SUMMARY_PARTIAL, Row
 
 _TEXT = ("scenario", "agent")
 

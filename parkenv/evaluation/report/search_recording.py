@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.envs.search_state import SearchState
-from parkenv.evaluation.compare import Case
-from parkenv.evaluation.episodes import EpisodeRunner
+from parkenv.evaluation.experiments.compare import Case
+from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.report.intentions import Intentions
-from parkenv.lot import ParkingLot, is_building
-from parkenv.lot_generators import ONE_WAY_HALF_WIDTH, TWO_WAY_HALF_WIDTH
-from parkenv.occupancy import World
+from parkenv.lots.generators import ONE_WAY_HALF_WIDTH, TWO_WAY_HALF_WIDTH
+from parkenv.world.lot import ParkingLot, is_building
+from parkenv.world.occupancy import World
 from planners.agent import make_agent
-from planners.oracle import OracleAgent
+from planners.bounds.oracle import OracleAgent
 
 MOST_SLOTS = 20_000
 """Lots with more are not drawn: a page with every slot of theirs would not load."""
@@ -119,7 +119,7 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
         "day": state.arrival.day,
         "arrival_s": round(start, 3),
         "goal": scenario.goal,
-        "view_range_m": round(float(scenario.sighting.view_range), 2),
+        "view_range_m": round(float(scenario.sensor_model.view_range), 2),
         "v_walk": round(float(scenario.v_walk), 4),
         "sensors": first.rig,
         "forecast": _bytes(state.belief.prior),

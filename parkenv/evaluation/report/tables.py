@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from parkenv.evaluation.results import Row
+from parkenv.evaluation.experiments.results import Row
 
 Cell = float | int | str | bool | None | list[float | None]
 

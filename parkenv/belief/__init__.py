@@ -1,0 +1,1 @@
+"""What the car knows of the slots: forecast, observations, decay."""

@@ -1,0 +1,121 @@
+"""How fast driving is simulated and parking is planned, on one core."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from parkenv.driving.lot_space import LotSpace
+from parkenv.driving.parking_task import ParkingTasks
+from parkenv.driving.vehicle import advance
+from parkenv.envs.drive import SUBSTEPS
+from parkenv.evaluation.bench.rows import BenchRow, absent, duration, rate, seconds_each
+from parkenv.world.lot import ParkingLot
+from planners.driving.parking import ParkingAgent
+
+STEPS = 100
+"""Steps of an environment from one reset to the next."""
+
+
+def drive_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
+    """Rows of `parkenv bench drive`: steps of the physics, environments included, and planning.
+
+    A step of the physics is 0.05 s of ours, with pymunk's step and contacts in it, and 1/15 s of highway-env's
+    parking. Resets are not counted in.
+
+    Args:
+        seed: of the tasks and the actions.
+        seconds: how long each figure is measured.
+    """
+    rows = rate("drive", "car and pymunk alone", bare_physics(seed, seconds), "physics steps/s")
+    peers = {}
+    if find_spec("highway_env") is not None:
+        peers["highway-env parking-v0"] = highway_parking(seed, seconds)
+    plain = environment_steps({}, seed, seconds)
+    rows += rate("drive", "parkenv/Drive-v0", SUBSTEPS * plain, "physics steps/s", **peers)
+    scan = environment_steps({"laser": True}, seed, seconds)
+    rows += rate("drive", "parkenv/Drive-v0, 1081 beams a step", SUBSTEPS * scan, "physics steps/s", **peers)
+    mapped = environment_steps({"obstacle_map": True}, seed, seconds)
+    rows += rate("drive", "parkenv/Drive-v0, obstacle map", SUBSTEPS * mapped, "physics steps/s", **peers)
+    for lot in ("campus", "street"):
+        reset, plan = reset_and_plan(lot, seed, seconds)
+        rows += duration("drive", f"reset, {lot}", 1e3 * reset, "ms")
+        rows += duration("drive", f"plan of the planner, {lot}", 1e3 * plan, "ms")
+    if not peers:
+        rows += absent("drive", "highway-env parking-v0: not installed", "physics steps/s")
+    return rows
+
+
+def bare_physics(seed: int, seconds: float) -> float:
+    """Steps a second of a car that drives to and fro among parked ones, contacts told."""
+    task = ParkingTasks(ParkingLot.packaged("campus")).draw(seed)
+    space, limits = LotSpace(task.vehicle, task.obstacles), task.vehicle.limits
+    state = task.start.copy()
+
+    def work(i: int) -> None:
+        pedal = 0.3 if i % 2 else -0.3
+        for _ in range(STEPS):
+            advance(state, pedal, 0.1, limits)
+            space.touched(*state[:3].tolist())
+
+    return STEPS / seconds_each(work, seconds)
+
+
+def environment_steps(arguments: dict[str, Any], seed: int, seconds: float) -> float:
+    """Steps a second of `parkenv/Drive-v0` as `gymnasium.make` gives it, two of the physics in each."""
+    env = gym.make("parkenv/Drive-v0", disable_env_checker=True, **arguments)
+    env.reset(seed=seed)
+    return _steps(env, _pedalling(seed), seconds)
+
+
+def highway_parking(seed: int, seconds: float) -> float:
+    """Steps of the physics a second of highway-env's parking-v0, fifteen of which are a second."""
+    import_module("highway_env")  # which registers its environments
+    env = gym.make("parking-v0", disable_env_checker=True)
+    env.reset(seed=seed)
+    config = env.unwrapped.config  # type: ignore[attr-defined]
+    each = config["simulation_frequency"] / config["policy_frequency"]
+    return float(each * _steps(env, _pedalling(seed), seconds))
+
+
+def reset_and_plan(lot: str, seed: int, seconds: float) -> tuple[float, float]:
+    """Median time, s, of a reset, and of a plan from where it starts."""
+    env = gym.make("parkenv/Drive-v0", lot=lot, obstacle_map=True, disable_env_checker=True)
+    agent = ParkingAgent()
+    reset = seconds_each(lambda i: env.reset(seed=seed + i), seconds, least=20)
+    seen = [env.reset(seed=seed + i)[0] for i in range(20)]
+    return reset, seconds_each(lambda i: agent.plan(seen[i % len(seen)]), seconds, least=20)
+
+
+def _pedalling(seed: int) -> Callable[[int], Any]:
+    rng = np.random.default_rng(seed)
+    steering = rng.uniform(-0.3, 0.3, STEPS).astype(np.float32)
+
+    def action(i: int) -> Any:
+        return np.array([0.3 if i % 20 < 10 else -0.3, steering[i]], dtype=np.float32)
+
+    return action
+
+
+def _steps(env: gym.Env[Any, Any], action: Callable[[int], Any], seconds: float) -> float:
+    """Steps a second, the median of runs of up to `STEPS`."""
+    rates: list[float] = []
+    actions = [action(i) for i in range(STEPS)]
+    end = time.perf_counter() + seconds
+    while len(rates) < 4 or time.perf_counter() < end:
+        env.reset()
+        done = 0
+        began = time.perf_counter()
+        for chosen in actions:
+            _, _, terminated, truncated, _ = env.step(chosen)
+            done += 1
+            if terminated or truncated:
+                break
+        rates.append(done / (time.perf_counter() - began))
+    return float(np.median(rates[1:]))

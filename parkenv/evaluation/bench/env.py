@@ -1,0 +1,160 @@
+"""How many steps a second environments take, beside others'."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from parkenv.envs.search_vector import ParkSearchVectorEnv
+from parkenv.evaluation.bench.rows import BenchRow, absent, rate
+from parkenv.world.lot import ACTIONS, ParkingLot
+from parkenv.world.scenario import Scenario
+
+BATCH = 1024
+SLOTS = (10, 20)
+LARGE = 10_000
+NEAREST = 5
+_BLOCK = 200
+_DRAWN = 100
+
+Stepper = Callable[[], int]
+"""Takes some steps, and returns how many."""
+
+
+def env_rows(
+    seed: int = 0, seconds: float = 0.6, *, batch: int = BATCH, large: int = LARGE
+) -> list[BenchRow]:
+    """Rows of `parkenv bench env`, on one core; all take random actions.
+
+    A step is a whole `step()` of one environment, be it in a batch, with all that comes with it: observations, infos,
+    and new episodes where old ones end. Actions are drawn beforehand for all alike. Gymnasium's CartPole batch is
+    numpy on four numbers an environment, and so has no world to draw, nor a belief to keep.
+
+    Steppers take turns, and each is judged by the median of its turns' rates, in seconds of this process: so a machine
+    that is busy with something else slows all of them alike.
+
+    Args:
+        seed: of worlds and actions.
+        seconds: how long each figure is measured.
+        batch: searches in a batch.
+        large: slots of the large lot.
+    """
+    import parkenv  # noqa: F401 - registers the environments
+
+    scenario = Scenario.on_lot(ParkingLot.grid(*SLOTS))
+    city = Scenario.on_lot(ParkingLot.city(large, seed))
+    batches = {
+        f"batch of {batch}, {scenario.lot.n_slots} slots, full belief, copy=False": _ours(
+            scenario, batch, "full", False
+        ),
+        f"batch of {batch}, {scenario.lot.n_slots} slots, full belief": _ours(scenario, batch, "full", True),
+        f"batch of {batch}, {scenario.lot.n_slots} slots, local k={NEAREST}": _ours(
+            scenario, batch, "local", True
+        ),
+        f"batch of {batch}, {city.lot.n_slots:,} slots, local k={NEAREST}": _ours(city, batch, "local", True),
+    }
+    cart_pole = gym.make_vec("CartPole-v1", batch, vectorization_mode="vector_entry_point")
+    steppers = {case: batch_stepper(envs, len(ACTIONS), seed) for case, envs in batches.items()}
+    steppers |= {"CartPole batch": batch_stepper(cart_pole, 2, seed)}
+    steppers |= {"Search-v0": single_stepper(gym.make("parkenv/Search-v0", scenario=scenario), seed)}
+    steppers |= {"CartPole": single_stepper(gym.make("CartPole-v1"), seed)}
+    others, missing = installed_peers(batch, seed)
+    rates = measured(steppers | others, seconds)
+    peers = {"gymnasium CartPole-v1 batch": rates["CartPole batch"]}
+    rows: list[BenchRow] = []
+    for case in batches:
+        rows += rate("batch", case, rates[case], "steps/s", **peers)
+    single = {"gymnasium CartPole-v1": rates["CartPole"]} | {name: rates[name] for name in others}
+    rows += rate(
+        "single", f"Search-v0, {scenario.lot.n_slots} slots", rates["Search-v0"], "steps/s", **single
+    )
+    for name in missing:
+        rows += absent("single", f"{name}: not installed", "steps/s")
+    for case, envs in batches.items():
+        rows += rate("memory", case, envs.bytes_each / 1024, "KiB an environment")
+    return rows
+
+
+def _ours(scenario: Scenario, batch: int, observation: str, copy: bool) -> ParkSearchVectorEnv:
+    return ParkSearchVectorEnv(batch, scenario, observation=observation, k=NEAREST, copy=copy)
+
+
+def batch_stepper(envs: gym.vector.VectorEnv[Any, Any, Any], n_actions: int, seed: int) -> Stepper:
+    """Random actions in a batch."""
+    actions = np.random.default_rng(seed).integers(0, n_actions, (_DRAWN, envs.num_envs))
+    envs.reset(seed=seed)
+
+    def step() -> int:
+        for i in range(_BLOCK):
+            envs.step(actions[i % _DRAWN])
+        return _BLOCK * envs.num_envs
+
+    return step
+
+
+def single_stepper(env: gym.Env[Any, Any], seed: int) -> Stepper:
+    """Random actions in one environment, begun anew whenever it ends."""
+    env.action_space.seed(seed)
+    actions = [env.action_space.sample() for _ in range(10 * _BLOCK)]
+    env.reset(seed=seed)
+
+    def step() -> int:
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+        return len(actions)
+
+    return step
+
+
+def installed_peers(batch: int, seed: int) -> tuple[dict[str, Stepper], list[str]]:
+    """Environments of other packages, where these are installed, and the names of those that are not."""
+    found: dict[str, Stepper] = {}
+    missing: list[str] = []
+    for package, env_id in (("highway_env", "parking-v0"), ("minigrid", "MiniGrid-Empty-8x8-v0")):
+        if find_spec(package) is None:
+            missing.append(f"{package} {env_id}")
+            continue
+        import_module(package)
+        found[f"{package} {env_id}"] = single_stepper(gym.make(env_id), seed)
+    if find_spec("envpool") is None:
+        missing.append("envpool CartPole-v1")
+    else:
+        pool: Any = import_module("envpool").make_gymnasium(
+            "CartPole-v1", num_envs=batch, num_threads=1, seed=seed
+        )
+        actions = np.random.default_rng(seed).integers(0, 2, (_DRAWN, batch)).astype(np.int32)
+        pool.reset()
+
+        def step() -> int:
+            for i in range(_BLOCK):
+                pool.step(actions[i % _DRAWN])
+            return _BLOCK * batch
+
+        found["envpool CartPole-v1 batch"] = step
+    return found, missing
+
+
+def measured(steppers: dict[str, Stepper], seconds: float) -> dict[str, float]:
+    """Steps a second of each."""
+    rates: dict[str, list[float]] = {name: [] for name in steppers}
+    spent = dict.fromkeys(steppers, 0.0)
+    for step in steppers.values():
+        step()  # compiles, and leaves the beginning, when all searches are of one age
+    while not all(rates.values()) or min(spent.values()) < seconds:
+        for name, step in steppers.items():
+            if rates[name] and spent[name] >= seconds:
+                continue
+            start = time.process_time()
+            steps = step()
+            took = time.process_time() - start
+            spent[name] += took
+            rates[name].append(steps / took)
+    return {name: float(np.median(values)) for name, values in rates.items()}

@@ -1,0 +1,137 @@
+"""How fast the detection and mapping stack is, beside OpenCV 4's detector and scikit-image's histograms."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.evaluation.bench.rows import BenchRow, duration, rate, seconds_each
+from parkenv.mapping.grid import OccupancyGrid
+from parkenv.mapping.slots import SlotFilter
+from parkenv.mapping.survey import Survey, SurveySettings
+from parkenv.perception.detector import CarModel, Detector, as_grey
+from parkenv.perception.hog import Descriptor
+from parkenv.perception.stack import PerceptionStack
+from parkenv.perception.sweeps import laser_sweep
+from parkenv.world.lot_scene import slot_lot
+from parkenv.world.scenario import Scenario
+from sim_sensors.rig import SensorRig
+
+PEERS_PYTHON = "PARKENV_BENCH_PYTHON"
+"""Environment variable that names the Python of another environment, with `opencv-python-headless<5` and
+`scikit-image`: OpenCV 5, which parkenv needs, has no HOGDescriptor any more."""
+
+_PEERS = """
+import json, sys, time
+import numpy as np
+image, seconds = np.load(sys.argv[1]), float(sys.argv[2])
+def each(work):
+    work()
+    times, end = [], time.perf_counter() + seconds
+    while len(times) < 3 or time.perf_counter() < end:
+        start = time.perf_counter(); work(); times.append(time.perf_counter() - start)
+    return float(np.median(times))
+found = {}
+try:
+    import cv2
+    cv2.setNumThreads(1)
+    if hasattr(cv2, "HOGDescriptor"):
+        hog = cv2.HOGDescriptor((128, 64), (16, 16), (8, 8), (8, 8), 9)
+        weights = np.zeros(hog.getDescriptorSize() + 1, np.float32); weights[-1] = -3
+        hog.setSVMDetector(weights)
+        found["opencv"] = each(lambda: hog.detectMultiScale(image, 0, (8, 8), (0, 0), 1.2, 0))
+except ImportError:
+    pass
+try:
+    from skimage.feature import hog as skimage_hog
+    found["skimage"] = each(lambda: skimage_hog(image, 9, (8, 8), (1, 1), feature_vector=False))
+except ImportError:
+    pass
+print(json.dumps(found))
+"""
+
+
+def perception_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
+    """Rows of `parkenv bench perception`; peers where `PEERS_PYTHON` names an environment that has them.
+
+    Args:
+        seed: of the lot.
+        seconds: how long each figure is measured.
+
+    Raises:
+        InputError: `PEERS_PYTHON` names no Python that runs.
+    """
+    scenario = Scenario.named("campus")
+    lot = scenario.lot
+    rng = np.random.default_rng(seed)
+    scene = slot_lot(lot).scene(rng.random(lot.n_slots) < 0.8, seed)
+    rig = SensorRig.thesis()
+    pose = np.array([*lot.vertex_xy[40], lot.vertex_yaw[40]])
+    capture = rig.capture(scene, pose, seed=seed)
+    image = capture.images["right"].image
+    grey = as_grey(image)
+    peers = _peers(grey, seconds)
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        rows = _detector_rows(grey, seconds, peers)
+    finally:
+        cv2.setNumThreads(threads)
+
+    stack = PerceptionStack(rig)
+    whole = seconds_each(lambda _: stack.look(capture), seconds)
+    rows += rate("perception", "frame to cars in the world, both models", 1.0 / whole, "frames/s")
+    _, laser, mount = rig.lasers[0]
+    sweep = laser_sweep(laser, mount, pose, capture.scans["laser"])
+    slots = SlotFilter(lot)
+    beams = seconds_each(lambda _: slots.see_through(sweep), seconds)
+    rows += duration("mapping", f"{laser.n_beams} beams into {lot.n_slots} slots", 1e3 * beams, "ms")
+    low_x, low_y, high_x, high_y = lot.bounds()
+    grid = OccupancyGrid((low_x, low_y), (high_x, high_y), 0.25)
+    cars = np.array([[0.2, 3.0], [-0.3, 5.0]])
+    update = seconds_each(lambda _: grid.update((pose[0], pose[1]), pose[2], 0.7, cars), seconds)
+    rows += duration("mapping", "grid update, 0.25 m cells, 12 m", 1e3 * update, "ms")
+    survey = Survey(Scenario.named("mini"), SurveySettings(weather="sunny"), stack)
+    session = seconds_each(survey.drive, 0.0, least=1)
+    return rows + rate("mapping", "sessions of mini, pictures drawn and seen", 60.0 / session, "sessions/min")
+
+
+def _detector_rows(grey: NDArray[np.uint8], seconds: float, peers: dict[str, float]) -> list[BenchRow]:
+    """One thread, the side model, every size from the window's own on, as OpenCV looks."""
+    side = CarModel.load("side")
+    plain = CarModel(side.descriptor, side.weights, -1e3, 2.0)
+    detector = Detector((plain,), least_height=64.0, most_height=480.0, scale_step=1.2, margin=0.0)
+    scan = seconds_each(lambda _: detector.detect(grey), seconds)
+    opencv = {"OpenCV 4 detectMultiScale": 1.0 / peers["opencv"]} if "opencv" in peers else {}
+    rows = rate(
+        "perception", "640×480, 128×64 window, step 1.2, one thread", 1.0 / scan, "frames/s", **opencv
+    )
+    cell = Descriptor(normalization="cell")
+    cells = seconds_each(lambda _: cell.features(grey), seconds)
+    skimage = {"scikit-image hog": 1e3 * peers["skimage"]} if "skimage" in peers else {}
+    return rows + duration("perception", "cells of 640×480, one thread", 1e3 * cells, "ms", **skimage)
+
+
+def _peers(grey: NDArray[np.uint8], seconds: float) -> dict[str, float]:
+    """Seconds that each peer takes for the image, in the other environment; or in this one what it has."""
+    python = os.environ.get(PEERS_PYTHON, sys.executable)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "image.npy"
+        np.save(file, grey)
+        try:
+            done = subprocess.run(
+                [python, "-c", _PEERS, str(file), str(seconds)], capture_output=True, text=True, check=True
+            )
+        except (OSError, subprocess.CalledProcessError) as error:
+            raise InputError(f"{PEERS_PYTHON}={python}: does not run the peers: {error}") from error
+    found: dict[str, float] = json.loads(done.stdout)
+    return found

@@ -1,0 +1,1 @@
+"""Comparisons of agents: specification, execution, results."""

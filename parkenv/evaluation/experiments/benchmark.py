@@ -1,0 +1,230 @@
+"""Benchmark suites: fixed scenarios, seeds and metrics, so that results of different people can be compared.
+
+A suite is a JSON file in the folder `suites`; it never changes once it is published: what would be better is another
+suite. A result file names the suite, carries every search's time, and can be checked by anybody who has it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import jsonschema
+import numpy as np
+
+from parkenv import __version__
+from parkenv.errors import InputError
+from parkenv.evaluation.experiments.compare import Case, at_occupancy, table
+from parkenv.evaluation.experiments.episodes import EpisodeRunner
+from parkenv.evaluation.experiments.results import ResultFolder, Row
+from parkenv.world.occupancy import ArrivalWindow
+from parkenv.world.scenario import KMH, Scenario
+from parkenv.world.sensor_model import SensorModel
+from planners.agent import make_agent
+
+RESULT_FORMAT = "parkenv-benchmark-result"
+RESULT_VERSION = 1
+SUITES = ("v1",)
+METRICS = (
+    "episodes", "parked_fraction", "total_s", "total_s_ci95", "regret_s", "regret_s_ci95", "failed_parks",
+    "decision_ms", "decision_ms_p99",
+)  # fmt: skip
+"""What a result tells of an agent in a task, in the words of `parkenv compare`; and its score."""
+_ROUNDING = 1e-6
+_FOLDER = Path(__file__).parent / "suites"
+
+
+@dataclass(frozen=True)
+class Task:
+    """One scenario of a suite.
+
+    Args:
+        name: of the task.
+        scenario: of the packaged ones.
+        occupancy_level: the mean occupancy that the world is set to; as it is where None.
+        sight: `perfect`, or the rig whose measured sight is taken.
+        v_walk_kmh: walking speed; the scenario's own where None.
+    """
+
+    name: str
+    scenario: str
+    occupancy_level: float | None = None
+    sight: str = "perfect"
+    v_walk_kmh: float | None = None
+
+    def made(self, arrival: ArrivalWindow) -> Scenario:
+        """The scenario itself, named after the task."""
+        made = Scenario.named(self.scenario).replace(name=self.name, arrival=arrival)
+        if self.sight != "perfect":
+            made = made.replace(sensor_model=SensorModel.named(self.sight))
+        if self.v_walk_kmh is not None:
+            made = made.replace(v_walk=self.v_walk_kmh * KMH)
+        return made if self.occupancy_level is None else at_occupancy(made, self.occupancy_level)
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A benchmark suite.
+
+    Args:
+        name: such as v1.
+        description: a sentence.
+        arrival: when searches begin.
+        seeds: one search for each, in every task.
+        tasks: where.
+        fingerprint: SHA-256 of the suite's file, as JSON without white space.
+    """
+
+    name: str
+    description: str
+    arrival: ArrivalWindow
+    seeds: range
+    tasks: tuple[Task, ...]
+    fingerprint: str
+
+    @classmethod
+    def named(cls, name: str) -> Self:
+        """A suite that comes with the package.
+
+        Raises:
+            InputError: there is none of that name; the message lists those there are.
+
+        Examples:
+            >>> suite = Suite.named("v1")
+            >>> suite.tasks[0].name, len(suite.seeds)
+            ('campus', 1000)
+        """
+        if name not in SUITES:
+            raise InputError(f"there is no benchmark suite {name!r}; known: {', '.join(SUITES)}")
+        content = json.loads(_file(f"{name}.json"))
+        canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
+        first = content["first_seed"]
+        return cls(
+            name,
+            content["description"],
+            ArrivalWindow.parse(content["arrival"], content["days"]),
+            range(first, first + content["episodes"]),
+            tuple(Task(**task) for task in content["tasks"]),
+            hashlib.sha256(canonical.encode()).hexdigest(),
+        )
+
+    def cases(self, agents: Sequence[str]) -> list[tuple[Case, range]]:
+        """Every agent in every task, for `run_cases`.
+
+        Raises:
+            InputError: an agent that does not exist, or that refuses a task.
+        """
+        worlds = [task.made(self.arrival) for task in self.tasks]
+        for world in worlds:
+            for agent in agents:
+                make_agent(agent, world)
+        return [(Case(world, agent), self.seeds) for world in worlds for agent in agents]
+
+
+def result_of(
+    suite: Suite, cases: Sequence[tuple[Case, range]], folder: ResultFolder, command: Sequence[str]
+) -> Row:
+    """What a result file holds, from a folder in which all cases are finished."""
+    episodes: dict[str, dict[str, dict[str, list[float]]]] = {}
+    for case, seeds in cases:
+        rows = [folder.episodes[case.key(s)] for s in seeds]
+        episodes.setdefault(case.agent, {})[case.scenario.name] = {
+            column: [round(row[column], 6) for row in rows] for column in ("total_s", "bound_s")
+        }
+    rows = [
+        {
+            "task": row["scenario"],
+            "agent": row["agent"],
+            **{metric: row[metric] for metric in METRICS},
+            "score": _score(episodes[row["agent"]][row["scenario"]]),
+        }
+        for row in table(cases, folder)
+    ]
+    return {
+        "format": RESULT_FORMAT,
+        "version": RESULT_VERSION,
+        "suite": suite.name,
+        "suite_sha256": suite.fingerprint,
+        "parkenv": __version__,
+        "command": list(command),
+        "rows": rows,
+        "scores": {agent: _mean_score(tasks) for agent, tasks in episodes.items()},
+        "episodes": episodes,
+    }
+
+
+def check_result(path: Path) -> Row:
+    """Read a result file and make sure that it is complete, agrees with itself, and is of the suite's own worlds.
+
+    The clairvoyant bounds of all searches are computed anew: a run in other worlds, or with other costs and speeds,
+    has others. What an agent took there only a run of the agent can tell.
+
+    Raises:
+        InputError: what is wrong, with the agent and task.
+    """
+    try:
+        result: Row = json.loads(path.read_text(encoding="utf-8"))
+        jsonschema.validate(result, json.loads(_file("result.schema.json")))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: no benchmark result ({error})") from error
+    except jsonschema.ValidationError as error:
+        raise InputError(f"{path}: {error.json_path} {error.message[:200]}") from error
+    suite = Suite.named(result["suite"])
+    if result["suite_sha256"] != suite.fingerprint:
+        raise InputError(f"{path}: made with settings that are not those of suite {suite.name}")
+    bounds = {task.name: _bounds(task, suite) for task in suite.tasks}
+    by_row = {(row["agent"], row["task"]): row for row in result["rows"]}
+    wanted = {(agent, task.name) for agent in result["episodes"] for task in suite.tasks}
+    if by_row.keys() != wanted or result["scores"].keys() != result["episodes"].keys():
+        raise InputError(f"{path}: rows or scores are not those of its agents in the suite's tasks")
+    for agent, tasks in result["episodes"].items():
+        for task in suite.tasks:
+            _check_task(path, agent, task.name, tasks.get(task.name), by_row[agent, task.name], suite, bounds)
+        if abs(result["scores"][agent] - _mean_score(tasks)) > _ROUNDING:
+            raise InputError(f"{path}: the score of {agent} is not what its searches come to")
+    return result
+
+
+def _check_task(
+    path: Path,
+    agent: str,
+    task: str,
+    searches: Mapping[str, Sequence[float]] | None,
+    row: Row,
+    suite: Suite,
+    bounds: Mapping[str, Sequence[float]],
+) -> None:
+    where = f"{path}: {agent} in {task}"
+    counts = {len(times) for times in searches.values()} if searches else {0}
+    if searches is None or counts != {len(suite.seeds)} or row["episodes"] != len(suite.seeds):
+        raise InputError(f"{where}: wants {len(suite.seeds)} searches, has {min(counts)}")
+    if not np.allclose(searches["bound_s"], bounds[task], rtol=0.0, atol=2 * _ROUNDING):
+        raise InputError(f"{where}: was not run in the suite's worlds, at its costs and speeds")
+    total, bound = np.array(searches["total_s"]), np.array(searches["bound_s"])
+    if (total < bound - 2 * _ROUNDING).any():
+        raise InputError(f"{where}: a search beats the clairvoyant bound")
+    told = row["total_s"], row["regret_s"], row["score"]
+    if not np.allclose(told, (total.mean(), (total - bound).mean(), _score(searches)), atol=1e-4):
+        raise InputError(f"{where}: its row is not what its searches come to")
+
+
+def _bounds(task: Task, suite: Suite) -> list[float]:
+    scenario = task.made(suite.arrival)
+    runner = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario))
+    return [runner.bound_s(seed) for seed in suite.seeds]
+
+
+def _score(searches: Mapping[str, Sequence[float]]) -> float:
+    return float(np.mean(searches["bound_s"]) / np.mean(searches["total_s"]))
+
+
+def _mean_score(tasks: Mapping[str, Mapping[str, Sequence[float]]]) -> float:
+    return float(np.mean([_score(searches) for searches in tasks.values()]))
+
+
+def _file(name: str) -> str:
+    return (_FOLDER / name).read_text(encoding="utf-8")

@@ -1,0 +1,261 @@
+"""Agents against each other in the same worlds: the runs, in parallel, and their summary."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from parkenv.errors import InputError
+from parkenv.evaluation.experiments.episodes import EpisodeRunner, SearchTrace
+from parkenv.evaluation.experiments.results import SETTING_COLUMNS, ResultFolder, Row, episode_key
+from parkenv.evaluation.experiments.statistics import mean_interval, summarize
+from parkenv.evaluation.experiments.workers import HERE, Workers
+from parkenv.world.keyed_random import world_key
+from parkenv.world.occupancy import ArrivalWindow, OccupancyProcess
+from parkenv.world.scenario import KMH, Scenario
+from parkenv.world.sensor_model import SensorModel
+from planners.agent import make_agent
+
+UNSEEN = "-unseen"
+"""What the names of scenarios end with whose slots are not seen before a try."""
+BLOCK = 10
+"""Episodes a task: few enough to lose little to a crash, enough to make up for starting one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One scenario with the costs and speeds of one setting, met by one agent.
+
+    Attributes:
+        scenario: with the setting's costs and speeds.
+        agent: the agent's name.
+        occupancy_level: the mean occupancy that the world was set to; None where it was left as it is.
+        options: of the agent, as `make_agent` takes them.
+        rig: whose sensors the car sees through; None where the scenario's sighting model stands for them.
+    """
+
+    scenario: Scenario
+    agent: str
+    occupancy_level: float | None = None
+    rig: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def columns(self) -> Row:
+        """What names this case in the tables."""
+        return {
+            "scenario": self.scenario.name,
+            "occupancy_level": self.occupancy_level,
+            "agent": self.agent,
+            "failure_cost_s": float(self.scenario.failure_s),
+            "v_walk_kmh": round(self.scenario.v_walk / KMH, 6),
+            "v_drive_kmh": round(self.scenario.v_drive / KMH, 6),
+        }
+
+    def key(self, seed: int) -> tuple[Any, ...]:
+        """The key of one of its episodes in a `ResultFolder`."""
+        return episode_key({**self.columns, "seed": seed})
+
+    def run(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row]]:
+        """Search once for each seed: rows of `episodes.csv` and of `timings.csv`."""
+        runner = self._runner()
+        rows, timings = [], []
+        for seed in seeds:
+            episode = runner.run(seed)
+            rows.append({**self.columns, **episode.row})
+            microseconds = " ".join(str(round(1e6 * s)) for s in episode.decision_s)
+            timings.append({**self.columns, "seed": seed, "decisions_us": microseconds})
+        return rows, timings
+
+    def run_reporting(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row], list[str]]:
+        """As `run`, and what it warned of: a worker's own warnings would not reach the user in order."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("default")
+            rows, timings = self.run(seeds)
+        return rows, timings, [f"{self.agent} in {self.scenario.name}: {w.message}" for w in caught]
+
+    def trace(self, seed: int) -> SearchTrace:
+        """One search, for a picture."""
+        return self._runner().run(seed).trace
+
+    def _runner(self) -> EpisodeRunner:
+        agent = make_agent(self.agent, self.scenario, **self.options)
+        return EpisodeRunner(self.scenario, self.agent, agent, self.rig)
+
+
+def settings_of(
+    scenario: Scenario,
+    failure_s: Sequence[float],
+    v_walk_kmh: Sequence[float],
+    v_drive_kmh: Sequence[float],
+) -> list[Scenario]:
+    """The scenario in every combination of failure cost, s, and speeds, km/h."""
+    return [
+        scenario.replace(failure_s=failure, v_walk=walk * KMH, v_drive=drive * KMH)
+        for failure, walk, drive in itertools.product(failure_s, v_walk_kmh, v_drive_kmh)
+    ]
+
+
+def unseen(scenario: Scenario) -> Scenario:
+    """The scenario with slots that nobody sees before trying to park there, under a name of its own."""
+    return scenario.replace(name=f"{scenario.name}{UNSEEN}", sensor_model=SensorModel.blind())
+
+
+def at_occupancy(scenario: Scenario, level: float) -> Scenario:
+    """The scenario at the middle of the first day of its arrival window, made so full on average.
+
+    Raises:
+        InputError: its world is a record, which is as full as it is.
+    """
+    window = scenario.arrival
+    middle = (window.start_s + window.end_s) / 2
+    # Days differ in how full they are, so that one level can be right for one of them only.
+    day = window.weekdays[0]
+    moment = ArrivalWindow((day,), middle, middle)
+
+    def adjusted(model: Any) -> Any:
+        if model is None:
+            return None
+        if not isinstance(model, OccupancyProcess):
+            raise InputError(f"scenario {scenario.name!r}: a recorded world cannot be made {level:.0%} full")
+        return model.at_mean_occupancy(level, day * 86400.0 + middle)
+
+    return scenario.replace(
+        arrival=moment, occupancy=adjusted(scenario.occupancy), prior=adjusted(scenario.prior)
+    )
+
+
+def run_cases(
+    cases: Sequence[tuple[Case, range]],
+    folder: ResultFolder,
+    *,
+    workers: Workers = HERE,
+    block_size: int = BLOCK,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> None:
+    """Run what the folder does not hold yet.
+
+    Args:
+        cases: each with the seeds of its episodes.
+        folder: where finished episodes go.
+        workers: where they run. The result does not depend on it.
+        block_size: episodes a task.
+        on_progress: told how many episodes have just been finished.
+
+    Raises:
+        KeyboardInterrupt: as it comes; what was finished is in the folder.
+    """
+    tasks = [
+        (case, block)
+        for case, seeds in cases
+        for block in _blocks([s for s in seeds if case.key(s) not in folder.episodes], block_size)
+    ]
+    done = sum(len(seeds) for _, seeds in cases) - sum(len(block) for _, block in tasks)
+    on_progress(done)
+    told = set()
+    work = [partial(case.run_reporting, block) for case, block in tasks]
+    for _, (rows, timings, messages) in workers.results(work):
+        folder.add(rows, timings)
+        on_progress(len(rows))
+        for message in messages:
+            # Once an agent and scenario: figures in the text differ from episode to episode.
+            if (topic := message.partition(":")[0]) not in told:
+                told.add(topic)
+                warnings.warn(message, stacklevel=2)
+
+
+def rows_of(names: Sequence[str], scenario: Scenario, seeds: Sequence[int], workers: Workers) -> list[Row]:
+    """A row for each agent, as `table` has them, of searches of which nothing else is kept."""
+    cases = [Case(scenario, name) for name in names]
+    blocks = [(case, block) for case in cases for block in _blocks(seeds, 5 * BLOCK)]
+    episodes: dict[str, list[Row]] = {case.agent: [] for case in cases}
+    for number, (rows, _) in workers.results([partial(case.run, block) for case, block in blocks]):
+        episodes[blocks[number][0].agent] += rows
+    by_seed = {name: sorted(rows, key=lambda row: row["seed"]) for name, rows in episodes.items()}
+    first = by_seed[names[0]]
+    return [summarize(c.columns, by_seed[c.agent], None if i == 0 else first) for i, c in enumerate(cases)]
+
+
+def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
+    """Make sure that the scenario has a world and a forecast for every search, before anything is written.
+
+    Raises:
+        InputError: such as a log that has no other day to forecast from.
+    """
+    days = set()
+    for seed in seeds:
+        key = world_key(seed, 0)
+        arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
+        if arrival.day not in days:
+            days.add(arrival.day)
+            scenario.forecast(arrival)
+            scenario.occupancy.world(key, arrival)
+
+
+def _blocks(seeds: Sequence[int], size: int) -> Iterator[Sequence[int]]:
+    for i in range(0, len(seeds), size):
+        yield seeds[i : i + size]
+
+
+def table(cases: Sequence[tuple[Case, range]], folder: ResultFolder) -> list[Row]:
+    """A row for every case that has finished episodes, in order; differences are to the first agent's.
+
+    Where `exact` is among the agents, `gap_to_exact` says by which share of its mean others take longer.
+    """
+    rows = []
+    first: dict[tuple[Any, ...], list[Row]] = {}
+    for case, seeds in cases:
+        keys = [key for s in seeds if (key := case.key(s)) in folder.episodes]
+        if not keys:
+            continue
+        episodes = [folder.episodes[key] for key in keys]
+        columns = case.columns
+        setting = tuple(v for k, v in columns.items() if k != "agent")
+        decision_s = list(itertools.chain.from_iterable(folder.decision_s(key) for key in keys))
+        rows.append(summarize(columns, episodes, first.get(setting), decision_s))
+        first.setdefault(setting, episodes)
+    names = [c for c in SETTING_COLUMNS if c != "agent"]
+    optimum = {tuple(r[c] for c in names): r["total_s"] for r in rows if r["agent"] == "exact"}
+    for row in rows:
+        best = optimum.get(tuple(row[c] for c in names))
+        if best is not None:
+            row["gap_to_exact"] = row["total_s"] / best - 1.0
+    return rows
+
+
+def against_occupancy(rows: Sequence[Row], edges: Sequence[float]) -> list[Row]:
+    """Total time against how full the lot was at the arrival, from episodes as they came.
+
+    Args:
+        rows: episodes.
+        edges: ends of the bins of occupancy, ascending.
+
+    Returns:
+        Rows with agent, failure_cost_s, occupancy (the bin's mean), total_s, total_s_ci95, episodes.
+    """
+    bins: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
+    for row in rows:
+        place = int(np.searchsorted(edges, row["occupancy"], side="right")) - 1
+        if 0 <= place < len(edges) - 1:
+            bins[row["agent"], row["failure_cost_s"], place].append(row)
+    result = []
+    for (agent, failure, _), inside in sorted(bins.items(), key=lambda item: item[0][1:]):
+        mean, low, high = mean_interval([r["total_s"] for r in inside])
+        result.append(
+            {
+                "agent": agent,
+                "failure_cost_s": failure,
+                "occupancy": float(np.mean([r["occupancy"] for r in inside])),
+                "episodes": len(inside),
+                "total_s": mean,
+                "total_s_ci95": [low, high],
+            }
+        )
+    return result

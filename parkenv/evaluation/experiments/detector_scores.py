@@ -1,0 +1,99 @@
+"""A detector judged on labelled photographs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from parkenv.evaluation.figures.picture_files import STYLE, save_picture
+from parkenv.perception.car_datasets import UIUC_SIZE, UIUC_TESTS, LabelledImage, read_uiuc_test
+from parkenv.perception.detection_scores import RecallPrecision, recall_precision
+from parkenv.perception.detector import CarModel, Detector
+
+_SMALLEST = {"single": 0.85, "multi": 0.65}
+_LARGEST = {"single": 1.2, "multi": 2.6}
+"""Sizes that are looked for, of UIUC's 100×40 box; the single-scale set has one."""
+
+
+@dataclass(frozen=True, eq=False)
+class TestSetScore:
+    """Result on one test set: its row in `summary.json`, and the curve."""
+
+    row: dict[str, Any]
+    curve: RecallPrecision
+
+
+def score_on_uiuc(
+    model: CarModel, folder: Path, *, on_image: Callable[[], None] = lambda: None
+) -> list[TestSetScore]:
+    """Recall and precision on UIUC's test sets, as many as the folder holds.
+
+    Args:
+        model: a side model.
+        folder: the published `CarData`.
+        on_image: called after every image.
+
+    Raises:
+        InputError: neither test set is there, or one is damaged.
+    """
+    sets = [name for name, (_, truth) in UIUC_TESTS.items() if (folder / truth).is_file()] or ["single"]
+    return [score_on(model, read_uiuc_test(folder, name), name, on_image=on_image) for name in sets]
+
+
+def score_on(
+    model: CarModel,
+    images: Sequence[LabelledImage],
+    test_set: str,
+    *,
+    on_image: Callable[[], None] = lambda: None,
+) -> TestSetScore:
+    """Recall and precision on labelled images, by UIUC's rule."""
+    height = UIUC_SIZE[1]
+    detector = Detector(
+        (model,), least_height=_SMALLEST[test_set] * height, most_height=_LARGEST[test_set] * height,
+        scale_step=1.08, threshold=0.002, overlap=0.3, margin=0.35,
+    )  # fmt: skip
+    found, begun = [], time.perf_counter()
+    for labelled in images:
+        found.append(detector.detect(labelled.image))
+        on_image()
+    seconds = time.perf_counter() - begun
+    curve = recall_precision(
+        [f.regions for f in found],
+        [f.score for f in found],
+        [i.boxes for i in images],
+        scales=test_set == "multi",
+    )
+    _, recall, precision = curve.at_equal_error() if len(curve.recall) else (0.0, 0.0, 0.0)
+    row = {
+        "test_set": test_set,
+        "images": len(images),
+        "cars": sum(len(i.boxes) for i in images),
+        "eer": curve.equal_error,
+        "average_precision": curve.average_precision,
+        "recall": recall,
+        "precision": precision,
+        "frames_per_s": len(images) / seconds,
+    }
+    return TestSetScore(row, curve)
+
+
+def save_curves(scores: Sequence[TestSetScore], title: str, path: Path) -> None:
+    """Recall against one minus precision, as these sets' papers draw it."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(5.4, 4.4))
+        ax = figure.subplots()
+        for score in scores:
+            label = f"{score.row['test_set']}-scale: equal error at {score.row['eer']:.1%}"
+            ax.plot(1.0 - score.curve.precision, score.curve.recall, label=label)
+        ax.plot([0.0, 1.0], [1.0, 0.0], color="0.7", linewidth=0.8, linestyle=":")
+        ax.set(xlim=(0.0, 0.3), ylim=(0.7, 1.005), xlabel="1 - precision", ylabel="recall", title=title)
+        ax.legend(loc="lower right")
+        figure.tight_layout()
+        save_picture(figure, path)

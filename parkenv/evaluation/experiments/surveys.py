@@ -1,0 +1,288 @@
+"""Many sessions into a map file, and how good the sessions and the map are."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.evaluation.experiments.workers import HERE, Workers
+from parkenv.files.atomic_write import atomic_write
+from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
+from parkenv.mapping.inference import SessionLog, predict
+from parkenv.mapping.store import MapStore
+from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
+from parkenv.mapping.survey_score import DISTANCE_ENDS, WAYS
+from parkenv.world.occupancy import DAY_S, Arrival, ArrivalWindow
+from parkenv.world.scenario import Scenario
+
+FloatArray = NDArray[np.float64]
+Row = dict[str, Any]
+
+ERROR_COLUMNS = ("range_error_m", "range_error_p95_m", "place_error_m", "heading_error_deg")
+SESSION_COLUMNS = (
+    "key", "weather", "time_s", "parked", "found", "detections", "right",
+    *ERROR_COLUMNS, *(f"thesis_{name}" for name in ERROR_COLUMNS),
+    "slot_accuracy", "slot_accuracy_seen", "unknown_fraction", "occupied_fraction", "seconds_per_frame",
+    "cars_in_frame", "cars_detected",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyRun:
+    """A survey that is done.
+
+    Attributes:
+        rows: a row a session, in order.
+        shown: the first session, with pictures; None if all were there already.
+    """
+
+    rows: list[Row]
+    shown: SessionResult | None
+
+
+def session_row(result: SessionResult) -> Row:
+    """What `sessions.csv` says of a session."""
+    score = result.score
+    return dict(
+        zip(
+            SESSION_COLUMNS,
+            (
+                result.session.key, result.session.weather, result.arrival.time, result.parked, result.found,
+                score.detections, score.right,
+                *(value for way in WAYS for value in _error_columns(score.errors(way))),
+                result.slot_accuracy, result.slot_accuracy_seen, float(1.0 - result.states.in_view.mean()),
+                float(result.truth.mean()), float(np.median(result.frame_s)),
+                *(" ".join(map(str, counts.tolist())) for counts in score.in_frame.T),
+            ),
+            strict=True,
+        )
+    )  # fmt: skip
+
+
+def _error_columns(errors: FloatArray) -> tuple[float, ...]:
+    """`ERROR_COLUMNS`: medians but for the second."""
+    if not len(errors):
+        return (float("nan"),) * len(ERROR_COLUMNS)
+    middle = np.median(errors, axis=0)
+    far = float(np.quantile(errors[:, 0], 0.95))
+    return float(middle[0]), far, float(middle[1]), float(np.degrees(middle[2]))
+
+
+def run_survey(
+    scenario: Scenario,
+    settings: SurveySettings,
+    sessions: int,
+    map_file: Path,
+    *,
+    workers: Workers = HERE,
+    pictures: int = 4,
+    on_session: Callable[[Row], None] = lambda _: None,
+) -> SurveyRun:
+    """Drive what the map file does not hold yet; each session is in it whole as soon as it is driven.
+
+    Args:
+        scenario: the world.
+        settings: how to drive.
+        sessions: how many.
+        map_file: made where it is not there. Beside it, `sessions.csv` keeps how good each session was.
+        workers: where they are driven; the result does not depend on it.
+        pictures: captures kept of the first session.
+        on_session: told of each session that is done.
+
+    Raises:
+        InputError: fewer than one session, or a map file that cannot be used.
+    """
+    if sessions < 1:
+        raise InputError(f"sessions is {sessions}, want at least 1")
+    survey = Survey(scenario, settings)
+    table = map_file.with_name("sessions.csv")
+    with MapStore(map_file, scenario.lot) as store:
+        # A row is written before its session: one without is of a drive that was cut off, and is driven again.
+        rows = {r["key"]: r for r in _read_rows(table) if store.has(r["key"])}
+        wanted = [survey.key_of(k) for k in range(sessions)]
+        missing = [k for k, key in enumerate(wanted) if not store.has(key) or key not in rows]
+        shown = None
+        for number, result in zip(missing, _driven(survey, missing, workers, pictures), strict=True):
+            row = session_row(result)
+            rows[row["key"]] = row
+            _write_rows(table, list(rows.values()))
+            if not store.has(row["key"]):
+                store.add(result.session)
+            if number == 0:
+                shown = result
+            on_session(row)
+    return SurveyRun([rows[key] for key in wanted], shown)
+
+
+def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_file: Path) -> Row:
+    """The row of `summary.json`."""
+    with MapStore(map_file, scenario.lot, create=False) as store:
+        log = store.log()
+        found = score_discovery(slots_found(store, len(log.time)), scenario.lot)
+    error, expected = map_error(scenario, settings.windows, log)
+    parked = sum(r["parked"] for r in run.rows)
+    detections = sum(r["detections"] for r in run.rows)
+    return {
+        "scenario": scenario.name,
+        "rig": settings.rig,
+        "weather": settings.weather or "any",
+        "sessions": len(run.rows),
+        "slots": scenario.lot.n_slots,
+        "car_detection_rate": sum(r["found"] for r in run.rows) / max(parked, 1),
+        "detection_precision": sum(r["right"] for r in run.rows) / max(detections, 1),
+        "range_abs_error_m": {
+            "median": _mean(run.rows, "range_error_m"),
+            "p95": _mean(run.rows, "range_error_p95_m"),
+        },
+        "car_pose": {
+            name: {c: _mean(run.rows, prefix + c) for c in ERROR_COLUMNS}
+            for name, prefix in (("fitted", ""), ("thesis", "thesis_"))
+        },
+        "slot_accuracy": _mean(run.rows, "slot_accuracy"),
+        "slot_accuracy_seen": _mean(run.rows, "slot_accuracy_seen"),
+        "unknown_fraction": _mean(run.rows, "unknown_fraction"),
+        "by_weather": {
+            weather: {
+                "sessions": len(its),
+                "car_detection_rate": sum(r["found"] for r in its) / max(sum(r["parked"] for r in its), 1),
+                "slot_accuracy": _mean(its, "slot_accuracy"),
+            }
+            for weather in sorted({r["weather"] for r in run.rows})
+            for its in [[r for r in run.rows if r["weather"] == weather]]
+        },
+        "detection_by_distance": detection_by_distance(run.rows),
+        "slots_found": found._asdict(),
+        "occupancy_mae": error,
+        "occupancy_mae_expected": expected,
+        "seconds_per_frame": _mean(run.rows, "seconds_per_frame"),
+    }
+
+
+def slots_found(store: MapStore, sessions: int) -> FoundSlots:
+    """Slots that the cars of all sessions in a map file show; nobody tells where any are.
+
+    What passes or is taken for a car now and then adds up over sessions, so the more there are the more cars a slot
+    must have had.
+    """
+    return discover(store.cars(), least=max(3, sessions // 2))
+
+
+def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
+    """How often a parked car that stands clear in a frame is detected there, by weather and distance.
+
+    Args:
+        rows: of sessions.
+
+    Returns:
+        Rows with weather, distance_m (both ends of the bin), in_frame, detected, rate and its 95 % interval
+        (Wilson's), for every bin that holds a car.
+    """
+    from scipy.stats import binomtest
+
+    counts: dict[str, NDArray[np.int64]] = {}
+    for row in rows:
+        found = np.array([[int(n) for n in str(row[c]).split()] for c in ("cars_in_frame", "cars_detected")])
+        counts[row["weather"]] = counts.get(row["weather"], 0) + found
+    result = []
+    for weather, (there, detected) in sorted(counts.items()):
+        for i, end in enumerate(DISTANCE_ENDS):
+            if there[i]:
+                test = binomtest(int(detected[i]), int(there[i])).proportion_ci(method="wilson")
+                result.append(
+                    {
+                        "weather": weather,
+                        "distance_m": [0.0 if i == 0 else DISTANCE_ENDS[i - 1], end],
+                        "in_frame": int(there[i]),
+                        "detected": int(detected[i]),
+                        "rate": float(detected[i] / there[i]),
+                        "rate_ci95": [float(test.low), float(test.high)],
+                    }
+                )
+    return result
+
+
+def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: SessionLog) -> tuple[float, float]:
+    """How far the map's predictions are from the true probabilities, and how far counts alone would be.
+
+    Args:
+        scenario: whose occupancy is the truth.
+        windows: in which sessions began; the map is asked at the middle of each, on its first day.
+        log: the map's sessions.
+
+    Returns:
+        Mean over slots and windows of |predicted - true|; and the sampling error that is to be expected of counts: the
+        same of the mean of as many independent draws as there are sessions in the window, at its very middle.
+    """
+    errors, chances = [], []
+    hour = log.time % DAY_S
+    for window in windows:
+        time = DAY_S * window.weekdays[0] + 0.5 * (window.start_s + window.end_s)
+        draws = int(((hour >= window.start_s) & (hour <= window.end_s)).sum())
+        true = scenario.occupancy.forecast(Arrival(time)).p_occupied
+        errors.append(np.abs(predict(log, time).p_occupied - true))
+        # Mean absolute deviation of a binomial share, by its normal limit.
+        chances.append(np.sqrt(2.0 / np.pi * true * (1.0 - true) / max(draws, 1)))
+    return float(np.mean(errors)), float(np.mean(chances))
+
+
+def _driven(
+    survey: Survey, numbers: Sequence[int], workers: Workers, pictures: int
+) -> Iterator[SessionResult]:
+    """Sessions in order."""
+    if workers.in_process or len(numbers) < 2:
+        for k in numbers:
+            yield survey.drive(k, pictures=pictures if k == 0 else 0)
+        return
+    yield from workers.in_order(
+        [partial(_drive, survey.scenario, survey.settings, k, pictures if k == 0 else 0) for k in numbers]
+    )
+
+
+_KEPT: dict[str, Survey] = {}
+
+
+def _drive(scenario: Scenario, settings: SurveySettings, number: int, pictures: int) -> SessionResult:
+    """In a worker: the survey is made once, and kept for the next session."""
+    name = repr((scenario.name, settings))
+    if name not in _KEPT:
+        _KEPT.clear()
+        _KEPT[name] = Survey(scenario, settings)
+    return _KEPT[name].drive(number, pictures=pictures)
+
+
+def _mean(rows: Sequence[Row], column: str) -> float:
+    """The mean over the sessions that could tell; NaN where none could."""
+    told = [r[column] for r in rows if np.isfinite(r[column])]
+    return float(np.mean(told)) if told else math.nan
+
+
+def _read_rows(path: Path) -> list[Row]:
+    if not path.exists():
+        return []
+    rows = []
+    for raw in csv.DictReader(path.read_text(encoding="utf-8").splitlines()):
+        if tuple(raw) != SESSION_COLUMNS:
+            raise InputError(f"{path}: not written by this version of parkenv; use another folder")
+        whole = ("parked", "found", "detections", "right")
+        words = ("key", "weather", "cars_in_frame", "cars_detected")
+        rows.append({k: v if k in words else int(v) if k in whole else float(v) for k, v in raw.items()})
+    return rows
+
+
+def _write_rows(path: Path, rows: Sequence[Row]) -> None:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, SESSION_COLUMNS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    with atomic_write(path) as beside:
+        beside.write_text(text.getvalue(), encoding="utf-8")

@@ -1,0 +1,161 @@
+"""What agents achieve against decisions made in training, with the planners for comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, PercentFormatter
+
+from parkenv.evaluation.experiments.statistics import mean_interval
+from parkenv.evaluation.figures.picture_files import INK, STYLE, save_picture
+from parkenv.evaluation.figures.time_figures import spread
+
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
+"""Of trainings, as many as can be told apart."""
+OFF_SCALE = 2.0
+"""Times above this many times the least one are off the figure."""
+_APART = 0.045  # of the axis, the least distance of two words beside the lines
+
+Curves = Sequence[Sequence[Mapping[str, Any]]]
+
+
+def columns_of(measure: str) -> tuple[str, str, str]:
+    """What the ends of the interval and the median of a measure are called: of seconds, or of shares."""
+    unit = "_s" if measure.endswith("_s") else ""
+    return f"low{unit}", f"high{unit}", f"median{unit}"
+
+
+def across_seeds(curves: Curves, measure: str = "total_s") -> list[dict[str, float]]:
+    """Mean over seeds, with its 95 % interval, and median, at the examinations that all seeds have.
+
+    Args:
+        curves: of each seed, the rows of its `curve.csv`.
+        measure: which column.
+
+    Returns:
+        Rows of steps, `measure` and its `columns_of`.
+    """
+    low_name, high_name, median_name = columns_of(measure)
+    rows = []
+    for examinations in zip(*curves, strict=False):
+        values = [row[measure] for row in examinations]
+        mean, low, high = mean_interval(values)
+        row = {"steps": float(np.mean([row["steps"] for row in examinations])), measure: mean}
+        rows.append(row | {low_name: low, high_name: high, median_name: float(np.median(values))})
+    return rows
+
+
+def save_learning_curves(
+    curves: Mapping[str, Curves], planners: Mapping[str, float], title: str, path: Path
+) -> None:
+    """Draw each algorithm's total time, and planners as horizontal lines.
+
+    Of one algorithm it is the mean over seeds in its interval; of several, where intervals would hide each other, the
+    median, for which one search driven in circles does not count, and single seeds thinly.
+
+    Args:
+        curves: of each algorithm, of each seed, the rows of its `curve.csv`.
+        planners: mean total time, s, of each planner in the same worlds.
+        title: of the figure.
+        path: of the PNG.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.2, 4.2 if len(curves) == 1 else 4.8), layout="constrained")
+        axes = figure.subplots()
+        highest = 0.0
+        for (name, its), color in zip(curves.items(), COLORS, strict=False):
+            drawn = _draw(axes, name, its, "total_s", color, alone=len(curves) == 1)
+            highest = max(highest, *drawn[len(drawn) // 10 :])
+        low = min(*planners.values(), *(r["total_s"] for its in curves.values() for c in its for r in c))
+        # An untrained policy drives in circles; where it ends is what is to be seen.
+        high = min(max([highest, *planners.values()]), OFF_SCALE * low)
+        margin = 0.06 * (high - low) or 1.0
+        axes.set_ylim(low - margin, high + margin)
+        shown = {name: t for name, t in planners.items() if t <= high + margin}
+        ascending = sorted(shown.items(), key=lambda item: item[1])
+        bottom, top = axes.get_ylim()
+        heights = spread([(seconds - bottom) / (top - bottom) for _, seconds in ascending], _APART)
+        for (name, seconds), height in zip(ascending, heights, strict=True):
+            _mark(axes, seconds, f"{name}  {seconds:.1f}", height)
+        axes.set(xlabel="decisions in training", ylabel="mean total time, s", title=title)
+        if len(curves) == 1:
+            axes.legend(loc="upper right", frameon=True, facecolor="white", edgecolor="none", framealpha=1.0)
+        else:
+            figure.legend(loc="outside lower left", ncols=2, frameon=False)
+        save_picture(figure, path)
+
+
+def save_success_curves(
+    curves: Mapping[str, Curves], kinds: Sequence[str], planner: Mapping[str, float], title: str, path: Path
+) -> None:
+    """Draw each algorithm's share of parkings that succeed, a panel for each kind of slot, beside the planner's.
+
+    As `save_learning_curves` does, of one algorithm the mean over seeds, of several the median.
+
+    Args:
+        curves: of each algorithm, of each seed, the rows of its `curve.csv`; see `DriveTraining.examine`.
+        kinds: of slots.
+        planner: share of the same parkings that the planner brings to an end, by kind; empty to draw none.
+        title: of the figure.
+        path: of the PNG.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(2.4 + 2.8 * len(kinds), 3.4), layout="constrained")
+        panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
+        for axes, kind in zip(panels, kinds, strict=True):
+            for (name, its), color in zip(curves.items(), COLORS, strict=False):
+                _draw(axes, name, its, f"{kind}_success", color, alone=len(curves) == 1)
+            if kind in planner:
+                share = planner[kind]
+                axes.axhline(share, color=INK, lw=0.8, ls=(0, (4, 3)), zorder=1)
+                axes.annotate(
+                    f"planner {share:.0%}", (0.0, share), xycoords=("axes fraction", "data"), xytext=(4, 3),
+                    textcoords="offset points", fontsize=8, color=INK,
+                )  # fmt: skip
+            axes.set(title=kind, xlabel="decisions in training", ylim=(-0.03, 1.1))
+            axes.set_yticks(np.linspace(0.0, 1.0, 6))
+            axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+        panels[0].set_ylabel("parkings that succeed")
+        panels[-1].legend(
+            loc="lower right", frameon=True, facecolor="white", edgecolor="none", framealpha=0.8
+        )
+        figure.suptitle(title, x=0.01, ha="left", fontsize=9.0)
+        save_picture(figure, path)
+
+
+def _draw(axes: Axes, name: str, curves: Curves, measure: str, color: str, *, alone: bool) -> Sequence[float]:
+    """Draw the mean over seeds in its interval, or the median among others, single seeds thinly; returns the line."""
+    rows = across_seeds(curves, measure)
+    low, high, median = columns_of(measure)
+    steps, line = [row["steps"] for row in rows], [row[measure if alone else median] for row in rows]
+    words = f"{len(curves)} seeds" if alone or len(curves) == 1 else f"median of {len(curves)} seeds"
+    for single in curves:
+        axes.plot([r["steps"] for r in single], [r[measure] for r in single], color=color, lw=0.5, alpha=0.35)
+    if alone and len(curves) > 1:
+        axes.fill_between(
+            steps, [row[low] for row in rows], [row[high] for row in rows], color=color, alpha=0.2, lw=0
+        )
+    axes.plot(steps, line, color=color, lw=2.0, label=f"{name}, {words}")
+    axes.set_xlim(left=0.0)
+    axes.xaxis.set_major_formatter(FuncFormatter(_count))
+    axes.grid(axis="y")
+    return line
+
+
+def _mark(axes: Axes, value: float, words: str, height: float) -> None:
+    """A horizontal line, with words beside the axes at a height, a share of theirs."""
+    axes.axhline(value, color=INK, lw=0.8, ls=(0, (4, 3)), zorder=1)
+    axes.annotate(
+        words, (1.0, height), xycoords="axes fraction", xytext=(5, 0),
+        textcoords="offset points", va="center", fontsize=8, color=INK,
+    )  # fmt: skip
+
+
+def _count(x: float, _: Any) -> str:
+    return f"{x / 1e6:g} M" if x >= 1e6 else f"{x / 1e3:g} k" if x >= 1e3 else f"{x:g}"

@@ -1,0 +1,286 @@
+"""Pictures of lots: the ground on which paths, beliefs and policies are drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import shapely
+from matplotlib.axes import Axes
+from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.patches import FancyArrowPatch, PathPatch, Polygon, Rectangle
+from matplotlib.path import Path as Outline
+from matplotlib.typing import ColorType
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from parkenv.envs.rendering import BELIEF_ANCHORS
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
+from parkenv.lots.generators import ONE_WAY_HALF_WIDTH, TWO_WAY_HALF_WIDTH
+from parkenv.world.drive_graph import linestrings
+from parkenv.world.lot import ParkingLot, is_building, mouth_heading
+
+FloatArray = NDArray[np.float64]
+
+GROUND = "#e7eae0"
+ASPHALT = "#5f646a"
+PAINT = "#ffffff"
+BUILDING = "#cdc5b8"
+WALL = "#877d70"
+ENTRY = "#1d8a4e"
+GOAL = "#ffc53a"
+GRAPH = "#ffd98a"
+INK = "#333333"
+BELIEF_MAP = LinearSegmentedColormap.from_list("belief", [[c / 255 for c in rgb] for rgb in BELIEF_ANCHORS])
+"""From free to taken."""
+SMALLEST_DISC = 6.0
+"""Points."""
+
+
+def draw_lot(
+    lot: ParkingLot,
+    ax: Axes,
+    *,
+    slot_color: ColorType | FloatArray | None = None,
+    show_graph: bool = False,
+) -> None:
+    """Draw a lot as seen from above, to scale, with a scale bar.
+
+    Everything is drawn with a z-order below 2 but for entries and goals (5), so that what others plot
+    lies between.
+
+    Args:
+        lot: the lot.
+        ax: where to draw; its limits and aspect are set, its ticks and frame are removed.
+        slot_color: fill of the slots: one colour, or (n_slots, 3 or 4) RGB(A) in 0..1; not filled if None.
+        show_graph: also draw the drive graph, an arrow for every move.
+    """
+    x0, y0, x1, y1 = lot.bounds()
+    margin = 3.0 + 0.02 * max(x1 - x0, y1 - y0)
+    bar_room = 0.04 * max(x1 - x0, y1 - y0)
+    ax.set(xlim=(x0 - margin, x1 + margin), ylim=(y0 - margin - bar_room, y1 + margin), xticks=[], yticks=[])
+    ax.set_aspect("equal")
+    ax.set_facecolor(GROUND)
+    ax.spines[:].set_visible(False)
+    # Paint has a width on the ground, within what the eye can make out.
+    scale = points_per_m(ax)
+    paint_width = float(np.clip(0.12 * scale, 0.2, 1.2))
+
+    ax.add_patch(_patch(_asphalt(lot), facecolor=ASPHALT, edgecolor="none", zorder=0.5))
+    _draw_lane_marks(lot, ax, paint_width)
+    corners = lot.slot_corners()
+    if slot_color is not None:
+        ax.add_collection(PolyCollection(list(corners), facecolors=slot_color, edgecolors="none", zorder=1.0))
+    # The mouth stays open, as it is painted on the ground.
+    first = np.array([0, 3, 1])[lot.slot_mouth]
+    outline = corners[np.arange(lot.n_slots)[:, None], (first[:, None] + np.arange(4)) % 4]
+    ax.add_collection(LineCollection(list(outline), colors=PAINT, linewidths=paint_width, zorder=1.1))
+    for wall in lot.walls:
+        if is_building(wall):
+            ax.add_patch(Polygon(wall, facecolor=BUILDING, edgecolor=WALL, linewidth=0.8, zorder=0.8))
+        else:
+            ax.plot(*wall.T, color=WALL, linewidth=1.6, solid_capstyle="butt", zorder=0.8)
+    if show_graph:
+        _draw_graph(lot, ax, scale)
+    _draw_entries_and_goals(lot, ax, scale)
+    _draw_scale_bar(ax, x0, y0 - 0.5 * margin - bar_room, x1 - x0)
+
+
+def draw_discs(lot: ParkingLot, ax: Axes, outer: FloatArray, inner: FloatArray) -> None:
+    """Draw two discs at each slot, as T Fig. 4.7: an outer one for a prediction, an inner one for what is there.
+
+    Args:
+        lot: drawn in `ax` already.
+        ax: where to draw.
+        outer: (n_slots,) probabilities that the slot is taken; their colours are those of `BELIEF_MAP`.
+        inner: (n_slots, 3 or 4) RGB(A) in 0..1.
+    """
+    scale = points_per_m(ax)
+    # As wide as the slot, or larger where that would be too small to see and neighbours leave room.
+    nearest = np.asarray(cKDTree(lot.slot_xy).query(lot.slot_xy, k=2)[0])[:, 1]
+    size = np.minimum(lot.slot_width, lot.slot_length)
+    size = np.maximum(size, np.minimum(nearest, SMALLEST_DISC / scale))
+    for share, colors, edge in ((0.92, BELIEF_MAP(outer), "none"), (0.52, inner, "#181b1f")):
+        discs = EllipseCollection(
+            share * size,
+            share * size,
+            np.zeros(lot.n_slots),
+            units="xy",
+            offsets=lot.slot_xy,
+            offset_transform=ax.transData,
+            facecolors=colors,
+            edgecolors=edge,
+            linewidths=float(np.clip(0.12 * scale, 0.2, 0.7)),
+            zorder=1.5,
+        )
+        ax.add_collection(discs)
+
+
+def points_per_m(ax: Axes) -> float:
+    """How large a metre of the lot is in axes with an equal aspect, points."""
+    box = ax.get_window_extent()
+    across, down = np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())
+    return float(min(box.width / across, box.height / down)) / ax.figure.dpi * 72
+
+
+def save_lot_picture(lot: ParkingLot, path: str | Path, *, show_graph: bool = False) -> None:
+    """Draw a lot into a file, whose suffix names the format (`.png`, `.pdf`, `.svg`).
+
+    Raises:
+        InputError: the format is not known, or the file cannot be written.
+    """
+    path = Path(path)
+    x0, y0, x1, y1 = lot.bounds()
+    longer, shorter = max(x1 - x0, y1 - y0), min(x1 - x0, y1 - y0)
+    short = 10.0 * min(1.0, (shorter + 0.15 * longer) / longer)
+    figure = Figure(figsize=(10.0, short) if x1 - x0 >= y1 - y0 else (short, 10.0))
+    draw_lot(lot, figure.add_axes((0.0, 0.0, 1.0, 1.0)), show_graph=show_graph)
+    formats = figure.canvas.get_supported_filetypes()
+    if path.suffix.removeprefix(".") not in formats:
+        raise InputError(
+            f"{path}: no picture format {path.suffix!r}, want one of {', '.join(sorted(formats))}"
+        )
+    with atomic_write(path) as beside:
+        figure.savefig(
+            beside, format=path.suffix.removeprefix("."), dpi=160, bbox_inches="tight", pad_inches=0.0
+        )
+
+
+def _asphalt(lot: ParkingLot) -> shapely.Geometry:
+    """What is paved: lanes, slots, and what lies between the two."""
+    half_width = [ONE_WAY_HALF_WIDTH if lane.oneway else TWO_WAY_HALF_WIDTH for lane in lot.lanes]
+    lanes = shapely.buffer(linestrings([lane.points for lane in lot.lanes]), half_width, quad_segs=16)
+    heading = mouth_heading(lot.slot_yaw, lot.slot_mouth)
+    outward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    to_lane = ((lot.vertex_xy[: lot.n_slots] - lot.mouth_xy()) * outward).sum(axis=1)
+    near = lot.slot_corners()
+    far = near + np.maximum(to_lane, 0.0)[:, None, None] * outward[:, None]
+    swept = shapely.convex_hull(shapely.multipoints(np.concatenate([near, far], axis=1)))
+    paved = shapely.union_all(np.concatenate([np.asarray(lanes), np.asarray(swept)]))
+    joint, apron = 0.6, 0.25
+    return shapely.buffer(shapely.buffer(paved, joint, join_style="mitre"), apron - joint, join_style="mitre")
+
+
+def _patch(area: shapely.Geometry, **style: object) -> PathPatch:
+    polygons = shapely.get_parts(shapely.normalize(area))
+    rings = [ring for polygon in polygons for ring in (polygon.exterior, *polygon.interiors)]
+    return PathPatch(
+        Outline.make_compound_path(*(Outline(np.asarray(r.coords), closed=True) for r in rings)), **style
+    )
+
+
+def _draw_lane_marks(lot: ParkingLot, ax: Axes, paint_width: float) -> None:
+    """A dashed line in the middle of two-way lanes, arrows on one-way lanes."""
+    two_way = [lane.points for lane in lot.lanes if not lane.oneway]
+    ax.add_collection(
+        LineCollection(
+            two_way, colors=PAINT, alpha=0.45, linewidths=paint_width, linestyles=(0, (5, 6)), zorder=0.9
+        )
+    )
+    arrow = np.array(
+        [[1.6, 0.0], [-0.2, 0.75], [-0.2, 0.2], [-1.6, 0.2], [-1.6, -0.2], [-0.2, -0.2], [-0.2, -0.75]]
+    )
+    arrows: list[FloatArray] = []
+    for lane in lot.lanes:
+        for start, step in zip(lane.points, np.diff(lane.points, axis=0), strict=False):
+            if lane.oneway:
+                length = float(np.hypot(*step))
+                turn = np.array([step, [-step[1], step[0]]]) / length
+                n = max(1, round(length / 24.0))
+                arrows += [start + (i + 0.5) / n * step + arrow @ turn for i in range(n)]
+    ax.add_collection(PolyCollection(arrows, facecolors=PAINT, edgecolors="none", alpha=0.85, zorder=0.9))
+
+
+def _draw_graph(lot: ParkingLot, ax: Axes, points_per_m: float) -> None:
+    source, column = np.nonzero(lot.neighbors >= 0)
+    tail, head = lot.vertex_xy[source], lot.vertex_xy[lot.neighbors[source, column]]
+    ax.quiver(
+        *tail.T,
+        *(head - tail).T,
+        angles="xy",
+        scale_units="xy",
+        scale=1.0,
+        units="xy",
+        width=0.18,
+        headwidth=4.5,
+        headlength=5.0,
+        headaxislength=4.5,
+        color=GRAPH,
+        zorder=1.5,
+    )
+    ax.scatter(
+        lot.vertex_xy[:, 0],
+        lot.vertex_xy[:, 1],
+        s=(0.55 * points_per_m) ** 2,
+        color=GRAPH,
+        edgecolors=INK,
+        linewidths=0.3,
+        zorder=1.6,
+    )
+
+
+def _draw_entries_and_goals(lot: ParkingLot, ax: Axes, points_per_m: float) -> None:
+    """An arrow into the lot along the lane of each entry, a star on each goal."""
+    lines = linestrings([lane.points for lane in lot.lanes])
+    middle = lot.slot_xy.mean(axis=0)
+    for xy in lot.entries:
+        k = int(np.argmin(np.asarray(shapely.distance(lines, shapely.Point(xy)))))
+        at = shapely.line_locate_point(lines[k], shapely.Point(xy))
+        ends = shapely.line_interpolate_point(lines[k], [max(at - 1.0, 0.0), at, at + 1.0])
+        before, here, after = shapely.get_coordinates(ends)
+        # Where cars could go either way, the way toward the slots is the way in.
+        ways = [after - here] if lot.lanes[k].oneway else [after - here, before - here]
+        way = max(ways, key=lambda way: float(way @ (middle - here)))
+        ax.add_patch(
+            FancyArrowPatch(
+                tuple(xy),
+                tuple(xy + 32.0 / points_per_m * way),
+                arrowstyle="simple,head_length=0.9,head_width=1.1,tail_width=0.45",
+                mutation_scale=14.0,
+                shrinkA=0.0,
+                shrinkB=0.0,
+                facecolor=ENTRY,
+                edgecolor=PAINT,
+                linewidth=0.7,
+                zorder=5,
+            )
+        )
+    ax.scatter(
+        lot.goals[:, 0],
+        lot.goals[:, 1],
+        marker="*",
+        s=340.0,
+        color=GOAL,
+        edgecolors=INK,
+        linewidths=0.9,
+        zorder=5,
+    )
+
+
+def _draw_scale_bar(ax: Axes, x: float, y: float, width: float) -> None:
+    """A bar of a round length, about a sixth of the lot's width, with its lower left corner at (x, y)."""
+    power = 10.0 ** np.floor(np.log10(width / 6))
+    length = power * max(step for step in (1, 2, 5) if step * power <= width / 6)
+    thickness = 0.005 * width
+    for i in (0, 1):
+        ax.add_patch(
+            Rectangle(
+                (x + i * length / 2, y),
+                length / 2,
+                thickness,
+                facecolor=(INK, "white")[i],
+                edgecolor=INK,
+                linewidth=0.7,
+            )
+        )
+    ax.annotate(
+        f"{length:g} m",
+        (x + length, y + thickness / 2),
+        (5, 0),
+        textcoords="offset points",
+        va="center",
+        color=INK,
+    )

@@ -1,0 +1,84 @@
+"""The style that all pictures share, and how they get into files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from PIL import Image
+
+from parkenv.files.atomic_write import atomic_write
+
+DPI = 150
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#666666",
+    "axes.axisbelow": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.7,
+    "legend.frameon": False,
+    "legend.fontsize": 9.0,
+    "xtick.color": "#444444",
+    "ytick.color": "#444444",
+    "figure.titlesize": 11.0,
+}
+
+INK = "#181b1f"
+TIME_COLORS = {
+    "drive_s": ("drive", "#0072b2"),
+    "failed_s": ("failed tries", "#d55e00"),
+    "walk_s": ("walk", "#a6cfe8"),
+    "gave_up_s": ("gave up", "#8c8c8c"),
+}
+"""What the parts of a search's time are called, and their colours."""
+
+
+def save_picture(figure: Figure, path: str | Path) -> None:
+    """Write a PNG, whole or not at all.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    with atomic_write(path) as beside:
+        figure.savefig(beside, format="png", dpi=DPI)
+
+
+def save_film(
+    frames: Sequence[NDArray[np.uint8]], path: str | Path, *, fps: float, colors: int | None = None
+) -> None:
+    """Write an endless GIF, whole or not at all.
+
+    Args:
+        frames: (h, w, 3) RGB each.
+        path: of the file.
+        fps: frames a second.
+        colors: of one palette for all frames, the rare ones among them: for drawings. Where None, each frame has a
+            palette of its own: for photographs.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    pictures = [Image.fromarray(frame) for frame in frames]
+    if colors is not None:
+        some = np.concatenate([*frames[:: max(1, len(frames) // 6)], frames[-1]])
+        palette = Image.fromarray(some).quantize(colors, Image.Quantize.MAXCOVERAGE)
+        pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
+    with atomic_write(path) as beside:
+        pictures[0].save(
+            beside,
+            format="GIF",
+            save_all=True,
+            append_images=pictures[1:],
+            duration=round(1000 / fps),
+            loop=0,
+            optimize=False,
+        )

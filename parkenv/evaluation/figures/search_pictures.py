@@ -1,0 +1,256 @@
+"""Pictures of single searches, as T Fig. 4.7 to 4.12."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import Normal, Stroke
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.evaluation.experiments.episodes import SearchTrace
+from parkenv.evaluation.figures.lot_picture import BELIEF_MAP, draw_discs, draw_lot, points_per_m
+from parkenv.evaluation.figures.picture_files import INK, STYLE, TIME_COLORS, save_picture
+from parkenv.world.lot import PARK
+from parkenv.world.scenario import KMH
+
+FloatArray = NDArray[np.float64]
+
+PATH, WALK = "#ffd000", "#1852ba"
+POLICY_SCALE = 2.2
+"""Points a metre from which arrows at every vertex can be told apart."""
+
+
+def draw_search(trace: SearchTrace, ax: Axes) -> None:
+    """Draw one search as in T Fig. 4.9 to 4.12.
+
+    At each slot an inner disc shows the truth and an outer ring the forecast; then the path from 1 to 2,
+    the walk, and, where there is room, what the first plan says at each vertex (T Fig. 4.8). Make the axes
+    as large as they will be: line widths and arrows follow from the scale.
+
+    Args:
+        trace: the search.
+        ax: where to draw; its limits, aspect and title are set.
+    """
+    lot = trace.scenario.lot
+    draw_lot(lot, ax)
+    scale = points_per_m(ax)
+    draw_discs(lot, ax, trace.forecast, BELIEF_MAP(trace.occupied.astype(np.float64)))
+    if _shows_policy(trace, scale):
+        _draw_policy(trace, ax, scale)
+    _draw_path(trace, ax, scale)
+    title = _title(trace, ax.get_window_extent().width / ax.figure.dpi)
+    ax.set_title(title, loc="left", fontsize=mpl.rcParams["font.size"], linespacing=1.35)
+
+
+def _title(trace: SearchTrace, width: float) -> str:
+    """What the search was and came to, in lines that fit a width in inches at the current font size."""
+    scenario, metrics = trace.scenario, trace.metrics
+    terms = [f"{metrics[key]:.0f} {name}" for key, (name, _) in TIME_COLORS.items()]
+    if not metrics["gave_up_s"]:
+        terms.pop()
+    replans = metrics.get("replans", 0)
+    planned = f"; {replans} re-plan{'s' if replans > 1 else ''}" if replans else ""
+    told = (
+        f"{trace.agent}: failure cost {scenario.failure_s:g} s, walk {scenario.v_walk / KMH:g}, "
+        f"drive {scenario.v_drive / KMH:g} km/h",
+        f"total {metrics['total_s']:.0f} s = {' + '.join(terms)}{planned}",
+    )
+    letters = int(width * 72 / (0.6 * mpl.rcParams["font.size"]))
+    return "\n".join(line for text in told for line in textwrap.wrap(text, max(letters, 10)))
+
+
+def _draw_path(trace: SearchTrace, ax: Axes, scale: float) -> None:
+    lot, parked = trace.scenario.lot, bool(trace.metrics["parked"])
+    xy = lot.vertex_xy[trace.path]
+    if parked:
+        end = lot.slot_xy[trace.path[-1]]
+        goal = lot.goals[trace.scenario.goal]
+        xy = np.vstack([xy, end])
+        ax.plot(
+            *np.stack([end, goal], axis=1),
+            color=WALK,
+            linewidth=1.8,
+            linestyle=(0, (3, 2)),
+            zorder=3,
+            path_effects=[Stroke(linewidth=3.4, foreground="white"), Normal()],
+        )
+    width = float(np.clip(0.5 * scale, 1.2, 3.0))
+    ax.plot(
+        *xy.T,
+        color=PATH,
+        linewidth=width,
+        solid_joinstyle="round",
+        zorder=3.1,
+        path_effects=[Stroke(linewidth=width + 1.6, foreground=INK), Normal()],
+    )
+    step = np.diff(xy, axis=0)
+    length = np.hypot(step[:, 0], step[:, 1])
+    if length.any():
+        driven = np.r_[0.0, np.cumsum(length)]
+        # A mark every inch of road, but not hundreds on a long search.
+        n = int(np.clip(driven[-1] * scale / 60.0, 1, 18))
+        at = (np.arange(n) + 0.5) / n * driven[-1]
+        leg = np.clip(np.searchsorted(driven, at, side="right") - 1, 0, len(length) - 1)
+        ahead = step[leg] / length[leg, None]
+        middle = xy[leg] + (at - driven[leg])[:, None] * ahead
+        ax.add_collection(
+            PolyCollection(
+                _placed(_ARROWHEAD * (3.0 + 1.4 * width) / scale, middle, ahead),
+                facecolors=PATH,
+                edgecolors=INK,
+                linewidths=0.8,
+                zorder=3.2,
+            )
+        )
+    for number, point, color in (("1", xy[0], INK), ("2", xy[-1], WALK if parked else "#c03219")):
+        ax.plot(*point, marker="o", markersize=11, color=color, markeredgecolor="white", zorder=6)
+        ax.annotate(
+            number,
+            point,
+            color="white",
+            weight="bold",
+            fontsize=8,
+            ha="center",
+            va="center_baseline",
+            zorder=6.1,
+        )
+
+
+_ARROWHEAD = np.array([[1.0, 0.0], [-0.8, 0.9], [-0.35, 0.0], [-0.8, -0.9]])
+_ARROW = np.array(
+    [[1.0, 0.0], [0.25, 0.42], [0.25, 0.13], [-1.0, 0.13], [-1.0, -0.13], [0.25, -0.13], [0.25, -0.42]]
+)
+
+
+def _shows_policy(trace: SearchTrace, scale: float) -> bool:
+    return trace.policy is not None and scale >= POLICY_SCALE
+
+
+def _draw_policy(trace: SearchTrace, ax: Axes, scale: float) -> None:
+    lot, policy = trace.scenario.lot, trace.policy
+    assert policy is not None
+    drives = np.flatnonzero(policy < PARK)
+    target = lot.neighbors[drives, policy[drives]]
+    drives, target = drives[target >= 0], target[target >= 0]
+    ahead = lot.vertex_xy[target] - lot.vertex_xy[drives]
+    ahead /= np.maximum(np.hypot(ahead[:, 0], ahead[:, 1]), 1e-9)[:, None]
+    colors = np.where(np.isin(np.arange(lot.n_vertices), trace.path), INK, "white")
+    ax.add_collection(
+        PolyCollection(
+            _placed(0.95 * _ARROW, lot.vertex_xy[drives], ahead),
+            facecolors=list(colors[drives]),
+            edgecolors="none",
+            zorder=3.5,
+        )
+    )
+    size = min(2.1 * scale, 14.0)
+    for color, extra in ((INK, 1.6), ("white", 0.0)):
+        ax.plot(
+            *lot.vertex_xy[np.flatnonzero(policy == PARK)].T,
+            linestyle="none",
+            marker="$\\mathbf{P}$",
+            markersize=size,
+            color=color,
+            markeredgewidth=extra,
+            zorder=3.6,
+        )
+
+
+def _placed(shape: FloatArray, at: FloatArray, ahead: FloatArray) -> list[FloatArray]:
+    """A shape, (k, 2) m with its nose to +x, at each point, turned ahead."""
+    turn = np.stack([ahead, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)], axis=1)
+    return list(at[:, None] + shape @ turn)
+
+
+def save_searches(traces: Sequence[SearchTrace], path: str | Path) -> None:
+    """Draw searches side by side: agents, or settings, in the same world.
+
+    Args:
+        traces: at least one.
+        path: the PNG to write.
+
+    Raises:
+        InputError: there are no traces, or the file cannot be written.
+    """
+    if not traces:
+        raise InputError("no search to draw")
+    bounds = np.array([trace.scenario.lot.bounds() for trace in traces])
+    across, up = (bounds[:, 2:] - bounds[:, :2]).T
+    aspect = float(
+        np.max((up + 6.0 + 0.1 * np.maximum(across, up)) / (across + 6.0 + 0.04 * np.maximum(across, up)))
+    )
+    columns = 1 if len(traces) == 1 or (len(traces) == 2 and aspect < 0.6) else 2
+    lines = -(-len(traces) // columns)
+    # All in inches; line widths follow from the size of the axes, so they are placed here for good.
+    width = 9.6 if columns == 1 else 7.0
+    height = min(width * aspect, 8.0)
+    width = height / aspect
+    zoom = 1.0 if columns == 1 else 1.2
+    key, gap = 0.66 * zoom, 0.14
+    with mpl.rc_context({**STYLE, "font.size": 10.0 * zoom}):
+        title = 0.12 + 0.19 * zoom * max(_title(trace, width).count("\n") + 1 for trace in traces)
+        total = max(columns * (width + gap) + gap, 7.4 * zoom), lines * (height + title) + key
+        figure = Figure(figsize=total)
+        side = (total[0] - columns * (width + gap) + gap) / 2
+        for i, trace in enumerate(traces):
+            line, column = divmod(i, columns)
+            left = side + column * (width + gap)
+            bottom = total[1] - (line + 1) * (height + title)
+            box = left / total[0], bottom / total[1], width / total[0], height / total[1]
+            draw_search(trace, figure.add_axes(box))
+        policy = any(_shows_policy(t, points_per_m(ax)) for t, ax in zip(traces, figure.axes, strict=True))
+        _draw_key(figure, key, zoom, policy=policy)
+        save_picture(figure, path)
+
+
+def _draw_key(figure: Figure, height: float, zoom: float, *, policy: bool) -> None:
+    """What the marks mean, along the lower edge."""
+    disc: dict[str, Any] = {
+        "linestyle": "none",
+        "marker": "o",
+        "markeredgecolor": INK,
+        "markeredgewidth": 0.5,
+    }
+    disc["markersize"] = 8 * zoom
+    cased = [Stroke(linewidth=3.8, foreground=INK), Normal()]
+    handles = [
+        Line2D([], [], color=BELIEF_MAP(0.0), label="truth: free", **disc),
+        Line2D([], [], color=BELIEF_MAP(1.0), label="taken", **disc),
+        Line2D([], [], color=PATH, linewidth=2.2, path_effects=cased, label="driven, 1 to 2"),
+        Line2D([], [], color=WALK, linewidth=1.8, linestyle=(0, (3, 2)), label="walk to the goal"),
+    ]
+    if policy:
+        plan = "$\\mathbf{P}\\rightarrow$"
+        handles.append(
+            Line2D([], [], linestyle="none", marker=plan, markersize=16 * zoom, color=INK, label="first plan")
+        )
+    width, total = figure.get_size_inches()
+    middle = 0.4 * height
+    bar = figure.add_axes(
+        ((width / 2 - 3.5 * zoom) / width, middle / total, 1.3 * zoom / width, 0.11 * zoom / total)
+    )
+    bar.imshow(np.linspace(0, 1, 256)[None], aspect="auto", cmap=BELIEF_MAP, extent=(0, 1, 0, 1))
+    bar.set_yticks([])
+    bar.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
+    bar.tick_params(length=2, labelsize=8 * zoom, pad=1)
+    bar.set_title("ring: forecast P(taken)", fontsize=8.5 * zoom, pad=3, loc="center")
+    figure.legend(
+        handles=handles,
+        loc="center left",
+        bbox_to_anchor=((width / 2 - 2.0 * zoom) / width, (middle + 0.05 * zoom) / total),
+        ncols=len(handles),
+        fontsize=8.5 * zoom,
+        handletextpad=0.6,
+        handlelength=1.8,
+        columnspacing=1.1,
+    )

@@ -1,0 +1,97 @@
+"""Pictures of what simulated sensors deliver."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from parkenv.envs.drawing import write_text
+from parkenv.evaluation.figures.lot_picture import draw_lot
+from parkenv.evaluation.figures.picture_files import STYLE, save_picture
+from parkenv.perception.sweeps import disparity
+from parkenv.world.lot import ParkingLot
+from sim_sensors.ground_truth import VehicleBoxes, View
+from sim_sensors.rig import Capture, SensorRig
+
+Image = NDArray[np.uint8]
+FloatArray = NDArray[np.float64]
+
+NEAREST, FARTHEST = 2.0, 30.0
+"""Depths, m, between which the colour scale runs."""
+BOX_COLORS = {View.SIDE: (255, 208, 0), View.END: (86, 180, 233), View.OBLIQUE: (230, 159, 0)}
+SEEN = 0.05
+"""Visible fraction from which a vehicle's box is drawn."""
+
+
+def with_boxes(image: Image, boxes: VehicleBoxes) -> Image:
+    """A copy of an image, (h, w, 3) RGB, with the boxes of the vehicles that are seen, farthest first."""
+    drawn = image.copy()
+    for i in np.flatnonzero(boxes.visible_fraction >= SEEN)[::-1]:
+        left, top, right, bottom = boxes.visible_box[i].tolist()
+        view = View(boxes.view[i])
+        cv2.rectangle(drawn, (left, top), (right - 1, bottom - 1), BOX_COLORS[view], 2, cv2.LINE_AA)
+        label = f"{view.name.lower()} {boxes.distance[i]:.0f} m {boxes.visible_fraction[i]:.0%}"
+        end = write_text(drawn, label, (left + 4, top + 15), BOX_COLORS[view], 13, 600)
+        cv2.rectangle(drawn, (left, top), (end + 4, top + 20), BOX_COLORS[view], cv2.FILLED)
+        write_text(drawn, label, (left + 4, top + 15), (16, 16, 16), 13, 600)
+    return drawn
+
+
+def draw_scan(ax: Axes, lot: ParkingLot, capture: Capture, rig: SensorRig) -> None:
+    """The lot from above, the vehicle, and where every beam ended."""
+    draw_lot(lot, ax)
+    x, y, yaw = capture.pose
+    for name, laser, mount in rig.lasers:
+        at_x, at_y, at_yaw = mount.in_world(capture.pose)
+        ranges = capture.scans[name]
+        hit = np.isfinite(ranges)
+        angle = laser.angles[hit] + at_yaw
+        ends = np.stack([at_x + ranges[hit] * np.cos(angle), at_y + ranges[hit] * np.sin(angle)], axis=1)
+        ax.scatter(ends[:, 0], ends[:, 1], s=2.0, color="#d0103a", linewidths=0, zorder=4)
+    ax.quiver(x, y, np.cos(yaw), np.sin(yaw), color="#ffd000", scale=18, width=0.012, zorder=5)
+    # What is out of the laser's reach tells nothing here.
+    ax.set(xlim=(x - 24.0, x + 24.0), ylim=(y - 18.0, y + 18.0))
+
+
+def save_sensor_preview(
+    lot: ParkingLot, rig: SensorRig, capture: Capture, boxes: VehicleBoxes, title: str, path: Path
+) -> None:
+    """The camera's frame with boxes, its depth, the stereo pair's disparity and the scan from above.
+
+    Args:
+        lot: the lot.
+        rig: with at least a camera, a stereo camera and a laser.
+        capture: by that rig.
+        boxes: of the first camera's frame.
+        title: a line above.
+        path: the PNG to write.
+    """
+    frame = capture.images[rig.cameras[0][0]]
+    name, stereo, _ = rig.stereo_cameras[0]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(10.6, 8.4))
+        figure.suptitle(title, x=0.02, ha="left", weight="bold")
+        places = ((0.02, 0.5), (0.02, 0.02), (0.5, 0.02), (0.5, 0.5))
+        axes = [figure.add_axes((x, y, 0.46, 0.43)) for x, y in places]
+        axes[0].imshow(with_boxes(frame.image, boxes))
+        axes[0].set_title("camera; true boxes, view, distance, visible share")
+        shown = axes[1].imshow(frame.depth, cmap="viridis_r", norm=LogNorm(NEAREST, FARTHEST))
+        axes[1].set_title("depth of the first opaque surface, m")
+        metres = figure.colorbar(shown, ax=axes[1], fraction=0.034, pad=0.01)
+        metres.set_ticks([2, 5, 10, 20, 30], labels=["2", "5", "10", "20", "30"], minor=False)
+        metres.ax.minorticks_off()
+        shown = axes[2].imshow(disparity(capture.pairs[name], stereo), cmap="magma")
+        axes[2].set_title("disparity by semi-global matching, px")
+        figure.colorbar(shown, ax=axes[2], fraction=0.034, pad=0.01)
+        for ax in axes[:3]:
+            ax.set_axis_off()
+        draw_scan(axes[3], lot, capture, rig)
+        axes[3].set_title("270° scan at knee height")
+        save_picture(figure, path)

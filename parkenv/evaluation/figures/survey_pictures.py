@@ -1,0 +1,212 @@
+"""Pictures of a survey: what was detected, what a session made of the lot, what the map says (T Fig. 4.4-4.7)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from parkenv.evaluation.figures.lot_picture import BELIEF_MAP, draw_discs, draw_lot
+from parkenv.evaluation.figures.picture_files import STYLE, save_picture
+from parkenv.mapping.discovery import DiscoveryScore, FoundSlots
+from parkenv.mapping.inference import Prediction
+from parkenv.mapping.survey import SessionResult
+from parkenv.perception.detector import Detections
+from parkenv.world.lot import ParkingLot
+
+FloatArray = NDArray[np.float64]
+
+SIDE_COLOR, END_COLOR, NOWHERE_COLOR = (255, 208, 0), (86, 180, 233), (200, 200, 200)
+TAKEN, FREE, UNKNOWN = "#d1495b", "#2a9d8f", "#9aa0a6"
+WRONG = "#ffd000"
+WEATHER_COLORS = {
+    "sunny": "#e69f00",
+    "overcast": "#7f7f7f",
+    "low_sun": "#d55e00",
+    "dusk": "#332288",
+    "rain": "#0072b2",
+}
+
+
+def draw_detections(
+    image: NDArray[np.uint8], found: Detections, placed: NDArray[np.int64] | None = None
+) -> NDArray[np.uint8]:
+    """A copy of an image, (h, w, 3) RGB, with what was detected in it.
+
+    Args:
+        image: the image.
+        found: in it.
+        placed: rows of those that stand somewhere; others are drawn thin and grey. All of them where None.
+    """
+    drawn = image.copy()
+    for i, (box, p, end) in enumerate(zip(found.boxes, found.probability, found.ends, strict=True)):
+        left, top, right, bottom = (round(float(v)) for v in box)
+        if placed is not None and i not in placed:
+            cv2.rectangle(drawn, (left, top), (right, bottom), NOWHERE_COLOR, 1, cv2.LINE_AA)
+            continue
+        color = END_COLOR if end else SIDE_COLOR
+        cv2.rectangle(drawn, (left, top), (right, bottom), color, 2, cv2.LINE_AA)
+        cv2.putText(drawn, f"{p:.2f}", (left + 4, max(top, 0) + 16), color, cv2.FontFace("sans"), 14, 700)
+    return drawn
+
+
+def save_detections(result: SessionResult, path: Path) -> None:
+    """Some frames of a session with their detections (T Fig. 4.4).
+
+    Yellow are sides, blue fronts and rears, thin and grey what no beam met or what is seen too little of.
+    """
+    with mpl.rc_context(STYLE):
+        n = len(result.looks)
+        figure = Figure(figsize=(4.2 * n, 3.5))
+        figure.suptitle(
+            f"Detections, {result.session.weather.replace('_', ' ')}", x=0.01, ha="left", weight="bold"
+        )
+        for i, (_, look) in enumerate(result.looks):
+            ax = figure.add_subplot(1, n, i + 1)
+            view = look.views[0]
+            ax.imshow(draw_detections(view.image, view.detections, view.cars.detection))
+            ax.set_axis_off()
+        figure.subplots_adjust(0.01, 0.01, 0.99, 0.9, wspace=0.02)
+        save_picture(figure, path)
+
+
+def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
+    """One session from above (T Fig. 4.5): the grid, the cars that were found, and the slots."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(11.0, _height(lot, 11.0, 3)))
+        axes = figure.subplots(3, 1)
+        for ax in axes:
+            draw_lot(lot, ax)
+        grid = result.grid
+        rows, columns = grid.log_odds.shape
+        low_x, low_y = grid.low
+        extent = (low_x, low_x + columns * grid.cell, low_y, low_y + rows * grid.cell)
+        shown = np.ma.masked_where(~grid.seen, grid.probability)
+        axes[0].imshow(
+            shown, origin="lower", extent=extent, cmap="cividis", vmin=0, vmax=1, alpha=0.85, zorder=3
+        )
+        axes[0].set_title("occupancy grid: P(a car stands here)")
+        cars = result.session.cars
+        axes[1].quiver(
+            cars[:, 0], cars[:, 1], np.cos(cars[:, 2]), np.sin(cars[:, 2]), pivot="mid", headwidth=1, headlength=0,
+            headaxislength=0, scale=60, width=0.0016, color="#ffb000", zorder=3,
+        )  # fmt: skip
+        axes[1].set_title(f"{len(cars)} sightings of cars, each with the direction fitted to its beams")
+        _draw_states(lot, result, axes[2])
+        figure.tight_layout()
+        save_picture(figure, path)
+
+
+def save_graph(lot: ParkingLot, predicted: Prediction, result: SessionResult, path: Path) -> None:
+    """The lot's graph with what the map predicts of each slot and what one session saw of it (T Fig. 4.7)."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(11.0, _height(lot, 11.0, 1) + 0.5), layout="constrained")
+        ax = figure.subplots()
+        draw_lot(lot, ax, show_graph=True)
+        states = result.states
+        seen = BELIEF_MAP(states.occupied.astype(np.float64))
+        seen[~states.in_view] = (*to_rgb(UNKNOWN), 1.0)
+        draw_discs(lot, ax, predicted.p_occupied, seen)
+        ax.set_title(
+            f"{lot.name}: the graph; outside what the map predicts, inside what one session saw "
+            f"({result.session.weather.replace('_', ' ')})"
+        )
+        scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(0, 1), BELIEF_MAP)
+        figure.colorbar(scale, ax=ax, fraction=0.02, label="P(taken)")
+        save_picture(figure, path)
+
+
+def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, path: Path) -> None:
+    """Slots that the cars of all sessions have shown, over the true ones that nobody told."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(11.0, _height(lot, 11.0, 1)), layout="constrained")
+        ax = figure.subplots()
+        draw_lot(lot, ax)
+        ahead = np.stack([np.cos(found.yaw), np.sin(found.yaw)], axis=1)
+        ends = found.xy[:, None] + 2.0 * np.array([-1.0, 1.0])[None, :, None] * ahead[:, None]
+        ax.add_collection(LineCollection(list(ends), colors=WRONG, linewidths=1.6, zorder=3))
+        ax.plot(*found.xy.T, linestyle="none", marker="o", markersize=3.0, color=WRONG, zorder=3.1)
+        off = f", {score.error:.2f} m off in the mean" if score.recall else ""
+        ax.set_title(
+            f"{lot.name}: {len(found.xy)} slots found without a map; {score.precision:.0%} of them are true, "
+            f"{score.recall:.0%} of {lot.n_slots} found{off}"
+        )
+        save_picture(figure, path)
+
+
+def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
+    """In which weather and from which distance cars are missed: rows of `surveys.detection_by_distance`."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(7.0, 3.8), layout="constrained")
+        ax = figure.subplots()
+        for i, weather in enumerate(dict.fromkeys(row["weather"] for row in rows)):
+            its = [row for row in rows if row["weather"] == weather]
+            color = WEATHER_COLORS.get(weather, UNKNOWN)
+            # Side by side, or the bars of the intervals hide each other.
+            x = np.array([np.mean(row["distance_m"]) for row in its]) + 0.09 * (i - 2)
+            rate = np.array([row["rate"] for row in its])
+            low, high = np.array([row["rate_ci95"] for row in its]).T
+            ax.plot(
+                x, rate, color=color, marker="o", markersize=4, linewidth=1.6, label=weather.replace("_", " ")
+            )
+            ax.vlines(x, low, high, color=color, linewidth=1.2, alpha=0.7)
+        ax.set(
+            xlabel="distance from the camera to the car's middle, m",
+            ylabel="detected in a frame in which it stands clear",
+            ylim=(0.0, 1.03),
+        )
+        ax.grid(axis="y")
+        ax.legend(loc="lower left", ncols=2)
+        ax.set_title(title)
+        save_picture(figure, path)
+
+
+def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, title: str, path: Path) -> None:
+    """What the map predicts of every slot (T Fig. 4.6), beside the truth where it is known."""
+    with mpl.rc_context(STYLE):
+        panels = [("predicted", predicted.p_occupied)] + (
+            [("true probability", true)] if true is not None else []
+        )
+        panels.append(("how sure: width of the interval", predicted.high - predicted.low))
+        figure = Figure(figsize=(11.0, _height(lot, 11.0, len(panels))))
+        axes = np.atleast_1d(figure.subplots(len(panels), 1))
+        for ax, (name, values) in zip(axes, panels, strict=True):
+            # cividis is read alike by those who do not tell red from green.
+            draw_lot(lot, ax, slot_color=mpl.colormaps["cividis"](values))
+            ax.set_title(f"{title}: {name}")
+            bar = figure.colorbar(
+                mpl.cm.ScalarMappable(mpl.colors.Normalize(0, 1), "cividis"), ax=ax, fraction=0.02
+            )
+            bar.ax.set_ylim(0, 1)
+        figure.tight_layout()
+        save_picture(figure, path)
+
+
+def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:
+    """Slots by what the filter says, with a bright edge where it is wrong."""
+    states, wrong = result.states, (result.states.occupied != result.truth) & result.states.in_view
+    color = np.array([to_rgb(TAKEN if o else FREE) for o in states.occupied])
+    color[~states.in_view] = to_rgb(UNKNOWN)
+    draw_lot(lot, ax, slot_color=color)
+    for corners in lot.slot_corners()[wrong]:
+        ax.fill(*corners.T, fill=False, edgecolor=WRONG, linewidth=2.0, zorder=4)
+    names = {"taken": TAKEN, "free": FREE, "never in view": UNKNOWN}
+    handles = [Patch(color=c, label=name) for name, c in names.items()]
+    handles.append(Patch(fill=False, edgecolor=WRONG, linewidth=2.0, label=f"wrong ({wrong.sum()})"))
+    ax.legend(handles=handles, loc="lower right", ncols=4, fontsize=8)
+    ax.set_title(f"slots: {result.slot_accuracy:.1%} right")
+
+
+def _height(lot: ParkingLot, width: float, panels: int) -> float:
+    x0, y0, x1, y1 = lot.bounds()
+    return panels * (width * (y1 - y0 + 8.0) / (x1 - x0 + 8.0) * 0.92 + 0.45)

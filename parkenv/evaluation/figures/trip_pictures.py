@@ -1,0 +1,165 @@
+"""A film of a whole trip, seen from above: near the car, with the lot in a corner."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.driving.vehicle import SPEED
+from parkenv.envs.drawing import SUBPIXEL_BITS, Image, fill_disc, fixed_point, mixed_color, write_text
+from parkenv.envs.drive_rendering import draw_car, draw_movers
+from parkenv.envs.rendering import (
+    ASPHALT,
+    CAR,
+    GAVE_UP,
+    HEIGHT,
+    HUD,
+    HUD_MARGIN,
+    INK,
+    WHITE,
+    WIDTH,
+    SearchRenderer,
+    View,
+    _Ground,
+    _lay_out,
+    clock,
+)
+from parkenv.envs.search_state import SearchState
+from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
+from parkenv.evaluation.trips.lot_driver import LotDriver
+from parkenv.world.scenario import Scenario
+
+FloatArray = NDArray[np.float64]
+
+SPEEDUP = 5
+"""How much faster than in life a film runs."""
+FPS = 10
+LAST_S = 2.0
+"""s that the last picture stays."""
+COLORS = 96
+"""Colours of a film: enough for flat pictures, and small files."""
+
+_SLOT_PX = 26.0  # a slot's width in the picture near the car
+_INSET = 0.34
+_STEP_S = 0.1
+
+
+class TripRenderer(SearchRenderer):
+    """Draws a search with the car where it really is.
+
+    Args:
+        scenario: where it takes place.
+        driver: who drives.
+        near: whether to show what is near the car, or the whole lot as `SearchRenderer` does.
+    """
+
+    def __init__(self, scenario: Scenario, driver: LotDriver, *, near: bool) -> None:
+        super().__init__(scenario)
+        self._driver, self._near = driver, near
+        self.trail: list[FloatArray] = []
+        if near:
+            self._whole = None
+
+    def rows(self) -> tuple[int, int]:
+        """First and last row, px, that the lot takes of a picture of all of it."""
+        assert self._whole is not None
+        west, south, east, north = self.scenario.lot.bounds()
+        corners = self._whole(np.array([[west, south], [east, north], [west, north], [east, south]]))
+        low, high = corners[:, 1].min() - 10.0, corners[:, 1].max() + 10.0
+        return max(0, int(low)), min(HEIGHT - HUD, int(high))
+
+    def _middle(self) -> FloatArray:
+        return self._driver.vehicle.at_middle(self._driver.state[:3])
+
+    def _ground_for(self, state: SearchState) -> _Ground:
+        if not self._near:
+            return super()._ground_for(state)
+        scale = _SLOT_PX / self._slot_width
+        stride = np.array(self._size) / scale / 3
+        column, row = np.round(self._middle()[:2] / stride).astype(int)
+        if self._ground is None or self._window_at != (column, row):
+            self._window_at = column, row
+            center = np.array([column, row]) * stride
+            self._ground = _lay_out(self.scenario, View.around(center, self._size, scale))
+        return self._ground
+
+    def _draw_trail(self, image: Image, view: View, state: SearchState) -> None:
+        del state  # where the car has been is not part of it
+        if len(self.trail) > 1:
+            points = fixed_point(view(np.array(self.trail)))
+            thickness = 2 if self._near else 3
+            cv2.polylines(
+                image, [points], False, mixed_color(ASPHALT, CAR, 0.7), thickness, cv2.LINE_AA, SUBPIXEL_BITS
+            )
+
+    def _draw_car(self, image: Image, view: View, state: SearchState) -> None:
+        del state
+        others = self._driver.others
+        if others is not None:
+            draw_movers(image, view, others.poses, [outline for _, outline in others.outlines])
+        if self._near:
+            draw_car(image, view, self._driver.vehicle, self._driver.state, CAR)
+            return
+        at = view(self._middle()[:2])
+        fill_disc(image, at, 11.0, INK)
+        fill_disc(image, at, 8.5, CAR)
+
+    def _draw_hud(self, image: Image, state: SearchState) -> None:
+        if not self._near:
+            return
+        driver = self._driver
+        x, baseline = HUD_MARGIN, HEIGHT - HUD // 2 + 5
+        for part in (
+            clock(driver.time),
+            f"{driver.time - state.arrival.time:.0f} s",
+            f"{3.6 * abs(float(driver.state[SPEED])):.0f} km/h",
+        ):
+            write_text(image, part, (x, baseline), WHITE, 15, 500)
+            x += 124 if ":" in part else 76
+        text = f"parked in {driver.log.tries[-1].slot}" if state.parked else driver.doing
+        left_again = ":" in text
+        write_text(image, text, (x, baseline), GAVE_UP if left_again else CAR, 15, 600)
+
+
+def film_trip(search: DrivenSearch, seed: int) -> tuple[Trip, list[Image]]:
+    """Drive a trip, and take pictures of it, (480, 640, 3) uint8 each, `FPS` a second of film."""
+    driver, env = search.driver, search.env
+    near = TripRenderer(search.scenario, driver, near=True)
+    far = TripRenderer(search.scenario, driver, near=False)
+    everything = np.arange(search.scenario.lot.n_slots)
+    frames: list[Image] = []
+    every = round(SPEEDUP / FPS / _STEP_S)
+    steps = 0
+    low, high = far.rows()
+
+    def take() -> None:
+        state = env.state
+        occupied = state.world.occupied(everything, driver.time)
+        if state.parked:
+            occupied[state.vertex] = False  # nobody else stands where the car does
+        frames.append(_inset(near.frame(state, occupied), far.frame(state, occupied), low, high))
+
+    def watch() -> None:
+        nonlocal steps
+        spot = driver.vehicle.at_middle(driver.state[:3])[:2]
+        for renderer in (near, far):
+            if not renderer.trail or np.hypot(*(spot - renderer.trail[-1])) > 0.3:
+                renderer.trail.append(spot)
+        if steps % every == 0:
+            take()
+        steps += 1
+
+    trip = search.run(seed, watch)
+    take()
+    return trip, frames + frames[-1:] * round(LAST_S * FPS)
+
+
+def _inset(near: Image, far: Image, low: int, high: int) -> Image:
+    """A picture with the whole lot, rows `low` to `high` of another, small in its corner."""
+    width, height = round(_INSET * WIDTH), round(_INSET * (high - low))
+    small = cv2.resize(far[low:high], (width, height), interpolation=cv2.INTER_AREA)
+    image = near.copy()
+    image[: height + 3, : width + 3] = INK
+    image[:height, :width] = small
+    return image

@@ -1,0 +1,1 @@
+"""Reinforcement learning: training environments, algorithms, behaviour cloning."""

@@ -1,0 +1,1 @@
+"""Whole trips with a driven car: executing a plan, calibration, sensor logs."""

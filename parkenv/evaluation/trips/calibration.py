@@ -1,0 +1,335 @@
+"""What driving takes, measured over many trips: the speed on the lanes, the manoeuvre, and a try that fails.
+
+The drive graph charges an edge's length at `v_drive`, nothing for the manoeuvre into a slot, and `failure_s` for a try
+at a taken one. Here these come from trips that were driven.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Self
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy import stats
+
+from parkenv.driving.parking_task import KINDS
+from parkenv.errors import InputError
+from parkenv.evaluation.experiments.compare import unseen
+from parkenv.evaluation.experiments.results import require_same_settings, write_settings
+from parkenv.evaluation.experiments.statistics import mean_interval
+from parkenv.evaluation.experiments.workers import HERE, Workers
+from parkenv.evaluation.figures.picture_files import INK, STYLE, save_picture
+from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
+from parkenv.evaluation.trips.driver import EDGE_KINDS, Leg, Try
+from parkenv.evaluation.trips.lot_driver import DrivingStyle
+from parkenv.files.atomic_write import atomic_write
+from parkenv.files.versioned_json import JsonFormat
+from parkenv.world.scenario import KMH, Scenario
+
+FloatArray = NDArray[np.float64]
+Row = dict[str, Any]
+
+SEEN, UNSEEN = "seen", "unseen"
+BLOCK = 5
+"""Trips a task."""
+_FORMAT = JsonFormat("parkenv-calibration", 1, "a calibration of `parkenv calibrate`")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What was measured in a scenario, and may take the place of what is assumed of it.
+
+    Args:
+        scenario: its name.
+        v_drive: m/s, m of the drive graph over the time on the lanes.
+        failure_s: s that a try at a taken slot takes, less the way that the car then need not drive any more.
+        manoeuvre_s: s from the decision to park until the car stands in the slot. The drive graph charges nothing for
+            it: whoever parks has this to add to the total time.
+        trips: how many it comes from.
+        speed_limit: m/s, that was kept to on the lanes.
+
+    Raises:
+        InputError: a value out of its range, by name.
+    """
+
+    scenario: str
+    v_drive: float
+    failure_s: float
+    manoeuvre_s: float
+    trips: int
+    speed_limit: float
+
+    def __post_init__(self) -> None:
+        for name in ("v_drive", "failure_s", "manoeuvre_s", "trips", "speed_limit"):
+            value = getattr(self, name)
+            number = isinstance(value, int | float) and not isinstance(value, bool)
+            least = "at least 0" if name in ("failure_s", "manoeuvre_s") else "above 0"
+            if not (number and math.isfinite(value) and (value >= 0.0 if "at" in least else value > 0.0)):
+                raise InputError(f"calibration {name} is {value!r}, want a finite number {least}")
+
+    def applied(self, scenario: Scenario) -> Scenario:
+        """A scenario with the measured speed and failure cost, under its own name."""
+        return scenario.replace(v_drive=self.v_drive, failure_s=self.failure_s)
+
+    def to_file(self, path: Path) -> None:
+        """Write it as JSON, whole or not at all."""
+        _FORMAT.write(path, dataclasses.asdict(self))
+
+    @classmethod
+    def from_file(cls, path: Path) -> Self:
+        """Read what `to_file` wrote.
+
+        Raises:
+            InputError: the file cannot be read, or is no calibration.
+        """
+        content = _FORMAT.read(path)
+        names = [f.name for f in dataclasses.fields(cls)]
+        if missing := [name for name in names if name not in content]:
+            raise InputError(f"{path}: has no {', '.join(missing)}")
+        return cls(**{name: content[name] for name in names})
+
+
+@dataclass(frozen=True, eq=False)
+class TripPlan:
+    """Which trips to drive.
+
+    Args:
+        scenario: the scenario.
+        agent: who decides.
+        style: how is driven.
+        rig: whose sensors see the slots, by name; None where the scenario's sighting model stands for them.
+    """
+
+    scenario: Scenario
+    agent: str
+    style: DrivingStyle
+    rig: str | None = None
+
+    def run(self, sight: str, seeds: Sequence[int]) -> list[Row]:
+        """Drive some trips: a row each, as `trip_row` has it."""
+        scenario, rig = (self.scenario, self.rig) if sight == SEEN else (unseen(self.scenario), None)
+        search = DrivenSearch(scenario, self.agent, style=self.style, rig=rig)
+        return [trip_row(search.run(seed), sight) for seed in seeds]
+
+
+def trip_row(trip: Trip, sight: str) -> Row:
+    """A trip as JSON holds it."""
+    row = dataclasses.asdict(trip)
+    return {
+        "sight": sight,
+        **row,
+        "legs": [list(leg) for leg in trip.legs],
+        "tries": [list(t) for t in trip.tries],
+    }
+
+
+class TripFolder:
+    """The file of trips, which gains a line for every trip that is finished.
+
+    Args:
+        path: the folder; it exists.
+        settings: what changes the outcome of a trip.
+        resume: go on with what is there.
+
+    Attributes:
+        rows: finished trips by sight and seed.
+
+    Raises:
+        InputError: the folder holds trips and `resume` is not set, or they are of other settings.
+    """
+
+    def __init__(self, path: Path, settings: Row, *, resume: bool = False) -> None:
+        self._file = path / "trips.jsonl"
+        self.rows: dict[tuple[str, int], Row] = {}
+        if self._file.exists():
+            if not resume:
+                raise InputError(
+                    f"--out {path}: holds trips; add --resume to go on with them, or name another folder"
+                )
+            require_same_settings(path, settings, "trips")
+            whole, _, _ = self._file.read_text(encoding="utf-8").rpartition("\n")
+            for line in whole.splitlines():
+                row = json.loads(line)
+                self.rows[row["sight"], row["seed"]] = row
+        write_settings(path, settings)
+        self.put_in_order()
+
+    def add(self, rows: Sequence[Row]) -> None:
+        """Append finished trips."""
+        with self._file.open("a", encoding="utf-8") as file:
+            file.writelines(json.dumps(row) + "\n" for row in rows)
+        self.rows |= {(row["sight"], row["seed"]): row for row in rows}
+
+    def put_in_order(self) -> None:
+        """Write the file anew, by sight and seed."""
+        with atomic_write(self._file) as beside:
+            beside.write_text(
+                "".join(json.dumps(row) + "\n" for _, row in sorted(self.rows.items())), encoding="utf-8"
+            )
+
+
+def drive_trips(
+    plan: TripPlan,
+    seeds: Sequence[int],
+    folder: TripFolder,
+    workers: Workers = HERE,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> list[Row]:
+    """Drive what the folder does not hold yet, each seed with and without sight of the slots; all rows in order.
+
+    Who sees the slots hardly ever tries a taken one; that is what the trips without sight are for.
+    """
+    tasks = [
+        partial(plan.run, sight, block)
+        for sight in (SEEN, UNSEEN)
+        for block in _blocks([s for s in seeds if (sight, s) not in folder.rows])
+    ]
+    wanted = [(sight, seed) for sight in (SEEN, UNSEEN) for seed in seeds]
+    on_progress(sum(key in folder.rows for key in wanted))
+    for _, rows in workers.results(tasks):
+        folder.add(rows)
+        on_progress(len(rows))
+    folder.put_in_order()
+    return [folder.rows[key] for key in wanted]
+
+
+def _blocks(seeds: Sequence[int]) -> Iterator[Sequence[int]]:
+    for i in range(0, len(seeds), BLOCK):
+        yield seeds[i : i + BLOCK]
+
+
+def samples(rows: Sequence[Row], speed: float) -> dict[str, FloatArray]:
+    """What the distributions are of.
+
+    Args:
+        rows: of trips.
+        speed: m/s on the lanes, by which the way that a failed try leads on is turned into time.
+
+    Returns:
+        `speed_kmh`: of each trip with sight on the lanes; `manoeuvre_s`, and of each kind of slot, of trips with sight;
+        `failed_s`, and of each kind of slot, of every failed try: the time until the car is back on the lane;
+        `lost_s`: likewise, less the way on; `s_per_m`, of each kind of edge that was driven.
+    """
+    seen = [row for row in rows if row["sight"] == SEEN]
+    tries = [Try(*t) for row in rows for t in row["tries"]]
+    failed = [t for t in tries if t.reason]
+    done = [Try(*t) for row in seen for t in row["tries"] if not t[4]]
+    legs = [Leg(*leg) for row in seen for leg in row["legs"]]
+    lists: dict[str, list[float]] = {
+        "speed_kmh": [
+            r["graph_m"] / r["lanes_s"] / KMH for r in seen if r["lanes_s"] > 0.0 and not r["failed_s"]
+        ],
+        "manoeuvre_s": [t.seconds for t in done],
+        **{f"manoeuvre_s.{kind}": [t.seconds for t in done if t.kind == kind] for kind in KINDS},
+        "failed_s": [t.seconds for t in failed],
+        "lost_s": [t.seconds - t.onward_m / speed for t in failed],
+        **{f"failed_s.{kind}": [t.seconds for t in failed if t.kind == kind] for kind in KINDS},
+        **{
+            f"s_per_m.{kind}": [leg.seconds / leg.graph_m for leg in legs if leg.kind == kind]
+            for kind in EDGE_KINDS
+        },
+    }
+    return {name: np.array(values) for name, values in lists.items() if values}
+
+
+def summary_of(values: FloatArray) -> Row:
+    """Median, mean with its 95 % interval, and p95 of a sample."""
+    mean, low, high = mean_interval(values)
+    return {
+        "n": len(values),
+        "median": float(np.median(values)),
+        "mean": mean,
+        "mean_ci95": [low, high],
+        "p95": float(np.quantile(values, 0.95)),
+    }
+
+
+def calibrate(rows: Sequence[Row], scenario: Scenario, speed_limit: float) -> tuple[Calibration, list[Row]]:
+    """The calibration that trips give, and a row for each distribution.
+
+    The speed is that of all trips with sight together, so that the drive times of the graph are right on average.
+
+    Raises:
+        InputError: no trip has parked, or no try has failed.
+    """
+    seen = [row for row in rows if row["sight"] == SEEN]
+    metres = np.array([row["graph_m"] for row in seen])
+    seconds = np.array([row["lanes_s"] for row in seen])
+    known = samples(rows, speed_limit)
+    for name, what in (("manoeuvre_s", "trip has parked"), ("lost_s", "try has failed")):
+        if name not in known:
+            raise InputError(f"of {len(rows)} trips in {scenario.name!r} no {what}: drive more of them")
+    speed = float(metres.sum() / seconds.sum())
+    table = [{"what": name, **summary_of(values)} for name, values in known.items()]
+    ratio = [speed / KMH, speed / KMH]
+    if len(seen) > 1 and np.ptp(metres / seconds) > 0.0:
+        interval = stats.bootstrap(
+            (metres, seconds),
+            lambda m, s, axis: m.sum(axis=axis) / s.sum(axis=axis) / KMH,
+            paired=True,
+            n_resamples=9999,
+            vectorized=True,
+            method="percentile",
+            rng=np.random.default_rng(0),
+        ).confidence_interval
+        ratio = [float(interval.low), float(interval.high)]
+    table.insert(0, {"what": "v_drive_kmh", "n": len(seen), "mean": speed / KMH, "mean_ci95": ratio})
+    made = Calibration(
+        scenario=scenario.name,
+        v_drive=speed,
+        failure_s=float(known["lost_s"].mean()),
+        manoeuvre_s=float(known["manoeuvre_s"].mean()),
+        trips=len(seen),
+        speed_limit=speed_limit,
+    )
+    return made, table
+
+
+def save_distributions(rows: Sequence[Row], speed_limit: float, title: str, path: Path) -> None:
+    """Draw what was measured: speed, manoeuvre and failed tries by slot kind, edges by their kind."""
+    known = samples(rows, speed_limit)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(10.0, 6.4), layout="constrained")
+        figure.suptitle(title, x=0.02, ha="left", weight="bold")
+        axes = figure.subplots(2, 2).ravel()
+        panels = (
+            ("speed on the lanes, a trip (km/h)", ["speed_kmh"], [""]),
+            ("manoeuvre into the slot (s)", [f"manoeuvre_s.{k}" for k in KINDS], list(KINDS)),
+            ("failed try, until back on the lane (s)", [f"failed_s.{k}" for k in KINDS], list(KINDS)),
+        )
+        colors = ("#0072b2", "#d55e00", "#009e73")
+        for ax, (heading, names, labels) in zip(axes, panels, strict=False):
+            shown = [
+                (known[n], label, c) for n, label, c in zip(names, labels, colors, strict=False) if n in known
+            ]
+            ax.set_title(heading)
+            if not shown:
+                continue
+            everything = np.concatenate([values for values, _, _ in shown])
+            low, high = float(everything.min()), float(everything.max())
+            bins = np.linspace(low - 0.02 * (high - low) - 0.05, high + 0.02 * (high - low) + 0.05, 31)
+            for values, label, color in shown:
+                ax.hist(values, bins=bins.tolist(), color=color, alpha=0.55, label=label or None)
+                ax.axvline(float(values.mean()), color=color, lw=1.4)
+                ax.text(
+                    float(values.mean()), 1.0, f" {values.mean():.1f}", color=INK, fontsize=8,
+                    transform=ax.get_xaxis_transform(), va="top",
+                )  # fmt: skip
+            ax.set_ylabel("trips" if names == ["speed_kmh"] else "tries")
+            if labels != [""]:
+                ax.legend()
+        ax = axes[3]
+        kinds = [k for k in EDGE_KINDS if f"s_per_m.{k}" in known]
+        ax.boxplot([known[f"s_per_m.{k}"] for k in kinds], tick_labels=kinds, whis=(5, 95), showfliers=False)
+        ax.axhline(1.0 / speed_limit, color="#d55e00", lw=1.0, ls="--")
+        ax.set_title("edges (s per m of the graph; dashed: speed limit)")
+        save_picture(figure, path)

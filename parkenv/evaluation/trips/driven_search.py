@@ -1,0 +1,293 @@
+"""The whole trip: an agent decides on the drive graph, and a car drives it, from the entry into the slot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from parkenv.driving.vehicle import VehicleParameters
+from parkenv.envs.lookout import Station
+from parkenv.envs.perception import Watcher
+from parkenv.envs.search import SearchEnv
+from parkenv.envs.search_step import (
+    DRIVEN_M,
+    FAILED_PARKS,
+    STEP_DRIVE,
+    STEP_FAILED,
+    STEP_WALK,
+    STEPS,
+    TIME,
+    drive_or_park,
+    learn,
+    look,
+    renew,
+    settle,
+    touched,
+)
+from parkenv.errors import InputError
+from parkenv.evaluation.trips.driver import Driver, Leg, Try
+from parkenv.evaluation.trips.lot_driver import DrivingStyle, LotDriver
+from parkenv.world.lot import PARK
+from parkenv.world.scenario import Scenario
+from planners.agent import Agent, make_agent
+from planners.bounds.oracle import OracleAgent
+from sim_sensors.rig import SensorRig
+
+Observation = dict[str, Any]
+
+MOST_STEPS = 2000
+"""Decisions, after which a trip is given up, as in `parkenv/Search-v0`."""
+
+
+class DrivenSearchEnv(SearchEnv):
+    """`parkenv/Search-v0` in which time passes as it does on the road.
+
+    World, observations and decisions are those of `parkenv/Search-v0`. What an edge, a try and the parking take is
+    asked of a driver; a try fails as well where the car does not get into a free slot, which it then holds for taken.
+    The time of the manoeuvre into the slot counts as driven.
+
+    Args:
+        scenario: the scenario.
+        driver: who drives; with a `GraphDriver` this is `parkenv/Search-v0` itself.
+        watcher: sensors that ride along, whose scenario this is: then the belief is what they make of what they measure
+            where the car really was, as in `parkenv/SearchPerception-v0`. Without, slots are seen from the vertices,
+            as the scenario's sighting model has it.
+    """
+
+    def __init__(self, scenario: Scenario, driver: Driver, watcher: Watcher | None = None) -> None:
+        super().__init__(scenario)
+        self.driver, self.watcher = driver, watcher
+        self._refused: set[int] = set()
+        self.manoeuvre: Try | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start a search, and the car at the entry."""
+        if self.watcher is not None:
+            self.watcher.forget()
+        result = super().reset(seed=seed, options=options)
+        state = self.state
+        self._refused.clear()
+        self.manoeuvre = None
+        self.driver.begin(state.key, state.world, state.vertex, state.time)
+        return result
+
+    def _advance(self, action: int) -> None:
+        """Have the action driven, and let as much time pass as that took."""
+        state, search = self._state, self.search
+        numbers = search.numbers[0]
+        vertex, before = state.vertex, state.time
+        possible = self.scenario.action_masks[vertex, action] == 1
+        if possible and action == PARK:
+            self._park(vertex, before)
+        elif possible:
+            seconds = self.driver.drive(vertex, action)
+            drive_or_park(search, 0, action)
+            numbers[STEP_DRIVE], numbers[TIME] = seconds, before + seconds
+        else:
+            self.driver.wait(self.scenario.wait_s)
+            drive_or_park(search, 0, action)
+        if not state.parked:
+            self._see(on_the_way=possible and action != PARK)
+            for slot in self._refused:
+                # It looks free, and is of no use to this car.
+                learn(search, 0, touched(search, 0, slot), True, 1.0)
+        settle(search, 0)
+        renew(search, 0)
+        self._clock[:] = state.time, state.time - state.arrival.time
+
+    def _see(self, *, on_the_way: bool) -> None:
+        """Tell the belief what the slots look like from where the car is, and from where it has been on its way."""
+        watcher = self.watcher
+        if watcher is None:
+            look(self.search, 0)
+            return
+        # After a try, or a wait, the car looks around once more; what it saw from amid the manoeuvre is of no use.
+        track = self.driver.track if on_the_way else self.driver.track[-1:]
+        stations: list[Station] = []
+        if track:
+            chosen = watcher.lookout.chosen(np.array([spot.driven_m for spot in track]))
+            spots = [track[i] for i in chosen.tolist()]
+            stations = [Station(s.time, s.pose, self.driver.movers_at(s)) for s in spots]
+        watcher.tell(self.search, watcher.lookout.measure(self._state, stations))
+
+    def _park(self, slot: int, before: float) -> None:
+        search, state = self.search, self._state
+        numbers, counts = search.numbers[0], search.counts[0]
+        taken = bool(state.world.occupied(np.array([slot]), before)[0])
+        outcome = self.driver.park(slot, taken)
+        if taken or not outcome.reason:
+            drive_or_park(search, 0, PARK)
+        else:
+            self._refused.add(slot)
+            counts[FAILED_PARKS] += 1
+            counts[STEPS] += 1
+            numbers[STEP_WALK] = 0.0
+        if not outcome.reason:
+            self.manoeuvre = outcome
+        lost = outcome.seconds if outcome.reason else 0.0
+        numbers[STEP_DRIVE], numbers[STEP_FAILED] = outcome.seconds - lost, lost
+        numbers[TIME] = before + outcome.seconds
+
+
+@dataclass(frozen=True)
+class Trip:
+    """One trip, driven from the entry to the goal.
+
+    Attributes:
+        seed: of the world.
+        agent: who decided.
+        total_s: all of it, the sum of the next five.
+        lanes_s: along the lanes, waiting included.
+        manoeuvre_s: from the decision to park until the car stood in the slot.
+        failed_s: of tries that failed.
+        walk_s: to the goal.
+        gave_up_s: of going elsewhere.
+        parked: whether the car was parked.
+        slot: where, by name.
+        slot_kind: how that slot lies to its lane.
+        graph_m: m of the graph's edges.
+        driven_m: m that the car drove, in either direction.
+        contacts: how often it touched something.
+        strays: how often it was off its way.
+        rescues: how often it was stuck and put back on the lane.
+        waited_s: s of braking and standing for others who were in the way.
+        legs: the edges, in order.
+        tries: the tries to park, in order.
+    """
+
+    seed: int
+    agent: str
+    total_s: float
+    lanes_s: float
+    manoeuvre_s: float
+    failed_s: float
+    walk_s: float
+    gave_up_s: float
+    parked: bool
+    slot: str
+    slot_kind: str
+    graph_m: float
+    driven_m: float
+    contacts: int
+    strays: int
+    rescues: int
+    waited_s: float
+    legs: tuple[Leg, ...]
+    tries: tuple[Try, ...]
+
+    @property
+    def failed(self) -> list[Try]:
+        """The tries that failed."""
+        return [t for t in self.tries if t.reason]
+
+
+class DrivenSearch:
+    """Drives trips in one scenario.
+
+    Args:
+        scenario: the scenario, whose traffic moves through the lot.
+        agent: who decides: a name that `make_agent` knows.
+        vehicle: the car.
+        style: how it is driven.
+        rig: sensors that ride along and tell the car which slots are taken: laser, stereo, both_sides, or a
+            `sim_sensors.rig.SensorRig`; None where the scenario's sighting model stands for them.
+        weather: as of `parkenv/SearchPerception-v0`.
+        captures: how many there are at most on an edge.
+
+    Raises:
+        InputError: an unknown agent, rig or weather; a speed that the car does not have; or a lot in which the car fits
+            nowhere.
+
+    Example:
+        >>> import math
+        >>> trip = DrivenSearch(Scenario.named("mini")).run(seed=1)
+        >>> parts = trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.gave_up_s
+        >>> trip.parked, math.isclose(trip.total_s, parts)
+        (True, True)
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        agent: str = "mdp",
+        vehicle: VehicleParameters | None = None,
+        style: DrivingStyle | None = None,
+        rig: str | SensorRig | None = None,
+        weather: str | None = None,
+        captures: int = 2,
+    ) -> None:
+        watcher = None if rig is None else Watcher(scenario, rig, weather, captures)
+        self.scenario = scenario if watcher is None else watcher.scenario
+        self.agent = agent
+        self._agent: Agent = make_agent(agent, self.scenario)
+        self.driver = LotDriver(self.scenario, vehicle, style)
+        self.env = DrivenSearchEnv(self.scenario, self.driver, watcher)
+
+    def run(
+        self,
+        seed: int,
+        watch: Callable[[], None] | None = None,
+        on_step: Callable[[Observation], None] = lambda _: None,
+    ) -> Trip:
+        """The trip in the world of a seed.
+
+        Args:
+            seed: 0 or more.
+            watch: called after every 0.1 s of driving; `driver` and `env` say where things stand.
+            on_step: called with what the agent observes at first, and after every decision that was carried out.
+
+        Raises:
+            InputError: a seed that is no whole number of 0 or more.
+        """
+        if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
+            raise InputError(f"seed is {seed!r}, want a whole number of at least 0")
+        env, driver, scenario = self.env, self.driver, self.scenario
+        driver.watch = watch or (lambda: None)
+        observation, _ = env.reset(seed=int(seed))
+        if isinstance(self._agent, OracleAgent):
+            self._agent.reveal(env.state.world, env.state.time)
+        memory: Any = None
+        info: dict[str, Any] = {}
+        over = False
+        on_step(observation)
+        for _ in range(MOST_STEPS):
+            action, memory = self._agent.predict(observation, memory)
+            observation, _, over, _, info = env.step(action)
+            on_step(observation)
+            if over:
+                break
+        gave_up_s = float(info["gave_up_s"]) + (0.0 if over else scenario.give_up_s)
+        parked = env.manoeuvre
+        manoeuvre_s = parked.seconds if parked else 0.0
+        lanes_s, failed_s, walk_s = (
+            float(info["drive_s"]) - manoeuvre_s,
+            float(info["failed_s"]),
+            float(info["walk_s"]),
+        )
+        log = driver.log
+        return Trip(
+            seed=int(seed),
+            agent=self.agent,
+            total_s=lanes_s + manoeuvre_s + failed_s + walk_s + gave_up_s,
+            lanes_s=lanes_s,
+            manoeuvre_s=manoeuvre_s,
+            failed_s=failed_s,
+            walk_s=walk_s,
+            gave_up_s=gave_up_s,
+            parked=bool(info["parked"]),
+            slot=parked.slot if parked else "",
+            slot_kind=parked.kind if parked else "",
+            graph_m=float(env.search.numbers[0, DRIVEN_M]),
+            driven_m=log.driven_m,
+            contacts=len(log.contacts),
+            strays=log.strays,
+            rescues=log.rescues,
+            waited_s=log.waited_s,
+            legs=tuple(log.legs),
+            tries=tuple(log.tries),
+        )

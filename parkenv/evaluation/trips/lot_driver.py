@@ -1,0 +1,620 @@
+"""A car that is driven through a lot: along the lanes, into slots, and out of those that turn out taken."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from parkenv.driving.driven_lines import DrivenEdge, DrivenLine, DrivenLines
+from parkenv.driving.encounters import SLOWEST, WATCHED_S
+from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
+from parkenv.driving.lot_surroundings import REACH_M, LotSurroundings
+from parkenv.driving.parking_task import KINDS, ParkingTasks
+from parkenv.driving.polite_traffic import PoliteTraffic
+from parkenv.driving.road_users import RoadUsers
+from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
+from parkenv.envs.drive import ANGLE_TOLERANCE, CONTROL_S, POSITION_TOLERANCE, SUBSTEPS
+from parkenv.errors import InputError
+from parkenv.evaluation.trips.driver import ACROSS, ALONG, NO_ROOM, NO_WAY, ROUND, TAKEN, TURN, Leg, Spot, Try
+from parkenv.world.occupancy import World
+from parkenv.world.scenario import Scenario
+from planners.driving.hybrid_astar import CarPath, SearchSettings, plan_path
+from planners.driving.lane_keeping import LaneKeeper, joined, rounded
+from planners.driving.parking import STRAYED_M, STRAYED_RAD
+from planners.driving.path_tracking import PathTracker, TrackingSettings
+
+if TYPE_CHECKING:
+    from sim_sensors.movers import Movers
+
+FloatArray = NDArray[np.float64]
+
+RESCUE_S = 60.0
+"""s that pass until a car that is stuck is back on the lane."""
+PATIENCE_S = 3.0
+"""s for which the car stands before somebody who waits, too, until those give way."""
+TURN_IN_M = 9.0
+"""m, from the rear axle to the middle of a junction where the driver decides where to go on."""
+
+_LEAD_M = 1.5
+_LANE = SearchSettings(change_m=8.0, attempts=((0.25, 0.5), (0.15, 0.5), (0.08, 0.5), (0.03, 0.25)))
+_WIDE = (0.6, 0.3, 0.06)  # by how much wider than need be turns are driven, where there is room
+_ONTO = (4.0, 6.5, 9.0, 12.0)  # m after a junction, where a turn into the lane may end
+_BACK = (0.0, 3.0, 6.0, 9.0)  # m after a slot, or after where the car turns round
+_CHANGE_S = 3.0  # s, about what a change of direction takes
+_PACE = 1.5  # m/s, about how fast one drives between them
+_NEAR_M, _ALIGNED = 0.4, math.radians(10.0)
+_AROUND = math.radians(150.0)
+_STRAYED_M = 1.0
+_MOST_PLANS = 6
+_LOOK_STEP = 0.2
+_LEAST_NOTICE = 0.8
+_WAITS_M = 7.0
+_BEND_M = 8.0
+_LONGEST_S = 240.0
+_SOON_S = 0.8  # brake hard for who is in the way by then
+_NOBODY: NDArray[np.float64] = np.empty(0)
+
+
+@dataclass(frozen=True)
+class DrivingStyle:
+    """How the car is driven.
+
+    Args:
+        speed: m/s, on the lanes at most; None for the scenario's `v_drive`.
+        acceleration: m/s², of getting faster, and of getting slower before turns.
+        braking: m/s², of stopping to park.
+        notice_m: m on along its path, where the car notices at the latest that a slot is taken which it drives into.
+
+    Raises:
+        InputError: a value that is not a finite number above 0, or a car that would notice too late to stop.
+
+    Example:
+        >>> DrivingStyle(notice_m=0.1)
+        Traceback (most recent call last):
+        ...
+        parkenv.errors.InputError: driving notice_m is 0.1 m, want at least 0.8, or the car could not stop in time
+    """
+
+    speed: float | None = None
+    acceleration: float = 1.2
+    braking: float = 2.0
+    notice_m: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "acceleration", "braking", "notice_m"):
+            value = getattr(self, name)
+            if name == "speed" and value is None:
+                continue
+            if not (isinstance(value, int | float) and math.isfinite(value) and value > 0.0):
+                raise InputError(f"driving {name} is {value!r}, want a finite number above 0")
+        if self.notice_m < _LEAST_NOTICE:
+            raise InputError(
+                f"driving notice_m is {self.notice_m:g} m, want at least {_LEAST_NOTICE:g}, or the car could not stop "
+                "in time"
+            )
+
+
+@dataclass
+class DriveLog:
+    """What was driven.
+
+    Attributes:
+        legs: the edges.
+        tries: the tries to park.
+        driven_m: m, in either direction.
+        contacts: what was touched, by name, once each time.
+        strays: how often the car was off its way and sought another.
+        rescues: how often there was none, and it was put back on the lane.
+        waited_s: s of braking and standing for others who were in the way.
+    """
+
+    legs: list[Leg] = field(default_factory=list)
+    tries: list[Try] = field(default_factory=list)
+    driven_m: float = 0.0
+    contacts: list[str] = field(default_factory=list)
+    strays: int = 0
+    rescues: int = 0
+    waited_s: float = 0.0
+
+
+class LotDriver:
+    """Drives a car for real: a kinematic bicycle among bodies of pymunk, by lane keeping and planned manoeuvres.
+
+    Ways along lanes are straights and arcs; where a lane is left for another the way between is planned among kerbs,
+    walls and slots as if all were filled, so it can be driven at any time. Parking, turning round and leaving a slot
+    are planned among the cars that really stand there. Who comes during a manoeuvre waits until the car is
+    out of the way.
+
+    The scenario's traffic moves about meanwhile. The car brakes for who is, or will be, in its way; they wait for it
+    likewise; and where both have stood for `PATIENCE_S`, the others give way, see `RoadUsers`.
+
+    Args:
+        scenario: whose lot, cars and traffic they are.
+        vehicle: the car.
+        style: how it is driven.
+
+    Attributes:
+        log: what was driven since `begin`.
+        state: (6,) of the vehicle, see `parkenv.driving.vehicle`.
+        time: now, s.
+        doing: what the car is about, in a word or two.
+        track: where it has been since the last decision, every 0.1 s.
+        others: everybody else who moves; None where nobody does.
+        watch: called after every step of the control, 0.1 s, for pictures.
+    """
+
+    def __init__(
+        self, scenario: Scenario, vehicle: VehicleParameters | None = None, style: DrivingStyle | None = None
+    ) -> None:
+        self.scenario = scenario
+        self.vehicle = vehicle or VehicleParameters()
+        self.style = style or DrivingStyle()
+        speed = scenario.v_drive if self.style.speed is None else self.style.speed
+        if speed > self.vehicle.max_speed:
+            raise InputError(
+                f"the speed on lanes is {speed:g} m/s, want at most {self.vehicle.max_speed:g}, the car's own"
+            )
+        lot = scenario.lot
+        self._lines = DrivenLines(lot)
+        self._around = LotSurroundings(scenario)
+        self._kinds = ParkingTasks(lot).slot_kinds
+        self._on_lane = TrackingSettings(
+            speed=speed, acceleration=self.style.acceleration, blend_m=2.0, firmness=0.5
+        )
+        self._turns: dict[tuple[int, int, int, int], CarPath | None] = {}
+        self.watch: Callable[[], None] = lambda: None
+        self.log = DriveLog()
+        self.track: list[Spot] = []
+        self.others: RoadUsers | None = None
+        self.doing = ""
+        self.state = np.zeros(STATE_SIZE)
+        self.time = 0.0
+
+    def begin(self, key: np.uint64, world: World, vertex: int, time: float) -> None:
+        """Start at a vertex at a time, s, in the world of a key; at full speed, as who comes from a street."""
+        self._around.begin(key, world)
+        self.log = DriveLog()
+        self.track = []
+        self.state = np.zeros(STATE_SIZE)
+        self.time = time
+        self._keeper: PathTracker | None = None
+        self._line: int | None = None
+        self._placed = False
+        self._touches = False
+        self._knew: set[int] | None = None
+        self._stood_s = 0.0
+        self.others = None
+        traffic = self.scenario.traffic
+        if traffic.cars or traffic.pedestrians:
+            rounds = PoliteTraffic(self.scenario.lot, traffic, key, self._around.slots)
+            self.others = RoadUsers(rounds, self.vehicle)
+        self._enter(self._standing(self.scenario.lot.vertex_xy[vertex]))
+
+    def drive(self, source: int, column: int) -> float:
+        """Drive along an edge of the graph until the car has come to its end; s."""
+        lot = self.scenario.lot
+        target, length = int(lot.neighbors[source, column]), float(lot.edge_length[source, column])
+        edge = self._lines.edge(source, target, length)
+        began, self.track = self.time, []
+        if not self._placed:
+            self._place(edge)
+        self.doing = "searching"
+        kind = ACROSS
+        if not edge.across:
+            kind = self._take(edge)
+            self._refresh()
+            while not self._arrived(edge, target) and self.time - began < _LONGEST_S:
+                if not self._keep_lane():
+                    break
+        leg = Leg(kind, length, self.time - began)
+        self.log.legs.append(leg)
+        return leg.seconds
+
+    def park(self, slot: int, taken: bool) -> Try:
+        """Stop, plan a manoeuvre into a slot and drive it; where it is taken or too narrow, drive back on the lane.
+
+        Args:
+            slot: its index.
+            taken: whether a car stands in it. The car finds out when it is about to drive into it.
+        """
+        lot, vehicle, began = self.scenario.lot, self.vehicle, self.time
+        self.track = []
+        self.doing = f"parking in {lot.slot_ids[slot]}"
+        self._halt(self.style.braking)
+        center = 0.5 * (lot.slot_xy[slot] + self.state[:2])
+        there = self._standing(center, slot)
+        inside = self._around.footprint(slot, self.time) if taken else None
+        self._enter(there if inside is None else _with(there, inside))
+        kind = self._kinds[slot]
+        pose = np.array([*lot.slot_xy[slot], lot.slot_yaw[slot]])
+        targets = {"nose-in": pose, "back-in": pose + np.array([0.0, 0.0, math.pi])}
+        if kind == KINDS[2]:
+            targets = {"": pose}
+        way, reason, onward = "", NO_ROOM, 0.0
+        if lot.slot_length[slot] >= vehicle.length and lot.slot_width[slot] >= vehicle.width:
+            way, reason = self._drive_in(targets, there, inside)
+        if reason:
+            self.doing = f"{lot.slot_ids[slot]}: {reason}"
+            onward = self._back(slot)
+        result = Try(lot.slot_ids[slot], kind, way, self.time - began, reason, onward)
+        self.log.tries.append(result)
+        return result
+
+    def wait(self, seconds: float) -> float:
+        """Brake, and stay for some time; s."""
+        until, self.track = self.time + seconds, []
+        self._refresh()
+        while self.time < until - 1e-9:
+            self._brake(self.style.braking)
+        return seconds
+
+    def movers_at(self, spot: Spot) -> Movers | None:
+        """Who else was where when the car was at a spot of its `track`."""
+        return None if self.others is None else self.others.movers(spot.clocks)
+
+    # --- Lanes
+
+    def _place(self, edge: DrivenEdge) -> None:
+        """Put the car where the first edge begins."""
+        line = self._lines.lines[edge.line]
+        self.state[:3] = line.pose(edge.start - self.vehicle.middle)
+        self.state[SPEED] = self._on_lane.speed
+        self._placed = True
+        self._make_room()
+
+    def _take(self, edge: DrivenEdge) -> str:
+        """Lay the way along an edge from where the car is; the edge's kind."""
+        if self._line == edge.line and self._keeper is not None and not self._keeper.done:
+            return ALONG
+        line = self._lines.lines[edge.line]
+        here = self._lines.lines[self._line] if self._line is not None else None
+        before, self._line = self._line, edge.line
+        if self._is_on(line):
+            self._follow_line(line)
+            return ALONG
+        if here is not None and self._is_on(here):
+            joint = line.pose(edge.start)
+            at = here.station_of(joint[:2])
+            if _away(here.pose(at), joint) < _NEAR_M / 2 and _askew(here.pose(at), joint) < _ALIGNED:
+                now = here.station_of(self.state[:2])
+                first = here.between(now, at) if at > now + 0.1 else self.state[None, :2]
+                points = np.concatenate([first, line.between(max(edge.start, 0.1), line.length)])
+                self._keeper = LaneKeeper(self.vehicle, rounded(points, _BEND_M), self._on_lane)
+                return ALONG
+            if _askew(here.pose(at), joint) < _AROUND:
+                turn = self._turn(before or 0, edge, at)
+                if turn is not None:
+                    self._keeper = LaneKeeper(self.vehicle, turn, self._on_lane)
+                    return TURN
+        return self._turn_onto(line)
+
+    def _follow_line(self, line: DrivenLine) -> None:
+        now = line.station_of(self.state[:2])
+        points = line.between(now, max(line.length, now + 1.0))
+        self._keeper = LaneKeeper(self.vehicle, rounded(points, _BEND_M), self._on_lane)
+
+    def _turn(self, before: int, edge: DrivenEdge, at: float) -> CarPath | None:
+        """From the line that the car is on to another that crosses it at station `at`; None where there is no way."""
+        here, line = self._lines.lines[before], self._lines.lines[edge.line]
+        # The line of the junction's middle, not of the other lane's side.
+        now = here.station_of(self.state[:2])
+        leave = at - TURN_IN_M + _LEAD_M
+        if now > leave:
+            leave = math.ceil(2.0 * (now + 0.2)) / 2.0
+        key = before, edge.line, round(10 * leave), round(10 * edge.start)
+        if key not in self._turns:
+            there = self._around.at_worst(here.pose(at)[:2])
+            path = self._planned_onto(here.pose(leave), line, edge.start, _ONTO, there, _WIDE)
+            if path is not None:
+                ends = line.station_of(path.sampled()[0][-1, :2])
+                if line.length - ends > 0.5:
+                    path = joined(path, rounded(line.between(ends, line.length), _BEND_M))
+            self._turns[key] = path
+        path = self._turns[key]
+        if path is None:
+            return None
+        return joined(rounded(here.between(now, leave), _BEND_M), path)
+
+    def _turn_onto(self, line: DrivenLine) -> str:
+        """Get onto a line from wherever the car is, and along it from there; the edge's kind."""
+        self._halt(self.style.braking)
+        askew = 0.0
+        for _ in range(_MOST_PLANS):
+            now = line.station_of(self.vehicle.at_middle(self.state[:3])[:2])
+            askew = max(askew, _askew(line.pose(now), self.state[:3]))
+            there = self._standing(self.state[:2])
+            self._enter(there)
+            onward = _ONTO if askew < _AROUND else _BACK
+            path = self._planned_onto(self.state[:3], line, now, onward, there, _WIDE[-1:])
+            if path is None:
+                break
+            tracker = PathTracker(self.vehicle, path)
+            self._follow(tracker)
+            if tracker.done:
+                break
+            self.log.strays += 1
+        if not self._is_on(line):
+            self._rescue(line)
+        self._follow_line(line)
+        return TURN if askew < _AROUND else ROUND
+
+    def _planned_onto(
+        self,
+        start: FloatArray,
+        line: DrivenLine,
+        at: float,
+        onward: Sequence[float],
+        there: Obstacles,
+        reserves: Sequence[float],
+    ) -> CarPath | None:
+        """The best way from a pose onto a line, as wide a turn as there is room for without going backward."""
+        best: tuple[float, CarPath] | None = None
+        for reserve in reserves:
+            settings = SearchSettings(
+                change_m=_LANE.change_m,
+                reserve=reserve,
+                attempts=_LANE.attempts,
+                most_expansions=4000 if reserve > _WIDE[-1] else _LANE.most_expansions,
+            )
+            for ahead in onward:
+                station = min(at + ahead, line.length - 0.3)
+                path = plan_path(
+                    self.vehicle, there.corners, there.n_corners, start, line.pose(station), settings
+                )
+                if path is None:
+                    continue
+                cost = _seconds_of(path) - ahead / _PACE
+                if best is None or cost < best[0]:
+                    best = cost, path
+                if path.length.min() > 0.0:
+                    break
+            if best is not None and best[1].length.min() > 0.0:
+                break
+        return None if best is None else best[1]
+
+    def _keep_lane(self) -> bool:
+        """A step along the way; whether there is more of it."""
+        assert self._keeper is not None
+        pose, speed, steering = self.state[:3], float(self.state[SPEED]), float(self.state[STEERING])
+        command = self._keeper.command(pose, speed, steering)
+        if self._keeper.done:
+            return False
+        if abs(self._keeper.offset) > _STRAYED_M:
+            self.log.strays += 1
+            assert self._line is not None
+            self._turn_onto(self._lines.lines[self._line])
+            return True
+        if not self._lets_go_first(self._keeper):
+            self._step(*command)
+        return True
+
+    def _arrived(self, edge: DrivenEdge, target: int) -> bool:
+        goal = self._lines.lines[edge.line].pose(edge.end)
+        slot = target < self.scenario.lot.n_slots
+        own = self.vehicle.at_middle(self.state[:3]) if slot else self.state[:3]
+        c, s = math.cos(goal[2]), math.sin(goal[2])
+        dx, dy = own[0] - goal[0], own[1] - goal[1]
+        ahead, aside = c * dx + s * dy, c * dy - s * dx
+        if _askew(goal, own) > math.radians(60.0) or abs(aside) > 3.0:
+            return False
+        return bool(ahead >= (0.0 if slot else -TURN_IN_M))
+
+    def _is_on(self, line: DrivenLine) -> bool:
+        """Whether the car drives along a line."""
+        pose = line.pose(line.station_of(self.state[:2]))
+        return _away(pose, self.state[:3]) < _NEAR_M and _askew(pose, self.state[:3]) < _ALIGNED
+
+    # --- Manoeuvres
+
+    def _drive_in(
+        self, targets: dict[str, FloatArray], there: Obstacles, inside: FloatArray | None
+    ) -> tuple[str, str]:
+        """Drive to the target that is reached soonest; which that is, and why the slot was left, if it was."""
+        ways = list(targets)
+        for _ in range(_MOST_PLANS):
+            paths = {way: path for way in ways if (path := self._planned_to(targets[way], there)) is not None}
+            if not paths:
+                return ways[0] if len(ways) == 1 else "", NO_WAY
+            way = min(paths, key=lambda w: _seconds_of(paths[w]))
+            ways = [way]
+            tracker = PathTracker(self.vehicle, paths[way])
+            notices = None if inside is None else self._noticing(tracker, inside)
+            if not self._follow(tracker, notices):
+                return way, TAKEN
+            own = self.vehicle.at_middle(self.state[:3])
+            if (
+                tracker.done
+                and _away(targets[way], own) <= POSITION_TOLERANCE
+                and _askew(targets[way], own) <= ANGLE_TOLERANCE
+            ):
+                return way, ""
+            self.log.strays += 1
+        return way, NO_WAY
+
+    def _noticing(self, tracker: PathTracker, inside: FloatArray) -> Callable[[], bool]:
+        """Whether the car would run into an outline within `notice_m` on its way."""
+        body = shapely.Polygon(inside)
+        ahead = np.arange(0.0, self.style.notice_m + _LOOK_STEP, _LOOK_STEP)
+
+        def notices() -> bool:
+            corners = self.vehicle.corners(tracker.poses_ahead(ahead))
+            return bool(shapely.intersects(shapely.polygons(corners), body).any())
+
+        return notices
+
+    def _planned_to(self, target: FloatArray, there: Obstacles) -> CarPath | None:
+        """A way to where the footprint's middle is to be."""
+        goal = self.vehicle.at_rear_axle(target)
+        return plan_path(self.vehicle, there.corners, there.n_corners, self.state[:3], goal)
+
+    def _follow(self, tracker: PathTracker, notices: Callable[[], bool] | None = None) -> bool:
+        """Follow a path to its end, or until the car has strayed and stands; False if it stopped as it noticed."""
+        while True:
+            pose, speed, steering = self.state[:3], float(self.state[SPEED]), float(self.state[STEERING])
+            command = tracker.command(pose, speed, steering)
+            if tracker.done:
+                return True
+            if notices is not None and notices():
+                self._halt(
+                    max(self.style.braking, 0.5 * speed * speed / (self.style.notice_m - 0.4)), tracker
+                )
+                return False
+            if abs(tracker.offset) > STRAYED_M or abs(tracker.askew) > STRAYED_RAD:
+                self._halt(self.style.braking, tracker)
+                return True
+            if not self._lets_go_first(tracker):
+                self._step(*command)
+
+    def _back(self, slot: int) -> float:
+        """Drive back on the lane, in the direction of the slot or of before, whichever is sooner; `onward_m`."""
+        ways = [self._lines.at(slot)]
+        if self._line is not None and self._line != ways[0][0]:
+            line = self._lines.lines[self._line]
+            ways.append((self._line, line.station_of(self.scenario.lot.vertex_xy[slot])))
+        there = self._standing(self.state[:2])
+        self._enter(there)
+        self._keeper = None
+        for _ in range(_MOST_PLANS):
+            if any(self._is_on(self._lines.lines[index]) for index, _ in ways):
+                break
+            best: tuple[float, CarPath, int] | None = None
+            for index, station in ways:
+                line = self._lines.lines[index]
+                for onward in _BACK:
+                    pose = line.pose(min(station + onward, line.length) - self.vehicle.middle)
+                    path = plan_path(self.vehicle, there.corners, there.n_corners, self.state[:3], pose)
+                    if path is not None and (best is None or _seconds_of(path) < best[0]):
+                        best = _seconds_of(path), path, index
+            if best is None:
+                self._rescue(self._lines.lines[ways[0][0]])
+                break
+            _, path, self._line = best
+            tracker = PathTracker(self.vehicle, path)
+            self._follow(tracker)
+            if tracker.done:
+                break
+            self.log.strays += 1
+        index, station = next((way for way in ways if way[0] == self._line), ways[0])
+        own = self._lines.lines[index].station_of(self.vehicle.at_middle(self.state[:3])[:2])
+        return own - station
+
+    # --- The car and what is around it
+
+    def _rescue(self, line: DrivenLine) -> None:
+        """Put a car that is stuck back on a line."""
+        self.log.rescues += 1
+        self.time += RESCUE_S
+        pose = line.pose(line.station_of(self.state[:2]))
+        self.state = np.r_[pose, np.zeros(STATE_SIZE - 3)]
+        self._make_room()
+
+    def _make_room(self) -> None:
+        """Have nobody stand where the car was put."""
+        if self.others is not None:
+            self.others.make_room(self.vehicle.corners(self.state[:3]))
+
+    def _lets_go_first(self, tracker: PathTracker) -> bool:
+        """Brake, or stand, for a step if somebody is in the way along a path; whether so."""
+        if self.others is None:
+            return False
+        speed = abs(float(self.state[SPEED]))
+        ahead = tracker.poses_ahead(WATCHED_S * max(speed, SLOWEST))
+        when = self.others.in_way(self.vehicle.at_middle(ahead))
+        if np.isinf(when).all():
+            self._stood_s = 0.0
+            return False
+        if speed == 0.0:
+            self._stood_s += CONTROL_S
+            if self._stood_s >= PATIENCE_S:
+                self.others.give_way(np.isfinite(when))
+                self._stood_s = 0.0
+        self.log.waited_s += CONTROL_S
+        self._brake(self.vehicle.max_braking if when.min() < _SOON_S else self.style.braking, tracker)
+        return True
+
+    def _halt(self, braking: float, tracker: PathTracker | None = None) -> None:
+        """Brake until the car stands."""
+        self._refresh()
+        while self.state[SPEED] != 0.0:
+            self._brake(braking, tracker)
+
+    def _brake(self, braking: float, tracker: PathTracker | None = None) -> None:
+        """Brake for a step of the control, along the path that the car is on."""
+        speed, steering = float(self.state[SPEED]), float(self.state[STEERING])
+        tracker = tracker or self._keeper
+        wheels = steering / self.vehicle.max_steering
+        if tracker is not None and speed != 0.0:
+            _, wheels = tracker.command(self.state[:3], speed, steering)
+        share = min(braking, abs(speed) / CONTROL_S) / self.vehicle.max_braking
+        self._step(-math.copysign(min(share, 1.0), speed) if speed else 0.0, wheels)
+
+    def _step(self, acceleration: float, steering: float) -> None:
+        """Drive for a step of the control."""
+        others = self.others
+        if others is not None:
+            others.onward(CONTROL_S, self.vehicle.corners(self.state[:3]))
+        for step in range(SUBSTEPS):
+            if others is not None:
+                self._space.move(others.between((step + 1) / SUBSTEPS))
+            way = advance(self.state, acceleration, steering, self.vehicle.limits)
+            self.log.driven_m += abs(way)
+            touched = self._space.touched(*self.state[:3].tolist())
+            if touched and not self._touches:
+                self.log.contacts.append(Thing(touched).words)
+            self._touches = bool(touched)
+            self.time += PHYSICS_S
+        clocks = _NOBODY if others is None else others.clocks
+        self.track.append(Spot(self.time, self.log.driven_m, self.vehicle.at_middle(self.state[:3]), clocks))
+        self.watch()
+        if np.abs(self.state[:2] - self._space_at).max() > REACH_M - 10.0:
+            self._refresh()
+
+    def _refresh(self) -> None:
+        """Bring what stands around up to date, unless that was done a moment ago and nearby."""
+        self._enter(self._standing(self.state[:2]))
+
+    def _standing(self, center: FloatArray, looks_free: int | None = None) -> Obstacles:
+        """What stands around a point, (2,) m, but for a car that is overlooked, and those that wait for this one."""
+        taken = set(self._around.taken(center, self.time))
+        if self._knew is not None:
+            new = np.array(sorted(taken - self._knew), dtype=np.int64)
+            close = np.hypot(*(self.scenario.lot.slot_xy[new] - self.state[:2]).T) < _WAITS_M
+            taken -= set(new[close].tolist())
+        self._knew = taken
+        return self._around.now(center, self.time, sorted(taken - {looks_free}))
+
+    def _enter(self, there: Obstacles) -> None:
+        """Drive among these."""
+        if self.others is None:
+            self._space = LotSpace(self.vehicle, there)
+        else:
+            self._space = LotSpace(self.vehicle, there, self.others.outlines)
+            self._space.move(self.others.poses)
+        self._space_at = self.state[:2].copy()
+
+
+def _with(there: Obstacles, outline: FloatArray) -> Obstacles:
+    """Obstacles, and a parked car."""
+    things = [(Thing(t), o) for t, o in zip(there.thing.tolist(), there.outlines(), strict=True)]
+    return Obstacles.of([*things, (Thing.PARKED_CAR, outline)])
+
+
+def _seconds_of(path: CarPath) -> float:
+    """About how long it takes to drive a path in the way of manoeuvres."""
+    changes = path.direction_changes + (len(path.length) > 0 and path.length[0] < 0.0)
+    return path.driven_m / _PACE + _CHANGE_S * changes
+
+
+def _away(a: FloatArray, b: FloatArray) -> float:
+    return math.hypot(a[0] - b[0], a[1] - b[1])
+
+
+def _askew(a: FloatArray, b: FloatArray) -> float:
+    """Angle, rad, between two headings."""
+    return abs(math.remainder(float(a[2] - b[2]), 2.0 * math.pi))

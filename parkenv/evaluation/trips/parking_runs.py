@@ -1,0 +1,209 @@
+"""Parkings driven to their end, and the table that many of them come down to."""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from scipy.stats import binomtest
+
+from parkenv.driving.vehicle import STEERING
+from parkenv.envs.drive_state import DriveState
+from parkenv.evaluation.experiments.workers import HERE, Workers
+from parkenv.files.atomic_write import atomic_write
+from parkenv.world.lot import ParkingLot
+from planners.agent import Agent
+from planners.driving.drivers import PLANNER, make_driver
+from planners.driving.parking import ParkingMemory
+
+CHUNK = 25
+"""Parkings that one worker drives at a time."""
+
+
+@dataclass(frozen=True)
+class ParkingCase:
+    """Where is parked, and how.
+
+    Args:
+        lot: the lot.
+        kinds: of slots; None: those that the lot has.
+        ways: of standing in perpendicular and oblique ones.
+        occupancy: share of the other slots that are taken.
+        slack: m that are kept clear around the slot.
+    """
+
+    lot: ParkingLot
+    kinds: tuple[str, ...] | None = None
+    ways: tuple[str, ...] = ("nose-in", "back-in")
+    occupancy: float = 0.85
+    slack: float = 0.0
+
+    def environment(self, render_mode: str | None = None) -> gym.Env[Any, Any]:
+        """`parkenv/Drive-v0` with the obstacle map."""
+        return gym.make(
+            "parkenv/Drive-v0",
+            lot=self.lot,
+            kinds=self.kinds,
+            ways=self.ways,
+            occupancy=self.occupancy,
+            slack=self.slack,
+            obstacle_map=True,
+            render_mode=render_mode,
+            disable_env_checker=True,
+        )
+
+
+@dataclass
+class Parking:
+    """One parking.
+
+    Attributes:
+        row: what came of it.
+        state: the episode at its end; its trail is what was driven.
+        frames: pictures of every `every` steps, where they were asked for.
+    """
+
+    row: dict[str, Any]
+    state: DriveState
+    frames: list[Any] = field(default_factory=list)
+
+
+def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0) -> Parking:
+    """Drive one parking to its end.
+
+    Args:
+        env: `parkenv/Drive-v0`; with `render_mode="rgb_array"` for pictures.
+        agent: the driver.
+        seed: of the task.
+        every: steps from picture to picture; 0 for none.
+
+    Returns:
+        A row with lot, seed, kind, way, slot, parked, reason (of a failure), time_s, driven_m, direction_changes,
+        wheel_rad (how far the wheels were turned in all), turned_rad (how far the heading was), position_error_m,
+        angle_error_deg; of a planner also plans, planning_s (all of them), path_m, expansions, margin_m.
+    """
+    observation, info = env.reset(seed=seed)
+    drive: Any = env.unwrapped
+    memory: Any = None
+    wheels = [float(drive.state.vehicle[STEERING])]
+    yaws = [float(drive.state.vehicle[2])]
+    frames = [env.render()] if every else []
+    over = truncated = False
+    decision_s = 0.0
+    while not over:
+        began = time.perf_counter()
+        action, memory = agent.predict(observation, memory)
+        decision_s += time.perf_counter() - began
+        observation, _, terminated, truncated, info = env.step(action)
+        wheels.append(float(drive.state.vehicle[STEERING]))
+        yaws.append(float(drive.state.vehicle[2]))
+        over = terminated or truncated
+        if every and (over or (len(wheels) - 1) % every == 0):
+            frames.append(env.render())
+    state: DriveState = drive.get_state()[1]
+    task = state.task
+    reason = info["contact"] or ("" if info["is_success"] else "out of time")
+    row = {
+        "lot": task.lot,
+        "seed": seed,
+        "kind": task.kind,
+        "way": task.way if task.kind != "parallel" else "",
+        "slot": task.slot_id,
+        "parked": bool(info["is_success"]),
+        "reason": reason,
+        **{k: info[k] for k in ("time_s", "driven_m", "direction_changes", "position_error_m")},
+        "angle_error_deg": float(np.degrees(info["angle_error_rad"])),
+        "wheel_rad": float(np.abs(np.diff(wheels)).sum()),
+        "turned_rad": float(np.abs(np.diff(yaws)).sum()),
+        "decision_ms": 1e3 * decision_s / (len(wheels) - 1),
+    }
+    if isinstance(memory, ParkingMemory):
+        first = memory.paths[0] if memory.paths else None
+        row |= {
+            "plans": len(memory.planning_s),
+            "planning_s": sum(memory.planning_s),
+            "first_planning_s": memory.planning_s[0],
+            "path_m": first.driven_m if first else np.nan,
+            "expansions": sum(p.expansions for p in memory.paths),
+            "margin_m": first.margin if first else np.nan,
+        }
+        if not row["parked"] and not info["contact"] and not memory.paths:
+            row["reason"] = "no path was found"
+    return Parking(row, state, frames)
+
+
+def park_all(
+    cases: Sequence[ParkingCase], seeds: Sequence[int], workers: Workers = HERE, driver: str = PLANNER
+) -> Iterator[list[Parking]]:
+    """Every seed in every case by one driver, some at a time and in order.
+
+    What is measured in wall time differs from run to run; nothing else does, on any number of workers.
+
+    Args:
+        cases: where is parked.
+        seeds: of the tasks.
+        workers: who runs it.
+        driver: a name for `planners.driving.drivers.make_driver`.
+    """
+    parts = [seeds[i : i + CHUNK] for i in range(0, len(seeds), CHUNK)]
+    yield from workers.in_order([partial(_park_some, case, part, driver) for case in cases for part in parts])
+
+
+def _park_some(case: ParkingCase, seeds: Sequence[int], driver: str) -> list[Parking]:
+    env, agent = case.environment(), make_driver(driver)
+    return [park_once(env, agent, seed) for seed in seeds]
+
+
+def parking_table(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each kind of slot and way of standing in it, and one for all: `kind` "all".
+
+    Returns:
+        kind, way, episodes, parked, success and its 95 % interval (Wilson), contacts; median and p95 of planning_ms
+        (the first plan), time_s and direction_changes; means of driven_m, wheel_rad, turned_rad.
+    """
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["kind"], row["way"]), []).append(row)
+    table = [_summary(kind, way, groups[kind, way]) for kind, way in sorted(groups)]
+    return [*table, _summary("all", "", rows)] if rows else []
+
+
+def write_parkings(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    """Write the rows of parkings as CSV, whole or not at all."""
+    columns = list(dict.fromkeys(name for row in rows for name in row))
+    with atomic_write(path) as beside, beside.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _summary(kind: str, way: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    parked = [row for row in rows if row["parked"]]
+    interval = binomtest(len(parked), len(rows)).proportion_ci(0.95, "wilson")
+    summary: dict[str, Any] = {
+        "kind": kind,
+        "way": way,
+        "episodes": len(rows),
+        "parked": len(parked),
+        "success": len(parked) / len(rows),
+        "success_ci95": [float(interval.low), float(interval.high)],
+        "contacts": sum(row["reason"] not in ("", "out of time", "no path was found") for row in rows),
+    }
+    columns = {
+        "planning_ms": [1e3 * row["first_planning_s"] for row in rows if "first_planning_s" in row],
+        "time_s": [row["time_s"] for row in parked],
+        "direction_changes": [row["direction_changes"] for row in parked],
+    }
+    for name, values in columns.items():
+        summary[name] = float(np.median(values)) if values else np.nan
+        summary[f"{name}_p95"] = float(np.quantile(values, 0.95)) if values else np.nan
+    for name in ("driven_m", "wheel_rad", "turned_rad", "position_error_m", "angle_error_deg"):
+        summary[name] = float(np.mean([row[name] for row in parked])) if parked else np.nan
+    return summary

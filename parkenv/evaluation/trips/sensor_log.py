@@ -1,0 +1,317 @@
+"""What sensors measured and the stack made of it, as a recording for the Rerun viewer (https://rerun.io)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from matplotlib import colormaps
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
+from parkenv.world.lot import ParkingLot
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+    from parkenv.envs.perception import SearchPerceptionEnv
+    from parkenv.evaluation.trips.driven_search import DrivenSearch, Observation, Trip
+    from parkenv.mapping.grid import OccupancyGrid
+    from parkenv.mapping.survey import Survey, SurveyMoment
+    from parkenv.perception.stack import Look
+    from planners.agent import Agent
+    from sim_sensors.rig import SensorRig
+
+FloatArray = NDArray[np.float64]
+
+TIMELINE = "drive"
+"""Seconds since the first drive began."""
+PAUSE_S = 5.0
+"""Between two drives."""
+GRID_EVERY = 10
+"""Captures between two pictures of the grid: it is large, and changes little."""
+JPEG_QUALITY = 80
+UNSEEN = 40
+SIDE, END, NOWHERE = (255, 208, 0), (86, 180, 233), (150, 150, 150)
+INK, PATH, SCAN, GOAL = (120, 126, 134), (0, 114, 178), (213, 94, 0), (204, 121, 167)
+
+
+class SensorLog:
+    """A recording on one time line: images, boxes, scans, grid, slots, path.
+
+    Entities are `lot/...` (m, z up: outlines of the slots, coloured by what is believed of each), `car` with its
+    cameras, images and boxes below it, `scan/...`, `grid`, `cars` that were found, and `path`.
+
+    Args:
+        recording: where to.
+        lot: which is drawn once.
+        rig: whose sensors measured.
+    """
+
+    def __init__(self, recording: rr.RecordingStream, lot: ParkingLot, rig: SensorRig) -> None:
+        self._rec, self._lot, self._rig = recording, lot, rig
+        self._path: list[list[float]] = []
+        self._moments = 0
+        self._begun = self._time = 0.0
+        corners = lot.slot_corners()[:, [0, 1, 2, 3, 0]]
+        self._outlines = np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=2)
+        self._draw_lot()
+        self._draw_rig()
+
+    def begin(self) -> None:
+        """Another drive begins, behind what was recorded so far."""
+        self._begun = 0.0 if not self._moments else self._time + PAUSE_S
+        self._path = []
+
+    def moment(self, time: float, look: Look) -> None:
+        """Where the car took itself to be, what its sensors measured there, and what was found.
+
+        Args:
+            time: s since the drive began.
+            look: what the stack made of it.
+        """
+        import rerun as rr
+
+        self._time = self._begun + time
+        self._rec.set_time(TIMELINE, duration=self._time)
+        x, y, yaw = (float(v) for v in look.vehicle)
+        axis = rr.RotationAxisAngle(axis=(0.0, 0.0, 1.0), radians=yaw)
+        self._rec.log("car", rr.Transform3D(translation=(x, y, 0.0), rotation=axis))
+        self._path.append([x, y, 0.05])
+        self._rec.log("path", rr.LineStrips3D([self._path], colors=[PATH], radii=0.08))
+        for view in look.views:
+            at = f"car/{view.name}"
+            self._rec.log(at, rr.EncodedImage(contents=_jpeg(view.image), media_type="image/jpeg"))
+            found = view.detections
+            standing = np.isin(np.arange(len(found)), view.cars.detection)
+            colors = np.where(standing[:, None], np.where(found.ends[:, None], END, SIDE), NOWHERE).astype(
+                np.uint8
+            )
+            labels = [f"{p:.2f}" for p in found.probability]
+            boxes = rr.Boxes2D(
+                array=found.boxes, array_format=rr.Box2DFormat.XYXY, colors=colors, labels=labels
+            )
+            self._rec.log(f"{at}/boxes", boxes)
+        for number, sweep in enumerate(look.sweeps):
+            ended = np.nonzero(np.isfinite(sweep.distance))[0]
+            points = np.column_stack([sweep.points(ended), np.full(len(ended), 0.5)])
+            self._rec.log(f"scan/{number}", rr.Points3D(points, colors=[SCAN], radii=0.04))
+        cars = [view.cars for view in look.views if len(view.cars)]
+        self._rec.log(
+            "cars",
+            rr.Boxes3D(
+                centers=np.concatenate([np.column_stack([c.xy, np.full(len(c), 0.75)]) for c in cars]),
+                sizes=np.concatenate([np.column_stack([c.size, np.full(len(c), 1.5)]) for c in cars]),
+                rotations=[
+                    rr.RotationAxisAngle(axis=(0, 0, 1), radians=a) for c in cars for a in c.yaw.tolist()
+                ],
+                colors=[SIDE],
+            )
+            if cars
+            else rr.Clear(recursive=False),
+        )
+        self._moments += 1
+
+    def slots(self, p_occupied: FloatArray, known: NDArray[np.bool_] | None = None) -> None:
+        """What is believed of every slot, (n_slots,), now; grey where nothing is `known`."""
+        import rerun as rr
+
+        colors = (255.0 * colormaps["cividis"](p_occupied)).astype(np.uint8)
+        if known is not None:
+            colors[~known] = (*INK, 255)
+        self._rec.log("lot/slots", rr.LineStrips3D(self._outlines, colors=colors, radii=0.07))
+        labels = [f"{name} {p:.0%}" for name, p in zip(self._lot.slot_ids, p_occupied, strict=True)]
+        centers = np.column_stack([self._lot.slot_xy, np.zeros(self._lot.n_slots)])
+        self._rec.log(
+            "lot/beliefs", rr.Points3D(centers, colors=colors, radii=0.35, labels=labels, show_labels=False)
+        )
+
+    def grid(self, grid: OccupancyGrid) -> None:
+        """The occupancy grid as it is now, every `GRID_EVERY` moments."""
+        if (self._moments - 1) % GRID_EVERY:
+            return
+        import rerun as rr
+
+        rows, columns = grid.log_odds.shape
+        low = np.array([*grid.low, -0.02])
+        side = grid.cell * np.array([columns, rows])
+        corners = low + np.array([[0, 0, 0], [side[0], 0, 0], [side[0], side[1], 0], [0, side[1], 0]])
+        picture = (255.0 * colormaps["cividis"](grid.probability)[..., :3]).astype(np.uint8)
+        picture[~grid.seen] = UNSEEN
+        self._rec.log(
+            "grid",
+            rr.Mesh3D(
+                vertex_positions=corners,
+                triangle_indices=[[0, 1, 2], [0, 2, 3]],
+                vertex_texcoords=[[0, 1], [1, 1], [1, 0], [0, 0]],
+                albedo_texture=picture[::-1],
+            ),
+        )
+
+    def _draw_lot(self) -> None:
+        import rerun as rr
+
+        lot = self._lot
+        self._rec.log("lot", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        xy = np.column_stack([lot.vertex_xy, np.zeros(len(lot.vertex_xy))])
+        start, direction = np.nonzero(lot.neighbors >= 0)
+        lanes = np.stack([xy[start], xy[lot.neighbors[start, direction]]], axis=1)
+        self._rec.log("lot/lanes", rr.LineStrips3D(lanes, colors=[INK], radii=0.03), static=True)
+        goals = np.column_stack([lot.goals, np.full(len(lot.goals), 0.5)])
+        marks = rr.Points3D(goals, radii=0.8, labels=["goal"] * len(goals), colors=[GOAL])
+        self._rec.log("lot/goal", marks, static=True)
+
+    def _draw_rig(self) -> None:
+        import rerun as rr
+
+        self._rec.log(
+            "car/body",
+            rr.Boxes3D(centers=[[0, 0, 0.75]], sizes=[[4.4, 1.8, 1.5]], colors=[PATH]),
+            static=True,
+        )
+        rig = self._rig
+        cameras = [
+            *rig.cameras,
+            *((name, stereo.camera, mount) for name, stereo, mount in rig.stereo_cameras),
+        ]
+        for name, camera, mount in cameras:
+            pose = mount.camera_pose(np.zeros(3))
+            self._rec.log(
+                f"car/{name}", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]),
+                rr.Pinhole(
+                    focal_length=(camera.fx, camera.fy), principal_point=(camera.cx, camera.cy),
+                    width=camera.width, height=camera.height, camera_xyz=rr.ViewCoordinates.RDF,
+                    image_plane_distance=2.0,
+                ),
+                static=True,
+            )  # fmt: skip
+
+
+def require_viewer() -> None:
+    """Say how to install the Rerun SDK where it is missing.
+
+    Raises:
+        InputError: it is.
+    """
+    if find_spec("rerun") is None:
+        raise InputError("a recording needs the Rerun SDK; install it with: pip install 'parkenv[viewer]'")
+
+
+@contextmanager
+def sensor_log(path: str | Path, lot: ParkingLot, rig: SensorRig) -> Iterator[SensorLog]:
+    """A log that becomes the file `path`, an .rrd, when the block ends.
+
+    Raises:
+        InputError: the extra `viewer` is not installed, or the file cannot be written.
+    """
+    require_viewer()
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    names = [name for name, _, _ in (*rig.cameras, *rig.stereo_cameras)]
+    low_x, low_y, high_x, high_y = lot.bounds()
+    middle, size = (0.5 * (low_x + high_x), 0.5 * (low_y + high_y)), max(high_x - low_x, high_y - low_y)
+    above = rrb.EyeControls3D(
+        position=(middle[0], middle[1] - 0.5 * size, 0.7 * size), look_target=(*middle, 0.0), eye_up=(0, 0, 1)
+    )
+    boxes = [f"- /car/{name}/boxes" for name in names]
+    layout = rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Spatial3DView(
+                name="Lot", origin="/", contents=["$origin/**", *boxes], eye_controls=above, line_grid=False
+            ),
+            rrb.Vertical(*(rrb.Spatial2DView(name=name, origin=f"/car/{name}") for name in names)),
+            column_shares=[3, 2],
+        ),
+        rrb.TimePanel(state="collapsed", timeline=TIMELINE),
+        collapse_panels=True,
+    )
+    with atomic_write(path) as beside:
+        recording = rr.RecordingStream("parkenv", recording_id=Path(path).stem, send_properties=False)
+        recording.save(beside, default_blueprint=layout)
+        try:
+            yield SensorLog(recording, lot, rig)
+        finally:
+            recording.flush()
+            recording.disconnect()
+
+
+def record_session(survey: Survey, number: int, log: SensorLog) -> None:
+    """Drive a session of a survey, as it is driven for the map, and record it.
+
+    Args:
+        survey: of which.
+        number: of the session.
+        log: where to; of the survey's lot and rig.
+    """
+    log.begin()
+    begun: list[float] = []
+
+    def keep(moment: SurveyMoment) -> None:
+        begun[:] = begun or [moment.time]
+        log.moment(moment.time - begun[0], moment.look)
+        states = moment.slots.states()
+        log.slots(states.p_occupied, states.in_view)
+        log.grid(moment.grid)
+
+    survey.drive(number, on_moment=keep)
+
+
+def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: SensorLog) -> None:
+    """Search once through the sensors, and record it.
+
+    Args:
+        env: the world.
+        agent: who searches, made for its scenario.
+        seed: of the world.
+        log: where to; of the environment's lot and rig.
+    """
+    log.begin()
+    observation, _ = env.reset(seed=seed)
+    begun, memory, over = env.state.arrival.time, None, False
+    while True:
+        for moment, look in env.looks:
+            log.moment(moment.time - begun, look)
+        log.slots(observation["p_occupied"].astype(np.float64))
+        if over:
+            return
+        action, memory = agent.predict(observation, memory)
+        observation, _, terminated, truncated, _ = env.step(int(action))
+        over = terminated or truncated
+
+
+def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
+    """Drive a trip with sensors, and record it.
+
+    Args:
+        search: with a rig.
+        seed: of the world.
+        log: where to; of the lot and the rig of `search`.
+
+    Raises:
+        InputError: a search without a rig.
+    """
+    watcher, env = search.env.watcher, search.env
+    if watcher is None:
+        raise InputError("a trip is recorded as its sensors see it, and this one has none: give it a rig")
+    log.begin()
+
+    def keep(observation: Observation) -> None:
+        for moment, look in watcher.looks:
+            log.moment(moment.time - env.state.arrival.time, look)
+        log.slots(observation["p_occupied"].astype(np.float64))
+
+    return search.run(seed, on_step=keep)
+
+
+def _jpeg(image: NDArray[np.uint8]) -> bytes:
+    _, encoded = cv2.imencode(
+        ".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    )
+    return encoded.tobytes()

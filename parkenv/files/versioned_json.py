@@ -1,0 +1,56 @@
+"""Small files of ours: JSON that says what it is, and of which version."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
+
+
+@dataclass(frozen=True)
+class JsonFormat:
+    """A kind of file.
+
+    Args:
+        name: what `"format"` says in it.
+        version: what `"version"` says in those that this version of the package writes, and reads.
+        meaning: what people call it.
+    """
+
+    name: str
+    version: int
+    meaning: str
+
+    def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
+        """The fields of a file, but for format and version.
+
+        Raises:
+            InputError: it cannot be read, is no JSON, or of another kind or version; the message names the file.
+        """
+        try:
+            content = json.loads(Path(path).read_text(encoding="utf-8"))
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror or error}, want {self.meaning}") from error
+        except ValueError as error:
+            raise InputError(f"{path}: not JSON ({error}), want {self.meaning}") from error
+        if not isinstance(content, dict) or content.pop("format", None) != self.name:
+            raise InputError(f'{path}: want {self.meaning}, a JSON object with "format": "{self.name}"')
+        if (version := content.pop("version", None)) != self.version:
+            raise InputError(f"{path}: version is {version!r}, want {self.version}")
+        return content
+
+    def write(self, path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
+        """Write a file, whole or not at all.
+
+        Raises:
+            InputError: it cannot be written.
+        """
+        content = {"format": self.name, "version": self.version, **fields}
+        with atomic_write(path) as beside:
+            beside.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

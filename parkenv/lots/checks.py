@@ -1,0 +1,174 @@
+"""Everything that is wrong, or looks wrong, with a lot file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import shapely
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from parkenv.errors import InputError
+from parkenv.lots.dragon_lake import dragon_lake_lot, is_dragon_lake
+from parkenv.lots.geojson import LotContents, LotProblem, graph_errors, read_contents
+from parkenv.lots.places.lot_import import import_lot, is_place
+from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.world.drive_graph import places
+from parkenv.world.lot import Lane, ParkingLot, corner_points, mouth_heading, mouth_points
+
+LANE_GAP = 1.0
+"""A lane that ends this near to another, m, without a common point was probably meant to join it."""
+SLOT_OVERLAP = 0.1
+"""Depth, m, from which an overlap of two slots is reported; less is drawing accuracy."""
+GOAL_REACH = 50.0
+"""Distance, m, from a goal to the nearest lane from which it is reported."""
+
+
+def check_lot(path: str | Path) -> list[LotProblem]:
+    """All that is wrong with a lot file, errors first; an empty list for a sound one. Does not raise.
+
+    Of OpenStreetMap and lists of slots it tells what is missing before a search can run there, and what an
+    import leaves out.
+
+    A file with errors cannot be read. Warnings tell what can be driven but was hardly meant so: goals
+    far from all lanes, lanes that cross or nearly touch without a common point, slots that overlap,
+    that turn their mouth away from their lane, that no entry leads to or from which no other is reached,
+    entries that lead to no slot.
+    """
+    path = Path(path)
+    if is_place(path):
+        return _place_problems(path)
+    if is_dragon_lake(path):
+        try:
+            dragon_lake_lot(ParkingLot, path)
+        except InputError as error:
+            return [LotProblem("error", None, str(error).removeprefix(f"{path}: "))]
+        return []
+    contents = read_contents(path)
+    problems = [*contents.errors, *graph_errors(contents), *_drawing_warnings(contents)]
+    if not any(problem.severity == "error" for problem in problems):
+        lot = ParkingLot(**contents.columns())
+        problems += _reach_warnings(lot, contents.numbers["slot"], contents.numbers["entry"])
+    return problems
+
+
+def _place_problems(path: Path) -> list[LotProblem]:
+    """What a map or a list of slots lacks, and what of it makes no slot."""
+    try:
+        draft = import_lot(path)
+    except InputError as error:
+        return [LotProblem("error", None, str(error).removeprefix(f"{path}: "))]
+    problems = [LotProblem("error", None, text) for text in draft.missing]
+    warnings = [LotProblem("warning", None, f"left out: {left}") for left in draft.left_out]
+    if not problems:
+        try:
+            lot = draft.lot()
+        except InputError as error:
+            problems.append(LotProblem("error", None, str(error)))
+        else:
+            warnings += _reach_warnings(lot, [None] * lot.n_slots, [None] * len(lot.entries))
+    return problems + warnings
+
+
+def _drawing_warnings(contents: LotContents) -> list[LotProblem]:
+    """What looks like a slip of the pen."""
+
+    def warn(feature: int, message: str) -> None:
+        warnings.append(LotProblem("warning", feature, message))
+
+    warnings: list[LotProblem] = []
+    if not contents.lanes:
+        return warnings
+    slots, numbers = contents.slots, contents.numbers
+    goals = np.array(contents.goals).reshape(-1, 2)
+    to_lane = nearest_on_lanes(contents.lanes, goals)[0] - goals
+    for number, distance in zip(numbers["goal"], np.hypot(to_lane[:, 0], to_lane[:, 1]), strict=True):
+        if distance > GOAL_REACH:
+            warn(number, f"goal: the nearest lane is {distance:.0f} m away; people walk at least that far")
+
+    mouth = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+    heading = mouth_heading(slots.yaw, slots.mouth)
+    to_lane = nearest_on_lanes(contents.lanes, mouth)[0] - mouth
+    away = to_lane[:, 0] * np.cos(heading) + to_lane[:, 1] * np.sin(heading) < 0.0
+    for i in np.flatnonzero(away).tolist():
+        warn(numbers["slot"][i], f"slot {contents.slot_ids[i]!r:.40}: its mouth faces away from its lane")
+
+    inner = corner_points(slots.xy, slots.yaw, slots.length - SLOT_OVERLAP, slots.width - SLOT_OVERLAP)
+    boxes = np.asarray(shapely.polygons(inner))
+    one, other = shapely.STRtree(boxes).query(boxes, predicate="intersects")
+    for i, j in zip(one[one < other], other[one < other], strict=True):
+        warn(
+            numbers["slot"][j],
+            f"slot {contents.slot_ids[j]!r:.40} overlaps slot {contents.slot_ids[i]!r:.40} "
+            f"of feature {numbers['slot'][i]}",
+        )
+    for lane, message in _loose_lanes(contents.lanes, numbers["lane"]):
+        warn(numbers["lane"][lane], f"lane {message}")
+    return warnings
+
+
+def _loose_lanes(lanes: Sequence[Lane], numbers: Sequence[int]) -> Iterator[tuple[int, str]]:
+    """Lanes that cross, or end close to one another, without a common point: cars cannot turn there."""
+    count = [len(lane.points) for lane in lanes]
+    xy = np.concatenate([lane.points for lane in lanes])
+    lane_of = np.repeat(np.arange(len(lanes)), count)
+    place = places(xy)
+    leg = np.flatnonzero(lane_of[:-1] == lane_of[1:])
+    legs = np.asarray(shapely.linestrings(np.stack([xy[leg], xy[leg + 1]], axis=1)))
+    tree = shapely.STRtree(legs)
+
+    one, other = tree.query(legs, predicate="intersects")
+    a, b = leg[one], leg[other]
+    joined = (place[a] == place[b]) | (place[a] == place[b + 1]) | (place[a + 1] == place[b])
+    apart = (a < b) & ~joined & (place[a + 1] != place[b + 1])
+    spot = shapely.point_on_surface(shapely.intersection(legs[one[apart]], legs[other[apart]]))
+    spot_xy = np.round(shapely.get_coordinates(spot), 1).tolist()
+    crossings = zip(lane_of[b[apart]].tolist(), lane_of[a[apart]].tolist(), map(tuple, spot_xy), strict=True)
+    for i, j, (x, y) in sorted(set(crossings)):
+        crossed = "itself" if i == j else f"the lane of feature {numbers[j]}"
+        yield i, f"crosses {crossed} at ({x:.1f}, {y:.1f}) m without a common point"
+
+    last = np.cumsum(count) - 1
+    ends = np.r_[last - count + 1, last]
+    ends = ends[np.bincount(place)[place[ends]] == 1]
+    points = np.asarray(shapely.points(xy[ends]))
+    end, near = tree.query(points, predicate="dwithin", distance=LANE_GAP)
+    gap = shapely.distance(points[end], legs[near])
+    loose = (lane_of[ends[end]] != lane_of[leg[near]]) & (gap > 0.0)
+    close = zip(lane_of[ends[end]], lane_of[leg[near]], ends[end], gap, strict=True)
+    seen: set[tuple[int, int]] = set()
+    for (i, j, point, distance), is_loose in zip(close, loose, strict=True):
+        if is_loose and (j, point) not in seen:
+            seen.add((j, point))
+            yield (
+                int(i),
+                (
+                    f"ends {distance:.2f} m from the lane of feature {numbers[j]} without a common point; "
+                    "cars cannot turn there"
+                ),
+            )
+
+
+def _reach_warnings(
+    lot: ParkingLot, numbers: Sequence[int | None], entry_numbers: Sequence[int | None]
+) -> Iterator[LotProblem]:
+    """Slots that no car gets to, slots from which a car gets to no other, entries that lead to none."""
+    n = lot.n_slots
+    graph = lot.drive_matrix()
+    reached = np.isfinite(dijkstra(graph, indices=lot.entry_vertices, min_only=True))
+    # The same question on the reversed graph: which vertices lead to some slot, perhaps themselves?
+    to_slot = np.isfinite(dijkstra(graph.T.tocsr(), indices=np.arange(n), min_only=True))
+    _, component = connected_components(graph, connection="strong")
+    slots_in = np.bincount(component[:n], minlength=component.max() + 1)
+    source, target = graph.nonzero()
+    leaves = (component[source] != component[target]) & to_slot[target]
+    goes_on = (slots_in > 1) | (np.bincount(component[source[leaves]], minlength=len(slots_in)) > 0)
+    for fault, message in (
+        (~reached[:n], "no way leads there from an entry"),
+        (~goes_on[component[:n]] & (n > 1), "no way leads on to another slot"),
+    ):
+        for i in np.flatnonzero(fault).tolist():
+            yield LotProblem("warning", numbers[i], f"slot {lot.slot_ids[i]!r:.40}: {message}")
+    for i in np.flatnonzero(~to_slot[lot.entry_vertices]).tolist():
+        yield LotProblem("warning", entry_numbers[i], "entry: no way leads from it to a slot")

@@ -1,0 +1,305 @@
+"""Lots made by rule: a grid of rows and aisles, a city of streets, and the rows of slots in both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from itertools import count
+from typing import Any, Self, TypeVar
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike, NDArray
+
+from parkenv.errors import InputError
+from parkenv.world.drive_graph import LANE_OFFSET, SLOT_REACH
+from parkenv.world.lot import Lane, Mouth, ParkingLot
+
+LotT = TypeVar("LotT", bound=ParkingLot)
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+BAY_SIZE = (5.0, 2.5)
+"""Length and width, m, of a perpendicular or angled slot."""
+KERB_SIZE = (6.0, 2.1)
+"""Length and width, m, of a kerbside slot."""
+TWO_WAY_HALF_WIDTH = 3.0
+"""From the centre line of a two-way street to its parked cars, m."""
+ONE_WAY_HALF_WIDTH = 2.0
+"""From the centre line of a one-way street to its parked cars, m."""
+CROSSING_CLEARANCE = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 5.0
+"""From the middle of a crossing to the first parked car, m: nobody parks within 5 m of the kerbs' corner."""
+BUILDING_SETBACK = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 2.9
+"""From the centre line of a street to the buildings, m: half the street, parked cars and a footway."""
+
+
+@dataclass(frozen=True, eq=False)
+class Slots:
+    """Geometry of n slots, one array a column of `ParkingLot`: its `slot_xy`, `slot_yaw` and so on."""
+
+    xy: FloatArray
+    yaw: FloatArray
+    length: FloatArray
+    width: FloatArray
+    mouth: NDArray[np.int8]
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def __getitem__(self, index: NDArray[np.intp] | BoolArray | slice) -> Slots:
+        return Slots(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Slots]) -> Self:
+        """All slots of several rows, in order."""
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
+
+    def columns(self) -> dict[str, Any]:
+        """The keyword arguments that `ParkingLot` takes."""
+        return {f"slot_{f.name}": getattr(self, f.name) for f in fields(self)}
+
+
+def bay_row(
+    start: ArrayLike,
+    heading: float,
+    n: int,
+    *,
+    size: tuple[float, float] = BAY_SIZE,
+    angle: float = np.pi / 2,
+) -> Slots:
+    """A row of n perpendicular or angled slots on the left of a line, entered from that line.
+
+    Args:
+        start: (2,) m, where the line of the slots' mouths starts.
+        heading: rad, direction of that line.
+        n: number of slots.
+        size: length and width of a slot, m.
+        angle: rad, between the line and the parked cars; below a right angle, cars that drive along the
+            line turn in without a swing.
+    """
+    length, width = size
+    along = np.array([np.cos(heading), np.sin(heading)])
+    left = np.array([-along[1], along[0]])
+    nose = np.cos(angle) * along + np.sin(angle) * left
+    # The near corner of an angled slot touches the line, so the middle of its mouth lies behind it.
+    mouth = (
+        np.asarray(start, dtype=np.float64)
+        + (np.arange(n)[:, None] + 0.5) * width / np.sin(angle) * along
+        + width / 2 * abs(np.cos(angle)) * left
+    )
+    return Slots(
+        xy=mouth + length / 2 * nose,
+        yaw=np.full(n, np.arctan2(nose[1], nose[0])),
+        length=np.full(n, length),
+        width=np.full(n, width),
+        mouth=np.zeros(n, dtype=np.int8),
+    )
+
+
+def kerb_rows(
+    start: FloatArray, end: FloatArray, left: BoolArray, size: tuple[float, float] = KERB_SIZE
+) -> tuple[Slots, NDArray[np.intp]]:
+    """As many kerbside slots as fit along each of m kerbs, spread evenly, and the kerb that each lies on.
+
+    Args:
+        start: (m, 2) m, where the edge between carriageway and parked cars starts.
+        end: (m, 2) m, where it ends; cars pass from start to end.
+        left: (m,) bool, whether the cars stand on the left of that edge; on the right otherwise.
+        size: length and width of a slot, m.
+    """
+    length, width = size
+    reach = np.hypot(*(end - start).T)
+    # The small allowance keeps a kerb of exactly k slots from losing one to rounding.
+    n_on = np.floor(reach / length + 1e-9).astype(np.intp)
+    kerb = np.repeat(np.arange(len(start)), n_on)
+    rank = np.arange(len(kerb)) - np.repeat(np.cumsum(n_on) - n_on, n_on)
+    along = ((end - start) / reach[:, None])[kerb]
+    outward = np.where(left, 1.0, -1.0)[kerb, None] * np.stack([-along[:, 1], along[:, 0]], axis=1)
+    pitch = (reach / np.maximum(n_on, 1))[kerb]
+    slots = Slots(
+        xy=start[kerb] + ((rank + 0.5) * pitch)[:, None] * along + width / 2 * outward,
+        yaw=np.arctan2(along[:, 1], along[:, 0]),
+        length=np.full(len(kerb), length),
+        width=np.full(len(kerb), width),
+        mouth=np.where(left, Mouth.RIGHT, Mouth.LEFT)[kerb].astype(np.int8),
+    )
+    return slots, kerb
+
+
+def grid_lot(
+    cls: type[LotT], rows: int, columns: int, *, name: str, pitch: float, depth: float, aisle: float
+) -> LotT:
+    """See `ParkingLot.grid`.
+
+    Raises:
+        InputError: a count below one, or a size that leaves no room to drive or no lane within reach.
+    """
+    _require_count("grid lot: rows", rows)
+    _require_count("grid lot: columns", columns)
+    for what, value, low, high in (
+        ("pitch", pitch, 1.0, 100.0),
+        ("depth", depth, 1.0, 100.0),
+        ("aisle", aisle, 2 * LANE_OFFSET, 2 * SLOT_REACH),
+    ):
+        if not low <= value <= high:
+            raise InputError(f"grid lot: {what} is {value} m, want {low:g} to {high:g} m")
+
+    n_aisles = (rows + 1) // 2
+    aisle_y = np.arange(n_aisles) * (2 * depth + aisle)
+    west, east = -aisle / 2, columns * pitch + aisle / 2
+
+    row, column = (index.ravel() for index in np.indices((rows, columns)))
+    up = row % 2 == 1  # the second row of an aisle lies north of it
+    side = np.where(up, 1.0, -1.0)
+    slots = Slots(
+        xy=np.stack([(column + 0.5) * pitch, aisle_y[row // 2] + side * (aisle + depth) / 2], axis=1),
+        yaw=side * np.pi / 2,
+        length=np.full(len(row), depth),
+        width=np.full(len(row), pitch),
+        mouth=np.zeros(len(row), dtype=np.int8),
+    )
+    lanes = [Lane(np.array([[west, y], [east, y]])) for y in aisle_y]
+    if n_aisles > 1:
+        lanes += [Lane(np.stack([np.full(n_aisles, x), aisle_y], axis=1)) for x in (west, east)]
+    return cls(
+        name=name,
+        slot_ids=tuple(f"{r}-{c}" for r in range(rows) for c in range(columns)),
+        **slots.columns(),
+        lanes=tuple(lanes),
+        entries=np.array([[west, 0.0]]),
+        goals=np.array([[east + aisle, aisle_y[-1] / 2]]),
+    )
+
+
+def city_lot(cls: type[LotT], n_slots: int, seed: int) -> LotT:
+    """See `ParkingLot.city`.
+
+    Every street runs from one edge of the city to the other, and the streets along its edges are two-way:
+    whatever the one-way streets between them, every place can be reached from every other. Slots are
+    numbered crossing by crossing from the south-west, so neighbours have near numbers. Where more slots
+    fit than are wanted, some are left out here and there, as driveways are. The block in the middle
+    is a square without a building; the goal is its centre.
+
+    Raises:
+        InputError: `n_slots` is below one.
+    """
+    _require_count("city: n_slots", n_slots)
+    # Blocks hold about 45 slots; one row of blocks more at a time until all fit.
+    for n_blocks in count(max(1, int(np.sqrt(n_slots / 48)))):
+        streets = _random_streets(n_blocks, np.random.default_rng([seed, n_blocks]))
+        slots = streets.kerb_slots()
+        if len(slots) >= n_slots:
+            break
+    rng = np.random.default_rng([seed, n_slots])
+    slots = slots[np.sort(rng.permutation(len(slots))[:n_slots])]
+
+    crossings = streets.crossings
+    gate = crossings[len(crossings) // 2, 0]
+    outside = gate - np.array([30.0, 0.0])
+    corners = streets.blocks()
+    middle = (len(corners) // 2, len(corners[0]) // 2)
+    built = np.ones(corners.shape[:2], dtype=bool)
+    built[middle] = False
+    return cls(
+        name=f"city-{n_slots}-{seed}",
+        slot_ids=tuple(map(str, range(n_slots))),
+        **slots.columns(),
+        lanes=(*streets.lanes(), Lane(np.stack([outside, gate]))),
+        entries=outside[None],
+        goals=corners[middle].mean(axis=0)[None],
+        walls=tuple(outlines(corners[built], BUILDING_SETBACK)),
+    )
+
+
+def _random_streets(n_blocks: int, rng: np.random.Generator) -> StreetGrid:
+    """Streets round `n_blocks` × `n_blocks` blocks of 60-140 m × 50-110 m, two in five of them one-way."""
+    x = np.cumsum(rng.uniform(60.0, 140.0, n_blocks + 1))
+    y = np.cumsum(rng.uniform(50.0, 110.0, n_blocks + 1))
+    crossings = np.stack(np.meshgrid(x, y), axis=-1) + rng.uniform(-6.0, 6.0, (n_blocks + 1, n_blocks + 1, 2))
+    oneway = rng.choice([-1, 0, 0, 0, 1], size=(2, n_blocks + 1))
+    oneway[:, [0, -1]] = 0
+    return StreetGrid(crossings, along=oneway[0], across=oneway[1])
+
+
+@dataclass(frozen=True, eq=False)
+class StreetGrid:
+    """Streets that cross each other, `along` from west to east and `across` from south to north.
+
+    Args:
+        crossings: (n_along, n_across, 2) m, where street i along crosses street j across.
+        along: (n_along,) int: 0 for a two-way street, 1 for a one-way street eastward, -1 westward.
+        across: (n_across,) int: 0 for a two-way street, 1 for a one-way street northward, -1 southward.
+    """
+
+    crossings: FloatArray
+    along: NDArray[np.int64]
+    across: NDArray[np.int64]
+
+    def lanes(self) -> list[Lane]:
+        """One lane a street."""
+        streets = [*self.crossings, *self.crossings.swapaxes(0, 1)]
+        directions = np.concatenate([self.along, self.across])
+        return [
+            Lane(points[::-1] if direction < 0 else points, oneway=bool(direction))
+            for points, direction in zip(streets, directions, strict=True)
+        ]
+
+    def blocks(self) -> FloatArray:
+        """Corners, (n_along - 1, n_across - 1, 4, 2) m, of the blocks, counter-clockwise."""
+        p = self.crossings
+        return np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)
+
+    def kerb_slots(self, outer: bool = True) -> Slots:
+        """Slots on both sides of all streets, crossing by crossing; `outer`: also outside the outermost."""
+        p = self.crossings
+        n_along, n_across = p.shape[:2]
+        row, column = np.indices((n_along, n_across))
+        # Each crossing owns the piece of street to its east and the piece to its north.
+        start = np.concatenate([p[:, :-1].reshape(-1, 2), p[:-1].reshape(-1, 2)])
+        end = np.concatenate([p[:, 1:].reshape(-1, 2), p[1:].reshape(-1, 2)])
+        direction = np.concatenate([np.repeat(self.along, n_across - 1), np.tile(self.across, n_along - 1)])
+        owner = np.concatenate(
+            [(row * n_across + column)[:, :-1].ravel(), (row * n_across + column)[:-1].ravel()]
+        )
+        right_open = np.concatenate([row[:, :-1].ravel() > 0, column[:-1].ravel() < n_across - 1])
+        left_open = np.concatenate([row[:, :-1].ravel() < n_along - 1, column[:-1].ravel() > 0])
+
+        backward = (direction < 0)[:, None]
+        start, end = np.where(backward, end, start), np.where(backward, start, end)
+        right_open, left_open = (
+            np.where(backward[:, 0], left_open, right_open),
+            np.where(backward[:, 0], right_open, left_open),
+        )
+        # On the left of a one-way street cars face the way they drive, of a two-way street the other way.
+        oneway = direction != 0
+        kerb_start = np.concatenate([start, np.where(oneway[:, None], start, end)])
+        kerb_end = np.concatenate([end, np.where(oneway[:, None], end, start)])
+        on_left = np.concatenate([np.zeros(len(start), dtype=bool), oneway])
+        half_width = np.tile(np.where(oneway, ONE_WAY_HALF_WIDTH, TWO_WAY_HALF_WIDTH), 2)
+        used = np.concatenate([right_open | outer, left_open | outer])
+        used &= np.hypot(*(kerb_end - kerb_start).T) > 2 * CROSSING_CLEARANCE
+
+        kerb_start, kerb_end, on_left, half_width = (
+            values[used] for values in (kerb_start, kerb_end, on_left, half_width)
+        )
+        tangent = kerb_end - kerb_start
+        tangent /= np.hypot(*tangent.T)[:, None]
+        outward = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1) * np.where(on_left, -1.0, 1.0)[:, None]
+        shift = half_width[:, None] * outward
+        slots, kerb = kerb_rows(
+            kerb_start + CROSSING_CLEARANCE * tangent + shift,
+            kerb_end - CROSSING_CLEARANCE * tangent + shift,
+            on_left,
+        )
+        return slots[np.argsort(np.tile(owner, 2)[used][kerb], kind="stable")]
+
+
+def outlines(corners: FloatArray, setback: float) -> list[FloatArray]:
+    """Closed outlines, (k, 2) m each, of the polygons `corners` (n, k, 2) m shrunk by `setback` m."""
+    shrunk = shapely.buffer(shapely.polygons(corners), -setback, join_style="mitre")
+    return [shapely.get_coordinates(polygon) for polygon in np.asarray(shrunk) if not polygon.is_empty]
+
+
+def _require_count(what: str, value: int) -> None:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
+        raise InputError(f"{what} is {value!r}, want a whole number, at least 1")

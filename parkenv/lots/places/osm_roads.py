@@ -1,0 +1,148 @@
+"""Roads that cars may drive, as OpenStreetMap tags them, and the ways in which they meet."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.lots.generators import ONE_WAY_HALF_WIDTH
+
+FloatArray = NDArray[np.float64]
+
+STREET_WIDTH = {
+    "trunk": 7.5,
+    "primary": 7.0,
+    "secondary": 7.0,
+    "tertiary": 6.5,
+    "unclassified": 6.0,
+    "residential": 6.0,
+    "road": 6.0,
+    "living_street": 5.0,
+    "service": 5.0,
+}
+"""Carriageway, m, without parked cars, of two-way roads that tag neither `width` nor `lanes`."""
+AISLE_WIDTH = 6.0
+"""The same of a `service=parking_aisle`."""
+LANE_WIDTH = 3.0
+"""Of each lane that `lanes` counts, m."""
+NOT_FOR_PARKING = ("drive-through", "emergency_access", "bus")
+"""Kinds of `highway=service` on which nobody searches."""
+
+
+class Rank(IntEnum):
+    """Which road a slot opens to where it faces several: the least rank."""
+
+    AISLE = 0
+    SERVICE = 1
+    STREET = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Road:
+    """A way that cars may drive.
+
+    Args:
+        id: `way/123`.
+        tags: of the way.
+        points: (k, 2) m, in the direction of traffic where it is one-way.
+        rank: what kind of road.
+        oneway: whether cars drive in the order of the points only.
+        turned: whether the points run against the way's own order, so that its left is on their right.
+    """
+
+    id: str
+    tags: Mapping[str, str]
+    points: FloatArray
+    rank: Rank
+    oneway: bool
+    turned: bool
+
+    @property
+    def half_width(self) -> float:
+        """From the centre line to the edge of the carriageway, m, parked cars aside."""
+        width = metres(self.tags.get("width"))
+        if width is not None and not self.has_kerb_parking:
+            return width / 2
+        lanes = metres(self.tags.get("lanes"))
+        if lanes is not None:
+            return lanes * LANE_WIDTH / 2
+        if self.rank is Rank.AISLE:
+            return AISLE_WIDTH / 2
+        if self.oneway:
+            return ONE_WAY_HALF_WIDTH
+        return STREET_WIDTH[self.tags["highway"].removesuffix("_link")] / 2
+
+    @property
+    def has_kerb_parking(self) -> bool:
+        """Whether the tags say anything of parking along the road; `width` then includes parked cars."""
+        return any(key.startswith("parking:") for key in self.tags)
+
+
+def road_of(element_id: str, tags: Mapping[str, str], points: FloatArray) -> Road | str | None:
+    """The road that a way is, why it is none though it carries cars, or None for any other way."""
+    kind = tags.get("highway", "").removesuffix("_link")
+    if kind not in STREET_WIDTH or tags.get("area") == "yes":
+        return None
+    service = tags.get("service")
+    if kind == "service" and service in NOT_FOR_PARKING:
+        return f"roads with service={service}"
+    reason = closed_to_cars(tags) or off_the_ground(tags)
+    if reason:
+        return f"roads with {reason}"
+    oneway = tags.get("oneway", "yes" if tags.get("junction") in ("roundabout", "circular") else "no")
+    turned = oneway in ("-1", "reverse")
+    step = np.diff(points, axis=0)
+    points = points[np.r_[True, np.hypot(step[:, 0], step[:, 1]) > 0.01]]
+    if len(points) < 2:
+        return "roads without a length"
+    rank = Rank.STREET
+    if kind == "service":
+        rank = Rank.AISLE if service == "parking_aisle" else Rank.SERVICE
+    return Road(
+        id=element_id,
+        tags=tags,
+        points=points[::-1] if turned else points,
+        rank=rank,
+        oneway=turned or oneway in ("yes", "true", "1"),
+        turned=turned,
+    )
+
+
+def closed_to_cars(tags: Mapping[str, str]) -> str | None:
+    """The tag that keeps cars out, the most specific one deciding; None where there is none."""
+    for key in ("motorcar", "motor_vehicle", "vehicle", "access"):
+        if key in tags:
+            return f"{key}={tags[key]}" if tags[key] in ("no", "private") else None
+    return None
+
+
+def off_the_ground(tags: Mapping[str, str]) -> str | None:
+    """The tag that puts a thing below the ground or on a deck; None where there is none."""
+    if tags.get("tunnel", "no") not in ("no", "building_passage"):
+        return f"tunnel={tags['tunnel']}"
+    if tags.get("location") in ("underground", "indoor", "roof"):
+        return f"location={tags['location']}"
+    if tags.get("indoor", "no") != "no":
+        return f"indoor={tags['indoor']}"
+    if tags.get("level", "0") != "0":
+        return f"level={tags['level']}"
+    if tags.get("layer", "0").startswith("-"):
+        return f"layer={tags['layer']}"
+    return None
+
+
+def metres(text: str | None) -> float | None:
+    """A tag's positive number, `6`, `6.5 m`; None for anything else."""
+    match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*m?\s*", text or "")
+    value = float(match[1]) if match else 0.0
+    return value if 0.0 < value < 100.0 else None
+
+
+def whole_number(text: str | None) -> int | None:
+    """A tag's count; None for anything else."""
+    return int(text) if text is not None and re.fullmatch(r"\d{1,6}", text.strip()) else None

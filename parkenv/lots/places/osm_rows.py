@@ -1,0 +1,140 @@
+"""Rows of slots along roads that bend."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from parkenv.lots.generators import BAY_SIZE, KERB_SIZE, Slots, bay_row
+from parkenv.world.lot import Mouth, corner_points
+
+FloatArray = NDArray[np.float64]
+Side = Literal["left", "right"]
+
+
+@dataclass(frozen=True)
+class Arrangement:
+    """How cars stand along a road.
+
+    Args:
+        angle: rad, between the road and the cars, from 0 (along it) to π/2 (across).
+        length: of a slot, m.
+        width: of a slot, m.
+    """
+
+    angle: float
+    length: float
+    width: float
+
+    @property
+    def pitch(self) -> float:
+        """From one slot to the next along the road, m."""
+        return self.length if self.angle == 0.0 else self.width / float(np.sin(self.angle))
+
+
+ARRANGEMENTS = {
+    "parallel": Arrangement(0.0, *KERB_SIZE),
+    "diagonal": Arrangement(np.pi / 3, *BAY_SIZE),
+    "perpendicular": Arrangement(np.pi / 2, *BAY_SIZE),
+}
+"""By the values of OpenStreetMap's `orientation`; diagonal cars stand at 60°."""
+DRAWN = 0.05
+"""Length, m, that a row may lack: OpenStreetMap's seven digits round to a centimetre."""
+NO_SLOTS = bay_row((0.0, 0.0), 0.0, 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where the slots of a row meet the road: n points on its centre line.
+
+    Args:
+        xy: (n, 2) m.
+        along: (n, 2) unit vectors in the order of the road's points.
+        outward: (n, 2) unit vectors toward the slots.
+    """
+
+    xy: FloatArray
+    along: FloatArray
+    outward: FloatArray
+
+
+def places_along(points: FloatArray, stations: FloatArray, pitch: float, side: Side) -> Places:
+    """Places on a road, (k, 2) m, at distances from its start, (n,) m, each as wide as `pitch`."""
+    run = np.r_[0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T))]
+    ends = [
+        np.stack([np.interp(stations + half, run, points[:, i]) for i in (0, 1)], axis=1)
+        for half in (-pitch / 2, pitch / 2)
+    ]
+    chord = ends[1] - ends[0]
+    along = chord / np.hypot(chord[:, 0], chord[:, 1])[:, None]
+    left = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    return Places((ends[0] + ends[1]) / 2, along, left if side == "left" else -left)
+
+
+def row_at(places: Places, offset: FloatArray | float, how: Arrangement, *, with_points: bool) -> Slots:
+    """The slots of a row.
+
+    Args:
+        places: where the row meets its road.
+        offset: m, (n,) or one for all, from the centre line to the near edge of the slots.
+        how: how cars stand.
+        with_points: whether cars pass the row in the order of the road's points.
+    """
+    heading = places.along if with_points else -places.along
+    outward = places.outward
+    reach = np.broadcast_to(np.asarray(offset, dtype=np.float64), len(outward))[:, None]
+    nose = np.cos(how.angle) * heading + np.sin(how.angle) * outward
+    if how.angle == 0.0:
+        center = places.xy + (reach + how.width / 2) * outward
+        on_right = heading[:, 1] * outward[:, 0] - heading[:, 0] * outward[:, 1] > 0.0
+        mouth = np.where(on_right, Mouth.LEFT, Mouth.RIGHT)
+    else:
+        # The near corner of an angled slot touches the edge, so the middle of its mouth lies behind it.
+        center = places.xy + (reach + how.width / 2 * np.cos(how.angle)) * outward + how.length / 2 * nose
+        mouth = np.full(len(outward), int(Mouth.REAR))
+    return Slots(
+        xy=center,
+        yaw=np.arctan2(nose[:, 1], nose[:, 0]),
+        length=np.full(len(outward), how.length),
+        width=np.full(len(outward), how.width),
+        mouth=mouth.astype(np.int8),
+    )
+
+
+def crowding(points: FloatArray, start: float, end: float, side: Side, reach: float) -> float:
+    """How much longer a stretch of a road is than its parallel `reach` m to a side; at least 1.
+
+    On the inside of a bend slots need so much more room along the road.
+    """
+    n = max(int((end - start) / 2.0), 2)
+    step = (end - start) / n
+    stations = np.asarray(start + (np.arange(n) + 0.5) * step, dtype=np.float64)
+    spots = places_along(points, stations, step, side)
+    beside = np.diff(spots.xy + reach * spots.outward, axis=0)
+    length = float(np.hypot(beside[:, 0], beside[:, 1]).sum())
+    return max(1.0, (end - start) * (n - 1) / n / max(length, 0.1))
+
+
+def boxes_of(slots: Slots, shrink: float = 0.0) -> NDArray[np.object_]:
+    """The slots' rectangles, (n,) polygons, m, narrower and shorter by `shrink` m."""
+    if not len(slots):
+        return np.empty(0, dtype=np.object_)
+    corners = corner_points(slots.xy, slots.yaw, slots.length - shrink, slots.width - shrink)
+    return np.asarray(shapely.polygons(corners))
+
+
+def without_overlaps(boxes: NDArray[np.object_]) -> NDArray[np.bool_]:
+    """Which rectangles, (n,), to keep so that none overlaps an earlier one that is kept."""
+    kept = np.ones(len(boxes), dtype=bool)
+    if len(boxes) < 2:
+        return kept
+    later, earlier = shapely.STRtree(boxes).query(boxes, predicate="intersects")
+    order = np.lexsort((earlier, later))
+    for i, j in zip(later[order].tolist(), earlier[order].tolist(), strict=True):
+        if j < i and kept[j]:
+            kept[i] = False
+    return kept

@@ -1,0 +1,1 @@
+"""The world: lot, drive graph, occupancy, sensor model, scenario."""

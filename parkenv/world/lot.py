@@ -1,0 +1,359 @@
+"""The lot: its slots, lanes, entries, goals and walls, and the drive graph that follows from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from enum import IntEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from parkenv.errors import InputError
+from parkenv.world.drive_graph import NODE_TOLERANCE, GraphError, GraphProblem, build_drive_graph
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+FloatArray = NDArray[np.float64]
+
+MOVES = ("up", "down", "left", "right")
+"""The names of the four columns of `ParkingLot.neighbors`, in order (eq. 3.13)."""
+PARK = len(MOVES)
+"""The action "park" (eq. 3.14); actions below it are the moves."""
+ACTIONS = (*MOVES, "park")
+SLOT_SIDE = 0.1
+"""Least length and width, m, of a slot."""
+
+
+class Mouth(IntEnum):
+    """The side of a parked car, standing nose-in along the slot's yaw, by which the slot is entered."""
+
+    REAR = 0  # perpendicular and angled slots
+    LEFT = 1  # kerbside slots to the right of their lane
+    RIGHT = 2  # kerbside slots to the left of their lane
+
+
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """A drivable centre line.
+
+    Args:
+        points: (k, 2) m, lot frame. Lanes are joined where they share a point.
+        oneway: whether cars may drive in the order of the points only. Cars keep to the right otherwise.
+    """
+
+    points: FloatArray
+    oneway: bool = False
+
+    def __post_init__(self) -> None:
+        points = _frozen(self.points, "points")
+        if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
+            raise InputError(f"lane points: shape {points.shape}, want (at least 2, 2)")
+        _require_finite("lane points", points)
+        step = np.diff(points, axis=0)
+        short = np.flatnonzero(np.hypot(step[:, 0], step[:, 1]) <= NODE_TOLERANCE)
+        if len(short):
+            raise InputError(
+                f"lane points[{short[0]}] and [{short[0] + 1}] are the same place, want a step between"
+            )
+        object.__setattr__(self, "points", points)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Lane):
+            return NotImplemented
+        return self.oneway == other.oneway and np.array_equal(self.points, other.points)
+
+    __hash__ = None  # type: ignore[assignment]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ParkingLot:
+    """A parking lot: what is painted on the ground, and how a car gets from one slot to the next.
+
+    Units are metres in a local frame, x east and y north; yaw is counter-clockwise from x. The drive
+    graph is derived from slots, lanes and entries when the lot is made, so two lots with equal features
+    have equal graphs. Vertex `i < n_slots` is the place on the lane before slot `i`, the state that the
+    thesis plans on (T §3.4.1, Fig. 3.6 right); the vertices after them are junctions and lane ends.
+
+    Args:
+        name: a word for tables and pictures.
+        slot_ids: n_slots unique names.
+        slot_xy: (n_slots, 2) float64, m, centres.
+        slot_yaw: (n_slots,) float64, rad, heading of a car that stands nose-in.
+        slot_length: (n_slots,) float64, m, along the yaw.
+        slot_width: (n_slots,) float64, m.
+        slot_mouth: (n_slots,) int8, a `Mouth` each: the side towards the lane.
+        lanes: the centre lines that cars drive along.
+        entries: (n_entries, 2) float64, m, where cars come in; each must lie near a lane.
+        goals: (n_goals, 2) float64, m, where people walk to; anywhere.
+        walls: polylines, (k, 2) m each; they stop the eye, not the walker.
+
+    Attributes:
+        vertex_xy: (n_vertices, 2) float64, m.
+        vertex_yaw: (n_vertices,) float64, rad, the direction of travel at a slot's vertex.
+        neighbors: (n_vertices, 4) int32, the vertex that up, down, left, right lead to, or -1.
+        edge_length: (n_vertices, 4) float64, m.
+        entry_vertices: (n_entries,) int64.
+
+    Raises:
+        InputError: a wrong shape, a value that is not finite, a repeated id, no slot, entry or goal.
+        GraphError: slots or entries that no lane serves, or more than four lanes out of one junction.
+
+    Examples:
+        >>> lot = ParkingLot.packaged("mini")
+        >>> lot.n_slots
+        10
+        >>> lot.neighbors.shape == (lot.n_vertices, 4)
+        True
+    """
+
+    name: str
+    slot_ids: tuple[str, ...]
+    slot_xy: FloatArray
+    slot_yaw: FloatArray
+    slot_length: FloatArray
+    slot_width: FloatArray
+    slot_mouth: NDArray[np.int8]
+    lanes: tuple[Lane, ...]
+    entries: FloatArray
+    goals: FloatArray
+    walls: tuple[FloatArray, ...] = ()
+
+    vertex_xy: FloatArray = field(init=False)
+    vertex_yaw: FloatArray = field(init=False)
+    neighbors: NDArray[np.int32] = field(init=False)
+    edge_length: FloatArray = field(init=False)
+    entry_vertices: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        def set_field(name: str, value: object) -> None:
+            object.__setattr__(self, name, value)
+
+        n = len(self.slot_ids)
+        if n == 0:
+            raise InputError(f"lot {self.name!r} has no slot")
+        if len(set(self.slot_ids)) < n:
+            seen: set[str] = set()
+            twice = next(i for i in self.slot_ids if i in seen or seen.add(i))  # type: ignore[func-returns-value]
+            raise InputError(f"lot {self.name!r}: slot id {twice!r} stands twice")
+        set_field("slot_ids", tuple(self.slot_ids))
+        set_field("lanes", tuple(self.lanes))
+        for name, shape in (
+            ("slot_xy", (n, 2)),
+            ("slot_yaw", (n,)),
+            ("slot_length", (n,)),
+            ("slot_width", (n,)),
+            ("entries", (len(self.entries), 2)),
+            ("goals", (len(self.goals), 2)),
+        ):
+            values = _frozen(getattr(self, name), name)
+            if values.shape != shape:
+                raise InputError(f"lot {self.name!r}: {name} has shape {values.shape}, want {shape}")
+            _require_finite(f"lot {self.name!r}: {name}", values)
+            set_field(name, values)
+        for name in ("slot_length", "slot_width"):
+            least = getattr(self, name).min()
+            if least < SLOT_SIDE:
+                raise InputError(f"lot {self.name!r}: {name} {least:g} m, want at least {SLOT_SIDE:g}")
+        mouth = np.array(self.slot_mouth, dtype=np.int8)
+        if mouth.shape != (n,) or not np.isin(mouth, list(Mouth)).all():
+            raise InputError(f"lot {self.name!r}: slot_mouth must hold {n} values of {list(map(int, Mouth))}")
+        mouth.flags.writeable = False
+        set_field("slot_mouth", mouth)
+        walls = tuple(_frozen(wall, "walls") for wall in self.walls)
+        for wall in walls:
+            if wall.ndim != 2 or wall.shape[1] != 2 or len(wall) < 2:
+                raise InputError(f"lot {self.name!r}: a wall has shape {wall.shape}, want (at least 2, 2)")
+            _require_finite(f"lot {self.name!r}: walls", wall)
+        set_field("walls", walls)
+        for kind, features in (("lane", self.lanes), ("entry", self.entries), ("goal", self.goals)):
+            if len(features) == 0:
+                raise InputError(f"lot {self.name!r} has no {kind}")
+
+        graph = build_drive_graph(
+            [(lane.points, lane.oneway) for lane in self.lanes], self.mouth_xy(), self.entries
+        )
+        for name in ("vertex_xy", "vertex_yaw", "neighbors", "edge_length", "entry_vertices"):
+            values = getattr(graph, name)
+            values.flags.writeable = False
+            set_field(name, values)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, ParkingLot):
+            return NotImplemented
+        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"ParkingLot({self.name!r}, {self.n_slots} slots, {self.n_vertices} vertices)"
+
+    @property
+    def n_slots(self) -> int:
+        """How many slots there are."""
+        return len(self.slot_ids)
+
+    @property
+    def n_vertices(self) -> int:
+        """How many places to stop there are: one a slot, then junctions and lane ends."""
+        return len(self.vertex_xy)
+
+    def walk_m(self, goal: int = 0) -> FloatArray:
+        """Straight distance, (n_slots,) m, from each slot to a goal (eq. 3.25)."""
+        away = self.slot_xy - self.goals[goal]
+        return np.asarray(np.hypot(away[:, 0], away[:, 1]))
+
+    def mouth_xy(self) -> FloatArray:
+        """Middle, (n_slots, 2) m, of the side by which each slot is entered."""
+        return mouth_points(self.slot_xy, self.slot_yaw, self.slot_length, self.slot_width, self.slot_mouth)
+
+    def slot_corners(self) -> FloatArray:
+        """Corners, (n_slots, 4, 2) m, counter-clockwise from the rear right one."""
+        return corner_points(self.slot_xy, self.slot_yaw, self.slot_length, self.slot_width)
+
+    def bounds(self) -> tuple[float, float, float, float]:
+        """Least x and y, greatest x and y, m, of all features."""
+        points = np.concatenate(
+            [
+                self.slot_corners().reshape(-1, 2),
+                *(lane.points for lane in self.lanes),
+                self.entries,
+                self.goals,
+                *self.walls,
+            ]
+        )
+        low, high = points.min(axis=0), points.max(axis=0)
+        return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+    def drive_matrix(self) -> csr_array[np.float64]:
+        """The drive graph as a sparse matrix, (n_vertices, n_vertices), m, for scipy's graph routines."""
+        from scipy.sparse import csr_array
+
+        source, column = np.nonzero(self.neighbors >= 0)
+        target = self.neighbors[source, column]
+        shape = (self.n_vertices, self.n_vertices)
+        # Parallel edges would be added up by the matrix: keep the shortest.
+        length = self.edge_length[source, column]
+        order = np.lexsort((length, target, source))
+        source, target, length = source[order], target[order], length[order]
+        first = np.r_[True, (np.diff(source) != 0) | (np.diff(target) != 0)]
+        return csr_array((length[first], (source[first], target[first])), shape=shape)
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Self:
+        """Read a lot from native GeoJSON (`.geojson`, `.json`) or a Dragon Lake map (`.yml`).
+
+        Raises:
+            InputError: the file cannot be read or is no lot; `parkenv lot check` lists all faults.
+        """
+        from parkenv.lots.lot_files import read_lot
+
+        return read_lot(cls, Path(path))
+
+    def to_file(self, path: str | Path) -> None:
+        """Write native GeoJSON that `from_file` reads back exactly."""
+        from parkenv.lots.geojson import write_lot
+
+        write_lot(self, Path(path))
+
+    @classmethod
+    def packaged(cls, name: str) -> Self:
+        """One of the lots that come with the package: campus, jam, street, mini."""
+        from parkenv.lots.lot_files import packaged_lot
+
+        return packaged_lot(cls, name)
+
+    @classmethod
+    def grid(
+        cls,
+        rows: int,
+        columns: int,
+        *,
+        name: str = "grid",
+        pitch: float = 2.5,
+        depth: float = 5.0,
+        aisle: float = 6.0,
+    ) -> Self:
+        """Rows of perpendicular slots along parallel two-way aisles, joined by a road at either end.
+
+        Rows lie in pairs back to back: row 0 south of the first aisle, rows 1 and 2 between the first and
+        the second, and so on. The entry is at the west end of the south aisle, the goal east of the lot.
+
+        Args:
+            rows: rows of slots; two rows share an aisle.
+            columns: slots a row.
+            name: the lot's name.
+            pitch: width of a slot, m.
+            depth: length of a slot, m.
+            aisle: width of an aisle and of the end roads, m.
+        """
+        from parkenv.lots.generators import grid_lot
+
+        return grid_lot(cls, rows, columns, name=name, pitch=pitch, depth=depth, aisle=aisle)
+
+    @classmethod
+    def city(cls, n_slots: int, seed: int = 0) -> Self:
+        """Kerbside slots round the blocks of a city of one-way and two-way streets, with exactly `n_slots`.
+
+        A million slots take seconds. The same seed gives the same city.
+        """
+        from parkenv.lots.generators import city_lot
+
+        return city_lot(cls, n_slots, seed)
+
+
+def mouth_heading(yaw: FloatArray, mouth: NDArray[np.int8]) -> FloatArray:
+    """Direction, (n,) rad, that each slot's mouth faces."""
+    heading: FloatArray = yaw + np.array([np.pi, np.pi / 2, -np.pi / 2])[mouth]
+    return heading
+
+
+def mouth_points(
+    xy: FloatArray, yaw: FloatArray, length: FloatArray, width: FloatArray, mouth: NDArray[np.int8]
+) -> FloatArray:
+    """Middle, (n, 2) m, of the side by which each slot is entered."""
+    half = np.where(mouth == Mouth.REAR, length, width) / 2
+    heading = mouth_heading(yaw, mouth)
+    middle: FloatArray = xy + half[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+    return middle
+
+
+def corner_points(xy: FloatArray, yaw: FloatArray, length: FloatArray, width: FloatArray) -> FloatArray:
+    """Corners, (n, 4, 2) m, counter-clockwise from the rear right one."""
+    along = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * length[:, None] / 2
+    left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1) * width[:, None] / 2
+    signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    return np.stack([xy + a * along + b * left for a, b in signs], axis=1)
+
+
+def is_building(wall: FloatArray) -> bool:
+    """Whether a wall, (k, 2), ends where it starts and so is a building's outline."""
+    return len(wall) >= 4 and np.array_equal(wall[0], wall[-1])
+
+
+def _frozen(values: ArrayLike, name: str) -> FloatArray:
+    try:
+        array = np.array(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: want numbers, got {values!r:.60}") from error
+    array.flags.writeable = False
+    return array
+
+
+def _require_finite(what: str, values: FloatArray) -> None:
+    if not np.isfinite(values).all():
+        where = tuple(np.argwhere(~np.isfinite(values))[0])
+        raise InputError(f"{what}[{', '.join(map(str, where))}] is {values[where]}, want a finite number")
+
+
+def _same(a: object, b: object) -> bool:
+    if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
+        return np.array_equal(a, b)
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(map(_same, a, b))
+    return a == b
+
+
+__all__ = ["ACTIONS", "MOVES", "PARK", "GraphError", "GraphProblem", "Lane", "Mouth", "ParkingLot"]

@@ -1,0 +1,96 @@
+"""A parking lot as the sensors see it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.world.lot import Mouth, ParkingLot, is_building
+from parkenv.world.occupancy import World
+from parkenv.world.scenario import Scenario
+from parkenv.world.traffic import LotTraffic
+from sim_sensors.scene import Scene
+from sim_sensors.slot_scenes import SlotLot, slot_surroundings
+
+FloatArray = NDArray[np.float64]
+
+WALL_HEIGHT = 1.8
+"""Height, m, of walls that a lot's file gives as open lines; closed ones are buildings."""
+
+_CARS_APART = 1 << 31
+
+
+def slot_lot(lot: ParkingLot, seed: int = 0) -> SlotLot:
+    """The lot's slots for `sim_sensors`: `slot_lot(lot).scene(occupied)` is what stands there.
+
+    Closed walls become buildings, open ones free-standing walls. Place i of the scene is slot i, in the lot's
+    own frame.
+
+    Args:
+        lot: the lot.
+        seed: of the cars' models and of everything's texture.
+    """
+    buildings = [wall[:-1] for wall in lot.walls if is_building(wall)]
+    legs = [
+        [*start, *end, WALL_HEIGHT]
+        for wall in lot.walls
+        if not is_building(wall)
+        for start, end in pairwise(wall)
+    ]
+    slots = SlotLot(
+        lot.slot_xy,
+        lot.slot_yaw,
+        lot.slot_length,
+        lot.slot_width,
+        kerbside=lot.slot_mouth != Mouth.REAR,
+        seed=seed,
+    )
+    lanes = [lane.points for lane in lot.lanes]
+    around = slot_surroundings(slots, lanes, buildings=buildings, walls=legs, seed=seed)
+    return replace(slots, surroundings=around)
+
+
+class LotScenes:
+    """A world as the sensors see it, moment after moment.
+
+    Which car stands in a slot depends on the world alone, as do the other cars that drive and the people who walk.
+    From one moment to the next only what has changed is changed.
+
+    Args:
+        slots: of the scenario's lot, as `slot_lot` makes it.
+        scenario: whose lot and traffic it is.
+        key: of the world.
+        world: which slots are taken when.
+    """
+
+    def __init__(self, slots: SlotLot, scenario: Scenario, key: np.uint64, world: World) -> None:
+        self._slots, self._world = slots, world
+        self._everything = np.arange(scenario.lot.n_slots)
+        self._first_car = int(key) % _CARS_APART
+        self._traffic = LotTraffic(scenario.lot, scenario.goal, scenario.traffic, key, slots)
+        self._stretch = np.empty(0, dtype=np.int64)
+        self._scene: Scene | None = None
+
+    def at(self, time: float, ego: FloatArray | None = None) -> Scene:
+        """The scene at `time`, s; slot i is its place i.
+
+        Args:
+            time: at or after the world's arrival.
+            ego: (3,) x, y, yaw of the car that carries the sensors, which is not part of the scene.
+        """
+        taken = self._world.occupied(self._everything, time)
+        stretch = self._world.stretch(self._everything, time)
+        if self._scene is None:
+            self._scene = self._slots.scene(taken, self._first_car + stretch)
+        else:
+            for slot in np.flatnonzero(stretch != self._stretch).tolist():
+                if taken[slot]:
+                    car = self._first_car + int(stretch[slot])
+                    self._scene = self._slots.filled(self._scene, slot, car)
+                else:
+                    self._scene = self._scene.without_vehicle(slot)
+        self._stretch = stretch
+        return self._scene.with_movers(self._traffic.at(time, ego))

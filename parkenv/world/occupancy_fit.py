@@ -1,0 +1,354 @@
+"""Maximum-likelihood rates of two-state chains that are seen only now and then.
+
+Counting flips between looks misses every car that came and left unseen. Here each pair of consecutive looks
+counts with its exact transition probability (Kalbfleisch and Lawless, "The analysis of panel data under a
+Markov assumption", JASA 1985), so coarse looks give the same rates as fine ones.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.optimize import brentq, minimize
+from scipy.special import expit
+
+from parkenv.errors import InputError
+from parkenv.world.occupancy import HOUR_S, BoolArray, FloatArray, IntArray, OccupancyProcess
+from sim_sensors.compilation import compiled
+
+if TYPE_CHECKING:
+    from parkenv.world.occupancy_log import OccupancyLog
+
+# From once in 30 years to once a second; a rate that the looks say nothing of stops here.
+_LOG_RATE_BOUNDS = (math.log(1e-9), 0.0)
+_LOG_FACTOR_BOUNDS = (-8.0, 8.0)
+_TINY = 1e-300
+_DAY_HOURS = 24
+_N_BINS = 2 * _DAY_HOURS  # hours of a weekday, hours of a weekend day
+_NIGHT_MEMORY = 5.0
+_MAX_PIECES = _DAY_HOURS
+_MAX_SCORES = 2 * _MAX_PIECES + 2
+
+
+@dataclass(frozen=True, eq=False)
+class FittedProcess:
+    """A process fitted to a log, with what is needed to judge it.
+
+    Args:
+        process: slot i of it is slot_ids[i]; each kind of factor has the geometric mean 1.
+        slot_ids: the log's slots.
+        log_likelihood: of all intervals, without the prior.
+        n_intervals: pairs of consecutive looks that were used.
+        arrival_factor_se: (n,) float64, standard error of the factor's natural logarithm.
+        arrival_profile_se: (168,) float64, likewise; NaN in hours that were never observed.
+        departure_factor_se: (n,) float64, likewise.
+        departure_profile_se: (168,) float64, likewise.
+    """
+
+    process: OccupancyProcess
+    slot_ids: tuple[str, ...]
+    log_likelihood: float
+    n_intervals: int
+    arrival_factor_se: FloatArray
+    arrival_profile_se: FloatArray
+    departure_factor_se: FloatArray
+    departure_profile_se: FloatArray
+
+
+def fit_constant_rates(dt: ArrayLike, start: ArrayLike, end: ArrayLike) -> tuple[float, float]:
+    """Arrival and departure rate, 1/s, of chains with constant rates, by maximum likelihood.
+
+    P(occupied at t+dt | x) = π + (x−π)·exp(−(λ+μ)·dt), π = λ/(λ+μ). Rates stay between 1e-9/s and 1/s; a kind
+    of flip that never happened gets 1e-9/s.
+
+    Args:
+        dt: (k,) float64, s, > 0, time between two looks.
+        start: (k,) bool, taken at the first look.
+        end: (k,) bool, taken at the second.
+    """
+    dt, start, end = np.asarray(dt, float), np.asarray(start, bool), np.asarray(end, bool)
+    if not dt.shape == start.shape == end.shape == (dt.size,) or not dt.size:
+        raise InputError(f"looks: got shapes {dt.shape}, {start.shape}, {end.shape}, wanted (k,), k > 0")
+    if not np.all((dt > 0) & np.isfinite(dt)):
+        raise InputError("looks: dt: wanted finite seconds > 0")
+    gaps, which = np.unique(dt, return_inverse=True)
+    n = np.bincount(which * 4 + start * 2 + end, minlength=4 * gaps.size).reshape(-1, 2, 2).T
+    (stay_free, leave), (take, stay) = n  # n[end, start, gap]
+
+    def loss(log_rates: FloatArray) -> tuple[float, FloatArray]:
+        rate = np.exp(log_rates)
+        total = rate.sum()
+        share = rate / total  # equilibrium: P(occupied), P(free)
+        moved = -np.expm1(-total * gaps)
+        value, by_share, by_total = 0.0, np.zeros(2), 0.0
+        for side, flipped, stayed in ((0, take, stay_free), (1, leave, stay)):
+            p = share[side] * moved
+            value -= np.sum(flipped * np.log(p + _TINY) + stayed * np.log1p(-p))
+            by_p = stayed / (1 - p) - flipped / (p + _TINY)
+            by_share[side] = np.sum(by_p * moved)
+            by_total += np.sum(by_p * share[side] * gaps * (1 - moved))
+        # share = rate / total, so both shares depend on both rates.
+        by_rate = by_total + (by_share - by_share @ share) / total
+        return value / dt.size, by_rate * rate / dt.size
+
+    # Flips per second watched never exceed the true rates by much: the start lies below the plateau where
+    # looks are so rare against the rates that their order tells nothing.
+    flips, watched = np.array([take.sum(), leave.sum()]), n.sum(axis=0) @ gaps
+    lowest, highest = np.exp(_LOG_RATE_BOUNDS)
+    first = np.log(np.clip(flips / np.maximum(watched, gaps[0]), lowest, highest))
+    found = minimize(
+        loss, first, jac=True, method="L-BFGS-B", bounds=[_LOG_RATE_BOUNDS] * 2, options={"ftol": 1e-12}
+    )
+    arrival, departure = np.exp(found.x)
+    return float(arrival), float(departure)
+
+
+@compiled
+def _score(
+    slot: int,
+    first_bin: int,
+    start: float,
+    end: float,
+    before: bool,
+    after: bool,
+    rates: FloatArray,
+    n: int,
+    index: IntArray,
+    score: FloatArray,
+) -> tuple[float, int]:
+    """Log-probability of one interval, and m; its derivatives by `theta[index[:m]]` go to `score[:m]`.
+
+    Forward, p = P(occupied) is carried through each piece of constant rates; backward, the adjoint of p.
+    """
+    begun = np.empty(_MAX_PIECES)
+    hour = int(start // HOUR_S)
+    at_arrival, at_departure = 2 * _N_BINS + slot, 2 * _N_BINS + n + slot
+    pieces = 0
+    p = 1.0 if before else 0.0
+    while start < end:
+        stop = min((hour + pieces + 1) * HOUR_S, end)
+        bin_ = first_bin + hour + pieces
+        arrival = rates[bin_] * rates[at_arrival]
+        total = arrival + rates[_N_BINS + bin_] * rates[at_departure]
+        begun[pieces] = p
+        p += (arrival / total - p) * -math.expm1(-total * (stop - start))
+        # Kept for the way back: the piece's duration.
+        score[2 * pieces] = stop - start
+        start = stop
+        pieces += 1
+    seen = p if after else 1.0 - p
+    seen = max(seen, _TINY)
+    adjoint = 1.0 / seen if after else -1.0 / seen
+    score[2 * pieces] = 0.0
+    score[2 * pieces + 1] = 0.0
+    index[2 * pieces] = at_arrival
+    index[2 * pieces + 1] = at_departure
+    for back in range(pieces):
+        i = pieces - 1 - back
+        bin_ = first_bin + hour + i
+        duration = score[2 * i]
+        arrival = rates[bin_] * rates[at_arrival]
+        departure = rates[_N_BINS + bin_] * rates[at_departure]
+        total = arrival + departure
+        kept = math.exp(-total * duration)
+        by_total = adjoint * duration * kept * (arrival / total - begun[i])
+        by_share = adjoint * -math.expm1(-total * duration) / (total * total)
+        by_arrival = (by_total + by_share * departure) * arrival
+        by_departure = (by_total - by_share * arrival) * departure
+        index[2 * i] = bin_
+        index[2 * i + 1] = _N_BINS + bin_
+        score[2 * i] = by_arrival
+        score[2 * i + 1] = by_departure
+        score[2 * pieces] += by_arrival
+        score[2 * pieces + 1] += by_departure
+        adjoint *= kept
+    return math.log(seen), 2 * pieces + 2
+
+
+@compiled
+def log_likelihood(
+    theta: FloatArray,
+    slot: IntArray,
+    first_bin: IntArray,
+    start: FloatArray,
+    end: FloatArray,
+    before: BoolArray,
+    after: BoolArray,
+) -> tuple[float, FloatArray]:
+    """Log-likelihood of intervals between looks, and its gradient (compiled).
+
+    Args:
+        theta: (96 + 2n,) float64, natural logarithms: arrival profile in 1/s (24 hours of a weekday, 24 of a
+            weekend day), departure profile likewise, arrival factors (n,), departure factors (n,).
+        slot: (k,) int64.
+        first_bin: (k,) int64, 0 on a weekday, 24 on a weekend day.
+        start: (k,) float64, s of the day.
+        end: (k,) float64, s of the day, > start.
+        before: (k,) bool, taken at start.
+        after: (k,) bool, taken at end.
+    """
+    rates = np.exp(theta)
+    n = (theta.size - 2 * _N_BINS) // 2
+    index, score = np.empty(_MAX_SCORES, np.int64), np.empty(_MAX_SCORES)
+    value, gradient = 0.0, np.zeros(theta.size)
+    for k in range(slot.size):
+        log_p, m = _score(
+            slot[k], first_bin[k], start[k], end[k], before[k], after[k], rates, n, index, score
+        )
+        value += log_p
+        for i in range(m):
+            gradient[index[i]] += score[i]
+    return value, gradient
+
+
+@compiled
+def _information(
+    theta: FloatArray,
+    slot: IntArray,
+    first_bin: IntArray,
+    start: FloatArray,
+    end: FloatArray,
+    before: BoolArray,
+    after: BoolArray,
+) -> FloatArray:
+    """Empirical Fisher information: the sum of the outer products of the intervals' scores."""
+    rates = np.exp(theta)
+    n = (theta.size - 2 * _N_BINS) // 2
+    index, score = np.empty(_MAX_SCORES, np.int64), np.empty(_MAX_SCORES)
+    information = np.zeros((theta.size, theta.size))
+    for k in range(slot.size):
+        _, m = _score(slot[k], first_bin[k], start[k], end[k], before[k], after[k], rates, n, index, score)
+        for i in range(m):
+            for j in range(m):
+                information[index[i], index[j]] += score[i] * score[j]
+    return information
+
+
+def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float = 2.0) -> FittedProcess:
+    """Fit an `OccupancyProcess` to a log by maximum likelihood.
+
+    Rates are a factor per slot times a profile per hour, one profile for weekdays and one for weekend days.
+    All pairs of consecutive looks on a day, no longer than `max_gap_s` apart, count; they are split exactly
+    at full hours. A weak log-normal prior keeps what never changed from running off to zero: each profile
+    value has its median at the constant rate of its class of day, each factor at 1, and the logarithm's
+    standard deviation is `prior_sd`.
+
+    Hours never observed: between observed hours the nearest observed one stands (the earlier, if equally
+    near). Before a day's first and after its last observed hour the lot comes to rest at the mean state of
+    the days' first looks, fast enough that the morning finds e⁻⁵ of the evening before: what the night did
+    is not known, but the morning is right. A class of day never observed takes the other's profile.
+
+    Args:
+        log: looks.
+        max_gap_s: s, longest interval used.
+        prior_sd: no unit, standard deviation of the logarithms under the prior.
+
+    Raises:
+        InputError: no two looks at a slot on one day within `max_gap_s`.
+    """
+    if not prior_sd > 0:
+        raise InputError(f"prior_sd: got {prior_sd}, wanted a number > 0")
+    looks = log.intervals(max_gap_s)
+    if not looks.slot.size:
+        raise InputError(f"{log.source}: no two looks at a slot on one day within {max_gap_s:g} s")
+    n = len(log.slot_ids)
+    kind = log.weekend[looks.day].astype(np.int64)
+    data = (looks.slot, kind * _DAY_HOURS, looks.start, looks.end, looks.before, looks.after)
+
+    constant = np.zeros((2, 2))  # log rates: arrival and departure, on weekdays and weekend days
+    for k in np.unique(kind):
+        used = kind == k
+        dt = looks.end[used] - looks.start[used]
+        constant[:, k] = np.log(fit_constant_rates(dt, looks.before[used], looks.after[used]))
+    centre = np.concatenate([np.repeat(constant.ravel(), _DAY_HOURS), np.zeros(2 * n)])
+
+    def loss(theta: FloatArray) -> tuple[float, FloatArray]:
+        value, gradient = log_likelihood(theta, *data)
+        off = (theta - centre) / prior_sd
+        return 0.5 * off @ off - value, off / prior_sd - gradient
+
+    bounds = [_LOG_RATE_BOUNDS] * (2 * _N_BINS) + [_LOG_FACTOR_BOUNDS] * (2 * n)
+    theta: FloatArray = minimize(
+        loss,
+        centre,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"maxiter": 1000, "ftol": 1e-10},
+    ).x
+    covariance = np.linalg.inv(_information(theta, *data) + np.eye(theta.size) / prior_sd**2)
+    value, _ = log_likelihood(theta, *data)
+
+    centred = _centring(n)
+    profile, factor = _split(centred @ theta)
+    profile_se, factor_se = _split(np.sqrt(np.diag(centred @ covariance @ centred.T)))
+    observed = _observed_hours(kind, looks.start, looks.end)
+    profile_se[:, ~observed] = np.nan
+    begins = log.first[:-1][np.diff(log.first) > 0]
+    for k in np.unique(kind):
+        resting = log.occupied[begins[log.weekend[log.day[begins]] == k]]
+        # Half a look on either side keeps the logit finite.
+        at_rest = (resting.sum() + 0.5) / (resting.size + 1)
+        _fill_unobserved(profile[:, k], observed[k], at_rest, factor)
+        if not observed[1 - k].any():
+            profile[:, 1 - k] = profile[:, k]
+    week, week_se = _week(np.exp(profile)), _week(profile_se)
+    process = OccupancyProcess(np.exp(factor[0]), week[0], np.exp(factor[1]), week[1])
+    return FittedProcess(
+        process,
+        log.slot_ids,
+        float(value),
+        looks.slot.size,
+        factor_se[0],
+        week_se[0],
+        factor_se[1],
+        week_se[1],
+    )
+
+
+def _split(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Profiles (2 sides, 2 classes of day, 24 hours) and factors (2 sides, n)."""
+    return theta[: 2 * _N_BINS].reshape(2, 2, _DAY_HOURS).copy(), theta[2 * _N_BINS :].reshape(2, -1)
+
+
+def _centring(n: int) -> FloatArray:
+    """Matrix that moves the factors' geometric mean into the profiles: only their product is determined."""
+    centring = np.eye(2 * _N_BINS + 2 * n)
+    for side in range(2):
+        bins = slice(side * _N_BINS, (side + 1) * _N_BINS)
+        slots = slice(2 * _N_BINS + side * n, 2 * _N_BINS + (side + 1) * n)
+        centring[bins, slots] = 1 / n
+        centring[slots, slots] -= 1 / n
+    return centring
+
+
+def _observed_hours(kind: IntArray, start: FloatArray, end: FloatArray) -> BoolArray:
+    """(2, 24) bool: does any interval reach into that hour of that class of day?"""
+    hours = np.arange(_DAY_HOURS) * HOUR_S
+    inside = (start[:, None] < hours + HOUR_S) & (end[:, None] > hours)
+    return np.stack([inside[kind == k].any(axis=0) for k in range(2)])
+
+
+def _fill_unobserved(profile: FloatArray, observed: BoolArray, at_rest: float, factor: FloatArray) -> None:
+    """Fill in the log rates (2, 24) of one class of day where never observed; the rule is fit_process's."""
+    hours = np.flatnonzero(observed)
+    for hour in np.flatnonzero(~observed):
+        profile[:, hour] = profile[:, hours[np.argmin(np.abs(hours - hour))]]
+    night = (np.arange(_DAY_HOURS) < hours[0]) | (np.arange(_DAY_HOURS) > hours[-1])
+    odds = factor[0] - factor[1]
+
+    def excess(shift: float) -> float:
+        return float(expit(odds + shift).mean()) - at_rest
+
+    reach = float(np.abs(odds).max()) + 50.0
+    # The day before may be of the other class, so the forgetting is left to the hours after midnight.
+    duration = HOUR_S * (hours[0] or _DAY_HOURS - 1 - hours[-1] or 1)
+    profile[1, night] = math.log(_NIGHT_MEMORY / duration * (1 - at_rest))
+    profile[0, night] = profile[1, night] + brentq(excess, -reach, reach)
+
+
+def _week(by_class: FloatArray) -> FloatArray:
+    """(2, 2, 24) by class of day to (2, 168) by hour of the week."""
+    return np.concatenate([np.tile(by_class[:, 0], 5), np.tile(by_class[:, 1], 2)], axis=1)

@@ -1,0 +1,347 @@
+"""Recorded occupancy: a log of looks at slots.
+
+Between looks the last known state holds; in a gap longer than `max_gap_s`, the state of the look nearest in
+time. Before a day's first look its first state holds, after its last look its last. A slot that was not seen
+at all on a day has no record of that day.
+"""
+
+import csv
+import gzip
+import os
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import date, datetime
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, Self, TextIO
+
+import numpy as np
+
+from parkenv.errors import InputError
+from parkenv.world.occupancy import (
+    DAY_S,
+    HOUR_S,
+    BoolArray,
+    FloatArray,
+    IntArray,
+)
+from sim_sensors.compilation import compiled
+
+DayClass = Literal["weekday", "weekend"]
+
+MAX_GAP_S = 7200.0
+DAY_HOURS = 24
+
+_KNOWN = ("datetime", "camera", "slot_id", "weather", "occupied")
+
+
+def weekday_of(day: str) -> int:
+    """Monday = 0 ... Sunday = 6, of an ISO date."""
+    return date.fromisoformat(day).weekday()
+
+
+def day_class(day: str) -> DayClass:
+    """`weekday` or `weekend`, of an ISO date.
+
+    >>> day_class("2015-11-12"), day_class("2015-11-21")
+    ('weekday', 'weekend')
+    """
+    return "weekday" if weekday_of(day) < 5 else "weekend"
+
+
+def _is_date(text: str) -> bool:
+    try:
+        return date.fromisoformat(text).isoformat() == text
+    except ValueError:
+        return False
+
+
+class Intervals(NamedTuple):
+    """Pairs of consecutive looks at one slot on one day; each field (k,).
+
+    slot and day are int64 indices; start and end float64 seconds of the day, end > start; before and after
+    say whether the slot was taken then.
+    """
+
+    slot: IntArray
+    day: IntArray
+    start: FloatArray
+    end: FloatArray
+    before: BoolArray
+    after: BoolArray
+
+
+class _Hours(NamedTuple):
+    """Seconds per (slot, day, hour of the day), each (m, n_days, 24) float64."""
+
+    replayed: FloatArray  # taken, over the whole day as it is replayed
+    occupied: FloatArray  # taken, between the day's first and last look only
+    seen: FloatArray  # between the day's first and last look
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyLog:
+    """What looks at the slots of a lot found, day by day.
+
+    Args:
+        slot_ids: the log's slots.
+        days: recorded days, ISO dates, ascending.
+        slot: (k,) int64, index of the slot that a look saw.
+        day: (k,) int64, index of the day.
+        second: (k,) float64, s since that day's midnight, in [0, 86400).
+        occupied: (k,) bool, what the look found.
+        max_gap_s: s, longest gap over which the last known state holds to the end.
+        source: the name that error messages give to the log.
+
+    The looks are kept sorted by day, slot and time; of several looks at a slot at one instant (by several
+    cameras) only the last in the input is kept.
+    """
+
+    slot_ids: tuple[str, ...]
+    days: tuple[str, ...]
+    slot: IntArray
+    day: IntArray
+    second: FloatArray
+    occupied: BoolArray
+    max_gap_s: float = MAX_GAP_S
+    source: str = "occupancy log"
+    # Record r = day * n_slots + slot: looks first[r] to first[r + 1]. A look's state holds from from_s on.
+    first: IntArray = field(init=False, repr=False)
+    from_s: FloatArray = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        slot, day = np.asarray(self.slot, np.int64), np.asarray(self.day, np.int64)
+        second, occupied = np.asarray(self.second, float), np.asarray(self.occupied, bool)
+        if not slot.size:
+            raise InputError(f"{self.source}: no looks, wanted at least one")
+        if not slot.shape == day.shape == second.shape == occupied.shape == (slot.size,):
+            raise InputError(f"{self.source}: wanted slot, day, second and occupied of one length")
+        for name, index, size in (("slot", slot, len(self.slot_ids)), ("day", day, len(self.days))):
+            if index.min() < 0 or index.max() >= size:
+                raise InputError(f"{self.source}: {name}: wanted indices from 0 to {size - 1}")
+        if list(self.days) != sorted({day for day in self.days if _is_date(day)}):
+            raise InputError(f"{self.source}: days: wanted different ISO dates in order")
+        if not np.all((second >= 0) & (second < DAY_S)):
+            raise InputError(f"{self.source}: second: wanted seconds of the day in [0, 86400)")
+        if not self.max_gap_s > 0:
+            raise InputError(f"max_gap_s: got {self.max_gap_s}, wanted seconds > 0")
+        order = np.lexsort((second, slot, day))
+        record = (day * len(self.slot_ids) + slot)[order]
+        stands = np.append((np.diff(record) > 0) | (np.diff(second[order]) > 0), True)
+        order, record = order[stands], record[stands]
+        slot, day, second, occupied = slot[order], day[order], second[order], occupied[order]
+        first = np.searchsorted(record, np.arange(len(self.slot_ids) * len(self.days) + 1))
+        gap = np.diff(second, prepend=second[0])
+        # In a long gap the state changes half-way, where the later look becomes the nearer one.
+        from_s = np.where(gap > self.max_gap_s, second - gap / 2, second)
+        from_s[np.diff(record, prepend=-1) > 0] = 0.0
+        arrays = {"slot": slot, "day": day, "second": second, "occupied": occupied}
+        for name, array in (arrays | {"first": first, "from_s": from_s}).items():
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "OccupancyLog":
+        return self  # immutable: copies share it
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str], max_gap_s: float = MAX_GAP_S) -> Self:
+        """Read a CSV file, gzipped if its name ends in `.gz`.
+
+        Columns: `datetime` (ISO, local time), `slot_id`, `occupied` (0 or 1); `camera` and `weather` may be
+        there and are not used.
+        A slot may be seen by several cameras; its looks must be in order of time.
+
+        Raises:
+            InputError: names the file, and the line and value where there is one.
+        """
+        path = Path(path)
+        slots: dict[str, int] = {}
+        moments: dict[str, datetime] = {}  # one look at many slots: many lines, one text
+        latest: dict[str, datetime] = {}
+        looks: list[tuple[int, datetime, bool]] = []
+        with csv_rows(path) as rows:
+            at_time, at_slot, at_occupied = csv_columns(
+                path, rows, _KNOWN, ("datetime", "slot_id", "occupied")
+            )
+            for line, row in rows:
+                text, slot_id, taken = row[at_time], row[at_slot], row[at_occupied]
+                moment = moments.get(text)
+                if moment is None:
+                    moment = moments[text] = _moment(path, line, text)
+                if not slot_id:
+                    raise InputError(f"{path}: line {line}: slot_id: empty, wanted a slot's name")
+                if taken not in ("0", "1"):
+                    raise InputError(f"{path}: line {line}: occupied: got {taken!r}, wanted 0 or 1")
+                if moment < latest.get(slot_id, moment):
+                    raise InputError(
+                        f"{path}: line {line}: datetime: {text} of slot {slot_id} is before its line above,"
+                        f" {latest[slot_id]}; wanted looks in order of time"
+                    )
+                latest[slot_id] = moment
+                looks.append((slots.setdefault(slot_id, len(slots)), moment, taken == "1"))
+        if not looks:
+            raise InputError(f"{path}: no looks, wanted at least one line below the header")
+        dates = [moment.date().isoformat() for _, moment, _ in looks]
+        days = sorted(set(dates))
+        day_index = {day: i for i, day in enumerate(days)}
+        seconds = [m.hour * 3600 + m.minute * 60 + m.second + m.microsecond * 1e-6 for _, m, _ in looks]
+        return cls(
+            tuple(slots),
+            tuple(days),
+            np.array([slot for slot, _, _ in looks], np.int64),
+            np.array([day_index[day] for day in dates], np.int64),
+            np.array(seconds, float),
+            np.array([taken for _, _, taken in looks], bool),
+            max_gap_s,
+            str(path),
+        )
+
+    @cached_property
+    def weekend(self) -> BoolArray:
+        """(n_days,) bool: is the day a Saturday or a Sunday?"""
+        return np.array([day_class(day) == "weekend" for day in self.days], bool)
+
+    def intervals(self, max_gap_s: float = MAX_GAP_S) -> Intervals:
+        """Pairs of consecutive looks at one slot on one day, at most `max_gap_s` apart."""
+        same_record = (np.diff(self.slot) == 0) & (np.diff(self.day) == 0)
+        earlier = np.flatnonzero(same_record & (np.diff(self.second) <= max_gap_s))
+        later = earlier + 1
+        return Intervals(
+            self.slot[earlier],
+            self.day[earlier],
+            self.second[earlier],
+            self.second[later],
+            self.occupied[earlier],
+            self.occupied[later],
+        )
+
+    def mean_occupancy(
+        self, kind: DayClass, hours: tuple[int, int] = (0, DAY_HOURS), days: BoolArray | None = None
+    ) -> FloatArray:
+        """(m,) float64: share of the time that each slot was taken, between the days' first and last looks.
+
+        Args:
+            kind: class of the days.
+            hours: first hour of the day, and the hour before which to stop.
+            days: (n_days,) bool, of which days; all by default.
+
+        Returns:
+            NaN for a slot that was not watched then.
+        """
+        if kind not in ("weekday", "weekend"):
+            raise InputError(f"class of day: got {kind!r}, wanted weekday or weekend")
+        used = self.weekend == (kind == "weekend")
+        if days is not None:
+            used &= days
+        window = slice(*hours)
+        occupied, seen = (seconds[:, used, window].sum(axis=(1, 2)) for seconds in self._hours[1:])
+        mean: FloatArray = np.divide(occupied, seen, out=np.full(occupied.shape, np.nan), where=seen > 0)
+        return mean
+
+    @property
+    def recorded(self) -> BoolArray:
+        """(m, n_days) bool: was the slot seen at all on that day?"""
+        return (np.diff(self.first) > 0).reshape(len(self.days), -1).T
+
+    @property
+    def replayed_share(self) -> FloatArray:
+        """(m, n_days, 24) float64: share of each hour that the replay is taken; 0 without a record."""
+        return self._hours.replayed / HOUR_S
+
+    @cached_property
+    def _hours(self) -> _Hours:
+        shape = (len(self.slot_ids), len(self.days), DAY_HOURS)
+        hours = _Hours(np.zeros(shape), np.zeros(shape), np.zeros(shape))
+        _sum_hours(self.first, self.from_s, self.second, self.occupied, *hours)
+        return hours
+
+
+@compiled
+def _add_hours(hours: FloatArray, start: float, end: float) -> None:
+    hour = int(start // HOUR_S)
+    while start < end:
+        stop = min((hour + 1) * HOUR_S, end)
+        hours[hour] += stop - start
+        start = stop
+        hour += 1
+
+
+@compiled
+def _sum_hours(
+    first: IntArray,
+    from_s: FloatArray,
+    second: FloatArray,
+    taken: BoolArray,
+    replayed: FloatArray,
+    occupied: FloatArray,
+    seen: FloatArray,
+) -> None:
+    n_slots = replayed.shape[0]
+    for record in range(first.size - 1):
+        day, slot = record // n_slots, record % n_slots
+        last = first[record + 1] - 1
+        for look in range(first[record], last + 1):
+            start, end = from_s[look], DAY_S if look == last else from_s[look + 1]
+            watched, left = max(start, second[first[record]]), min(end, second[last])
+            _add_hours(seen[slot, day], watched, left)
+            if taken[look]:
+                _add_hours(replayed[slot, day], start, end)
+                _add_hours(occupied[slot, day], watched, left)
+
+
+@contextmanager
+def csv_rows(path: Path) -> Iterator[Iterator[tuple[int, list[str]]]]:
+    """Rows of a CSV file with their line numbers; whatever cannot be read becomes an InputError."""
+    width = 0
+
+    def rows(file: TextIO) -> Iterator[tuple[int, list[str]]]:
+        nonlocal width
+        reader = csv.reader(file)
+        for row in reader:
+            width = width or len(row)
+            if row and len(row) != width:
+                raise InputError(f"{path}: line {reader.line_num}: got {len(row)} fields, wanted {width}")
+            if row:
+                yield reader.line_num, row
+
+    opened: Callable[..., Any] = gzip.open if path.suffix == ".gz" else open
+    try:
+        with opened(path, "rt", encoding="utf-8-sig", newline="") as file:
+            yield rows(file)
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise InputError(f"{path}: not a whole gzip file ({error}), wanted it complete") from error
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}, wanted a CSV file") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: not CSV text in UTF-8 ({error})") from error
+
+
+def csv_columns(
+    path: Path, rows: Iterator[tuple[int, list[str]]], known: Sequence[str], needed: Sequence[str]
+) -> list[int]:
+    """Where the needed columns stand in the header."""
+    _, header = next(rows, (0, []))
+    if not header:
+        raise InputError(f"{path}: empty, wanted a header with the columns {', '.join(needed)}")
+    for name in header:
+        if name not in known:
+            raise InputError(f"{path}: column {name!r} is unknown, wanted some of {', '.join(known)}")
+        if header.count(name) > 1:
+            raise InputError(f"{path}: column {name!r} stands there twice, wanted it once")
+    for name in needed:
+        if name not in header:
+            raise InputError(f"{path}: column {name!r} is missing, wanted {', '.join(needed)}")
+    return [header.index(name) for name in needed]
+
+
+def _moment(path: Path, line: int, text: str) -> datetime:
+    wanted = "wanted local date and time, for example 2015-11-12 07:09"
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        moment = None
+    if moment is None or ":" not in text or moment.tzinfo is not None:
+        raise InputError(f"{path}: line {line}: datetime: got {text!r}, {wanted}")
+    return moment

@@ -1,0 +1,355 @@
+"""Worlds that replay the days of a log on the slots of a lot."""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from parkenv.errors import InputError
+from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform
+from parkenv.world.occupancy import (
+    DAY_NAMES,
+    DAY_S,
+    HOUR_S,
+    MAX_PROBABILITY,
+    MIN_PROBABILITY,
+    Arrival,
+    ArrivalWindow,
+    BoolArray,
+    FloatArray,
+    Forecast,
+    IntArray,
+)
+from parkenv.world.occupancy_fit import fit_constant_rates
+from parkenv.world.occupancy_log import DAY_HOURS, OccupancyLog, csv_columns, csv_rows, day_class, weekday_of
+from sim_sensors.compilation import compiled
+
+PRIOR_DAYS = 1.0
+"""Weight, in days, of the lot's mean in a slot's forecast."""
+
+
+def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
+    """Read which slot of a log each slot of a lot replays.
+
+    Args:
+        path: CSV file with the columns `slot_id` (of the lot) and `log_slot_id`, a line a slot.
+        lot_slot_ids: ids of the lot's slots, n.
+        log: the log.
+
+    Returns:
+        (n,) int64, indices into `log.slot_ids`, in the order of `lot_slot_ids`.
+
+    Raises:
+        InputError: names file, line and value.
+    """
+    path = Path(path)
+    log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
+    lot_index = {slot_id: i for i, slot_id in enumerate(lot_slot_ids)}
+    mapping = np.full(len(lot_slot_ids), -1, np.int64)
+    with csv_rows(path) as rows:
+        at_slot, at_log_slot = csv_columns(path, rows, ("slot_id", "log_slot_id"), ("slot_id", "log_slot_id"))
+        for line, row in rows:
+            slot_id, log_slot_id = row[at_slot], row[at_log_slot]
+            if slot_id not in lot_index:
+                raise InputError(f"{path}: line {line}: slot_id: got {slot_id!r}, wanted a slot of the lot")
+            if mapping[lot_index[slot_id]] >= 0:
+                raise InputError(f"{path}: line {line}: slot_id: {slot_id!r} a second time, wanted it once")
+            if log_slot_id not in log_index:
+                raise InputError(
+                    f"{path}: line {line}: log_slot_id: got {log_slot_id!r}, wanted a slot of {log.source}"
+                )
+            mapping[lot_index[slot_id]] = log_index[log_slot_id]
+    missing = [slot_id for slot_id, i in lot_index.items() if mapping[i] < 0]
+    if missing:
+        raise InputError(
+            f"{path}: slot_id: {len(missing)} slots of the lot have no line, the first is {missing[0]!r}"
+        )
+    return mapping
+
+
+@compiled
+def _replay(
+    slots: IntArray,
+    second: float,
+    free: bool,
+    first: IntArray,
+    stop: IntArray,
+    from_s: FloatArray,
+    taken: BoolArray,
+) -> FloatArray:
+    """1.0 or 0.0: taken at `second` or not; with `free`, the second from which the slot is free."""
+    answer = np.empty(slots.size)
+    for i, slot in enumerate(slots):
+        if not 0 <= slot < first.size:
+            raise IndexError("slot index out of range")
+        end = stop[slot]
+        look = first[slot] + np.searchsorted(from_s[first[slot] : end], second, side="right") - 1
+        if not free:
+            answer[i] = 1.0 if taken[look] else 0.0
+            continue
+        answer[i] = second
+        while look < end and taken[look]:
+            look += 1
+            answer[i] = from_s[look] if look < end else np.inf
+    return answer
+
+
+@compiled
+def _changes(
+    slots: IntArray, second: float, first: IntArray, stop: IntArray, from_s: FloatArray, taken: BoolArray
+) -> IntArray:
+    """How often each slot's state has changed from its first record to `second`."""
+    count = np.zeros(slots.size, np.int64)
+    for i, slot in enumerate(slots):
+        if not 0 <= slot < first.size:
+            raise IndexError("slot index out of range")
+        look = first[slot] + 1
+        while look < stop[slot] and from_s[look] <= second:
+            count[i] += taken[look] != taken[look - 1]
+            look += 1
+    return count
+
+
+class RecordedWorld:
+    """One recorded day, replayed; past the end of the day its last state holds."""
+
+    def __init__(self, log: OccupancyLog, records: IntArray, arrival: Arrival) -> None:
+        self.log = log
+        self.arrival = arrival
+        self._first, self._stop = log.first[records], log.first[records + 1]
+        self._midnight = weekday_of(arrival.day) * DAY_S
+
+    def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
+        """(k,) bool: is each of the slots (k,) taken at `time`, which is at or after the arrival?"""
+        return self._look(slots, time, free=False) > 0
+
+    def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
+        """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
+        return np.maximum(self._look(slots, time, free=True) + self._midnight, time)
+
+    def stretch(self, slots: ArrayLike, time: float) -> IntArray:
+        """(k,) int64: how often the state of each slot has changed since the day's first record of it."""
+        second = self._second(time)
+        looks = (self._first, self._stop, self.log.from_s, self.log.occupied)
+        count: IntArray = _changes(np.asarray(slots, np.int64), second, *looks)
+        return count
+
+    def _second(self, time: float) -> float:
+        """Second of the recorded day."""
+        if not self.arrival.time <= time < math.inf:
+            raise InputError(
+                f"time: got {time}, wanted finite seconds from the arrival at {self.arrival.time} on"
+            )
+        return float(time) - self._midnight
+
+    def _look(self, slots: ArrayLike, time: float, free: bool) -> FloatArray:
+        second = self._second(time)
+        looks = (self._first, self._stop, self.log.from_s, self.log.occupied)
+        answer: FloatArray = _replay(np.asarray(slots, np.int64), second, free, *looks)
+        return answer
+
+
+class Layout(NamedTuple):
+    """What does not depend on the second of an arrival on a given day."""
+
+    log_slot: IntArray  # (n,)
+    record: IntArray  # (n,)
+    held_out: frozenset[int]  # days that the world replays: the forecast must not know them
+    share: FloatArray  # (m * 24,) share of each hour taken, summed over the other days
+    lot_share: FloatArray  # (24,) the same, summed over the slots, too
+    n_days: IntArray  # (m,) other days with a record
+    n_records: int  # all of them
+    decay_rate: float
+
+
+@compiled(error_model="numpy")
+def recorded_forecast(
+    log_slot: int, second: float, share: FloatArray, lot_share: FloatArray, n_days: FloatArray, n_records: int
+) -> float:
+    """P(taken) at a second of the day, from the hour around it; arguments as in `Layout` (for batches, too)."""
+    low, high = max(second - HOUR_S / 2, 0.0), min(second + HOUR_S / 2, DAY_S)
+    taken = in_all = 0.0
+    for hour in range(int(low // HOUR_S), min(int(high // HOUR_S), DAY_HOURS - 1) + 1):
+        weight = (min((hour + 1) * HOUR_S, high) - max(hour * HOUR_S, low)) / (high - low)
+        taken += weight * share[log_slot * DAY_HOURS + hour]
+        in_all += weight * lot_share[hour]
+    p = (taken + PRIOR_DAYS * in_all / n_records) / (n_days[log_slot] + PRIOR_DAYS)
+    return float(min(max(p, MIN_PROBABILITY), MAX_PROBABILITY))
+
+
+@compiled
+def _forecast(
+    log_slots: IntArray,
+    second: float,
+    share: FloatArray,
+    lot_share: FloatArray,
+    n_days: IntArray,
+    n_records: int,
+) -> FloatArray:
+    p = np.empty(log_slots.size)
+    for i, log_slot in enumerate(log_slots):
+        p[i] = recorded_forecast(log_slot, second, share, lot_share, n_days, n_records)
+    return p
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedOccupancy:
+    """A log laid on the n slots of a lot: every episode replays a recorded day.
+
+    The lot's slots, nearest to the goal first, get the log's m slots, fullest first (mean occupancy on the
+    days of the arrival's class, weekday or weekend): rank r gets log rank floor(r·m/n). If the lot is larger,
+    a log slot serves several lot slots: the k-th copy replays the k-th next recorded day of the class on
+    which the log slot was seen, cyclically, so no two slots share a record. If it is smaller, the ranks are
+    thinned evenly.
+
+    Nothing of the days that a world replays is used to lay it out or to forecast it.
+
+    Args:
+        log: the recorded looks.
+        walk_m: (n,) float64, m, walking distance from each slot to the goal.
+        mapping: (n,) int64, log slot of each lot slot, in place of the rule (see `read_mapping`).
+    """
+
+    log: OccupancyLog
+    walk_m: FloatArray
+    mapping: IntArray | None = None
+    _layouts: dict[int, Layout] = field(init=False, repr=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        walk = np.array(self.walk_m, float)
+        if walk.ndim != 1 or not walk.size or not np.all((walk >= 0) & np.isfinite(walk)):
+            raise InputError(f"walk_m: got shape {walk.shape}, wanted (n,) finite metres >= 0")
+        object.__setattr__(self, "walk_m", walk)
+        if self.mapping is not None:
+            mapping = np.array(self.mapping, np.int64)
+            m = len(self.log.slot_ids)
+            if mapping.shape != walk.shape or mapping.min() < 0 or mapping.max() >= m:
+                raise InputError(f"mapping: wanted ({walk.size},) indices of log slots from 0 to {m - 1}")
+            object.__setattr__(self, "mapping", mapping)
+
+    @property
+    def n_slots(self) -> int:
+        """Number of slots of the lot."""
+        return int(self.walk_m.size)
+
+    def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
+        """A recorded day, uniform among those on the window's weekdays, and a time of day, uniform in it."""
+        days = self.days_in(window)
+        day = days[int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(days))]
+        return Arrival(weekday_of(day) * DAY_S + window.draw_second(key), day)
+
+    def days_in(self, window: ArrivalWindow) -> list[str]:
+        """The recorded days on the window's weekdays; InputError if there are none."""
+        days = [day for day in self.log.days if weekday_of(day) in window.weekdays]
+        if not days:
+            names = ",".join(DAY_NAMES[weekday] for weekday in window.weekdays)
+            raise InputError(f"{self.log.source}: no recorded day is one of {names}")
+        return days
+
+    def world(self, key: np.uint64, arrival: Arrival) -> RecordedWorld:  # noqa: ARG002 - the day decides all
+        """The replay of the arrival's day."""
+        return RecordedWorld(self.log, self._layout(arrival).record, arrival)
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        """What the other days of the class say of the hour around the arrival.
+
+        Per log slot the mean over the days that the world does not replay, shrunk by a Beta prior worth one
+        day to the mean of all the log's slots, and clipped to [0.001, 0.999]. The relaxation rate is that of
+        one chain with constant rates, fitted to all looks on those days.
+        """
+        layout = self._layout(arrival)
+        second = arrival.time - weekday_of(arrival.day) * DAY_S
+        p = _forecast(
+            layout.log_slot, second, layout.share, layout.lot_share, layout.n_days, layout.n_records
+        )
+        return Forecast(p, np.full(self.n_slots, layout.decay_rate))
+
+    def _layout(self, arrival: Arrival) -> Layout:
+        if arrival.day not in self.log.days:
+            raise InputError(f"Arrival.day: got {arrival.day!r}, wanted a recorded day of {self.log.source}")
+        second = arrival.time - weekday_of(arrival.day) * DAY_S
+        if not 0 <= second < DAY_S:
+            raise InputError(f"Arrival.time: got {arrival.time}, wanted a second of {arrival.day}")
+        return self.layout(arrival.day)
+
+    def layout(self, day: str) -> Layout:
+        """How the log lies on the lot when `day`, one of the log's, is replayed."""
+        index = self.log.days.index(day)
+        if index not in self._layouts:
+            self._layouts[index] = self._lay_out(index)
+        return self._layouts[index]
+
+    def _lay_out(self, day: int) -> Layout:
+        log = self.log
+        same_class = np.flatnonzero(log.weekend == log.weekend[day])
+        replay_order = np.roll(same_class, -int(np.searchsorted(same_class, day)))
+        held_out = {day}
+        while True:
+            others = np.isin(np.arange(len(log.days)), [d for d in same_class if d not in held_out])
+            if not others.any():
+                raise InputError(
+                    f"{log.source}: a world of {self.n_slots} slots replays all {same_class.size} recorded"
+                    f" {day_class(log.days[day])} days, wanted at least one more to forecast from"
+                )
+            log_slot = self._assign(log.days[day], others) if self.mapping is None else self.mapping
+            days = self._replay_days(log_slot, replay_order)
+            # What is replayed must not have had a say in the ranks: rank again without it.
+            if held_out.issuperset(days):
+                break
+            held_out.update(days)
+        looks = log.intervals(log.max_gap_s)
+        used = others[looks.day]
+        if not used.any():
+            raise InputError(
+                f"{log.source}: no two consecutive looks on the days that are left to forecast from"
+            )
+        rates = fit_constant_rates((looks.end - looks.start)[used], looks.before[used], looks.after[used])
+        share = log.replayed_share[:, others].sum(axis=1)
+        n_days = log.recorded[:, others].sum(axis=1)
+        return Layout(
+            log_slot,
+            days * len(log.slot_ids) + log_slot,
+            frozenset(held_out),
+            share.ravel(),
+            share.sum(axis=0),
+            n_days,
+            int(n_days.sum()),
+            sum(rates),
+        )
+
+    def _assign(self, day: str, others: BoolArray) -> IntArray:
+        """(n,) log slot of each lot slot, by the rule of the ranks."""
+        n, m = self.n_slots, len(self.log.slot_ids)
+        mean = self.log.mean_occupancy(day_class(day), days=others)
+        unknown = np.isnan(mean)
+        mean[unknown] = 0.0 if unknown.all() else mean[~unknown].mean()
+        log_slot = np.empty(n, np.int64)
+        log_slot[np.argsort(self.walk_m, kind="stable")] = np.argsort(-mean, kind="stable")[
+            np.arange(n) * m // n
+        ]
+        return log_slot
+
+    def _replay_days(self, log_slot: IntArray, replay_order: IntArray) -> IntArray:
+        """(n,) day that each lot slot replays: copies of a log slot, nearest first, take the days in turn."""
+        recorded = self.log.recorded[:, replay_order]
+        days = np.empty(self.n_slots, np.int64)
+        left = {int(s): iter(replay_order[recorded[s]]) for s in np.unique(log_slot)}
+        for slot in np.argsort(self.walk_m, kind="stable"):
+            chosen = next(left[int(log_slot[slot])], None)
+            if chosen is None:
+                name = self.log.slot_ids[log_slot[slot]]
+                n_copies, n_days = (
+                    int((log_slot == log_slot[slot]).sum()),
+                    int(recorded[log_slot[slot]].sum()),
+                )
+                raise InputError(
+                    f"{self.log.source}: slot {name} would serve {n_copies} slots of the lot but was recorded"
+                    f" on {n_days} days of the class; wanted a smaller lot or a longer log"
+                )
+            days[slot] = chosen
+        return days

@@ -1,0 +1,164 @@
+"""How well slots are seen from the lane."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.files.versioned_json import JsonFormat
+
+FloatArray = NDArray[np.float64]
+
+SENSOR_MODEL_NAMES = ("laser", "stereo")
+"""Rigs for which the package brings what their stack was measured to see."""
+_FOLDER = Path(__file__).parent / "sensor_models"
+_FORMAT = JsonFormat("parkenv-sensor-model", 1, "a sighting model")
+
+
+class SensorRates(NamedTuple):
+    """How well each of k slots is seen.
+
+    Attributes:
+        seen: (k,) float64, P(a slot in view is made out at all).
+        hit: (k,) float64, P(looks taken | taken, seen).
+        false_alarm: (k,) float64, P(looks taken | free, seen).
+    """
+
+    seen: FloatArray
+    hit: FloatArray
+    false_alarm: FloatArray
+
+    def of(self, rows: slice) -> SensorRates:
+        """The rates of some of the slots."""
+        return SensorRates(self.seen[rows], self.hit[rows], self.false_alarm[rows])
+
+
+@dataclass(frozen=True)
+class SensorBand:
+    """How well slots are seen that lie at some distance, on one side.
+
+    Args:
+        up_to: m, distance from the car to the slot's vertex; the nearest band that reaches holds.
+        beside: whether these are the slots on the right of a car that stands on its lane, where the thesis's camera
+            looks.
+        seen_rate: P(a slot in view is made out at all). What hides a slot goes on hiding it: who looks again from as
+            far away sees as much of it as before.
+        hit_rate: P(looks taken | taken).
+        false_alarm_rate: P(looks taken | free).
+
+    Raises:
+        InputError: a rate outside [0, 1], a negative distance, or looks that say nothing (equal rates).
+    """
+
+    up_to: float
+    beside: bool
+    seen_rate: float
+    hit_rate: float
+    false_alarm_rate: float
+
+    def __post_init__(self) -> None:
+        if not (self.up_to >= 0.0 and math.isfinite(self.up_to)):
+            raise InputError(f"up_to is {self.up_to} m, want a finite distance of at least 0")
+        _require_rates(self.hit_rate, self.false_alarm_rate)
+        if not 0.0 <= self.seen_rate <= 1.0:
+            raise InputError(f"seen_rate is {self.seen_rate}, want a probability")
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """How well a slot is seen from the lane.
+
+    Args:
+        view_range: m; a slot is in view while the car is within this distance of the slot's vertex. The
+            default shows the slot that the car stands at, its neighbours and those across the aisle.
+        hit_rate: P(looks taken | taken).
+        false_alarm_rate: P(looks taken | free).
+        bands: rates by distance and side, which go before these two where a band reaches.
+
+    Raises:
+        InputError: a rate outside [0, 1], a negative range, or looks that say nothing (equal rates).
+    """
+
+    view_range: float = 6.0
+    hit_rate: float = 1.0
+    false_alarm_rate: float = 0.0
+    bands: tuple[SensorBand, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not (self.view_range >= 0.0 and math.isfinite(self.view_range)):
+            raise InputError(f"view_range is {self.view_range} m, want a finite distance of at least 0")
+        _require_rates(self.hit_rate, self.false_alarm_rate)
+
+    @classmethod
+    def named(cls, name: str) -> Self:
+        """How well the detection and mapping stack sees with a rig: what `parkenv fit-sensor-model` measured of it.
+
+        Args:
+            name: `laser`, a camera and a 270° laser; `stereo`, a stereo pair alone.
+
+        Raises:
+            InputError: another name.
+
+        Examples:
+            >>> SensorModel.named("laser").view_range
+            16.0
+        """
+        if name not in SENSOR_MODEL_NAMES:
+            raise InputError(f"sensor_model is {name!r}, want one of {', '.join(SENSOR_MODEL_NAMES)}")
+        return cls.from_file(_FOLDER / f"{name}.json")
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> Self:
+        """Read what `to_file` wrote.
+
+        Raises:
+            InputError: it cannot be read; the message names the file and what is wrong with it.
+        """
+        content = _FORMAT.read(path)
+        try:
+            bands = tuple(SensorBand(**band) for band in content["bands"])
+            return cls(content["view_range"], content["hit_rate"], content["false_alarm_rate"], bands)
+        except (KeyError, TypeError, InputError) as error:
+            raise InputError(f"{path}: {error}") from error
+
+    def to_file(self, path: str | os.PathLike[str]) -> None:
+        """Write the model as JSON."""
+        _FORMAT.write(path, asdict(self))
+
+    @classmethod
+    def blind(cls) -> Self:
+        """Nothing is seen of a slot before somebody tries to park there."""
+        return cls(0.0, bands=tuple(SensorBand(0.0, beside, 0.0, 1.0, 0.0) for beside in (False, True)))
+
+    @property
+    def perfect(self) -> bool:
+        """Whether every look shows the truth."""
+        return not self.bands and self.hit_rate == 1.0 and self.false_alarm_rate == 0.0
+
+    def rates(self, distance: FloatArray, beside: NDArray[np.bool_]) -> SensorRates:
+        """The rates of slots at given distances, (k,) m, beside the car or not, (k,) bool."""
+        k = len(distance)
+        rates = SensorRates(np.ones(k), np.full(k, self.hit_rate), np.full(k, self.false_alarm_rate))
+        for band in sorted(self.bands, key=lambda band: -band.up_to):
+            reached = (distance <= band.up_to) & (beside == band.beside)
+            rates.seen[reached] = band.seen_rate
+            rates.hit[reached] = band.hit_rate
+            rates.false_alarm[reached] = band.false_alarm_rate
+        return rates
+
+
+def _require_rates(hit_rate: float, false_alarm_rate: float) -> None:
+    for name, rate in (("hit_rate", hit_rate), ("false_alarm_rate", false_alarm_rate)):
+        if not 0.0 <= rate <= 1.0:
+            raise InputError(f"{name} is {rate}, want a probability")
+    if hit_rate <= false_alarm_rate:
+        raise InputError(
+            f"hit_rate {hit_rate} is not above false_alarm_rate {false_alarm_rate}: looks would say nothing"
+        )

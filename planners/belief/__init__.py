@@ -1,0 +1,1 @@
+"""Planning in belief space: the path of the least expected total time."""

@@ -1,0 +1,574 @@
+"""The exact optimum of a search over belief states, on small lots.
+
+The model is the true one of a search in which nothing changes: each slot is free with a known probability,
+independently, and stays as it is; a slot is revealed as soon as it is in view. What the car knows is then the
+set of slots seen and the set of those seen free, so the optimum follows by dynamic programming over
+
+    (where the car is, seen, seen free).
+
+Three facts keep that small, and none loses anything:
+
+- Driving through vertices that show nothing new decides nothing: the car chooses among the *frontier*, the
+  vertices that show something new and that it can reach through such as do not.
+- A slot f' seen free is forgotten where another one f is as good from there: w_f + D(f', f) <= w_f'.
+- The search is over where the best slot seen free, by a way that shows nothing new, is as near as any other
+  slot could be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from parkenv.errors import InputError
+from parkenv.world.lot import MOVES, PARK
+from parkenv.world.scenario import SearchProblem
+from planners.agent import Observation, SearchAgent
+from planners.driving.road_table import RoadTable
+from sim_sensors.compilation import compiled
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MOST_SLOTS = 25
+"""Slots that the key of a belief state has room for."""
+MOST_STATES = 8_000_000
+"""Belief states that are kept by default; they take about 200 MB, and twice that on the way."""
+
+_POSITION_BITS = 10
+_SEARCH_ENDS = -1
+_CHUNK = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class _LotMasks:
+    """A small lot as the dynamic program needs it; sets of slots are the bits of integers."""
+
+    shows: IntArray  # (n_vertices,) what is in view of each vertex
+    neighbors: NDArray[np.int32]
+    move_s: FloatArray
+    seconds: FloatArray  # (n_vertices, n_vertices)
+    walk_s: FloatArray
+    worse_than: IntArray  # (n_slots,) the slots that make each one needless
+    p_free: FloatArray
+    give_up_s: float
+    look_s: FloatArray  # (n_vertices,) the wait that shows what is in view of where the car begins
+
+
+class ExactSolution:
+    """The optimum from one belief state on.
+
+    Args:
+        problem: lot, goal, speeds, costs and view range. Slots must be seen without error.
+        p_occupied: (n_slots,) probability that each slot is taken; only those of unseen slots matter.
+        vertex: where the car is.
+        seen: (n_slots,) bool, slots whose state is known; none where None.
+        free: (n_slots,) bool, those of them that are free.
+        most_states: how many belief states may be kept.
+
+    Attributes:
+        expected_s: s, the least expected time from here to the goal.
+        n_states: belief states that were kept.
+
+    Raises:
+        InputError: more than `MOST_SLOTS` slots or `most_states` states, or looks that may err.
+
+    Examples:
+        >>> from parkenv import ParkingLot
+        >>> problem = SearchProblem(lot=ParkingLot.packaged("mini"), give_up_s=300.0)
+        >>> entry = int(problem.lot.entry_vertices[0])
+        >>> ExactSolution(problem, np.zeros(10), entry).expected_s < ExactSolution(
+        ...     problem, np.full(10, 0.8), entry).expected_s
+        True
+    """
+
+    def __init__(
+        self,
+        problem: SearchProblem,
+        p_occupied: ArrayLike,
+        vertex: int,
+        seen: NDArray[np.bool_] | None = None,
+        free: NDArray[np.bool_] | None = None,
+        *,
+        most_states: int = MOST_STATES,
+        table: RoadTable | None = None,
+    ) -> None:
+        n = problem.lot.n_slots
+        require_small(problem)
+        p = np.asarray(p_occupied, dtype=np.float64)
+        if p.shape != (n,) or not ((p >= 0.0) & (p <= 1.0)).all():
+            raise InputError(f"p_occupied: want {n} probabilities, got shape {p.shape}")
+        self._masks = _lot_masks(problem, p, table or RoadTable.of(problem))
+        seen_bits = bits_of(np.zeros(n, np.bool_) if seen is None else seen)
+        free_bits = bits_of(np.zeros(n, np.bool_) if free is None else free) & seen_bits
+        self._n = n
+        root = _key(seen_bits, vertex, _without_needless(free_bits, self._masks.worse_than), n)
+        self._enumerate(root, most_states)
+        self._solve()
+        self.n_states = len(self._keys)
+        self.expected_s = float(self._values[0])
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> ExactSolution:
+        return self  # immutable: copies of a plan share it
+
+    def decide(self, seen: int, vertex: int, free: int) -> tuple[float, int] | None:
+        """Expected seconds and the next vertex to look from (-1: park at what is known); None if never reached.
+
+        Args:
+            seen: slots seen, as bits.
+            vertex: where the car decides: where it began, or a vertex that showed something new.
+            free: slots seen free, as bits.
+        """
+        free = _without_needless(free, self._masks.worse_than)
+        level = _popcount(seen)
+        low, high = self._levels[level], self._levels[level + 1]
+        key = _key(seen, vertex, free, self._n)
+        at = low + int(np.searchsorted(self._keys[low:high], key))
+        if at >= high or self._keys[at] != key:
+            return None
+        return float(self._values[at]), int(self._choices[at])
+
+    def _enumerate(self, root: int, most_states: int) -> None:
+        """All states that can follow from the first one, by how many slots have been seen."""
+        n = self._n
+        masks = self._masks
+        pending: list[list[IntArray]] = [[] for _ in range(n + 1)]
+        pending[_popcount(root >> (n + _POSITION_BITS))].append(np.array([root], dtype=np.int64))
+        found, total = [], 0
+        for level in range(n + 1):
+            keys = np.unique(np.concatenate(pending[level])) if pending[level] else np.empty(0, np.int64)
+            pending[level] = []
+            found.append(keys)
+            total += len(keys)
+            for start in range(0, len(keys), _CHUNK):
+                if total > most_states:
+                    break
+                new = np.unique(_successors(keys[start : start + _CHUNK], n, *_graph(masks)))
+                levels = _popcounts(new >> (n + _POSITION_BITS))
+                for more in np.unique(levels):
+                    pending[more].append(new[levels == more])
+                    if len(pending[more]) > 32:
+                        pending[more] = [np.unique(np.concatenate(pending[more]))]
+            if total > most_states:
+                raise InputError(
+                    f"this lot has over {most_states} belief states, the limit of the exact planner: want fewer "
+                    f"slots than {n} (about 20 round one aisle, 16 round two), or a higher most_states"
+                )
+        self._keys = np.concatenate(found)
+        self._levels = np.concatenate([[0], np.cumsum([len(keys) for keys in found])]).astype(np.int64)
+
+    def _solve(self) -> None:
+        masks = self._masks
+        self._values = np.empty(len(self._keys))
+        self._choices = np.empty(len(self._keys), dtype=np.int16)
+        for level in range(self._n, -1, -1):
+            _back_up(
+                self._keys,
+                self._levels,
+                level,
+                self._values,
+                self._choices,
+                self._n,
+                *_graph(masks),
+                masks.p_free,
+                masks.give_up_s,
+            )
+
+
+def require_small(problem: SearchProblem) -> None:
+    """Refuse what the exact planner cannot do.
+
+    Raises:
+        InputError: too many slots or vertices, or looks that may err.
+    """
+    lot = problem.lot
+    if lot.n_slots > MOST_SLOTS or lot.n_vertices > 1 << _POSITION_BITS:
+        raise InputError(
+            f"lot {lot.name!r} has {lot.n_slots} slots and {lot.n_vertices} vertices; the exact planner takes at most "
+            f"{MOST_SLOTS} slots and {1 << _POSITION_BITS} vertices"
+        )
+    if not problem.sensor_model.perfect:
+        raise InputError("the exact planner wants slots that are seen without error")
+
+
+def bits_of(slots: NDArray[np.bool_]) -> int:
+    """A set of slots, (n_slots,) bool, as the bits of a number."""
+    return int(sum(1 << int(s) for s in np.flatnonzero(slots)))
+
+
+def _lot_masks(problem: SearchProblem, p_occupied: FloatArray, table: RoadTable) -> _LotMasks:
+    lot = problem.lot
+    starts, slots = problem.slots_in_view
+    shows = np.zeros(lot.n_vertices, dtype=np.int64)
+    np.bitwise_or.at(shows, np.repeat(np.arange(lot.n_vertices), np.diff(starts)), 1 << slots)
+    n, walk = lot.n_slots, problem.walk_s
+    from_slot = table.seconds[:n, :n]
+    gain = walk[:, None] - (walk[None, :] + from_slot)
+    as_good = (gain > 1e-9) | ((np.abs(gain) <= 1e-9) & (np.arange(n)[None, :] < np.arange(n)[:, None]))
+    np.fill_diagonal(as_good, val=False)
+    # Of two that are as good as each other the lower number stays; mutual loss would forget both.
+    worse_than = np.array([bits_of(row) for row in as_good], dtype=np.int64)
+    missing = (lot.neighbors < 0).any(axis=1)
+    return _LotMasks(
+        shows,
+        lot.neighbors,
+        problem.move_s,
+        table.seconds,
+        walk,
+        worse_than,
+        1.0 - p_occupied,
+        problem.give_up_s,
+        np.where(missing, problem.wait_s, np.inf),
+    )
+
+
+def _graph(
+    masks: _LotMasks,
+) -> tuple[IntArray, NDArray[np.int32], FloatArray, FloatArray, FloatArray, IntArray, FloatArray]:
+    return (
+        masks.shows,
+        masks.neighbors,
+        masks.move_s,
+        masks.seconds,
+        masks.walk_s,
+        masks.worse_than,
+        masks.look_s,
+    )
+
+
+@compiled
+def _key(seen: int, vertex: int, free: int, n: int) -> int:
+    return (((seen << _POSITION_BITS) | vertex) << n) | free
+
+
+@compiled
+def _popcount(bits: int) -> int:
+    count = 0
+    while bits:
+        bits &= bits - 1
+        count += 1
+    return count
+
+
+@compiled
+def _popcounts(bits: IntArray) -> IntArray:
+    counts = np.empty(len(bits), np.int64)
+    for i in range(len(bits)):
+        counts[i] = _popcount(bits[i])
+    return counts
+
+
+@compiled
+def _without_needless(free: int, worse_than: IntArray) -> int:
+    """Only the slots seen free that no other one makes needless."""
+    kept = free
+    for s in range(len(worse_than)):
+        if (free >> s) & 1 and worse_than[s] & free:
+            kept &= ~(1 << s)
+    return kept
+
+
+@compiled
+def _within_known(
+    vertex: int,
+    seen: int,
+    shows: IntArray,
+    neighbors: NDArray[np.int32],
+    move_s: FloatArray,
+    look_s: FloatArray,
+    reach: FloatArray,
+    came_from: IntArray,
+    done: NDArray[np.uint8],
+) -> None:
+    """Drive times, s, through vertices that show nothing new, to those and to the frontier.
+
+    Where the car begins on a vertex whose view it has not had yet, the time to that vertex is that of the
+    shortest way to end a step there: a wait, or a drive round.
+    """
+    reach[:] = np.inf
+    came_from[:] = -1
+    done[:] = 0
+    reach[vertex] = 0.0
+    again = look_s[vertex]
+    while True:
+        best, v = np.inf, -1
+        for u in range(len(reach)):
+            if done[u] == 0 and reach[u] < best:
+                best, v = reach[u], u
+        if v < 0:
+            break
+        done[v] = 1
+        if shows[v] & ~seen and v != vertex:
+            continue
+        for m in range(neighbors.shape[1]):
+            u = neighbors[v, m]
+            if u < 0:
+                continue
+            seconds = best + move_s[v, m]
+            if u == vertex:
+                again = min(again, seconds)
+            elif seconds < reach[u]:
+                reach[u] = seconds
+                came_from[u] = v
+    if shows[vertex] & ~seen:
+        reach[vertex] = again
+
+
+@compiled
+def _best_known(free: int, reach: FloatArray, walk_s: FloatArray) -> float:
+    best = np.inf
+    for s in range(len(walk_s)):
+        if (free >> s) & 1:
+            best = min(best, reach[s] + walk_s[s])
+    return best
+
+
+@compiled
+def _least_unseen(vertex: int, seen: int, seconds: FloatArray, walk_s: FloatArray) -> float:
+    least = np.inf
+    for s in range(len(walk_s)):
+        if not (seen >> s) & 1:
+            least = min(least, seconds[vertex, s] + walk_s[s])
+    return least
+
+
+@compiled
+def _successors(
+    keys: IntArray,
+    n: int,
+    shows: IntArray,
+    neighbors: NDArray[np.int32],
+    move_s: FloatArray,
+    seconds: FloatArray,
+    walk_s: FloatArray,
+    worse_than: IntArray,
+    look_s: FloatArray,
+) -> IntArray:
+    """States that one more look can lead to, repeats included."""
+    n_vertices = len(shows)
+    reach, came_from = np.empty(n_vertices), np.empty(n_vertices, np.int64)
+    done = np.empty(n_vertices, np.uint8)
+    found = np.empty(1024, np.int64)
+    count = 0
+    all_slots, positions = (1 << n) - 1, (1 << _POSITION_BITS) - 1
+    previous, least = -1, np.inf
+    for i in range(len(keys)):
+        free, group = keys[i] & all_slots, keys[i] >> n
+        vertex, seen = group & positions, group >> _POSITION_BITS
+        if group != previous:
+            _within_known(vertex, seen, shows, neighbors, move_s, look_s, reach, came_from, done)
+            least = _least_unseen(vertex, seen, seconds, walk_s)
+            previous = group
+        best = _best_known(free, reach, walk_s)
+        if best <= min(least, _best_known(free, seconds[vertex], walk_s)):
+            continue
+        for v in range(n_vertices):
+            new = shows[v] & ~seen
+            if new == 0 or not reach[v] < best:
+                continue
+            revealed = new
+            while True:
+                if count == len(found):
+                    larger = np.empty(2 * count, np.int64)
+                    larger[:count] = found
+                    found = larger
+                found[count] = _key(seen | new, v, _without_needless(free | revealed, worse_than), n)
+                count += 1
+                if revealed == 0:
+                    break
+                revealed = (revealed - 1) & new
+    return found[:count]
+
+
+@compiled
+def _back_up(
+    keys: IntArray,
+    levels: IntArray,
+    level: int,
+    values: FloatArray,
+    choices: NDArray[np.int16],
+    n: int,
+    shows: IntArray,
+    neighbors: NDArray[np.int32],
+    move_s: FloatArray,
+    seconds: FloatArray,
+    walk_s: FloatArray,
+    worse_than: IntArray,
+    look_s: FloatArray,
+    p_free: FloatArray,
+    give_up_s: float,
+) -> None:
+    """Bellman's equation for the states with `level` slots seen, those with more being solved."""
+    n_vertices = len(shows)
+    reach, came_from = np.empty(n_vertices), np.empty(n_vertices, np.int64)
+    done = np.empty(n_vertices, np.uint8)
+    low, high = np.empty(n_vertices, np.int64), np.empty(n_vertices, np.int64)
+    all_slots, positions = (1 << n) - 1, (1 << _POSITION_BITS) - 1
+    previous, least = -1, np.inf
+    for i in range(levels[level], levels[level + 1]):
+        free, group = keys[i] & all_slots, keys[i] >> n
+        vertex, seen = group & positions, group >> _POSITION_BITS
+        if group != previous:
+            _within_known(vertex, seen, shows, neighbors, move_s, look_s, reach, came_from, done)
+            least = _least_unseen(vertex, seen, seconds, walk_s)
+            previous = group
+            for v in range(n_vertices):
+                low[v] = -1
+        best = _best_known(free, reach, walk_s)
+        choice = _SEARCH_ENDS
+        if best == np.inf and seen == all_slots:
+            best = give_up_s
+        elif best > min(least, _best_known(free, seconds[vertex], walk_s)):
+            limit = best
+            if best == np.inf:
+                # Slots that no way leads to leave the lot unproven; a step limit then charges the same.
+                best = give_up_s
+            for v in range(n_vertices):
+                new = shows[v] & ~seen
+                if new == 0 or not reach[v] < limit:
+                    continue
+                after = seen | new
+                if low[v] < 0:
+                    start, end = levels[_popcount(after)], levels[_popcount(after) + 1]
+                    low[v] = start + np.searchsorted(keys[start:end], _key(after, v, 0, n))
+                    high[v] = start + np.searchsorted(keys[start:end], _key(after, v, all_slots, n) + 1)
+                expected = reach[v]
+                revealed = new
+                while True:
+                    chance = 1.0
+                    for s in range(n):
+                        if (new >> s) & 1:
+                            chance *= p_free[s] if (revealed >> s) & 1 else 1.0 - p_free[s]
+                    if chance > 0.0:
+                        key = _key(after, v, _without_needless(free | revealed, worse_than), n)
+                        at = low[v] + np.searchsorted(keys[low[v] : high[v]], key)
+                        expected += chance * values[at]
+                    if revealed == 0:
+                        break
+                    revealed = (revealed - 1) & new
+                # A forced look counts even where it may end in giving up.
+                if expected < best or (choice == _SEARCH_ENDS and limit == np.inf):
+                    best, choice = expected, v
+        values[i] = best
+        choices[i] = choice
+
+
+@dataclass
+class ExactPlan:
+    """What the exact agent remembers.
+
+    Attributes:
+        forecast: (n_slots,) float32, the belief before anything was seen.
+        solution: the optimum from the state that it was last solved for.
+        seen: slots seen, as bits.
+        free: slots that looked free when last seen, as bits.
+        target: the vertex that it drives to for a look; -1 to park at what it knows; -2 before a decision.
+    """
+
+    forecast: NDArray[np.float32]
+    solution: ExactSolution
+    seen: int = 0
+    free: int = 0
+    target: int = -2
+
+
+class ExactAgent(SearchAgent[ExactPlan]):
+    """`exact`: follows the optimum over belief states; for lots of up to about 20 slots.
+
+    It takes what it sees for lasting. Where a slot seen free turns out taken it solves again from there.
+
+    Args:
+        problem: lot, goal, speeds and costs.
+        most_states: how many belief states may be kept.
+
+    Raises:
+        InputError: too large a lot, or slots that are seen with errors.
+    """
+
+    name: ClassVar[str] = "exact"
+
+    def __init__(self, problem: SearchProblem, most_states: int = MOST_STATES) -> None:
+        super().__init__(problem)
+        require_small(self.problem)
+        self.most_states = most_states
+        self.table = RoadTable.of(self.problem)
+
+    def begin(self, observation: Observation) -> ExactPlan:
+        """Solve from the forecast."""
+        forecast = np.array(observation["p_occupied"])
+        return ExactPlan(forecast, self._solved(forecast, int(observation["vertex"]), 0, 0))
+
+    def decide(self, observation: Observation, memory: ExactPlan) -> int:
+        """Toward the next look, or to the slot that it settles for."""
+        vertex, p = int(observation["vertex"]), observation["p_occupied"]
+        # A forecast of 0 or 1 cannot be told from a sighting, and need not be.
+        certain = (memory.forecast == 0.0) | (memory.forecast == 1.0)
+        seen = memory.seen | bits_of((p != memory.forecast) | (certain & self._in_view(vertex)))
+        free = bits_of((p < memory.forecast) | (certain & (p < 0.5))) & seen
+        news = (seen, free) != (memory.seen, memory.free)
+        if news or memory.target == -2 or vertex == memory.target:
+            memory.seen, memory.free = seen, free
+            decision = memory.solution.decide(seen, vertex, free)
+            if decision is None:
+                memory.solution = self._solved(memory.forecast, vertex, seen, free)
+                decision = memory.solution.decide(seen, vertex, free)
+                assert decision is not None
+            memory.target = decision[1]
+        return self._toward(vertex, memory)
+
+    def _solved(self, forecast: NDArray[np.float32], vertex: int, seen: int, free: int) -> ExactSolution:
+        slots = np.arange(len(forecast))
+        as_bool = [((bits >> slots) & 1).astype(np.bool_) for bits in (seen, free)]
+        return ExactSolution(
+            self.problem,
+            forecast,
+            vertex,
+            as_bool[0],
+            as_bool[1],
+            most_states=self.most_states,
+            table=self.table,
+        )
+
+    def _in_view(self, vertex: int) -> NDArray[np.bool_]:
+        starts, slots = self.problem.slots_in_view
+        shown = np.zeros(self.problem.lot.n_slots, dtype=np.bool_)
+        shown[slots[starts[vertex] : starts[vertex + 1]]] = True
+        return shown
+
+    def _toward(self, vertex: int, memory: ExactPlan) -> int:
+        n_vertices, lot = self.problem.lot.n_vertices, self.problem.lot
+        masks = memory.solution._masks
+        reach, came_from = np.empty(n_vertices), np.empty(n_vertices, np.int64)
+        _within_known(
+            vertex,
+            memory.seen,
+            masks.shows,
+            lot.neighbors,
+            self.problem.move_s,
+            masks.look_s,
+            reach,
+            came_from,
+            np.empty(n_vertices, np.uint8),
+        )
+        target = memory.target
+        if target < 0:
+            free = (memory.free >> np.arange(lot.n_slots)) & 1 == 1
+            if not free.any():
+                return self._wait(vertex)
+            target = int(np.where(free, reach[: lot.n_slots] + self.problem.walk_s, np.inf).argmin())
+            if target == vertex:
+                return PARK
+        elif target == vertex:
+            return self._wait(vertex)
+        step = target
+        while came_from[step] != vertex:
+            step = int(came_from[step])
+        return self.table.move_to(vertex, step)
+
+    def _wait(self, vertex: int) -> int:
+        """A move that the graph does not have; where it has all four, one that it has."""
+        missing = np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)
+        return int(missing[0]) if len(missing) else int(len(MOVES) - 1)

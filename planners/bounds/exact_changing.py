@@ -1,0 +1,282 @@
+"""The optimum of a search over belief states where slots fill and empty, on very small lots.
+
+What the car knows of a slot is how it looked at the last look, and how long ago that was: its chance of being free
+follows from these two, p(t) = p∞ + (p(0) - p∞)·exp(-rt). On a grid of times the belief states are
+
+    (where the car is, and for each slot: never seen, or free or taken so many steps ago),
+
+and the least expected time from each solves Bellman's equation, which is iterated until it holds. Costs are exact;
+time since a look is rounded to whole steps, and no longer told apart after `memory_steps`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from parkenv.errors import InputError
+from parkenv.world.lot import PARK
+from parkenv.world.scenario import SearchProblem
+from planners.agent import Observation, SearchAgent
+from sim_sensors.compilation import compiled
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MOST_STATES = 20_000_000
+"""Belief states that are kept at most; they take 180 MB."""
+_TOLERANCE = 1e-4
+_MOST_SWEEPS = 20_000
+_WAIT = 4
+
+
+class ChangingSolution:
+    """The optimum from every belief state.
+
+    Args:
+        problem: lot, goal, speeds and costs; slots are seen without error.
+        p_occupied: (n_slots,) probability that each slot is taken, which does not change.
+        rate: (n_slots,) 1/s, arrival rate plus departure rate.
+        step_s: s, of the grid of times; a move or a wait ages what is known by its time, rounded to at least one step.
+        memory_steps: how many ages are told apart.
+
+    Attributes:
+        values: (n_vertices, n_codes) float64, s, the least expected time; inf where a state cannot come about.
+        belief_error: how far from the truth the chance of a slot can be that was seen too long ago to tell.
+        rounding_error: by which part the time that a move ages what is known may be off.
+
+    Raises:
+        InputError: looks that may err, a value out of its range, or too many states.
+
+    Example:
+        Where cars leave more often, the same slots, equally often taken, are found sooner.
+
+        >>> from parkenv import ParkingLot
+        >>> problem = SearchProblem(lot=ParkingLot.grid(1, 2), give_up_s=600.0)
+        >>> entry, p = int(problem.lot.entry_vertices[0]), np.full(2, 0.8)
+        >>> slow, quick = (ChangingSolution(problem, p, np.full(2, r), 1.0, 12) for r in (1e-3, 1e-1))
+        >>> quick.expected_s(entry) < slow.expected_s(entry)
+        True
+    """
+
+    def __init__(
+        self,
+        problem: SearchProblem,
+        p_occupied: ArrayLike,
+        rate: ArrayLike,
+        step_s: float,
+        memory_steps: int,
+    ) -> None:
+        lot, n = problem.lot, problem.lot.n_slots
+        p, r = np.asarray(p_occupied, dtype=np.float64), np.asarray(rate, dtype=np.float64)
+        if p.shape != (n,) or not ((p > 0.0) & (p < 1.0)).all():
+            raise InputError(f"p_occupied: want {n} probabilities between 0 and 1, got shape {p.shape}")
+        if r.shape != (n,) or not ((r > 0.0) & np.isfinite(r)).all():
+            raise InputError(f"rate: want {n} finite rates above 0, got shape {r.shape}")
+        if not (step_s > 0.0 and math.isfinite(step_s)) or memory_steps < 2:
+            raise InputError(
+                f"step_s is {step_s} and memory_steps {memory_steps}, want seconds above 0 and at least 2"
+            )
+        if not problem.sensor_model.perfect:
+            raise InputError("the exact planner wants slots that are seen without error")
+        codes = 2 * memory_steps + 1
+        if codes**n * lot.n_vertices > MOST_STATES:
+            raise InputError(
+                f"{n} slots, {lot.n_vertices} vertices and {memory_steps} steps make more than {MOST_STATES} belief "
+                "states: want fewer slots or steps"
+            )
+        self.problem, self.step_s, self.memory_steps = problem, step_s, memory_steps
+        self.belief_error = float(
+            np.exp(-r * (memory_steps - 1) * step_s).max() * max(p.max(), 1.0 - p.min())
+        )
+        ages = np.arange(memory_steps) * step_s
+        usual = 1.0 - p[:, None]
+        faded = np.exp(-r[:, None] * ages)
+        # P(free) by code: never seen, seen free so many steps ago, seen taken so many steps ago.
+        self._free = np.concatenate([usual, usual + (1.0 - usual) * faded, usual * (1.0 - faded)], axis=1)
+        moves = np.concatenate([lot.neighbors, np.arange(lot.n_vertices)[:, None]], axis=1).astype(np.int64)
+        waits = (lot.neighbors < 0).any(axis=1)
+        moves[~waits, _WAIT] = -1
+        seconds = np.concatenate([problem.move_s, np.full((lot.n_vertices, 1), problem.wait_s)], axis=1)
+        steps = np.maximum(np.rint(seconds / step_s), 1).astype(np.int64)
+        made = moves >= 0
+        self.rounding_error = float(np.abs(steps[made] * step_s / seconds[made] - 1.0).max())
+        starts, slots = problem.slots_in_view
+        self.values = np.full((lot.n_vertices, codes**n), np.inf)
+        self._choices = np.full(self.values.shape, -1, dtype=np.int8)
+        sweeps = _iterate(
+            self.values,
+            self._choices,
+            self._free,
+            moves,
+            seconds,
+            steps,
+            starts,
+            slots,
+            problem.walk_s,
+            problem.give_up_s,
+            memory_steps,
+        )
+        if sweeps >= _MOST_SWEEPS:
+            raise InputError(
+                "Bellman's equation did not settle: want rates that let a car leave within hours"
+            )
+
+    def expected_s(self, vertex: int, codes: IntArray | None = None) -> float:
+        """Least expected time, s, from a vertex; what is known is coded as `code` does, nothing where None."""
+        return float(self.values[vertex, self._index(codes)])
+
+    def decide(self, vertex: int, codes: IntArray) -> int:
+        """The optimal action: a move, `PARK`, or 5 to wait and look again."""
+        choice = int(self._choices[vertex, self._index(codes)])
+        return {_WAIT: 5, 5: PARK}.get(choice, choice)
+
+    def code(self, seen: NDArray[np.bool_], free: NDArray[np.bool_], age_s: FloatArray) -> IntArray:
+        """Codes, (n_slots,), of slots that were seen or not, looked free or not, and were seen so long ago."""
+        age = np.minimum(np.rint(age_s / self.step_s), self.memory_steps - 1).astype(np.int64)
+        return np.where(seen, 1 + age + np.where(free, 0, self.memory_steps), 0)
+
+    def _index(self, codes: IntArray | None) -> int:
+        if codes is None:
+            return 0
+        return int((np.asarray(codes) * (2 * self.memory_steps + 1) ** np.arange(len(codes))).sum())
+
+
+@compiled
+def _iterate(
+    values: FloatArray,
+    choices: NDArray[np.int8],
+    free: FloatArray,
+    moves: IntArray,
+    seconds: FloatArray,
+    steps: IntArray,
+    view_starts: IntArray,
+    view_slots: IntArray,
+    walk_s: FloatArray,
+    give_up_s: float,
+    memory_steps: int,
+) -> int:
+    """Solve in place, by sweeps over the states that can come about; how many it took."""
+    n_vertices, n_states = values.shape
+    n = len(free)
+    n_codes = 2 * memory_steps + 1
+    powers = np.ones(n, np.int64)
+    for s in range(1, n):
+        powers[s] = powers[s - 1] * n_codes
+    codes, aged = np.empty(n, np.int64), np.empty(n, np.int64)
+    sweep = 0
+    while sweep < _MOST_SWEEPS:
+        worst = 0.0
+        for v in range(n_vertices):
+            for state in range(n_states):
+                rest, all_taken, possible = state, True, True
+                for s in range(n):
+                    codes[s] = rest % n_codes
+                    rest //= n_codes
+                    all_taken = all_taken and codes[s] > memory_steps
+                for i in range(view_starts[v], view_starts[v + 1]):
+                    c = codes[view_slots[i]]
+                    # What is in view was seen just now, but for where the search begins, unseen.
+                    possible = possible and (state == 0 or c == 1 or c == 1 + memory_steps)
+                if not possible:
+                    continue
+                before = values[v, state]
+                if before == np.inf:
+                    before = give_up_s
+                    values[v, state] = give_up_s
+                if all_taken:
+                    continue
+                best, choice = np.inf, -1
+                if v < n and codes[v] == 1:
+                    best, choice = walk_s[v], 5
+                for m in range(moves.shape[1]):
+                    u = moves[v, m]
+                    if u < 0:
+                        continue
+                    base = 0
+                    for s in range(n):
+                        c = codes[s]
+                        if 1 <= c <= memory_steps:
+                            c = min(c + steps[v, m], memory_steps)
+                        elif c > memory_steps:
+                            c = min(c + steps[v, m], 2 * memory_steps)
+                        aged[s] = c
+                        base += c * powers[s]
+                    first, k = view_starts[u], view_starts[u + 1] - view_starts[u]
+                    expected = seconds[v, m]
+                    for outcome in range(1 << k):
+                        chance, after = 1.0, base
+                        for i in range(k):
+                            s = view_slots[first + i]
+                            if (outcome >> i) & 1:
+                                chance *= free[s, aged[s]]
+                                after += (1 - aged[s]) * powers[s]
+                            else:
+                                chance *= 1.0 - free[s, aged[s]]
+                                after += (1 + memory_steps - aged[s]) * powers[s]
+                        follows = values[u, after]
+                        expected += chance * (give_up_s if follows == np.inf else follows)
+                    if expected < best:
+                        best, choice = expected, m
+                values[v, state], choices[v, state] = best, choice
+                worst = max(worst, abs(best - before))
+        sweep += 1
+        if worst < _TOLERANCE:
+            break
+    return sweep
+
+
+@dataclass
+class ChangingPlan:
+    """What the agent remembers.
+
+    Attributes:
+        forecast: (n_slots,) float32, the belief before anything was seen.
+        seen: (n_slots,) bool.
+        free: (n_slots,) bool, how each slot looked at the last look.
+        looked_at: (n_slots,) float64, s, when that was.
+    """
+
+    forecast: NDArray[np.float32]
+    seen: NDArray[np.bool_]
+    free: NDArray[np.bool_]
+    looked_at: FloatArray
+
+
+class ChangingAgent(SearchAgent[ChangingPlan]):
+    """Follows a `ChangingSolution`, whose forecast and rates it takes for true.
+
+    Args:
+        solution: the optimum.
+    """
+
+    name: ClassVar[str] = "exact-changing"
+
+    def __init__(self, solution: ChangingSolution) -> None:
+        super().__init__(solution.problem)
+        self.solution = solution
+
+    def begin(self, observation: Observation) -> ChangingPlan:
+        """Nothing seen yet."""
+        n = self.problem.lot.n_slots
+        nothing = np.zeros(n, dtype=np.bool_)
+        return ChangingPlan(np.array(observation["p_occupied"]), nothing, nothing.copy(), np.zeros(n))
+
+    def decide(self, observation: Observation, memory: ChangingPlan) -> int:
+        """Take in what is in view, and do what is best."""
+        vertex, time = int(observation["vertex"]), float(observation["time"][1])
+        p = np.asarray(observation["p_occupied"])
+        if time > 0.0:
+            starts, slots = self.problem.slots_in_view
+            shown = slots[starts[vertex] : starts[vertex + 1]]
+            memory.seen[shown], memory.looked_at[shown] = True, time
+            memory.free[shown] = p[shown] < memory.forecast[shown]
+        codes = self.solution.code(memory.seen, memory.free, time - memory.looked_at)
+        action = self.solution.decide(vertex, codes)
+        if action > PARK:
+            return int(np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)[0])
+        return action

@@ -1,0 +1,1 @@
+"""Planning and tracking the motion of the car."""

@@ -1,0 +1,202 @@
+"""The driver that parks: plans a path through the obstacle map, follows it, and plans again where that went wrong."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.driving.encounters import SLOWEST, WATCHED_S, encounters
+from parkenv.driving.vehicle import VehicleParameters
+from parkenv.errors import InputError
+from planners.driving.hybrid_astar import CarPath, SearchSettings, plan_path
+from planners.driving.path_tracking import PathTracker, TrackingSettings
+
+FloatArray = NDArray[np.float64]
+Observation = Mapping[str, Any]
+
+MOST_PLANS = 12
+"""Plans in one episode; after that the car stays where it is."""
+STRAYED_M, STRAYED_RAD = 0.20, math.radians(12.0)
+"""How far from its path a car may come before another is planned."""
+
+PATIENCE_S = 3.0
+"""After so long a wait for somebody who stands, s, the driver looks for a way around."""
+
+_CONTROL_S = 0.1
+_NOWHERE = 999.0  # m; unused rows of the obstacle map lie beyond
+_STANDS = 0.01
+
+
+@dataclass
+class ParkingMemory:
+    """What the driver remembers of an episode.
+
+    Attributes:
+        tracker: of the path that is followed; None where there is none.
+        paths: all that were planned, in the slot's frame.
+        planning_s: wall time of each planning, s.
+        stuck: whether no path was found.
+        others: (n, 2) m, where those who move were a step ago.
+        waited_s: for how long the car has been waiting for somebody.
+    """
+
+    tracker: PathTracker | None = None
+    paths: list[CarPath] = field(default_factory=list)
+    planning_s: list[float] = field(default_factory=list)
+    stuck: bool = False
+    others: FloatArray | None = None
+    waited_s: float = 0.0
+
+
+class ParkingAgent:
+    """Parks in `parkenv/Drive-v0`: hybrid A*, Reeds-Shepp, and a tracking controller.
+
+    It knows the car, and of the world what the observation says: where the car and the slot are, and, with
+    `obstacle_map=True`, the outlines of parked cars, kerbs and walls, and of those who move, for whom it waits.
+
+    Args:
+        vehicle: the car.
+        search: settings of the planning.
+        tracking: settings of the tracking.
+    """
+
+    name = "planner"
+
+    def __init__(
+        self,
+        vehicle: VehicleParameters | None = None,
+        search: SearchSettings | None = None,
+        tracking: TrackingSettings | None = None,
+    ) -> None:
+        self.vehicle = vehicle or VehicleParameters()
+        self.search = search or SearchSettings()
+        self.tracking = tracking or TrackingSettings()
+
+    def predict(
+        self,
+        observation: Observation,
+        state: Sequence[ParkingMemory] | ParkingMemory | None = None,
+        episode_start: NDArray[np.bool_] | Sequence[bool] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], Sequence[ParkingMemory] | ParkingMemory]:
+        """stable-baselines3's interface: single observations, or batches of them with a leading axis.
+
+        Args:
+            observation: from `parkenv/Drive-v0` with `obstacle_map=True`, or a vector of them.
+            state: what the last call returned; None at the start.
+            episode_start: for each environment, whether its episode has just begun. With None, it has
+                where there is no state.
+            deterministic: accepted for the interface; this agent makes no distinction.
+
+        Returns:
+            The action, (2,) or (n_envs, 2) float32, and the state to hand back.
+
+        Raises:
+            InputError: an observation without the obstacle map.
+        """
+        del deterministic
+        for key in ("cars", "lines"):
+            if key not in observation:
+                raise InputError(
+                    f"the observation has no {key!r}: make the environment with obstacle_map=True"
+                )
+        if np.ndim(observation["achieved_goal"]) == 1:
+            starts = state is None or (episode_start is not None and bool(np.any(episode_start)))
+            memory: ParkingMemory = ParkingMemory() if starts else state  # type: ignore[assignment]
+            return self._decide(observation, memory), memory
+        n = len(observation["achieved_goal"])
+        memories: list[Any] = [None] * n if state is None else list(state)  # type: ignore[arg-type]
+        actions = np.empty((n, 2), dtype=np.float32)
+        for i in range(n):
+            single = {key: values[i] for key, values in observation.items()}
+            if memories[i] is None or (episode_start is not None and episode_start[i]):
+                memories[i] = ParkingMemory()
+            actions[i] = self._decide(single, memories[i])
+        return actions, memories
+
+    def plan(self, observation: Observation, *, around_others: bool = False) -> CarPath | None:
+        """A path from where the car is to where it is to stand, in the slot's frame.
+
+        Args:
+            observation: with the obstacle map.
+            around_others: whether those who move are in the way, too, where they are now.
+        """
+        cars = observation["cars"]
+        if around_others:
+            cars = np.concatenate([cars, observation["movers"]])
+        outlines, n_corners = _obstacles(cars, observation["lines"])
+        start, target = (
+            self.vehicle.at_rear_axle(_pose(observation[goal])) for goal in ("achieved_goal", "desired_goal")
+        )
+        return plan_path(self.vehicle, outlines, n_corners, start, target, self.search)
+
+    def _decide(self, observation: Observation, memory: ParkingMemory) -> NDArray[np.float32]:
+        pose = self.vehicle.at_rear_axle(_pose(observation["achieved_goal"]))
+        speed, steering = float(observation["observation"][4]), float(observation["observation"][5])
+        tracker = memory.tracker
+        waits = tracker is not None and "movers" in observation and self._waits(observation, memory, speed)
+        if waits:
+            memory.waited_s += _CONTROL_S
+            if memory.waited_s < PATIENCE_S or abs(speed) >= _STANDS:
+                return self._stop(speed, steering)
+            memory.waited_s, memory.tracker, tracker = 0.0, None, None
+        elif tracker is not None:
+            memory.waited_s = 0.0
+            command = tracker.command(pose, speed, steering)
+            strayed = abs(tracker.offset) > STRAYED_M or abs(tracker.askew) > STRAYED_RAD
+            if not (tracker.done or strayed):
+                return np.array(command, dtype=np.float32)
+            if abs(speed) >= _STANDS:
+                return self._stop(speed, steering)
+        if not memory.stuck and len(memory.paths) < MOST_PLANS:
+            began = time.perf_counter()
+            path = self.plan(observation, around_others=waits)
+            memory.planning_s.append(time.perf_counter() - began)
+            if path is not None and len(path.length):
+                memory.paths.append(path)
+                memory.tracker = PathTracker(self.vehicle, path, self.tracking)
+                return np.array(memory.tracker.command(pose, speed, steering), dtype=np.float32)
+        if not waits:
+            memory.stuck = True
+        return np.zeros(2, dtype=np.float32)
+
+    def _stop(self, speed: float, steering: float) -> NDArray[np.float32]:
+        """Brake, and leave the wheels as they are."""
+        # As hard as stops the car within the step, and no harder.
+        pedal = min(abs(speed) / (self.vehicle.max_braking * _CONTROL_S), 1.0)
+        return np.array(
+            [-math.copysign(pedal, speed), steering / self.vehicle.max_steering], dtype=np.float32
+        )
+
+    def _waits(self, observation: Observation, memory: ParkingMemory, speed: float) -> bool:
+        """Whether somebody who moves on as until now would come too near to the car on its path."""
+        outlines = np.asarray(observation["movers"], dtype=np.float64)
+        at = outlines.mean(axis=1)
+        before, memory.others = memory.others, at
+        velocity = np.zeros_like(at) if before is None else (at - before) / _CONTROL_S
+        assert memory.tracker is not None
+        own = memory.tracker.poses_ahead(WATCHED_S * max(abs(speed), SLOWEST))
+        when = encounters(self.vehicle, self.vehicle.at_middle(own), list(outlines), velocity)
+        return bool(np.isfinite(when).any())
+
+
+def _pose(goal: NDArray[np.float32]) -> FloatArray:
+    """(3,) x, y, yaw of a goal."""
+    return np.array([float(goal[0]), float(goal[1]), math.atan2(float(goal[3]), float(goal[2]))])
+
+
+def _obstacles(cars: NDArray[np.float32], lines: NDArray[np.float32]) -> tuple[FloatArray, NDArray[np.int64]]:
+    """Outlines, (n, k, 2) m, and how many corners of each count."""
+    cars = cars[cars[:, 0, 0] < _NOWHERE]
+    lines = lines[lines[:, 0, 0] < _NOWHERE]
+    outlines = np.concatenate([cars, np.repeat(lines, [1, cars.shape[1] - 1], axis=1)]).astype(np.float64)
+    count = np.full(len(outlines), 2, dtype=np.int64)
+    # An outline of fewer corners repeats its last.
+    count[: len(cars)] = 1 + (np.abs(np.diff(cars, axis=1)) > 0.0).any(axis=2).sum(axis=1)
+    return outlines, count

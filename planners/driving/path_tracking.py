@@ -1,0 +1,229 @@
+"""Drive a car along a path: where to steer, and how fast, forward and backward.
+
+The steering is feedback about the rear axle (Samson 1992; Paden et al., "A survey of motion planning and control
+techniques for self-driving urban vehicles", 2016, §V): like Stanley's rule it steers off the heading error and the
+offset from the path, and unlike it in reverse too, where the front axle would lead it astray.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.driving.vehicle import VehicleParameters, move_along
+from parkenv.errors import InputError
+from planners.driving.hybrid_astar import CarPath
+from sim_sensors.compilation import compiled
+
+FloatArray = NDArray[np.float64]
+
+SAMPLE_M = 0.05
+"""m between the samples of a path."""
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """How fast, and how firmly, a car follows a path.
+
+    Args:
+        speed, reverse_speed: m/s, at most.
+        acceleration: m/s², of getting faster and slower.
+        firmness: 1/m; an offset from the path dies out over some 2/firmness metres.
+        blend_m: m, over which the steering goes from one arc's to the next one's while the car moves.
+        control_s: s, from one command to the next.
+
+    Raises:
+        InputError: a value that is not a finite number above 0.
+    """
+
+    speed: float = 2.2
+    reverse_speed: float = 1.5
+    acceleration: float = 1.2
+    firmness: float = 1.3
+    blend_m: float = 0.6
+    control_s: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name in ("speed", "reverse_speed", "acceleration", "firmness", "blend_m", "control_s"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise InputError(f"tracking {name} is {value!r}, want above 0")
+
+
+_CRAWL = 0.1  # m/s, the least speed that is asked for before the end
+_ARRIVED = 0.01  # m
+_BRAKE_FROM = 0.85  # of the acceleration
+_LAG = 0.8  # steps
+_CLOSE = 0.06  # m
+_AIMED = 0.02  # rad, of the wheels, before the car sets off
+_STANDS = 0.01  # m/s
+_RATE_SHARE = 0.8  # of the steering rate that a path may ask for; the rest corrects
+_REACTION_S = 0.2
+
+
+class PathTracker:
+    """Follows one path; remembers how far it has come.
+
+    Args:
+        vehicle: the car.
+        path: the path.
+        settings: of the tracking.
+
+    Attributes:
+        done: whether the car has come to the path's end.
+        offset: m, how far from the path the car last was, left above 0.
+        askew: rad, how far its heading last was from the path's.
+    """
+
+    def __init__(
+        self, vehicle: VehicleParameters, path: CarPath, settings: TrackingSettings | None = None
+    ) -> None:
+        self._vehicle = vehicle
+        self._settings = settings = settings or TrackingSettings()
+        self._stretches = _stretches(vehicle, path, settings)
+        self._stretch = 0
+        self._at = 0
+        self._set_off = False
+        self.done = False
+        self.offset = 0.0
+        self.askew = 0.0
+
+    def command(self, pose: FloatArray, speed: float, steering: float) -> tuple[float, float]:
+        """Acceleration and steering, -1 to 1 each as `parkenv.driving.vehicle.advance` takes them.
+
+        Args:
+            pose: (3,) x, y in m and yaw in rad of the rear axle.
+            speed: m/s, below 0 backward.
+            steering: rad, of the wheels.
+        """
+        while True:
+            stretch = self._stretches[self._stretch]
+            first = max(self._at - 4, 0)
+            near = stretch.poses[first : self._at + 31]
+            self._at = first + int(np.hypot(near[:, 0] - pose[0], near[:, 1] - pose[1]).argmin())
+            x, y, yaw = stretch.poses[self._at].tolist()
+            along = math.cos(yaw) * (float(pose[0]) - x) + math.sin(yaw) * (float(pose[1]) - y)
+            # On to the path's point abeam of the car: between two samples the path is as good as an arc.
+            x, y, yaw = move_along(x, y, yaw, float(stretch.curvature[self._at]), along)
+            dx, dy = float(pose[0]) - x, float(pose[1]) - y
+            station = float(stretch.station[self._at]) + stretch.direction * along
+            self.offset = math.cos(yaw) * dy - math.sin(yaw) * dx
+            self.askew = math.remainder(float(pose[2]) - yaw, 2.0 * math.pi)
+            left = float(stretch.station[-1]) - station
+            if not (left < _CLOSE and abs(speed) < _STANDS and self._set_off):
+                return self._drive(stretch, station, left, speed, steering)
+            if self._stretch + 1 == len(self._stretches):
+                self.done = True
+                return 0.0, 0.0
+            self._stretch += 1
+            self._at, self._set_off = 0, False
+
+    def poses_ahead(self, distances: FloatArray) -> FloatArray:
+        """Poses, (n, 3), on the path, distances, (n,) m, on from where the car last was; to the next stop at most."""
+        stretch = self._stretches[self._stretch]
+        station = np.minimum(stretch.station[self._at] + distances, stretch.station[-1])
+        at = np.searchsorted(stretch.station, station - 1e-9)
+        return np.asarray(stretch.poses[np.minimum(at, len(stretch.poses) - 1)])
+
+    def _drive(
+        self, stretch: _Stretch, station: float, left: float, speed: float, steering: float
+    ) -> tuple[float, float]:
+        settings, vehicle = self._settings, self._vehicle
+        reach = abs(speed) * settings.control_s
+        # A command is carried out, on the mean, half a step late, and the wheels take as long again to come there.
+        bend = float(np.interp(station + 1.5 * reach, stretch.station, stretch.curvature))
+        if not self._set_off:
+            wheels = math.atan(bend * vehicle.wheelbase)
+            if abs(speed) >= _STANDS or abs(steering - wheels) > _AIMED:
+                return self._pedal(0.0, speed), self._turn(wheels)
+            self._set_off = True
+        w = settings.firmness
+        bend -= w * w * self.offset + 2.0 * w * stretch.direction * self.askew
+        turn = self._turn(math.atan(bend * vehicle.wheelbase))
+        if left < _ARRIVED:
+            return self._pedal(0.0, speed), turn
+        # The braking that ends where the stretch does; it takes the better part of a step to set in.
+        braking = 0.5 * speed * speed / max(left - _LAG * reach, 1e-3)
+        if speed * stretch.direction > 0.0 and braking > _BRAKE_FROM * settings.acceleration:
+            return -stretch.direction * min(braking / vehicle.max_braking, 1.0), turn
+        pace = float(np.interp(station + reach, stretch.station, stretch.pace))
+        return self._pedal(stretch.direction * max(pace, _CRAWL), speed), turn
+
+    def _turn(self, wheels: float) -> float:
+        return min(max(wheels / self._vehicle.max_steering, -1.0), 1.0)
+
+    def _pedal(self, goal: float, speed: float) -> float:
+        """The share of the acceleration's limit that leads to a speed within the reaction time."""
+        most = 1.5 * self._settings.acceleration
+        needed = min(max((goal - speed) / _REACTION_S, -most), most)
+        limit = self._vehicle.max_braking if needed * speed < 0.0 else self._vehicle.max_acceleration
+        return min(max(needed / limit, -1.0), 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class _Stretch:
+    """A path between two changes of direction: samples of what is driven."""
+
+    direction: float  # 1 forward, -1 backward
+    station: FloatArray  # (n,) m from its start
+    poses: FloatArray  # (n, 3)
+    curvature: FloatArray  # (n,) 1/m
+    pace: FloatArray  # (n,) m/s, at most
+
+
+def _stretches(vehicle: VehicleParameters, path: CarPath, settings: TrackingSettings) -> list[_Stretch]:
+    """The path cut where its direction changes, with wheels that turn at a finite rate.
+
+    From arc to arc the curvature goes over on a ramp about their joint. Both arcs turn the car as far as before, so
+    the path is left by millimetres alone. Each stretch begins on the planned path.
+    """
+    kept = np.abs(path.length) > 1e-9
+    length, curvature = path.length[kept], path.curvature[kept]
+    cuts = np.flatnonzero(np.diff(np.sign(length))) + 1
+    start = tuple(path.start.tolist())
+    stretches = []
+    for arcs in np.split(np.arange(len(length)), cuts):
+        direction = math.copysign(1.0, length[arcs[0]])
+        ends = np.r_[0.0, np.cumsum(np.abs(length[arcs]))]
+        ramp = np.minimum(0.5 * settings.blend_m, 0.5 * np.minimum(np.diff(ends)[1:], np.diff(ends)[:-1]))
+        knots = np.r_[0.0, np.stack([ends[1:-1] - ramp, ends[1:-1] + ramp], axis=1).ravel(), ends[-1]]
+        bends = np.repeat(curvature[arcs], 2)
+        station = np.linspace(0.0, ends[-1], max(2, math.ceil(ends[-1] / SAMPLE_M) + 1))
+        # Knots are samples, too: between them the curvature is linear, and the turn its mean.
+        station = np.unique(np.r_[station, knots])
+        bend = np.interp(station, knots, bends)
+        poses = [start]
+        for step, turn in zip(
+            np.diff(station).tolist(), (0.5 * (bend[1:] + bend[:-1])).tolist(), strict=True
+        ):
+            poses.append(move_along(*poses[-1], turn, direction * step))
+        fastest = settings.speed if direction > 0.0 else settings.reverse_speed
+        rate = _RATE_SHARE * vehicle.steering_rate
+        pace = _pace(station, np.arctan(bend * vehicle.wheelbase), fastest, rate, settings.acceleration)
+        stretches.append(_Stretch(direction, station, np.array(poses), bend, pace))
+        for i in arcs.tolist():
+            start = move_along(*start, float(curvature[i]), float(length[i]))
+    return stretches
+
+
+@compiled(error_model="numpy")
+def _pace(
+    station: FloatArray, wheels: FloatArray, fastest: float, rate: float, acceleration: float
+) -> FloatArray:
+    """Speeds, (n,) m/s, at which the wheels turn no faster than `rate`, rad/s, and from which the car can stop."""
+    n = len(station)
+    pace = np.empty(n)
+    for i in range(n):
+        steep = 0.0
+        for j in range(max(i - 1, 0), min(i + 1, n - 1)):
+            steep = max(steep, abs(wheels[j + 1] - wheels[j]) / max(station[j + 1] - station[j], 1e-6))
+        pace[i] = min(fastest, rate / max(steep, 1e-9))
+    pace[n - 1] = 0.0
+    for i in range(n - 2, -1, -1):
+        pace[i] = min(
+            pace[i], math.sqrt(pace[i + 1] ** 2 + 2.0 * acceleration * (station[i + 1] - station[i]))
+        )
+    return pace

@@ -1,0 +1,91 @@
+"""Every drive of a lot, or of a part of it, at once: times between all vertices, and the way from each to each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import dijkstra
+
+from parkenv.errors import InputError
+from parkenv.world.scenario import SearchProblem
+from sim_sensors.compilation import compiled
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RoadTable:
+    """All drives of a lot.
+
+    Attributes:
+        seconds: (n_vertices, n_vertices) float64, s, from row to column; inf where no way leads.
+        following: (n_vertices, n_vertices) int16, the vertex that comes next on a shortest way from row to
+            column, -1 where no way leads and on the diagonal.
+        neighbors: (n_vertices, 4) int32, where each move leads, or -1.
+        move_s: (n_vertices, 4) float64, s, of each of them.
+    """
+
+    seconds: FloatArray
+    following: NDArray[np.int16]
+    neighbors: NDArray[np.int32]
+    move_s: FloatArray
+
+    @classmethod
+    def of(cls, problem: SearchProblem) -> Self:
+        """The table of a problem's whole lot."""
+        return cls.over(problem.lot.neighbors, problem.move_s)
+
+    @classmethod
+    def over(cls, neighbors: NDArray[np.int32], move_s: FloatArray) -> Self:
+        """The table of a graph: (n_vertices, 4) neighbours, -1 for none, and drive times, s."""
+        n = len(neighbors)
+        source, move = np.nonzero(neighbors >= 0)
+        target, drive = neighbors[source, move], move_s[source, move]
+        # Parallel edges would be added up by the matrix: keep the quickest.
+        order = np.lexsort((drive, target, source))
+        source, target, drive = source[order], target[order], drive[order]
+        first = np.r_[True, (np.diff(source) != 0) | (np.diff(target) != 0)][: len(source)]
+        matrix: Any = csr_matrix((drive[first], (source[first], target[first])), shape=(n, n))
+        seconds = np.ascontiguousarray(dijkstra(matrix), dtype=np.float64)
+        following = np.empty(seconds.shape, dtype=np.int16)
+        _follow(seconds, neighbors, move_s, following)
+        return cls(seconds, following, neighbors, move_s)
+
+    def move(self, vertex: int, target: int) -> int:
+        """The first move of a shortest way.
+
+        Raises:
+            InputError: no way leads to the target, or the car is there already.
+        """
+        following = int(self.following[vertex, target])
+        if following < 0:
+            raise InputError(f"no way leads on from vertex {vertex} to vertex {target}")
+        return self.move_to(vertex, following)
+
+    def move_to(self, vertex: int, neighbor: int) -> int:
+        """The quickest move that leads to a neighbouring vertex."""
+        leads = self.neighbors[vertex] == neighbor
+        return int(np.where(leads, self.move_s[vertex], np.inf).argmin())
+
+
+@compiled
+def _follow(
+    seconds: FloatArray,
+    neighbors: NDArray[np.int32],
+    move_s: FloatArray,
+    following: NDArray[np.int16],
+) -> None:
+    n = len(seconds)
+    for v in range(n):
+        for t in range(n):
+            best, chosen = np.inf, -1
+            if v != t:
+                for m in range(neighbors.shape[1]):
+                    u = neighbors[v, m]
+                    if u >= 0 and move_s[v, m] + seconds[u, t] < best:
+                        best, chosen = move_s[v, m] + seconds[u, t], u
+            following[v, t] = chosen

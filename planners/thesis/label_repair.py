@@ -1,0 +1,103 @@
+"""A label-setting plan mended after some probabilities changed, instead of made anew.
+
+After Ramalingam and Reps (1996): what a change can make worse is the tree of vertices whose labels came by way of
+the changed stop. They take the best label that the rest offers, and labels spread on from there, from stops that
+became better, and nowhere else. Most sightings touch a handful of vertices, whatever the size of the lot. Where a
+change reaches farther than a fixed part of the lot, a fresh pass is the faster way, and is what is done.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from planners.thesis.heap import push
+from planners.thesis.label_setting import (
+    STOP,
+    FloatArray,
+    Labels,
+    StoppingGraph,
+    settle_again,
+    spread,
+    stop_cost,
+)
+from sim_sensors.compilation import compiled
+
+REACH = 0.1
+"""Part of the lot's vertices that a repair may touch before a fresh pass takes over."""
+_LEAST_REACH = 64
+_AFFECTED = STOP + 1
+
+
+def repair(graph: StoppingGraph, labels: Labels, vertices: NDArray[np.int64], p_free: FloatArray) -> int:
+    """Bring a plan up to date, in place; it then equals a fresh one.
+
+    Args:
+        graph: the lot's part, the one that the plan was made with.
+        labels: the plan, which must be settled; afterwards it may not be, as after `settle`.
+        vertices: (k,) int64, the slots whose probability changed.
+        p_free: (k,) float64, their new probabilities.
+
+    Returns:
+        How many labels were set; -1 where a fresh pass was the shorter way.
+    """
+    labels.p_free[vertices] = p_free
+    reach = max(_LEAST_REACH, int(REACH * len(labels.cost)))
+    touched = -1
+    if labels.settled and len(vertices) <= reach:
+        touched = _repair(graph, vertices, labels.p_free, labels.cost, labels.move, reach)
+    if touched < 0:
+        settle_again(graph, labels)
+    return touched
+
+
+@compiled(error_model="numpy")
+def _repair(
+    graph: StoppingGraph,
+    vertices: NDArray[np.int64],
+    p_free: FloatArray,
+    cost: FloatArray,
+    move: NDArray[np.int8],
+    reach: int,
+) -> int:
+    """The number of labels set; -1, and labels that are of no use, where the reach does not suffice."""
+    affected, n_affected = np.empty(reach, dtype=np.int32), 0
+    keys, queued, size = np.empty(2 * reach), np.empty(2 * reach, dtype=np.int32), 0
+    for i in range(len(vertices)):
+        s = vertices[i]
+        if move[s] == STOP and stop_cost(graph, p_free, s) > cost[s]:
+            affected[n_affected], move[s] = s, _AFFECTED
+            n_affected += 1
+    tail = 0
+    while tail < n_affected:
+        v = affected[tail]
+        tail += 1
+        for e in range(graph.in_start[v], graph.in_start[v + 1]):
+            u = graph.in_source[e]
+            if move[u] == graph.in_move[e]:
+                if n_affected == reach:
+                    return -1
+                affected[n_affected], move[u] = u, _AFFECTED
+                n_affected += 1
+    for i in range(n_affected):
+        u = affected[i]
+        cost[u], best = stop_cost(graph, p_free, u), STOP
+        for a in range(graph.neighbors.shape[1]):
+            v = graph.neighbors[u, a]
+            if v >= 0 and move[v] != _AFFECTED:
+                label = graph.move_s[u, a] + graph.gamma * cost[v]
+                if label < cost[u]:
+                    cost[u], best = label, a
+        move[u] = best
+        if cost[u] < np.inf:
+            size = push(keys, queued, size, cost[u], u)
+    n_set = n_affected
+    for i in range(len(vertices)):
+        s = vertices[i]
+        own = stop_cost(graph, p_free, s)
+        if own < cost[s]:
+            cost[s], move[s] = own, STOP
+            size = push(keys, queued, size, own, s)
+            n_set += 1
+    n_spread = spread(graph, cost, move, keys, queued, size)
+    return n_set + n_spread if n_spread >= 0 else -1

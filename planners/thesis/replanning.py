@@ -1,0 +1,198 @@
+"""The thesis's agents: plan by the MDP, look, update, plan again (T §3.4.4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.world.scenario import SearchProblem
+from planners.agent import Observation, SearchAgent
+from planners.thesis.label_repair import repair
+from planners.thesis.label_setting import (
+    Labels,
+    StoppingGraph,
+    best_move,
+    best_moves,
+    by_policy_iteration,
+    settle,
+    with_p_free,
+)
+from planners.thesis.mdp import ParkingMDP
+from sim_sensors.compilation import compiled
+
+RELEVANT_CHANGE = 0.01
+"""A probability that moved less than this since the last plan is the same one, grown a little older."""
+SOLVERS = ("label_setting", "policy_iteration")
+"""How plans are found: exactly in near-linear time, or as in the thesis. They lead to the same actions."""
+
+
+@dataclass
+class Plan:
+    """What a planning agent remembers.
+
+    Attributes:
+        graph: what it knows of the lot.
+        labels: what each vertex costs, and the probabilities that this was found for.
+        replans: how often it has been made anew since the episode began.
+    """
+
+    graph: StoppingGraph
+    labels: Labels
+    replans: int = 0
+
+    @property
+    def policy(self) -> NDArray[np.int64]:
+        """The action for each vertex, (n_vertices,) int64; worked out when asked for."""
+        moves: NDArray[np.int64] = best_moves(self.graph, self.labels.p_free, self.labels.cost)
+        return moves
+
+
+class StaticAgent(SearchAgent[Plan]):
+    """`mdp-static`: plans once on the forecast and follows that plan, whatever it sees.
+
+    Where its slot turns out taken it tries again, since in the thesis's model the next try is as likely
+    to succeed as the first; T §3.4.4 introduces re-planning for that reason.
+
+    Args:
+        problem: lot, goal, speeds and costs.
+        failure_s: cost of a failed try as the planner weighs it, s; the problem's own where None.
+        gamma: discount a decision.
+        solver: one of `SOLVERS`.
+
+    Raises:
+        InputError: an unknown solver, a value out of its range, or policy iteration with gamma 1.
+    """
+
+    name: ClassVar[str] = "mdp-static"
+
+    def __init__(
+        self,
+        problem: SearchProblem,
+        failure_s: float | None = None,
+        gamma: float = 0.9999,
+        solver: str = "label_setting",
+    ) -> None:
+        super().__init__(problem)
+        if solver not in SOLVERS:
+            raise InputError(f"solver is {solver!r}, want one of {', '.join(SOLVERS)}")
+        if solver == "policy_iteration" and gamma >= 1.0:
+            raise InputError(f"gamma is {gamma}, want below 1 for the solver policy_iteration")
+        self.failure_s = problem.failure_s if failure_s is None else failure_s
+        self.gamma = gamma
+        self.solver = solver
+        nothing_free = np.ones(problem.lot.n_slots)
+        self._mdp = ParkingMDP.from_belief(self.problem, nothing_free, failure_s=self.failure_s, gamma=gamma)
+        self._graph = StoppingGraph.of(self._mdp)
+        least_s = min(float(self._graph.in_s.min(initial=np.inf)), problem.wait_s, self.failure_s)
+        self._suspect_s = least_s / (1.0 - gamma) if gamma < 1.0 else np.inf
+
+    def solve(self, p_occupied: NDArray[np.floating]) -> Labels:
+        """The optimal plan for a belief, (n_slots,).
+
+        Raises:
+            InputError: the belief has the wrong shape or is no probability somewhere.
+        """
+        n_slots = self.problem.lot.n_slots
+        if p_occupied.shape != (n_slots,):
+            raise InputError(f"p_occupied has shape {p_occupied.shape}, want ({n_slots},)")
+        p_free = np.zeros(self._mdp.n_states)
+        np.subtract(1.0, p_occupied, out=p_free[:n_slots], dtype=np.float64)
+        if not (p_free.min() >= 0.0 and p_free.max() <= 1.0):
+            raise InputError("p_occupied must lie in [0, 1]")
+        if self.solver == "policy_iteration":
+            labels, _ = by_policy_iteration(with_p_free(self._mdp, p_free))
+        else:
+            labels = self._settled(settle(self._graph, p_free))
+        self._check_discount(labels, float(labels.cost.max()))
+        return labels
+
+    def expected_time(self, p_occupied: NDArray[np.floating]) -> NDArray[np.float64]:
+        """What the model expects a search from each vertex to take, (n_vertices,) s."""
+        return self._mdp.expected_time(-self.solve(p_occupied).cost)
+
+    def begin(self, observation: Observation) -> Plan:
+        """Plan on the forecast."""
+        return Plan(self._graph, self.solve(observation["p_occupied"]))
+
+    def decide(self, observation: Observation, memory: Plan) -> int:
+        """What the plan says for this vertex."""
+        labels = memory.labels
+        return int(best_move(self._graph, labels.p_free, labels.cost, int(observation["vertex"])))
+
+    def _settled(self, labels: Labels) -> Labels:
+        """A plan that label setting could not finish, since circling pays, by policy iteration."""
+        if labels.settled:
+            return labels
+        return by_policy_iteration(with_p_free(self._mdp, labels.p_free), labels)[0]
+
+    def _check_discount(self, labels: Labels, cost_s: float) -> None:
+        """Warn where a cost is so high that circling can look better than parking."""
+        if cost_s >= self._suspect_s:
+            with_p_free(self._mdp, labels.p_free).check_discount(-labels.cost)
+
+
+class ReplanningAgent(StaticAgent):
+    """`mdp`: the thesis's planner. It plans again after every sighting that changes a probability.
+
+    A change counts from `RELEVANT_CHANGE` on, or where a look makes a slot certain; ageing that adds up to as
+    much counts, too. The plan is mended where the changes reach, not made anew.
+
+    It goes on until it has parked or the environment declares the lot proven full. Where nothing that it
+    can reach may be free, the model's best is to wait, and so does the agent.
+    """
+
+    name: ClassVar[str] = "mdp"
+
+    def decide(self, observation: Observation, memory: Plan) -> int:
+        """Plan again if the belief has changed, starting from the last plan; then follow the plan."""
+        labels = memory.labels
+        slots, p_free = _news(observation["p_occupied"], labels.p_free, RELEVANT_CHANGE)
+        if len(slots):
+            if self.solver == "policy_iteration":
+                labels.p_free[slots] = p_free
+                labels, _ = by_policy_iteration(with_p_free(self._mdp, labels.p_free), labels)
+            else:
+                repair(self._graph, labels, slots, p_free)
+                labels = self._settled(labels)
+            memory.labels = labels
+            memory.replans += 1
+            self._check_discount(labels, float(labels.cost[observation["vertex"]]))
+        return super().decide(observation, memory)
+
+
+_BLOCK = 1024
+"""Slots compared at a time: a plain loop that finds most blocks unchanged runs at the memory's pace."""
+
+
+@compiled
+def _news(
+    p_occupied: NDArray[np.floating], planned: NDArray[np.float64], relevant: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Every slot whose probability is not the planned one, and what it is, if any has changed enough; else none.
+
+    A look that settles a slot counts however likely it was: else a nearly hopeless slot, found taken, would go on
+    being tried.
+    """
+    n = len(p_occupied)
+    blocks, n_blocks, n_changed = np.empty(n // _BLOCK + 1, dtype=np.int64), 0, 0
+    for start in range(0, n, _BLOCK):
+        believed, before, here = p_occupied[start : start + _BLOCK], planned[start : start + _BLOCK], 0
+        for k in range(len(believed)):
+            here += 1.0 - np.float64(believed[k]) != before[k]
+        if here:
+            blocks[n_blocks] = start
+            n_blocks, n_changed = n_blocks + 1, n_changed + here
+    slots, p_free = np.empty(n_changed, dtype=np.int64), np.empty(n_changed)
+    matters, i = False, 0
+    for start in blocks[:n_blocks]:
+        for s in range(start, min(start + _BLOCK, n)):
+            p = 1.0 - np.float64(p_occupied[s])
+            if p != planned[s]:
+                slots[i], p_free[i] = s, p
+                matters |= abs(p - planned[s]) > relevant or p == 0.0 or p == 1.0
+                i += 1
+    return (slots, p_free) if matters else (slots[:0], p_free[:0])

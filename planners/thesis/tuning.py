@@ -1,0 +1,263 @@
+"""`mdp-tuned`: the thesis's planner at the failure cost that its own forecast recommends.
+
+The failure cost is the one number of the thesis's planner that has no right value (T §4.3 shows 10 s to be too bold
+and 90 s too careful). Here it is chosen by simulation: worlds are drawn from the forecast alone, slots being
+independent and lasting, the planner searches all of them at each cost, and the cost with the least mean time wins.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from parkenv.errors import InputError
+from parkenv.world.scenario import SearchProblem
+from planners.agent import Observation, SearchAgent, require_sight
+from planners.belief.planning_graph import Ground
+from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
+from planners.routes import DriveRoutes
+from planners.thesis.replanning import Plan, ReplanningAgent
+from sim_sensors.compilation import compiled
+
+FloatArray = NDArray[np.float64]
+
+COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
+"""Failure costs, s, to choose from: twice as high each time."""
+WORLDS = 128
+_MOST_STEPS = 2000
+_KEPT = 256
+
+
+@dataclass(frozen=True, eq=False)
+class Tuning:
+    """What the simulation found.
+
+    Attributes:
+        costs: (k,) float64, s, the failure costs compared.
+        mean_s: (k,) float64, s, mean total time of the planner at each, in the same worlds.
+    """
+
+    costs: FloatArray
+    mean_s: FloatArray
+
+    @property
+    def best(self) -> float:
+        """The failure cost with the least mean time, s; among equals the lowest."""
+        return float(self.costs[self.mean_s.argmin()])
+
+
+def tune_failure_cost(
+    problem: SearchProblem,
+    p_occupied: ArrayLike,
+    vertex: int,
+    *,
+    costs: Sequence[float] = COSTS,
+    worlds: int = WORLDS,
+    seed: int = 0,
+    near: Neighborhood | None = None,
+) -> Tuning:
+    """Simulate the thesis's planner in worlds drawn from a forecast.
+
+    Slots are seen without error when they come in view, and last; a lot seen to be full costs `give_up_s`. A large
+    lot is simulated where the search will take place (`Neighborhoods`), from the gate on where it starts far away.
+
+    Args:
+        problem: lot, goal, speeds and costs.
+        p_occupied: (n_slots,) the forecast.
+        vertex: where the search begins.
+        costs: failure costs to compare, s, each above 0.
+        worlds: how many worlds are drawn; the same ones for each cost.
+        seed: of the worlds.
+        near: the part of the lot to simulate, with its drives; where None it is made.
+
+    Raises:
+        InputError: a cost or a number of worlds that is not positive, probabilities of a wrong number or size.
+    """
+    p = np.asarray(p_occupied, dtype=np.float64)
+    tried = np.asarray(costs, dtype=np.float64)
+    if p.shape != (problem.lot.n_slots,) or not ((p >= 0.0) & (p <= 1.0)).all():
+        raise InputError(f"p_occupied: want {problem.lot.n_slots} probabilities, got shape {p.shape}")
+    if not len(tried) or not (np.isfinite(tried) & (tried > 0.0)).all():
+        raise InputError(f"costs are {list(costs)}, want finite seconds above 0")
+    if worlds < 1:
+        raise InputError(f"worlds is {worlds}, want at least 1")
+    near = near or Neighborhoods(problem).toward(vertex)
+    here = near.place(vertex)
+    p = p[near.slots]
+    taken = np.random.default_rng(seed).random((worlds, len(p))) < p
+    ground = near.ground(problem, problem.failure_s)
+    return Tuning(tried, _mean_times(here if here >= 0 else near.place(near.gate), taken, p, tried, ground))
+
+
+@compiled
+def _mean_times(
+    vertex: int, taken: NDArray[np.bool_], p_occupied: FloatArray, costs: FloatArray, ground: Ground
+) -> FloatArray:
+    n_worlds, n = taken.shape
+    mean = np.zeros(len(costs))
+    odds, seen = np.empty(n), np.empty(n, np.bool_)
+    for c in range(len(costs)):
+        for w in range(n_worlds):
+            seen[:] = False
+            for s in range(n):
+                odds[s] = p_occupied[s] / (1.0 - p_occupied[s]) if p_occupied[s] < 1.0 else np.inf
+            mean[c] += _search(vertex, taken[w], costs[c], ground, odds, seen) / n_worlds
+    return mean
+
+
+@compiled
+def _search(
+    vertex: int,
+    taken: NDArray[np.bool_],
+    cost: float,
+    ground: Ground,
+    odds: FloatArray,
+    seen: NDArray[np.bool_],
+) -> float:
+    """Total time, s, of the thesis's planner in one world; its belief, P(taken)/P(free), and memory are written to."""
+    total, unseen, found = 0.0, len(taken), False
+    for _ in range(_MOST_STEPS):
+        target, value = _promise(vertex, cost, ground, odds)
+        if target < 0 or not value < np.inf:
+            break
+        if target == vertex and seen[target]:
+            return float(total + ground.walk_s[target])
+        if target == vertex:
+            # The search begins before this slot: it tries without having looked.
+            if not taken[target]:
+                return float(total + ground.walk_s[target])
+            total += ground.failure_s
+        else:
+            following = int(ground.following[vertex, target])
+            total += ground.seconds[vertex, following]
+            vertex = following
+        for i in range(ground.view_starts[vertex], ground.view_starts[vertex + 1]):
+            s = ground.view_slots[i]
+            if not seen[s]:
+                seen[s] = True
+                unseen -= 1
+                found = found or not taken[s]
+                odds[s] = np.inf if taken[s] else 0.0
+        if unseen == 0 and not found:
+            break
+    return total + ground.give_up_s
+
+
+@compiled
+def _promise(vertex: int, cost: float, ground: Ground, odds: FloatArray) -> tuple[int, float]:
+    """The slot that the thesis's planner drives to, and the time, s, that it expects.
+
+    With γ = 1 its plan is to drive to one slot and to try until it is free: drive + walk + cost·(1 - p)/p.
+    """
+    best, chosen = np.inf, -1
+    row = ground.seconds[vertex]
+    for s in range(len(odds)):
+        value = row[s] + ground.walk_s[s] + cost * odds[s]
+        if value < best:
+            best, chosen = value, s
+    return chosen, best
+
+
+@dataclass
+class TunedPlan:
+    """What the tuned planner remembers.
+
+    Attributes:
+        failure_s: s, the failure cost that it chose.
+        gate: the vertex that it drives to before it follows its plan, or -1.
+        plan: the thesis's planner's own memory.
+    """
+
+    failure_s: float
+    gate: int
+    plan: Plan
+
+    @property
+    def replans(self) -> int:
+        """How often it has planned anew since the episode began."""
+        return self.plan.replans
+
+    @property
+    def policy(self) -> NDArray[np.int64]:
+        """The action for each vertex, (n_vertices,) int64."""
+        return self.plan.policy
+
+
+class TunedAgent(SearchAgent[TunedPlan]):
+    """`mdp-tuned`: at the arrival chooses its failure cost for the forecast, then is the thesis's planner.
+
+    On a lot too large to be simulated it first drives to the gate of the part that was.
+
+    Args:
+        problem: lot, goal, speeds and costs.
+        worlds: how many worlds are drawn from the forecast.
+        seed: of those worlds.
+        gamma: discount a decision.
+        most_vertices: a lot with more is simulated in part (`Neighborhoods`).
+
+    Raises:
+        InputError: no worlds, or a bad `most_vertices`.
+    """
+
+    name: ClassVar[str] = "mdp-tuned"
+
+    def __init__(
+        self,
+        problem: SearchProblem,
+        worlds: int = WORLDS,
+        seed: int = 0,
+        gamma: float = 0.9999,
+        most_vertices: int = MOST_VERTICES,
+    ) -> None:
+        super().__init__(problem)
+        require_sight(self.name, problem)
+        if worlds < 1:
+            raise InputError(f"worlds is {worlds}, want at least 1")
+        self.worlds, self.seed, self.gamma = worlds, seed, gamma
+        self._neighborhoods = Neighborhoods(self.problem, most_vertices)
+        self._routes = DriveRoutes(self.problem)
+        self._planners: dict[float, ReplanningAgent] = {}
+        self._tuned: OrderedDict[tuple[int, bytes], Tuning] = OrderedDict()
+
+    def tuning(self, p_occupied: NDArray[np.floating], vertex: int) -> Tuning:
+        """The simulation for a forecast, (n_slots,), and an entry; kept for the next search like it."""
+        # To the percent: arrivals within minutes of each other have the same forecast.
+        near = self._neighborhoods.toward(vertex)
+        rounded = np.round(np.asarray(p_occupied, dtype=np.float64), 2)
+        key = vertex, rounded[near.slots].tobytes()
+        if key not in self._tuned:
+            self._tuned[key] = tune_failure_cost(
+                self.problem,
+                np.clip(rounded, 0.001, 0.999),
+                vertex,
+                worlds=self.worlds,
+                seed=self.seed,
+                near=near,
+            )
+            if len(self._tuned) > _KEPT:
+                self._tuned.popitem(last=False)
+        return self._tuned[key]
+
+    def begin(self, observation: Observation) -> TunedPlan:
+        """Choose the failure cost, and plan at it."""
+        vertex = int(observation["vertex"])
+        best = self.tuning(observation["p_occupied"], vertex).best
+        if best not in self._planners:
+            self._planners[best] = ReplanningAgent(self.problem, failure_s=best, gamma=self.gamma)
+        near = self._neighborhoods.toward(vertex)
+        gate = near.gate if near.place(vertex) < 0 else -1
+        return TunedPlan(best, gate, self._planners[best].begin(observation))
+
+    def decide(self, observation: Observation, memory: TunedPlan) -> int:
+        """As the thesis's planner at the chosen cost, from the gate on."""
+        vertex = int(observation["vertex"])
+        if vertex == memory.gate:
+            memory.gate = -1
+        if memory.gate >= 0:
+            return self._routes.move_toward(vertex, memory.gate)
+        return self._planners[memory.failure_s].decide(observation, memory.plan)

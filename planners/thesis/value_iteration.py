@@ -1,0 +1,71 @@
+"""The reference solver: value iteration with in-place (Gauss-Seidel) sweeps."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from planners.thesis.mdp import ParkingMDP
+from planners.thesis.policy_iteration import Solution
+from sim_sensors.compilation import compiled
+
+FloatArray = NDArray[np.float64]
+
+
+def value_iteration(mdp: ParkingMDP, *, tolerance: float = 1e-9, max_iterations: int = 2_000_000) -> Solution:
+    """Apply Bellman's update until no value can be farther than `tolerance` from the optimum.
+
+    Slow where gamma is near 1 and little is free, and independent of the other solvers: it is there to
+    check them.
+
+    Args:
+        mdp: the process.
+        tolerance: s, bound on the error of the values: the last change times γ/(1-γ); at γ = 1, where
+            no such bound exists, the last change itself.
+        max_iterations: sweeps after which to give up.
+
+    Raises:
+        InputError: the tolerance is not positive.
+        RuntimeError: not converged within `max_iterations`.
+    """
+    if not tolerance > 0.0:
+        raise InputError(f"tolerance is {tolerance}, want above 0")
+    rewards, successors, continuation = mdp.rewards(), mdp.successors(), mdp.continuation()
+    # Starting below the optimum, from trying here for ever, keeps γ = 1 from settling on a bonus nobody earns.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        retry = rewards[:, -1] / (1.0 - continuation[:, -1])
+    values = np.where(
+        mdp.p_free > 0.0, retry, -1e9 if mdp.gamma == 1.0 else -mdp.failure_s / (1.0 - mdp.gamma)
+    )
+    step = tolerance if mdp.gamma == 1.0 else tolerance * (1.0 - mdp.gamma) / mdp.gamma
+    sweeps = _sweep_until(values, rewards, successors, continuation, step, max_iterations)
+    if sweeps > max_iterations:
+        raise RuntimeError(f"value iteration did not settle within {max_iterations} sweeps")
+    return Solution(values, mdp.action_values(values).argmax(axis=1), sweeps)
+
+
+@compiled
+def _sweep_until(
+    values: FloatArray,
+    rewards: FloatArray,
+    successors: NDArray[np.int64],
+    continuation: FloatArray,
+    step: float,
+    max_sweeps: int,
+) -> int:
+    n, n_actions = rewards.shape
+    for sweep in range(1, max_sweeps + 1):
+        change = 0.0
+        for s in range(n):
+            best = -np.inf
+            for a in range(n_actions):
+                best = max(best, rewards[s, a] + continuation[s, a] * values[successors[s, a]])
+            # Rounding moves a value by about an ulp for ever: that is no change.
+            moved = abs(best - values[s])
+            if moved > 4e-16 * abs(best):
+                change = max(change, moved)
+            values[s] = best
+        if change <= step:
+            return sweep
+    return max_sweeps + 1

@@ -1,0 +1,1 @@
+"""The camera: projection, rasteriser, shading, weather, image sensor."""

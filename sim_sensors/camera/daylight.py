@@ -1,0 +1,80 @@
+"""The light of a weather as it reaches a point: from the sun, the sky, and what a direction shows in a mirror."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_sensors.camera.light_maps import LightMaps, open_sky
+from sim_sensors.camera.sky import look_up, sky_domes
+from sim_sensors.camera.textures import LEAF
+from sim_sensors.camera.weather import Weather
+from sim_sensors.compilation import compiled
+
+Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+Color = tuple[float, float, float]
+
+SHADOW_BIAS = 0.05
+"""m, toward the sun, against self-shadowing."""
+
+_GROUND_TONE = 0.12  # albedo of the ground where it is only mirrored or bounces light
+
+
+class Light(NamedTuple):
+    """A weather's light as the compiled code takes it; colours are linear RGB radiance, relative (see `Weather`).
+
+    Attributes:
+        sun_direction: (3,) float64, unit vector to the sun, world frame.
+        sun, sky, horizon: (3,) float64, as in `Weather`.
+        haze, wetness, lit_windows: as in `Weather`.
+        background, mirrored: (n, n, 3) float32, the sky, sharp and blurred, as `look_up` takes it.
+        ground: (3,) float64, of open ground, where it is only mirrored or bounces light.
+    """
+
+    sun_direction: FloatArray
+    sun: FloatArray
+    sky: FloatArray
+    horizon: FloatArray
+    haze: float
+    wetness: float
+    lit_windows: float
+    background: Float32Array
+    mirrored: Float32Array
+    ground: FloatArray
+
+
+def daylight(weather: Weather) -> Light:
+    """The light of a weather."""
+    background, mirrored = sky_domes(weather)
+    sun, sky = np.array(weather.sun), np.array(weather.sky)
+    return Light(
+        np.array(weather.sun_direction),
+        sun,
+        sky,
+        np.array(weather.horizon),
+        weather.haze,
+        weather.wetness,
+        weather.lit_windows,
+        background,
+        mirrored,
+        _GROUND_TONE * (1.0 - 0.5 * weather.wetness) * (sun * weather.sun_direction[2] + sky),
+    )
+
+
+@compiled(**LEAF)
+def mirrored(
+    px: float, py: float, pz: float, rx: float, ry: float, rz: float, light: Light, maps: LightMaps
+) -> Color:
+    """What the direction (rx, ry, rz) shows from a point: the sky, or the ground with its shadows."""
+    if rz >= 0.0:
+        red, green, blue = look_up(light.mirrored, rx, ry, rz)
+        return red, green, blue
+    reach = max(pz, 0.05) / max(-rz, 0.02)
+    hidden = open_sky(maps, px + rx * reach, py + ry * reach)
+    # Toward the horizon stand other cars, kerbs, hedges: darker than the open ground.
+    far = min(1.0, reach * 0.12)
+    tone = (0.25 + 0.75 * hidden) * (1.0 - 0.45 * far)
+    return light.ground[0] * tone, light.ground[1] * tone, light.ground[2] * tone

@@ -1,0 +1,221 @@
+"""The ground seen from above: asphalt with patches, cracks, oil and worn paint, drawn once for a scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_sensors.camera.textures import LEAF, fractal_noise
+from sim_sensors.compilation import compiled
+from sim_sensors.mesh import Ground
+
+_FINEST = 0.025  # m a texel
+_MOST_TEXELS = 20e6
+_MARGIN = 6.0  # m of ground drawn round what is paved or painted
+_SUBPIXEL = 4  # bits of fraction in OpenCV's polygon corners
+
+
+class GroundTexture(NamedTuple):
+    """Albedo of the ground as an image pyramid.
+
+    Attributes:
+        texels: (total, 3) uint8: the root of the grey albedo, how much of it is grass, how much water can stand
+            there, each 255 = 1; level after level, row-major, rows go with y.
+        start: (n_levels,) int64, first texel of each level.
+        shape: (n_levels, 2) int64, rows and columns of each level.
+        per_m: (n_levels, 2) float64, texels per metre along y and x.
+        x, y: m, the corner of the image.
+        texel: m, side of a texel of the finest level.
+    """
+
+    texels: NDArray[np.uint8]
+    start: NDArray[np.int64]
+    shape: NDArray[np.int64]
+    per_m: NDArray[np.float64]
+    x: float
+    y: float
+    texel: float
+
+
+_TEXTURES: WeakKeyDictionary[Ground, GroundTexture] = WeakKeyDictionary()
+
+
+def ground_texture(ground: Ground) -> GroundTexture:
+    """The texture of a ground; made on first use and kept as long as the ground lives (about 1 s)."""
+    if ground not in _TEXTURES:
+        _TEXTURES[ground] = _draw(ground)
+    return _TEXTURES[ground]
+
+
+def _draw(ground: Ground) -> GroundTexture:
+    generator = np.random.default_rng(ground.seed)
+    low, high = _extent(ground)
+    texel = max(_FINEST, math.sqrt(float(np.prod(high - low)) / _MOST_TEXELS))
+    columns, rows = (np.ceil((high - low) / texel / 16).astype(int) * 16).tolist()
+
+    def corners(points: NDArray[np.float64]) -> NDArray[np.int32]:
+        # OpenCV counts from the centre of the first pixel.
+        pixels: NDArray[np.float64] = (points - low) / texel - 0.5
+        return np.asarray(np.round(pixels * 2**_SUBPIXEL), dtype=np.int32)
+
+    paved = np.zeros((rows, columns), dtype=np.uint8)
+    for polygon in ground.paved:
+        cv2.fillPoly(paved, [corners(polygon)], 255, cv2.LINE_AA, _SUBPIXEL)
+    paint = np.zeros_like(paved)
+    for x0, y0, x1, y1, width in ground.markings:
+        cv2.fillConvexPoly(paint, corners(_strip(x0, y0, x1, y1, width)), 255, cv2.LINE_AA, _SUBPIXEL)
+
+    blotch = _spread(fractal_noise(512, generator, 1.3), paved.shape, texel, 40.0)
+    mottle = _spread(fractal_noise(512, generator, 0.8), paved.shape, texel, 9.0)
+    grain = generator.standard_normal((512, 512)).astype(np.float32)
+    grain = np.tile(grain, (rows // 512 + 1, columns // 512 + 1))[:rows, :columns]
+
+    asphalt = 0.115 * (1.0 + 0.16 * blotch + 0.1 * mottle + 0.13 * grain)
+    _repair(asphalt, generator, texel)
+    asphalt *= _stains(paved.shape, ground, corners, generator, texel)
+    _crack(asphalt, generator, texel)
+    # Paint goes where tyres roll and where the stones stand out.
+    wear = np.clip(0.8 - 0.28 * mottle - 0.2 * blotch - 0.14 * grain, 0.1, 0.95)
+    cover = wear * (paint.astype(np.float32) / 255.0)
+    grey = asphalt * (1.0 - cover) + (0.5 + 0.05 * blotch + 0.02 * grain) * cover
+
+    on_pavement = paved.astype(np.float32) / 255.0
+    grass = 0.075 * (1.0 + 0.2 * blotch + 0.25 * mottle + 0.35 * grain)
+    texels = np.empty((rows, columns, 3), dtype=np.float32)
+    texels[..., 0] = np.sqrt(np.clip(grey * on_pavement + grass * (1.0 - on_pavement), 0.004, 1.0))
+    texels[..., 1] = 1.0 - on_pavement
+    texels[..., 2] = np.clip(0.4 - 0.3 * blotch - 0.1 * mottle, 0.0, 1.0) * on_pavement
+    return _pyramid((texels * 255.0).astype(np.uint8), low, texel)
+
+
+def _extent(ground: Ground) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    points = [np.zeros((1, 2)) if not ground.paved and not len(ground.markings) else np.empty((0, 2))]
+    points.extend(ground.paved)
+    points.extend((ground.markings[:, :2], ground.markings[:, 2:4]))
+    stacked = np.concatenate(points)
+    return stacked.min(axis=0) - _MARGIN, stacked.max(axis=0) + _MARGIN
+
+
+def _strip(x0: float, y0: float, x1: float, y1: float, width: float) -> NDArray[np.float64]:
+    """The four corners of a line of some width."""
+    along = np.array([x1 - x0, y1 - y0])
+    across = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9) * width / 2.0
+    start, end = np.array([x0, y0]), np.array([x1, y1])
+    return np.stack([start - across, end - across, end + across, start + across])
+
+
+def _spread(
+    noise: NDArray[np.float64], shape: tuple[int, int], texel: float, period: float
+) -> NDArray[np.float32]:
+    """Stretch tileable noise so that it repeats every `period` metres."""
+    size = max(8, round(period / texel))
+    big = cv2.resize(noise.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC)
+    repeats = (shape[0] // size + 1, shape[1] // size + 1)
+    return np.ascontiguousarray(np.tile(big, repeats)[: shape[0], : shape[1]])
+
+
+def _repair(asphalt: NDArray[np.float32], generator: np.random.Generator, texel: float) -> None:
+    """Darker or lighter rectangles where the road was opened."""
+    rows, columns = asphalt.shape
+    for _ in range(int(asphalt.size * texel**2 / 250.0)):
+        height, width = (generator.uniform(0.5, 3.5, 2) / texel).astype(int)
+        row, column = int(generator.integers(rows)), int(generator.integers(columns))
+        asphalt[row : row + height, column : column + width] *= generator.uniform(0.72, 1.18)
+
+
+def _stains(
+    shape: tuple[int, ...],
+    ground: Ground,
+    corners: Callable[[NDArray[np.float64]], NDArray[np.int32]],
+    generator: np.random.Generator,
+    texel: float,
+) -> NDArray[np.float32]:
+    """Oil and rust where engines stood, denser near markings; factor on the albedo."""
+    stain = np.zeros(shape[:2], dtype=np.uint8)
+    n_lines = len(ground.markings)
+    area = shape[0] * shape[1] * texel**2
+    for _ in range(int(area / 12.0)):
+        center = generator.uniform(0.0, 1.0, 2) * (shape[1], shape[0])
+        if n_lines and generator.random() < 0.6:
+            line = ground.markings[generator.integers(n_lines)]
+            near = line[:2] + (line[2:4] - line[:2]) * generator.random() + generator.normal(0.0, 1.1, 2)
+            center = corners(near[None, :])[0] / 2**_SUBPIXEL
+        radius = max(1, round(float(generator.exponential(0.09)) / texel))
+        position = (int(center[0]), int(center[1]))
+        cv2.circle(stain, position, radius, int(generator.integers(40, 160)), -1)
+    soft = cv2.GaussianBlur(stain, (0, 0), 1.6).astype(np.float32) / 255.0
+    return np.asarray(1.0 - 0.75 * soft, dtype=np.float32)
+
+
+def _crack(asphalt: NDArray[np.float32], generator: np.random.Generator, texel: float) -> None:
+    """Dark wandering lines."""
+    rows, columns = asphalt.shape
+    mask = np.zeros((rows, columns), dtype=np.uint8)
+    for _ in range(int(rows * columns * texel**2 / 90.0)):
+        steps = int(generator.integers(6, 40))
+        heading = generator.uniform(0.0, 2.0 * np.pi) + np.cumsum(generator.normal(0.0, 0.35, steps))
+        path = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0) * 0.12 / texel
+        path += generator.uniform(0.0, 1.0, 2) * (columns, rows)
+        cv2.polylines(mask, [path.astype(np.int32)], False, int(generator.integers(70, 200)), 1, cv2.LINE_AA)
+    asphalt *= 1.0 - 0.6 * mask.astype(np.float32) / 255.0
+
+
+def _pyramid(image: NDArray[np.uint8], low: NDArray[np.float64], texel: float) -> GroundTexture:
+    levels = [image]
+    while min(image.shape[:2]) > 8 and len(levels) < 9:
+        half = (max(1, image.shape[1] // 2), max(1, image.shape[0] // 2))
+        image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        levels.append(image)
+    shape = np.array([level.shape[:2] for level in levels], dtype=np.int64)
+    start = np.concatenate([[0], np.cumsum(shape.prod(axis=1))[:-1]]).astype(np.int64)
+    texels = np.concatenate([level.reshape(-1, 3) for level in levels])
+    # Levels are not exact halves where a side is odd.
+    per_m = shape / (shape[0] * texel)
+    return GroundTexture(texels, start, shape, per_m, float(low[0]), float(low[1]), texel)
+
+
+@compiled(**LEAF)
+def sample_ground(texture: GroundTexture, x: float, y: float, level: int) -> tuple[float, float, int, int]:
+    """The ground at (x, y), m, bilinear: grey albedo, share of grass; and its texel and the one below."""
+    level = min(max(level, 0), texture.shape.shape[0] - 1)
+    columns = texture.shape[level, 1]
+    # Beyond the drawn part it repeats, mirrored, so that no streaks run to the horizon.
+    u = _mirrored((x - texture.x) * texture.per_m[level, 1] - 0.5, columns)
+    v = _mirrored((y - texture.y) * texture.per_m[level, 0] - 0.5, texture.shape[level, 0])
+    column = int(u)
+    row = int(v)
+    a = u - column
+    b = v - row
+    i = texture.start[level] + row * columns + column
+    j = i + columns
+    t = texture.texels
+    above = t[i, 0] + a * (float(t[i + 1, 0]) - t[i, 0])
+    below = t[j, 0] + a * (float(t[j + 1, 0]) - t[j, 0])
+    root = (above + b * (below - above)) / 255.0
+    return root * root, t[i, 1] / 255.0, i, j
+
+
+@compiled(**LEAF)
+def sample_water(texture: GroundTexture, i: int, j: int) -> float:
+    """How much water can stand between the texels i and j of `sample_ground`."""
+    t = texture.texels
+    return float(float(t[i, 2]) + t[i + 1, 2] + t[j, 2] + t[j + 1, 2]) / 1020.0
+
+
+@compiled(**LEAF)
+def _mirrored(u: float, n: int) -> float:
+    """`u` folded back into [0, n - 1)."""
+    span = n - 1.001
+    if u < 0.0:
+        u = -u
+    if u > span:
+        u -= 2.0 * span * np.floor(u / (2.0 * span))
+        if u > span:
+            u = 2.0 * span - u
+    return float(u)

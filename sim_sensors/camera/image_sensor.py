@@ -1,0 +1,206 @@
+"""From light to bytes: lens blur, vignetting, exposure, shot and read noise, tone curve."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numba import prange
+from numpy.typing import NDArray
+
+from sim_sensors.camera.rasterizer import BAND, interleaved
+from sim_sensors.camera.textures import FAST
+from sim_sensors.compilation import compiled
+from sim_sensors.errors import SensorError
+
+Float32Array = NDArray[np.float32]
+
+_CURVE_STEPS = 4096
+_BRIGHTEST = 4.0  # of the tone curve's input; 1 is where a plain sRGB curve would clip
+_KNEE = 0.7  # from there on highlights are compressed, as a camera's own curve does
+_NOISE = 1 << 20  # numbers in the noise table
+
+
+@dataclass(frozen=True)
+class ImageSensor:
+    """How a camera turns radiance into bytes.
+
+    Args:
+        mid_grey: mean of the exposed image (linear, 1 is white) that the automatic exposure aims at.
+        least_gain, greatest_gain: limits of the automatic exposure.
+        blur: px, standard deviation of the lens's point spread, at most 0.8.
+        vignetting: fraction of the light lost in the image's corners.
+        shot_noise: deviation at white and gain 1; grows with the root of light and of gain.
+        read_noise: deviation in the dark at gain 1; grows with gain.
+
+    Raises:
+        SensorError: a value that is negative, not finite or out of range.
+    """
+
+    mid_grey: float = 0.19
+    least_gain: float = 0.1
+    greatest_gain: float = 8.0
+    blur: float = 0.55
+    vignetting: float = 0.22
+    shot_noise: float = 0.01
+    read_noise: float = 0.0008
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (math.isfinite(value) and value >= 0.0):
+                raise SensorError(f"{name} is {value}, want a finite number of at least 0")
+        if self.blur > 0.8:
+            raise SensorError(f"blur is {self.blur} px, want at most 0.8")
+        if self.vignetting >= 1.0:
+            raise SensorError(f"vignetting is {self.vignetting}, want below 1")
+        if not 0.0 < self.least_gain <= self.greatest_gain:
+            raise SensorError(
+                f"least_gain {self.least_gain} and greatest_gain {self.greatest_gain} are no limits, "
+                "want 0 < least <= greatest"
+            )
+
+    def gain(self, radiance: Float32Array) -> float:
+        """Automatic exposure of an (h, w, 3) image: the factor that brings its mean to mid grey.
+
+        Every eighth pixel's green is measured, and what is very bright counts no more than white: a low sun does not
+        turn the street black.
+        """
+        sample = radiance[::8, ::8, 1].astype(np.float64)
+        mean = float(np.minimum(sample, 3.0 * np.median(sample)).mean())
+        return min(max(self.mid_grey / max(mean, 1e-6), self.least_gain), self.greatest_gain)
+
+    def expose(
+        self, radiance: Float32Array, seed: int, gain: float, *, rain: float = 0.0
+    ) -> NDArray[np.uint8]:
+        """Take the picture.
+
+        Args:
+            radiance: (h, w, 3) float32, linear RGB.
+            seed: of the noise; equal seeds give equal bytes.
+            gain: of `gain`, or chosen.
+            rain: 0 to 1, streaks of falling drops.
+
+        Returns:
+            (h, w, 3) uint8, RGB.
+        """
+        height, width, _ = radiance.shape
+        generator = np.random.default_rng(seed)
+        offsets = generator.integers(0, _NOISE - 3 * width if 3 * width < _NOISE else 1, height)
+        if rain > 0.0:
+            radiance = radiance.copy()
+            _draw_rain(radiance, rain, generator)
+        # A kernel of three taps with the wanted variance.
+        side = self.blur**2 / 2.0
+        image = np.empty((height, width, 3), dtype=np.uint8)
+        _expose(
+            radiance,
+            _noise_table(),
+            offsets,
+            _tone_curve(),
+            interleaved((height + BAND - 1) // BAND),
+            np.float32(side),
+            np.float32(gain),
+            np.float32(self.vignetting),
+            np.float32(self.shot_noise**2 * gain),
+            np.float32((self.read_noise * gain) ** 2),
+            image,
+        )
+        return image
+
+
+@lru_cache(maxsize=1)
+def _noise_table() -> Float32Array:
+    return np.random.default_rng(43).standard_normal(_NOISE, dtype=np.float32)
+
+
+@lru_cache(maxsize=1)
+def _tone_curve() -> NDArray[np.uint8]:
+    """8-bit codes over the square root of the light, so that the dark gets most of the steps."""
+    light = np.linspace(0.0, 1.0, _CURVE_STEPS) ** 2 * _BRIGHTEST
+    over = np.maximum(light - _KNEE, 0.0)
+    light = np.minimum(light, _KNEE) + (1.0 - _KNEE) * (1.0 - np.exp(-over / (1.0 - _KNEE)))
+    code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
+    return np.round(255.0 * np.clip(code, 0.0, 1.0)).astype(np.uint8)
+
+
+def _draw_rain(radiance: Float32Array, rain: float, generator: np.random.Generator) -> None:
+    """Faint near-vertical streaks, brighter than what is behind them."""
+    height, width, _ = radiance.shape
+    count = int(rain * 500 * height * width / (640 * 480))
+    column = generator.uniform(0, width, count)
+    row = generator.uniform(-20, height, count)
+    length = generator.uniform(0.01, 0.05, count) * height
+    lean = generator.normal(0.04, 0.02)
+    strength = generator.uniform(0.02, 0.09, count) * float(radiance[::8, ::8].mean())
+    _streaks(radiance, column, row, length, lean, strength)
+
+
+@compiled
+def _streaks(
+    radiance: Float32Array,
+    column: NDArray[np.float64],
+    row: NDArray[np.float64],
+    length: NDArray[np.float64],
+    lean: float,
+    strength: NDArray[np.float64],
+) -> None:
+    height, width, _ = radiance.shape
+    for i in range(column.shape[0]):
+        for y in range(max(0, int(row[i])), min(height, int(row[i] + length[i]))):
+            x = int(column[i] + lean * (y - row[i]))
+            if 0 <= x < width:
+                for channel in range(3):
+                    radiance[y, x, channel] += strength[i]
+
+
+@compiled(parallel=True, fastmath=FAST)
+def _expose(
+    radiance: Float32Array,
+    noise: Float32Array,
+    offsets: NDArray[np.int64],
+    curve: NDArray[np.uint8],
+    order: NDArray[np.int64],
+    side: np.float32,
+    gain: np.float32,
+    vignetting: np.float32,
+    shot_variance: np.float32,
+    read_variance: np.float32,
+    image: NDArray[np.uint8],
+) -> None:
+    height, width, _ = radiance.shape
+    n = 3 * width
+    flat = radiance.reshape(height, n)
+    codes = image.reshape(height, n)
+    middle = np.float32(1.0) - np.float32(2.0) * side
+    steps = np.float32(_CURVE_STEPS - 1) / np.sqrt(np.float32(_BRIGHTEST))
+    brightest = np.float32(_BRIGHTEST)
+    zero = np.float32(0.0)
+    per_corner = vignetting / np.float32(0.25 * (width * width + height * height))
+    for task in prange(order.shape[0]):
+        column = np.empty(n, dtype=np.float32)
+        step = np.empty(n, dtype=np.int32)
+        for y in range(order[task] * BAND, min(height, order[task] * BAND + BAND)):
+            here = flat[y]
+            above = flat[max(y - 1, 0)]
+            below = flat[min(y + 1, height - 1)]
+            for i in range(n):
+                column[i] = middle * here[i] + side * (above[i] + below[i])
+            across = np.float32(y + 0.5 - 0.5 * height)
+            drawn = noise[offsets[y] : offsets[y] + n]
+            for i in range(n):
+                left = column[i - 3] if i >= 3 else column[i]
+                right = column[i + 3] if i < n - 3 else column[i]
+                along = (
+                    np.float32(np.int32(i) // np.int32(3))
+                    + np.float32(0.5)
+                    - np.float32(0.5) * np.float32(width)
+                )
+                light = middle * column[i] + side * (left + right)
+                light *= gain * (np.float32(1.0) - per_corner * (along * along + across * across))
+                light += drawn[i] * np.sqrt(shot_variance * max(light, zero) + read_variance)
+                step[i] = np.int32(steps * np.sqrt(min(max(light, zero), brightest)) + np.float32(0.5))
+            row = codes[y]
+            for i in range(n):
+                row[i] = curve[step[i]]

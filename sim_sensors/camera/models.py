@@ -1,0 +1,352 @@
+"""Pinhole and stereo cameras: a scene, a pose, weather and a seed in; image, depth and instance ids out."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_sensors.camera.ground_texture import ground_texture
+from sim_sensors.camera.image_sensor import ImageSensor
+from sim_sensors.camera.light_maps import bounding_boxes, light_maps
+from sim_sensors.camera.projection import ScreenTriangles, project
+from sim_sensors.camera.rasterizer import FAR, Visibility, rasterize
+from sim_sensors.camera.shading import shade
+from sim_sensors.camera.weather import Weather
+from sim_sensors.compilation import compiled
+from sim_sensors.errors import SensorError
+from sim_sensors.mesh import Ground, Instances, MeshPool
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+
+_AHEAD = 12.0  # m, before the camera: the middle of what is lit in detail
+
+
+class Drawable(Protocol):
+    """What a camera can look at.
+
+    The arrays inside are taken to be constant: shadows and textures made from them are kept as long as the
+    objects live. To change the scene make new `Instances`; the same pool and ground go on.
+    """
+
+    @property
+    def pool(self) -> MeshPool:
+        """The meshes."""
+
+    @property
+    def instances(self) -> Instances:
+        """Where they stand."""
+
+    @property
+    def ground(self) -> Ground:
+        """The plane below."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What a camera delivers, and the truth about it.
+
+    Attributes:
+        image: (h, w, 3) uint8, RGB.
+        depth: (h, w) float32, m along the optical axis, of the first *opaque* surface at the pixel's centre: glass
+            is looked through, as stereo and lidar do. inf for the sky.
+        glass_depth: (h, w) float32, m along the optical axis, of the nearest pane before that surface; inf where
+            there is none.
+        ids: (h, w) int32, `Instances.ids` of the first surface, a pane counted as one: 0 for scenery, ground and
+            sky. So a vehicle's pixels include its windows.
+    """
+
+    image: NDArray[np.uint8]
+    depth: Float32Array
+    glass_depth: Float32Array
+    ids: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """A camera without distortion. Pixel (row, column) has its centre at (column + 0.5, row + 0.5).
+
+    Args:
+        width, height: px.
+        fx, fy: px, focal lengths.
+        cx, cy: px, principal point.
+        sensor: exposure, blur and noise.
+        supersampling: 1, or 2 to draw four samples a pixel: smoother edges at four times the cost. Depth and ids
+            are always taken at the pixel's centre.
+        coarse_beyond: m; farther things are drawn with coarse meshes where the pool has them.
+
+    Raises:
+        SensorError: a size below 1, a focal length that is not positive, anything not finite.
+    """
+
+    width: int = 640
+    height: int = 480
+    fx: float = 520.0
+    fy: float = 520.0
+    cx: float = 320.0
+    cy: float = 240.0
+    sensor: ImageSensor = field(default_factory=ImageSensor)
+    supersampling: int = 1
+    coarse_beyond: float = 25.0
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise SensorError(f"image size is {self.width}×{self.height} px, want at least 1×1")
+        for name in ("fx", "fy"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise SensorError(f"{name} is {getattr(self, name)} px, want a finite number above 0")
+        for name in ("cx", "cy"):
+            if not math.isfinite(getattr(self, name)):
+                raise SensorError(f"{name} is {getattr(self, name)} px, want a finite number")
+        if self.supersampling not in (1, 2):
+            raise SensorError(f"supersampling is {self.supersampling}, want 1 or 2")
+        if not self.coarse_beyond >= 0.0:
+            raise SensorError(f"coarse_beyond is {self.coarse_beyond} m, want at least 0")
+
+    @classmethod
+    def from_field_of_view(
+        cls, width: int = 640, height: int = 480, horizontal: float = 1.1
+    ) -> PinholeCamera:
+        """Square pixels, principal point in the middle.
+
+        Args:
+            width: px.
+            height: px.
+            horizontal: rad, field of view across the width, above 0 and below π.
+        """
+        if not 0.0 < horizontal < math.pi:
+            raise SensorError(f"field of view is {horizontal} rad, want above 0 and below π")
+        focal = width / 2.0 / math.tan(horizontal / 2.0)
+        return cls(width, height, focal, focal, width / 2.0, height / 2.0)
+
+    @property
+    def intrinsics(self) -> tuple[float, float, float, float]:
+        """fx, fy, cx, cy in px."""
+        return self.fx, self.fy, self.cx, self.cy
+
+    @property
+    def matrix(self) -> FloatArray:
+        """(3, 3) float64, from the camera frame to homogeneous pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def render(
+        self,
+        scene: Drawable,
+        pose: FloatArray,
+        weather: Weather | None = None,
+        seed: int = 0,
+        *,
+        gain: float | None = None,
+    ) -> Frame:
+        """Take a picture. Equal arguments give equal bytes, on any number of threads.
+
+        The first look at a ground draws its texture (about a second), the first call after installation also
+        compiles (both are kept).
+
+        Args:
+            scene: pool, instances and ground.
+            pose: (4, 4) float64, camera (x right, y down, z forward) to world; see `camera_pose`.
+            weather: the light; the default is a sunny day.
+            seed: of the sensor's noise.
+            gain: exposure; None for automatic.
+
+        Raises:
+            SensorError: a pose that is not finite or no rotation, or lies below the ground or inside a vehicle.
+        """
+        weather = Weather() if weather is None else weather
+        pose = checked_pose(scene, pose)
+        radiance, geometry = self._look(scene, pose, weather)
+        chosen = self.sensor.gain(radiance) if gain is None else gain
+        image = self.sensor.expose(radiance, seed, chosen, rain=weather.rain)
+        return Frame(image, *geometry)
+
+    def _look(
+        self, scene: Drawable, pose: FloatArray, weather: Weather
+    ) -> tuple[Float32Array, tuple[Float32Array, Float32Array, NDArray[np.int32]]]:
+        """Radiance, and depth, glass depth and ids."""
+        triangles, visibility = self.visibility(scene, pose)
+        geometry = _geometry(visibility, triangles.instance, scene.instances.ids)
+        texture = ground_texture(scene.ground)
+        x, y = pose[:2, 3] + _AHEAD * pose[:2, 2]
+        maps = light_maps(scene.pool, scene.instances, weather, float(x), float(y))
+        if self.supersampling == 1:
+            return shade(triangles, visibility, pose, self.intrinsics, weather, texture, maps), geometry
+        fine = PinholeCamera(
+            2 * self.width, 2 * self.height, 2 * self.fx, 2 * self.fy, 2 * self.cx, 2 * self.cy,
+            coarse_beyond=self.coarse_beyond,
+        )  # fmt: skip
+        triangles, visibility = fine.visibility(scene, pose)
+        radiance = shade(triangles, visibility, pose, fine.intrinsics, weather, texture, maps)
+        return _halved(radiance), geometry
+
+    def visibility(self, scene: Drawable, pose: FloatArray) -> tuple[ScreenTriangles, Visibility]:
+        """Which triangle each pixel sees; the geometry alone, without light."""
+        size = (self.width, self.height)
+        triangles = project(scene.pool, scene.instances, pose, self.intrinsics, size, self.coarse_beyond)
+        # The ground z = 0 is met where the ray's z component times depth makes up for the camera's height.
+        down = -pose[2, :3] / pose[2, 3]
+        floor_x, floor_y = down[0] / self.fx, down[1] / self.fy
+        floor = np.array([floor_x, floor_y, down[2] - floor_x * self.cx - floor_y * self.cy])
+        return triangles, rasterize(triangles, size, floor, 1.0 / FAR)
+
+
+@dataclass(frozen=True, eq=False)
+class StereoFrame:
+    """A rectified pair: rows agree, and a point's disparity is fx · baseline / depth, left minus right.
+
+    Attributes:
+        left: with depth and ids as of a single camera.
+        right: the same from the right camera.
+    """
+
+    left: Frame
+    right: Frame
+
+
+@dataclass(frozen=True)
+class StereoCamera:
+    """Two equal cameras side by side, Bumblebee-like; the left one's pose is the pair's.
+
+    Args:
+        camera: either of the two.
+        baseline: m, the right camera stands this far along the left one's x axis.
+
+    Raises:
+        SensorError: a baseline that is not positive and finite.
+    """
+
+    camera: PinholeCamera = field(default_factory=PinholeCamera)
+    baseline: float = 0.12
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.baseline) and self.baseline > 0.0):
+            raise SensorError(f"baseline is {self.baseline} m, want a finite number above 0")
+
+    def right_pose(self, pose: FloatArray) -> FloatArray:
+        """Pose of the right camera, (4, 4), from that of the left."""
+        moved = np.array(pose, dtype=np.float64)
+        moved[:3, 3] += self.baseline * moved[:3, 0]
+        return moved
+
+    def render_stereo(
+        self, scene: Drawable, pose: FloatArray, weather: Weather | None = None, seed: int = 0
+    ) -> StereoFrame:
+        """Take both pictures at once, with one exposure; arguments and errors as of `PinholeCamera.render`.
+
+        Textures, sky and shadows are made once for both. The two images' noise is independent.
+        """
+        weather = Weather() if weather is None else weather
+        sensor = self.camera.sensor
+        frames = []
+        gain = None
+        for side, eye in enumerate((pose, self.right_pose(pose))):
+            radiance, geometry = self.camera._look(scene, checked_pose(scene, eye), weather)
+            gain = sensor.gain(radiance) if gain is None else gain
+            frames.append(Frame(sensor.expose(radiance, 2 * seed + side, gain, rain=weather.rain), *geometry))
+        return StereoFrame(*frames)
+
+
+def camera_pose(
+    x: float, y: float, z: float, yaw: float, pitch: float = 0.0, roll: float = 0.0
+) -> FloatArray:
+    """Camera-to-world matrix of a camera that looks along `yaw`.
+
+    Args:
+        x: m, world frame.
+        y: m.
+        z: m, above the ground.
+        yaw: rad, counter-clockwise from x, of the optical axis.
+        pitch: rad, above 0 looks up.
+        roll: rad, about the optical axis, above 0 tilts the head to the right.
+
+    Returns:
+        (4, 4) float64; columns are the camera's right, down and forward axes, and its position.
+    """
+    values = (x, y, z, yaw, pitch, roll)
+    if not all(math.isfinite(value) for value in values):
+        raise SensorError(f"camera pose is {values}, want finite numbers")
+    forward = np.array([math.cos(yaw) * math.cos(pitch), math.sin(yaw) * math.cos(pitch), math.sin(pitch)])
+    level = np.array([math.sin(yaw), -math.cos(yaw), 0.0])
+    steep = np.cross(forward, level)
+    pose = np.eye(4)
+    pose[:3, 0] = math.cos(roll) * level + math.sin(roll) * steep
+    pose[:3, 1] = math.cos(roll) * steep - math.sin(roll) * level
+    pose[:3, 2] = forward
+    pose[:3, 3] = (x, y, z)
+    return pose
+
+
+def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
+    """The pose as a contiguous (4, 4) float64 array.
+
+    Raises:
+        SensorError: of another shape, not finite, no rotation, not above the ground, or inside a vehicle.
+    """
+    pose = np.ascontiguousarray(pose, dtype=np.float64)
+    if pose.shape != (4, 4):
+        raise SensorError(f"camera pose has shape {pose.shape}, want (4, 4)")
+    if not np.isfinite(pose).all():
+        raise SensorError(f"camera pose is {pose.tolist()}, want finite numbers")
+    rotation = pose[:3, :3]
+    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0.0:
+        raise SensorError(f"camera pose has axes {rotation.tolist()}, want a rotation")
+    if pose[2, 3] <= 0.0:
+        raise SensorError(f"camera height is {pose[2, 3]} m, want above the ground, z = 0")
+    instances = scene.instances
+    box = bounding_boxes(scene.pool)[instances.mesh]
+    offset = pose[:3, 3] - instances.pose[:, :3]
+    cosine, sine = np.cos(instances.pose[:, 3]), np.sin(instances.pose[:, 3])
+    local = np.stack(
+        [
+            cosine * offset[:, 0] + sine * offset[:, 1],
+            cosine * offset[:, 1] - sine * offset[:, 0],
+            offset[:, 2],
+        ],
+        axis=1,
+    )
+    inside = ((local > box[:, :3]) & (local < box[:, 3:])).all(axis=1) & (instances.ids > 0)
+    if inside.any():
+        vehicle = int(instances.ids[np.argmax(inside)])
+        raise SensorError(
+            f"camera position {pose[:3, 3].tolist()} is inside vehicle {vehicle}, want it outside"
+        )
+    return pose
+
+
+@compiled
+def _geometry(
+    visibility: Visibility, instance: NDArray[np.int32], ids: NDArray[np.int32]
+) -> tuple[Float32Array, Float32Array, NDArray[np.int32]]:
+    height, width = visibility.triangle.shape
+    depth = np.empty((height, width), dtype=np.float32)
+    glass = np.empty((height, width), dtype=np.float32)
+    seen = np.empty((height, width), dtype=np.int32)
+    infinite = np.float32(np.inf)
+    one = np.float32(1.0)
+    for y in range(height):
+        for x in range(width):
+            inverse = visibility.inverse_depth[y, x]
+            depth[y, x] = one / inverse if inverse > 0 else infinite
+            pane = visibility.pane[y, x]
+            glass[y, x] = one / visibility.pane_inverse_depth[y, x] if pane >= 0 else infinite
+            t = pane if pane >= 0 else visibility.triangle[y, x]
+            seen[y, x] = ids[instance[t]] if t >= 0 else 0
+    return depth, glass, seen
+
+
+@compiled
+def _halved(image: Float32Array) -> Float32Array:
+    """Mean of every 2×2 pixels of an (h, w, 3) image."""
+    height, width, _ = image.shape
+    out = np.empty((height // 2, width // 2, 3), dtype=np.float32)
+    for y in range(height // 2):
+        for x in range(width // 2):
+            for c in range(3):
+                total = image[2 * y, 2 * x, c] + image[2 * y, 2 * x + 1, c]
+                total += image[2 * y + 1, 2 * x, c] + image[2 * y + 1, 2 * x + 1, c]
+                out[y, x, c] = np.float32(0.25) * total
+    return out

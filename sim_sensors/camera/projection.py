@@ -1,0 +1,293 @@
+"""From a scene to triangles on the screen: culling, level of detail, projection, clipping at the near plane.
+
+A triangle's inverse depth and its normal (over depth) are linear in the pixel, whatever its corners do: both
+come from the cross products of its corners in the camera frame (Olano and Greer, *Triangle scan conversion
+using 2D homogeneous coordinates*, 1997). So clipping at the near plane only decides which pixels are covered,
+and depth is exact for triangles that pass behind the camera.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_sensors.camera.textures import FAST, LEAF
+from sim_sensors.compilation import compiled
+from sim_sensors.mesh import Instances, Material, MeshPool
+
+Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int32]
+
+NEAR = 0.05  # m, nothing nearer is drawn
+
+# Things whose inside is never seen. A car's shell is not among them: one sees it through the windows.
+_CLOSED = np.zeros(256, dtype=np.bool_)
+_CLOSED[[Material.RUBBER, Material.FACADE, Material.BARK, Material.STONE, Material.POST]] = True
+
+
+class ScreenTriangles(NamedTuple):
+    """What is left of the scene's triangles on the screen.
+
+    Attributes:
+        corners: (n, 6) float32, px: x, y of the three corners; pixel (row, column) has its centre at
+            (column + 0.5, row + 0.5).
+        inverse_depth: (n, 3) float64: 1/depth in 1/m at (x, y) px is a·x + b·y + c.
+        normal: (n, 9) float32: row-major 3×3 matrix from the ray (u, v, 1) in the camera frame to the
+            interpolated outward normal in the world frame, times a positive factor.
+        material: (n,) uint8.
+        color: (n, 3) uint8, sRGB.
+        instance: (n,) int32, index into the instances, ascending.
+    """
+
+    corners: Float32Array
+    inverse_depth: FloatArray
+    normal: Float32Array
+    material: NDArray[np.uint8]
+    color: NDArray[np.uint8]
+    instance: IntArray
+
+
+def project(
+    pool: MeshPool,
+    instances: Instances,
+    pose: FloatArray,
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int],
+    coarse_beyond: float = math.inf,
+) -> ScreenTriangles:
+    """Cull, transform and clip; triangles that cover no pixel centre are left out.
+
+    Args:
+        pool: the meshes.
+        instances: where they stand.
+        pose: (4, 4) camera to world, camera frame x right, y down, z forward.
+        intrinsics: fx, fy, cx, cy, px.
+        size: width, height, px.
+        coarse_beyond: m; farther instances are drawn with the pool's coarse meshes, if it has any.
+    """
+    visible = _visible_instances(instances, pool.radius, pose, intrinsics, size)
+    mesh = instances.mesh[visible]
+    if pool.coarse is not None:
+        away = np.linalg.norm(instances.pose[visible, :3] - pose[:3, 3], axis=1) > coarse_beyond
+        mesh = np.where(away, pool.coarse[mesh], mesh)
+    # A clipped triangle may become two.
+    capacity = 2 * int((pool.triangle_start[mesh + 1] - pool.triangle_start[mesh]).sum())
+    most_vertices = int((pool.vertex_start[mesh + 1] - pool.vertex_start[mesh]).max(initial=0))
+    out = ScreenTriangles(
+        np.empty((capacity, 6), dtype=np.float32),
+        np.empty((capacity, 3)),
+        np.empty((capacity, 9), dtype=np.float32),
+        np.empty(capacity, dtype=np.uint8),
+        np.empty((capacity, 3), dtype=np.uint8),
+        np.empty(capacity, dtype=np.int32),
+    )
+    count = _project(
+        pool.vertices,
+        pool.normals,
+        pool.triangles,
+        pool.material,
+        pool.color,
+        pool.vertex_start,
+        pool.triangle_start,
+        visible,
+        mesh,
+        instances.pose,
+        np.ascontiguousarray(pose, dtype=np.float64),
+        *intrinsics,
+        *size,
+        _CLOSED,
+        np.empty((most_vertices, 3)),
+        np.empty((3, 4)),
+        np.empty((3, 3)),
+        np.empty((4, 2)),
+        out,
+    )
+    return ScreenTriangles(
+        out.corners[:count],
+        out.inverse_depth[:count],
+        out.normal[:count],
+        out.material[:count],
+        out.color[:count],
+        out.instance[:count],
+    )
+
+
+def _visible_instances(
+    instances: Instances,
+    radius: Float32Array,
+    pose: FloatArray,
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int],
+) -> IntArray:
+    """Instances whose bounding sphere reaches into the viewing pyramid."""
+    fx, fy, cx, cy = intrinsics
+    center = (instances.pose[:, :3] - pose[:3, 3]) @ pose[:3, :3]
+    reach = radius[instances.mesh].astype(np.float64)
+    seen = center[:, 2] > NEAR - reach
+    # The pyramid's four side planes pass through the camera; their normals point out of it.
+    for plane in (
+        (fx, 0.0, cx - size[0]),
+        (-fx, 0.0, -cx),
+        (0.0, fy, cy - size[1]),
+        (0.0, -fy, -cy),
+    ):
+        normal = np.array(plane) / np.linalg.norm(plane)
+        seen &= center @ normal < reach
+    return np.flatnonzero(seen).astype(np.int32)
+
+
+@compiled(fastmath=FAST, _nrt=False)
+def _project(
+    vertices: Float32Array,
+    normals: Float32Array,
+    triangles: IntArray,
+    material: NDArray[np.uint8],
+    color: NDArray[np.uint8],
+    vertex_start: NDArray[np.int64],
+    triangle_start: NDArray[np.int64],
+    visible: IntArray,
+    mesh: IntArray,
+    poses: FloatArray,
+    camera: FloatArray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    width: int,
+    height: int,
+    closed: NDArray[np.bool_],
+    moved: FloatArray,
+    to_camera: FloatArray,
+    cross: FloatArray,
+    polygon: FloatArray,
+    out: ScreenTriangles,
+) -> int:
+    """Fill `out`; how many. The arrays before it are room to work in."""
+    count = 0
+    for index in range(visible.shape[0]):
+        q = visible[index]
+        first_vertex = vertex_start[mesh[index]]
+        cosine = math.cos(poses[q, 3])
+        sine = math.sin(poses[q, 3])
+        for i in range(3):
+            to_camera[i, 0] = camera[0, i] * cosine + camera[1, i] * sine
+            to_camera[i, 1] = camera[1, i] * cosine - camera[0, i] * sine
+            to_camera[i, 2] = camera[2, i]
+            to_camera[i, 3] = 0.0
+            for j in range(3):
+                to_camera[i, 3] += camera[j, i] * (poses[q, j] - camera[j, 3])
+        for k in range(vertex_start[mesh[index] + 1] - first_vertex):
+            x = vertices[first_vertex + k, 0]
+            y = vertices[first_vertex + k, 1]
+            z = vertices[first_vertex + k, 2]
+            for i in range(3):
+                moved[k, i] = (
+                    to_camera[i, 0] * x + to_camera[i, 1] * y + to_camera[i, 2] * z + to_camera[i, 3]
+                )
+        for t in range(triangle_start[mesh[index]], triangle_start[mesh[index] + 1]):
+            corner = triangles[t]
+            a = moved[corner[0]]
+            b = moved[corner[1]]
+            c = moved[corner[2]]
+            if a[2] < NEAR and b[2] < NEAR and c[2] < NEAR:
+                continue
+            for i in range(3):
+                j = (i + 1) % 3
+                k = (i + 2) % 3
+                cross[0, i] = b[j] * c[k] - b[k] * c[j]
+                cross[1, i] = c[j] * a[k] - c[k] * a[j]
+                cross[2, i] = a[j] * b[k] - a[k] * b[j]
+            volume = a[0] * cross[0, 0] + a[1] * cross[0, 1] + a[2] * cross[0, 2]
+            # Seen edge-on (or no triangle at all); seen from behind.
+            if abs(volume) < 1e-12 or (volume > 0.0 and closed[material[t]]):
+                continue
+            corners = _clip(a, b, c, fx, fy, cx, cy, polygon)
+            if not _covers_pixels(polygon, corners, width, height):
+                continue
+            scale = 1.0 / volume
+            inverse_x = (cross[0, 0] + cross[1, 0] + cross[2, 0]) * scale / fx
+            inverse_y = (cross[0, 1] + cross[1, 1] + cross[2, 1]) * scale / fy
+            inverse_c = (cross[0, 2] + cross[1, 2] + cross[2, 2]) * scale
+            inverse_c -= inverse_x * cx + inverse_y * cy
+            for part in range(corners - 2):
+                for i in range(2):
+                    out.corners[count, i] = polygon[0, i]
+                    out.corners[count, 2 + i] = polygon[part + 1, i]
+                    out.corners[count, 4 + i] = polygon[part + 2, i]
+                out.inverse_depth[count, 0] = inverse_x
+                out.inverse_depth[count, 1] = inverse_y
+                out.inverse_depth[count, 2] = inverse_c
+                for i in range(3):
+                    in_x = 0.0
+                    in_y = 0.0
+                    in_z = 0.0
+                    for k in range(3):
+                        vertex = first_vertex + corner[k]
+                        in_x += normals[vertex, 0] * cross[k, i]
+                        in_y += normals[vertex, 1] * cross[k, i]
+                        in_z += normals[vertex, 2] * cross[k, i]
+                    out.normal[count, i] = (cosine * in_x - sine * in_y) * scale
+                    out.normal[count, 3 + i] = (sine * in_x + cosine * in_y) * scale
+                    out.normal[count, 6 + i] = in_z * scale
+                    out.color[count, i] = color[t, i]
+                out.material[count] = material[t]
+                out.instance[count] = q
+                count += 1
+    return count
+
+
+@compiled(**LEAF)
+def _clip(
+    a: FloatArray,
+    b: FloatArray,
+    c: FloatArray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    polygon: FloatArray,
+) -> int:
+    """Project the part of a triangle beyond the near plane into `polygon`, px; how many corners it has."""
+    if a[2] >= NEAR and b[2] >= NEAR and c[2] >= NEAR:
+        polygon[0, 0] = fx * a[0] / a[2] + cx
+        polygon[0, 1] = fy * a[1] / a[2] + cy
+        polygon[1, 0] = fx * b[0] / b[2] + cx
+        polygon[1, 1] = fy * b[1] / b[2] + cy
+        polygon[2, 0] = fx * c[0] / c[2] + cx
+        polygon[2, 1] = fy * c[1] / c[2] + cy
+        return 3
+    count = 0
+    for i in range(3):
+        p = a if i == 0 else (b if i == 1 else c)
+        q = b if i == 0 else (c if i == 1 else a)
+        if p[2] >= NEAR:
+            polygon[count, 0] = fx * p[0] / p[2] + cx
+            polygon[count, 1] = fy * p[1] / p[2] + cy
+            count += 1
+        if (p[2] >= NEAR) != (q[2] >= NEAR):
+            along = (NEAR - p[2]) / (q[2] - p[2])
+            polygon[count, 0] = fx * (p[0] + along * (q[0] - p[0])) / NEAR + cx
+            polygon[count, 1] = fy * (p[1] + along * (q[1] - p[1])) / NEAR + cy
+            count += 1
+    return count
+
+
+@compiled(**LEAF)
+def _covers_pixels(polygon: FloatArray, corners: int, width: int, height: int) -> bool:
+    """Whether the bounding box of the polygon holds the centre of a pixel of the image."""
+    left = right = polygon[0, 0]
+    top = bottom = polygon[0, 1]
+    for i in range(1, corners):
+        left = min(left, polygon[i, 0])
+        right = max(right, polygon[i, 0])
+        top = min(top, polygon[i, 1])
+        bottom = max(bottom, polygon[i, 1])
+    left = math.ceil(max(left, 0.0) - 0.5)
+    right = math.floor(min(right, float(width)) - 0.5)
+    top = math.ceil(max(top, 0.0) - 0.5)
+    bottom = math.floor(min(bottom, float(height)) - 0.5)
+    return bool(left <= right and top <= bottom)

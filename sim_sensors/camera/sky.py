@@ -1,0 +1,149 @@
+"""The sky as a picture in which any direction can be looked up without trigonometry."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_sensors.camera.textures import LEAF, cloud_tile, fractal_noise
+from sim_sensors.camera.weather import Weather
+from sim_sensors.compilation import compiled
+
+Float32Array = NDArray[np.float32]
+
+_SHARP = 1536  # texels over the half sphere: one is about 0.1°
+_BLURRED = 160
+
+
+@lru_cache(maxsize=8)
+def sky_domes(weather: Weather) -> tuple[Float32Array, Float32Array]:
+    """The upper half sphere, sharp for the background and blurred for reflections.
+
+    Paraboloid maps: direction (x, y, z) with z ≥ 0 lies at ((x, y) / (1 + z) + 1) / 2 of the side. The skyline
+    of far trees and roofs is in it.
+
+    Returns:
+        two arrays (n, n, 3) float32, linear RGB radiance.
+    """
+    generator = np.random.default_rng([weather.seed, 7])
+    side = (np.arange(_SHARP) + 0.5) / _SHARP * 2.0 - 1.0
+    u, v = np.meshgrid(side, side)
+    square = u * u + v * v
+    inside = np.minimum(square, 1.0)
+    z = (1.0 - inside) / (1.0 + inside)
+    # Corners outside the unit disc repeat the horizon, so that bilinear look-ups at the rim stay in it.
+    stretch = np.where(square > 1.0, 1.0 / np.sqrt(square), 1.0)
+    x = 2.0 * u * stretch / (1.0 + inside)
+    y = 2.0 * v * stretch / (1.0 + inside)
+
+    toward_horizon = ((1.0 - z) ** 2.2)[..., None]
+    dome = np.array(weather.zenith) * (1.0 - toward_horizon) + np.array(weather.horizon) * toward_horizon
+    dome *= (1.0 + 0.35 * (1 - weather.clouds) * _glow(weather, x, y, z))[..., None]
+    dome = _with_clouds(dome, weather, generator, x, y, z)
+    dome = _with_skyline(dome, weather, generator, x, y, z)
+    sharp = np.ascontiguousarray(dome, dtype=np.float32)
+    blurred = cv2.resize(sharp, (_BLURRED, _BLURRED), interpolation=cv2.INTER_AREA)
+    return sharp, np.ascontiguousarray(blurred, dtype=np.float32)
+
+
+def _glow(
+    weather: Weather, x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """How much brighter the air is near the sun."""
+    sun = weather.sun_direction
+    cosine = np.clip(x * sun[0] + y * sun[1] + z * sun[2], 0.0, 1.0)
+    glow: NDArray[np.float64] = cosine**6 + 3.0 * cosine**60 + 12.0 * cosine**1500
+    return glow
+
+
+def _with_clouds(
+    dome: NDArray[np.float64],
+    weather: Weather,
+    generator: np.random.Generator,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    noise = (0.5 + 0.2 * fractal_noise(256, generator, 1.5)).astype(np.float32)
+    # A cloud sheet at unit height, drawn out toward the horizon but never to a point.
+    column = (x / (z + 0.2) * 0.17 * 256) % 256
+    row = (y / (z + 0.2) * 0.17 * 256) % 256
+    sheet = cv2.remap(
+        noise, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
+    )
+    threshold = np.quantile(noise, 1.0 - weather.clouds) if weather.clouds > 0.0 else 2.0
+    cover = np.clip((sheet - threshold + 0.06) * 4.0, 0.0, 1.0)[..., None]
+    brightness = 0.75 + 0.5 * np.clip(sheet, 0.0, 1.0)[..., None]
+    white = np.array(weather.sky) * 0.95 + np.array(weather.sun) * 0.12
+    blended: NDArray[np.float64] = dome * (1.0 - cover) + white * brightness * cover
+    return blended
+
+
+def _with_skyline(
+    dome: NDArray[np.float64],
+    weather: Weather,
+    generator: np.random.Generator,
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Far trees and roofs up to about 8° high, hazy."""
+    azimuth = np.mod(np.arctan2(y, x) / (2.0 * np.pi), 1.0)
+    bins = 1024
+    crowns = 0.05 + 0.022 * fractal_noise(bins, generator, 0.9)[0]
+    roofs = np.repeat(generator.uniform(0.02, 0.13, 64), bins // 64)
+    is_roof = np.repeat(generator.random(64) < 0.3, bins // 64)
+    top = np.where(is_roof, roofs, np.clip(crowns, 0.012, 0.16))
+    height = top[np.minimum((azimuth * bins).astype(np.int64), bins - 1)]
+    built = is_roof[np.minimum((azimuth * bins).astype(np.int64), bins - 1)]
+    tile = cloud_tile()
+    noise = tile.levels[: tile.size**2].reshape(tile.size, tile.size)
+    speckle = noise[(z * 2200).astype(np.int64) % tile.size, (azimuth * 6000).astype(np.int64) % tile.size]
+    light = np.array(weather.sky) + 0.35 * np.array(weather.sun)
+    leaf = np.array([0.05, 0.075, 0.03]) * (0.3 + 1.4 * speckle[..., None])
+    wall = np.array([0.3, 0.27, 0.24]) * (0.8 + 0.4 * speckle[..., None])
+    far = np.where(built[..., None], wall, leaf) * light
+    veil = min(0.85, 0.12 + weather.haze * 120.0)
+    far = far * (1.0 - veil) + np.array(weather.horizon) * veil
+    mask = np.clip((height - z) * 400.0 + 0.5, 0.0, 1.0)[..., None]
+    blended: NDArray[np.float64] = dome * (1.0 - mask) + far * mask
+    return blended
+
+
+@compiled(**LEAF)
+def look_up(dome: Float32Array, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Bilinear radiance in the unit direction (x, y, z), z ≥ 0."""
+    n = dome.shape[0]
+    scale = 0.5 / (1.0 + z)
+    u = (x * scale + 0.5) * n - 0.5
+    v = (y * scale + 0.5) * n - 0.5
+    column = min(max(int(u), 0), n - 2)
+    row = min(max(int(v), 0), n - 2)
+    a = min(max(u - column, 0.0), 1.0)
+    b = min(max(v - row, 0.0), 1.0)
+    w00 = (1 - a) * (1 - b)
+    w01 = a * (1 - b)
+    w10 = (1 - a) * b
+    w11 = a * b
+    red = (
+        dome[row, column, 0] * w00
+        + dome[row, column + 1, 0] * w01
+        + dome[row + 1, column, 0] * w10
+        + dome[row + 1, column + 1, 0] * w11
+    )
+    green = (
+        dome[row, column, 1] * w00
+        + dome[row, column + 1, 1] * w01
+        + dome[row + 1, column, 1] * w10
+        + dome[row + 1, column + 1, 1] * w11
+    )
+    blue = (
+        dome[row, column, 2] * w00
+        + dome[row, column + 1, 2] * w01
+        + dome[row + 1, column, 2] * w10
+        + dome[row + 1, column + 1, 2] * w11
+    )
+    return red, green, blue

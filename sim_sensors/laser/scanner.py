@@ -1,0 +1,229 @@
+"""A laser scanner that looks over a `ScanPlane`: its beams, its noise, its scans."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import ndtri
+
+from sim_sensors.errors import SensorError
+from sim_sensors.laser.footprints import NO_RETURN, ScanPlane
+from sim_sensors.laser.kernel import BEAMS_PER_BLOCK, BEAMS_PER_DRAW, BeamTable, scan_all
+
+Float32Array = NDArray[np.float32]
+Int32Array = NDArray[np.int32]
+
+NOISE_TABLE_SIZE = 1 << 16
+
+
+@dataclass(frozen=True)
+class LaserScanner:
+    """A planar laser scanner; by default like a Hokuyo UTM-30LX: 1081 beams over 270°, 30 m.
+
+    Beam n looks along start + n·step, counter-clockwise, from the sensor's x axis. A range is the distance to the
+    nearest footprint or wall, `inf` where there is none below `max_range` or where the return dropped out. Inside
+    a footprint that is not excluded the lens is covered: every beam reads 0 m. On a wall's very line the wall
+    is not seen. Compiled and deterministic; runs on the calling thread alone and without the interpreter lock.
+
+    Args:
+        n_beams: number of beams.
+        start: angle of beam 0, rad.
+        step: angle between beams, rad, above 0. All beams together stay within one turn.
+        max_range: m.
+        noise_sd: standard deviation of the Gaussian range noise, m. Noisy ranges stay within 0 to max_range.
+        dropout: probability that a return is lost, 0 to 1, each beam on its own.
+
+    Raises:
+        SensorError: a value out of these bounds.
+
+    Examples:
+        >>> plane = ScanPlane([[[1, -1], [2, -1], [2, 1], [1, 1]]])
+        >>> LaserScanner(n_beams=3, start=-np.pi / 2, step=np.pi / 2).scan(plane, (0, 0, 0)).tolist()
+        [inf, 1.0, inf]
+    """
+
+    n_beams: int = 1081
+    start: float = -3 * math.pi / 4
+    step: float = math.radians(0.25)
+    max_range: float = 30.0
+    noise_sd: float = 0.01
+    dropout: float = 0.005
+
+    def __post_init__(self) -> None:
+        if (
+            isinstance(self.n_beams, bool)
+            or not isinstance(self.n_beams, int | np.integer)
+            or self.n_beams < 1
+        ):
+            raise SensorError(f"n_beams: wanted an integer of 1 or more, got {self.n_beams!r}")
+        for name in ("start", "step", "max_range", "noise_sd", "dropout"):
+            value = getattr(self, name)
+            if not isinstance(value, int | float | np.number) or not math.isfinite(value):
+                raise SensorError(f"{name}: wanted a finite number, got {value!r}")
+        if self.step <= 0 or (self.n_beams - 1) * self.step >= 2 * math.pi:
+            raise SensorError(
+                f"step: wanted above 0 and {self.n_beams} beams within one turn, got {self.step} rad"
+            )
+        if self.max_range <= 0:
+            raise SensorError(f"max_range: wanted above 0 m, got {self.max_range}")
+        if self.noise_sd < 0:
+            raise SensorError(f"noise_sd: wanted 0 m or more, got {self.noise_sd}")
+        if not 0 <= self.dropout <= 1:
+            raise SensorError(f"dropout: wanted 0 to 1, got {self.dropout}")
+
+    @cached_property
+    def angles(self) -> NDArray[np.float64]:
+        """(n_beams,) float64, rad, laser frame."""
+        return np.asarray(self.start + self.step * np.arange(self.n_beams), dtype=np.float64)
+
+    @cached_property
+    def _lost_below(self) -> np.float32:
+        return np.float32(ndtri(self.dropout))
+
+    @cached_property
+    def _beams(self) -> BeamTable:
+        number = np.arange(-(-self.n_beams // BEAMS_PER_BLOCK) * BEAMS_PER_BLOCK)
+        middle = (self.n_beams - 1) / 2
+        angle = (number - middle) * self.step
+        u, v, b = (a.astype(np.float32) for a in (np.cos(angle), np.sin(angle), number))
+        return BeamTable(u, v, b, int(self.n_beams), middle, 1 / self.step, float(self.max_range))
+
+    def scan(
+        self,
+        plane: ScanPlane,
+        pose: ArrayLike,
+        rng: np.random.Generator | None = None,
+        *,
+        exclude: int | None = None,
+    ) -> Float32Array:
+        """One scan.
+
+        Args:
+            plane: what stands there.
+            pose: (3,) x, y (m) and yaw (rad) of the sensor in the world frame.
+            rng: draws noise and drop-outs; None for exact ranges.
+            exclude: id of footprints to look through, such as the vehicle that carries the sensor.
+
+        Returns:
+            (n_beams,) float32, m, `inf` for no return.
+
+        Raises:
+            SensorError: a pose that is not three finite numbers.
+        """
+        ranges, _ = self._measure(plane, _poses(pose, "pose", 1), rng, exclude, False)
+        return np.asarray(ranges[0])
+
+    def scan_with_ids(
+        self,
+        plane: ScanPlane,
+        pose: ArrayLike,
+        rng: np.random.Generator | None = None,
+        *,
+        exclude: int | None = None,
+    ) -> tuple[Float32Array, Int32Array]:
+        """One scan as `scan` makes it, and (n_beams,) int32: the id hit, `WALL` (-2), or `NO_RETURN` (-1)."""
+        ranges, ids = self._measure(plane, _poses(pose, "pose", 1), rng, exclude, True)
+        return ranges[0], ids[0]
+
+    def scan_batch(
+        self,
+        plane: ScanPlane,
+        poses: ArrayLike,
+        rng: np.random.Generator | None = None,
+        *,
+        exclude: ArrayLike | None = None,
+    ) -> Float32Array:
+        """Many scans of one plane.
+
+        Args:
+            plane: what stands there.
+            poses: (b, 3) x, y (m) and yaw (rad) of the sensor in the world frame.
+            rng: draws noise and drop-outs; None for exact ranges.
+            exclude: an id for all, or (b,) int, one for each pose, -1 for none.
+
+        Returns:
+            (b, n_beams) float32, m, `inf` for no return.
+
+        Raises:
+            SensorError: poses or ids of another shape, or a pose that is not finite.
+        """
+        return self._measure(plane, _poses(poses, "poses", 2), rng, exclude, False)[0]
+
+    def scan_batch_with_ids(
+        self,
+        plane: ScanPlane,
+        poses: ArrayLike,
+        rng: np.random.Generator | None = None,
+        *,
+        exclude: ArrayLike | None = None,
+    ) -> tuple[Float32Array, Int32Array]:
+        """Scans as `scan_batch` makes them, and (b, n_beams) int32 ids as in `scan_with_ids`."""
+        return self._measure(plane, _poses(poses, "poses", 2), rng, exclude, True)
+
+    def _measure(
+        self,
+        plane: ScanPlane,
+        poses: NDArray[np.float64],
+        rng: np.random.Generator | None,
+        exclude: ArrayLike | None,
+        with_ids: bool,
+    ) -> tuple[Float32Array, Int32Array]:
+        b = len(poses)
+        excluded = np.full(b, NO_RETURN, np.int32)
+        if exclude is not None:
+            given = np.asarray(exclude)
+            if given.shape not in ((), (b,)) or not np.issubdtype(given.dtype, np.integer):
+                raise SensorError(f"exclude: wanted an id or ({b},) of them, got {exclude!r}")
+            excluded[:] = given
+        # The first offset of a pair is for the noise, the second for the drop-outs.
+        n_draws = 0 if rng is None else -(-self.n_beams // BEAMS_PER_DRAW)
+        offsets = np.empty((b, 0, 2), np.int64)
+        if rng is not None:
+            offsets = rng.integers(NOISE_TABLE_SIZE, size=(b, n_draws, 2))
+        ranges = np.empty((b, self.n_beams), np.float32)
+        ids = np.full((b if with_ids else 0, self.n_beams), NO_RETURN, np.int32)
+        scan_all(
+            tuple(plane.cells[0]),
+            tuple(plane.cells[1]),
+            poses,
+            float(self.start + self._beams.middle * self.step),
+            excluded,
+            self._beams,
+            _noise_table(),
+            offsets,
+            np.float32(self.noise_sd),
+            self._lost_below,
+            ranges,
+            ids,
+        )
+        return ranges, ids
+
+
+def _poses(value: ArrayLike, name: str, ndim: int) -> NDArray[np.float64]:
+    try:
+        poses = np.ascontiguousarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise SensorError(f"{name}: wanted numbers, got {value!r}") from error
+    if poses.ndim != ndim or poses.shape[-1] != 3:
+        raise SensorError(f"{name}: wanted shape {'(3,)' if ndim == 1 else '(b, 3)'}, got {poses.shape}")
+    poses = poses.reshape(-1, 3)
+    if not np.isfinite(poses).all():
+        i = int(np.argmin(np.isfinite(poses).all(1)))
+        raise SensorError(f"{name}: wanted finite x, y and yaw, got {poses[i].tolist()}")
+    return poses
+
+
+@lru_cache(maxsize=1)
+def _noise_table() -> Float32Array:
+    """(NOISE_TABLE_SIZE + BEAMS_PER_DRAW,) float32: the standard normal's quantiles, shuffled once and for all.
+
+    The table is a constant, as a ziggurat's is; what is random is where a scan reads in it. Every value stands for
+    the same probability, so that drop-outs, drawn by a threshold, have the probability that was asked for.
+    """
+    quantiles = ndtri((np.arange(NOISE_TABLE_SIZE) + 0.5) / NOISE_TABLE_SIZE)
+    shuffled = np.random.default_rng(0).permutation(quantiles)
+    return np.concatenate([shuffled, shuffled[:BEAMS_PER_DRAW]]).astype(np.float32)

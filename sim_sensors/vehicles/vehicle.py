@@ -1,0 +1,285 @@
+"""Vehicle models made by parameters: a body, a size, a paint and a seed give a mesh, the same one every time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_sensors.camera.surfaces import Shape, ShapeBuilder
+from sim_sensors.errors import SensorError
+from sim_sensors.mesh import Material, Mesh
+from sim_sensors.vehicles.bodies import (
+    N_FINISHES,
+    Finish,
+    Skin,
+    add_bonnet,
+    add_flanks,
+    add_tail_top,
+    add_underside,
+)
+from sim_sensors.vehicles.cabins import Glasshouse, add_cabin, add_seats
+from sim_sensors.vehicles.classes import BODIES, draw_body, draw_paint, draw_size
+from sim_sensors.vehicles.forms import Form, draw_form
+from sim_sensors.vehicles.parts import (
+    PLATE_M,
+    add_cladding,
+    add_handles,
+    add_mirrors,
+    add_plates,
+    add_rails,
+    add_reflectors,
+    add_slats,
+    add_wheels,
+    plate_places,
+)
+
+FloatArray = NDArray[np.float64]
+
+KNEE_M = 0.5
+"""Height of the laser plane above ground, m (T §3.3.2)."""
+FOOTPRINT_CORNERS = 24
+"""The most corners of a footprint."""
+DETAILED, COARSE = 0, 1
+"""Levels of detail of a mesh."""
+
+_DUST = np.array([128.0, 116.0, 98.0])
+_SHAPES_KEPT = 1024
+
+
+@dataclass(frozen=True)
+class VehicleModel:
+    """One kind of car: its shape, its paint and the trim that its seed gives it.
+
+    Args:
+        body: one of `vehicle_classes.BODIES`.
+        segment: of the market, as in `vehicle_classes.SIZE_CLASSES`; wheels and nose go by it.
+        size: length, width without mirrors, height, m.
+        paint: sRGB, 0 to 255.
+        seed: 0 or more, of everything else.
+
+    Raises:
+        SensorError: an unknown body, a size that no vehicle has, a paint or a seed out of range.
+
+    Examples:
+        >>> car = VehicleModel.from_seed("estate", 7)
+        >>> car.body, car.footprint().shape[1], car == VehicleModel.from_seed("estate", 7)
+        ('estate', 2, True)
+    """
+
+    body: str
+    segment: str
+    size: tuple[float, float, float]
+    paint: tuple[int, int, int]
+    seed: int
+
+    def __post_init__(self) -> None:
+        if self.body not in BODIES:
+            raise SensorError(f"body: wanted one of {', '.join(BODIES)}, got {self.body!r}")
+        if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
+            raise SensorError(f"seed: wanted an integer, 0 or more, got {self.seed!r}")
+        limits = ((3.2, 6.0), (1.5, 2.2), (1.3, 2.2))
+        for name, value, (low, high) in zip(("length", "width", "height"), self.size, limits, strict=True):
+            if not low <= value <= high:
+                raise SensorError(f"size: wanted a {name} of {low} to {high} m, got {value}")
+        if len(self.paint) != 3 or not all(0 <= c <= 255 for c in self.paint):
+            raise SensorError(f"paint: wanted three numbers from 0 to 255, got {self.paint!r}")
+
+    @classmethod
+    def from_seed(cls, body: str | None, seed: int) -> VehicleModel:
+        """Draw a model: size in its class, paint and trim by how common they are.
+
+        Args:
+            body: one of `vehicle_classes.BODIES`; None draws that too, by `BODY_SHARE`.
+            seed: 0 or more.
+        """
+        if body is not None and body not in BODIES:
+            raise SensorError(f"body: wanted one of {', '.join(BODIES)}, got {body!r}")
+        if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+            raise SensorError(f"seed: wanted an integer, 0 or more, got {seed!r}")
+        rng = np.random.default_rng([int(seed), 1])
+        drawn = draw_body(rng)
+        chosen = drawn if body is None else body
+        segment, size = draw_size(chosen, rng)
+        return cls(chosen, segment, size, draw_paint(rng), int(seed))
+
+    def painted(self, paint: tuple[int, int, int]) -> VehicleModel:
+        """The same car in another colour, sRGB; its shape is shared."""
+        return replace(self, paint=paint)
+
+    @property
+    def length(self) -> float:
+        """M."""
+        return self.size[0]
+
+    @property
+    def width(self) -> float:
+        """m, without mirrors."""
+        return self.size[1]
+
+    @property
+    def height(self) -> float:
+        """M."""
+        return self.size[2]
+
+    @cached_property
+    def form(self) -> Form:
+        """The measures that the shape follows."""
+        return draw_form(self.body, self.segment, self.size, np.random.default_rng([self.seed, 2]))
+
+    def mesh(self, level: int = DETAILED) -> Mesh:
+        """The car's triangles, vehicle frame.
+
+        Shapes are kept, so asking again, or for another paint, is cheap.
+
+        Args:
+            level: `DETAILED` (0), about 3,800 triangles, or `COARSE` (1), about 560.
+        """
+        if level not in (DETAILED, COARSE):
+            raise SensorError(f"level: wanted 0 (detailed) or 1 (coarse), got {level!r}")
+        shape = _shape(self.painted((0, 0, 0)), level)
+        return shape.dyed(*self._palette())
+
+    def footprint(self) -> FloatArray:
+        """What a laser at knee height meets.
+
+        Returns:
+            (k, 2) float64, m, vehicle frame: a convex polygon, counter-clockwise, at most `FOOTPRINT_CORNERS`
+            corners, within 2 cm of the convex hull of the mesh's section at `KNEE_M`.
+        """
+        return _footprint(self.painted((0, 0, 0))).copy()
+
+    def _palette(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Material and colour of every `Finish`."""
+        rng = np.random.default_rng([self.seed, 3])
+        variety = self.form.variety
+        paint = np.array(self.paint, dtype=np.float64)
+        dirt = float(rng.beta(1.3, 4.0))
+        plain = self.body in ("van", "pickup") and variety[3] < 0.4
+        rugged = plain or (self.body == "suv" and variety[5] < 0.65)
+        plastic = np.array([44.0, 45.0, 47.0]) + rng.uniform(-8, 10)
+        cabin = np.array([40.0, 40.0, 42.0]) + rng.uniform(-12, 22)
+        seat = cabin * rng.uniform(0.9, 1.25) if rng.random() < 0.8 else np.array([128.0, 112.0, 92.0])
+        rim = (
+            np.array([168.0, 170.0, 173.0]) * rng.uniform(0.75, 1.1)
+            if rng.random() < 0.78
+            else np.full(3, 38.0)
+        )
+        bright = np.array([196.0, 198.0, 200.0]) if variety[2] < 0.6 else np.array([26.0, 26.0, 28.0])
+        dusty = paint + (0.05 + 0.25 * dirt) * (_DUST - paint)
+        dirty = paint + (0.12 + 0.55 * dirt) * (_DUST - paint)
+        body_colored = variety[1] < 0.75
+        table: dict[Finish, tuple[Material, FloatArray | tuple[int, int, int]]] = {
+            Finish.BODY: (Material.PAINT, paint),
+            Finish.BODY_DUSTY: (Material.PAINT, dusty),
+            Finish.BODY_DIRTY: (Material.PAINT, dirty),
+            Finish.SEAM: (Material.TRIM, 0.35 * paint * 0.5 + 8),
+            Finish.GLASS: (Material.GLASS, np.array([26.0, 32.0, 31.0]) + rng.uniform(0, 8)),
+            Finish.TRIM: (Material.TRIM, (24, 24, 25)),
+            Finish.BUMPER: (Material.TRIM, plastic) if plain else (Material.PAINT, dusty),
+            Finish.CLADDING: (Material.TRIM, plastic + dirt * 30) if rugged else (Material.PAINT, dirty),
+            Finish.GRILLE: (Material.TRIM, (17, 17, 18)),
+            Finish.BRIGHT: (Material.CHROME, bright),
+            Finish.HEADLAMP: (Material.LAMP, (62, 66, 72)),
+            Finish.REFLECTOR: (Material.LAMP, (238, 242, 246)),
+            Finish.INDICATOR: (Material.LAMP, (222, 128, 30)),
+            Finish.TAIL_LAMP: (Material.LAMP, (150, 14, 18)),
+            Finish.TAIL_LAMP_DARK: (Material.LAMP, (96, 8, 12)),
+            Finish.REVERSING_LAMP: (Material.LAMP, (172, 96, 94)),
+            Finish.PLATE: (Material.PLATE, (228, 228, 222)),
+            Finish.PLATE_INK: (Material.PLATE, (22, 22, 24)),
+            Finish.PLATE_BAND: (Material.PLATE, (20, 60, 150)),
+            Finish.TYRE: (Material.RUBBER, np.array([30.0, 30.0, 31.0]) + 26 * dirt),
+            Finish.RIM: (Material.RIM, rim + 0.25 * dirt * (_DUST - rim)),
+            Finish.RIM_DARK: (Material.RIM, (26, 26, 27)),
+            Finish.SEAT: (Material.INTERIOR, seat),
+            Finish.CABIN: (Material.INTERIOR, cabin),
+            Finish.HEADLINER: (Material.INTERIOR, (120, 118, 114)),
+            Finish.UNDERSIDE: (Material.TRIM, (14, 14, 14)),
+            Finish.MIRROR: (Material.PAINT, paint)
+            if body_colored and not plain
+            else (Material.TRIM, plastic),
+            Finish.HANDLE: (Material.PAINT, paint)
+            if body_colored and not plain
+            else (Material.TRIM, plastic),
+            Finish.RAIL: (Material.CHROME, bright),
+            Finish.PILLAR: (Material.TRIM, (20, 20, 21)),
+        }
+        material = np.zeros(N_FINISHES, dtype=np.uint8)
+        color = np.zeros((N_FINISHES, 3), dtype=np.uint8)
+        for finish, (kind, rgb) in table.items():
+            material[finish] = kind
+            color[finish] = np.clip(np.round(rgb), 0, 255)
+        return material, color
+
+
+@lru_cache(maxsize=_SHAPES_KEPT)
+def _skin(model: VehicleModel, coarse: bool) -> Skin:
+    return Skin(model.form, coarse=coarse)
+
+
+@lru_cache(maxsize=2 * _SHAPES_KEPT)
+def _shape(model: VehicleModel, level: int) -> Shape:
+    """The triangles of a model of any paint."""
+    coarse = level == COARSE
+    form, skin, build = model.form, _skin(model, coarse), ShapeBuilder()
+    house = Glasshouse(skin)
+    add_flanks(build, skin)
+    add_underside(build, skin)
+    add_bonnet(build, skin)
+    add_tail_top(build, skin)
+    house.add_shell(build, coarse=coarse)
+    add_cabin(build, skin)
+    add_wheels(build, form, coarse=coarse)
+    if coarse:
+        return build.build()
+    add_seats(build, skin)
+    add_plates(build, skin, np.random.default_rng([model.seed, 4]).integers(0, 12, 7))
+    add_reflectors(build, skin)
+    add_mirrors(build, skin)
+    add_handles(build, skin)
+    if form.variety[2] < 0.7:
+        add_slats(build, skin)
+    if form.body in ("suv", "estate") and form.variety[4] < 0.6:
+        add_rails(build, house)
+    if form.body in ("suv", "pickup"):
+        add_cladding(build, skin)
+    return build.build()
+
+
+@lru_cache(maxsize=_SHAPES_KEPT)
+def _footprint(model: VehicleModel) -> FloatArray:
+    skin = _skin(model, False)
+    left = skin.section(KNEE_M)
+    for at, _ in plate_places(skin):  # flat ones stand out from a round bumper
+        if abs(at[2] - KNEE_M) < PLATE_M[1] / 2:
+            left = np.vstack([left, [at[0], PLATE_M[0] / 2]])
+    hull = _convex_hull(np.vstack([left, left * [1.0, -1.0]]))
+    while len(hull) > FOOTPRINT_CORNERS:
+        before, after = np.roll(hull, 1, axis=0), np.roll(hull, -1, axis=0)
+        chord, reach = after - before, hull - before
+        lost = np.abs(chord[:, 0] * reach[:, 1] - chord[:, 1] * reach[:, 0]) / np.hypot(*chord.T)
+        hull = np.delete(hull, int(np.argmin(lost)), axis=0)
+    return hull
+
+
+def _convex_hull(points: FloatArray) -> FloatArray:
+    """(k, 2) counter-clockwise, without corners on straight edges (Andrew's monotone chain)."""
+    ordered = np.unique(np.round(points, 9), axis=0)
+
+    def chain(row: list[list[float]]) -> list[list[float]]:
+        out: list[list[float]] = []
+        for p in row:
+            while len(out) > 1 and (
+                (out[-1][0] - out[-2][0]) * (p[1] - out[-2][1])
+                - (out[-1][1] - out[-2][1]) * (p[0] - out[-2][0])
+                <= 1e-7
+            ):
+                out.pop()
+            out.append(p)
+        return out[:-1]
+
+    row: list[list[float]] = ordered.tolist()
+    return np.array(chain(row) + chain(row[::-1]))
