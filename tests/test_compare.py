@@ -6,26 +6,19 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import PARKENV, parkenv
 from scipy import stats
 
 from parkenv import InputError, ParkingLot, SensorModel
 from parkenv.evaluation.experiments.results import EPISODE_COLUMNS, ResultFolder
 from parkenv.evaluation.experiments.statistics import mean_interval, summarize
 
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 DATA = Path(__file__).parents[2] / "shared" / "data"
-
-
-def parkenv(*arguments, **options):
-    return subprocess.run(
-        [*PARKENV, *map(str, arguments)], capture_output=True, text=True, timeout=600, check=False, **options
-    )
 
 
 def small(out, *more, agents="mdp,greedy-goal,oracle", episodes=12):
