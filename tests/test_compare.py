@@ -14,9 +14,10 @@ import pytest
 from command_line import PARKENV, parkenv
 from scipy import stats
 
-from parkenv import InputError, ParkingLot, SensorModel
+from parkenv import InputError, SensorModel
 from parkenv.evaluation.experiments.results import EPISODE_COLUMNS, ResultFolder
 from parkenv.evaluation.experiments.statistics import mean_interval, summarize
+from parkenv.lots import packaged_lot, write_lot
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -268,7 +269,7 @@ LOG = "datetime,camera,slot_id,weather,occupied\n"
 @pytest.fixture
 def lot_file(tmp_path):
     path = tmp_path / "lot.geojson"
-    ParkingLot.packaged("mini").to_file(path)
+    write_lot(packaged_lot("mini"), path)
     return path
 
 
