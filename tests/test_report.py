@@ -4,12 +4,11 @@ import itertools
 import json
 import re
 import shutil
-import subprocess
-import sys
 
 import jsonschema
 import numpy as np
 import pytest
+from command_line import parkenv
 
 from parkenv import InputError, Scenario
 from parkenv.cli.report import make_report
@@ -23,14 +22,6 @@ from parkenv.evaluation.report.tables import table_of
 from parkenv.lots import packaged_lot, write_lot
 from parkenv.world.lot import PARK
 from planners import make_agent
-
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
-
-
-def parkenv(*arguments):
-    return subprocess.run(
-        [*PARKENV, *map(str, arguments)], capture_output=True, text=True, timeout=600, check=False
-    )
 
 
 def data_of(page):
