@@ -14,8 +14,8 @@ from parkenv import InputError, Scenario
 from parkenv.cli.report import make_report
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.results import episode_key
-from parkenv.evaluation.report.intentions import Intentions
 from parkenv.evaluation.report.page import SCHEMA, page_data
+from parkenv.evaluation.report.plan_preview import PlanPreview
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.report.search_recording import Encounter, choose, record
 from parkenv.evaluation.report.tables import table_of
@@ -300,9 +300,7 @@ def test_asking_belief_for_its_plan_changes_nothing():
     }  # fmt: skip
     action, memory = agent.predict(observation)
     before = [np.array(v) for v in (memory.kind, memory.p_occupied, memory.targets)]
-    ahead = Intentions(scenario.public(), agent).ahead(
-        observation, int(observation["vertex"]), int(action), memory
-    )
+    ahead = PlanPreview(scenario.public(), agent).ahead(observation, int(action), memory)
     assert ahead
     for old, new in zip(before, (memory.kind, memory.p_occupied, memory.targets), strict=True):
         np.testing.assert_array_equal(old, new)

@@ -204,7 +204,7 @@ def test_imitation_begins_near_the_planner():
 
 def test_what_cannot_imitate_says_so():
     shown = Demonstrations.collect("mdp", SCENARIO, range(5_000_000, 5_000_002))
-    with pytest.raises(InputError, match="dqn cannot begin by imitation"):
+    with pytest.raises(InputError, match="dqn has no behaviour cloning"):
         SearchTraining("dqn", 10, 10, (SCENARIO,), EXAMINED, demonstrations=shown)
 
 
