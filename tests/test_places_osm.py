@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from parkenv import ParkingLot, Scenario
+from parkenv import ParkingLot, make_scenario
 from parkenv.cli import app
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case
@@ -989,7 +989,7 @@ def test_a_search_runs_on_what_was_imported(tmp_path, name):
     PLACES[name]().draft(tmp_path).lot().to_file(tmp_path / "lot.geojson")
     assert check_lot(tmp_path / "lot.geojson") == []
     lot = ParkingLot.from_file(tmp_path / "lot.geojson")
-    scenario = Scenario.on_lot(lot)
+    scenario = make_scenario(lot)
     for agent in ("mdp", "greedy-drive"):
         rows = Case(scenario, agent).run(range(4))[0]
         assert all(row["parked"] for row in rows)

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
 
 from parkenv.evaluation.bench.rows import BenchRow, duration, seconds_each
+from parkenv.scenarios.build import make_scenario
 from parkenv.world.lot import PARK, ParkingLot
-from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.thesis.label_repair import repair
 from planners.thesis.label_setting import (
@@ -149,7 +149,7 @@ def city_rows(
         seed: of the city and of the worlds.
         agents: who searches, by name.
     """
-    scenario = Scenario.on_lot(ParkingLot.city(n_slots, seed))
+    scenario = make_scenario(ParkingLot.city(n_slots, seed))
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     rows: list[BenchRow] = []
     for name in agents:
@@ -207,7 +207,7 @@ def drive(
 
 def forecast_process(lot: ParkingLot, seed: int) -> ParkingMDP:
     """What the planner faces who arrives on a typical working day."""
-    scenario = Scenario.on_lot(lot)
+    scenario = make_scenario(lot)
     arrival = scenario.occupancy.draw_arrival(scenario.arrival, np.uint64(seed))
     return ParkingMDP.from_belief(scenario, scenario.forecast(arrival).p_occupied)
 
