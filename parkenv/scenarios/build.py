@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from parkenv.errors import InputError
+from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot
 from parkenv.scenarios.spec import (
     ForecastSpec,
     LotSpec,
@@ -107,13 +108,13 @@ def build(spec: ScenarioSpec) -> Scenario:
 
 def _lot(spec: LotSpec) -> ParkingLot:
     if spec.name is not None:
-        return ParkingLot.packaged(spec.name)
+        return packaged_lot(spec.name)
     if spec.file is not None:
-        return ParkingLot.from_file(spec.file)
+        return read_lot(spec.file)
     if spec.grid is not None:
-        return ParkingLot.grid(**spec.grid.model_dump())
+        return grid_lot(**spec.grid.model_dump())
     assert spec.city is not None
-    return ParkingLot.city(spec.city.slots, spec.city.seed)
+    return city_lot(spec.city.slots, spec.city.seed)
 
 
 def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyModel:
