@@ -413,7 +413,7 @@ def test_wrong_bands_are_named(wrong, message):
         ({"goal": 9}, "goal is 9"),
         ({"entry": -1}, "entry"),
         ({"sensor_model": 3}, "SensorModel"),
-        ({"scenario": "moon"}, "unknown scenario 'moon'; known: campus"),
+        ({"scenario": "moon"}, "unknown scenario 'moon', and no such file; known: campus"),
         ({"scenario": 3}, "want a Scenario"),
         ({"render_mode": "hologram"}, "render_mode"),
     ],

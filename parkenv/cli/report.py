@@ -209,7 +209,7 @@ def _require_same_files(run: RunFolder) -> None:
 
     before = read_settings(run.path) or {}
     options = _parsed(run)
-    for name in ("lot", "occupancy", "mapping", "calibrated"):
+    for name in ("occupancy", "mapping", "calibrated"):
         if options[name] is not None and args.fingerprint(options[name]) != before.get(name):
             raise InputError(f"--{name} {options[name]} has changed since the run")
 
