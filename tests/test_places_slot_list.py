@@ -240,6 +240,21 @@ def test_it_says_how_to_give_an_entry_and_a_goal(tmp_path):
     assert of_lot(tmp_path, grid_lot(2, 8), entries=((x, y),), goals=((9.0, 9.0),)).lot().n_slots == 16
 
 
+def test_parking_costs_stay_with_their_slots(tmp_path):
+    lot = grid_lot(2, 8)
+    cost = np.arange(16) * 10.0
+    order = np.random.default_rng(3).permutation(16)
+    lines = [f"{lot.slot_ids[i]},{lot.slot_xy[i, 0]},{lot.slot_xy[i, 1]},{cost[i]}" for i in order]
+    (tmp_path / "slots.csv").write_text("\n".join(["id,x,y,parking_cost_s", *lines]))
+    ends = {"entries": (tuple(lot.entries[0]),), "goals": (tuple(lot.goals[0]),)}
+    west = Wishes(bounds=((-5.0, -20.0), (12.5, 20.0)), **ends)
+    for wishes, n in ((Wishes(**ends), 16), (west, 10)):
+        drawn = import_lot(tmp_path / "slots.csv", wishes).lot()
+        assert drawn.n_slots == n
+        costs = dict(zip(lot.slot_ids, cost, strict=True))
+        assert drawn.slot_parking_cost_s.tolist() == [costs[name] for name in drawn.slot_ids]
+
+
 # ---- faults ----
 
 FAULTS = [
@@ -256,6 +271,7 @@ FAULTS = [
     ("lat,lon\n91,2", "row 2: lat is '91', want a number from -90 to 90"),
     ("lat,lon\n1,-181", "row 2: lon is '-181', want a number from -180 to 180"),
     ("x,y,yaw\n1,2,", "row 2: yaw is '', want a number"),
+    ("x,y,parking_cost_s\n1,2,-3", "row 2: parking_cost_s is '-3', want a number from 0 to 1e\\+08"),
     ("id,x,y\na,1,2\na,9,2", "row 3: id 'a' stands already in row 2"),
     ("id,x,y\n,1,2", "row 2: id '' is empty"),
     ("x,y\n1,2\n9,9\n1.01,2", "row 4: slot '4' lies where slot '2' of row 2 does"),

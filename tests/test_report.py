@@ -4,33 +4,24 @@ import itertools
 import json
 import re
 import shutil
-import subprocess
-import sys
 
 import jsonschema
 import numpy as np
 import pytest
+from command_line import parkenv
 
 from parkenv import InputError, make_scenario
 from parkenv.cli.report import make_report
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.results import episode_key
-from parkenv.evaluation.report.intentions import Intentions
 from parkenv.evaluation.report.page import SCHEMA, page_data
+from parkenv.evaluation.report.plan_preview import PlanPreview
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.report.search_recording import Encounter, choose, record
 from parkenv.evaluation.report.tables import table_of
 from parkenv.lots import packaged_lot, write_lot
 from parkenv.world.lot import PARK
 from planners import make_agent
-
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
-
-
-def parkenv(*arguments):
-    return subprocess.run(
-        [*PARKENV, *map(str, arguments)], capture_output=True, text=True, timeout=600, check=False
-    )
 
 
 def data_of(page):
@@ -309,9 +300,7 @@ def test_asking_belief_for_its_plan_changes_nothing():
     }  # fmt: skip
     action, memory = agent.predict(observation)
     before = [np.array(v) for v in (memory.kind, memory.p_occupied, memory.targets)]
-    ahead = Intentions(scenario.public(), agent).ahead(
-        observation, int(observation["vertex"]), int(action), memory
-    )
+    ahead = PlanPreview(scenario.public(), agent).ahead(observation, int(action), memory)
     assert ahead
     for old, new in zip(before, (memory.kind, memory.p_occupied, memory.targets), strict=True):
         np.testing.assert_array_equal(old, new)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import parkenv
 
 from parkenv import Scenario, make_scenario
 from parkenv.envs.perception import SearchPerceptionEnv
@@ -87,8 +88,7 @@ def test_without_the_viewer_it_says_how_to_get_it(
 
 
 def test_compare_records_its_first_search_where_it_looks_through_sensors(tmp_path: Path) -> None:
-    parkenv = [sys.executable, "-c", "from parkenv.cli import main; main()"]
-    command = [*parkenv, "compare", "--scenario", "mini", "--agents", "mdp", "-n", "1", "--no-figures"]
+    command = ["compare", "--scenario", "mini", "--agents", "mdp", "-n", "1", "--no-figures"]
     command += [
         "--occupancy-levels",
         "none",
@@ -97,8 +97,9 @@ def test_compare_records_its_first_search_where_it_looks_through_sensors(tmp_pat
         "--rerun",
         str(tmp_path / "s.rrd"),
     ]
-    refused = subprocess.run(command, capture_output=True, text=True)
+    refused = parkenv(*command)
     assert refused.returncode == 2
     assert "add --sensors laser" in refused.stderr
-    subprocess.run([*command, "--sensors", "laser", "--jobs", "1"], check=True, capture_output=True)
+    done = parkenv(*command, "--sensors", "laser", "--jobs", 1)
+    assert done.returncode == 0, done.stderr
     assert rows_of(tmp_path / "s.rrd")["/car/right/boxes"] > 1

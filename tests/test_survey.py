@@ -2,12 +2,12 @@
 
 import json
 import subprocess
-import sys
 import time
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import PARKENV, parkenv
 
 from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
 from parkenv.evaluation.experiments.surveys import map_error, run_survey
@@ -20,7 +20,6 @@ from parkenv.world.occupancy import ArrivalWindow
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount, SensorRig
 
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 BUSY = Traffic(cars=2, pedestrians=4)
 
 
@@ -79,9 +78,6 @@ def test_the_maps_error_is_zero_where_it_is_right():
 
 
 def test_survey_and_map_on_the_command_line(tmp_path):
-    def parkenv(*words):
-        return subprocess.run([*PARKENV, *map(str, words)], capture_output=True, text=True)
-
     out = tmp_path / "s"
     done = parkenv(
         "survey", "--scenario", "mini", "-n", 1, "--weather", "sunny", "--every", 3, "--jobs", 1, "--out", out
@@ -194,7 +190,7 @@ def test_a_killed_survey_loses_only_the_drive_under_way(tmp_path):
     with MapStore(out / "map.sqlite", scenario.lot, create=False) as store:
         before = store.sessions()
     assert 1 <= len(before) < 500
-    done = subprocess.run([*command, "-n", str(len(before) + 1)], capture_output=True, text=True)
+    done = parkenv(*command[len(PARKENV) :], "-n", len(before) + 1)
     assert done.returncode == 0, done.stderr
     with MapStore(out / "map.sqlite", scenario.lot, create=False) as store:
         after = {s.key: s for s in store.sessions()}

@@ -43,7 +43,7 @@ def fit_sight(
     Example:
     * `parkenv fit-sensor-model --rig stereo --out stereo.json`
     """
-    from parkenv.evaluation.experiments.sensor_model_fit import DRIVERS, measure_sight
+    from parkenv.evaluation.experiments.sensor_model_fit import AGENTS, measure_sensors
     from parkenv.world.traffic import Traffic
 
     scenarios = [
@@ -56,9 +56,9 @@ def fit_sight(
         console=console, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
         bar = progress.add_task(
-            "Searching through the sensors", total=searches * len(DRIVERS) * len(scenarios)
+            "Searching through the sensors", total=searches * len(AGENTS) * len(scenarios)
         )
-        counts = measure_sight(
+        counts = measure_sensors(
             scenarios,
             rig,
             searches,
@@ -73,11 +73,11 @@ def fit_sight(
         f"What the stack says of slots, rig {rig}",
         ["slots up to", "side", "looks", "told", "taken, said taken", "free, said taken"],
     )
-    for band, looks in zip(model.bands, counts.looks.reshape(-1, 2, 3), strict=True):
+    for band, seen in zip(model.bands, counts.counts.reshape(-1, 2, 3), strict=True):
         table.add_row(
             f"{band.up_to:g} m",
             "right" if band.beside else "elsewhere",
-            str(looks.sum()),
+            str(seen.sum()),
             f"{band.seen_rate:.0%}",
             f"{band.hit_rate:.3f}",
             f"{band.false_alarm_rate:.3f}",

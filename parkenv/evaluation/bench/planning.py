@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
 
 from parkenv.evaluation.bench.rows import BenchRow, duration, seconds_each
+from parkenv.evaluation.simulate import simulate
 from parkenv.lots import city_lot, packaged_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.lot import PARK, ParkingLot
@@ -157,14 +158,7 @@ def city_rows(
         first, decisions = [], []
         agent = make_agent(name, scenario)
         for episode in range(CITY_SEARCHES):
-            observation, _ = env.reset(seed=seed + episode)
-            memory, over, times = None, False, []
-            while not over:
-                start = time.perf_counter()
-                action, memory = agent.predict(observation, memory)
-                times.append(time.perf_counter() - start)
-                observation, _, terminated, truncated, _ = env.step(action)
-                over = terminated or truncated
+            times = simulate(env, agent, seed + episode).decision_s
             first.append(times[0])
             decisions += times[1:]
         case = f"{name}, city, {n_slots:,} slots"
