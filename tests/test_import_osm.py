@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from parkenv import Scenario
+from parkenv import make_scenario
 from parkenv.cli import app
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case
@@ -988,7 +988,7 @@ def test_a_search_runs_on_what_was_imported(tmp_path, name):
     write_lot(PLACES[name]().draft(tmp_path).lot(), tmp_path / "lot.geojson")
     assert check_lot(tmp_path / "lot.geojson") == []
     lot = read_lot(tmp_path / "lot.geojson")
-    scenario = Scenario.on_lot(lot)
+    scenario = make_scenario(lot)
     for agent in ("mdp", "greedy-drive"):
         rows = Case(scenario, agent).run(range(4))[0]
         assert all(row["parked"] for row in rows)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 
-from parkenv import Scenario
+from parkenv import make_scenario
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.figures.import_picture import save_import_picture
@@ -75,7 +75,7 @@ def test_dragon_lake_is_found_again_from_its_slots_alone(tmp_path):
     # Aisles and the roads between them lie where the map's own waypoints are.
     nearest, _, _ = nearest_on_lanes(found.lanes, lot.vertex_xy[: lot.n_slots])
     assert np.hypot(*(nearest - lot.vertex_xy[: lot.n_slots]).T).max() < 3.0
-    scenario = Scenario.on_lot(found)
+    scenario = make_scenario(found)
     rows = Case(scenario, "greedy-drive").run(range(3))[0]
     assert all(r["parked"] for r in rows)
 
@@ -303,6 +303,6 @@ def test_a_search_runs_on_a_list_of_slots(tmp_path):
     draft = of_lot(tmp_path, lot, entries=(tuple(lot.entries[0]),), goals=(tuple(lot.goals[0]),))
     write_lot(draft.lot(), tmp_path / "lot.geojson")
     assert check_lot(tmp_path / "lot.geojson") == []
-    scenario = Scenario.on_lot(read_lot(tmp_path / "lot.geojson"))
+    scenario = make_scenario(read_lot(tmp_path / "lot.geojson"))
     rows = Case(scenario, "mdp").run(range(4))[0]
     assert all(r["parked"] and r["walk_s"] > 0.0 for r in rows)
