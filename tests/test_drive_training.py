@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from parkenv import make_scenario
 from parkenv.cli import app
 from parkenv.driving.lot_space import LotSpace
 from parkenv.driving.vehicle import SPEED, STATE_SIZE, YAW, VehicleParameters
@@ -38,7 +39,6 @@ from parkenv.evaluation.training.drive_practice import (
 from parkenv.evaluation.training.drive_training import DriveTraining, parked_by, parked_on
 from parkenv.evaluation.training.rl_training import read_curve, train_one
 from parkenv.lots import packaged_lot
-from parkenv.world.scenario import Scenario
 from planners.driving.driver_view import BEAMS, FARTHEST_M, HOLD, DriverView, Outlines, command, see
 from planners.driving.drivers import make_driver
 from planners.learned import ModelCard
@@ -478,7 +478,7 @@ def test_models_of_another_task_are_refused(trained, name):
     from planners.agent import make_agent
 
     with pytest.raises(InputError, match=r"was trained to drive, not to search; `parkenv park` runs it"):
-        make_agent(f"{algorithm}:{folder / name}", Scenario.named("mini"))
+        make_agent(f"{algorithm}:{folder / name}", make_scenario("mini"))
     other = "ppo" if algorithm != "ppo" else "sac"
     with pytest.raises(InputError, match=f"is a model of {algorithm}, not of {other}"):
         make_driver(f"{other}:{folder / name}")

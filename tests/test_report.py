@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command_line import parkenv
 
-from parkenv import InputError, Scenario
+from parkenv import InputError, make_scenario
 from parkenv.cli.report import make_report
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.results import episode_key
@@ -254,7 +254,7 @@ def test_text_in_the_data_cannot_end_its_element(tmp_path):
 
 
 def test_searches_are_chosen_in_turns_over_settings():
-    mini = Scenario.named("mini")
+    mini = make_scenario("mini")
     cases = [
         (Case(mini.replace(failure_s=cost), agent), range(5, 9))
         for cost in (1.0, 2.0)
@@ -269,7 +269,7 @@ def test_searches_are_chosen_in_turns_over_settings():
     "name", ["mdp", "mdp-tuned", "belief", "greedy-goal", "first-free", "oracle", "random"]
 )
 def test_plans_are_ways_that_can_be_driven_and_begin_with_what_is_done(name):
-    scenario = Scenario.named("campus")
+    scenario = make_scenario("campus")
     recorded = record(Encounter((Case(scenario, name),), 3), {})
     (search,), neighbors = recorded["searches"], scenario.lot.neighbors
     assert search["agrees"] is None
@@ -288,7 +288,7 @@ def test_plans_are_ways_that_can_be_driven_and_begin_with_what_is_done(name):
 
 
 def test_asking_belief_for_its_plan_changes_nothing():
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     case = Case(scenario, "belief")
     recorded = record(Encounter((case,), 11), {})["searches"][0]
     assert recorded["total_s"] == case.run([11])[0][0]["total_s"]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from command_line import parkenv
 
-from parkenv import Scenario
+from parkenv import Scenario, make_scenario
 from parkenv.envs.perception import SearchPerceptionEnv
 from parkenv.errors import InputError
 from parkenv.evaluation.trips.sensor_log import GRID_EVERY, record_search, record_session, sensor_log
@@ -31,7 +31,7 @@ def rows_of(path: Path) -> Counter[str]:
 
 @pytest.fixture(scope="module")
 def mini() -> Scenario:
-    return Scenario.named("mini")
+    return make_scenario("mini")
 
 
 def test_a_search_through_sensors_is_recorded_step_by_step(mini: Scenario, tmp_path: Path) -> None:

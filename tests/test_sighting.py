@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from parkenv import InputError, Scenario, SensorBand, SensorModel, Traffic
+from parkenv import InputError, SensorBand, SensorModel, Traffic, make_scenario
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.sensor_model_fit import BAND_ENDS, ObservationCounts, count_observations
 from parkenv.world.lot import PARK
@@ -116,7 +116,7 @@ def test_too_few_looks_are_refused():
 
 def test_looks_of_a_real_search_are_counted():
     """Every slot in view after every step is counted once, and the stack is right about most that it speaks of."""
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     looks = count_observations(scenario, "laser", "greedy-drive", range(3), "overcast").counts
     said = looks.sum(axis=(0, 1))
     assert said.sum() >= 10
@@ -136,7 +136,7 @@ def test_the_file_says_what_it_is(tmp_path):
 @pytest.mark.slow
 def test_the_fast_environment_stands_for_the_slow_one():
     """Through the sensors and with the model fitted to them: the same ranking, and means close to each other."""
-    scenario = Scenario.named("campus", sensor_model=SensorModel.named("laser"), traffic=Traffic(3, 5))
+    scenario = make_scenario("campus", sensor_model=SensorModel.named("laser"), traffic=Traffic(3, 5))
     means = {}
     for rig in ("laser", None):
         for agent in ("first-free", "greedy-drive", "greedy-goal"):
@@ -153,4 +153,4 @@ def test_the_fast_environment_stands_for_the_slow_one():
 @pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
 def test_agents_that_plan_on_what_they_see_refuse_to_search_blindly(name):
     with pytest.raises(InputError, match="slots are seen"):
-        make_agent(name, Scenario.named("mini", sensor_model=SensorModel.blind()))
+        make_agent(name, make_scenario("mini", sensor_model=SensorModel.blind()))

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
 
-from parkenv import Scenario
+from parkenv import make_scenario
 from parkenv.evaluation.simulate import EpisodeResult, Observer, Step, simulate
 from planners import make_agent
 from sim_sensors.compilation import seconds_spent
 
-MINI = Scenario.named("mini")
+MINI = make_scenario("mini")
 
 
 class Counter(Observer):

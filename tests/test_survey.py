@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command_line import PARKENV, parkenv
 
-from parkenv import InputError, OccupancyProcess, Scenario, Traffic
+from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
 from parkenv.evaluation.experiments.surveys import map_error, run_survey
 from parkenv.mapping.inference import SessionLog
 from parkenv.mapping.store import MapStore
@@ -25,10 +25,10 @@ BUSY = Traffic(cars=2, pedestrians=4)
 
 def halves(name="mini"):
     """Every other slot taken for ever."""
-    lot = Scenario.named(name).lot
+    lot = make_scenario(name).lot
     taken = np.arange(lot.n_slots) % 2 == 0
     world = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
-    return Scenario.named(name, occupancy=world, traffic=BUSY), taken
+    return make_scenario(name, occupancy=world, traffic=BUSY), taken
 
 
 @pytest.mark.parametrize("rig", ["laser", "stereo"])
@@ -166,7 +166,7 @@ def test_bad_settings_are_named(wrong, message):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "rig"), [("campus", "laser"), ("street", "laser"), ("campus", "stereo")])
 def test_held_out_sessions_are_as_right_as_promised(name, rig):
-    scenario = Scenario.named(name, traffic=BUSY)
+    scenario = make_scenario(name, traffic=BUSY)
     window = ArrivalWindow((1,), 36_000.0, 43_200.0)
     survey = Survey(scenario, SurveySettings(rig=rig, windows=(window,), seed=777))
     results = [survey.drive(0)]
@@ -176,7 +176,7 @@ def test_held_out_sessions_are_as_right_as_promised(name, rig):
 @pytest.mark.slow
 def test_a_killed_survey_loses_only_the_drive_under_way(tmp_path):
     """SIGKILL in the middle: what the map file holds is whole, and the same command goes on from there."""
-    scenario, out = Scenario.named("mini"), tmp_path / "s"
+    scenario, out = make_scenario("mini"), tmp_path / "s"
     command = [*PARKENV, "survey", "--scenario", "mini", "--every", "4", "--jobs", "1", "--out", str(out)]
     drive = subprocess.Popen([*command, "-n", "500"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:

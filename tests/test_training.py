@@ -17,6 +17,7 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
+from parkenv import make_scenario
 from parkenv.cli.search_course import SearchCourse
 from parkenv.cli.training_course import curves_beside
 from parkenv.envs.local_observation import LocalObservation
@@ -29,11 +30,10 @@ from parkenv.evaluation.training.cloning import Demonstrations, clone
 from parkenv.evaluation.training.configs import DRIVE_RECIPES, MAX_STEPS, RECIPES
 from parkenv.evaluation.training.rl_training import read_curve, train_one, write_curve
 from parkenv.evaluation.training.search_training import SearchTraining, examined, search_times
-from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.learned import ALGORITHMS, LearnedAgent, ModelCard
 
-SCENARIO = Scenario.named("mini")
+SCENARIO = make_scenario("mini")
 EXAMINED = range(2_000_000, 2_000_020)
 
 
@@ -187,7 +187,7 @@ def test_a_planner_that_finishes_nothing_cannot_be_imitated(monkeypatch):
 
 @pytest.mark.slow
 def test_imitation_begins_near_the_planner():
-    campus = Scenario.named("campus")
+    campus = make_scenario("campus")
     shown = Demonstrations.collect("first-free", campus, range(5_000_000, 5_000_300))
     assert shown.local.shape == (len(shown.actions), 86)
     assert (shown.masks[np.arange(len(shown.actions)), shown.actions] == 1).all()
@@ -209,7 +209,7 @@ def test_what_cannot_imitate_says_so():
 
 
 def test_a_model_runs_on_lots_that_it_was_not_trained_on(trained):
-    campus = Scenario.named("campus")
+    campus = make_scenario("campus")
     row = search_times(LearnedAgent(campus, "maskable-ppo", trained / "model.zip"), campus, range(4))
     assert row["episodes"] == 4
 

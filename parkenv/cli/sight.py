@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
+from parkenv.scenarios.build import make_scenario
 
 
 def fit_sight(
@@ -22,8 +23,8 @@ def fit_sight(
     searches: Annotated[
         int, typer.Option("--searches", "-n", min=1, help="Of each of three agents in each scenario.")
     ] = 20,
-    arrival: args.ArrivalOption = "08:00-13:00",
-    days: args.DaysOption = "weekdays",
+    arrival: args.ArrivalOption = None,
+    days: args.DaysOption = None,
     weather: Annotated[
         str | None,
         typer.Option("--weather", help="sunny, overcast, low_sun, dusk, rain; drawn where not given."),
@@ -46,8 +47,8 @@ def fit_sight(
     from parkenv.world.traffic import Traffic
 
     scenarios = [
-        its.replace(traffic=Traffic(cars=3, pedestrians=5))
-        for its in args.scenarios_of(scenario, None, None, None, None, arrival, days, None)
+        make_scenario(spec, traffic=Traffic(cars=3, pedestrians=5))
+        for spec in args.scenario_specs(scenario, arrival=arrival, days=days)
     ]
     console = make_console()
     with args.workers_of(jobs, backend, address) as workers, Progress(

@@ -20,8 +20,8 @@ from scipy.sparse import csr_matrix, vstack
 from parkenv.evaluation.bench.rows import BenchRow, duration, seconds_each
 from parkenv.evaluation.simulate import simulate
 from parkenv.lots import city_lot, packaged_lot
+from parkenv.scenarios.build import make_scenario
 from parkenv.world.lot import PARK, ParkingLot
-from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.thesis.label_repair import repair
 from planners.thesis.label_setting import (
@@ -151,7 +151,7 @@ def city_rows(
         seed: of the city and of the worlds.
         agents: who searches, by name.
     """
-    scenario = Scenario.on_lot(city_lot(n_slots, seed))
+    scenario = make_scenario(city_lot(n_slots, seed))
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     rows: list[BenchRow] = []
     for name in agents:
@@ -202,7 +202,7 @@ def drive(
 
 def forecast_process(lot: ParkingLot, seed: int) -> ParkingMDP:
     """What the planner faces who arrives on a typical working day."""
-    scenario = Scenario.on_lot(lot)
+    scenario = make_scenario(lot)
     arrival = scenario.occupancy.draw_arrival(scenario.arrival, np.uint64(seed))
     return ParkingMDP.from_belief(scenario, scenario.forecast(arrival).p_occupied)
 

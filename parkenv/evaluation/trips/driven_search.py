@@ -201,7 +201,7 @@ class DrivenSearch:
 
     Example:
         >>> import math
-        >>> trip = DrivenSearch(Scenario.named("mini")).run(seed=1)
+        >>> trip = DrivenSearch(make_scenario("mini")).run(seed=1)
         >>> parts = trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.gave_up_s
         >>> trip.parked, math.isclose(trip.total_s, parts)
         (True, True)
