@@ -57,7 +57,9 @@ def program_of(page):
             for line in block.replace("\\\n", " ").splitlines():
                 name, *arguments = shlex.split(line, comments=True)
                 assert name == "parkenv", f"{line}: what is no command of ours stands in a block of sh"
-                program.append(f"done = run_parkenv(*{arguments!r})\nassert done.returncode == 0, done.stderr")
+                program.append(
+                    f"done = run_parkenv(*{arguments!r})\nassert done.returncode == 0, done.stderr"
+                )
     return "\n".join(program)
 
 
