@@ -1,4 +1,4 @@
-"""`parkenv/Drive-v0`: contract, goals, ends, tasks, determinism, state, faults."""
+"""`parkenv/Drive-v1`: contract, goals, ends, tasks, determinism, state, faults."""
 
 import json
 import math
@@ -22,7 +22,7 @@ from parkenv.envs.drive import CONTROL_S, DriveEnv, goal_errors
 from parkenv.world.lot import corner_points
 from sim_sensors.laser.scanner import LaserScanner
 
-ID = "parkenv/Drive-v0"
+ID = "parkenv/Drive-v1"
 LOTS = ("campus", "jam", "street", "mini")
 CAR = VehicleParameters()
 

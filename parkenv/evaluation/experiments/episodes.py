@@ -62,7 +62,7 @@ class EpisodeRunner:
         scenario: the scenario, with the costs and speeds of the setting.
         name: the agent's name, for the trace.
         agent: the agent.
-        rig: of `parkenv/SearchPerception-v0`, to look through its sensors; None for `parkenv/Search-v0`.
+        rig: of `parkenv/SearchPerception-v1`, to look through its sensors; None for `parkenv/Search-v1`.
     """
 
     def __init__(self, scenario: Scenario, name: str, agent: Agent, rig: str | None = None) -> None:
@@ -70,9 +70,9 @@ class EpisodeRunner:
         self.name = name
         self.agent = agent
         self.env = (
-            gym.make("parkenv/Search-v0", scenario=scenario)
+            gym.make("parkenv/Search-v1", scenario=scenario)
             if rig is None
-            else gym.make("parkenv/SearchPerception-v0", scenario=scenario, rig=rig)
+            else gym.make("parkenv/SearchPerception-v1", scenario=scenario, rig=rig)
         )
         if (k := getattr(agent, "local_k", None)) is not None:
             from parkenv.envs.local_observation import LocalObservation

@@ -92,7 +92,7 @@ def count_looks(
         InputError: an unknown rig.
     """
     scenario = scenario.replace(sensor_model=_AT_FIRST)
-    env = gym.make("parkenv/SearchPerception-v0", scenario=scenario, rig=rig, weather=weather)
+    env = gym.make("parkenv/SearchPerception-v1", scenario=scenario, rig=rig, weather=weather)
     agent = make_agent(driver, scenario)
     starts, slots = scenario.slots_in_view
     distance, beside = scenario.sight_lines

@@ -63,7 +63,7 @@ class Demonstrations:
             InputError: it finished none.
         """
         planner = make_agent(agent, scenario)
-        env = gym.make("parkenv/Search-v0", scenario=scenario, max_episode_steps=MAX_STEPS)
+        env = gym.make("parkenv/Search-v1", scenario=scenario, max_episode_steps=MAX_STEPS)
         around = LocalObservation(env, k)
         local: list[NDArray[np.float32]] = []
         masks: list[NDArray[np.int8]] = []
