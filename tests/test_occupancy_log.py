@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from parkenv.errors import InputError
 from parkenv.world.keyed_random import world_key
-from parkenv.world.occupancy import DAY_S, HOUR_S, Arrival, ArrivalWindow
+from parkenv.world.occupancy import Arrival, ArrivalWindow
 from parkenv.world.occupancy_log import OccupancyLog, day_class
 from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
+from parkenv.world.week import DAY_S, HOUR_S
 
 REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
 HEADER = "datetime,camera,slot_id,weather,occupied\n"

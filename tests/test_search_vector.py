@@ -360,9 +360,7 @@ def test_a_lot_of_ten_thousand_slots_touches_only_what_is_near():
     rng = np.random.default_rng(0)
     for _ in range(50):
         envs.step(rng.integers(0, 4, 2))
-    from parkenv.envs.search_step import N_TOUCHED
-
-    assert 0 < envs._search.counts[:, N_TOUCHED].max() < 600
+    assert 0 < envs._searches.records["n_columns"].max() < 600
 
 
 @pytest.mark.parametrize(
@@ -373,7 +371,7 @@ def test_a_lot_of_ten_thousand_slots_touches_only_what_is_near():
         ({"num_envs": 2.5}, "num_envs is 2.5"),
         ({"num_envs": True}, "num_envs is True"),
         ({"max_episode_steps": 0}, "max_episode_steps is 0"),
-        ({"observation": "raw"}, "observation is 'raw', want one of full, local"),
+        ({"observation": "raw"}, "observation is 'raw', want one of full, occupancy, local"),
         ({"observation": "local", "k": 0}, "k is 0"),
         ({"autoreset_mode": "Sometimes"}, "autoreset_mode is 'Sometimes', want one of NextStep"),
         ({"scenario": []}, "scenario is an empty sequence"),

@@ -47,7 +47,7 @@ def decay_to_prior(prior: float, rate: float, said: float, elapsed: float) -> fl
     return float(prior + (said - prior) * decay_factor(rate * elapsed))
 
 
-@compiled(inline="always")
+@compiled(error_model="numpy", forceinline=True)
 def bayes_update(p: float, looks_taken: bool, hit_rate: float, false_alarm_rate: float) -> float:
     """The belief `p` in a slot after one look at it; Bayes's rule.
 

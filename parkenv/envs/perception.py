@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from parkenv.envs.lookout import Lookout, Moment
 from parkenv.envs.search import SearchEnv
+from parkenv.envs.search_control import SearchControl
 from parkenv.envs.search_state import SearchState
-from parkenv.envs.search_step import VERTEX, Search, drive_or_park, renew, settle, take_in, tell_time
 from parkenv.envs.sensors import beside_the_lot
 from parkenv.mapping.slots import SlotFilter
 from parkenv.perception.detector import Detector
@@ -80,11 +80,12 @@ class Watcher:
         self.looks: list[tuple[Moment, Look]] = []
         self.report = _NOTHING
 
-    def tell(self, search: Search, moments: Sequence[Moment]) -> None:
+    def tell(self, control: SearchControl, vertex: int, moments: Sequence[Moment]) -> None:
         """See what was captured on the way to the vertex where the car is, and take it into the belief.
 
         Args:
-            search: of this scenario, under way; its first.
+            control: of a search in this scenario.
+            vertex: where the car is.
             moments: oldest first.
         """
         self.looks = [(moment, self.stack.look(moment.capture)) for moment in moments]
@@ -95,12 +96,11 @@ class Watcher:
             for view in look.views:
                 slots.see_cars(view.cars)
         states = slots.states()
-        vertex = search.counts[0, VERTEX]
         rows = slice(self._view_starts[vertex], self._view_starts[vertex + 1])
         near, rates = self._view_slots[rows], self._rates.of(rows)
         told = states.in_view[near] & (states.p_occupied[near] != 0.5)
         self.report = Report(near[told], states.occupied[near[told]])
-        take_in(search, 0, *self.report, rates.hit[told], rates.false_alarm[told])
+        control.apply_observations(*self.report, rates.hit[told], rates.false_alarm[told])
 
 
 class SearchPerceptionEnv(SearchEnv):
@@ -197,15 +197,14 @@ class SearchPerceptionEnv(SearchEnv):
         self._before = (self.state.vertex, self.state.time)
         return super().step(action)
 
-    def _advance(self, action: int) -> None:
+    def _advance(self, action: int) -> tuple[Any, ...]:
         """Act; capture, detect, range, and tell the belief what the slots look like."""
-        drive_or_park(self.search, 0, action)
-        self._state.come_along()
-        if not self._state.parked:
-            self.watcher.tell(self.search, self.watcher.lookout.look(self._state, self._before))
-        settle(self.search, 0)
-        renew(self.search, 0)
-        tell_time(self.search, 0, self._clock)
+        control, state = self._control, self._state
+        control.drive_or_park(action)
+        state.extend_path()
+        if not state.parked:
+            self.watcher.tell(control, state.vertex, self.watcher.lookout.look(state, self._before))
+        return control.finish_step()
 
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
         """The lot from above, and beside it the newest pictures."""

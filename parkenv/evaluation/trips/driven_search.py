@@ -13,21 +13,6 @@ from parkenv.driving.vehicle import VehicleParameters
 from parkenv.envs.lookout import Station
 from parkenv.envs.perception import Watcher
 from parkenv.envs.search import SearchEnv
-from parkenv.envs.search_step import (
-    DRIVEN_M,
-    FAILED_PARKS,
-    STEP_DRIVE,
-    STEP_FAILED,
-    STEP_WALK,
-    STEPS,
-    TIME,
-    drive_or_park,
-    learn,
-    look,
-    renew,
-    settle,
-    touched,
-)
 from parkenv.errors import InputError
 from parkenv.evaluation.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
 from parkenv.evaluation.trips.driver import Driver, Leg, Try
@@ -72,35 +57,32 @@ class DrivenSearchEnv(SearchEnv):
         self.driver.begin(state.key, state.world, state.vertex, state.time)
         return result
 
-    def _advance(self, action: int) -> None:
+    def _advance(self, action: int) -> tuple[Any, ...]:
         """Have the action driven, and let as much time pass as that took."""
-        state, search = self._state, self.search
-        numbers = search.numbers[0]
-        vertex, before = state.vertex, state.time
+        state, control = self._state, self._control
+        vertex, begin = state.vertex, state.time
         possible = self.scenario.action_masks[vertex, action] == 1
         if possible and action == PARK:
-            self._park(vertex, before)
+            self._park(vertex, begin)
         elif possible:
             seconds = self.driver.drive(vertex, action)
-            drive_or_park(search, 0, action)
-            numbers[STEP_DRIVE], numbers[TIME] = seconds, before + seconds
+            control.drive_or_park(action)
+            control.set_step_time(begin, drive_s=seconds)
         else:
             self.driver.wait(self.scenario.wait_s)
-            drive_or_park(search, 0, action)
+            control.drive_or_park(action)
         if not state.parked:
             self._see(on_the_way=possible and action != PARK)
             for slot in self._refused:
                 # It looks free, and is of no use to this car.
-                learn(search, 0, touched(search, 0, slot), True, 1.0)
-        settle(search, 0)
-        renew(search, 0)
-        self._clock[:] = state.time, state.time - state.arrival.time
+                control.set_taken(slot)
+        return control.finish_step()
 
     def _see(self, *, on_the_way: bool) -> None:
         """Tell the belief what the slots look like from where the car is, and from where it has been on its way."""
         watcher = self.watcher
         if watcher is None:
-            look(self.search, 0)
+            self._control.observe()
             return
         # After a try, or a wait, the car looks around once more; what it saw from amid the manoeuvre is of no use.
         track = self.driver.track if on_the_way else self.driver.track[-1:]
@@ -109,25 +91,21 @@ class DrivenSearchEnv(SearchEnv):
             chosen = watcher.lookout.chosen(np.array([spot.driven_m for spot in track]))
             spots = [track[i] for i in chosen.tolist()]
             stations = [Station(s.time, s.pose, self.driver.movers_at(s)) for s in spots]
-        watcher.tell(self.search, watcher.lookout.measure(self._state, stations))
+        moments = watcher.lookout.measure(self._state, stations)
+        watcher.tell(self._control, self._state.vertex, moments)
 
-    def _park(self, slot: int, before: float) -> None:
-        search, state = self.search, self._state
-        numbers, counts = search.numbers[0], search.counts[0]
-        taken = bool(state.world.occupied(np.array([slot]), before)[0])
+    def _park(self, slot: int, begin: float) -> None:
+        taken = bool(self._state.world.occupied(np.array([slot]), begin)[0])
         outcome = self.driver.park(slot, taken)
         if taken or not outcome.reason:
-            drive_or_park(search, 0, PARK)
+            self._control.drive_or_park(PARK)
         else:
             self._refused.add(slot)
-            counts[FAILED_PARKS] += 1
-            counts[STEPS] += 1
-            numbers[STEP_WALK] = 0.0
+            self._control.fail_attempt()
         if not outcome.reason:
             self.manoeuvre = outcome
         lost = outcome.seconds if outcome.reason else 0.0
-        numbers[STEP_DRIVE], numbers[STEP_FAILED] = outcome.seconds - lost, lost
-        numbers[TIME] = before + outcome.seconds
+        self._control.set_step_time(begin, drive_s=outcome.seconds - lost, failed_s=lost)
 
 
 @dataclass(frozen=True)
@@ -261,7 +239,7 @@ class DrivenSearch:
             parked=bool(info["parked"]),
             slot=parked.slot if parked else "",
             slot_kind=parked.kind if parked else "",
-            graph_m=float(env.search.numbers[0, DRIVEN_M]),
+            graph_m=env.state.driven_m,
             driven_m=log.driven_m,
             contacts=len(log.contacts),
             strays=log.strays,
