@@ -19,8 +19,8 @@ from parkenv.cli import (
     park,
     plan,
     report,
+    sensor_model,
     sensors,
-    sight,
     survey,
     train,
 )
@@ -47,7 +47,7 @@ app.add_typer(sensors.app, name="sensors")
 app.command("demo")(demo.demo)
 app.command("survey")(survey.survey)
 app.command("map")(survey.show_map)
-app.command("fit-sensor-model")(sight.fit_sight)
+app.command("fit-sensor-model")(sensor_model.fit_sensor_model)
 app.command("detect")(detect.detect)
 app.command("train-detector")(detect.train_detector)
 app.command("evaluate-detector")(detect.evaluate_detector)

@@ -262,6 +262,15 @@ def sighting_of(word: str) -> SensorModel:
     return SensorModel.from_file(word)
 
 
+DetectorOption = Annotated[
+    str,
+    typer.Option(
+        "--detector",
+        help="hog: the packaged models; side or front: one of them; a model file; MODULE:CLASS: your own.",
+    ),
+]
+
+
 def rig_of(word: str | None) -> str | None:
     """A rig's name, checked."""
     from sim_sensors.rig import RIG_NAMES

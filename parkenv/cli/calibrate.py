@@ -200,10 +200,10 @@ def trip(
     _show(console, driven)
     console.print(f"The film is {out}")
     if rerun is not None:
-        assert search.env.watcher is not None
+        assert search.env.perception is not None
         with (
             console.status(f"Driving once more for {rerun}"),
-            sensor_log(rerun, its.lot, search.env.watcher.lookout.rig) as recording,
+            sensor_log(rerun, its.lot, search.env.perception.sampler.rig) as recording,
         ):
             record_trip(search, seed, recording)
         console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")

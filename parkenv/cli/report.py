@@ -159,22 +159,22 @@ def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
         _require_same_files(run)
         return None, [*comparison_of(**_options(run, comparison_of)).cases]
     if run.kind == "survey":
-        from parkenv.cli.survey import surveyed_by
+        from parkenv.cli.survey import survey_of_options
 
         return (
-            partial(_survey, *surveyed_by(**_options(run, surveyed_by))),
+            partial(_survey, *survey_of_options(**_options(run, survey_of_options))),
             len(run.table("sessions.csv")),
         ), []
     if run.kind == "demo":
-        from parkenv.cli.demo import first_part, last_part
+        from parkenv.cli.demo import search_spec, survey_spec
         from parkenv.cli.survey import MAP_FILE
         from parkenv.mapping.store import MapStore
 
-        its, settings = first_part(**_options(run, first_part))
+        its, settings = survey_spec(**_options(run, survey_spec))
         with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:
             log = store.log()
-        numbers = {k: v for k, v in _parsed(run).items() if k in ("searches", "seed")}
-        return (partial(_survey, its, settings), len(log.time)), [*last_part(its, log, **numbers)]
+        numbers = {k: v for k, v in _parsed(run).items() if k in ("searches", "seed", "detector")}
+        return (partial(_survey, its, settings), len(log.time)), [*search_spec(its, log, **numbers)]
     if run.kind == "train":
         return None, _trained(run)
     return None, []

@@ -38,7 +38,8 @@ class Case:
         agent: the agent's name.
         occupancy_level: the mean occupancy that the world was set to; None where it was left as it is.
         options: of the agent, as `make_agent` takes them.
-        rig: whose sensors the car sees through; None where the scenario's sighting model stands for them.
+        rig: simulated sensors that observe the slots; None: the scenario's sensor model replaces them.
+        detector: of the rig's images, as `make_detector` takes it; None: the packaged one.
     """
 
     scenario: Scenario
@@ -46,6 +47,7 @@ class Case:
     occupancy_level: float | None = None
     rig: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
+    detector: str | None = None
 
     @property
     def columns(self) -> Row:
@@ -87,7 +89,7 @@ class Case:
 
     def _runner(self) -> EpisodeRunner:
         agent = make_agent(self.agent, self.scenario, **self.options)
-        return EpisodeRunner(self.scenario, self.agent, agent, self.rig)
+        return EpisodeRunner(self.scenario, self.agent, agent, self.rig, self.detector)
 
 
 def settings_of(

@@ -62,17 +62,25 @@ class EpisodeRunner:
         scenario: the scenario, with the costs and speeds of the setting.
         name: the agent's name, for the trace.
         agent: the agent.
-        rig: of `parkenv/SearchPerception-v0`, to look through its sensors; None for `parkenv/Search-v0`.
+        rig: of `parkenv/SearchPerception-v0`, whose sensors observe the slots; None: `parkenv/Search-v0`.
+        detector: of `parkenv/SearchPerception-v0`.
     """
 
-    def __init__(self, scenario: Scenario, name: str, agent: Agent, rig: str | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        name: str,
+        agent: Agent,
+        rig: str | None = None,
+        detector: str | None = None,
+    ) -> None:
         self.scenario = scenario
         self.name = name
         self.agent = agent
         self.env = (
             gym.make("parkenv/Search-v0", scenario=scenario)
             if rig is None
-            else gym.make("parkenv/SearchPerception-v0", scenario=scenario, rig=rig)
+            else gym.make("parkenv/SearchPerception-v0", scenario=scenario, rig=rig, detector=detector)
         )
         if (k := getattr(agent, "local_k", None)) is not None:
             from parkenv.envs.local_observation import LocalObservation

@@ -1,4 +1,4 @@
-"""How well the stack sees, counted in searches through the sensors, for the environment that does without them."""
+"""Fit a sensor model: count the errors of the perception pipeline in searches with simulated sensors."""
 
 from __future__ import annotations
 
@@ -20,84 +20,86 @@ from planners.agent import make_agent
 IntArray = NDArray[np.int64]
 
 BAND_ENDS = (0.5, 3.5, 6.5, 9.5, 12.5, 16.0)
-"""m, from the car to a slot's vertex; the first band is the slot that the car stands at."""
-DRIVERS = ("greedy-drive", "mdp", "first-free")
-"""Agents whose searches are watched: looks are where searches go."""
-LEAST_LOOKS = 20
-"""Looks in a band from which its own rates are taken, not those of all bands."""
-_AT_FIRST = SensorModel(BAND_ENDS[-1], 0.98, 0.02)
+"""m, from the car to a slot's vertex: upper ends of the distance bands; the first is the slot beside the car."""
+AGENTS = ("greedy-drive", "mdp", "first-free")
+"""Agents that search, so that slots are observed from where searches lead."""
+LEAST_OBSERVATIONS = 20
+"""Observations in a band from which its own rates are used, not those of all bands."""
+_INITIAL_MODEL = SensorModel(BAND_ENDS[-1], 0.98, 0.02)
 
 
 @dataclass(frozen=True, eq=False)
-class LookCounts:
-    """Slots in view after a step, and what the stack said of them.
+class ObservationCounts:
+    """Counts of slots within sensor range after a step, by true and observed state.
 
     Attributes:
-        looks: (bands, 2, 2, 3) int64, by distance, by whether the slot lies beside the car, by whether it is taken, and
-            by what was said: nothing, free, taken.
+        counts: (bands, 2, 2, 3) int64, by distance band, by whether the slot is beside the car, by whether it is taken,
+            and by the observed state: none, free, taken.
     """
 
-    looks: IntArray
+    counts: IntArray
 
     @classmethod
-    def none(cls) -> LookCounts:
-        """No look yet."""
+    def zero(cls) -> ObservationCounts:
+        """Return counts of zero."""
         return cls(np.zeros((len(BAND_ENDS), 2, 2, 3), dtype=np.int64))
 
-    def __add__(self, other: LookCounts) -> LookCounts:
-        return LookCounts(self.looks + other.looks)
+    def __add__(self, other: ObservationCounts) -> ObservationCounts:
+        return ObservationCounts(self.counts + other.counts)
 
-    def fitted(self) -> SensorModel:
-        """The model with these rates; a band's errors are drawn to half an error each (Jeffreys's prior).
+    def fit(self) -> SensorModel:
+        """Return the sensor model with these rates, each smoothed by half an observation (Jeffreys's prior).
 
         Raises:
-            InputError: too little was seen to tell.
+            InputError: too few observations.
         """
-        said = self.looks.sum(axis=(0, 1))[:, 1:]
-        if said.sum(axis=1).min() < LEAST_LOOKS:
+        observed = self.counts.sum(axis=(0, 1))[:, 1:]
+        if observed.sum(axis=1).min() < LEAST_OBSERVATIONS:
+            free, taken = observed.sum(axis=1).tolist()
             raise InputError(
-                f"{said.sum(axis=1).tolist()} looks at free and at taken slots, want at least {LEAST_LOOKS} of each"
+                f"{free} observations of free and {taken} of taken slots, want at least {LEAST_OBSERVATIONS} of each"
             )
-        false_alarm, hit = _shares(said)
+        false_alarm, hit = _taken_rates(observed)
         bands = []
         for i, end in enumerate(BAND_ENDS):
             for beside in (False, True):
-                looks = self.looks[i, int(beside)]
-                there, told = looks.sum(), looks[:, 1:]
-                rates = _shares(told) if told.sum(axis=1).min() >= LEAST_LOOKS else (false_alarm, hit)
-                seen = float(told.sum() / there) if there else 0.0
+                in_band = self.counts[i, int(beside)]
+                n, observed = in_band.sum(), in_band[:, 1:]
+                enough = observed.sum(axis=1).min() >= LEAST_OBSERVATIONS
+                rates = _taken_rates(observed) if enough else (false_alarm, hit)
+                seen = float(observed.sum() / n) if n else 0.0
                 bands.append(SensorBand(end, beside, round(seen, 4), round(rates[1], 4), round(rates[0], 4)))
         return SensorModel(BAND_ENDS[-1], round(hit, 4), round(false_alarm, 4), tuple(bands))
 
 
-def _shares(said: IntArray) -> tuple[float, float]:
-    """Share of looks that showed a taken slot: of free ones, and of taken ones."""
-    free, taken = (float((row[1] + 0.5) / (row.sum() + 1.0)) for row in said)
+def _taken_rates(observed: IntArray) -> tuple[float, float]:
+    """Return the fraction observed as taken of free slots and of taken slots, from (2, 2) counts."""
+    free, taken = (float((row[1] + 0.5) / (row.sum() + 1.0)) for row in observed)
     return free, taken
 
 
-def count_looks(
-    scenario: Scenario, rig: str, driver: str, seeds: Sequence[int], weather: str | None = None
-) -> LookCounts:
-    """Search through the sensors, and count what the stack says of slots against what is there.
+def count_observations(
+    scenario: Scenario, rig: str, agent_name: str, seeds: Sequence[int], weather: str | None = None
+) -> ObservationCounts:
+    """Run searches with simulated sensors, and count observed against true slot states.
 
     Args:
         scenario: the world.
         rig: `laser` or `stereo`.
-        driver: name of the agent that searches.
-        seeds: one a search.
-        weather: drawn for each search where None.
+        agent_name: the agent that searches.
+        seeds: one for each search.
+        weather: None: drawn for each search.
 
     Raises:
         InputError: an unknown rig.
     """
-    scenario = scenario.replace(sensor_model=_AT_FIRST)
+    scenario = scenario.replace(sensor_model=_INITIAL_MODEL)
     env = gym.make("parkenv/SearchPerception-v0", scenario=scenario, rig=rig, weather=weather)
-    agent = make_agent(driver, scenario)
+    agent = make_agent(agent_name, scenario)
     starts, slots = scenario.slots_in_view
     distance, beside = scenario.sight_lines
     band = np.searchsorted(BAND_ENDS, distance)
-    looks = LookCounts.none().looks
+    counts = ObservationCounts.zero().counts
     inner: Any = env.unwrapped
     for seed in seeds:
         observation, _ = env.reset(seed=seed)
@@ -109,17 +111,17 @@ def count_looks(
             over = terminated or truncated
             if info["parked"]:
                 break
-            state, report = inner.state, inner.report
+            state, observation_of_slots = inner.state, inner.perception.observation
             rows = slice(starts[state.vertex], starts[state.vertex + 1])
             near = slots[rows]
-            said = np.zeros(len(near), dtype=np.int64)
-            said[np.searchsorted(near, report.slots)] = 1 + report.looks_taken
+            observed = np.zeros(len(near), dtype=np.int64)
+            observed[np.searchsorted(near, observation_of_slots.slots)] = 1 + observation_of_slots.taken
             taken = state.world.occupied(near, state.time).astype(np.int64)
-            np.add.at(looks, (band[rows], beside[rows].astype(np.int64), taken, said), 1)
-    return LookCounts(looks)
+            np.add.at(counts, (band[rows], beside[rows].astype(np.int64), taken, observed), 1)
+    return ObservationCounts(counts)
 
 
-def measure_sight(
+def count_all_observations(
     scenarios: Sequence[Scenario],
     rig: str,
     searches: int,
@@ -128,26 +130,26 @@ def measure_sight(
     weather: str | None = None,
     workers: Workers = HERE,
     on_progress: Callable[[], None] = lambda: None,
-) -> LookCounts:
-    """`count_looks` of all drivers in all scenarios.
+) -> ObservationCounts:
+    """Sum `count_observations` over all `AGENTS` in all scenarios.
 
     Args:
         scenarios: worlds.
         rig: `laser` or `stereo`.
-        searches: of each driver in each scenario.
+        searches: of each agent in each scenario.
         seed: of the first search.
-        weather: drawn for each search where None.
-        workers: where they run; the result does not depend on it.
-        on_progress: called when a search is done.
+        weather: None: drawn for each search.
+        workers: run the searches; the result does not depend on them.
+        on_progress: called after each search.
     """
     tasks = [
-        partial(count_looks, scenario, rig, driver, [s], weather)
+        partial(count_observations, scenario, rig, agent_name, [s], weather)
         for scenario in scenarios
         for s in range(seed, seed + searches)
-        for driver in DRIVERS
+        for agent_name in AGENTS
     ]
-    counts = LookCounts.none()
-    for _, looks in workers.results(tasks):
-        counts += looks
+    total = ObservationCounts.zero()
+    for _, counts in workers.results(tasks):
+        total += counts
         on_progress()
-    return counts
+    return total

@@ -100,7 +100,7 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
     state: SearchState | None = None
     for case in encounter.cases:
         agent = make_agent(case.agent, case.scenario, **case.options)
-        runner = EpisodeRunner(case.scenario, case.agent, agent, case.rig)
+        runner = EpisodeRunner(case.scenario, case.agent, agent, case.rig, case.detector)
         search, state = _search(runner, encounter.seed)
         before = counted.get(case.key(encounter.seed))
         search["counted_s"] = before

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from parkenv.envs.perception import SearchPerceptionEnv
     from parkenv.evaluation.trips.driven_search import DrivenSearch, Observation, Trip
     from parkenv.mapping.grid import OccupancyGrid
-    from parkenv.mapping.survey import Survey, SurveyMoment
-    from parkenv.perception.stack import Look
+    from parkenv.mapping.survey import Survey, SurveyFrame
+    from parkenv.perception.pipeline import PerceptionResult
     from planners.agent import Agent
     from sim_sensors.rig import SensorRig
 
@@ -57,7 +57,7 @@ class SensorLog:
     def __init__(self, recording: rr.RecordingStream, lot: ParkingLot, rig: SensorRig) -> None:
         self._rec, self._lot, self._rig = recording, lot, rig
         self._path: list[list[float]] = []
-        self._moments = 0
+        self._captures = 0
         self._begun = self._time = 0.0
         corners = lot.slot_corners()[:, [0, 1, 2, 3, 0]]
         self._outlines = np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=2)
@@ -66,31 +66,31 @@ class SensorLog:
 
     def begin(self) -> None:
         """Another drive begins, behind what was recorded so far."""
-        self._begun = 0.0 if not self._moments else self._time + PAUSE_S
+        self._begun = 0.0 if not self._captures else self._time + PAUSE_S
         self._path = []
 
-    def moment(self, time: float, look: Look) -> None:
-        """Where the car took itself to be, what its sensors measured there, and what was found.
+    def capture(self, time: float, result: PerceptionResult) -> None:
+        """Record the estimated pose of the car, its measurements, and the detected cars.
 
         Args:
             time: s since the drive began.
-            look: what the stack made of it.
+            result: of the perception pipeline.
         """
         import rerun as rr
 
         self._time = self._begun + time
         self._rec.set_time(TIMELINE, duration=self._time)
-        x, y, yaw = (float(v) for v in look.vehicle)
+        x, y, yaw = (float(v) for v in result.vehicle)
         axis = rr.RotationAxisAngle(axis=(0.0, 0.0, 1.0), radians=yaw)
         self._rec.log("car", rr.Transform3D(translation=(x, y, 0.0), rotation=axis))
         self._path.append([x, y, 0.05])
         self._rec.log("path", rr.LineStrips3D([self._path], colors=[PATH], radii=0.08))
-        for view in look.views:
+        for view in result.views:
             at = f"car/{view.name}"
             self._rec.log(at, rr.EncodedImage(contents=_jpeg(view.image), media_type="image/jpeg"))
             found = view.detections
             standing = np.isin(np.arange(len(found)), view.cars.detection)
-            colors = np.where(standing[:, None], np.where(found.ends[:, None], END, SIDE), NOWHERE).astype(
+            colors = np.where(standing[:, None], np.where(found.end_on[:, None], END, SIDE), NOWHERE).astype(
                 np.uint8
             )
             labels = [f"{p:.2f}" for p in found.probability]
@@ -98,11 +98,11 @@ class SensorLog:
                 array=found.boxes, array_format=rr.Box2DFormat.XYXY, colors=colors, labels=labels
             )
             self._rec.log(f"{at}/boxes", boxes)
-        for number, sweep in enumerate(look.sweeps):
-            ended = np.nonzero(np.isfinite(sweep.distance))[0]
-            points = np.column_stack([sweep.points(ended), np.full(len(ended), 0.5)])
+        for number, scan in enumerate(result.scans):
+            ended = np.nonzero(np.isfinite(scan.distance))[0]
+            points = np.column_stack([scan.points(ended), np.full(len(ended), 0.5)])
             self._rec.log(f"scan/{number}", rr.Points3D(points, colors=[SCAN], radii=0.04))
-        cars = [view.cars for view in look.views if len(view.cars)]
+        cars = [view.cars for view in result.views if len(view.cars)]
         self._rec.log(
             "cars",
             rr.Boxes3D(
@@ -116,7 +116,7 @@ class SensorLog:
             if cars
             else rr.Clear(recursive=False),
         )
-        self._moments += 1
+        self._captures += 1
 
     def slots(self, p_occupied: FloatArray, known: NDArray[np.bool_] | None = None) -> None:
         """What is believed of every slot, (n_slots,), now; grey where nothing is `known`."""
@@ -133,8 +133,8 @@ class SensorLog:
         )
 
     def grid(self, grid: OccupancyGrid) -> None:
-        """The occupancy grid as it is now, every `GRID_EVERY` moments."""
-        if (self._moments - 1) % GRID_EVERY:
+        """The occupancy grid as it is now, every `GRID_EVERY` captures."""
+        if (self._captures - 1) % GRID_EVERY:
             return
         import rerun as rr
 
@@ -253,14 +253,15 @@ def record_session(survey: Survey, number: int, log: SensorLog) -> None:
     log.begin()
     begun: list[float] = []
 
-    def keep(moment: SurveyMoment) -> None:
-        begun[:] = begun or [moment.time]
-        log.moment(moment.time - begun[0], moment.look)
-        states = moment.slots.states()
+    def keep(frame: SurveyFrame) -> None:
+        time = frame.result.captured.time
+        begun[:] = begun or [time]
+        log.capture(time - begun[0], frame.result)
+        states = frame.slots.states()
         log.slots(states.p_occupied, states.in_view)
-        log.grid(moment.grid)
+        log.grid(frame.grid)
 
-    survey.drive(number, on_moment=keep)
+    survey.drive(number, on_frame=keep)
 
 
 def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: SensorLog) -> None:
@@ -276,8 +277,8 @@ def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: Sensor
     observation, _ = env.reset(seed=seed)
     begun, memory, over = env.state.arrival.time, None, False
     while True:
-        for moment, look in env.looks:
-            log.moment(moment.time - begun, look)
+        for result in env.perception.results:
+            log.capture(result.captured.time - begun, result)
         log.slots(observation["p_occupied"].astype(np.float64))
         if over:
             return
@@ -297,14 +298,14 @@ def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
     Raises:
         InputError: a search without a rig.
     """
-    watcher, env = search.env.watcher, search.env
-    if watcher is None:
+    perception, env = search.env.perception, search.env
+    if perception is None:
         raise InputError("a trip is recorded as its sensors see it, and this one has none: give it a rig")
     log.begin()
 
     def keep(observation: Observation) -> None:
-        for moment, look in watcher.looks:
-            log.moment(moment.time - env.state.arrival.time, look)
+        for result in perception.results:
+            log.capture(result.captured.time - env.state.arrival.time, result)
         log.slots(observation["p_occupied"].astype(np.float64))
 
     return search.run(seed, on_step=keep)
