@@ -5,8 +5,8 @@ import gymnasium as gym
 import parkenv
 from planners import make_agent
 
-scenario = parkenv.Scenario.named("campus")
-env = gym.make("parkenv/Search-v0", scenario=scenario, render_mode="ansi")
+scenario = parkenv.make_scenario("campus")
+env = gym.make("parkenv/Search-v1", scenario=scenario, render_mode="ansi")
 agent = make_agent("mdp", scenario)
 
 observation, info = env.reset(seed=7)

@@ -24,6 +24,7 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import WIDE, make_console, make_table
 from parkenv.errors import InputError
+from parkenv.scenarios.build import build
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.compare import Case
@@ -56,10 +57,10 @@ def compare(
     occupancy: args.OccupancyOption = None,
     mapping: args.MappingOption = None,
     goal: args.GoalOption = None,
-    arrival: args.ArrivalOption = "08:00-13:00",
-    days: args.DaysOption = "weekdays",
+    arrival: args.ArrivalOption = None,
+    days: args.DaysOption = None,
     view_range: args.ViewRangeOption = None,
-    sight: args.SightOption = None,
+    sight: args.SensorModelOption = None,
     sensors: args.SensorsOption = None,
     agents: Annotated[
         str,
@@ -164,6 +165,7 @@ def compare(
     """
     from parkenv.evaluation.experiments.compare import check_worlds, table
     from parkenv.evaluation.experiments.results import ResultFolder
+    from parkenv.evaluation.figures.registry import ComparisonResults, draw_figures, remove_figures
     from parkenv.world.scenario import KMH
 
     if rerun is not None:
@@ -189,7 +191,7 @@ def compare(
     settings = {
         "version": __version__,
         "scenarios": [s.name for s in scenarios],
-        "lot": args.fingerprint(lot),
+        "lot": lot,
         "occupancy": args.fingerprint(occupancy),
         "mapping": args.fingerprint(mapping),
         "goal": goal,
@@ -209,6 +211,7 @@ def compare(
     console = make_console()
     with args.workers_of(jobs, backend, address) as workers:
         folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)
+        remove_figures(out)
         interrupted = run_with_bar(console, cases + sweep, folder, workers)
 
     rows, sweep_rows = table(cases, folder), table(sweep, folder)
@@ -237,13 +240,8 @@ def compare(
         raise typer.Exit(130)
     if figures:
         with console.status("Drawing figures"):
-            if sweeps:
-                _draw_sweep(out, rows)
-            else:
-                drawn = [(case, its) for case, its in cases if case.scenario.name not in maps]
-                _draw(out, [r for r in rows if r["scenario"] not in maps], sweep_rows, drawn, folder, seed)
-            if maps:
-                _draw_maps(out, rows, {name: said for name, (_, said) in maps.items()})
+            flat = {name: (name.partition(MAP_SAYS)[0], said) for name, (_, said) in maps.items()}
+            draw_figures(ComparisonResults(cases, folder.episodes, rows, sweep_rows, flat, seed), out)
     console.print(f"Episodes, summary and figures are in {out}")
     if rerun is not None:
         with console.status(f"Searching the first search once more for {rerun}"):
@@ -290,12 +288,12 @@ class Comparison:
 def comparison_of(
     *,
     scenario: str | None,
-    lot: Path | None,
+    lot: str | None,
     occupancy: Path | None,
     mapping: Path | None,
     goal: str | None,
-    arrival: str,
-    days: str,
+    arrival: str | None,
+    days: str | None,
     view_range: float | None,
     sight: str | None,
     sensors: str | None,
@@ -329,7 +327,13 @@ def comparison_of(
     levels = [] if sweeps or occupancy_levels == "none" else _levels(occupancy_levels)
     rig = args.rig_of(sensors)
     sight = sight or ("perfect" if rig is None else "stereo" if rig == "stereo" else "laser")
-    scenarios = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range, sight)
+    scenarios = [
+        build(spec)
+        for spec in args.scenario_specs(
+            scenario, lot=lot, occupancy=occupancy, mapping=mapping, goal=goal, arrival=arrival, days=days,
+            sensor_model=sight, view_range=view_range,
+        )
+    ]  # fmt: skip
     options: dict[str, dict[str, Any]] = {
         "mdp": {"solver": solver}, "mdp-static": {"solver": solver},
         "belief": {} if budget_ms is None else {"budget_ms": budget_ms},
@@ -489,65 +493,3 @@ def _interval(mean: float, ends: list[float], *, signed: bool = False) -> str:
 def _seconds(value: float, signed: bool = False) -> str:
     # Adding zero turns the -0.0 of a rounded difference into 0.0.
     return f"{round(value, 1) + 0.0:{'+' if signed else ''}{'.0f' if abs(value) >= 1000 else '.1f'}}"
-
-
-PICTURED = ("greedy-goal", "first-free", "oracle")
-"""Agents whose paths are drawn beside the first agent's."""
-
-
-def _draw_maps(out: Path, rows: list[Any], said: dict[str, float]) -> None:
-    from parkenv.evaluation.figures.time_figures import save_time_against_map
-
-    # At the first of the costs and speeds, whatever else was asked for.
-    setting = {c: rows[0][c] for c in ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")}
-    rows = [row for row in rows if setting.items() <= row.items()]
-    for name in dict.fromkeys(flat.partition(MAP_SAYS)[0] for flat in said):
-        flat = [
-            row for row in rows if row["scenario"].partition(MAP_SAYS)[0] == name and row["scenario"] in said
-        ]
-        own = [row for row in rows if row["scenario"] == name]
-        path = out / f"time_against_map_{name}.png"
-        save_time_against_map(flat, own, lambda row: said[row["scenario"]], path)
-
-
-def _draw_sweep(out: Path, rows: list[Any]) -> None:
-    from parkenv.evaluation.experiments.compare import UNSEEN
-    from parkenv.evaluation.figures.time_figures import save_time_against_failure_cost
-
-    for name in dict.fromkeys(row["scenario"].removesuffix(UNSEEN) for row in rows):
-        seen, unseen = ([r for r in rows if r["scenario"] == n] for n in (name, name + UNSEEN))
-        save_time_against_failure_cost(seen, unseen, out / f"time_against_failure_cost_{name}.png")
-
-
-def _draw(
-    out: Path, rows: list[Any], sweep_rows: list[Any], cases: list[Any], folder: Any, seed: int
-) -> None:
-    from parkenv.evaluation.experiments.compare import against_occupancy
-    from parkenv.evaluation.figures.search_pictures import save_searches
-    from parkenv.evaluation.figures.time_figures import save_time_against_occupancy, save_time_split
-
-    for name in dict.fromkeys(row["scenario"] for row in rows):
-        save_time_split([r for r in rows if r["scenario"] == name], out / f"time_split_{name}.png")
-        swept = [{**r, "occupancy": r["occupancy_level"]} for r in sweep_rows if r["scenario"] == name]
-        if not swept:
-            # As the sweep: at the first of the speeds, whatever else was asked for.
-            shown = [(c, seeds) for c, seeds in cases if c.scenario.name == name]
-            speeds = shown[0][0].scenario.v_walk, shown[0][0].scenario.v_drive
-            recorded = [
-                folder.episodes[c.key(s)]
-                for c, seeds in shown
-                for s in seeds
-                if (c.scenario.v_walk, c.scenario.v_drive) == speeds
-            ]
-            swept = against_occupancy(recorded, (0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001))
-        if swept:
-            save_time_against_occupancy(swept, out / f"time_against_occupancy_{name}.png")
-        settings: dict[tuple[Any, ...], list[Any]] = {}
-        for case, _ in cases:
-            if case.scenario.name == name:
-                c = case.columns
-                settings.setdefault((c["failure_cost_s"], c["v_walk_kmh"], c["v_drive_kmh"]), []).append(case)
-        for (failure, walk, drive), its_cases in settings.items():
-            drawn = [its_cases[0], *(c for c in its_cases[1:] if c.agent in PICTURED)]
-            file = out / f"searches_{name}_failure{failure:g}_walk{walk:g}_drive{drive:g}.png"
-            save_searches([case.trace(seed) for case in drawn], file)

@@ -53,7 +53,7 @@ def park(
         Path, typer.Option("--out", "-o", help="Folder for pictures, episodes.csv and summary.json.")
     ] = Path("results/park"),
 ) -> None:
-    """Let drivers park in `parkenv/Drive-v0`: how often they do, how long they plan and drive.
+    """Let drivers park in `parkenv/Drive-v1`: how often they do, how long they plan and drive.
 
     Writes a picture of one parking for each kind of slot and way of standing in it, an animation of one, and
     pictures of failures where there are any; of several agents, into a folder for each.
@@ -66,16 +66,16 @@ def park(
     * `parkenv park --lot parking_map.yml --way back-in`
     """
     from parkenv.driving.parking_task import KINDS, WAYS
-    from parkenv.envs.drive import lot_named
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, parking_table, write_parkings
+    from parkenv.lots import load_lot
     from planners.driving.drivers import make_driver
 
     kinds = None if kind == "all" else _chosen("--kind", kind, KINDS)
     ways = WAYS if way == "both" else _chosen("--way", way, WAYS)
     cases = []
     for name in args.words("--lot", lot):
-        case = ParkingCase(lot_named(name), kinds, ways, occupancy, slack)
+        case = ParkingCase(load_lot(name), kinds, ways, occupancy, slack)
         case.environment().close()  # complains before anything is driven
         cases.append(case)
     labels = _labels(args.words("--agents", agents))

@@ -12,6 +12,7 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
+from parkenv.scenarios.build import build
 
 
 def plan(
@@ -27,8 +28,8 @@ def plan(
     occupancy: args.OccupancyOption = None,
     mapping: args.MappingOption = None,
     goal: args.GoalOption = None,
-    arrival: args.ArrivalOption = "08:00-13:00",
-    days: args.DaysOption = "weekdays",
+    arrival: args.ArrivalOption = None,
+    days: args.DaysOption = None,
     view_range: args.ViewRangeOption = None,
     agent: Annotated[str, typer.Option("--agent", help="A planning agent: mdp or mdp-static.")] = "mdp",
     failure_cost: args.FailureCostOption = "10",
@@ -53,16 +54,22 @@ def plan(
 
     from parkenv.evaluation.experiments.compare import Case, settings_of
     from parkenv.evaluation.experiments.results import make_folder, write_summary
-    from parkenv.evaluation.figures.search_pictures import save_searches
+    from parkenv.evaluation.figures.picture_files import save_picture
+    from parkenv.evaluation.figures.search_pictures import draw_searches
     from planners.agent import make_agent
     from planners.thesis.replanning import StaticAgent
 
     failure = args.costs("--failure-cost", failure_cost)
     walk = args.speeds("--v-walk-kmh", v_walk_kmh)
     drive = args.speeds("--v-drive-kmh", v_drive_kmh)
-    base, *others = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range)
-    if others:
-        raise InputError(f"--scenario is {scenario!r}, want one: plan draws one scenario at a time")
+    base = build(
+        args.one_scenario(
+            args.scenario_specs(
+                scenario, lot=lot, occupancy=occupancy, mapping=mapping, goal=goal, arrival=arrival, days=days,
+                view_range=view_range,
+            )
+        )
+    )  # fmt: skip
     if not isinstance(make_agent(agent, base), StaticAgent):
         raise InputError(f"--agent {agent!r} makes no plan; known: mdp, mdp-static")
     make_folder(out)
@@ -113,7 +120,7 @@ def plan(
                 f"{row['walked_m']:.0f}",
                 str(row["replans"]),
             )
-        save_searches(traces, out / "plan.png")
+        save_picture(draw_searches(traces), out / "plan.png")
     summary = {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "rows": rows}
     write_summary(out, summary)
     console.print(table)

@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
+from parkenv.scenarios.build import make_scenario
 
 
 def fit_sensor_model(
@@ -23,8 +24,8 @@ def fit_sensor_model(
         int,
         typer.Option("--searches", "-n", min=1, help="Searches of each of three agents in each scenario."),
     ] = 20,
-    arrival: args.ArrivalOption = "08:00-13:00",
-    days: args.DaysOption = "weekdays",
+    arrival: args.ArrivalOption = None,
+    days: args.DaysOption = None,
     weather: Annotated[
         str | None,
         typer.Option(
@@ -47,12 +48,12 @@ def fit_sensor_model(
     Example:
     * `parkenv fit-sensor-model --rig stereo --out stereo.json`
     """
-    from parkenv.evaluation.experiments.sensor_model_fit import AGENTS, count_all_observations
+    from parkenv.evaluation.experiments.sensor_model_fit import AGENTS, measure_sensors
     from parkenv.world.traffic import Traffic
 
     scenarios = [
-        its.replace(traffic=Traffic(cars=3, pedestrians=5))
-        for its in args.scenarios_of(scenario, None, None, None, None, arrival, days, None)
+        make_scenario(spec, traffic=Traffic(cars=3, pedestrians=5))
+        for spec in args.scenario_specs(scenario, arrival=arrival, days=days)
     ]
     console = make_console()
     with args.workers_of(jobs, backend, address) as workers, Progress(
@@ -62,7 +63,7 @@ def fit_sensor_model(
         bar = progress.add_task(
             "Searching with simulated sensors", total=searches * len(AGENTS) * len(scenarios)
         )
-        counts = count_all_observations(
+        counts = measure_sensors(
             scenarios,
             rig,
             searches,
@@ -71,7 +72,7 @@ def fit_sensor_model(
             workers=workers,
             on_progress=lambda: progress.advance(bar),
         )
-    model = counts.fit()
+    model = counts.fitted()
     model.to_file(out)
     table = make_table(
         f"Observations of slots, rig {rig}",

@@ -1,11 +1,11 @@
-"""Lots made by rule: a grid of rows and aisles, a city of streets, and the rows of slots in both."""
+"""Generate lots: a grid of rows and aisles, a city of streets, and the rows of slots in both."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from itertools import count
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 import shapely
@@ -15,7 +15,6 @@ from parkenv.errors import InputError
 from parkenv.world.drive_graph import LANE_OFFSET, SLOT_REACH
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
-LotT = TypeVar("LotT", bound=ParkingLot)
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
@@ -28,20 +27,28 @@ TWO_WAY_HALF_WIDTH = 3.0
 ONE_WAY_HALF_WIDTH = 2.0
 """From the centre line of a one-way street to its parked cars, m."""
 CROSSING_CLEARANCE = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 5.0
-"""From the middle of a crossing to the first parked car, m: nobody parks within 5 m of the kerbs' corner."""
+"""From the middle of a crossing to the first parked car, m: parking is forbidden within 5 m of the kerbs' corner."""
 BUILDING_SETBACK = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 2.9
 """From the centre line of a street to the buildings, m: half the street, parked cars and a footway."""
 
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """Geometry of n slots, one array a column of `ParkingLot`: its `slot_xy`, `slot_yaw` and so on."""
+    """The columns of n slots: each field `name` is the column `slot_name` of `ParkingLot`.
+
+    An empty `parking_cost_s` stands for zeros.
+    """
 
     xy: FloatArray
     yaw: FloatArray
     length: FloatArray
     width: FloatArray
     mouth: NDArray[np.int8]
+    parking_cost_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not len(self.parking_cost_s):
+            object.__setattr__(self, "parking_cost_s", np.zeros(len(self.xy)))
 
     def __len__(self) -> int:
         return len(self.xy)
@@ -50,8 +57,13 @@ class Slots:
         return Slots(*(getattr(self, f.name)[index] for f in fields(self)))
 
     @classmethod
+    def of_lot(cls, lot: ParkingLot) -> Self:
+        """The slots of a lot."""
+        return cls(*(getattr(lot, f"slot_{f.name}") for f in fields(cls)))
+
+    @classmethod
     def joined(cls, parts: Sequence[Slots]) -> Self:
-        """All slots of several rows, in order."""
+        """Concatenate the slots of several rows."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def columns(self) -> dict[str, Any]:
@@ -67,15 +79,15 @@ def bay_row(
     size: tuple[float, float] = BAY_SIZE,
     angle: float = np.pi / 2,
 ) -> Slots:
-    """A row of n perpendicular or angled slots on the left of a line, entered from that line.
+    """Make a row of n perpendicular or angled slots on the left of a line, entered from that line.
 
     Args:
-        start: (2,) m, where the line of the slots' mouths starts.
+        start: (2,) m, start of the line of the slots' mouths.
         heading: rad, direction of that line.
         n: number of slots.
         size: length and width of a slot, m.
         angle: rad, between the line and the parked cars; below a right angle, cars that drive along the
-            line turn in without a swing.
+            line can turn in directly.
     """
     length, width = size
     along = np.array([np.cos(heading), np.sin(heading)])
@@ -99,12 +111,12 @@ def bay_row(
 def kerb_rows(
     start: FloatArray, end: FloatArray, left: BoolArray, size: tuple[float, float] = KERB_SIZE
 ) -> tuple[Slots, NDArray[np.intp]]:
-    """As many kerbside slots as fit along each of m kerbs, spread evenly, and the kerb that each lies on.
+    """Make as many kerbside slots as fit along each of m kerbs, evenly spread; return them and the kerb of each.
 
     Args:
-        start: (m, 2) m, where the edge between carriageway and parked cars starts.
-        end: (m, 2) m, where it ends; cars pass from start to end.
-        left: (m,) bool, whether the cars stand on the left of that edge; on the right otherwise.
+        start: (m, 2) m, start of the edge between carriageway and parked cars.
+        end: (m, 2) m, end of that edge; traffic runs from start to end.
+        left: (m,) bool, whether the cars park on the left of that edge; on the right otherwise.
         size: length and width of a slot, m.
     """
     length, width = size
@@ -127,9 +139,26 @@ def kerb_rows(
 
 
 def grid_lot(
-    cls: type[LotT], rows: int, columns: int, *, name: str, pitch: float, depth: float, aisle: float
-) -> LotT:
-    """See `ParkingLot.grid`.
+    rows: int,
+    columns: int,
+    *,
+    name: str = "grid",
+    pitch: float = 2.5,
+    depth: float = 5.0,
+    aisle: float = 6.0,
+) -> ParkingLot:
+    """Make rows of perpendicular slots along parallel two-way aisles, joined by a road at either end.
+
+    Rows lie in pairs back to back: row 0 south of the first aisle, rows 1 and 2 between the first and
+    the second, and so on. The entry is at the west end of the south aisle, the goal east of the lot.
+
+    Args:
+        rows: number of rows of slots; two rows share an aisle.
+        columns: slots per row.
+        name: the lot's name.
+        pitch: width of a slot, m.
+        depth: length of a slot, m.
+        aisle: width of an aisle and of the end roads, m.
 
     Raises:
         InputError: a count below one, or a size that leaves no room to drive or no lane within reach.
@@ -161,7 +190,7 @@ def grid_lot(
     lanes = [Lane(np.array([[west, y], [east, y]])) for y in aisle_y]
     if n_aisles > 1:
         lanes += [Lane(np.stack([np.full(n_aisles, x), aisle_y], axis=1)) for x in (west, east)]
-    return cls(
+    return ParkingLot(
         name=name,
         slot_ids=tuple(f"{r}-{c}" for r in range(rows) for c in range(columns)),
         **slots.columns(),
@@ -171,14 +200,16 @@ def grid_lot(
     )
 
 
-def city_lot(cls: type[LotT], n_slots: int, seed: int) -> LotT:
-    """See `ParkingLot.city`.
+def city_lot(n_slots: int, seed: int = 0) -> ParkingLot:
+    """Make kerbside slots round the blocks of a city of one-way and two-way streets, `n_slots` in all.
+
+    A million slots take seconds. The same seed gives the same city.
 
     Every street runs from one edge of the city to the other, and the streets along its edges are two-way:
-    whatever the one-way streets between them, every place can be reached from every other. Slots are
-    numbered crossing by crossing from the south-west, so neighbours have near numbers. Where more slots
-    fit than are wanted, some are left out here and there, as driveways are. The block in the middle
-    is a square without a building; the goal is its centre.
+    whatever the one-way streets between them, every slot can be reached from every other. Slots are
+    numbered crossing by crossing from the south-west, so neighbours have close numbers. Where more slots
+    fit than are wanted, random ones are left out, like driveways. The block in the middle is a square
+    without a building; the goal is its centre.
 
     Raises:
         InputError: `n_slots` is below one.
@@ -200,7 +231,7 @@ def city_lot(cls: type[LotT], n_slots: int, seed: int) -> LotT:
     middle = (len(corners) // 2, len(corners[0]) // 2)
     built = np.ones(corners.shape[:2], dtype=bool)
     built[middle] = False
-    return cls(
+    return ParkingLot(
         name=f"city-{n_slots}-{seed}",
         slot_ids=tuple(map(str, range(n_slots))),
         **slots.columns(),
@@ -223,7 +254,7 @@ def _random_streets(n_blocks: int, rng: np.random.Generator) -> StreetGrid:
 
 @dataclass(frozen=True, eq=False)
 class StreetGrid:
-    """Streets that cross each other, `along` from west to east and `across` from south to north.
+    """A grid of streets, `along` from west to east and `across` from south to north.
 
     Args:
         crossings: (n_along, n_across, 2) m, where street i along crosses street j across.
@@ -250,11 +281,11 @@ class StreetGrid:
         return np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)
 
     def kerb_slots(self, outer: bool = True) -> Slots:
-        """Slots on both sides of all streets, crossing by crossing; `outer`: also outside the outermost."""
+        """Make slots on both sides of all streets, crossing by crossing; `outer`: also on the outer sides."""
         p = self.crossings
         n_along, n_across = p.shape[:2]
         row, column = np.indices((n_along, n_across))
-        # Each crossing owns the piece of street to its east and the piece to its north.
+        # Each crossing owns the segments of street to its east and to its north.
         start = np.concatenate([p[:, :-1].reshape(-1, 2), p[:-1].reshape(-1, 2)])
         end = np.concatenate([p[:, 1:].reshape(-1, 2), p[1:].reshape(-1, 2)])
         direction = np.concatenate([np.repeat(self.along, n_across - 1), np.tile(self.across, n_along - 1)])

@@ -1,13 +1,14 @@
-"""Lots as GeoJSON: what a file holds, and what is wrong with it.
+"""Native lot files (GeoJSON): writing, reading, and collecting all errors of a file.
 
 The native file is a GeoJSON FeatureCollection with the further members
 `"parkenv": {"format": "lot", "version": 1}`, `"name"` and `"frame": "local"` (metres). Without
-`frame`, positions are longitude and latitude as RFC 7946 has it, and are projected to metres east and north
-of the middle of the features. `properties.kind` tells what a feature is:
+`frame`, positions are longitude and latitude (RFC 7946), and are projected to metres east and north of the
+middle of the features. `properties.kind` is the kind of a feature:
 
 | kind | geometry | properties |
 |---|---|---|
-| `slot` | Polygon | `id`; all or none of `center`, `yaw`, `length`, `width`, `mouth` (rear, left, right) |
+| `slot` | Polygon | `id`; `parking_cost_s`, 0 if absent; all or none of `center`, `yaw`, `length`, `width`, \
+`mouth` (rear, left, right) |
 | `lane` | LineString | `oneway`, false if absent |
 | `entry`, `goal` | Point | |
 | `wall` | LineString or Polygon | |
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -43,19 +44,19 @@ KINDS = {
     "goal": ("Point",),
     "wall": ("LineString", "Polygon"),
 }
-"""The kinds of features, and the geometries that each may have."""
+"""The kinds of features, and the geometry types allowed for each."""
 SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")
-"""The properties that fix a slot exactly."""
+"""The properties that define a slot exactly."""
 MOUTHS = {mouth.name.lower(): mouth for mouth in Mouth}
 FARTHEST = 1e8
-"""Greatest coordinate, m: enough for any map grid, and far from where float64 loses the millimetre."""
+"""Greatest coordinate, m: enough for any map grid, and small enough for float64 to keep the millimetre."""
 SLOT_AGREEMENT = 0.01
-"""Farthest, m, that a slot's polygon may lie from the rectangle that its properties describe."""
+"""Greatest distance, m, between a slot's polygon and the rectangle that its properties describe."""
 
 
 @dataclass(frozen=True)
 class LotProblem:
-    """Something wrong with a lot file; `feature` is the 0-based index in the FeatureCollection."""
+    """An error or warning about a lot file; `feature` is the 0-based index in the FeatureCollection."""
 
     severity: Literal["error", "warning"]
     feature: int | None
@@ -66,12 +67,13 @@ class LotProblem:
         return f"{self.severity}: {where}{self.message}"
 
 
-def write_lot(lot: ParkingLot, path: Path) -> None:
-    """See `ParkingLot.to_file`. The file appears whole or not at all.
+def write_lot(lot: ParkingLot, path: str | Path) -> None:
+    """Write a lot as native GeoJSON, which `read_lot` reads back exactly. The file appears whole or not at all.
 
     Raises:
         InputError: the name does not end in `.geojson` or `.json`, or the file cannot be written.
     """
+    path = Path(path)
     if path.suffix.lower() not in (".geojson", ".json"):
         raise InputError(f"{path}: a lot is written as .geojson or .json")
     head = {
@@ -100,9 +102,11 @@ def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
         (Mouth(mouth).name.lower() for mouth in lot.slot_mouth),
         strict=True,
     )
-    for slot_id, ring, shape in zip(lot.slot_ids, rings, shapes, strict=True):
+    costs = lot.slot_parking_cost_s.tolist()
+    for slot_id, ring, shape, cost in zip(lot.slot_ids, rings, shapes, costs, strict=True):
         exact = dict(zip(SLOT_SHAPE, shape, strict=True))
-        yield feature("Polygon", [ring], kind="slot", id=slot_id, **exact)
+        priced = {"parking_cost_s": cost} if cost else {}
+        yield feature("Polygon", [ring], kind="slot", id=slot_id, **priced, **exact)
     for lane in lot.lanes:
         yield feature("LineString", lane.points.tolist(), kind="lane", oneway=lane.oneway)
     for kind, points in (("entry", lot.entries), ("goal", lot.goals)):
@@ -115,12 +119,12 @@ def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
             yield feature("LineString", wall.tolist(), kind="wall")
 
 
-# ---- reading: all faults are gathered, so nothing below raises out of `read_contents` ----
+# ---- reading: all errors are collected, so nothing below raises out of `read_contents` ----
 
 
 @dataclass
 class LotContents:
-    """What a file holds, as far as it is sound; `numbers[kind]` are the feature numbers of what is held."""
+    """The valid features of a file; `numbers[kind]` are their feature numbers, `errors` the faults of the others."""
 
     name: str
     slot_ids: list[str] = field(default_factory=list)
@@ -145,13 +149,13 @@ class LotContents:
         }
 
     def error(self, feature: int | None, message: str) -> None:
-        """Note an error of a feature, or of the file as a whole."""
+        """Record an error of a feature, or of the file as a whole."""
         self.errors.append(LotProblem("error", feature, message))
 
 
 @dataclass(frozen=True)
 class _RawFeature:
-    """A feature whose geometry is sound so far: its parts are slices of one array of all positions."""
+    """A feature with a valid geometry: its parts are slices of one array of all positions."""
 
     number: int
     kind: str
@@ -161,7 +165,7 @@ class _RawFeature:
 
 
 def read_contents(path: Path) -> LotContents:
-    """All that a file holds and is sound, and all errors found on the way. Does not raise."""
+    """Read all valid features of a file, and record all errors. Does not raise."""
     contents = LotContents(path.stem)
     try:
         document = _load(path)
@@ -200,14 +204,14 @@ def read_contents(path: Path) -> LotContents:
 
     for feature in raw:
         if feature.kind != "slot":
-            _hold(contents, feature, [xy[part] for part in feature.parts])
+            _add_feature(contents, feature, [xy[part] for part in feature.parts])
     _read_slots(contents, [feature for feature in raw if feature.kind == "slot"], xy, exact=local)
     contents.errors.sort(key=lambda problem: -1 if problem.feature is None else problem.feature)
     return contents
 
 
-def _hold(contents: LotContents, feature: _RawFeature, parts: list[FloatArray]) -> None:
-    """Keep a lane, an entry, a goal, or a wall, which has a part for every ring."""
+def _add_feature(contents: LotContents, feature: _RawFeature, parts: list[FloatArray]) -> None:
+    """Add a lane, an entry, a goal, or a wall with one part per ring."""
     if feature.kind == "lane":
         try:
             contents.lanes.append(Lane(parts[0], feature.properties.get("oneway", False)))
@@ -238,16 +242,16 @@ def _load(path: Path) -> Any:
 
 
 def _check_head(document: Any, stem: str) -> tuple[str, bool]:
-    """The lot's name, and whether its positions are metres in a local frame."""
+    """Validate the head; return the lot's name, and whether positions are metres in a local frame."""
     if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
         kind = document.get("type") if isinstance(document, dict) else type(document).__name__
         raise InputError(f"type is {kind!r:.40}, want a GeoJSON 'FeatureCollection'")
     if not isinstance(document.get("features"), list):
         raise InputError(f"features is {document.get('features')!r:.40}, want a list of features")
-    made_as = document.get("parkenv", {"format": "lot", "version": LOT_VERSION})
-    if not isinstance(made_as, dict) or made_as.get("format") != "lot":
-        raise InputError(f'parkenv is {made_as!r:.60}, want {{"format": "lot", "version": {LOT_VERSION}}}')
-    version = made_as.get("version")
+    header = document.get("parkenv", {"format": "lot", "version": LOT_VERSION})
+    if not isinstance(header, dict) or header.get("format") != "lot":
+        raise InputError(f'parkenv is {header!r:.60}, want {{"format": "lot", "version": {LOT_VERSION}}}')
+    version = header.get("version")
     if type(version) is not int or version < 1:
         raise InputError(f"parkenv.version is {version!r:.40}, want {LOT_VERSION}")
     if version > LOT_VERSION:
@@ -263,7 +267,7 @@ def _check_head(document: Any, stem: str) -> tuple[str, bool]:
 def _check_feature(
     number: int, feature: Any, positions: list[tuple[float, float]], kinds_seen: set[object]
 ) -> _RawFeature:
-    """Append the feature's positions and say which they are."""
+    """Validate a feature and append its positions to `positions`."""
     if not isinstance(feature, dict) or feature.get("type") != "Feature":
         raise InputError("want a GeoJSON object of type 'Feature'")
     properties, geometry = (
@@ -314,9 +318,9 @@ def _is_number(value: Any) -> bool:
 
 
 def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, exact: bool) -> None:
-    """Check the slots of a file and hold the sound ones.
+    """Validate the slots of a file and add the valid ones.
 
-    The exact properties count where the frame is local: after a projection they cannot be told from stale.
+    Exact properties are used in a local frame only: after a projection stale ones would go unnoticed.
     """
     if not raw:
         return
@@ -324,33 +328,36 @@ def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, e
     area = shapely.area(shapely.convex_hull(polygons))
     valid = shapely.is_valid(polygons)
     first_with: dict[str, int] = {}
-    sound: list[int] = []
+    valid_rows: list[int] = []
     ids: list[str] = []
     shapes: list[tuple[float, ...] | None] = []
+    costs: list[float] = []
     for i, feature in enumerate(raw):
         try:
             slot_id = _slot_id(feature)
             if slot_id in first_with:
-                raise InputError(f"slot: id {slot_id!r:.40} stands already at feature {first_with[slot_id]}")
+                raise InputError(f"slot: id {slot_id!r:.40} appears already in feature {first_with[slot_id]}")
             first_with[slot_id] = feature.number
             if area[i] < SLOT_SIDE**2:
                 raise InputError(f"slot {slot_id!r:.40}: the polygon is flat, want an area to park on")
             if not valid[i]:
                 reason = shapely.is_valid_reason(polygons[i])
                 raise InputError(f"slot {slot_id!r:.40}: the polygon is not a simple one: {reason}")
+            cost = _parking_cost(feature.properties, slot_id)
             shapes.append(_slot_shape(feature.properties, slot_id) if exact else None)
         except InputError as error:
             contents.error(feature.number, str(error))
             continue
-        sound.append(i)
+        valid_rows.append(i)
         ids.append(slot_id)
+        costs.append(cost)
 
-    polygons = polygons[sound]
+    polygons = polygons[valid_rows]
     bare = np.array([shape is None for shape in shapes], dtype=bool)
     slots = slots_from_polygons(polygons[bare], contents.lanes)
     if not bare.all():
         # x, y, yaw, length, width, mouth
-        table = np.empty((len(sound), 6))
+        table = np.empty((len(valid_rows), 6))
         table[bare] = np.column_stack([slots.xy, slots.yaw, slots.length, slots.width, slots.mouth])
         table[~bare] = [shape for shape in shapes if shape is not None]
         slots = Slots(table[:, :2], table[:, 2], table[:, 3], table[:, 4], table[:, 5].astype(np.int8))
@@ -361,19 +368,19 @@ def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, e
     thin = slots.width < SLOT_SIDE
     for k in np.flatnonzero(disagrees):
         contents.error(
-            raw[sound[k]].number,
+            raw[valid_rows[k]].number,
             f"slot {ids[k]!r:.40}: the polygon lies {apart[k]:.2f} m from what center, yaw, length and width "
             f"say, want at most {SLOT_AGREEMENT:g} m",
         )
     for k in np.flatnonzero(thin):
         contents.error(
-            raw[sound[k]].number,
+            raw[valid_rows[k]].number,
             f"slot {ids[k]!r:.40}: the polygon is {slots.width[k]:.3f} m wide, want at least {SLOT_SIDE:g} m",
         )
     kept = np.flatnonzero(~disagrees & ~thin)
-    contents.slots = slots[kept]
+    contents.slots = replace(slots, parking_cost_s=np.array(costs, dtype=np.float64))[kept]
     contents.slot_ids = [ids[k] for k in kept]
-    contents.numbers["slot"] = [raw[sound[k]].number for k in kept]
+    contents.numbers["slot"] = [raw[valid_rows[k]].number for k in kept]
 
 
 def _polygons(rings: Sequence[FloatArray]) -> NDArray[np.object_]:
@@ -390,8 +397,16 @@ def _slot_id(feature: _RawFeature) -> str:
     return given
 
 
+def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
+    """Seconds that parking in a slot costs; 0 where the file does not say."""
+    cost = properties.get("parking_cost_s", 0.0)
+    if not _is_number(cost) or cost < 0.0:
+        raise InputError(f"slot {slot_id!r:.40}: parking_cost_s is {cost!r:.40}, want seconds, at least 0")
+    return float(cost)
+
+
 def _slot_shape(properties: dict[str, Any], slot_id: str) -> tuple[float, ...] | None:
-    """Exact x, y, yaw, length, width and mouth, or None where a slot has its polygon only."""
+    """Exact x, y, yaw, length, width and mouth, or None for a slot with its polygon only."""
     absent = [name for name in SLOT_SHAPE if name not in properties]
     if len(absent) == len(SLOT_SHAPE):
         return None
@@ -411,7 +426,7 @@ def _slot_shape(properties: dict[str, Any], slot_id: str) -> tuple[float, ...] |
 
 
 def graph_errors(contents: LotContents) -> list[LotProblem]:
-    """Slots and entries that no lane serves, crowded junctions: what only the drive graph shows."""
+    """Errors of the drive graph: slots and entries that no lane serves, junctions of too many lanes."""
     lanes = [(lane.points, lane.oneway) for lane in contents.lanes]
     if not lanes:
         return []
@@ -421,7 +436,7 @@ def graph_errors(contents: LotContents) -> list[LotProblem]:
     entries = np.array(contents.entries).reshape(-1, 2)
     errors = []
     while True:
-        # What does not fit is left out and the rest is tried again, so that all faults are found.
+        # Faulty features are left out and the rest is tried again, so that all faults are found.
         try:
             build_drive_graph(lanes, mouth_xy[left["slot"]], entries[left["entry"]])
         except GraphError as error:

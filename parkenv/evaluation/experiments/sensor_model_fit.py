@@ -1,4 +1,4 @@
-"""Fit a sensor model: count the errors of the perception pipeline in searches with simulated sensors."""
+"""Fit a surrogate sensor model to the perception pipeline's errors, counted in searches with simulated sensors."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.workers import HERE, Workers
+from parkenv.evaluation.simulate import Observer, Step, simulate
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorBand, SensorModel
 from planners.agent import make_agent
@@ -20,108 +21,120 @@ from planners.agent import make_agent
 IntArray = NDArray[np.int64]
 
 BAND_ENDS = (0.5, 3.5, 6.5, 9.5, 12.5, 16.0)
-"""m, from the car to a slot's vertex: upper ends of the distance bands; the first is the slot beside the car."""
+"""m, from the car to a slot's vertex; the first band is the slot at which the car stands."""
 AGENTS = ("greedy-drive", "mdp", "first-free")
-"""Agents that search, so that slots are observed from where searches lead."""
+"""Agents whose searches are counted: observations are made where searches go."""
 LEAST_OBSERVATIONS = 20
-"""Observations in a band from which its own rates are used, not those of all bands."""
-_INITIAL_MODEL = SensorModel(BAND_ENDS[-1], 0.98, 0.02)
+"""Observations in a band from which its own rates are taken, not those of all bands."""
+_ASSUMED = SensorModel(BAND_ENDS[-1], 0.98, 0.02)
 
 
 @dataclass(frozen=True, eq=False)
 class ObservationCounts:
-    """Counts of slots within sensor range after a step, by true and observed state.
+    """Slots in view after a step, and what the perception pipeline reported of them.
 
     Attributes:
-        counts: (bands, 2, 2, 3) int64, by distance band, by whether the slot is beside the car, by whether it is taken,
+        counts: (bands, 2, 2, 3) int64, by distance, by whether the slot lies beside the car, by whether it is taken,
             and by the observed state: none, free, taken.
     """
 
     counts: IntArray
 
     @classmethod
-    def zero(cls) -> ObservationCounts:
-        """Return counts of zero."""
+    def none(cls) -> ObservationCounts:
+        """Return zero counts."""
         return cls(np.zeros((len(BAND_ENDS), 2, 2, 3), dtype=np.int64))
 
     def __add__(self, other: ObservationCounts) -> ObservationCounts:
         return ObservationCounts(self.counts + other.counts)
 
-    def fit(self) -> SensorModel:
-        """Return the sensor model with these rates, each smoothed by half an observation (Jeffreys's prior).
+    def fitted(self) -> SensorModel:
+        """Return the sensor model with these rates; half an error is added to each band's (Jeffreys prior).
 
         Raises:
             InputError: too few observations.
         """
-        observed = self.counts.sum(axis=(0, 1))[:, 1:]
-        if observed.sum(axis=1).min() < LEAST_OBSERVATIONS:
-            free, taken = observed.sum(axis=1).tolist()
+        reported = self.counts.sum(axis=(0, 1))[:, 1:]
+        if reported.sum(axis=1).min() < LEAST_OBSERVATIONS:
             raise InputError(
-                f"{free} observations of free and {taken} of taken slots, want at least {LEAST_OBSERVATIONS} of each"
+                f"{reported.sum(axis=1).tolist()} observations of free and of taken slots, want at least "
+                f"{LEAST_OBSERVATIONS} of each"
             )
-        false_alarm, hit = _taken_rates(observed)
+        false_alarm, hit = _taken_rates(reported)
         bands = []
         for i, end in enumerate(BAND_ENDS):
             for beside in (False, True):
-                in_band = self.counts[i, int(beside)]
-                n, observed = in_band.sum(), in_band[:, 1:]
-                enough = observed.sum(axis=1).min() >= LEAST_OBSERVATIONS
-                rates = _taken_rates(observed) if enough else (false_alarm, hit)
-                seen = float(observed.sum() / n) if n else 0.0
+                counts = self.counts[i, int(beside)]
+                in_view, reported = counts.sum(), counts[:, 1:]
+                enough = reported.sum(axis=1).min() >= LEAST_OBSERVATIONS
+                rates = _taken_rates(reported) if enough else (false_alarm, hit)
+                seen = float(reported.sum() / in_view) if in_view else 0.0
                 bands.append(SensorBand(end, beside, round(seen, 4), round(rates[1], 4), round(rates[0], 4)))
         return SensorModel(BAND_ENDS[-1], round(hit, 4), round(false_alarm, 4), tuple(bands))
 
 
-def _taken_rates(observed: IntArray) -> tuple[float, float]:
-    """Return the fraction observed as taken of free slots and of taken slots, from (2, 2) counts."""
-    free, taken = (float((row[1] + 0.5) / (row.sum() + 1.0)) for row in observed)
+def _taken_rates(reported: IntArray) -> tuple[float, float]:
+    """Return the fraction observed as taken: of free slots, and of taken slots."""
+    free, taken = (float((row[1] + 0.5) / (row.sum() + 1.0)) for row in reported)
     return free, taken
 
 
+class _ObservationCounter(Observer):
+    """Counts what the perception pipeline reports after each step of a search, until the car is parked.
+
+    Args:
+        scenario: the world.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._starts, self._slots = scenario.slots_in_view
+        distance, beside = scenario.sight_lines
+        self._band = np.searchsorted(BAND_ENDS, distance)
+        self._beside = beside.astype(np.int64)
+        self.counts = ObservationCounts.none()
+
+    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        """Take the environment."""
+        del observation
+        self._env: Any = env.unwrapped
+
+    def on_step(self, step: Step) -> None:
+        """Compare the report with the true occupancy."""
+        if step.info["parked"]:
+            return
+        state, observed = self._env.state, self._env.perception.observation
+        rows = slice(self._starts[state.vertex], self._starts[state.vertex + 1])
+        near = self._slots[rows]
+        reported = np.zeros(len(near), dtype=np.int64)
+        reported[np.searchsorted(near, observed.slots)] = 1 + observed.taken
+        taken = state.world.occupied(near, state.time).astype(np.int64)
+        np.add.at(self.counts.counts, (self._band[rows], self._beside[rows], taken, reported), 1)
+
+
 def count_observations(
-    scenario: Scenario, rig: str, agent_name: str, seeds: Sequence[int], weather: str | None = None
+    scenario: Scenario, rig: str, agent: str, seeds: Sequence[int], weather: str | None = None
 ) -> ObservationCounts:
-    """Run searches with simulated sensors, and count observed against true slot states.
+    """Search with simulated sensors, and compare the perception pipeline's reports with the true occupancy.
 
     Args:
         scenario: the world.
         rig: `laser` or `stereo`.
-        agent_name: the agent that searches.
-        seeds: one for each search.
-        weather: None: drawn for each search.
+        agent: name of the agent that searches.
+        seeds: one per search.
+        weather: drawn for each search where None.
 
     Raises:
         InputError: an unknown rig.
     """
-    scenario = scenario.replace(sensor_model=_INITIAL_MODEL)
-    env = gym.make("parkenv/SearchPerception-v0", scenario=scenario, rig=rig, weather=weather)
-    agent = make_agent(agent_name, scenario)
-    starts, slots = scenario.slots_in_view
-    distance, beside = scenario.sight_lines
-    band = np.searchsorted(BAND_ENDS, distance)
-    counts = ObservationCounts.zero().counts
-    inner: Any = env.unwrapped
+    scenario = scenario.replace(sensor_model=_ASSUMED)
+    env = gym.make("parkenv/SearchPerception-v1", scenario=scenario, rig=rig, weather=weather)
+    searcher, counter = make_agent(agent, scenario), _ObservationCounter(scenario)
     for seed in seeds:
-        observation, _ = env.reset(seed=seed)
-        memory: Any = None
-        over = False
-        while not over:
-            action, memory = agent.predict(observation, memory)
-            observation, _, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
-            if info["parked"]:
-                break
-            state, observation_of_slots = inner.state, inner.perception.observation
-            rows = slice(starts[state.vertex], starts[state.vertex + 1])
-            near = slots[rows]
-            observed = np.zeros(len(near), dtype=np.int64)
-            observed[np.searchsorted(near, observation_of_slots.slots)] = 1 + observation_of_slots.taken
-            taken = state.world.occupied(near, state.time).astype(np.int64)
-            np.add.at(counts, (band[rows], beside[rows].astype(np.int64), taken, observed), 1)
-    return ObservationCounts(counts)
+        simulate(env, searcher, seed, (counter,))
+    return counter.counts
 
 
-def count_all_observations(
+def measure_sensors(
     scenarios: Sequence[Scenario],
     rig: str,
     searches: int,
@@ -131,25 +144,25 @@ def count_all_observations(
     workers: Workers = HERE,
     on_progress: Callable[[], None] = lambda: None,
 ) -> ObservationCounts:
-    """Sum `count_observations` over all `AGENTS` in all scenarios.
+    """Sum `count_observations` over all agents of `AGENTS` and all scenarios.
 
     Args:
         scenarios: worlds.
         rig: `laser` or `stereo`.
-        searches: of each agent in each scenario.
+        searches: per agent and scenario.
         seed: of the first search.
-        weather: None: drawn for each search.
-        workers: run the searches; the result does not depend on them.
+        weather: drawn for each search where None.
+        workers: where the searches run; the result does not depend on it.
         on_progress: called after each search.
     """
     tasks = [
-        partial(count_observations, scenario, rig, agent_name, [s], weather)
+        partial(count_observations, scenario, rig, agent, [s], weather)
         for scenario in scenarios
         for s in range(seed, seed + searches)
-        for agent_name in AGENTS
+        for agent in AGENTS
     ]
-    total = ObservationCounts.zero()
-    for _, counts in workers.results(tasks):
-        total += counts
+    counts = ObservationCounts.none()
+    for _, more in workers.results(tasks):
+        counts += more
         on_progress()
-    return total
+    return counts

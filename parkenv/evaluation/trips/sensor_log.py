@@ -6,22 +6,25 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
+import gymnasium as gym
 import numpy as np
+from gymnasium.wrappers import TimeLimit
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.evaluation.simulate import STEP_LIMIT, Observer, Step, simulate
 from parkenv.files.atomic_write import atomic_write
 from parkenv.world.lot import ParkingLot
 
 if TYPE_CHECKING:
     import rerun as rr
 
-    from parkenv.envs.perception import SearchPerceptionEnv
-    from parkenv.evaluation.trips.driven_search import DrivenSearch, Observation, Trip
+    from parkenv.envs.perception import OnboardPerception, SearchPerceptionEnv
+    from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
     from parkenv.mapping.grid import OccupancyGrid
     from parkenv.mapping.survey import Survey, SurveyFrame
     from parkenv.perception.pipeline import PerceptionResult
@@ -57,7 +60,7 @@ class SensorLog:
     def __init__(self, recording: rr.RecordingStream, lot: ParkingLot, rig: SensorRig) -> None:
         self._rec, self._lot, self._rig = recording, lot, rig
         self._path: list[list[float]] = []
-        self._captures = 0
+        self._n_captures = 0
         self._begun = self._time = 0.0
         corners = lot.slot_corners()[:, [0, 1, 2, 3, 0]]
         self._outlines = np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=2)
@@ -66,7 +69,7 @@ class SensorLog:
 
     def begin(self) -> None:
         """Another drive begins, behind what was recorded so far."""
-        self._begun = 0.0 if not self._captures else self._time + PAUSE_S
+        self._begun = 0.0 if not self._n_captures else self._time + PAUSE_S
         self._path = []
 
     def capture(self, time: float, result: PerceptionResult) -> None:
@@ -116,7 +119,7 @@ class SensorLog:
             if cars
             else rr.Clear(recursive=False),
         )
-        self._captures += 1
+        self._n_captures += 1
 
     def slots(self, p_occupied: FloatArray, known: NDArray[np.bool_] | None = None) -> None:
         """What is believed of every slot, (n_slots,), now; grey where nothing is `known`."""
@@ -133,8 +136,8 @@ class SensorLog:
         )
 
     def grid(self, grid: OccupancyGrid) -> None:
-        """The occupancy grid as it is now, every `GRID_EVERY` captures."""
-        if (self._captures - 1) % GRID_EVERY:
+        """The occupancy grid as it is now, every `GRID_EVERY` moments."""
+        if (self._n_captures - 1) % GRID_EVERY:
             return
         import rerun as rr
 
@@ -264,27 +267,43 @@ def record_session(survey: Survey, number: int, log: SensorLog) -> None:
     survey.drive(number, on_frame=keep)
 
 
-def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: SensorLog) -> None:
-    """Search once through the sensors, and record it.
+class _SearchLogger(Observer):
+    """Records what the sensors of a search captured, and the belief, after every decision.
 
     Args:
-        env: the world.
-        agent: who searches, made for its scenario.
+        log: where to.
+        perception: of the environment.
+    """
+
+    def __init__(self, log: SensorLog, perception: OnboardPerception) -> None:
+        self._log, self._perception = log, perception
+
+    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        """Begin a drive."""
+        self._log.begin()
+        self._start = env.unwrapped.state.arrival.time  # type: ignore[attr-defined]
+        self._record(observation)
+
+    def on_step(self, step: Step) -> None:
+        """Record the captures of the step."""
+        self._record(step.next_observation)
+
+    def _record(self, observation: Any) -> None:
+        for result in self._perception.results:
+            self._log.capture(result.captured.time - self._start, result)
+        self._log.slots(observation["p_occupied"].astype(np.float64))
+
+
+def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: SensorLog) -> None:
+    """Search once with simulated sensors, and record it.
+
+    Args:
+        env: the environment.
+        agent: made for its scenario.
         seed: of the world.
         log: where to; of the environment's lot and rig.
     """
-    log.begin()
-    observation, _ = env.reset(seed=seed)
-    begun, memory, over = env.state.arrival.time, None, False
-    while True:
-        for result in env.perception.results:
-            log.capture(result.captured.time - begun, result)
-        log.slots(observation["p_occupied"].astype(np.float64))
-        if over:
-            return
-        action, memory = agent.predict(observation, memory)
-        observation, _, terminated, truncated, _ = env.step(int(action))
-        over = terminated or truncated
+    simulate(TimeLimit(env, STEP_LIMIT), agent, seed, (_SearchLogger(log, env.perception),))
 
 
 def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
@@ -298,17 +317,10 @@ def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
     Raises:
         InputError: a search without a rig.
     """
-    perception, env = search.env.perception, search.env
+    perception = search.env.perception
     if perception is None:
-        raise InputError("a trip is recorded as its sensors see it, and this one has none: give it a rig")
-    log.begin()
-
-    def keep(observation: Observation) -> None:
-        for result in perception.results:
-            log.capture(result.captured.time - env.state.arrival.time, result)
-        log.slots(observation["p_occupied"].astype(np.float64))
-
-    return search.run(seed, on_step=keep)
+        raise InputError("a recorded trip needs sensors: give it a rig")
+    return search.run(seed, (_SearchLogger(log, perception),))
 
 
 def _jpeg(image: NDArray[np.uint8]) -> bytes:

@@ -3,8 +3,6 @@
 import copy
 import json
 import re
-import subprocess
-import sys
 from contextlib import suppress
 from dataclasses import dataclass, field
 from xml.sax.saxutils import quoteattr
@@ -12,19 +10,21 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import pytest
 import shapely
+from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from parkenv import ParkingLot, Scenario
+from parkenv import make_scenario
 from parkenv.cli import app
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.figures.import_picture import save_import_picture
+from parkenv.lots import packaged_lot, read_lot, write_lot
 from parkenv.lots.checks import check_lot
+from parkenv.lots.importers.import_options import ImportOptions
+from parkenv.lots.importers.lot_import import import_lot
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.places.lot_draft import Wishes
-from parkenv.lots.places.lot_import import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import Mouth
@@ -34,7 +34,6 @@ AISLE = {"highway": "service", "service": "parking_aisle"}
 SERVICE = {"highway": "service"}
 STREET = {"highway": "residential", "name": "Hauptstraße"}
 SPACE = {"amenity": "parking_space"}
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 
 
 @dataclass
@@ -141,10 +140,10 @@ class Map:
                 feature(f"node/{number[point]}", tags, "Point", at[number[point]])
         return json.dumps({"type": "FeatureCollection", "features": features})
 
-    def draft(self, tmp_path, **wishes):
+    def draft(self, tmp_path, **options):
         path = tmp_path / "place.osm"
         path.write_text(self.xml(), encoding="utf-8")
-        return import_lot(path, Wishes(**wishes))
+        return import_lot(path, ImportOptions(**options))
 
 
 def car_park():
@@ -239,20 +238,20 @@ def test_multipolygons_are_the_same_in_xml_and_json(tmp_path):
 
 
 def test_native_lots_pass_through(tmp_path):
-    lot = ParkingLot.packaged("mini")
-    lot.to_file(tmp_path / "mini.geojson")
+    lot = packaged_lot("mini")
+    write_lot(lot, tmp_path / "mini.geojson")
     assert import_lot(tmp_path / "mini.geojson").lot() == lot
-    moved = import_lot(tmp_path / "mini.geojson", Wishes(goals=((3.0, 4.0),))).lot()
+    moved = import_lot(tmp_path / "mini.geojson", ImportOptions(goals=((3.0, 4.0),))).lot()
     assert moved.goals.tolist() == [[3.0, 4.0]]
-    with pytest.raises(InputError, match="bounds go with OpenStreetMap"):
-        import_lot(tmp_path / "mini.geojson", Wishes(bounds=((0, 0), (9, 9))))
+    with pytest.raises(InputError, match="bounds apply to OpenStreetMap"):
+        import_lot(tmp_path / "mini.geojson", ImportOptions(bounds=((0, 0), (9, 9))))
 
 
 def test_a_map_is_no_lot_and_the_error_says_what_makes_one_of_it(tmp_path):
     for name, text in (("a.osm", car_park().xml()), ("a.json", car_park().overpass(geometry=True))):
         (tmp_path / name).write_text(text)
         with pytest.raises(InputError, match=r"`parkenv lot import .* makes a lot of it"):
-            ParkingLot.from_file(tmp_path / name)
+            read_lot(tmp_path / name)
 
 
 @given(st.floats(-179.9, 179.9), st.floats(-85, 85), st.floats(-3000, 3000), st.floats(-3000, 3000))
@@ -365,7 +364,7 @@ def test_slots_that_no_way_leads_to_are_listed(tmp_path):
     # A one-way aisle from the lot's far side to the service road: nobody gets onto it.
     place.way([(-40, 20), (0, 20)], AISLE, oneway="yes").box(-20, 23, -17.5, 28, SPACE)
     draft = place.draft(tmp_path)
-    assert reasons(draft)["slots that no way leads to from an entry"] == ("way/31",)
+    assert reasons(draft)["slots that cannot be reached from an entry"] == ("way/31",)
     assert draft.lot().n_slots == 22
 
 
@@ -784,12 +783,12 @@ FAULTS = [
     (
         "a.osm",
         with_text(lambda t: t.replace("<way", '<node id="1" lat="48.1" lon="7.8"/><way', 1)),
-        r"node/1 stands twice, at 4\d\.\d+, 7\.\d+ and at 48\.1, 7\.8",
+        r"node/1 appears twice, at 4\d\.\d+, 7\.\d+ and at 48\.1, 7\.8",
     ),
     (
         "a.osm",
         with_text(lambda t: t.replace("</osm>", '<way id="1"><nd ref="2"/><nd ref="1"/></way></osm>')),
-        "way/1 stands twice, with other nodes",
+        "way/1 appears twice, with other nodes",
     ),
     (
         "a.osm",
@@ -986,10 +985,10 @@ PLACES = {
 
 @pytest.mark.parametrize("name", PLACES)
 def test_a_search_runs_on_what_was_imported(tmp_path, name):
-    PLACES[name]().draft(tmp_path).lot().to_file(tmp_path / "lot.geojson")
+    write_lot(PLACES[name]().draft(tmp_path).lot(), tmp_path / "lot.geojson")
     assert check_lot(tmp_path / "lot.geojson") == []
-    lot = ParkingLot.from_file(tmp_path / "lot.geojson")
-    scenario = Scenario.on_lot(lot)
+    lot = read_lot(tmp_path / "lot.geojson")
+    scenario = make_scenario(lot)
     for agent in ("mdp", "greedy-drive"):
         rows = Case(scenario, agent).run(range(4))[0]
         assert all(row["parked"] for row in rows)
@@ -1007,10 +1006,10 @@ def test_the_command_line_imports_draws_and_checks(tmp_path):
     assert done.exit_code == 0, done.output
     assert "22 slots from amenity=parking_space" in done.output
     assert "left out: spaces for disabled drivers: 2 (way/5, way/7)" in done.output
-    assert ParkingLot.from_file(lot).n_slots == 22
+    assert read_lot(lot).n_slots == 22
     assert picture.stat().st_size > 10_000
     assert run("import", place, "--out", lot, "--disabled").exit_code == 0
-    assert ParkingLot.from_file(lot).n_slots == 24
+    assert read_lot(lot).n_slots == 24
     refused = run("import", place, "--out", lot, "--goal", "48")
     assert str(refused.exception) == "--goal is '48', want 2 numbers with commas between"
 
@@ -1019,7 +1018,7 @@ def test_the_command_line_draws_what_it_refuses_and_writes_no_lot(tmp_path):
     bare = Map().way([(0, 0), (50, 0)], AISLE).box(9, 3, 12, 8, SPACE)
     (tmp_path / "bare.osm").write_text(bare.xml(), encoding="utf-8")
     words = ["lot", "import", "bare.osm", "--out", "bare.geojson", "--picture", "bare.png"]
-    done = subprocess.run([*PARKENV, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = parkenv(*words, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("parkenv: error: bare.osm: no entry")
     assert done.stderr.count("\n") == 1
