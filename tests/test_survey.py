@@ -146,7 +146,7 @@ def test_the_search_and_its_worlds_are_the_same_as_without_sensors():
 def test_a_rig_that_cannot_see_or_range_is_refused():
     laser = SensorRig(lasers=(("laser", LaserScanner(), Mount(z=0.5)),))
     with pytest.raises(InputError, match="no camera, or no ranging sensor"):
-        PerceptionPipeline(laser, Scenario.named("mini").lot)
+        PerceptionPipeline(laser, make_scenario("mini").lot)
 
 
 @pytest.mark.parametrize(
