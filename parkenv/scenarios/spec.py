@@ -282,7 +282,15 @@ class ScenarioSpec(Spec):
         SensorModelSpec, BeforeValidator(_sensor_tables, json_schema_input_type=str | SensorModelSpec)
     ] = SensorModelSpec(name="perfect")
     rig: RigName = Field("laser", description="The sensors of the car, where they are simulated.")
-    traffic: TrafficSpec = TrafficSpec()
+    traffic: TrafficSpec | None = Field(
+        None, description="Other road users; none if absent, some in surveys."
+    )
+
+    @property
+    def title(self) -> str:
+        """The name that the scenario has in tables: its own, or else the lot's."""
+        lot = self.lot
+        return self.name or lot.name or (lot.file.stem if lot.file else "city" if lot.city else "grid")
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
