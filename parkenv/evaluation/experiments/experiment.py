@@ -26,6 +26,7 @@ from parkenv.evaluation.experiments.compare import (
 from parkenv.evaluation.experiments.results import ResultFolder, Row
 from parkenv.evaluation.experiments.spec import SPEC_FILE, ExperimentSpec
 from parkenv.evaluation.experiments.workers import HERE, Workers
+from parkenv.evaluation.figures.registry import ComparisonResults, remove_figures
 from parkenv.evaluation.trips.calibration import Calibration
 from parkenv.files.spec_file import Spec
 from parkenv.scenarios.build import build
@@ -220,6 +221,18 @@ class ExperimentResult:
     occupancy_rows: list[Row]
     complete: bool
 
+    def figure_data(self) -> ComparisonResults:
+        """What the figures of a comparison are drawn from."""
+        flat = {name: (name.partition(MAP_SAYS)[0], p) for name, (_, p) in self.experiment.maps.items()}
+        return ComparisonResults(
+            self.experiment.cases,
+            self.folder.episodes,
+            self.rows,
+            self.occupancy_rows,
+            flat,
+            self.experiment.spec.seed,
+        )
+
 
 def run_experiment(
     spec: ExperimentSpec,
@@ -265,6 +278,7 @@ def run_experiment(
     cases = experiment.cases + experiment.occupancy_cases
     with workers:
         folder = ResultFolder(out, experiment.settings(), resume=resume, overwrite=overwrite)
+        remove_figures(out)
         spec.write(out / SPEC_FILE)
         on_start(sum(len(seeds) for _, seeds in cases))
         try:
