@@ -184,12 +184,15 @@ def _message(model: type[BaseModel], error: ValidationError, source: str) -> str
     # A misspelt key first: it explains a missing one.
     first = min(details, key=lambda d: d["type"] != "extra_forbidden")
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
-    return f"{source}{': ' if source else ''}{_fault(model, first)}{more}"
+    if source.startswith("--"):
+        # An option is the field.
+        return _fault(model, first, source)
+    field = ".".join(str(part) for part in first["loc"])
+    return f"{source}{': ' if source else ''}{_fault(model, first, field)}{more}"
 
 
-def _fault(model: type[BaseModel], detail: ErrorDetails) -> str:
+def _fault(model: type[BaseModel], detail: ErrorDetails, field: str) -> str:
     location, kind = detail["loc"], detail["type"]
-    field = ".".join(str(part) for part in location)
     if kind == "extra_forbidden":
         place = f" in [{field.rpartition('.')[0]}]" if len(location) > 1 else ""
         return f"unknown key {location[-1]!r}{place}; {nearest(str(location[-1]), _keys_at(model, location[:-1]))}"

@@ -142,7 +142,7 @@ class BenchmarkSpec(Workplace):
     """A run of a benchmark suite: scenarios, costs, speeds and seeds are the suite's."""
 
     kind: Literal["benchmark"] = "benchmark"
-    suite: Literal["v1"] = "v1"
+    suite: str = "v1"
     agents: Several[AgentItem] = Field(
         tuple(
             AgentSpec(name=name)
