@@ -36,7 +36,7 @@ class Agent(Protocol):
 
 
 class SearchAgent(ABC, Generic[Memory]):
-    """Base of the agents for `parkenv/Search-v0`: one decision at a time, batches handled here.
+    """Base of the agents for `parkenv/Search-v1`: one decision at a time, batches handled here.
 
     An agent object holds what it knows of the problem and never changes; what it remembers of an episode
     travels in `state`, so one object may serve many episodes at once.
@@ -66,7 +66,7 @@ class SearchAgent(ABC, Generic[Memory]):
         """stable-baselines3's interface: single observations, or batches of them with a leading axis.
 
         Args:
-            observation: from `parkenv/Search-v0` or a vector of them.
+            observation: from `parkenv/Search-v1` or a vector of them.
             state: what the last call returned; None at the start.
             episode_start: for each environment, whether its episode has just begun. With None, it has
                 where there is no state.
