@@ -19,6 +19,7 @@ from parkenv.cli import (
     park,
     plan,
     report,
+    run,
     sensor_model,
     sensors,
     survey,
@@ -37,6 +38,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("compare")(compare.compare)
+app.command("run")(run.run)
 app.command("plan")(plan.plan)
 app.command("park")(park.park)
 app.command("trip")(calibrate.trip)
