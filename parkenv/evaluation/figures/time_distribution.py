@@ -39,7 +39,7 @@ def time_distributions(results: ComparisonResults) -> Iterator[tuple[str, Figure
             continue
         panels = settings.setdefault((c["failure_cost_s"], c["v_walk_kmh"], c["v_drive_kmh"]), {})
         totals = panels.setdefault(c["scenario"], {})
-        totals[case.agent] = np.array([episode["total_s"] for episode in episodes])
+        totals[case.label] = np.array([episode["total_s"] for episode in episodes])
         totals[BOUND] = np.array([episode["bound_s"] for episode in episodes])
     for setting, panels in settings.items():
         for totals in panels.values():
