@@ -5,8 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
-from parkenv import Lane, Mouth, ParkingLot, Scenario
+from parkenv import Lane, Mouth, ParkingLot, make_scenario
 from parkenv.evaluation.experiments.compare import Case
+from parkenv.lots import read_lot, write_lot
 
 # Twelve slots on either side of one aisle that runs east; cars stand nose-in, so they are entered at the rear.
 x = 6.0 + 2.5 * np.arange(12)
@@ -24,10 +25,10 @@ lot = ParkingLot(
 )
 with tempfile.TemporaryDirectory() as folder:
     file = Path(folder) / "yard.geojson"
-    lot.to_file(file)
-    assert ParkingLot.from_file(file) == lot
+    write_lot(lot, file)
+    assert read_lot(file) == lot
 
-scenario = Scenario.on_lot(lot)
+scenario = make_scenario(lot)
 for agent in ("mdp", "greedy-goal", "greedy-drive", "oracle"):
     rows, _ = Case(scenario, agent).run(range(50))
     print(f"{agent:13s} {np.mean([row['total_s'] for row in rows]):6.1f} s")

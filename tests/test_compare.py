@@ -6,26 +6,20 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import PARKENV, parkenv
 from scipy import stats
 
-from parkenv import InputError, ParkingLot, SensorModel
+from parkenv import InputError, SensorModel
 from parkenv.evaluation.experiments.results import EPISODE_COLUMNS, ResultFolder
 from parkenv.evaluation.experiments.statistics import mean_interval, summarize
+from parkenv.lots import packaged_lot, write_lot
 
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 DATA = Path(__file__).parents[2] / "shared" / "data"
-
-
-def parkenv(*arguments, **options):
-    return subprocess.run(
-        [*PARKENV, *map(str, arguments)], capture_output=True, text=True, timeout=600, check=False, **options
-    )
 
 
 def small(out, *more, agents="mdp,greedy-goal,oracle", episodes=12):
@@ -275,7 +269,7 @@ LOG = "datetime,camera,slot_id,weather,occupied\n"
 @pytest.fixture
 def lot_file(tmp_path):
     path = tmp_path / "lot.geojson"
-    ParkingLot.packaged("mini").to_file(path)
+    write_lot(packaged_lot("mini"), path)
     return path
 
 

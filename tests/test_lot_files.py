@@ -8,9 +8,14 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.sparse.csgraph import connected_components, dijkstra
+from typer.testing import CliRunner
 
+from parkenv.cli import app
 from parkenv.errors import InputError
+from parkenv.evaluation.figures.lot_picture import save_lot_picture
+from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.build import LOTS, build
 from parkenv.lots.checks import check_lot
 from parkenv.lots.lot_files import PACKAGED_LOTS
@@ -55,7 +60,7 @@ def written(tmp_path, content) -> Path:
 
 
 def read(tmp_path, content) -> ParkingLot:
-    return ParkingLot.from_file(written(tmp_path, content))
+    return read_lot(written(tmp_path, content))
 
 
 def with_exact(slot, **changes):
@@ -68,7 +73,7 @@ def with_exact(slot, **changes):
 
 @pytest.mark.parametrize("name", PACKAGED_LOTS)
 def test_packaged_lots_are_what_their_script_makes(name, tmp_path):
-    lot = ParkingLot.packaged(name)
+    lot = packaged_lot(name)
     assert lot == LOTS[name]()
     build(tmp_path)
     committed = Path(__file__).parents[1] / "parkenv" / "lots" / "packaged" / f"{name}.geojson"
@@ -78,7 +83,7 @@ def test_packaged_lots_are_what_their_script_makes(name, tmp_path):
 
 def test_unknown_packaged_lot_lists_the_known_ones():
     with pytest.raises(InputError, match="no packaged lot 'camp', want one of campus, jam, street, mini"):
-        ParkingLot.packaged("camp")
+        packaged_lot("camp")
 
 
 @given(
@@ -91,11 +96,12 @@ def test_unknown_packaged_lot_lists_the_known_ones():
     name=st.text(),
     goal=points,
     walls=st.lists(st.lists(points, min_size=2, max_size=5), max_size=3),
+    cost=st.just(0.0) | st.floats(0.0, 1e8),
 )
 def test_written_lots_are_read_back_to_the_bit(
-    tmp_path, rows, columns, pitch, aisle, turn, shift, name, goal, walls
+    tmp_path, rows, columns, pitch, aisle, turn, shift, name, goal, walls, cost
 ):
-    grid = ParkingLot.grid(rows, columns, name=name, pitch=pitch, aisle=aisle)
+    grid = grid_lot(rows, columns, name=name, pitch=pitch, aisle=aisle)
     matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
 
     def moved(xy):
@@ -112,10 +118,11 @@ def test_written_lots_are_read_back_to_the_bit(
         entries=moved(grid.entries),
         goals=[goal],
         walls=tuple(map(np.array, walls)),
+        slot_parking_cost_s=np.linspace(0.0, cost, grid.n_slots),
     )
     path = tmp_path / "lot.geojson"
-    lot.to_file(path)
-    again = ParkingLot.from_file(path)
+    write_lot(lot, path)
+    again = read_lot(path)
     assert again == lot
     assert again.slot_xy.tobytes() == lot.slot_xy.tobytes()
     assert again.edge_length.tobytes() == lot.edge_length.tobytes()
@@ -123,18 +130,31 @@ def test_written_lots_are_read_back_to_the_bit(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_cities_are_read_back_to_the_bit(tmp_path, seed):
-    lot = ParkingLot.city(200, seed)
-    lot.to_file(tmp_path / "city.json")
-    assert ParkingLot.from_file(tmp_path / "city.json") == lot
+    lot = city_lot(200, seed)
+    write_lot(lot, tmp_path / "city.json")
+    assert read_lot(tmp_path / "city.json") == lot
     assert check_lot(tmp_path / "city.json") == []
 
 
 def test_closed_walls_are_polygons_in_the_file(tmp_path):
-    lot = ParkingLot.packaged("mini")
-    lot.to_file(tmp_path / "mini.geojson")
+    lot = packaged_lot("mini")
+    write_lot(lot, tmp_path / "mini.geojson")
     features = json.loads((tmp_path / "mini.geojson").read_text())["features"]
     shapes = [f["geometry"]["type"] for f in features if f["properties"]["kind"] == "wall"]
     assert shapes == ["LineString", "Polygon"]
+
+
+def test_parking_costs_need_no_exact_shape_and_stand_with_their_slot(tmp_path):
+    doc = document()
+    doc["features"][1]["properties"]["parking_cost_s"] = 120
+    assert read(tmp_path, doc).slot_parking_cost_s.tolist() == [0.0, 120.0]
+    with_exact(doc["features"][0], parking_cost_s=7.5)
+    lot = read(tmp_path, doc)
+    assert lot.slot_parking_cost_s.tolist() == [7.5, 120.0]
+    write_lot(replace(lot, slot_parking_cost_s=[0.0, 120.0]), tmp_path / "again.geojson")
+    slots = [f["properties"] for f in json.loads((tmp_path / "again.geojson").read_text())["features"][:2]]
+    assert "parking_cost_s" not in slots[0]  # files of lots without costs stay as they are
+    assert slots[1]["parking_cost_s"] == 120.0
 
 
 def test_a_lot_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
@@ -148,7 +168,7 @@ def test_a_lot_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "write_text", full_disk)
     with pytest.raises(InputError, match="cannot be written: No space left on device"):
-        ParkingLot.packaged("mini").to_file(path)
+        write_lot(packaged_lot("mini"), path)
     monkeypatch.undo()
     assert path.read_text() == "before"
     assert list(tmp_path.iterdir()) == [path]
@@ -156,9 +176,9 @@ def test_a_lot_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
 
 def test_a_lot_is_not_written_where_it_could_not_be_read(tmp_path):
     with pytest.raises(InputError, match=r"written as \.geojson or \.json"):
-        ParkingLot.packaged("mini").to_file(tmp_path / "lot.yml")
+        write_lot(packaged_lot("mini"), tmp_path / "lot.yml")
     with pytest.raises(InputError, match="cannot be written"):
-        ParkingLot.packaged("mini").to_file(tmp_path / "nowhere" / "lot.geojson")
+        write_lot(packaged_lot("mini"), tmp_path / "nowhere" / "lot.geojson")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -204,7 +224,7 @@ def test_outlines_alone_tell_the_same_lots(tmp_path, name):
     for f in doc["features"]:
         if f["properties"]["kind"] == "slot":
             f["properties"] = {"kind": "slot", "id": f["properties"]["id"]}
-    lot, known = read(tmp_path, doc), ParkingLot.packaged(name)
+    lot, known = read(tmp_path, doc), packaged_lot(name)
     np.testing.assert_array_equal(lot.slot_mouth, known.slot_mouth)
     np.testing.assert_allclose(lot.slot_xy, known.slot_xy, atol=2e-3)
     np.testing.assert_allclose(lot.slot_length, known.slot_length, atol=4e-3)
@@ -216,9 +236,9 @@ def test_longitude_and_latitude_become_metres(tmp_path):
     from pyproj import Geod
 
     geod = Geod(ellps="WGS84")
-    known = ParkingLot.packaged("jam")
+    known = packaged_lot("jam")
     path = tmp_path / "jam.geojson"
-    known.to_file(path)
+    write_lot(known, path)
     doc = json.loads(path.read_text())
     del doc["frame"], doc["parkenv"]
 
@@ -281,7 +301,7 @@ needs_dragon_lake = pytest.mark.skipif(
 
 @needs_dragon_lake
 def test_dragon_lake_is_a_drivable_lot():
-    lot = ParkingLot.from_file(DRAGON_LAKE)
+    lot = read_lot(DRAGON_LAKE)
     assert lot.n_slots == 364
     assert lot.slot_ids[0] == "A-0-0"
     assert {"A-0-41", "B-1-24", "I-0-20"} < set(lot.slot_ids)
@@ -294,7 +314,7 @@ def test_dragon_lake_is_a_drivable_lot():
 
 @needs_dragon_lake
 def test_dragon_lake_is_not_driven_through_parked_rows():
-    lot = ParkingLot.from_file(DRAGON_LAKE)
+    lot = read_lot(DRAGON_LAKE)
     source, column = np.nonzero(lot.neighbors >= 0)
     ways = np.stack([lot.vertex_xy[source], lot.vertex_xy[lot.neighbors[source, column]]], axis=1)
     slots = shapely.polygons(lot.slot_corners())
@@ -310,7 +330,7 @@ def test_dragon_lake_is_not_driven_through_parked_rows():
 
 @needs_dragon_lake
 def test_dragon_lake_rows_open_to_their_own_aisles():
-    lot = ParkingLot.from_file(DRAGON_LAKE)
+    lot = read_lot(DRAGON_LAKE)
     vertex_y = dict(zip(lot.slot_ids, lot.vertex_xy[:364, 1], strict=True))
     for slot, aisle in (
         ("A-0-3", 64.95),
@@ -328,9 +348,9 @@ def test_dragon_lake_rows_open_to_their_own_aisles():
 
 @needs_dragon_lake
 def test_dragon_lake_goes_through_the_native_format(tmp_path):
-    lot = ParkingLot.from_file(DRAGON_LAKE)
-    lot.to_file(tmp_path / "dlp.geojson")
-    assert ParkingLot.from_file(tmp_path / "dlp.geojson") == lot
+    lot = read_lot(DRAGON_LAKE)
+    write_lot(lot, tmp_path / "dlp.geojson")
+    assert read_lot(tmp_path / "dlp.geojson") == lot
     assert check_lot(tmp_path / "dlp.geojson") == []
 
 
@@ -346,7 +366,7 @@ def test_a_map_that_is_none_is_refused(tmp_path, text, message):
     path = tmp_path / "map.yml"
     path.write_text(text)
     with pytest.raises(InputError, match=message) as caught:
-        ParkingLot.from_file(path)
+        read_lot(path)
     assert "\n" not in str(caught.value)
     (problem,) = check_lot(path)
     assert problem.severity == "error"
@@ -396,6 +416,14 @@ FAULTS = [
     (set_feature(2, "lane", "Polygon", box(0, 0, 1, 1)), 2, "lane: geometry is 'Polygon', want LineString"),
     (set_feature(5, "wall", "Point", [0, 0]), 5, "wall: geometry is 'Point', want LineString or Polygon"),
     (lambda d: d["features"][3].update(geometry=None), 3, "entry: geometry is None, want Point"),
+    *(
+        (
+            lambda d, cost=cost: d["features"][1]["properties"].update(parking_cost_s=cost),
+            1,
+            f"slot 'b': parking_cost_s is {cost!r}, want seconds, at least 0",
+        )
+        for cost in (-1, "2 EUR", None, True, float("nan"), float("inf"))
+    ),
     (
         set_feature(3, "entry", "Point", [0, float("nan")]),
         3,
@@ -484,7 +512,7 @@ def test_faults_are_named(tmp_path, change, number, message):
     assert [problem.feature for problem in errors] == [number]
     assert message in errors[0].message
     with pytest.raises(InputError) as caught:
-        ParkingLot.from_file(path)
+        read_lot(path)
     where = "" if number is None else f"feature {number}: "
     assert str(caught.value) == f"{path}: {where}{errors[0].message}"
     assert "\n" not in str(caught.value)
@@ -503,7 +531,7 @@ def test_faults_are_named(tmp_path, change, number, message):
 def test_files_that_are_no_geojson_are_refused(tmp_path, text, message):
     path = written(tmp_path, text)
     with pytest.raises(InputError, match=message):
-        ParkingLot.from_file(path)
+        read_lot(path)
     (problem,) = check_lot(path)
     assert problem.feature is None
 
@@ -517,12 +545,12 @@ def test_every_cut_of_a_file_is_refused(tmp_path):
 
 def test_files_that_are_not_there_or_no_text_are_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be read: No such file"):
-        ParkingLot.from_file(tmp_path / "lot.geojson")
+        read_lot(tmp_path / "lot.geojson")
     with pytest.raises(InputError, match=r"unknown kind of file '\.osm'"):
-        ParkingLot.from_file(tmp_path / "lot.osm")
+        read_lot(tmp_path / "lot.osm")
     (tmp_path / "lot.json").write_bytes(b'{"name": "\xff"}')
     with pytest.raises(InputError, match="not UTF-8 text"):
-        ParkingLot.from_file(tmp_path / "lot.json")
+        read_lot(tmp_path / "lot.json")
 
 
 def test_metres_without_a_frame_are_refused(tmp_path):
@@ -554,7 +582,7 @@ def test_all_faults_are_listed_at_once(tmp_path):
     with pytest.raises(
         InputError, match=r"feature 0: kind .* \(and 3 more; `parkenv lot check .* lists all\)"
     ):
-        ParkingLot.from_file(path)
+        read_lot(path)
 
 
 WARNINGS = [
@@ -589,7 +617,7 @@ def test_slips_of_the_pen_are_warned_of_and_read(tmp_path, change, number, messa
     problems = check_lot(path)
     assert {p.severity for p in problems} == {"warning"}
     assert any(p.feature == number and message in p.message for p in problems), problems
-    assert ParkingLot.from_file(path).n_slots == 2
+    assert read_lot(path).n_slots == 2
 
 
 def test_slots_that_cannot_be_reached_or_left_are_warned_of(tmp_path):
@@ -649,6 +677,26 @@ def test_no_content_makes_the_checker_raise(tmp_path, data):
     errors = [p for p in check_lot(path) if p.severity == "error"]
     if errors:
         with pytest.raises(InputError):
-            ParkingLot.from_file(path)
+            read_lot(path)
     else:
-        ParkingLot.from_file(path)
+        read_lot(path)
+
+
+# ---- the command line ----
+
+
+def test_commands_state_parking_costs_and_draw_them(tmp_path):
+    costs = np.array([0.0, 0.0, 30.0, 60.0, 90.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    lot = replace(packaged_lot("mini"), slot_parking_cost_s=costs)
+    write_lot(lot, tmp_path / "priced.geojson")
+    for words in (["check"], ["show", "--out", str(tmp_path / "priced.png")]):
+        told = CliRunner().invoke(app, ["lot", words[0], str(tmp_path / "priced.geojson"), *words[1:]])
+        assert told.exit_code == 0, told.output
+        assert "parking costs 0 to 90 s (3 slots above 0)" in told.output
+    save_lot_picture(packaged_lot("mini"), tmp_path / "plain.png")
+    pictures = [
+        np.asarray(Image.open(tmp_path / f"{name}.png").convert("RGB")) for name in ("priced", "plain")
+    ]
+    # Three differently coloured slots on asphalt that is grey everywhere on the plain lot.
+    vivid = [int((np.ptp(picture.astype(int), axis=2) > 60).sum()) for picture in pictures]
+    assert vivid[0] > 3 * vivid[1]

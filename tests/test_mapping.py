@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from parkenv import InputError, ParkingLot, Scenario
+from parkenv import InputError, make_scenario
+from parkenv.lots import packaged_lot
 from parkenv.mapping.discovery import discover, score_discovery
 from parkenv.mapping.grid import P_FREE, P_OCCUPIED, OccupancyGrid
 from parkenv.mapping.inference import MapPrior, SessionLog, counted, predict
@@ -76,7 +77,7 @@ def test_a_grid_without_area_is_refused():
 
 @pytest.fixture(scope="module")
 def mini():
-    return Scenario.named("mini").lot
+    return make_scenario("mini").lot
 
 
 def drive_by(lot, scene, noise=None, step=1.0):
@@ -223,9 +224,9 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 def test_a_map_is_a_prior_of_a_search():
     import gymnasium as gym
 
-    lot = Scenario.named("mini").lot
+    lot = make_scenario("mini").lot
     log = sessions([40_000.0] * 9, [np.arange(lot.n_slots) % 2 == 0] * 9)
-    scenario = Scenario.named("mini", prior=MapPrior(log))
+    scenario = make_scenario("mini", prior=MapPrior(log))
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     observation, _ = env.reset(seed=0)
     even = observation["p_occupied"][::2]
@@ -273,7 +274,7 @@ def test_files_that_are_no_maps_are_refused(mini, tmp_path):
     newer = sqlite3.connect(tmp_path / "newer")
     newer.execute(f"PRAGMA user_version = {VERSION + 1}")
     newer.commit()
-    MapStore(tmp_path / "else", ParkingLot.packaged("jam")).close()
+    MapStore(tmp_path / "else", packaged_lot("jam")).close()
     for name, message in (
         ("text", "is no map file"),
         ("other", "no map file of parkenv"),
@@ -297,7 +298,7 @@ import sys, numpy as np
 from pathlib import Path
 from parkenv import ParkingLot
 from parkenv.mapping.store import MapStore, Session
-lot = ParkingLot.packaged("mini")
+lot = packaged_lot("mini")
 with MapStore(Path(sys.argv[1]), lot) as store:
     for k in range(int(sys.argv[3])):
         store.add(Session(f"{sys.argv[2]}{k:04d}", 0.0, "laser", "rain", np.full(lot.n_slots, 0.7), np.zeros((50, 3))))
@@ -339,7 +340,7 @@ def test_a_kill_leaves_whole_sessions_only(mini, tmp_path):
 
 
 def test_slots_are_found_where_cars_stand_again_and_again():
-    lot = ParkingLot.packaged("campus")
+    lot = packaged_lot("campus")
     rng = np.random.default_rng(3)
     seen = []
     for _ in range(20):

@@ -16,13 +16,14 @@ from hypothesis import strategies as st
 from numba.core.errors import TypingError
 
 import parkenv
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorBand, SensorModel
+from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.envs.search_alone import held
 from parkenv.envs.wrappers import ThesisReward
+from parkenv.lots import grid_lot
+from parkenv.scenarios.spec import SCENARIO_NAMES
 from parkenv.world.decay import decay_factor
 from parkenv.world.lot import PARK
-from parkenv.world.scenario import SCENARIO_NAMES
 
 ENV_IDS = [name for name in gym.registry if name.startswith("parkenv/Search")]
 
@@ -110,7 +111,7 @@ def test_resets_without_a_seed_go_through_other_worlds_of_the_same_seed():
 @settings(max_examples=20)
 def test_the_world_does_not_depend_on_who_drives(seed):
     """Two cars that behave differently meet the same slot states at the same times."""
-    scenario = Scenario.named("street")
+    scenario = make_scenario("street")
     worlds = []
     for policy in (0, 1):
         env = gym.make("parkenv/Search-v0", scenario=scenario)
@@ -156,7 +157,7 @@ def test_the_thesis_reward_differs_by_r_max_on_success():
 
 
 def two_slots(taken):
-    lot = ParkingLot.grid(1, 2, aisle=6.0)
+    lot = grid_lot(1, 2, aisle=6.0)
     return Scenario(name="two", lot=lot, occupancy=always(lot, np.array(taken)), failure_s=7.0, wait_s=2.0)
 
 
@@ -267,7 +268,7 @@ def test_observations_are_not_live_buffers():
 
 def test_only_slots_in_view_are_learnt_of():
     """The belief of a slot that was never in view stays at its forecast, whatever stands there."""
-    scenario = Scenario.named("campus", sensor_model=SensorModel(view_range=6.0))
+    scenario = make_scenario("campus", sensor_model=SensorModel(view_range=6.0))
     env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
     observation, _ = env.reset(seed=0)
     lot, forecast = scenario.lot, env.state.belief.prior
@@ -300,7 +301,7 @@ def test_fading_is_the_exponential(x):
 
 
 def test_the_belief_in_a_slot_left_behind_grows_old():
-    lot = ParkingLot.grid(1, 12)
+    lot = grid_lot(1, 12)
     process = OccupancyProcess.from_demand(np.zeros(12), np.zeros(168), 600.0)
     scenario = Scenario(name="a", lot=lot, occupancy=process, sensor_model=SensorModel(view_range=0.0))
     env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
@@ -331,7 +332,7 @@ def test_a_seed_holds_after_going_on_from_another_search():
 
 
 def test_noisy_sight_errs_as_often_as_stated():
-    lot = ParkingLot.grid(4, 25)
+    lot = grid_lot(4, 25)
     taken = np.arange(lot.n_slots) % 2 == 0
     scenario = Scenario(
         name="noisy",
@@ -352,7 +353,7 @@ def test_noisy_sight_errs_as_often_as_stated():
 
 
 def test_sight_differs_by_distance_and_side():
-    lot = Scenario.named("mini").lot
+    lot = make_scenario("mini").lot
     bands = (
         SensorBand(up_to=1.0, beside=True, seen_rate=1.0, hit_rate=1.0, false_alarm_rate=0.0),
         SensorBand(up_to=6.0, beside=True, seen_rate=0.5, hit_rate=0.9, false_alarm_rate=0.1),
@@ -412,7 +413,7 @@ def test_wrong_bands_are_named(wrong, message):
         ({"goal": 9}, "goal is 9"),
         ({"entry": -1}, "entry"),
         ({"sensor_model": 3}, "SensorModel"),
-        ({"scenario": "moon"}, "unknown scenario 'moon'; known: campus"),
+        ({"scenario": "moon"}, "unknown scenario 'moon', and no such file; known: campus"),
         ({"scenario": 3}, "want a Scenario"),
         ({"render_mode": "hologram"}, "render_mode"),
     ],
@@ -435,7 +436,7 @@ def test_wrong_use_is_refused():
         with pytest.raises(InputError, match="action is"):
             env.step(wrong)
     with pytest.raises(InputError, match="slots"):
-        Scenario(name="x", lot=ParkingLot.grid(1, 3), occupancy=always(None, np.array([True])))
+        Scenario(name="x", lot=grid_lot(1, 3), occupancy=always(None, np.array([True])))
     for wrong in ({"hit_rate": 1.2}, {"view_range": -1.0}, {"hit_rate": 0.2, "false_alarm_rate": 0.3}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             SensorModel(**wrong)

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from parkenv import InputError, ParkingLot, Scenario
+from parkenv import InputError, make_scenario
 from parkenv.cli import app
 from parkenv.driving.driven_lines import KEPT_RIGHT_M, DrivenLines
 from parkenv.driving.encounters import WATCHED_S
@@ -33,6 +33,7 @@ from parkenv.evaluation.trips.driven_search import DrivenSearch, DrivenSearchEnv
 from parkenv.evaluation.trips.driver import ACROSS, ALONG, NO_ROOM, TAKEN, TURN, GraphDriver
 from parkenv.evaluation.trips.lot_driver import DrivingStyle, LotDriver
 from parkenv.evaluation.trips.sensor_log import record_trip
+from parkenv.lots import packaged_lot
 from parkenv.world.keyed_random import world_key
 from parkenv.world.lot_scene import LotScenes
 from parkenv.world.occupancy import OccupancyProcess
@@ -44,25 +45,25 @@ from planners.driving.path_tracking import TrackingSettings
 from sim_sensors.rig import SensorRig
 
 CAR = VehicleParameters()
-MINI = Scenario.named("mini")
+MINI = make_scenario("mini")
 LOTS = ("campus", "jam", "street", "mini")
 
 
 @lru_cache
 def lines_of(name):
-    lot = ParkingLot.packaged(name)
+    lot = packaged_lot(name)
     return lot, DrivenLines(lot)
 
 
 @lru_cache
 def searched(name, blind=False, notice_m=2.0):
-    scenario = Scenario.named(name)
+    scenario = make_scenario(name)
     return DrivenSearch(unseen(scenario) if blind else scenario, style=DrivingStyle(notice_m=notice_m))
 
 
 def started(name, seed=0, **kinds):
     """A driver in the world of a seed, at the entry, and the world."""
-    scenario = Scenario.named(name)
+    scenario = make_scenario(name)
     driver = LotDriver(scenario, **kinds)
     key = world_key(seed, 0)
     arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
@@ -160,7 +161,7 @@ def test_a_lane_keeper_stays_near_its_path_at_any_speed_and_slows_down_in_turns(
 @pytest.mark.parametrize("name", ["mini", "campus"])
 def test_with_the_graphs_times_a_trip_is_the_search_itself(name):
     """Replace what was driven by what the graph says, and every decision and second is that of Search-v0."""
-    scenario = unseen(Scenario.named(name))
+    scenario = unseen(make_scenario(name))
     agent = make_agent("mdp", scenario)
     plain, driven = SearchEnv(scenario), DrivenSearchEnv(scenario, GraphDriver(scenario))
     failed = 0
@@ -292,7 +293,7 @@ def test_with_sensors_the_belief_is_what_the_stack_sees_and_not_what_is_so(monke
 @pytest.mark.slow
 def test_with_sensors_what_was_never_captured_changes_nothing():
     """Other cars in slots out of reach of every capture so far: the same beliefs, decisions and times."""
-    campus = Scenario.named("campus")
+    campus = make_scenario("campus")
     lot, taken = campus.lot, np.arange(campus.lot.n_slots) % 2 == 0
     entry = lot.vertex_xy[int(lot.entry_vertices[0])]
     away = np.hypot(*(lot.slot_xy - entry).T)
@@ -317,7 +318,7 @@ def test_with_sensors_what_was_never_captured_changes_nothing():
 
 
 def busy(name, cars, pedestrians):
-    return Scenario.named(name, traffic=Traffic(cars, pedestrians))
+    return make_scenario(name, traffic=Traffic(cars, pedestrians))
 
 
 @pytest.mark.parametrize(
@@ -499,7 +500,7 @@ def test_a_failed_try_takes_longer_the_later_it_is_noticed_and_ends_on_the_lane(
 
 
 def test_a_slot_too_narrow_for_the_car_is_left_and_not_sought_again():
-    lot = ParkingLot.packaged("mini")
+    lot = packaged_lot("mini")
     width = lot.slot_width.copy()
     narrow = np.arange(0, lot.n_slots, 2)
     width[narrow] = 2.2

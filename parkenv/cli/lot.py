@@ -4,26 +4,19 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 from rich.console import Console
 
 from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
-from parkenv.world.lot import ParkingLot
+
+if TYPE_CHECKING:
+    from parkenv.world.lot import ParkingLot
 
 app = typer.Typer(help="Show, check, import and convert lots.", no_args_is_help=True)
-
-
-def _load(lot: str) -> ParkingLot:
-    from parkenv.lots.lot_files import PACKAGED_LOTS
-
-    if lot in PACKAGED_LOTS:
-        return ParkingLot.packaged(lot)
-    if not Path(lot).exists():
-        raise InputError(f"{lot}: no such file, nor a packaged lot ({', '.join(PACKAGED_LOTS)})")
-    return ParkingLot.from_file(lot)
 
 
 @app.command()
@@ -34,17 +27,31 @@ def show(
 ) -> None:
     """Draw a lot, and say what is in it."""
     from parkenv.evaluation.figures.lot_picture import save_lot_picture
+    from parkenv.lots import load_lot
 
-    its_lot = _load(lot)
+    its_lot = load_lot(lot)
     picture = out or Path(f"{its_lot.name}.png")
     save_lot_picture(its_lot, picture, show_graph=graph)
-    low_x, low_y, high_x, high_y = its_lot.bounds()
-    oneway = sum(lane.oneway for lane in its_lot.lanes)
-    make_console().print(
-        f"{its_lot.name}: {its_lot.n_slots} slots, {len(its_lot.lanes)} lanes ({oneway} one-way), "
-        f"{len(its_lot.entries)} entries, {len(its_lot.goals)} goals, {its_lot.n_vertices} vertices, "
-        f"{high_x - low_x:.0f} × {high_y - low_y:.0f} m. Drawn in {picture}",
-    )
+    make_console().print(f"{_summary(its_lot)}. Drawn in {picture}")
+
+
+def _summary(lot: ParkingLot) -> str:
+    low_x, low_y, high_x, high_y = lot.bounds()
+    oneway = sum(lane.oneway for lane in lot.lanes)
+    parts = [
+        f"{lot.name}: {lot.n_slots} slots",
+        f"{len(lot.lanes)} lanes ({oneway} one-way)",
+        f"{len(lot.entries)} entries",
+        f"{len(lot.goals)} goals",
+        f"{lot.n_vertices} vertices",
+        f"{high_x - low_x:.0f} × {high_y - low_y:.0f} m",
+    ]
+    cost = lot.slot_parking_cost_s
+    if cost.any():
+        parts.append(
+            f"parking costs {cost.min():g} to {cost.max():g} s ({np.count_nonzero(cost)} slots above 0)"
+        )
+    return ", ".join(parts)
 
 
 @app.command()
@@ -55,7 +62,8 @@ def check(
 
     Exit code 2 where there are errors; warnings alone leave it at 0.
     """
-    from parkenv.lots.checks import check_lot
+    from parkenv.lots import check_lot, read_lot
+    from parkenv.lots.file_formats import lot_format
 
     console = Console(highlight=False, soft_wrap=True)
     problems = check_lot(file)
@@ -73,6 +81,9 @@ def check(
         console.print(f"{file}: {errors} errors, {len(problems) - errors} warnings", markup=False)
     if errors:
         raise typer.Exit(2)
+    file_format = lot_format(file)
+    if file_format is not None and file_format.is_complete:
+        console.print(_summary(read_lot(file)), markup=False)
 
 
 @app.command("import")
@@ -116,8 +127,8 @@ def import_place(
     * `parkenv lot import map.osm --out lot.geojson --picture lot.png`
     * `parkenv lot import slots.csv --out lot.geojson --entry 0,0 --goal 40,25`
     """
+    from parkenv.lots import import_lot, write_lot
     from parkenv.lots.places.lot_draft import Wishes
-    from parkenv.lots.places.lot_import import import_lot
 
     corners = None if bounds is None else _numbers("--bounds", bounds, 4)
     wishes = Wishes(
@@ -141,8 +152,8 @@ def import_place(
         lot = draft.lot()
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
-    lot.to_file(out)
-    console.print(f"Wrote {out}: {lot.n_slots} slots, {lot.n_vertices} vertices", markup=False)
+    write_lot(lot, out)
+    console.print(f"Wrote {out}. {_summary(lot)}", markup=False)
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:
@@ -161,5 +172,7 @@ def convert(
     out: Annotated[Path, typer.Argument(help="The GeoJSON file to write.")],
 ) -> None:
     """Write a lot as native GeoJSON, e.g. to edit it."""
-    _load(lot).to_file(out)
+    from parkenv.lots import load_lot, write_lot
+
+    write_lot(load_lot(lot), out)
     make_console().print(f"Wrote {out}")

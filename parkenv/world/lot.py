@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
-from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -88,7 +87,9 @@ class ParkingLot:
         lanes: the centre lines that cars drive along.
         entries: (n_entries, 2) float64, m, where cars come in; each must lie near a lane.
         goals: (n_goals, 2) float64, m, where people walk to; anywhere.
-        walls: polylines, (k, 2) m each; they stop the eye, not the walker.
+        walls: polylines, (k, 2) m each; they block the view, not the walker.
+        slot_parking_cost_s: (n_slots,) float64, s, at least 0: what parking in each slot costs, as time. A price
+            is converted by the value of time: 2 € at 12 € per hour are 600 s. Empty: all 0.
 
     Attributes:
         vertex_xy: (n_vertices, 2) float64, m.
@@ -102,7 +103,8 @@ class ParkingLot:
         GraphError: slots or entries that no lane serves, or more than four lanes out of one junction.
 
     Examples:
-        >>> lot = ParkingLot.packaged("mini")
+        >>> from parkenv.lots import packaged_lot
+        >>> lot = packaged_lot("mini")
         >>> lot.n_slots
         10
         >>> lot.neighbors.shape == (lot.n_vertices, 4)
@@ -120,6 +122,7 @@ class ParkingLot:
     entries: FloatArray
     goals: FloatArray
     walls: tuple[FloatArray, ...] = ()
+    slot_parking_cost_s: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     vertex_xy: FloatArray = field(init=False)
     vertex_yaw: FloatArray = field(init=False)
@@ -140,11 +143,14 @@ class ParkingLot:
             raise InputError(f"lot {self.name!r}: slot id {twice!r} stands twice")
         set_field("slot_ids", tuple(self.slot_ids))
         set_field("lanes", tuple(self.lanes))
+        if np.size(self.slot_parking_cost_s) == 0:
+            set_field("slot_parking_cost_s", np.zeros(n))
         for name, shape in (
             ("slot_xy", (n, 2)),
             ("slot_yaw", (n,)),
             ("slot_length", (n,)),
             ("slot_width", (n,)),
+            ("slot_parking_cost_s", (n,)),
             ("entries", (len(self.entries), 2)),
             ("goals", (len(self.goals), 2)),
         ):
@@ -157,6 +163,9 @@ class ParkingLot:
             least = getattr(self, name).min()
             if least < SLOT_SIDE:
                 raise InputError(f"lot {self.name!r}: {name} {least:g} m, want at least {SLOT_SIDE:g}")
+        if self.slot_parking_cost_s.min() < 0.0:
+            least = self.slot_parking_cost_s.min()
+            raise InputError(f"lot {self.name!r}: slot_parking_cost_s {least:g} s, want at least 0")
         mouth = np.array(self.slot_mouth, dtype=np.int8)
         if mouth.shape != (n,) or not np.isin(mouth, list(Mouth)).all():
             raise InputError(f"lot {self.name!r}: slot_mouth must hold {n} values of {list(map(int, Mouth))}")
@@ -240,68 +249,6 @@ class ParkingLot:
         source, target, length = source[order], target[order], length[order]
         first = np.r_[True, (np.diff(source) != 0) | (np.diff(target) != 0)]
         return csr_array((length[first], (source[first], target[first])), shape=shape)
-
-    @classmethod
-    def from_file(cls, path: str | Path) -> Self:
-        """Read a lot from native GeoJSON (`.geojson`, `.json`) or a Dragon Lake map (`.yml`).
-
-        Raises:
-            InputError: the file cannot be read or is no lot; `parkenv lot check` lists all faults.
-        """
-        from parkenv.lots.lot_files import read_lot
-
-        return read_lot(cls, Path(path))
-
-    def to_file(self, path: str | Path) -> None:
-        """Write native GeoJSON that `from_file` reads back exactly."""
-        from parkenv.lots.geojson import write_lot
-
-        write_lot(self, Path(path))
-
-    @classmethod
-    def packaged(cls, name: str) -> Self:
-        """One of the lots that come with the package: campus, jam, street, mini."""
-        from parkenv.lots.lot_files import packaged_lot
-
-        return packaged_lot(cls, name)
-
-    @classmethod
-    def grid(
-        cls,
-        rows: int,
-        columns: int,
-        *,
-        name: str = "grid",
-        pitch: float = 2.5,
-        depth: float = 5.0,
-        aisle: float = 6.0,
-    ) -> Self:
-        """Rows of perpendicular slots along parallel two-way aisles, joined by a road at either end.
-
-        Rows lie in pairs back to back: row 0 south of the first aisle, rows 1 and 2 between the first and
-        the second, and so on. The entry is at the west end of the south aisle, the goal east of the lot.
-
-        Args:
-            rows: rows of slots; two rows share an aisle.
-            columns: slots a row.
-            name: the lot's name.
-            pitch: width of a slot, m.
-            depth: length of a slot, m.
-            aisle: width of an aisle and of the end roads, m.
-        """
-        from parkenv.lots.generators import grid_lot
-
-        return grid_lot(cls, rows, columns, name=name, pitch=pitch, depth=depth, aisle=aisle)
-
-    @classmethod
-    def city(cls, n_slots: int, seed: int = 0) -> Self:
-        """Kerbside slots round the blocks of a city of one-way and two-way streets, with exactly `n_slots`.
-
-        A million slots take seconds. The same seed gives the same city.
-        """
-        from parkenv.lots.generators import city_lot
-
-        return city_lot(cls, n_slots, seed)
 
 
 def mouth_heading(yaw: FloatArray, mouth: NDArray[np.int8]) -> FloatArray:
