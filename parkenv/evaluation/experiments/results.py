@@ -49,14 +49,6 @@ _BOOL = {"parked", "truncated"}
 SETTINGS = "settings.json"
 SUMMARY = "summary.json"
 SUMMARY_PARTIAL = "summary.partial.json"
-PICTURES = (
-    "time_split_",
-    "time_against_occupancy_",
-    "time_against_failure_cost_",
-    "time_against_map_",
-    "searches_",
-)
-"""What the names of a comparison's figures begin with."""
 
 Row = dict[str, Any]
 Key = tuple[Any, ...]
@@ -124,10 +116,19 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) 
 
 
 def _parts(name: str, was: Any, its: Any) -> list[tuple[str, Any, Any]]:
-    """A setting then and now; one that is a mapping by each name that both have."""
-    if isinstance(was, dict) and isinstance(its, dict):
-        return [(f"{name}: {key}", was[key], its[key]) for key in sorted(was.keys() & its.keys())]
-    return [(name, was, its)]
+    """A setting then and now; a mapping by each name that both have, and what stands there by every name."""
+    if not (isinstance(was, dict) and isinstance(its, dict)):
+        return [(name, was, its)]
+    parts: list[tuple[str, Any, Any]] = []
+    for key in sorted(was.keys() & its.keys()):
+        old, new = was[key], its[key]
+        if isinstance(old, dict) and isinstance(new, dict):
+            parts += [
+                (f"{key}.{part}", old.get(part), new.get(part)) for part in sorted(old.keys() | new.keys())
+            ]
+        else:
+            parts.append((f"{name}: {key}", old, new))
+    return parts
 
 
 def make_folder(path: Path) -> None:
@@ -184,9 +185,6 @@ class ResultFolder:
                 f"--out {path}: holds {state} comparison; add --resume to go on with it, --overwrite to replace it, "
                 "or name another folder"
             )
-        for picture in path.glob("*.png"):
-            if picture.name.startswith(PICTURES):
-                picture.unlink()
         (path / SUMMARY).unlink(missing_ok=True)
         write_settings(path, settings)
         # Rewritten from what could be read: a line that a crash tore is gone, and its episode runs again.

@@ -102,8 +102,10 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
     state: SearchState | None = None
     for case in encounter.cases:
         agent = make_agent(case.agent, case.scenario, **case.options)
-        recorder = SearchRecorder(case.agent, PlanPreview(case.scenario.public(), agent))
-        EpisodeRunner(case.scenario, case.agent, agent, case.rig).run(encounter.seed, (recorder,))
+        recorder = SearchRecorder(case.label, PlanPreview(case.scenario.public(), agent))
+        EpisodeRunner(case.scenario, case.label, agent, case.rig, case.detector).run(
+            encounter.seed, (recorder,)
+        )
         state, search = recorder.state, recorder.recording
         before = counted.get(case.key(encounter.seed))
         search["counted_s"] = before
