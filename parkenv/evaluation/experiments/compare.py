@@ -243,7 +243,7 @@ def table(cases: Sequence[tuple[Case, range]], folder: ResultFolder) -> list[Row
     return rows
 
 
-def against_occupancy(rows: Sequence[Row], edges: Sequence[float]) -> list[Row]:
+def against_occupancy(rows: Sequence[Mapping[str, Any]], edges: Sequence[float]) -> list[Row]:
     """Total time against how full the lot was at the arrival, from episodes as they came.
 
     Args:
@@ -253,7 +253,7 @@ def against_occupancy(rows: Sequence[Row], edges: Sequence[float]) -> list[Row]:
     Returns:
         Rows with agent, failure_cost_s, occupancy (the bin's mean), total_s, total_s_ci95, episodes.
     """
-    bins: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
+    bins: dict[tuple[Any, ...], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
         place = int(np.searchsorted(edges, row["occupancy"], side="right")) - 1
         if 0 <= place < len(edges) - 1:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from parkenv.evaluation.report.search_recording import describe_lot
+from parkenv.evaluation.report.lot_data import describe_lot
 from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.survey import Survey, SurveyFrame
 from parkenv.perception.pipeline import CameraView, PerceptionResult
