@@ -543,8 +543,8 @@ def test_bad_input_is_one_clear_error():
     with pytest.raises(InputError, match="this one has none: give it a rig"):
         record_trip(searched("mini"), 0, None)
     for words, message in (
-        (["--rerun", "trip.rrd"], "add --sensors laser"),
-        (["--unseen", "--sensors", "laser"], "--unseen and --sensors"),
+        (["--rerun", "trip.rrd"], "add --rig laser"),
+        (["--unseen", "--rig", "laser"], "--unseen and --rig"),
     ):
         result = CliRunner().invoke(app, ["trip", "--scenario", "mini", *words])
         assert isinstance(result.exception, InputError)
@@ -633,7 +633,9 @@ def test_trips_are_gone_on_with_where_they_were_left(tmp_path):
 def test_the_commands_calibrate_compare_and_film(tmp_path):
     run = CliRunner().invoke
     out = tmp_path / "calibrate"
-    result = run(app, ["calibrate", "--scenario", "mini", "--trips", "3", "--seed", "0", "--out", str(out)])
+    result = run(
+        app, ["calibrate", "--scenario", "mini", "--episodes", "3", "--seed", "0", "--out", str(out)]
+    )
     assert result.exit_code == 0, result.output
     summary = json.loads((out / "summary.json").read_text())
     made = Calibration.from_file(out / "calibrated.json")
@@ -694,7 +696,7 @@ def test_the_commands_calibrate_compare_and_film(tmp_path):
         assert picture.size == (640, 480)
         assert picture.n_frames > 40
     recording = tmp_path / "trip.rrd"
-    words = ["trip", "--scenario", "mini", "--seed", "3", "--sensors", "laser", "--rerun", str(recording)]
+    words = ["trip", "--scenario", "mini", "--seed", "3", "--rig", "laser", "--rerun", str(recording)]
     result = run(app, [*words, "--out", str(film)])
     assert result.exit_code == 0, result.output
     assert recording.stat().st_size > 50_000
