@@ -7,6 +7,7 @@ import numpy as np
 
 from parkenv import Lane, Mouth, ParkingLot, Scenario
 from parkenv.evaluation.experiments.compare import Case
+from parkenv.lots import read_lot, write_lot
 
 # Twelve slots on either side of one aisle that runs east; cars stand nose-in, so they are entered at the rear.
 x = 6.0 + 2.5 * np.arange(12)
@@ -24,8 +25,8 @@ lot = ParkingLot(
 )
 with tempfile.TemporaryDirectory() as folder:
     file = Path(folder) / "yard.geojson"
-    lot.to_file(file)
-    assert ParkingLot.from_file(file) == lot
+    write_lot(lot, file)
+    assert read_lot(file) == lot
 
 scenario = Scenario.on_lot(lot)
 for agent in ("mdp", "greedy-goal", "greedy-drive", "oracle"):

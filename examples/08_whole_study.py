@@ -9,17 +9,18 @@ from pathlib import Path
 
 import numpy as np
 
-from parkenv import ParkingLot, Scenario
+from parkenv import Scenario
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.experiments.surveys import run_survey, summarize
+from parkenv.lots import grid_lot
 from parkenv.mapping.inference import MapPrior
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SurveySettings
 from parkenv.world.flat_map import FlatMap
 from parkenv.world.occupancy import ArrivalWindow
 
-lot = ParkingLot.grid(4, 20)
+lot = grid_lot(4, 20)
 world = Scenario.on_lot(lot, arrival=ArrivalWindow.parse("11:00-13:00"))
 print(f"{lot.n_slots} slots")
 

@@ -5,6 +5,7 @@ from dataclasses import fields
 import numpy as np
 
 from parkenv import Lane, ParkingLot, SensorModel
+from parkenv.lots import grid_lot
 from parkenv.world.scenario import SearchProblem
 
 SHAPES = ((1, 12), (2, 6), (4, 3), (2, 5), (3, 4), (1, 9))
@@ -24,7 +25,7 @@ def small_lot(seed: int, shapes=SHAPES):
     The slots' chances rise with the walk, are all the same, or follow a beta distribution.
     """
     rng = np.random.default_rng([7, seed])
-    plain = ParkingLot.grid(*shapes[seed % len(shapes)], pitch=PITCHES[seed // 6 % 3])
+    plain = grid_lot(*shapes[seed % len(shapes)], pitch=PITCHES[seed // 6 % 3])
     west, south, east, north = plain.bounds()
     goal = [[rng.uniform(west - 10.0, east + 10.0), rng.uniform(south - 10.0, north + 10.0)]]
     problem = SearchProblem(
@@ -47,7 +48,7 @@ def small_lot(seed: int, shapes=SHAPES):
 
 def cut_in_two():
     """Two lots side by side; the entry leads into the western one alone."""
-    west = ParkingLot.grid(2, 5)
+    west = grid_lot(2, 5)
     f = features(west)
     shift = np.array([200.0, 0.0])
     n = west.n_slots

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from small_lots import cut_in_two
 
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorModel
+from parkenv import InputError, OccupancyProcess, Scenario, SensorModel
 from parkenv.evaluation.experiments.compare import Case, settings_of
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
+from parkenv.lots import grid_lot
 from parkenv.world.scenario import SCENARIO_NAMES, SearchProblem
 from planners import AGENT_NAMES, make_agent
 
@@ -137,7 +138,7 @@ def parked_slot(scenario, agent, **options):
 
 
 def test_strategies_park_where_their_names_say():
-    lot = ParkingLot.grid(2, 30)
+    lot = grid_lot(2, 30)
     walk, rng = lot.walk_m(), np.random.default_rng(5)
     taken = rng.random(lot.n_slots) < 0.6
     scenario = frozen_world(lot, taken)
@@ -159,7 +160,7 @@ def test_strategies_park_where_their_names_say():
 
 
 def test_strategies_find_the_only_free_slot():
-    lot = ParkingLot.grid(4, 12)
+    lot = grid_lot(4, 12)
     taken = np.ones(lot.n_slots, dtype=bool)
     taken[29] = False
     scenario = frozen_world(lot, taken)
@@ -169,7 +170,7 @@ def test_strategies_find_the_only_free_slot():
 
 @pytest.mark.parametrize("agent", ["mdp", "greedy-goal", "greedy-drive", "first-free", "random"])
 def test_a_full_lot_is_given_up_once_it_is_proven_full(agent):
-    lot = ParkingLot.grid(2, 5)
+    lot = grid_lot(2, 5)
     scenario = frozen_world(lot, np.ones(lot.n_slots, dtype=bool), give_up_s=500.0)
     row = EpisodeRunner(scenario, agent, make_agent(agent, scenario)).run(0).row
     assert not row["parked"]
@@ -179,7 +180,7 @@ def test_a_full_lot_is_given_up_once_it_is_proven_full(agent):
 
 
 def test_a_search_cut_off_is_charged_like_one_that_gave_up():
-    lot = ParkingLot.grid(2, 5)
+    lot = grid_lot(2, 5)
     scenario = frozen_world(lot, np.ones(lot.n_slots, dtype=bool), failure_s=1.0, give_up_s=500.0)
     scenario = scenario.replace(sensor_model=SensorModel(view_range=0.0))
     row = EpisodeRunner(scenario, "mdp-static", make_agent("mdp-static", scenario)).run(0).row
@@ -193,7 +194,7 @@ def test_a_search_cut_off_is_charged_like_one_that_gave_up():
 
 def test_the_planner_plans_again_only_when_a_probability_changes():
     """Where the forecast is what is seen, nothing changes but that slots become certain."""
-    lot = ParkingLot.grid(2, 20)
+    lot = grid_lot(2, 20)
     scenario = frozen_world(lot, np.arange(lot.n_slots) % 2 == 0, sensor_model=SensorModel(view_range=0.0))
     agent = make_agent("mdp", scenario)
     env = gym.make("parkenv/Search-v0", scenario=scenario)
@@ -213,7 +214,7 @@ def test_the_planner_plans_again_only_when_a_probability_changes():
 
 
 def test_the_static_planner_keeps_trying_its_taken_slot():
-    lot = ParkingLot.grid(2, 8)
+    lot = grid_lot(2, 8)
     scenario = frozen_world(lot, np.ones(lot.n_slots, dtype=bool), sensor_model=SensorModel(view_range=0.0))
     row = EpisodeRunner(scenario, "mdp-static", make_agent("mdp-static", scenario)).run(0).row
     assert row["failed_parks"] > 100

@@ -9,6 +9,7 @@ from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorMo
 from parkenv.evaluation.experiments.compare import Case, at_occupancy
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.statistics import mean_interval
+from parkenv.lots import grid_lot
 from parkenv.world.sensor_model import SensorBand
 from planners import make_agent
 from planners.belief.agent import WORK_PER_MS
@@ -98,7 +99,7 @@ def test_decisions_keep_to_their_budget(monkeypatch):
 
 
 def test_it_parks_at_once_in_an_empty_lot_that_is_known_to_be():
-    lot = ParkingLot.grid(2, 20)
+    lot = grid_lot(2, 20)
     empty = world(lot, np.zeros(lot.n_slots, dtype=bool), prior_logit=-5.0)
     row = search(empty)
     assert row["total_s"] == pytest.approx(row["bound_s"], abs=1.0)
@@ -180,7 +181,7 @@ def test_doubt_stays_small_where_the_map_is_right():
 
 
 def test_nothing_free_anywhere_ends_in_proof():
-    lot = ParkingLot.grid(2, 8)
+    lot = grid_lot(2, 8)
     row = search(world(lot, np.ones(lot.n_slots, dtype=bool), give_up_s=400.0))
     assert row["gave_up_s"] == 400.0
     assert not row["truncated"]
@@ -189,7 +190,7 @@ def test_nothing_free_anywhere_ends_in_proof():
 
 
 def test_the_goal_may_be_the_entry():
-    lot = ParkingLot.grid(2, 10)
+    lot = grid_lot(2, 10)
     here = ParkingLot(**{**features(lot), "goals": lot.entries})
     taken = np.arange(lot.n_slots) % 3 != 0
     row = search(world(here, taken))
@@ -199,7 +200,7 @@ def test_the_goal_may_be_the_entry():
 
 @pytest.mark.parametrize("taken", [False, True])
 def test_one_slot(taken):
-    lot = ParkingLot.grid(1, 1)
+    lot = grid_lot(1, 1)
     row = search(world(lot, np.array([taken]), give_up_s=50.0))
     assert row["parked"] != taken
     assert row["gave_up_s"] == (50.0 if taken else 0.0)
@@ -221,7 +222,7 @@ def test_a_lot_cut_in_two_is_searched_where_a_way_leads():
 
 @pytest.mark.parametrize("prior_logit", [-6.0, 6.0])
 def test_a_prior_that_is_badly_wrong_does_not_keep_it_from_parking(prior_logit):
-    lot = ParkingLot.grid(4, 12)
+    lot = grid_lot(4, 12)
     taken = np.ones(lot.n_slots, dtype=bool)
     taken[[7, 30]] = False
     row = search(world(lot, taken, prior_logit=prior_logit))

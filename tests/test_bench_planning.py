@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from parkenv import ParkingLot
 from parkenv.evaluation.bench.planning import drive, forecast_process, planning_rows, transitions
+from parkenv.lots import grid_lot
 from planners.thesis.label_repair import repair
 from planners.thesis.label_setting import StoppingGraph, settle
 
@@ -19,7 +19,7 @@ def test_rows_have_the_keys_of_every_bench_and_stand_beside_the_thesis():
 
 
 def test_what_peers_are_given_is_the_same_process():
-    mdp = forecast_process(ParkingLot.grid(2, 6), 0)
+    mdp = forecast_process(grid_lot(2, 6), 0)
     p = transitions(mdp)
     n = mdp.n_states
     np.testing.assert_allclose(np.asarray(p.sum(axis=1)).ravel(), 1.0)
@@ -29,7 +29,7 @@ def test_what_peers_are_given_is_the_same_process():
 
 
 def test_the_measured_drive_ends_and_sees_each_slot_once():
-    lot = ParkingLot.grid(4, 10)
+    lot = grid_lot(4, 10)
     mdp = forecast_process(lot, 0)
     graph = StoppingGraph.of(mdp)
     for seed in range(5):

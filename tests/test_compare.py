@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from parkenv import InputError, ParkingLot, SensorModel
+from parkenv import InputError, SensorModel
 from parkenv.evaluation.experiments.results import EPISODE_COLUMNS, ResultFolder
 from parkenv.evaluation.experiments.statistics import mean_interval, summarize
+from parkenv.lots import packaged_lot, write_lot
 
 PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -275,7 +276,7 @@ LOG = "datetime,camera,slot_id,weather,occupied\n"
 @pytest.fixture
 def lot_file(tmp_path):
     path = tmp_path / "lot.geojson"
-    ParkingLot.packaged("mini").to_file(path)
+    write_lot(packaged_lot("mini"), path)
     return path
 
 

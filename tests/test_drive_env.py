@@ -13,12 +13,13 @@ from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from parkenv import InputError, ParkingLot, Traffic
+from parkenv import InputError, Traffic
 from parkenv.driving.drivable_area import DrivableArea
 from parkenv.driving.lot_space import LotSpace, Thing
 from parkenv.driving.parking_task import AREA, ParkingTasks
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.envs.drive import CONTROL_S, DriveEnv, goal_errors
+from parkenv.lots import packaged_lot, write_lot
 from parkenv.world.lot import corner_points
 from sim_sensors.laser.scanner import LaserScanner
 
@@ -54,7 +55,7 @@ def placed_at(env, x, y, yaw, speed=0.0):
 
 @lru_cache
 def tasks_on(lot):
-    return ParkingTasks(ParkingLot.packaged(lot))
+    return ParkingTasks(packaged_lot(lot))
 
 
 @lru_cache
@@ -271,7 +272,7 @@ def test_tasks_are_what_they_say(seed, lot):
 
 @pytest.fixture(scope="module")
 def campus():
-    return ParkingLot.packaged("campus")
+    return packaged_lot("campus")
 
 
 def test_each_kind_and_way_is_drawn(campus):
@@ -279,7 +280,7 @@ def test_each_kind_and_way_is_drawn(campus):
     assert {(t.kind, t.way) for t in drawn} == {
         (kind, way) for kind in ("perpendicular", "oblique") for way in ("nose-in", "back-in")
     }
-    street = ParkingTasks(ParkingLot.packaged("street"))
+    street = ParkingTasks(packaged_lot("street"))
     assert {street.draw(k).kind for k in range(5)} == {"parallel"}
 
 
@@ -478,7 +479,7 @@ def test_a_start_in_collision_is_refused_and_a_free_one_is_taken():
 
 def test_a_lot_that_does_not_say_how_wide_its_slots_are_is_refused(tmp_path):
     path = tmp_path / "lot.geojson"
-    ParkingLot.packaged("mini").to_file(path)
+    write_lot(packaged_lot("mini"), path)
     document = json.loads(path.read_text())
     slot = next(f for f in document["features"] if f["properties"]["kind"] == "slot")
     whole = dict(slot["properties"])
@@ -495,6 +496,6 @@ def test_a_lot_that_does_not_say_how_wide_its_slots_are_is_refused(tmp_path):
 
 def test_a_lot_file_is_driven_in(tmp_path):
     path = tmp_path / "lot.geojson"
-    ParkingLot.packaged("mini").to_file(path)
+    write_lot(packaged_lot("mini"), path)
     one, two = make(path), make("mini")
     np.testing.assert_equal(random_drive(one, 3), random_drive(two, 3))

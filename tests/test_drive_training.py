@@ -37,14 +37,14 @@ from parkenv.evaluation.training.drive_practice import (
 )
 from parkenv.evaluation.training.drive_training import DriveTraining, parked_by, parked_on
 from parkenv.evaluation.training.rl_training import read_curve, train_one
-from parkenv.world.lot import ParkingLot
+from parkenv.lots import packaged_lot
 from parkenv.world.scenario import Scenario
 from planners.driving.driver_view import BEAMS, FARTHEST_M, HOLD, DriverView, Outlines, command, see
 from planners.driving.drivers import make_driver
 from planners.learned import ModelCard
 
 PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
-MINI, STREET = ParkingLot.packaged("mini"), ParkingLot.packaged("street")
+MINI, STREET = packaged_lot("mini"), packaged_lot("street")
 EXAMINED = range(2_000_000, 2_000_006)
 STEPS = {"ppo": 2_000, "sac": 1_000, "tqc": 1_000}
 
@@ -92,7 +92,7 @@ def trained(request, tmp_path_factory):
 # What is practised on
 
 
-@pytest.mark.parametrize("lot", [MINI, STREET, ParkingLot.packaged("campus")], ids=lambda lot: lot.name)
+@pytest.mark.parametrize("lot", [MINI, STREET, packaged_lot("campus")], ids=lambda lot: lot.name)
 def test_the_batch_drives_as_the_environment_does(lot):
     n, rng = 8, np.random.default_rng(0)
     envs = [DriveEnv(lot=lot, obstacle_map=True, reward="dense") for _ in range(n)]
@@ -203,7 +203,7 @@ def practice_of(algorithm, n=4, lots=(MINI, STREET), levels=None):
 
 
 def test_places_are_the_kinds_of_slots_that_there_are():
-    lots = (STREET, ParkingLot.packaged("campus"), MINI)
+    lots = (STREET, packaged_lot("campus"), MINI)
     assert [(p.lot.name, p.kind) for p in places_of(lots)] == [
         ("campus", "perpendicular"), ("mini", "perpendicular"), ("campus", "oblique"), ("street", "parallel"),
     ]  # fmt: skip

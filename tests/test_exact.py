@@ -10,6 +10,7 @@ from small_lots import small_lot
 
 from parkenv import InputError, Lane, Mouth, OccupancyProcess, ParkingLot, Scenario, SensorModel
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
+from parkenv.lots import packaged_lot
 from parkenv.world.scenario import SearchProblem
 from planners import make_agent
 from planners.bounds.exact import ExactSolution
@@ -126,7 +127,7 @@ def test_the_agent_takes_as_long_as_it_says_and_nobody_takes_less(seed):
 
 def test_the_mean_of_searches_in_the_environment_is_the_expectation():
     """The environment plays by the rules that the dynamic program assumes."""
-    lot = ParkingLot.packaged("mini")
+    lot = packaged_lot("mini")
     # An hour of equilibrium at 60 %, in which nothing moves while a car searches.
     lasting = OccupancyProcess.from_demand(np.full(lot.n_slots, np.log(1.5)), np.zeros(168), 1e7)
     scenario = Scenario(name="lasting", lot=lot, occupancy=lasting, give_up_s=300.0)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorModel
+from parkenv import InputError, OccupancyProcess, Scenario, SensorModel
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.statistics import mean_interval
+from parkenv.lots import grid_lot
 from planners import make_agent
 from planners.bounds.exact import ExactSolution
 from planners.bounds.exact_changing import ChangingAgent, ChangingSolution
@@ -16,7 +17,7 @@ def busy(n_slots=3, stay_s=20.0, taken=(0.7, 0.85, 0.8), give_up_s=600.0):
     p = np.array(taken)
     return Scenario(
         name="busy",
-        lot=ParkingLot.grid(1, n_slots, pitch=6.0),
+        lot=grid_lot(1, n_slots, pitch=6.0),
         occupancy=OccupancyProcess.from_demand(np.log(p / (1.0 - p)), np.zeros(168), stay_s),
         v_drive=3.0,
         wait_s=2.0,

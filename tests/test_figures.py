@@ -11,7 +11,7 @@ from parkenv.evaluation.figures import time_figures
 from parkenv.evaluation.figures.rates_picture import save_rates
 from parkenv.evaluation.figures.search_pictures import BELIEF_MAP, draw_search, save_searches
 from parkenv.evaluation.figures.time_figures import AGENT_COLORS, save_time_against_occupancy, save_time_split
-from parkenv.world.lot import ParkingLot
+from parkenv.lots import grid_lot
 from parkenv.world.occupancy import OccupancyProcess
 from parkenv.world.scenario import Scenario
 from planners.agent import AGENT_NAMES, make_agent
@@ -203,7 +203,7 @@ def test_searches_of_any_number_are_laid_out(tmp_path, n):
     assert 600 <= height <= 2600
 
 
-@pytest.mark.parametrize("lot", [ParkingLot.grid(12, 3), ParkingLot.grid(2, 40)], ids=["high", "wide"])
+@pytest.mark.parametrize("lot", [grid_lot(12, 3), grid_lot(2, 40)], ids=["high", "wide"])
 def test_titles_fit_lots_of_any_shape(lot):
     searched = trace("first-free", Scenario.on_lot(lot))
     figure = Figure(figsize=(3, 8) if lot.n_slots == 36 else (9, 3))

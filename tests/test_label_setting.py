@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 
-from parkenv import InputError, ParkingLot, Scenario
+from parkenv import InputError, Scenario
+from parkenv.lots import city_lot, grid_lot
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SCENARIO_NAMES
 from planners import ParkingMDP, label_setting, make_agent, policy_iteration, value_iteration
@@ -47,7 +48,7 @@ def expect_same_values(ours, theirs):
 
 def test_without_discount_it_is_the_shortest_way_to_a_stop():
     """γ = 1: V = max over slots of (r_max - walk) - (1 - p)/p·c - drive."""
-    lot = ParkingLot.grid(4, 9)
+    lot = grid_lot(4, 9)
     scenario = Scenario.on_lot(lot, failure_s=7.0)
     p_free = np.random.default_rng(0).uniform(0.05, 1.0, lot.n_slots)
     solution = label_setting(ParkingMDP.from_belief(scenario, 1.0 - p_free, gamma=1.0))
@@ -159,7 +160,7 @@ def test_where_circling_beats_every_stop_policy_iteration_takes_over():
 def test_directed_lots_with_little_free_are_settled_in_one_pass():
     """The real thing: lots with one-way lanes need no other solver, as long as something may be free."""
     rng = np.random.default_rng(1)
-    for lot in [ParkingLot.city(600), *(Scenario.named(name).lot for name in SCENARIO_NAMES)]:
+    for lot in [city_lot(600), *(Scenario.named(name).lot for name in SCENARIO_NAMES)]:
         scenario = Scenario.on_lot(lot)
         for chance in (0.0, 0.02, 0.3):
             p_free = np.where(rng.random(lot.n_slots) < chance, rng.random(lot.n_slots), 0.0)
@@ -177,7 +178,7 @@ def test_directed_lots_with_little_free_are_settled_in_one_pass():
 @settings(max_examples=150)
 def test_a_mended_plan_equals_a_fresh_one(seed, gamma, failure):
     rng = np.random.default_rng(seed)
-    lot = ParkingLot.grid(int(rng.integers(1, 5)), int(rng.integers(2, 9)))
+    lot = grid_lot(int(rng.integers(1, 5)), int(rng.integers(2, 9)))
     mdp = ParkingMDP.from_belief(
         Scenario.on_lot(lot),
         rng.choice([0.0, 1.0, *rng.random(3)], lot.n_slots),
@@ -210,7 +211,7 @@ def check_mending(mdp, n_slots, rng):
 
 @pytest.fixture(scope="module")
 def city():
-    scenario = Scenario.on_lot(ParkingLot.city(3000))
+    scenario = Scenario.on_lot(city_lot(3000))
     mdp = ParkingMDP.from_belief(scenario, np.random.default_rng(0).uniform(0.3, 1.0, 3000))
     return StoppingGraph.of(mdp), mdp.p_free
 

@@ -9,8 +9,9 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import parkenv  # noqa: F401 - registers the ids
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario
+from parkenv import InputError, OccupancyProcess, Scenario
 from parkenv.envs.local_observation import FIRST_NEAR, HERE, PER_MOVE, PER_NEAR, LocalObservation
+from parkenv.lots import grid_lot
 from parkenv.world.lot import MOVES, PARK
 from parkenv.world.scenario import SCENARIO_NAMES
 
@@ -101,7 +102,7 @@ def test_every_number_is_what_the_table_says(name):
 
 def aisle(taken):
     """One aisle of slots that are taken, or free, for ever."""
-    lot = ParkingLot.grid(1, len(taken))
+    lot = grid_lot(1, len(taken))
     process = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
     return Scenario(name="aisle", lot=lot, occupancy=process)
 

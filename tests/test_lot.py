@@ -8,6 +8,7 @@ from scipy.sparse.csgraph import connected_components
 
 from parkenv.errors import InputError
 from parkenv.evaluation.figures.lot_picture import draw_lot, save_lot_picture
+from parkenv.lots import city_lot, grid_lot, packaged_lot
 from parkenv.lots.generators import CROSSING_CLEARANCE, KERB_SIZE, bay_row
 from parkenv.world.drive_graph import LANE_OFFSET
 from parkenv.world.lot import Lane, Mouth, ParkingLot
@@ -109,7 +110,7 @@ def test_arrays_that_were_passed_in_stay_the_callers():
 
 
 def test_grid_is_laid_out_as_documented():
-    lot = ParkingLot.grid(4, 3, pitch=2.5, depth=5.0, aisle=6.0)
+    lot = grid_lot(4, 3, pitch=2.5, depth=5.0, aisle=6.0)
     assert lot.slot_ids[:4] == ("0-0", "0-1", "0-2", "1-0")
     by_id = dict(zip(lot.slot_ids, lot.slot_xy, strict=True))
     assert by_id["0-0"][1] < 0.0 < by_id["1-0"][1]  # either side of the south aisle
@@ -131,7 +132,7 @@ def test_grid_is_laid_out_as_documented():
 )
 def test_grid_that_cannot_be_is_refused(arguments, message):
     with pytest.raises(InputError, match=message):
-        ParkingLot.grid(**arguments)
+        grid_lot(**arguments)
 
 
 def test_angled_row_touches_its_line_and_does_not_overlap():
@@ -151,7 +152,7 @@ def test_angled_row_touches_its_line_and_does_not_overlap():
 
 @pytest.mark.parametrize("n_slots", [1, 2, 37, 600, 5000])
 def test_city_has_exactly_the_slots_asked_for_and_every_place_leads_to_every_other(n_slots):
-    lot = ParkingLot.city(n_slots, seed=3)
+    lot = city_lot(n_slots, seed=3)
     assert lot.n_slots == n_slots
     assert len(lot.entries) == len(lot.goals) == 1
     assert connected_components(lot.drive_matrix(), connection="strong")[0] == 1
@@ -160,12 +161,12 @@ def test_city_has_exactly_the_slots_asked_for_and_every_place_leads_to_every_oth
 
 
 def test_city_is_the_same_for_the_same_seed_only():
-    assert ParkingLot.city(300, seed=1) == ParkingLot.city(300, seed=1)
-    assert ParkingLot.city(300, seed=1) != ParkingLot.city(300, seed=2)
+    assert city_lot(300, seed=1) == city_lot(300, seed=1)
+    assert city_lot(300, seed=1) != city_lot(300, seed=2)
 
 
 def test_city_parks_at_the_kerb_and_clear_of_crossings():
-    lot = ParkingLot.city(2000, seed=5)
+    lot = city_lot(2000, seed=5)
     assert {(length, width) for length, width in zip(lot.slot_length, lot.slot_width, strict=True)} == {
         KERB_SIZE
     }
@@ -183,7 +184,7 @@ def test_city_parks_at_the_kerb_and_clear_of_crossings():
 
 
 def test_city_numbers_neighbours_near_each_other():
-    lot = ParkingLot.city(5000, seed=0)
+    lot = city_lot(5000, seed=0)
     step = np.hypot(*np.diff(lot.slot_xy, axis=0).T)
     assert np.median(step) < 10.0
     assert np.mean(step) < 60.0
@@ -191,12 +192,12 @@ def test_city_numbers_neighbours_near_each_other():
 
 def test_city_wants_a_slot():
     with pytest.raises(InputError, match="n_slots is 0"):
-        ParkingLot.city(0)
+        city_lot(0)
 
 
 @pytest.mark.slow
 def test_city_of_a_million_slots():
-    lot = ParkingLot.city(1_000_000, seed=0)
+    lot = city_lot(1_000_000, seed=0)
     assert lot.n_slots == 1_000_000
     assert connected_components(lot.drive_matrix(), connection="strong")[0] == 1
     assert (lot.edge_length[lot.neighbors >= 0] > 0.0).all()
@@ -205,7 +206,7 @@ def test_city_of_a_million_slots():
 @pytest.mark.parametrize("name", ["campus", "jam", "street", "mini"])
 def test_every_packaged_lot_can_be_drawn(name, tmp_path):
     path = tmp_path / f"{name}.png"
-    save_lot_picture(ParkingLot.packaged(name), path, show_graph=name == "mini")
+    save_lot_picture(packaged_lot(name), path, show_graph=name == "mini")
     assert path.read_bytes().startswith(b"\x89PNG")
 
 
@@ -213,7 +214,7 @@ def test_slots_take_one_colour_each():
     from matplotlib.collections import PolyCollection
     from matplotlib.figure import Figure
 
-    lot = ParkingLot.packaged("mini")
+    lot = packaged_lot("mini")
     colors = np.linspace(0.0, 1.0, 4 * lot.n_slots).reshape(-1, 4)
     ax = Figure().add_subplot()
     draw_lot(lot, ax, slot_color=colors)
@@ -223,7 +224,7 @@ def test_slots_take_one_colour_each():
 
 def test_picture_format_that_is_not_known_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"no picture format '\.bmpp'"):
-        save_lot_picture(ParkingLot.packaged("mini"), tmp_path / "lot.bmpp")
+        save_lot_picture(packaged_lot("mini"), tmp_path / "lot.bmpp")
     with pytest.raises(InputError, match="cannot be written"):
-        save_lot_picture(ParkingLot.packaged("mini"), tmp_path / "nowhere" / "lot.png")
+        save_lot_picture(packaged_lot("mini"), tmp_path / "nowhere" / "lot.png")
     assert list(tmp_path.iterdir()) == []

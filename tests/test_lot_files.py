@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from parkenv.errors import InputError
+from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.build import LOTS, build
 from parkenv.lots.checks import check_lot
 from parkenv.lots.lot_files import PACKAGED_LOTS
@@ -55,7 +56,7 @@ def written(tmp_path, content) -> Path:
 
 
 def read(tmp_path, content) -> ParkingLot:
-    return ParkingLot.from_file(written(tmp_path, content))
+    return read_lot(written(tmp_path, content))
 
 
 def with_exact(slot, **changes):
@@ -68,7 +69,7 @@ def with_exact(slot, **changes):
 
 @pytest.mark.parametrize("name", PACKAGED_LOTS)
 def test_packaged_lots_are_what_their_script_makes(name, tmp_path):
-    lot = ParkingLot.packaged(name)
+    lot = packaged_lot(name)
     assert lot == LOTS[name]()
     build(tmp_path)
     committed = Path(__file__).parents[1] / "parkenv" / "lots" / "packaged" / f"{name}.geojson"
@@ -78,7 +79,7 @@ def test_packaged_lots_are_what_their_script_makes(name, tmp_path):
 
 def test_unknown_packaged_lot_lists_the_known_ones():
     with pytest.raises(InputError, match="no packaged lot 'camp', want one of campus, jam, street, mini"):
-        ParkingLot.packaged("camp")
+        packaged_lot("camp")
 
 
 @given(
@@ -95,7 +96,7 @@ def test_unknown_packaged_lot_lists_the_known_ones():
 def test_written_lots_are_read_back_to_the_bit(
     tmp_path, rows, columns, pitch, aisle, turn, shift, name, goal, walls
 ):
-    grid = ParkingLot.grid(rows, columns, name=name, pitch=pitch, aisle=aisle)
+    grid = grid_lot(rows, columns, name=name, pitch=pitch, aisle=aisle)
     matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
 
     def moved(xy):
@@ -114,8 +115,8 @@ def test_written_lots_are_read_back_to_the_bit(
         walls=tuple(map(np.array, walls)),
     )
     path = tmp_path / "lot.geojson"
-    lot.to_file(path)
-    again = ParkingLot.from_file(path)
+    write_lot(lot, path)
+    again = read_lot(path)
     assert again == lot
     assert again.slot_xy.tobytes() == lot.slot_xy.tobytes()
     assert again.edge_length.tobytes() == lot.edge_length.tobytes()
@@ -123,15 +124,15 @@ def test_written_lots_are_read_back_to_the_bit(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_cities_are_read_back_to_the_bit(tmp_path, seed):
-    lot = ParkingLot.city(200, seed)
-    lot.to_file(tmp_path / "city.json")
-    assert ParkingLot.from_file(tmp_path / "city.json") == lot
+    lot = city_lot(200, seed)
+    write_lot(lot, tmp_path / "city.json")
+    assert read_lot(tmp_path / "city.json") == lot
     assert check_lot(tmp_path / "city.json") == []
 
 
 def test_closed_walls_are_polygons_in_the_file(tmp_path):
-    lot = ParkingLot.packaged("mini")
-    lot.to_file(tmp_path / "mini.geojson")
+    lot = packaged_lot("mini")
+    write_lot(lot, tmp_path / "mini.geojson")
     features = json.loads((tmp_path / "mini.geojson").read_text())["features"]
     shapes = [f["geometry"]["type"] for f in features if f["properties"]["kind"] == "wall"]
     assert shapes == ["LineString", "Polygon"]
@@ -148,7 +149,7 @@ def test_a_lot_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "write_text", full_disk)
     with pytest.raises(InputError, match="cannot be written: No space left on device"):
-        ParkingLot.packaged("mini").to_file(path)
+        write_lot(packaged_lot("mini"), path)
     monkeypatch.undo()
     assert path.read_text() == "before"
     assert list(tmp_path.iterdir()) == [path]
@@ -156,9 +157,9 @@ def test_a_lot_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
 
 def test_a_lot_is_not_written_where_it_could_not_be_read(tmp_path):
     with pytest.raises(InputError, match=r"written as \.geojson or \.json"):
-        ParkingLot.packaged("mini").to_file(tmp_path / "lot.yml")
+        write_lot(packaged_lot("mini"), tmp_path / "lot.yml")
     with pytest.raises(InputError, match="cannot be written"):
-        ParkingLot.packaged("mini").to_file(tmp_path / "nowhere" / "lot.geojson")
+        write_lot(packaged_lot("mini"), tmp_path / "nowhere" / "lot.geojson")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -204,7 +205,7 @@ def test_outlines_alone_tell_the_same_lots(tmp_path, name):
     for f in doc["features"]:
         if f["properties"]["kind"] == "slot":
             f["properties"] = {"kind": "slot", "id": f["properties"]["id"]}
-    lot, known = read(tmp_path, doc), ParkingLot.packaged(name)
+    lot, known = read(tmp_path, doc), packaged_lot(name)
     np.testing.assert_array_equal(lot.slot_mouth, known.slot_mouth)
     np.testing.assert_allclose(lot.slot_xy, known.slot_xy, atol=2e-3)
     np.testing.assert_allclose(lot.slot_length, known.slot_length, atol=4e-3)
@@ -216,9 +217,9 @@ def test_longitude_and_latitude_become_metres(tmp_path):
     from pyproj import Geod
 
     geod = Geod(ellps="WGS84")
-    known = ParkingLot.packaged("jam")
+    known = packaged_lot("jam")
     path = tmp_path / "jam.geojson"
-    known.to_file(path)
+    write_lot(known, path)
     doc = json.loads(path.read_text())
     del doc["frame"], doc["parkenv"]
 
@@ -281,7 +282,7 @@ needs_dragon_lake = pytest.mark.skipif(
 
 @needs_dragon_lake
 def test_dragon_lake_is_a_drivable_lot():
-    lot = ParkingLot.from_file(DRAGON_LAKE)
+    lot = read_lot(DRAGON_LAKE)
     assert lot.n_slots == 364
     assert lot.slot_ids[0] == "A-0-0"
     assert {"A-0-41", "B-1-24", "I-0-20"} < set(lot.slot_ids)
@@ -294,7 +295,7 @@ def test_dragon_lake_is_a_drivable_lot():
 
 @needs_dragon_lake
 def test_dragon_lake_is_not_driven_through_parked_rows():
-    lot = ParkingLot.from_file(DRAGON_LAKE)
+    lot = read_lot(DRAGON_LAKE)
     source, column = np.nonzero(lot.neighbors >= 0)
     ways = np.stack([lot.vertex_xy[source], lot.vertex_xy[lot.neighbors[source, column]]], axis=1)
     slots = shapely.polygons(lot.slot_corners())
@@ -310,7 +311,7 @@ def test_dragon_lake_is_not_driven_through_parked_rows():
 
 @needs_dragon_lake
 def test_dragon_lake_rows_open_to_their_own_aisles():
-    lot = ParkingLot.from_file(DRAGON_LAKE)
+    lot = read_lot(DRAGON_LAKE)
     vertex_y = dict(zip(lot.slot_ids, lot.vertex_xy[:364, 1], strict=True))
     for slot, aisle in (
         ("A-0-3", 64.95),
@@ -328,9 +329,9 @@ def test_dragon_lake_rows_open_to_their_own_aisles():
 
 @needs_dragon_lake
 def test_dragon_lake_goes_through_the_native_format(tmp_path):
-    lot = ParkingLot.from_file(DRAGON_LAKE)
-    lot.to_file(tmp_path / "dlp.geojson")
-    assert ParkingLot.from_file(tmp_path / "dlp.geojson") == lot
+    lot = read_lot(DRAGON_LAKE)
+    write_lot(lot, tmp_path / "dlp.geojson")
+    assert read_lot(tmp_path / "dlp.geojson") == lot
     assert check_lot(tmp_path / "dlp.geojson") == []
 
 
@@ -346,7 +347,7 @@ def test_a_map_that_is_none_is_refused(tmp_path, text, message):
     path = tmp_path / "map.yml"
     path.write_text(text)
     with pytest.raises(InputError, match=message) as caught:
-        ParkingLot.from_file(path)
+        read_lot(path)
     assert "\n" not in str(caught.value)
     (problem,) = check_lot(path)
     assert problem.severity == "error"
@@ -484,7 +485,7 @@ def test_faults_are_named(tmp_path, change, number, message):
     assert [problem.feature for problem in errors] == [number]
     assert message in errors[0].message
     with pytest.raises(InputError) as caught:
-        ParkingLot.from_file(path)
+        read_lot(path)
     where = "" if number is None else f"feature {number}: "
     assert str(caught.value) == f"{path}: {where}{errors[0].message}"
     assert "\n" not in str(caught.value)
@@ -503,7 +504,7 @@ def test_faults_are_named(tmp_path, change, number, message):
 def test_files_that_are_no_geojson_are_refused(tmp_path, text, message):
     path = written(tmp_path, text)
     with pytest.raises(InputError, match=message):
-        ParkingLot.from_file(path)
+        read_lot(path)
     (problem,) = check_lot(path)
     assert problem.feature is None
 
@@ -517,12 +518,12 @@ def test_every_cut_of_a_file_is_refused(tmp_path):
 
 def test_files_that_are_not_there_or_no_text_are_refused(tmp_path):
     with pytest.raises(InputError, match="cannot be read: No such file"):
-        ParkingLot.from_file(tmp_path / "lot.geojson")
+        read_lot(tmp_path / "lot.geojson")
     with pytest.raises(InputError, match=r"unknown kind of file '\.osm'"):
-        ParkingLot.from_file(tmp_path / "lot.osm")
+        read_lot(tmp_path / "lot.osm")
     (tmp_path / "lot.json").write_bytes(b'{"name": "\xff"}')
     with pytest.raises(InputError, match="not UTF-8 text"):
-        ParkingLot.from_file(tmp_path / "lot.json")
+        read_lot(tmp_path / "lot.json")
 
 
 def test_metres_without_a_frame_are_refused(tmp_path):
@@ -554,7 +555,7 @@ def test_all_faults_are_listed_at_once(tmp_path):
     with pytest.raises(
         InputError, match=r"feature 0: kind .* \(and 3 more; `parkenv lot check .* lists all\)"
     ):
-        ParkingLot.from_file(path)
+        read_lot(path)
 
 
 WARNINGS = [
@@ -589,7 +590,7 @@ def test_slips_of_the_pen_are_warned_of_and_read(tmp_path, change, number, messa
     problems = check_lot(path)
     assert {p.severity for p in problems} == {"warning"}
     assert any(p.feature == number and message in p.message for p in problems), problems
-    assert ParkingLot.from_file(path).n_slots == 2
+    assert read_lot(path).n_slots == 2
 
 
 def test_slots_that_cannot_be_reached_or_left_are_warned_of(tmp_path):
@@ -649,6 +650,6 @@ def test_no_content_makes_the_checker_raise(tmp_path, data):
     errors = [p for p in check_lot(path) if p.severity == "error"]
     if errors:
         with pytest.raises(InputError):
-            ParkingLot.from_file(path)
+            read_lot(path)
     else:
-        ParkingLot.from_file(path)
+        read_lot(path)

@@ -8,6 +8,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from parkenv.errors import InputError
+from parkenv.lots import grid_lot, packaged_lot
 from parkenv.world.drive_graph import (
     ENTRY_REACH,
     LANE_OFFSET,
@@ -177,7 +178,7 @@ def test_what_no_lane_serves_is_listed():
 
 @given(rows=st.integers(1, 7), columns=st.integers(1, 9))
 def test_grids_are_strongly_connected_and_their_matrix_is_their_graph(rows, columns):
-    lot = ParkingLot.grid(rows, columns)
+    lot = grid_lot(rows, columns)
     matrix = lot.drive_matrix()
     assert connected_components(matrix, connection="strong")[0] == 1
     source, column = np.nonzero(lot.neighbors >= 0)
@@ -189,13 +190,13 @@ def test_grids_are_strongly_connected_and_their_matrix_is_their_graph(rows, colu
 
 @pytest.mark.parametrize("name", ["campus", "jam", "street", "mini"])
 def test_packaged_lots_are_driven_on_lanes_only(name):
-    lot = ParkingLot.packaged(name)
+    lot = packaged_lot(name)
     assert connected_components(lot.drive_matrix(), connection="strong")[0] == 1
     assert crossed_slots(lot) == []
 
 
 def test_grid_is_driven_on_lanes_only():
-    assert crossed_slots(ParkingLot.grid(6, 12)) == []
+    assert crossed_slots(grid_lot(6, 12)) == []
 
 
 def crossed_slots(lot: ParkingLot) -> list[tuple[str, int]]:
@@ -210,7 +211,7 @@ def crossed_slots(lot: ParkingLot) -> list[tuple[str, int]]:
 
 
 def test_from_aisle_to_aisle_the_way_is_round_the_end_of_the_rows():
-    lot = ParkingLot.grid(4, 10)
+    lot = grid_lot(4, 10)
     back_to_back = [lot.slot_ids.index(name) for name in ("1-4", "2-4")]
     assert np.hypot(*(lot.slot_xy[back_to_back[0]] - lot.slot_xy[back_to_back[1]])) == pytest.approx(5.0)
     assert drive_from(lot, back_to_back[0])[back_to_back[1]] > 16.0 + 2 * 4 * 2.5

@@ -13,7 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from parkenv import InputError, ParkingLot, Scenario
+from parkenv import InputError, Scenario
+from parkenv.lots import packaged_lot
 from parkenv.mapping.discovery import discover, score_discovery
 from parkenv.mapping.grid import P_FREE, P_OCCUPIED, OccupancyGrid
 from parkenv.mapping.inference import MapPrior, SessionLog, counted, predict
@@ -273,7 +274,7 @@ def test_files_that_are_no_maps_are_refused(mini, tmp_path):
     newer = sqlite3.connect(tmp_path / "newer")
     newer.execute(f"PRAGMA user_version = {VERSION + 1}")
     newer.commit()
-    MapStore(tmp_path / "else", ParkingLot.packaged("jam")).close()
+    MapStore(tmp_path / "else", packaged_lot("jam")).close()
     for name, message in (
         ("text", "is no map file"),
         ("other", "no map file of parkenv"),
@@ -297,7 +298,7 @@ import sys, numpy as np
 from pathlib import Path
 from parkenv import ParkingLot
 from parkenv.mapping.store import MapStore, Session
-lot = ParkingLot.packaged("mini")
+lot = packaged_lot("mini")
 with MapStore(Path(sys.argv[1]), lot) as store:
     for k in range(int(sys.argv[3])):
         store.add(Session(f"{sys.argv[2]}{k:04d}", 0.0, "laser", "rain", np.full(lot.n_slots, 0.7), np.zeros((50, 3))))
@@ -339,7 +340,7 @@ def test_a_kill_leaves_whole_sessions_only(mini, tmp_path):
 
 
 def test_slots_are_found_where_cars_stand_again_and_again():
-    lot = ParkingLot.packaged("campus")
+    lot = packaged_lot("campus")
     rng = np.random.default_rng(3)
     seen = []
     for _ in range(20):

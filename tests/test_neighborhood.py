@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import dijkstra
 
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario
+from parkenv import InputError, OccupancyProcess, Scenario
 from parkenv.evaluation.experiments.compare import at_occupancy
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
+from parkenv.lots import city_lot, grid_lot
 from planners import make_agent
 from planners.neighborhood import Neighborhoods
 
@@ -62,7 +63,7 @@ def test_slots_known_to_be_taken_draw_nobody():
 
 
 def test_far_from_the_goal_the_part_begins_at_a_gate_on_a_quickest_way():
-    problem = Scenario.on_lot(ParkingLot.city(3000)).public()
+    problem = Scenario.on_lot(city_lot(3000)).public()
     entry = int(problem.lot.entry_vertices[0])
     parts = Neighborhoods(problem, 500)
     near = parts.toward(entry)
@@ -76,7 +77,7 @@ def test_far_from_the_goal_the_part_begins_at_a_gate_on_a_quickest_way():
 @pytest.mark.parametrize(("level", "seeds"), [(0.6, 4), (0.9, 4)])
 def test_leaving_out_what_cannot_matter_changes_nothing(level, seeds):
     """The farthest tenth of a lot: the searches are the same to the last second."""
-    scenario = at_occupancy(Scenario.on_lot(ParkingLot.grid(8, 40)), level)
+    scenario = at_occupancy(Scenario.on_lot(grid_lot(8, 40)), level)
     most = scenario.lot.n_vertices * 9 // 10
     whole, part = (
         EpisodeRunner(scenario, "belief", make_agent("belief", scenario, trusting=True, most_vertices=m))
@@ -96,7 +97,7 @@ def nearly_full(lot, free):
 
 @pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
 def test_where_a_part_is_full_the_search_goes_on_beyond_it(name):
-    lot = ParkingLot.city(600)
+    lot = city_lot(600)
     order = np.argsort(lot.walk_m())
     free = order[-40:]
     scenario = nearly_full(lot, free)
@@ -118,7 +119,7 @@ def test_a_bad_size_is_refused():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
 def test_a_city_of_100_000_slots(name):
-    scenario = at_occupancy(Scenario.on_lot(ParkingLot.city(100_000)), 0.95)
+    scenario = at_occupancy(Scenario.on_lot(city_lot(100_000)), 0.95)
     agent, env = make_agent(name, scenario), gym.make("parkenv/Search-v0", scenario=scenario)
     for seed in range(2):
         observation, _ = env.reset(seed=seed)

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from parkenv import InputError, ParkingLot, Traffic
+from parkenv import InputError, Traffic
 from parkenv.cli import app
 from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
 from parkenv.driving.parking_task import ParkingTasks
@@ -22,6 +22,7 @@ from parkenv.evaluation.bench import drive as bench_drive
 from parkenv.evaluation.bench.drive import bare_physics, environment_steps
 from parkenv.evaluation.experiments.workers import Workers
 from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
+from parkenv.lots import packaged_lot, read_lot, write_lot
 from planners.driving.clearance import clearance, room_at, stands_free
 from planners.driving.hybrid_astar import CarPath, SearchSettings, plan_path
 from planners.driving.parking import ParkingAgent
@@ -35,7 +36,7 @@ LOW, HIGH = np.array([-20.0, -20.0]), np.array([20.0, 20.0])
 
 @lru_cache
 def tasks_on(lot):
-    return ParkingTasks(ParkingLot.packaged(lot))
+    return ParkingTasks(packaged_lot(lot))
 
 
 def planned(task, settings=None):
@@ -177,7 +178,7 @@ def test_no_faster_than_asked_for():
 
 @pytest.mark.parametrize("lot", LOTS)
 def test_the_planner_parks(lot):
-    env, agent = ParkingCase(ParkingLot.packaged(lot)).environment(), ParkingAgent()
+    env, agent = ParkingCase(packaged_lot(lot)).environment(), ParkingAgent()
     for seed in range(6):
         row = park_once(env, agent, seed).row
         assert row["parked"], row
@@ -187,14 +188,14 @@ def test_the_planner_parks(lot):
 
 
 def park_thousand():
-    lots = [ParkingLot.packaged(name) for name in LOTS]
+    lots = [packaged_lot(name) for name in LOTS]
     cases = [
         ParkingCase(lots[0], ("perpendicular",)),
         ParkingCase(lots[0], ("oblique",)),
         *(ParkingCase(lot) for lot in lots[1:]),
     ]
     if DRAGON_LAKE.exists():
-        cases.append(ParkingCase(ParkingLot.from_file(DRAGON_LAKE)))
+        cases.append(ParkingCase(read_lot(DRAGON_LAKE)))
     per_case = -(-1000 // len(cases))
     with Workers(1) as workers:
         return [p.row for some in park_all(cases, range(1000, 1000 + per_case), workers) for p in some]
@@ -203,7 +204,7 @@ def park_thousand():
 def test_the_planner_parks_on_an_imported_lot(tmp_path):
     """Outlines in degrees, without names of lengths, widths or mouths, as maps have them."""
     path = tmp_path / "imported.geojson"
-    ParkingLot.packaged("mini").to_file(path)
+    write_lot(packaged_lot("mini"), path)
     document = json.loads(path.read_text())
     del document["frame"], document["parkenv"]
 
@@ -217,7 +218,7 @@ def test_the_planner_parks_on_an_imported_lot(tmp_path):
         feature["properties"] = {k: v for k, v in feature["properties"].items() if k in kept}
         feature["geometry"]["coordinates"] = in_degrees(feature["geometry"]["coordinates"])
     path.write_text(json.dumps(document))
-    env = ParkingCase(ParkingLot.from_file(path)).environment()
+    env = ParkingCase(read_lot(path)).environment()
     for seed in range(4):
         row = park_once(env, ParkingAgent(), seed).row
         assert row["parked"], row
@@ -266,7 +267,7 @@ def test_an_observation_without_the_map_is_refused():
 
 
 def test_where_no_path_is_the_car_stays_and_that_is_said():
-    env = ParkingCase(ParkingLot.packaged("mini")).environment()
+    env = ParkingCase(packaged_lot("mini")).environment()
     no_room = ParkingAgent(search=SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0))
     parking = next(p for p in (park_once(env, no_room, seed) for seed in range(20)) if not p.row["parked"])
     assert parking.row["reason"] == "no path was found"
@@ -310,7 +311,7 @@ WALL_TIMES = ("decision_ms", "planning_s", "first_planning_s")
 
 
 def test_results_do_not_depend_on_the_number_of_workers():
-    cases = [ParkingCase(ParkingLot.packaged("mini"))]
+    cases = [ParkingCase(packaged_lot("mini"))]
 
     def rows(jobs):
         with Workers(jobs) as workers:

@@ -16,11 +16,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from parkenv import ParkingLot, Scenario
+from parkenv import Scenario
 from parkenv.cli import app
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.figures.import_picture import save_import_picture
+from parkenv.lots import packaged_lot, read_lot, write_lot
 from parkenv.lots.checks import check_lot
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.places.lot_draft import Wishes
@@ -239,8 +240,8 @@ def test_multipolygons_are_the_same_in_xml_and_json(tmp_path):
 
 
 def test_native_lots_pass_through(tmp_path):
-    lot = ParkingLot.packaged("mini")
-    lot.to_file(tmp_path / "mini.geojson")
+    lot = packaged_lot("mini")
+    write_lot(lot, tmp_path / "mini.geojson")
     assert import_lot(tmp_path / "mini.geojson").lot() == lot
     moved = import_lot(tmp_path / "mini.geojson", Wishes(goals=((3.0, 4.0),))).lot()
     assert moved.goals.tolist() == [[3.0, 4.0]]
@@ -252,7 +253,7 @@ def test_a_map_is_no_lot_and_the_error_says_what_makes_one_of_it(tmp_path):
     for name, text in (("a.osm", car_park().xml()), ("a.json", car_park().overpass(geometry=True))):
         (tmp_path / name).write_text(text)
         with pytest.raises(InputError, match=r"`parkenv lot import .* makes a lot of it"):
-            ParkingLot.from_file(tmp_path / name)
+            read_lot(tmp_path / name)
 
 
 @given(st.floats(-179.9, 179.9), st.floats(-85, 85), st.floats(-3000, 3000), st.floats(-3000, 3000))
@@ -986,9 +987,9 @@ PLACES = {
 
 @pytest.mark.parametrize("name", PLACES)
 def test_a_search_runs_on_what_was_imported(tmp_path, name):
-    PLACES[name]().draft(tmp_path).lot().to_file(tmp_path / "lot.geojson")
+    write_lot(PLACES[name]().draft(tmp_path).lot(), tmp_path / "lot.geojson")
     assert check_lot(tmp_path / "lot.geojson") == []
-    lot = ParkingLot.from_file(tmp_path / "lot.geojson")
+    lot = read_lot(tmp_path / "lot.geojson")
     scenario = Scenario.on_lot(lot)
     for agent in ("mdp", "greedy-drive"):
         rows = Case(scenario, agent).run(range(4))[0]
@@ -1007,10 +1008,10 @@ def test_the_command_line_imports_draws_and_checks(tmp_path):
     assert done.exit_code == 0, done.output
     assert "22 slots from amenity=parking_space" in done.output
     assert "left out: spaces for disabled drivers: 2 (way/5, way/7)" in done.output
-    assert ParkingLot.from_file(lot).n_slots == 22
+    assert read_lot(lot).n_slots == 22
     assert picture.stat().st_size > 10_000
     assert run("import", place, "--out", lot, "--disabled").exit_code == 0
-    assert ParkingLot.from_file(lot).n_slots == 24
+    assert read_lot(lot).n_slots == 24
     refused = run("import", place, "--out", lot, "--goal", "48")
     assert str(refused.exception) == "--goal is '48', want 2 numbers with commas between"
 

@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 
-from parkenv import ParkingLot, Scenario
+from parkenv import Scenario
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.figures.import_picture import save_import_picture
+from parkenv.lots import grid_lot, read_lot, write_lot
 from parkenv.lots.checks import check_lot
 from parkenv.lots.generators import BAY_SIZE, Slots, bay_row
 from parkenv.lots.local_frame import LocalFrame
@@ -50,7 +51,7 @@ def row(n, y, *, x=0.0, pitch=2.5):
 @pytest.mark.parametrize("with_yaw", [False, True])
 @pytest.mark.parametrize(("rows", "columns"), [(2, 4), (4, 8), (5, 6), (6, 20)])
 def test_a_grid_is_found_again(tmp_path, rows, columns, with_yaw):
-    lot = ParkingLot.grid(rows, columns)
+    lot = grid_lot(rows, columns)
     draft = of_lot(
         tmp_path, lot, with_yaw=with_yaw, entries=(tuple(lot.entries[0]),), goals=(tuple(lot.goals[0]),)
     )
@@ -65,7 +66,7 @@ def test_a_grid_is_found_again(tmp_path, rows, columns, with_yaw):
 
 @pytest.mark.skipif(not DRAGON_LAKE.exists(), reason="the Dragon Lake map is not beside this checkout")
 def test_dragon_lake_is_found_again_from_its_slots_alone(tmp_path):
-    lot = ParkingLot.from_file(DRAGON_LAKE)
+    lot = read_lot(DRAGON_LAKE)
     draft = of_lot(tmp_path, lot, entries=(tuple(lot.entries[0]),), goals=((80.0, -4.0),))
     found = draft.lot()
     assert found.slot_ids == lot.slot_ids
@@ -107,7 +108,7 @@ def test_a_road_leads_through_a_gap_in_the_rows(tmp_path):
 
 
 def test_latitudes_and_longitudes_are_metres_after_all(tmp_path):
-    lot = ParkingLot.grid(4, 8)
+    lot = grid_lot(4, 8)
     frame = LocalFrame(lon=-122.25, lat=37.87)
     lines = ["LAT,LON"] + [f"{lat:.8f},{lon:.8f}" for lon, lat in frame.to_lonlat(lot.slot_xy)]
     path = tmp_path / "slots.csv"
@@ -121,7 +122,7 @@ def test_latitudes_and_longitudes_are_metres_after_all(tmp_path):
 
 
 def test_bounds_keep_a_part(tmp_path):
-    lot = ParkingLot.grid(4, 8)
+    lot = grid_lot(4, 8)
     draft = of_lot(tmp_path, lot, bounds=((-1.0, -20.0), (12.4, 50.0)))
     assert len(draft.slots) == 20
     with pytest.raises(InputError, match="no slot within the bounds"):
@@ -129,7 +130,7 @@ def test_bounds_keep_a_part(tmp_path):
 
 
 def test_stray_slots_are_left_out_and_listed(tmp_path):
-    lot = ParkingLot.grid(4, 8)
+    lot = grid_lot(4, 8)
     xy = np.vstack([lot.slot_xy, [[60.0, 60.0]]])
     draft = listed(tmp_path, xy, entries=((-3.0, 0.0),), goals=((9.0, 9.0),))
     assert [str(left) for left in draft.left_out] == ["slots that stand in no row: 1 (s32)"]
@@ -147,7 +148,7 @@ def test_stray_slots_are_left_out_and_listed(tmp_path):
     seed=st.integers(0, 1000),
 )
 def test_a_moved_list_gives_the_same_lot_moved(tmp_path, turn, shift, rows, columns, pitch, aisle, seed):
-    lot = ParkingLot.grid(rows, columns, pitch=pitch, aisle=aisle)
+    lot = grid_lot(rows, columns, pitch=pitch, aisle=aisle)
     matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
 
     def moved(xy):
@@ -170,7 +171,7 @@ def test_a_moved_list_gives_the_same_lot_moved(tmp_path, turn, shift, rows, colu
 @given(seed=st.integers(0, 10_000))
 def test_inexact_lists_give_lots_in_which_every_slot_opens_to_a_lane(tmp_path, seed):
     rng = np.random.default_rng(seed)
-    lot = ParkingLot.grid(4, int(rng.integers(6, 15)))
+    lot = grid_lot(4, int(rng.integers(6, 15)))
     kept = np.sort(rng.permutation(lot.n_slots)[: lot.n_slots - 3])
     xy = lot.slot_xy[kept] + rng.uniform(-0.15, 0.15, (len(kept), 2))
     draft = listed(tmp_path, xy, yaw=lot.slot_yaw[kept], entries=((-3.0, 0.0),), goals=((50.0, 20.0),))
@@ -231,12 +232,12 @@ def test_cars_that_would_drive_in_through_the_next_row_are_refused(tmp_path):
 
 
 def test_it_says_how_to_give_an_entry_and_a_goal(tmp_path):
-    draft = of_lot(tmp_path, ParkingLot.grid(2, 8))
+    draft = of_lot(tmp_path, grid_lot(2, 8))
     with pytest.raises(InputError, match=r"give one by --entry X,Y, e\.g\. .*; no goal: .*--goal X,Y"):
         draft.lot()
     entry = draft.missing[0].split("e.g. ")[1].split(" or ")[0]
     x, y = map(float, entry.split(","))
-    assert of_lot(tmp_path, ParkingLot.grid(2, 8), entries=((x, y),), goals=((9.0, 9.0),)).lot().n_slots == 16
+    assert of_lot(tmp_path, grid_lot(2, 8), entries=((x, y),), goals=((9.0, 9.0),)).lot().n_slots == 16
 
 
 # ---- faults ----
@@ -282,10 +283,10 @@ def test_files_that_cannot_be_read_are_named(tmp_path):
 
 
 def test_a_search_runs_on_a_list_of_slots(tmp_path):
-    lot = ParkingLot.grid(4, 8)
+    lot = grid_lot(4, 8)
     draft = of_lot(tmp_path, lot, entries=(tuple(lot.entries[0]),), goals=(tuple(lot.goals[0]),))
-    draft.lot().to_file(tmp_path / "lot.geojson")
+    write_lot(draft.lot(), tmp_path / "lot.geojson")
     assert check_lot(tmp_path / "lot.geojson") == []
-    scenario = Scenario.on_lot(ParkingLot.from_file(tmp_path / "lot.geojson"))
+    scenario = Scenario.on_lot(read_lot(tmp_path / "lot.geojson"))
     rows = Case(scenario, "mdp").run(range(4))[0]
     assert all(r["parked"] and r["walk_s"] > 0.0 for r in rows)

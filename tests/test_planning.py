@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from parkenv import InputError, ParkingLot, Scenario
+from parkenv import InputError, Scenario
+from parkenv.lots import grid_lot
 from parkenv.world.lot import PARK
 from planners import CirclingWarning, ParkingMDP, label_setting, policy_iteration, value_iteration
 
@@ -90,7 +91,7 @@ def test_policy_iteration_agrees_with_value_iteration(seed, gamma, failure):
 @settings(max_examples=20)
 def test_solvers_agree_on_random_lots(seed):
     rng = np.random.default_rng(seed)
-    lot = ParkingLot.grid(int(rng.integers(1, 5)), int(rng.integers(2, 9)))
+    lot = grid_lot(int(rng.integers(1, 5)), int(rng.integers(2, 9)))
     scenario = Scenario.on_lot(lot, failure_s=float(rng.uniform(0, 90)))
     mdp = ParkingMDP.from_belief(scenario, rng.uniform(0.0, 0.99, lot.n_slots), gamma=0.999)
     np.testing.assert_allclose(
@@ -123,7 +124,7 @@ def test_an_unavailable_move_costs_its_wait_and_stays():
 
 
 def test_a_low_discount_is_warned_of():
-    lot = ParkingLot.grid(2, 40)
+    lot = grid_lot(2, 40)
     scenario = Scenario.on_lot(lot, failure_s=90.0)
     mdp = ParkingMDP.from_belief(scenario, np.full(lot.n_slots, 0.99), gamma=0.99)
     with pytest.warns(CirclingWarning, match=r"gamma 0\.99 is too low"):

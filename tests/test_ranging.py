@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from laser_drive import CAMERA, EYE, LASER, MOUNT, look, turned_off
 
-from parkenv import InputError, ParkingLot
+from parkenv import InputError
+from parkenv.lots import packaged_lot
 from parkenv.mapping.route import survey_route
 from parkenv.perception.box_fit import fit_box
 from parkenv.perception.detector import Detections
@@ -227,7 +228,7 @@ def test_points_are_checked():
 @pytest.mark.parametrize("name", ["campus", "street"])
 def test_fitted_cars_stand_where_the_cars_do(name):
     """Along a survey of parked cars: heading and place of the fit beside those of the thesis's way (T §4.2)."""
-    lot = ParkingLot.packaged(name)
+    lot = packaged_lot(name)
     rng = np.random.default_rng(1)
     scene = slot_lot(lot, 1).scene(rng.random(lot.n_slots) < 0.6)
     off = {locate: [], locate_plainly: []}
@@ -258,7 +259,7 @@ def pairs():
     _, stereo, mount = rig.stereo_cameras[0]
     looks = []
     for name in ("campus", "street"):
-        lot = ParkingLot.packaged(name)
+        lot = packaged_lot(name)
         scene = slot_lot(lot, 2).scene(np.random.default_rng(2).random(lot.n_slots) < 0.7)
         way = poses_along(survey_route(lot).path, 1.0)
         cars = [len(look(scene, pose)[1]) for pose in way]

@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from parkenv import OccupancyLog, ParkingLot, RecordedOccupancy, Scenario
+from parkenv import OccupancyLog, RecordedOccupancy, Scenario
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.statistics import mean_interval
+from parkenv.lots import read_lot
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 MAP, LOG = DATA / "dlp" / "parking_map.yml", DATA / "cnr_ext" / "occupancy_15_days.csv.gz"
@@ -19,7 +20,7 @@ needs_data = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def scenario():
-    lot = ParkingLot.from_file(MAP)
+    lot = read_lot(MAP)
     return Scenario.on_lot(lot, RecordedOccupancy(OccupancyLog.read(LOG), lot.walk_m()))
 
 

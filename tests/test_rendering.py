@@ -11,6 +11,7 @@ from parkenv.envs import rendering
 from parkenv.envs.rendering import SearchRenderer, belief_colors, clock
 from parkenv.envs.window import Window
 from parkenv.errors import InputError
+from parkenv.lots import city_lot
 from parkenv.world.lot import PARK, Lane, ParkingLot
 from parkenv.world.occupancy import Arrival, OccupancyProcess
 from parkenv.world.scenario import Scenario
@@ -113,7 +114,7 @@ def test_a_lot_higher_than_wide_is_turned_and_drawn_as_large():
 
 
 def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
-    scenario = Scenario.on_lot(ParkingLot.city(4000, seed=2))
+    scenario = Scenario.on_lot(city_lot(4000, seed=2))
     renderer = SearchRenderer(scenario)
     assert renderer._whole is None
     env = gym.make("parkenv/Search-v0", scenario=scenario)
@@ -133,7 +134,7 @@ def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
 
 
 def test_a_goal_out_of_the_window_is_pointed_at():
-    scenario = Scenario.on_lot(ParkingLot.city(4000, seed=2))
+    scenario = Scenario.on_lot(city_lot(4000, seed=2))
     env = gym.make("parkenv/Search-v0", scenario=scenario, render_mode="rgb_array")
     env.reset(seed=0)
     away = scenario.lot.goals[0] - scenario.lot.vertex_xy[env.unwrapped.state.vertex]
@@ -197,9 +198,7 @@ def test_text_tells_place_time_and_surroundings():
 
 
 def test_text_of_a_large_lot_fits_the_terminal_too():
-    env = gym.make(
-        "parkenv/Search-v0", scenario=Scenario.on_lot(ParkingLot.city(4000, seed=2)), render_mode="ansi"
-    )
+    env = gym.make("parkenv/Search-v0", scenario=Scenario.on_lot(city_lot(4000, seed=2)), render_mode="ansi")
     env.reset(seed=0)
     lines = env.render().splitlines()
     assert len(lines) <= 22

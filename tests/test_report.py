@@ -11,7 +11,7 @@ import jsonschema
 import numpy as np
 import pytest
 
-from parkenv import InputError, ParkingLot, Scenario
+from parkenv import InputError, Scenario
 from parkenv.cli.report import make_report
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.results import episode_key
@@ -20,6 +20,7 @@ from parkenv.evaluation.report.page import SCHEMA, page_data
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.report.search_recording import Encounter, choose, record
 from parkenv.evaluation.report.tables import table_of
+from parkenv.lots import packaged_lot, write_lot
 from parkenv.world.lot import PARK
 from planners import make_agent
 
@@ -187,7 +188,7 @@ def test_a_total_that_differs_is_told(run, tmp_path, capsys):
 
 def test_a_world_that_has_changed_since_is_not_replayed_but_told(tmp_path):
     lot = tmp_path / "lot.geojson"
-    ParkingLot.packaged("mini").to_file(lot)
+    write_lot(packaged_lot("mini"), lot)
     out = tmp_path / "compare"
     done = parkenv(
         "compare", "--lot", lot, "--agents", "mdp,oracle", "-n", 2, "--occupancy-levels", "none", "--no-figures",

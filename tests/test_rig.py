@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from parkenv import ParkingLot
+from parkenv.lots import packaged_lot
 from parkenv.world.lot_scene import slot_lot
 from sim_sensors.camera.models import PinholeCamera
 from sim_sensors.errors import SensorError
@@ -17,13 +17,13 @@ from sim_sensors.rig import LEFT, RIGHT, Mount, SensorRig, poses_along
 
 @pytest.fixture(scope="module")
 def scene():
-    lot = ParkingLot.packaged("mini")
+    lot = packaged_lot("mini")
     return slot_lot(lot).scene(np.arange(lot.n_slots) % 3 != 0)
 
 
 @pytest.fixture(scope="module")
 def pose():
-    lot = ParkingLot.packaged("mini")
+    lot = packaged_lot("mini")
     return np.array([*lot.vertex_xy[2], lot.vertex_yaw[2]])
 
 

@@ -7,14 +7,15 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv import InputError, Lane, ParkingLot, Scenario
+from parkenv.lots import city_lot, grid_lot, packaged_lot
 from planners import make_agent
 from planners.routes import DriveRoutes
 
 LOTS = {
-    "campus": ParkingLot.packaged("campus"),
-    "street": ParkingLot.packaged("street"),
-    "grid": ParkingLot.grid(4, 10),
-    "city": ParkingLot.city(300),
+    "campus": packaged_lot("campus"),
+    "street": packaged_lot("street"),
+    "grid": grid_lot(4, 10),
+    "city": city_lot(300),
 }
 
 

@@ -16,10 +16,11 @@ from hypothesis import strategies as st
 from numba.core.errors import TypingError
 
 import parkenv
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorBand, SensorModel
+from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.envs.search_alone import held
 from parkenv.envs.wrappers import ThesisReward
+from parkenv.lots import grid_lot
 from parkenv.world.decay import decay_factor
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SCENARIO_NAMES
@@ -156,7 +157,7 @@ def test_the_thesis_reward_differs_by_r_max_on_success():
 
 
 def two_slots(taken):
-    lot = ParkingLot.grid(1, 2, aisle=6.0)
+    lot = grid_lot(1, 2, aisle=6.0)
     return Scenario(name="two", lot=lot, occupancy=always(lot, np.array(taken)), failure_s=7.0, wait_s=2.0)
 
 
@@ -300,7 +301,7 @@ def test_fading_is_the_exponential(x):
 
 
 def test_the_belief_in_a_slot_left_behind_grows_old():
-    lot = ParkingLot.grid(1, 12)
+    lot = grid_lot(1, 12)
     process = OccupancyProcess.from_demand(np.zeros(12), np.zeros(168), 600.0)
     scenario = Scenario(name="a", lot=lot, occupancy=process, sensor_model=SensorModel(view_range=0.0))
     env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
@@ -331,7 +332,7 @@ def test_a_seed_holds_after_going_on_from_another_search():
 
 
 def test_noisy_sight_errs_as_often_as_stated():
-    lot = ParkingLot.grid(4, 25)
+    lot = grid_lot(4, 25)
     taken = np.arange(lot.n_slots) % 2 == 0
     scenario = Scenario(
         name="noisy",
@@ -435,7 +436,7 @@ def test_wrong_use_is_refused():
         with pytest.raises(InputError, match="action is"):
             env.step(wrong)
     with pytest.raises(InputError, match="slots"):
-        Scenario(name="x", lot=ParkingLot.grid(1, 3), occupancy=always(None, np.array([True])))
+        Scenario(name="x", lot=grid_lot(1, 3), occupancy=always(None, np.array([True])))
     for wrong in ({"hit_rate": 1.2}, {"view_range": -1.0}, {"hit_rate": 0.2, "false_alarm_rate": 0.3}):
         with pytest.raises(InputError, match=next(iter(wrong))):
             SensorModel(**wrong)

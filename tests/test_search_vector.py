@@ -7,10 +7,11 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 import parkenv  # noqa: F401 - registers the ids
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorBand, SensorModel
+from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
 from parkenv.belief.slot_belief import bayes_update
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_vector import ParkSearchVectorEnv
+from parkenv.lots import city_lot, grid_lot
 from parkenv.world.occupancy import Arrival, ArrivalWindow, Forecast
 from parkenv.world.occupancy_log import OccupancyLog
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -58,14 +59,14 @@ def busy_log(n_slots=6, n_days=12):
 
 
 def recorded_scenario():
-    lot = ParkingLot.grid(2, 8)
+    lot = grid_lot(2, 8)
     occupancy = RecordedOccupancy(busy_log(), lot.walk_m(0))
     return Scenario(name="log", lot=lot, occupancy=occupancy, arrival=ArrivalWindow.parse("08:00-13:00"))
 
 
 def restless_scenario():
     """Slots change within seconds, so that worlds go through many stretches while the car looks."""
-    lot = ParkingLot.grid(2, 10)
+    lot = grid_lot(2, 10)
     process = OccupancyProcess.from_demand(np.linspace(0, 4, 20), np.sin(np.arange(168)), 15.0)
     return Scenario(name="restless", lot=lot, occupancy=process, arrival=ArrivalWindow.parse("9:50-10:10"))
 
@@ -336,7 +337,7 @@ def test_what_is_handed_out_is_not_live_unless_asked():
 
 
 def test_a_lot_of_ten_thousand_slots_touches_only_what_is_near():
-    scenario = Scenario.on_lot(ParkingLot.city(10_000))
+    scenario = Scenario.on_lot(city_lot(10_000))
     envs = make_batch(2, scenario, observation="local")
     observation, _ = envs.reset(seed=0)
     assert (

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from parkenv import InputError, Lane, Mouth, ParkingLot
+from parkenv.lots import packaged_lot
 from parkenv.mapping.route import survey_route
 
 LOTS = ["campus", "jam", "street", "mini"]
@@ -16,7 +17,7 @@ def legal(lot, a, b):
 @pytest.mark.parametrize("both_sides", [False, True])
 @pytest.mark.parametrize("name", LOTS)
 def test_every_slot_is_passed_and_the_drive_ends_where_it_began(name, both_sides):
-    lot = ParkingLot.packaged(name)
+    lot = packaged_lot(name)
     route = survey_route(lot, both_sides=both_sides)
     assert set(route.vertices.tolist()) >= set(range(lot.n_slots))
     assert route.vertices[0] == route.vertices[-1] == lot.entry_vertices[0]
@@ -26,7 +27,7 @@ def test_every_slot_is_passed_and_the_drive_ends_where_it_began(name, both_sides
 
 @pytest.mark.parametrize("name", LOTS)
 def test_the_camera_on_the_right_has_every_slot_on_its_side(name):
-    lot = ParkingLot.packaged(name)
+    lot = packaged_lot(name)
     route = survey_route(lot)
     seen = set()
     for before, vertex, after in zip(
@@ -42,7 +43,7 @@ def test_the_camera_on_the_right_has_every_slot_on_its_side(name):
 
 @pytest.mark.parametrize("name", LOTS)
 def test_lanes_are_driven_as_they_may_be_but_for_slots_on_their_left(name):
-    lot = ParkingLot.packaged(name)
+    lot = packaged_lot(name)
     free, strict = survey_route(lot), survey_route(lot, both_sides=True)
     for a, b in zip(strict.vertices[:-1], strict.vertices[1:], strict=True):
         assert legal(lot, a, b)
@@ -56,7 +57,7 @@ def test_lanes_are_driven_as_they_may_be_but_for_slots_on_their_left(name):
 
 
 def test_one_aisle_is_driven_there_and_back():
-    lot = ParkingLot.packaged("mini")
+    lot = packaged_lot("mini")
     route = survey_route(lot)
     x = route.path[:, 0]
     there_and_back = 2 * (x.max() - x.min())

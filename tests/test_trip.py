@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from parkenv import InputError, ParkingLot, Scenario
+from parkenv import InputError, Scenario
 from parkenv.cli import app
 from parkenv.driving.driven_lines import KEPT_RIGHT_M, DrivenLines
 from parkenv.driving.encounters import WATCHED_S
@@ -33,6 +33,7 @@ from parkenv.evaluation.trips.driven_search import DrivenSearch, DrivenSearchEnv
 from parkenv.evaluation.trips.driver import ACROSS, ALONG, NO_ROOM, TAKEN, TURN, GraphDriver
 from parkenv.evaluation.trips.lot_driver import DrivingStyle, LotDriver
 from parkenv.evaluation.trips.sensor_log import record_trip
+from parkenv.lots import packaged_lot
 from parkenv.world.keyed_random import world_key
 from parkenv.world.lot_scene import LotScenes
 from parkenv.world.occupancy import OccupancyProcess
@@ -50,7 +51,7 @@ LOTS = ("campus", "jam", "street", "mini")
 
 @lru_cache
 def lines_of(name):
-    lot = ParkingLot.packaged(name)
+    lot = packaged_lot(name)
     return lot, DrivenLines(lot)
 
 
@@ -499,7 +500,7 @@ def test_a_failed_try_takes_longer_the_later_it_is_noticed_and_ends_on_the_lane(
 
 
 def test_a_slot_too_narrow_for_the_car_is_left_and_not_sought_again():
-    lot = ParkingLot.packaged("mini")
+    lot = packaged_lot("mini")
     width = lot.slot_width.copy()
     narrow = np.arange(0, lot.n_slots, 2)
     width[narrow] = 2.2

@@ -12,6 +12,7 @@ import numpy as np
 import typer
 
 from parkenv.errors import InputError
+from parkenv.lots import load_lot
 from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy import ArrivalWindow, OccupancyModel, OccupancyProcess
 from parkenv.world.scenario import Scenario
@@ -211,7 +212,7 @@ def workers_of(jobs: int, backend: str, address: str | None) -> Workers:
 
 def lot_of(path: Path, goal: str | None = None) -> ParkingLot:
     """The lot in a file, with another goal where one is given."""
-    lot = ParkingLot.from_file(path)
+    lot = load_lot(path)
     if goal is None:
         return lot
     try:

@@ -63,16 +63,16 @@ class DriveCourse(Course):
     @cached_property
     def lots(self) -> list[ParkingLot]:
         """Where it is trained."""
-        from parkenv.envs.drive import lot_named
+        from parkenv.lots import load_lot
 
-        return [lot_named(name) for name in args.words("--lot", self.lot)]
+        return [load_lot(name) for name in args.words("--lot", self.lot)]
 
     @cached_property
     def tested(self) -> list[ParkingLot]:
         """Where it is tested."""
-        from parkenv.envs.drive import lot_named
+        from parkenv.lots import load_lot
 
-        return [lot_named(name) for name in args.words("--test-on", self.test_on or self.lot)]
+        return [load_lot(name) for name in args.words("--test-on", self.test_on or self.lot)]
 
     def check(self) -> None:
         """See `Course`."""

@@ -11,19 +11,8 @@ from rich.console import Console
 
 from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
-from parkenv.world.lot import ParkingLot
 
 app = typer.Typer(help="Show, check, import and convert lots.", no_args_is_help=True)
-
-
-def _load(lot: str) -> ParkingLot:
-    from parkenv.lots.lot_files import PACKAGED_LOTS
-
-    if lot in PACKAGED_LOTS:
-        return ParkingLot.packaged(lot)
-    if not Path(lot).exists():
-        raise InputError(f"{lot}: no such file, nor a packaged lot ({', '.join(PACKAGED_LOTS)})")
-    return ParkingLot.from_file(lot)
 
 
 @app.command()
@@ -34,8 +23,9 @@ def show(
 ) -> None:
     """Draw a lot, and say what is in it."""
     from parkenv.evaluation.figures.lot_picture import save_lot_picture
+    from parkenv.lots import load_lot
 
-    its_lot = _load(lot)
+    its_lot = load_lot(lot)
     picture = out or Path(f"{its_lot.name}.png")
     save_lot_picture(its_lot, picture, show_graph=graph)
     low_x, low_y, high_x, high_y = its_lot.bounds()
@@ -116,8 +106,8 @@ def import_place(
     * `parkenv lot import map.osm --out lot.geojson --picture lot.png`
     * `parkenv lot import slots.csv --out lot.geojson --entry 0,0 --goal 40,25`
     """
+    from parkenv.lots import import_lot, write_lot
     from parkenv.lots.places.lot_draft import Wishes
-    from parkenv.lots.places.lot_import import import_lot
 
     corners = None if bounds is None else _numbers("--bounds", bounds, 4)
     wishes = Wishes(
@@ -141,7 +131,7 @@ def import_place(
         lot = draft.lot()
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
-    lot.to_file(out)
+    write_lot(lot, out)
     console.print(f"Wrote {out}: {lot.n_slots} slots, {lot.n_vertices} vertices", markup=False)
 
 
@@ -161,5 +151,7 @@ def convert(
     out: Annotated[Path, typer.Argument(help="The GeoJSON file to write.")],
 ) -> None:
     """Write a lot as native GeoJSON, e.g. to edit it."""
-    _load(lot).to_file(out)
+    from parkenv.lots import load_lot, write_lot
+
+    write_lot(load_lot(lot), out)
     make_console().print(f"Wrote {out}")

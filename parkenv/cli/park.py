@@ -66,16 +66,16 @@ def park(
     * `parkenv park --lot parking_map.yml --way back-in`
     """
     from parkenv.driving.parking_task import KINDS, WAYS
-    from parkenv.envs.drive import lot_named
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, parking_table, write_parkings
+    from parkenv.lots import load_lot
     from planners.driving.drivers import make_driver
 
     kinds = None if kind == "all" else _chosen("--kind", kind, KINDS)
     ways = WAYS if way == "both" else _chosen("--way", way, WAYS)
     cases = []
     for name in args.words("--lot", lot):
-        case = ParkingCase(lot_named(name), kinds, ways, occupancy, slack)
+        case = ParkingCase(load_lot(name), kinds, ways, occupancy, slack)
         case.environment().close()  # complains before anything is driven
         cases.append(case)
     labels = _labels(args.words("--agents", agents))

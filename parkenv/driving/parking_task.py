@@ -119,7 +119,8 @@ class ParkingTasks:
             these kinds that it fits into.
 
     Examples:
-        >>> task = ParkingTasks(ParkingLot.packaged("campus"), kinds=("oblique",)).draw(7)
+        >>> from parkenv.lots import packaged_lot
+        >>> task = ParkingTasks(packaged_lot("campus"), kinds=("oblique",)).draw(7)
         >>> task.kind, task.slot_id[0], task.size
         ('oblique', 'F', (5.0, 2.5))
     """

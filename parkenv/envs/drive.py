@@ -19,6 +19,7 @@ from parkenv.driving.polite_traffic import PoliteTraffic
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters, advance, placed
 from parkenv.envs.drive_state import DriveState
 from parkenv.errors import InputError
+from parkenv.lots import load_lot
 from parkenv.world.keyed_random import world_key
 from parkenv.world.lot import ParkingLot
 from parkenv.world.traffic import Traffic
@@ -180,7 +181,7 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self.render_mode = render_mode
         self.vehicle = vehicle or VehicleParameters()
         self.tasks = ParkingTasks(
-            lot_named(lot),
+            lot if isinstance(lot, ParkingLot) else load_lot(lot),
             self.vehicle,
             None if kinds is None else tuple(kinds),
             tuple(ways),
@@ -441,25 +442,6 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
             "angle_error_rad": self._errors[1],
             "parked": state.parked,
         }
-
-
-def lot_named(lot: ParkingLot | str | Path) -> ParkingLot:
-    """A lot, a packaged one by its name, or the one in a file.
-
-    Raises:
-        InputError: neither a lot, nor a packaged name, nor a file that holds one.
-    """
-    from parkenv.lots.lot_files import PACKAGED_LOTS
-
-    if isinstance(lot, ParkingLot):
-        return lot
-    if not isinstance(lot, str | Path):
-        raise InputError(f"lot is a {type(lot).__name__}, want a ParkingLot, a packaged lot's name or a file")
-    if str(lot) in PACKAGED_LOTS:
-        return ParkingLot.packaged(str(lot))
-    if not Path(lot).exists():
-        raise InputError(f"{lot}: no such file, nor a packaged lot ({', '.join(PACKAGED_LOTS)})")
-    return ParkingLot.from_file(lot)
 
 
 def goal_errors(

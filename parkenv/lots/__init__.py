@@ -1,1 +1,23 @@
-"""The lots that come with the package, as files; `python -m parkenv.lots.build` makes them anew."""
+"""Lots: read and write lot files, import real places, generate lots by rule, check lots.
+
+`ParkingLot` itself knows no files; the functions here make it from files and rules.
+"""
+
+from parkenv.lots.checks import check_lot
+from parkenv.lots.generators import city_lot, grid_lot
+from parkenv.lots.geojson import LotProblem, write_lot
+from parkenv.lots.lot_files import PACKAGED_LOTS, load_lot, packaged_lot, read_lot
+from parkenv.lots.places.lot_import import import_lot
+
+__all__ = [
+    "PACKAGED_LOTS",
+    "LotProblem",
+    "check_lot",
+    "city_lot",
+    "grid_lot",
+    "import_lot",
+    "load_lot",
+    "packaged_lot",
+    "read_lot",
+    "write_lot",
+]

@@ -16,6 +16,7 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.lots.generators import BAY_SIZE, BUILDING_SETBACK, Slots, StreetGrid, bay_row
+from parkenv.lots.geojson import write_lot
 from parkenv.world.lot import Lane, ParkingLot, corner_points
 
 FloatArray = NDArray[np.float64]
@@ -212,7 +213,7 @@ LOTS: dict[str, Callable[[], ParkingLot]] = {make.__name__: make for make in (ca
 def build(folder: Path) -> None:
     """Write all packaged lots into a folder."""
     for name, make in LOTS.items():
-        make().to_file(folder / f"{name}.geojson")
+        write_lot(make(), folder / f"{name}.geojson")
 
 
 if __name__ == "__main__":

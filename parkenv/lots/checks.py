@@ -10,9 +10,10 @@ import shapely
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from parkenv.errors import InputError
-from parkenv.lots.dragon_lake import dragon_lake_lot, is_dragon_lake
+from parkenv.lots.dragon_lake import dragon_lake_lot
+from parkenv.lots.file_formats import LotFormat, lot_format
 from parkenv.lots.geojson import LotContents, LotProblem, graph_errors, read_contents
-from parkenv.lots.places.lot_import import import_lot, is_place
+from parkenv.lots.places.lot_import import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.drive_graph import places
 from parkenv.world.lot import Lane, ParkingLot, corner_points, mouth_heading, mouth_points
@@ -37,11 +38,12 @@ def check_lot(path: str | Path) -> list[LotProblem]:
     entries that lead to no slot.
     """
     path = Path(path)
-    if is_place(path):
+    file_format = lot_format(path)
+    if file_format is not None and not file_format.is_complete:
         return _place_problems(path)
-    if is_dragon_lake(path):
+    if file_format is LotFormat.DRAGON_LAKE:
         try:
-            dragon_lake_lot(ParkingLot, path)
+            dragon_lake_lot(path)
         except InputError as error:
             return [LotProblem("error", None, str(error).removeprefix(f"{path}: "))]
         return []

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import yaml
@@ -13,16 +12,10 @@ from parkenv.errors import InputError
 from parkenv.lots.generators import Slots, bay_row
 from parkenv.world.lot import Lane, ParkingLot
 
-LotT = TypeVar("LotT", bound=ParkingLot)
 FloatArray = NDArray[np.float64]
 
 
-def is_dragon_lake(path: Path) -> bool:
-    """Whether a file is such a map, by its name."""
-    return path.suffix.lower() in (".yml", ".yaml")
-
-
-def dragon_lake_lot(cls: type[LotT], path: Path) -> LotT:
+def dragon_lake_lot(path: Path) -> ParkingLot:
     """The lot of the Dragon Lake Parking data set, from its `parking_map.yml`.
 
     Slots fill the `bounds` of each parking area in the rows and columns of its `shape`, and are called
@@ -92,7 +85,7 @@ def dragon_lake_lot(cls: type[LotT], path: Path) -> LotT:
             slot_ids += [f"{area}-{row}-{column}" for column in range(n_columns)]
     if not parts:
         raise InputError(f"{path}: no PARKING_AREAS: an empty lot")
-    return cls(
+    return ParkingLot(
         name="dragon-lake",
         slot_ids=tuple(slot_ids),
         **Slots.joined(parts).columns(),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from itertools import count
-from typing import Any, Self, TypeVar
+from typing import Any, Self
 
 import numpy as np
 import shapely
@@ -15,7 +15,6 @@ from parkenv.errors import InputError
 from parkenv.world.drive_graph import LANE_OFFSET, SLOT_REACH
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
-LotT = TypeVar("LotT", bound=ParkingLot)
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
@@ -127,9 +126,26 @@ def kerb_rows(
 
 
 def grid_lot(
-    cls: type[LotT], rows: int, columns: int, *, name: str, pitch: float, depth: float, aisle: float
-) -> LotT:
-    """See `ParkingLot.grid`.
+    rows: int,
+    columns: int,
+    *,
+    name: str = "grid",
+    pitch: float = 2.5,
+    depth: float = 5.0,
+    aisle: float = 6.0,
+) -> ParkingLot:
+    """Make rows of perpendicular slots along parallel two-way aisles, joined by a road at either end.
+
+    Rows lie in pairs back to back: row 0 south of the first aisle, rows 1 and 2 between the first and
+    the second, and so on. The entry is at the west end of the south aisle, the goal east of the lot.
+
+    Args:
+        rows: number of rows of slots; two rows share an aisle.
+        columns: slots per row.
+        name: the lot's name.
+        pitch: width of a slot, m.
+        depth: length of a slot, m.
+        aisle: width of an aisle and of the end roads, m.
 
     Raises:
         InputError: a count below one, or a size that leaves no room to drive or no lane within reach.
@@ -161,7 +177,7 @@ def grid_lot(
     lanes = [Lane(np.array([[west, y], [east, y]])) for y in aisle_y]
     if n_aisles > 1:
         lanes += [Lane(np.stack([np.full(n_aisles, x), aisle_y], axis=1)) for x in (west, east)]
-    return cls(
+    return ParkingLot(
         name=name,
         slot_ids=tuple(f"{r}-{c}" for r in range(rows) for c in range(columns)),
         **slots.columns(),
@@ -171,8 +187,10 @@ def grid_lot(
     )
 
 
-def city_lot(cls: type[LotT], n_slots: int, seed: int) -> LotT:
-    """See `ParkingLot.city`.
+def city_lot(n_slots: int, seed: int = 0) -> ParkingLot:
+    """Make kerbside slots round the blocks of a city of one-way and two-way streets, `n_slots` in all.
+
+    A million slots take seconds. The same seed gives the same city.
 
     Every street runs from one edge of the city to the other, and the streets along its edges are two-way:
     whatever the one-way streets between them, every place can be reached from every other. Slots are
@@ -200,7 +218,7 @@ def city_lot(cls: type[LotT], n_slots: int, seed: int) -> LotT:
     middle = (len(corners) // 2, len(corners[0]) // 2)
     built = np.ones(corners.shape[:2], dtype=bool)
     built[middle] = False
-    return cls(
+    return ParkingLot(
         name=f"city-{n_slots}-{seed}",
         slot_ids=tuple(map(str, range(n_slots))),
         **slots.columns(),

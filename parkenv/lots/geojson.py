@@ -66,12 +66,13 @@ class LotProblem:
         return f"{self.severity}: {where}{self.message}"
 
 
-def write_lot(lot: ParkingLot, path: Path) -> None:
-    """See `ParkingLot.to_file`. The file appears whole or not at all.
+def write_lot(lot: ParkingLot, path: str | Path) -> None:
+    """Write a lot as native GeoJSON, which `read_lot` reads back exactly. The file appears whole or not at all.
 
     Raises:
         InputError: the name does not end in `.geojson` or `.json`, or the file cannot be written.
     """
+    path = Path(path)
     if path.suffix.lower() not in (".geojson", ".json"):
         raise InputError(f"{path}: a lot is written as .geojson or .json")
     head = {

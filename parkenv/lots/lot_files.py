@@ -1,50 +1,43 @@
-"""Lots in files: which reader a file needs, and the lots that come with the package."""
+"""Lots in files: reading the formats that describe a whole lot, and the packaged lots."""
 
 from __future__ import annotations
 
 from importlib import resources
 from pathlib import Path
-from typing import TypeVar
 
 from parkenv.errors import InputError
-from parkenv.lots.dragon_lake import dragon_lake_lot, is_dragon_lake
+from parkenv.lots.dragon_lake import dragon_lake_lot
+from parkenv.lots.file_formats import LotFormat, lot_format
 from parkenv.lots.geojson import graph_errors, read_contents
-from parkenv.lots.places.lot_import import is_place
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.lot import ParkingLot
 
-LotT = TypeVar("LotT", bound=ParkingLot)
-
 PACKAGED_LOTS = ("campus", "jam", "street", "mini")
+"""The lots that come with the package."""
 
 
-def read_lot(cls: type[LotT], path: Path) -> LotT:
-    """See `ParkingLot.from_file`.
-
-    Slots without exact properties are taken from their polygons, see `slots_from_polygons`. The Dragon Lake
-    map is read as `dragon_lake_lot` says.
+def load_lot(name_or_path: str | Path) -> ParkingLot:
+    """Load a packaged lot by its name, or a lot file by its path.
 
     Raises:
-        InputError: the first fault of the file, and how many more there are.
+        InputError: neither a packaged lot nor a file, or the file holds no valid lot (see `read_lot`).
+
+    Examples:
+        >>> load_lot("campus").n_slots
+        181
     """
-    if is_dragon_lake(path):
-        return dragon_lake_lot(cls, path)
-    contents = read_contents(path)
-    if not contents.errors:
-        try:
-            return cls(**contents.columns())
-        except GraphError:
-            pass
-    errors = [*contents.errors, *graph_errors(contents)]
-    first = str(errors[0]).removeprefix("error: ")
-    if is_place(path):
-        raise InputError(f"{path}: {first}; `parkenv lot import {path}` makes a lot of it")
-    more = f" (and {len(errors) - 1} more; `parkenv lot check {path}` lists all)" if len(errors) > 1 else ""
-    raise InputError(f"{path}: {first}{more}")
+    if not isinstance(name_or_path, str | Path):
+        raise InputError(f"lot is a {type(name_or_path).__name__}, want a packaged lot's name or a lot file")
+    if str(name_or_path) in PACKAGED_LOTS:
+        return packaged_lot(str(name_or_path))
+    path = Path(name_or_path)
+    if not path.exists():
+        raise InputError(f"{path}: no such file, nor a packaged lot ({', '.join(PACKAGED_LOTS)})")
+    return read_lot(path)
 
 
-def packaged_lot(cls: type[LotT], name: str) -> LotT:
-    """See `ParkingLot.packaged`.
+def packaged_lot(name: str) -> ParkingLot:
+    """Load one of the lots that come with the package: campus, jam, street, mini.
 
     Raises:
         InputError: no lot of that name comes with the package.
@@ -52,4 +45,31 @@ def packaged_lot(cls: type[LotT], name: str) -> LotT:
     if name not in PACKAGED_LOTS:
         raise InputError(f"no packaged lot {name!r}, want one of {', '.join(PACKAGED_LOTS)}")
     with resources.as_file(resources.files("parkenv.lots") / "packaged" / f"{name}.geojson") as path:
-        return read_lot(cls, path)
+        return read_lot(path)
+
+
+def read_lot(path: str | Path) -> ParkingLot:
+    """Read a lot from native GeoJSON (`.geojson`, `.json`) or a Dragon Lake map (`.yml`).
+
+    Slots without exact properties take their shape from their polygons (`slots_from_polygons`).
+
+    Raises:
+        InputError: the file cannot be read or holds no valid lot; the message states the first fault and the
+            number of further ones, `parkenv.lots.check_lot` lists all.
+    """
+    path = Path(path)
+    file_format = lot_format(path)
+    if file_format is LotFormat.DRAGON_LAKE:
+        return dragon_lake_lot(path)
+    contents = read_contents(path)
+    if not contents.errors:
+        try:
+            return ParkingLot(**contents.columns())
+        except GraphError:
+            pass
+    errors = [*contents.errors, *graph_errors(contents)]
+    first = str(errors[0]).removeprefix("error: ")
+    if file_format is not None and not file_format.is_complete:
+        raise InputError(f"{path}: {first}; `parkenv lot import {path}` makes a lot of it")
+    more = f" (and {len(errors) - 1} more; `parkenv lot check {path}` lists all)" if len(errors) > 1 else ""
+    raise InputError(f"{path}: {first}{more}")

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
-from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -102,7 +101,8 @@ class ParkingLot:
         GraphError: slots or entries that no lane serves, or more than four lanes out of one junction.
 
     Examples:
-        >>> lot = ParkingLot.packaged("mini")
+        >>> from parkenv.lots import packaged_lot
+        >>> lot = packaged_lot("mini")
         >>> lot.n_slots
         10
         >>> lot.neighbors.shape == (lot.n_vertices, 4)
@@ -240,68 +240,6 @@ class ParkingLot:
         source, target, length = source[order], target[order], length[order]
         first = np.r_[True, (np.diff(source) != 0) | (np.diff(target) != 0)]
         return csr_array((length[first], (source[first], target[first])), shape=shape)
-
-    @classmethod
-    def from_file(cls, path: str | Path) -> Self:
-        """Read a lot from native GeoJSON (`.geojson`, `.json`) or a Dragon Lake map (`.yml`).
-
-        Raises:
-            InputError: the file cannot be read or is no lot; `parkenv lot check` lists all faults.
-        """
-        from parkenv.lots.lot_files import read_lot
-
-        return read_lot(cls, Path(path))
-
-    def to_file(self, path: str | Path) -> None:
-        """Write native GeoJSON that `from_file` reads back exactly."""
-        from parkenv.lots.geojson import write_lot
-
-        write_lot(self, Path(path))
-
-    @classmethod
-    def packaged(cls, name: str) -> Self:
-        """One of the lots that come with the package: campus, jam, street, mini."""
-        from parkenv.lots.lot_files import packaged_lot
-
-        return packaged_lot(cls, name)
-
-    @classmethod
-    def grid(
-        cls,
-        rows: int,
-        columns: int,
-        *,
-        name: str = "grid",
-        pitch: float = 2.5,
-        depth: float = 5.0,
-        aisle: float = 6.0,
-    ) -> Self:
-        """Rows of perpendicular slots along parallel two-way aisles, joined by a road at either end.
-
-        Rows lie in pairs back to back: row 0 south of the first aisle, rows 1 and 2 between the first and
-        the second, and so on. The entry is at the west end of the south aisle, the goal east of the lot.
-
-        Args:
-            rows: rows of slots; two rows share an aisle.
-            columns: slots a row.
-            name: the lot's name.
-            pitch: width of a slot, m.
-            depth: length of a slot, m.
-            aisle: width of an aisle and of the end roads, m.
-        """
-        from parkenv.lots.generators import grid_lot
-
-        return grid_lot(cls, rows, columns, name=name, pitch=pitch, depth=depth, aisle=aisle)
-
-    @classmethod
-    def city(cls, n_slots: int, seed: int = 0) -> Self:
-        """Kerbside slots round the blocks of a city of one-way and two-way streets, with exactly `n_slots`.
-
-        A million slots take seconds. The same seed gives the same city.
-        """
-        from parkenv.lots.generators import city_lot
-
-        return city_lot(cls, n_slots, seed)
 
 
 def mouth_heading(yaw: FloatArray, mouth: NDArray[np.int8]) -> FloatArray:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from parkenv.errors import InputError
+from parkenv.lots import packaged_lot
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy import (
     Arrival,
@@ -251,13 +252,13 @@ def typical_occupancy(
 
 
 def _campus() -> dict[str, Any]:
-    lot = ParkingLot.packaged("campus")
+    lot = packaged_lot("campus")
     return {"lot": lot, "occupancy": typical_occupancy(lot, pull=2.5, demand=0.3)}
 
 
 def _jam() -> dict[str, Any]:
     # The map knows ordinary days; today an event has filled whatever lies near the goal.
-    lot = ParkingLot.packaged("jam")
+    lot = packaged_lot("jam")
     usual = typical_occupancy(lot, pull=1.0, demand=-0.3)
     walk = lot.walk_m()
     near = walk < np.quantile(walk, 0.75)
@@ -266,12 +267,12 @@ def _jam() -> dict[str, Any]:
 
 
 def _street() -> dict[str, Any]:
-    lot = ParkingLot.packaged("street")
+    lot = packaged_lot("street")
     return {"lot": lot, "occupancy": typical_occupancy(lot, pull=0.8, demand=0.8, mean_stay_s=1800.0)}
 
 
 def _mini() -> dict[str, Any]:
-    lot = ParkingLot.packaged("mini")
+    lot = packaged_lot("mini")
     # Ten slots are now and then all taken; there is another car park five minutes away.
     return {"lot": lot, "occupancy": typical_occupancy(lot, pull=1.0, demand=-0.8), "give_up_s": 300.0}
 

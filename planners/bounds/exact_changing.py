@@ -55,8 +55,8 @@ class ChangingSolution:
     Example:
         Where cars leave more often, the same slots, equally often taken, are found sooner.
 
-        >>> from parkenv import ParkingLot
-        >>> problem = SearchProblem(lot=ParkingLot.grid(1, 2), give_up_s=600.0)
+        >>> from parkenv.lots import grid_lot
+        >>> problem = SearchProblem(lot=grid_lot(1, 2), give_up_s=600.0)
         >>> entry, p = int(problem.lot.entry_vertices[0]), np.full(2, 0.8)
         >>> slow, quick = (ChangingSolution(problem, p, np.full(2, r), 1.0, 12) for r in (1e-3, 1e-1))
         >>> quick.expected_s(entry) < slow.expected_s(entry)

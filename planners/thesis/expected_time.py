@@ -35,10 +35,10 @@ def expected_time(agent: Agent, problem: SearchProblem, p_occupied: ArrayLike, v
         InputError: looks that may err, or a forecast that is not one.
 
     Examples:
-        >>> from parkenv import ParkingLot
+        >>> from parkenv.lots import packaged_lot
         >>> from planners import make_agent
         >>> from planners.bounds.exact import ExactSolution
-        >>> problem = SearchProblem(lot=ParkingLot.packaged("mini"), give_up_s=300.0)
+        >>> problem = SearchProblem(lot=packaged_lot("mini"), give_up_s=300.0)
         >>> entry, forecast = int(problem.lot.entry_vertices[0]), np.full(10, 0.7)
         >>> best = ExactSolution(problem, forecast, entry).expected_s
         >>> theirs = expected_time(make_agent("greedy-goal", problem), problem, forecast, entry)

@@ -16,7 +16,7 @@ from parkenv.driving.parking_task import ParkingTasks
 from parkenv.driving.vehicle import advance
 from parkenv.envs.drive import SUBSTEPS
 from parkenv.evaluation.bench.rows import BenchRow, absent, duration, rate, seconds_each
-from parkenv.world.lot import ParkingLot
+from parkenv.lots import packaged_lot
 from planners.driving.parking import ParkingAgent
 
 STEPS = 100
@@ -54,7 +54,7 @@ def drive_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
 
 def bare_physics(seed: int, seconds: float) -> float:
     """Steps a second of a car that drives to and fro among parked ones, contacts told."""
-    task = ParkingTasks(ParkingLot.packaged("campus")).draw(seed)
+    task = ParkingTasks(packaged_lot("campus")).draw(seed)
     space, limits = LotSpace(task.vehicle, task.obstacles), task.vehicle.limits
     state = task.start.copy()
 

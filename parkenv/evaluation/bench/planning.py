@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
 
 from parkenv.evaluation.bench.rows import BenchRow, duration, seconds_each
+from parkenv.lots import city_lot, packaged_lot
 from parkenv.world.lot import PARK, ParkingLot
 from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
@@ -64,7 +65,7 @@ def planning_rows(
     sizes = [n for n in SIZES if n <= largest]
     return [
         *solving_rows(sizes, seed, seconds),
-        *repair_rows(lot or ParkingLot.packaged("campus"), seed, seconds),
+        *repair_rows(lot or packaged_lot("campus"), seed, seconds),
         *city_rows_apart(min(CITY, largest), seed),
     ]
 
@@ -80,7 +81,7 @@ def solving_rows(sizes: list[int], seed: int, seconds: float) -> list[BenchRow]:
     measured: dict[str, float] = {}
     vertices, own = [], []
     for n_slots in sizes:
-        mdp = forecast_process(ParkingLot.city(n_slots, seed), seed)
+        mdp = forecast_process(city_lot(n_slots, seed), seed)
         graph, n = StoppingGraph.of(mdp), mdp.n_states
         labels = settle(graph, mdp.p_free)
         ours = seconds_each(lambda _, g=graph, p=mdp.p_free: settle(g, p), seconds)  # type: ignore[misc]
@@ -149,7 +150,7 @@ def city_rows(
         seed: of the city and of the worlds.
         agents: who searches, by name.
     """
-    scenario = Scenario.on_lot(ParkingLot.city(n_slots, seed))
+    scenario = Scenario.on_lot(city_lot(n_slots, seed))
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     rows: list[BenchRow] = []
     for name in agents:

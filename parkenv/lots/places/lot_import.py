@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
 from parkenv.errors import InputError
-from parkenv.lots.dragon_lake import is_dragon_lake
+from parkenv.lots.file_formats import LotFormat, lot_format
+from parkenv.lots.lot_files import read_lot
 from parkenv.lots.places.lot_draft import LotDraft, Wishes, points_in
 from parkenv.lots.places.osm import osm_draft
-from parkenv.lots.places.osm_elements import holds_osm
 from parkenv.lots.places.slot_list import slot_list_draft
-from parkenv.world.lot import ParkingLot
-
-
-def is_place(path: Path) -> bool:
-    """Whether a file is a map or a list that a lot is made from by rules, not a lot itself."""
-    suffix = path.suffix.lower()
-    if suffix in (".json", ".geojson"):
-        try:
-            return holds_osm(json.loads(path.read_text(encoding="utf-8-sig")))
-        except (OSError, ValueError, RecursionError):
-            return False  # the reader of lots says what is wrong
-    return suffix in (".osm", ".xml", ".csv")
 
 
 def import_lot(path: str | Path, wishes: Wishes | None = None) -> LotDraft:
@@ -46,17 +33,19 @@ def import_lot(path: str | Path, wishes: Wishes | None = None) -> LotDraft:
     """
     path = Path(path)
     wishes = wishes or Wishes()
-    if is_place(path):
-        draft_of = slot_list_draft if path.suffix.lower() == ".csv" else osm_draft
-        return draft_of(path, wishes)
-    if not is_dragon_lake(path) and path.suffix.lower() not in (".json", ".geojson"):
+    file_format = lot_format(path)
+    if file_format is LotFormat.OSM:
+        return osm_draft(path, wishes)
+    if file_format is LotFormat.SLOT_LIST:
+        return slot_list_draft(path, wishes)
+    if file_format is None:
         raise InputError(
             f"{path}: unknown kind of file {path.suffix!r}, want .osm or .xml (OpenStreetMap; convert .pbf first), "
             ".json or .geojson (Overpass, overpass-turbo, a native lot), .csv (slot centres) or a Dragon Lake .yml"
         )
     if wishes.bounds is not None:
         raise InputError(f"{path}: bounds go with OpenStreetMap and lists of slots; this file is a whole lot")
-    draft = LotDraft.of_lot(ParkingLot.from_file(path))
+    draft = LotDraft.of_lot(read_lot(path))
     if wishes.goals:
         draft = replace(draft, goals=points_in(None, wishes.goals))
     if wishes.entries:

@@ -1,0 +1,45 @@
+"""The formats of files that lots are read from or imported from."""
+
+from __future__ import annotations
+
+import json
+from enum import Enum
+from pathlib import Path
+
+from parkenv.lots.places.osm_elements import holds_osm
+
+
+class LotFormat(Enum):
+    """What a file describes a lot in."""
+
+    GEOJSON = "native GeoJSON"
+    DRAGON_LAKE = "Dragon Lake map"
+    OSM = "OpenStreetMap"
+    SLOT_LIST = "list of slot centres"
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether a file of this format is a whole lot; of the others, `import_lot` derives one by rules."""
+        return self in (LotFormat.GEOJSON, LotFormat.DRAGON_LAKE)
+
+
+def lot_format(path: Path) -> LotFormat | None:
+    """The format of a file by its suffix and, for JSON, its content; None for an unknown suffix. Does not raise.
+
+    A JSON file that cannot be read counts as native: the reader of lots then says what is wrong with it.
+    """
+    suffix = path.suffix.lower()
+    if suffix in (".json", ".geojson"):
+        try:
+            is_osm = holds_osm(json.loads(path.read_text(encoding="utf-8-sig")))
+        except (OSError, ValueError, RecursionError):
+            is_osm = False
+        return LotFormat.OSM if is_osm else LotFormat.GEOJSON
+    by_suffix = {
+        ".yml": LotFormat.DRAGON_LAKE,
+        ".yaml": LotFormat.DRAGON_LAKE,
+        ".osm": LotFormat.OSM,
+        ".xml": LotFormat.OSM,
+        ".csv": LotFormat.SLOT_LIST,
+    }
+    return by_suffix.get(suffix)
