@@ -77,6 +77,11 @@ class SearchProblem:
         return _read_only(self.lot.walk_m(self.goal) / self.v_walk)
 
     @cached_property
+    def arrival_cost_s(self) -> FloatArray:
+        """What parking in each slot costs on arrival, (n_slots,) s: the walk."""
+        return self.walk_s
+
+    @cached_property
     def move_s(self) -> FloatArray:
         """Drive time of each edge, (n_vertices, 4) s; 0 where there is none (eq. 3.22)."""
         return _read_only(self.lot.edge_length / self.v_drive)

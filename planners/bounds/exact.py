@@ -28,7 +28,7 @@ from parkenv.errors import InputError
 from parkenv.world.lot import MOVES, PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
-from planners.driving.road_table import RoadTable
+from planners.road_table import RoadTable
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
