@@ -5,7 +5,7 @@ import gymnasium as gym
 import parkenv
 from planners import make_agent
 
-scenario = parkenv.Scenario.named("campus")
+scenario = parkenv.make_scenario("campus")
 env = gym.make("parkenv/Search-v0", scenario=scenario, render_mode="ansi")
 agent = make_agent("mdp", scenario)
 

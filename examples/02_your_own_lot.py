@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from parkenv import Lane, Mouth, ParkingLot, Scenario
+from parkenv import Lane, Mouth, ParkingLot, make_scenario
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.lots import read_lot, write_lot
 
@@ -28,7 +28,7 @@ with tempfile.TemporaryDirectory() as folder:
     write_lot(lot, file)
     assert read_lot(file) == lot
 
-scenario = Scenario.on_lot(lot)
+scenario = make_scenario(lot)
 for agent in ("mdp", "greedy-goal", "greedy-drive", "oracle"):
     rows, _ = Case(scenario, agent).run(range(50))
     print(f"{agent:13s} {np.mean([row['total_s'] for row in rows]):6.1f} s")

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from parkenv import Scenario
+from parkenv import make_scenario
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from planners import make_agent
 
-scenario = Scenario.named("jam")
+scenario = make_scenario("jam")
 print("failure cost s   total s   driven m   walked m   re-plans")
 for failure_s in (1.0, 5.0, 10.0, 30.0, 90.0):
     runner = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario, failure_s=failure_s))

@@ -9,7 +9,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 import parkenv
 from planners import make_agent
 
-scenario = parkenv.Scenario.named("mini")
+scenario = parkenv.make_scenario("mini")
 venv = make_vec_env(lambda: gym.make("parkenv/Search-v0", scenario=scenario), n_envs=4, seed=0)
 
 mean, spread = evaluate_policy(make_agent("mdp", scenario), venv, n_eval_episodes=100)

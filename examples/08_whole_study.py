@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from parkenv import Scenario
+from parkenv import make_scenario
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.experiments.surveys import run_survey, summarize
@@ -21,7 +21,7 @@ from parkenv.world.flat_map import FlatMap
 from parkenv.world.occupancy import ArrivalWindow
 
 lot = grid_lot(4, 20)
-world = Scenario.on_lot(lot, arrival=ArrivalWindow.parse("11:00-13:00"))
+world = make_scenario(lot, arrival=ArrivalWindow.parse("11:00-13:00"))
 print(f"{lot.n_slots} slots")
 
 with tempfile.TemporaryDirectory() as folder:

@@ -12,6 +12,7 @@ from gymnasium.envs.registration import register, registry
 
 if TYPE_CHECKING:
     from parkenv.errors import InputError
+    from parkenv.scenarios.build import make_scenario
     from parkenv.world.lot import Lane, Mouth, ParkingLot
     from parkenv.world.occupancy import ArrivalWindow, OccupancyProcess
     from parkenv.world.occupancy_log import OccupancyLog
@@ -36,6 +37,7 @@ _EXPORTS = {
     "SensorBand": "parkenv.world.sensor_model",
     "SensorModel": "parkenv.world.sensor_model",
     "Traffic": "parkenv.world.traffic",
+    "make_scenario": "parkenv.scenarios.build",
 }
 
 __all__ = [
@@ -52,6 +54,7 @@ __all__ = [
     "SensorBand",
     "SensorModel",
     "Traffic",
+    "make_scenario",
 ]
 
 

@@ -12,6 +12,7 @@ SHAPES = ((1, 12), (2, 6), (4, 3), (2, 5), (3, 4), (1, 9))
 PITCHES = (2.5, 6.0, 15.0)
 VIEWS = (0.0, 6.0)
 MEAN_FREE = (0.1, 0.3, 0.6)
+SLOT_COLUMNS = ("slot_yaw", "slot_length", "slot_width", "slot_mouth", "slot_parking_cost_s")
 
 
 def features(lot):
@@ -57,7 +58,7 @@ def cut_in_two():
             **f,
             "slot_ids": tuple(map(str, range(2 * n))),
             "slot_xy": np.concatenate([west.slot_xy, west.slot_xy + shift]),
-            **{k: np.tile(f[k], 2) for k in ("slot_yaw", "slot_length", "slot_width", "slot_mouth")},
+            **{k: np.tile(f[k], 2) for k in SLOT_COLUMNS},
             "lanes": (*west.lanes, *(Lane(lane.points + shift, lane.oneway) for lane in west.lanes)),
             "goals": west.goals + shift,
         }

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from small_lots import cut_in_two
 
-from parkenv import InputError, OccupancyProcess, Scenario, SensorModel
+from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, make_scenario
 from parkenv.evaluation.experiments.compare import Case, settings_of
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.lots import grid_lot
-from parkenv.world.scenario import SCENARIO_NAMES, SearchProblem
+from parkenv.scenarios.spec import SCENARIO_NAMES
+from parkenv.world.scenario import SearchProblem
 from planners import AGENT_NAMES, make_agent
 
 SEEDS = range(12)
@@ -36,7 +37,7 @@ def frozen_world(lot, taken, **changes):
 
 
 def test_unknown_names_and_options_are_refused_with_the_known_ones():
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     with pytest.raises(InputError, match="unknown agent 'mpd'; known: mdp, mdp-static, greedy-goal"):
         make_agent("mpd", scenario)
     with pytest.raises(InputError, match="no option 'cost'; known: failure_s, gamma"):
@@ -61,7 +62,7 @@ def test_an_agent_of_your_own_is_named_by_module_and_class(tmp_path, monkeypatch
     )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.path", list(sys.path))
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     agent = make_agent("my_agents:Parker", scenario)
     assert not hasattr(agent.given, "occupancy")  # what stands in the slots is kept from it
     env = gym.make("parkenv/Search-v0", scenario=scenario)
@@ -81,14 +82,14 @@ def test_an_agent_of_your_own_is_named_by_module_and_class(tmp_path, monkeypatch
 
 @pytest.mark.parametrize("name", AGENT_NAMES)
 def test_agents_get_the_public_part_of_a_scenario_only(name):
-    agent = make_agent(name, Scenario.named("campus"))
+    agent = make_agent(name, make_scenario("campus"))
     assert type(agent.problem) is SearchProblem
     assert not hasattr(agent.problem, "occupancy")
 
 
 @pytest.mark.parametrize("name", [n for n in AGENT_NAMES if n != "oracle"])
 def test_a_batch_of_observations_gives_the_actions_of_the_single_ones(name):
-    scenario = Scenario.named("campus")
+    scenario = make_scenario("campus")
     agent = make_agent(name, scenario)
     envs = [gym.make("parkenv/Search-v0", scenario=scenario) for _ in range(3)]
     observations = [env.reset(seed=i)[0] for i, env in enumerate(envs)]
@@ -107,14 +108,14 @@ def test_stable_baselines_evaluates_a_planner():
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.evaluation import evaluate_policy
 
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     venv = make_vec_env(lambda: gym.make("parkenv/Search-v0", scenario=scenario), n_envs=2, seed=0)
     reward, _ = evaluate_policy(make_agent("mdp", scenario), venv, n_eval_episodes=6)
     assert -120.0 < reward < 0.0
 
 
 def test_one_agent_may_serve_many_episodes_at_once():
-    scenario = Scenario.named("campus")
+    scenario = make_scenario("campus")
     shared = make_agent("mdp", scenario)
     runner = EpisodeRunner(scenario, "mdp", shared)
     first = [runner.run(seed).row for seed in (0, 1, 0)]
@@ -122,7 +123,7 @@ def test_one_agent_may_serve_many_episodes_at_once():
 
 
 def test_random_agent_repeats_itself_under_a_seed():
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     run = EpisodeRunner(scenario, "random", make_agent("random", scenario, seed=1)).run
     other = EpisodeRunner(scenario, "random", make_agent("random", scenario, seed=2)).run
     assert [run(s).row for s in SEEDS] == [run(s).row for s in SEEDS]
@@ -223,7 +224,7 @@ def test_the_static_planner_keeps_trying_its_taken_slot():
 
 def test_the_planner_never_tries_a_slot_that_it_sees_taken():
     for name in SCENARIO_NAMES:
-        rows = episodes(Scenario.named(name), "mdp")
+        rows = episodes(make_scenario(name), "mdp")
         assert mean(rows, "failed_parks") == 0.0
         assert mean(rows, "replans") > 0.0
 
@@ -233,7 +234,7 @@ def test_the_planner_never_tries_a_slot_that_it_sees_taken():
 
 @pytest.mark.parametrize("name", SCENARIO_NAMES)
 def test_nobody_beats_the_bound_and_the_oracle_reaches_it(name):
-    scenario = Scenario.named(
+    scenario = make_scenario(
         name, sensor_model=SensorModel(view_range=6.0, hit_rate=0.95, false_alarm_rate=0.05)
     )
     for agent in AGENT_NAMES:
@@ -244,7 +245,7 @@ def test_nobody_beats_the_bound_and_the_oracle_reaches_it(name):
 
 
 def test_the_oracle_waits_for_a_slot_that_is_about_to_come_free():
-    scenario = Scenario.named("mini", entry=0)
+    scenario = make_scenario("mini", entry=0)
     busy = scenario.replace(occupancy=scenario.occupancy.at_mean_occupancy(0.97, 10 * 3600.0))
     rows = episodes(busy, "oracle", range(60))
     parked = [r for r in rows if r["parked"]]
@@ -255,7 +256,7 @@ def test_the_oracle_waits_for_a_slot_that_is_about_to_come_free():
 
 
 def test_the_oracle_must_be_shown_the_future():
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     with pytest.raises(RuntimeError, match="reveal"):
         make_agent("oracle", scenario).predict(env.reset(seed=0)[0])
@@ -280,7 +281,7 @@ def test_the_oracle_turns_to_a_slot_where_the_lot_cannot_be_proven_full():
 
 def test_agents_meet_the_same_worlds():
     """Same arrival, same fullness, same bound for every agent under one seed."""
-    scenario = Scenario.named("street")
+    scenario = make_scenario("street")
     for seed in range(4):
         met = {
             (row["arrival_s"], row["occupancy"], row["bound_s"])
@@ -294,7 +295,7 @@ def test_agents_meet_the_same_worlds():
 
 
 def setting(name, failure_s, v_walk_kmh, v_drive_kmh):
-    return settings_of(Scenario.named(name), [failure_s], [v_walk_kmh], [v_drive_kmh])[0]
+    return settings_of(make_scenario(name), [failure_s], [v_walk_kmh], [v_drive_kmh])[0]
 
 
 def test_on_campus_it_drives_in_and_weighs_distance_against_occupancy():

@@ -19,6 +19,7 @@ LAYERS = (
     "perception",
     "mapping",
     "belief",
+    "scenarios",
     "driving",
     "envs",
     "evaluation",

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from small_lots import cut_in_two, features, small_lot
 
-from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorModel
+from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorModel, make_scenario
 from parkenv.evaluation.experiments.compare import Case, at_occupancy
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.statistics import mean_interval
@@ -66,7 +66,7 @@ def search(scenario, seed=0, **options):
 
 
 def test_equal_seeds_give_equal_searches():
-    scenario = Scenario.named("campus")
+    scenario = make_scenario("campus")
     runner = EpisodeRunner(scenario, "belief", make_agent("belief", scenario))
     assert runner.run(3).row == runner.run(3).row == search(scenario, 3)
 
@@ -86,7 +86,7 @@ def choices(scenario, monkeypatch, seed=1, **options):
 
 
 def test_decisions_keep_to_their_budget(monkeypatch):
-    scenario = at_occupancy(Scenario.named("campus"), 0.95)
+    scenario = at_occupancy(make_scenario("campus"), 0.95)
     n = scenario.lot.n_slots
     one_candidate = 30 * (MOST_STEPS + n + MOST_STEPS) + n
     quick, usual, slow = (
@@ -107,7 +107,7 @@ def test_it_parks_at_once_in_an_empty_lot_that_is_known_to_be():
 
 def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong():
     """On jam the tuned planner trusts its map into every aisle; what the first slots show is enough to doubt it."""
-    scenario = Scenario.named("jam")
+    scenario = make_scenario("jam")
     ours, theirs = (
         np.array([r["total_s"] for r in Case(scenario, name).run(range(10))[0]])
         for name in ("belief", "mdp-tuned")
@@ -120,7 +120,7 @@ def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong():
 @pytest.mark.parametrize("level", [0.3, 0.7])
 def test_doubt_costs_nothing_where_cars_drive_past_what_is_free(level):
     """A free slot far from the goal is driven past, so having come so far does not mean that it was taken."""
-    scenario = at_occupancy(Scenario.named("campus"), level)
+    scenario = at_occupancy(make_scenario("campus"), level)
     observation, _ = gym.make("parkenv/Search-v0", scenario=scenario).reset(seed=5)
     expected = []
     for trusting in (True, False):
@@ -131,7 +131,7 @@ def test_doubt_costs_nothing_where_cars_drive_past_what_is_free(level):
 
 def test_what_it_saw_tells_how_long_cars_stay():
     """The rate is not observed; the way in which a sighting fades is."""
-    scenario = Scenario.named("street")
+    scenario = make_scenario("street")
     agent = make_agent("belief", scenario)
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     observation, _ = env.reset(seed=2)
@@ -235,7 +235,7 @@ def test_a_prior_that_is_badly_wrong_does_not_keep_it_from_parking(prior_logit):
 @pytest.mark.parametrize("name", ["campus", "jam"])
 def test_what_a_worthless_map_costs(name, said):
     """All is said to be free, or taken. Told that all is free, the thesis's planner loses 90 s to the bound on jam."""
-    scenario = Scenario.named(name)
+    scenario = make_scenario(name)
     prior = OccupancyProcess.from_demand(np.full(scenario.lot.n_slots, said), np.zeros(168))
     rows = Case(scenario.replace(prior=prior), "belief").run(range(8))[0]
     assert all(row["parked"] for row in rows)
@@ -266,7 +266,7 @@ def test_it_expects_slots_that_it_saw_taken_to_come_free():
 
 
 def test_looks_that_err_cost_tries_but_do_not_trap_it():
-    scenario = Scenario.named("campus", sensor_model=SensorModel(hit_rate=0.9, false_alarm_rate=0.1))
+    scenario = make_scenario("campus", sensor_model=SensorModel(hit_rate=0.9, false_alarm_rate=0.1))
     rows = [search(scenario, seed) for seed in range(4)]
     assert all(row["parked"] for row in rows)
     assert max(row["failed_parks"] for row in rows) <= 5
@@ -274,13 +274,13 @@ def test_looks_that_err_cost_tries_but_do_not_trap_it():
 
 def test_a_bad_budget_is_refused():
     with pytest.raises(InputError, match="budget_ms is 0"):
-        make_agent("belief", Scenario.named("mini"), budget_ms=0.0)
+        make_agent("belief", make_scenario("mini"), budget_ms=0.0)
 
 
 def hidden_lots(name, seen_rate, occupancy=None):
     """From every view alike: so what is not made out once never is, however often the car comes back."""
     bands = tuple(SensorBand(6.0, beside, seen_rate, 1.0, 0.0) for beside in (False, True))
-    scenario = Scenario.named(name).replace(sensor_model=SensorModel(bands=bands))
+    scenario = make_scenario(name).replace(sensor_model=SensorModel(bands=bands))
     return scenario if occupancy is None else at_occupancy(scenario, occupancy)
 
 
@@ -304,7 +304,7 @@ def test_hidden_slots_are_tried_where_nothing_better_is_left(seen_rate):
 
 def test_a_path_is_kept_to_until_something_is_seen_unless_another_is_better_than_it_was(monkeypatch):
     """Paths are valued by estimates, which differ by where the car is: it could turn round between two for ever."""
-    scenario = at_occupancy(Scenario.named("campus"), 0.95)
+    scenario = at_occupancy(make_scenario("campus"), 0.95)
     made = choices(scenario, monkeypatch, seed=442, budget_ms=10.0)
     kept = [(promise_s, choice.onward_s) for promise_s, choice in made if promise_s < np.inf]
     assert len(kept) > 10

@@ -1,11 +1,10 @@
 """Benchmark suites: a result can be checked by anybody, and one that was tampered with is refused."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
+from command_line import parkenv
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments import benchmark
@@ -13,7 +12,6 @@ from parkenv.evaluation.experiments.benchmark import Suite, check_result, result
 from parkenv.evaluation.experiments.compare import run_cases
 from parkenv.evaluation.experiments.results import ResultFolder, write_summary
 
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 AGENTS = ("first-free", "greedy-goal")
 
 
@@ -90,15 +88,12 @@ def test_suites_do_not_change():
 
 
 def test_the_command_tells_of_suites_and_refuses_what_is_none(tmp_path):
-    def parkenv(*arguments):
-        return subprocess.run([*PARKENV, "benchmark", *map(str, arguments)], capture_output=True, text=True)
-
-    shown = parkenv("show", "v1")
+    shown = parkenv("benchmark", "show", "v1")
     assert shown.returncode == 0
     assert "campus-full" in shown.stdout
-    unknown = parkenv("run", "v7", "--out", tmp_path / "out")
+    unknown = parkenv("benchmark", "run", "v7", "--out", tmp_path / "out")
     assert (unknown.returncode, "known: v1" in unknown.stderr) == (2, True)
     for content in ('{"format": "park', "[" * 100_000):
         (tmp_path / "torn.json").write_text(content)
-        torn = parkenv("check", tmp_path / "torn.json")
+        torn = parkenv("benchmark", "check", tmp_path / "torn.json")
         assert (torn.returncode, "no benchmark result" in torn.stderr) == (2, True)

@@ -6,12 +6,12 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import PARKENV, parkenv
 from scipy import stats
 
 from parkenv import InputError, SensorModel
@@ -19,14 +19,7 @@ from parkenv.evaluation.experiments.results import EPISODE_COLUMNS, ResultFolder
 from parkenv.evaluation.experiments.statistics import mean_interval, summarize
 from parkenv.lots import packaged_lot, write_lot
 
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 DATA = Path(__file__).parents[2] / "shared" / "data"
-
-
-def parkenv(*arguments, **options):
-    return subprocess.run(
-        [*PARKENV, *map(str, arguments)], capture_output=True, text=True, timeout=600, check=False, **options
-    )
 
 
 def small(out, *more, agents="mdp,greedy-goal,oracle", episodes=12):

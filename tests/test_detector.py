@@ -1,13 +1,12 @@
 """Finding cars: training, files, the sliding window, and scores by UIUC's rule."""
 
 import json
-import subprocess
-import sys
 import zipfile
 
 import cv2
 import numpy as np
 import pytest
+from command_line import parkenv
 
 from parkenv import InputError
 from parkenv.perception.car_datasets import Crops, read_crop_folder, read_uiuc_test, read_uiuc_training
@@ -17,8 +16,6 @@ from parkenv.perception.detector import CarModel, Detector, as_grey, best_boxes
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.image_files import images_in, read_image
 from parkenv.perception.training import TrainingSettings, train
-
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 
 
 def toy_car(rng, size=(100, 40)):
@@ -188,9 +185,6 @@ def test_uiuc_is_read_as_published_trained_on_and_judged(tmp_path):
     assert len(read_uiuc_training(data).positives) == 25
     labelled = read_uiuc_test(data, "multi")
     np.testing.assert_array_equal(labelled[0].boxes, [[30, 50, 170, 106]])
-
-    def parkenv(*words):
-        return subprocess.run([*PARKENV, *map(str, words)], capture_output=True, text=True)
 
     done = parkenv("train-detector", "--uiuc", data, "--out", tmp_path / "m.npz", "--rounds", 1)
     assert done.returncode == 0, done.stderr

@@ -7,16 +7,17 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import PARKENV, parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from parkenv import make_scenario
 from parkenv.cli import app
 from parkenv.driving.lot_space import LotSpace
 from parkenv.driving.vehicle import SPEED, STATE_SIZE, YAW, VehicleParameters
@@ -38,12 +39,10 @@ from parkenv.evaluation.training.drive_practice import (
 from parkenv.evaluation.training.drive_training import DriveTraining, parked_by, parked_on
 from parkenv.evaluation.training.rl_training import read_curve, train_one
 from parkenv.lots import packaged_lot
-from parkenv.world.scenario import Scenario
 from planners.driving.driver_view import BEAMS, FARTHEST_M, HOLD, DriverView, Outlines, command, see
 from planners.driving.drivers import make_driver
 from planners.learned import ModelCard
 
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 MINI, STREET = packaged_lot("mini"), packaged_lot("street")
 EXAMINED = range(2_000_000, 2_000_006)
 STEPS = {"ppo": 2_000, "sac": 1_000, "tqc": 1_000}
@@ -479,7 +478,7 @@ def test_models_of_another_task_are_refused(trained, name):
     from planners.agent import make_agent
 
     with pytest.raises(InputError, match=r"was trained to drive, not to search; `parkenv park` runs it"):
-        make_agent(f"{algorithm}:{folder / name}", Scenario.named("mini"))
+        make_agent(f"{algorithm}:{folder / name}", make_scenario("mini"))
     other = "ppo" if algorithm != "ppo" else "sac"
     with pytest.raises(InputError, match=f"is a model of {algorithm}, not of {other}"):
         make_driver(f"{other}:{folder / name}")
@@ -543,12 +542,12 @@ def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algo
     out = tmp_path / "out"
     steps = 40_000 if algorithm == "ppo" else 4_000
     every = steps // 4
-    arguments = [
-        *PARKENV, "train", algorithm, "--env", "drive", "--lot", "mini", "--steps", str(steps),
+    command = [
+        "train", algorithm, "--env", "drive", "--lot", "mini", "--steps", str(steps),
         "--seeds", "2", "--examine-every", str(every), "--examined-on", "4", "--jobs", "2", "--out", str(out),
     ]  # fmt: skip
     process = subprocess.Popen(
-        arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        [*PARKENV, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
     )
     deadline = time.monotonic() + 600
     while time.monotonic() < deadline and len(read_curve(out / "seed_0" / "curve.csv")) < 2:
@@ -556,9 +555,9 @@ def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algo
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     survived = (out / "seed_0" / "curve.csv").read_text()
-    refused = subprocess.run(arguments, capture_output=True, text=True)
+    refused = parkenv(*command)
     assert (refused.returncode, "--resume" in refused.stderr) == (2, True)
-    subprocess.run([*arguments, "--resume"], check=True, capture_output=True)
+    assert parkenv(*command, "--resume").returncode == 0
     assert (out / "seed_0" / "curve.csv").read_text().startswith(survived)
     summary = json.loads((out / "summary.json").read_text())
     assert [row["seed"] for row in summary["rows"]] == [0, 1]
@@ -566,11 +565,9 @@ def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algo
     assert summary["examined"] == {"perpendicular": 1.0, "all": 1.0}
     assert (out / "learning_curve.png").stat().st_size > 10_000
     model = f"{algorithm}:{out / 'seed_1' / 'model.zip'}"
-    parked = subprocess.run(
-        [*PARKENV, "park", "--agents", f"planner,{model}", "--lot", "mini", "--episodes", "4", "--out",
-         str(tmp_path / "parked")],
-        capture_output=True, text=True,
-    )  # fmt: skip
+    parked = parkenv(
+        "park", "--agents", f"planner,{model}", "--lot", "mini", "--episodes", 4, "--out", tmp_path / "parked"
+    )
     assert parked.returncode == 0, parked.stderr
     rows = json.loads((tmp_path / "parked" / "summary.json").read_text())["rows"]
     assert {row["agent"] for row in rows} == {"planner", algorithm}

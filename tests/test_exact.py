@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 from small_lots import small_lot
 
-from parkenv import InputError, Lane, Mouth, OccupancyProcess, ParkingLot, Scenario, SensorModel
+from parkenv import (
+    InputError,
+    Lane,
+    Mouth,
+    OccupancyProcess,
+    ParkingLot,
+    Scenario,
+    SensorModel,
+    make_scenario,
+)
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.lots import packaged_lot
 from parkenv.world.scenario import SearchProblem
@@ -139,7 +148,7 @@ def test_the_mean_of_searches_in_the_environment_is_the_expectation():
 
 
 def test_the_agent_copes_with_cars_that_come_and_go():
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     busy = scenario.replace(occupancy=scenario.occupancy.at_mean_occupancy(0.9, 10 * 3600.0))
     runner = EpisodeRunner(busy, "exact", make_agent("exact", busy))
     rows = [runner.run(seed).row for seed in range(40)]
@@ -160,9 +169,9 @@ def test_a_certain_lot_is_a_shortest_way():
 
 def test_what_is_too_large_or_uncertain_is_refused_with_the_limit():
     with pytest.raises(InputError, match="at most 25 slots"):
-        make_agent("exact", Scenario.named("campus"))
+        make_agent("exact", make_scenario("campus"))
     with pytest.raises(InputError, match="seen without error"):
-        make_agent("exact", Scenario.named("mini", sensor_model=SensorModel(hit_rate=0.9)))
+        make_agent("exact", make_scenario("mini", sensor_model=SensorModel(hit_rate=0.9)))
     problem, p, entry = small_lot(2)
     with pytest.raises(InputError, match="over 500 belief states, the limit"):
         ExactSolution(problem, p, entry, most_states=500)
@@ -188,7 +197,7 @@ def test_it_goes_on_from_what_it_knows():
 
 
 def test_the_agent_runs_from_any_entry_of_the_environment():
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     agent = make_agent("exact", scenario)
     observation, _ = env.reset(seed=1)

@@ -5,6 +5,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+from parkenv import make_scenario
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.episodes import EpisodeRunner, SearchTrace
 from parkenv.evaluation.figures import time_figures
@@ -13,7 +14,6 @@ from parkenv.evaluation.figures.search_pictures import BELIEF_MAP, draw_search, 
 from parkenv.evaluation.figures.time_figures import AGENT_COLORS, save_time_against_occupancy, save_time_split
 from parkenv.lots import grid_lot
 from parkenv.world.occupancy import OccupancyProcess
-from parkenv.world.scenario import Scenario
 from planners.agent import AGENT_NAMES, make_agent
 
 
@@ -37,7 +37,7 @@ def row(agent="mdp", drive=30.0, failed=5.0, walk=60.0, gave_up=0.0, **more):
 
 
 def trace(name="mdp", scenario=None, seed=0):
-    scenario = scenario or Scenario.named("mini")
+    scenario = scenario or make_scenario("mini")
     return EpisodeRunner(scenario, name, make_agent(name, scenario)).run(seed).trace
 
 
@@ -174,7 +174,7 @@ def test_the_path_is_numbered_and_the_policy_drawn_where_there_is_one():
 
 
 def test_a_search_that_gave_up_or_never_moved_is_drawn(tmp_path):
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     n = scenario.lot.n_slots
     entry = int(scenario.lot.entry_vertices[0])
     metrics = {
@@ -205,7 +205,7 @@ def test_searches_of_any_number_are_laid_out(tmp_path, n):
 
 @pytest.mark.parametrize("lot", [grid_lot(12, 3), grid_lot(2, 40)], ids=["high", "wide"])
 def test_titles_fit_lots_of_any_shape(lot):
-    searched = trace("first-free", Scenario.on_lot(lot))
+    searched = trace("first-free", make_scenario(lot))
     figure = Figure(figsize=(3, 8) if lot.n_slots == 36 else (9, 3))
     ax = figure.add_axes((0, 0, 1, 0.8))
     draw_search(searched, ax)

@@ -7,10 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 
-from parkenv import InputError, Scenario
+from parkenv import InputError, make_scenario
 from parkenv.lots import city_lot, grid_lot
+from parkenv.scenarios.spec import SCENARIO_NAMES
 from parkenv.world.lot import PARK
-from parkenv.world.scenario import SCENARIO_NAMES
 from planners import ParkingMDP, label_setting, make_agent, policy_iteration, value_iteration
 from planners.thesis.label_repair import repair
 from planners.thesis.label_setting import TIE_S, StoppingGraph, best_moves, settle
@@ -49,7 +49,7 @@ def expect_same_values(ours, theirs):
 def test_without_discount_it_is_the_shortest_way_to_a_stop():
     """γ = 1: V = max over slots of (r_max - walk) - (1 - p)/p·c - drive."""
     lot = grid_lot(4, 9)
-    scenario = Scenario.on_lot(lot, failure_s=7.0)
+    scenario = make_scenario(lot, failure_s=7.0)
     p_free = np.random.default_rng(0).uniform(0.05, 1.0, lot.n_slots)
     solution = label_setting(ParkingMDP.from_belief(scenario, 1.0 - p_free, gamma=1.0))
     drive = dijkstra(lot.drive_matrix() / scenario.v_drive)[:, : lot.n_slots]
@@ -160,8 +160,8 @@ def test_where_circling_beats_every_stop_policy_iteration_takes_over():
 def test_directed_lots_with_little_free_are_settled_in_one_pass():
     """The real thing: lots with one-way lanes need no other solver, as long as something may be free."""
     rng = np.random.default_rng(1)
-    for lot in [city_lot(600), *(Scenario.named(name).lot for name in SCENARIO_NAMES)]:
-        scenario = Scenario.on_lot(lot)
+    for lot in [city_lot(600), *(make_scenario(name).lot for name in SCENARIO_NAMES)]:
+        scenario = make_scenario(lot)
         for chance in (0.0, 0.02, 0.3):
             p_free = np.where(rng.random(lot.n_slots) < chance, rng.random(lot.n_slots), 0.0)
             p_free[-1] = 0.2 if chance else 0.0
@@ -180,7 +180,7 @@ def test_a_mended_plan_equals_a_fresh_one(seed, gamma, failure):
     rng = np.random.default_rng(seed)
     lot = grid_lot(int(rng.integers(1, 5)), int(rng.integers(2, 9)))
     mdp = ParkingMDP.from_belief(
-        Scenario.on_lot(lot),
+        make_scenario(lot),
         rng.choice([0.0, 1.0, *rng.random(3)], lot.n_slots),
         failure_s=failure,
         gamma=gamma,
@@ -211,7 +211,7 @@ def check_mending(mdp, n_slots, rng):
 
 @pytest.fixture(scope="module")
 def city():
-    scenario = Scenario.on_lot(city_lot(3000))
+    scenario = make_scenario(city_lot(3000))
     mdp = ParkingMDP.from_belief(scenario, np.random.default_rng(0).uniform(0.3, 1.0, 3000))
     return StoppingGraph.of(mdp), mdp.p_free
 
@@ -252,7 +252,7 @@ def test_changes_everywhere_are_planned_afresh(city):
 @pytest.mark.parametrize("failure_s", [0.0, 10.0, 90.0])
 @pytest.mark.parametrize("name", SCENARIO_NAMES)
 def test_both_solvers_lead_to_the_same_actions(name, failure_s):
-    scenario = Scenario.named(name, failure_s=failure_s)
+    scenario = make_scenario(name, failure_s=failure_s)
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     agents = [make_agent("mdp", scenario, solver=s) for s in ("label_setting", "policy_iteration")]
     for seed in range(6):
@@ -272,7 +272,7 @@ def test_both_solvers_lead_to_the_same_actions(name, failure_s):
 
 
 def test_the_plan_is_expected_to_take_the_same_time_by_either_solver():
-    scenario = Scenario.named("campus")
+    scenario = make_scenario("campus")
     belief = np.random.default_rng(0).uniform(0.5, 1.0, scenario.lot.n_slots)
     for name in ("mdp", "mdp-static"):
         times = [
@@ -283,7 +283,7 @@ def test_the_plan_is_expected_to_take_the_same_time_by_either_solver():
 
 
 def test_agents_say_what_is_wrong():
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     with pytest.raises(InputError, match="solver is 'lp', want one of label_setting, policy_iteration"):
         make_agent("mdp", scenario, solver="lp")
     with pytest.raises(InputError, match="want below 1 for the solver policy_iteration"):
@@ -298,7 +298,7 @@ def test_agents_say_what_is_wrong():
 
 
 def test_without_discount_the_agent_plans_in_seconds():
-    scenario = Scenario.named("campus")
+    scenario = make_scenario("campus")
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     agent = make_agent("mdp", scenario, gamma=1.0)
     observation, _ = env.reset(seed=1)
@@ -310,7 +310,7 @@ def test_without_discount_the_agent_plans_in_seconds():
 
 
 def test_a_hopeless_slot_found_taken_is_news_and_a_drift_is_not():
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     agent = make_agent("mdp", scenario)
     belief = np.full(10, 0.995, dtype=np.float32)
     observation = {"vertex": 3, "p_occupied": belief}

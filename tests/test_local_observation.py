@@ -9,11 +9,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import parkenv  # noqa: F401 - registers the ids
-from parkenv import InputError, OccupancyProcess, Scenario
+from parkenv import InputError, OccupancyProcess, Scenario, make_scenario
 from parkenv.envs.local_observation import FIRST_NEAR, HERE, PER_MOVE, PER_NEAR, LocalObservation
 from parkenv.lots import grid_lot
+from parkenv.scenarios.spec import SCENARIO_NAMES
 from parkenv.world.lot import MOVES, PARK
-from parkenv.world.scenario import SCENARIO_NAMES
 
 K = 4
 
@@ -46,7 +46,7 @@ def graph_of(scenario):
 @pytest.mark.parametrize("name", ["mini", "street"])
 def test_every_number_is_what_the_table_says(name):
     """Against networkx and the environment's own belief, at every step of a few drives."""
-    scenario = Scenario.named(name)
+    scenario = make_scenario(name)
     lot, n = scenario.lot, scenario.lot.n_slots
     drive = dict(nx.all_pairs_dijkstra_path_length(graph_of(scenario)))
     env = LocalObservation(gym.make("parkenv/Search-v0", scenario=scenario), K)
@@ -131,7 +131,7 @@ def test_what_lies_ahead_is_told_move_by_move():
 
 
 def test_the_best_free_slot_is_remembered_until_it_is_seen_taken():
-    scenario = Scenario.named("street")
+    scenario = make_scenario("street")
     env = LocalObservation(gym.make("parkenv/Search-v0", scenario=scenario), K)
     rng = np.random.default_rng(0)
     remembered = 0

@@ -8,9 +8,13 @@ import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
 from scipy.sparse.csgraph import connected_components, dijkstra
+from typer.testing import CliRunner
 
+from parkenv.cli import app
 from parkenv.errors import InputError
+from parkenv.evaluation.figures.lot_picture import save_lot_picture
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.build import LOTS, build
 from parkenv.lots.checks import check_lot
@@ -92,9 +96,10 @@ def test_unknown_packaged_lot_lists_the_known_ones():
     name=st.text(),
     goal=points,
     walls=st.lists(st.lists(points, min_size=2, max_size=5), max_size=3),
+    cost=st.just(0.0) | st.floats(0.0, 1e8),
 )
 def test_written_lots_are_read_back_to_the_bit(
-    tmp_path, rows, columns, pitch, aisle, turn, shift, name, goal, walls
+    tmp_path, rows, columns, pitch, aisle, turn, shift, name, goal, walls, cost
 ):
     grid = grid_lot(rows, columns, name=name, pitch=pitch, aisle=aisle)
     matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -113,6 +118,7 @@ def test_written_lots_are_read_back_to_the_bit(
         entries=moved(grid.entries),
         goals=[goal],
         walls=tuple(map(np.array, walls)),
+        slot_parking_cost_s=np.linspace(0.0, cost, grid.n_slots),
     )
     path = tmp_path / "lot.geojson"
     write_lot(lot, path)
@@ -136,6 +142,19 @@ def test_closed_walls_are_polygons_in_the_file(tmp_path):
     features = json.loads((tmp_path / "mini.geojson").read_text())["features"]
     shapes = [f["geometry"]["type"] for f in features if f["properties"]["kind"] == "wall"]
     assert shapes == ["LineString", "Polygon"]
+
+
+def test_parking_costs_need_no_exact_shape_and_stand_with_their_slot(tmp_path):
+    doc = document()
+    doc["features"][1]["properties"]["parking_cost_s"] = 120
+    assert read(tmp_path, doc).slot_parking_cost_s.tolist() == [0.0, 120.0]
+    with_exact(doc["features"][0], parking_cost_s=7.5)
+    lot = read(tmp_path, doc)
+    assert lot.slot_parking_cost_s.tolist() == [7.5, 120.0]
+    write_lot(replace(lot, slot_parking_cost_s=[0.0, 120.0]), tmp_path / "again.geojson")
+    slots = [f["properties"] for f in json.loads((tmp_path / "again.geojson").read_text())["features"][:2]]
+    assert "parking_cost_s" not in slots[0]  # files of lots without costs stay as they are
+    assert slots[1]["parking_cost_s"] == 120.0
 
 
 def test_a_lot_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
@@ -397,6 +416,14 @@ FAULTS = [
     (set_feature(2, "lane", "Polygon", box(0, 0, 1, 1)), 2, "lane: geometry is 'Polygon', want LineString"),
     (set_feature(5, "wall", "Point", [0, 0]), 5, "wall: geometry is 'Point', want LineString or Polygon"),
     (lambda d: d["features"][3].update(geometry=None), 3, "entry: geometry is None, want Point"),
+    *(
+        (
+            lambda d, cost=cost: d["features"][1]["properties"].update(parking_cost_s=cost),
+            1,
+            f"slot 'b': parking_cost_s is {cost!r}, want seconds, at least 0",
+        )
+        for cost in (-1, "2 EUR", None, True, float("nan"), float("inf"))
+    ),
     (
         set_feature(3, "entry", "Point", [0, float("nan")]),
         3,
@@ -653,3 +680,23 @@ def test_no_content_makes_the_checker_raise(tmp_path, data):
             read_lot(path)
     else:
         read_lot(path)
+
+
+# ---- the command line ----
+
+
+def test_commands_state_parking_costs_and_draw_them(tmp_path):
+    costs = np.array([0.0, 0.0, 30.0, 60.0, 90.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    lot = replace(packaged_lot("mini"), slot_parking_cost_s=costs)
+    write_lot(lot, tmp_path / "priced.geojson")
+    for words in (["check"], ["show", "--out", str(tmp_path / "priced.png")]):
+        told = CliRunner().invoke(app, ["lot", words[0], str(tmp_path / "priced.geojson"), *words[1:]])
+        assert told.exit_code == 0, told.output
+        assert "parking costs 0 to 90 s (3 slots above 0)" in told.output
+    save_lot_picture(packaged_lot("mini"), tmp_path / "plain.png")
+    pictures = [
+        np.asarray(Image.open(tmp_path / f"{name}.png").convert("RGB")) for name in ("priced", "plain")
+    ]
+    # Three differently coloured slots on asphalt that is grey everywhere on the plain lot.
+    vivid = [int((np.ptp(picture.astype(int), axis=2) > 60).sum()) for picture in pictures]
+    assert vivid[0] > 3 * vivid[1]

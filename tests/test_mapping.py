@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from parkenv import InputError, Scenario
+from parkenv import InputError, make_scenario
 from parkenv.lots import packaged_lot
 from parkenv.mapping.discovery import discover, score_discovery
 from parkenv.mapping.grid import P_FREE, P_OCCUPIED, OccupancyGrid
@@ -77,7 +77,7 @@ def test_a_grid_without_area_is_refused():
 
 @pytest.fixture(scope="module")
 def mini():
-    return Scenario.named("mini").lot
+    return make_scenario("mini").lot
 
 
 def drive_by(lot, scene, noise=None, step=1.0):
@@ -224,9 +224,9 @@ def test_intervals_hold_the_truth_as_often_as_they_say():
 def test_a_map_is_a_prior_of_a_search():
     import gymnasium as gym
 
-    lot = Scenario.named("mini").lot
+    lot = make_scenario("mini").lot
     log = sessions([40_000.0] * 9, [np.arange(lot.n_slots) % 2 == 0] * 9)
-    scenario = Scenario.named("mini", prior=MapPrior(log))
+    scenario = make_scenario("mini", prior=MapPrior(log))
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     observation, _ = env.reset(seed=0)
     even = observation["p_occupied"][::2]

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import dijkstra
 
-from parkenv import InputError, OccupancyProcess, Scenario
+from parkenv import InputError, OccupancyProcess, Scenario, make_scenario
 from parkenv.evaluation.experiments.compare import at_occupancy
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.lots import city_lot, grid_lot
@@ -21,7 +21,7 @@ def everything_at_best(problem, start):
 
 
 def test_a_small_lot_is_one_neighbourhood():
-    problem = Scenario.named("street").public()
+    problem = make_scenario("street").public()
     near = Neighborhoods(problem).toward(0)
     assert near.whole
     np.testing.assert_array_equal(near.slots, np.arange(problem.lot.n_slots))
@@ -31,7 +31,7 @@ def test_a_small_lot_is_one_neighbourhood():
 
 @pytest.mark.parametrize("name", ["campus", "street"])
 def test_a_part_holds_the_vertices_that_may_do_best_and_the_ways_to_them(name):
-    problem = Scenario.named(name).public()
+    problem = make_scenario(name).public()
     lot, most = problem.lot, problem.lot.n_vertices // 2
     start = int(lot.neighbors[problem.walk_s.argmin()].max())
     near = Neighborhoods(problem, most).around(start, np.empty(0, dtype=np.int64))
@@ -53,7 +53,7 @@ def test_a_part_holds_the_vertices_that_may_do_best_and_the_ways_to_them(name):
 
 
 def test_slots_known_to_be_taken_draw_nobody():
-    problem = Scenario.named("campus").public()
+    problem = make_scenario("campus").public()
     start = int(problem.walk_s.argmin())
     parts = Neighborhoods(problem, 80)
     before = parts.around(start, np.empty(0, dtype=np.int64))
@@ -63,7 +63,7 @@ def test_slots_known_to_be_taken_draw_nobody():
 
 
 def test_far_from_the_goal_the_part_begins_at_a_gate_on_a_quickest_way():
-    problem = Scenario.on_lot(city_lot(3000)).public()
+    problem = make_scenario(city_lot(3000)).public()
     entry = int(problem.lot.entry_vertices[0])
     parts = Neighborhoods(problem, 500)
     near = parts.toward(entry)
@@ -77,7 +77,7 @@ def test_far_from_the_goal_the_part_begins_at_a_gate_on_a_quickest_way():
 @pytest.mark.parametrize(("level", "seeds"), [(0.6, 4), (0.9, 4)])
 def test_leaving_out_what_cannot_matter_changes_nothing(level, seeds):
     """The farthest tenth of a lot: the searches are the same to the last second."""
-    scenario = at_occupancy(Scenario.on_lot(grid_lot(8, 40)), level)
+    scenario = at_occupancy(make_scenario(grid_lot(8, 40)), level)
     most = scenario.lot.n_vertices * 9 // 10
     whole, part = (
         EpisodeRunner(scenario, "belief", make_agent("belief", scenario, trusting=True, most_vertices=m))
@@ -111,15 +111,15 @@ def test_where_a_part_is_full_the_search_goes_on_beyond_it(name):
 
 def test_a_bad_size_is_refused():
     with pytest.raises(InputError, match="most_vertices is 3"):
-        make_agent("belief", Scenario.named("campus"), most_vertices=3)
+        make_agent("belief", make_scenario("campus"), most_vertices=3)
     with pytest.raises(InputError, match="most_vertices is 40000"):
-        make_agent("mdp-tuned", Scenario.named("campus"), most_vertices=40_000)
+        make_agent("mdp-tuned", make_scenario("campus"), most_vertices=40_000)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
 def test_a_city_of_100_000_slots(name):
-    scenario = at_occupancy(Scenario.on_lot(city_lot(100_000)), 0.95)
+    scenario = at_occupancy(make_scenario(city_lot(100_000)), 0.95)
     agent, env = make_agent(name, scenario), gym.make("parkenv/Search-v0", scenario=scenario)
     for seed in range(2):
         observation, _ = env.reset(seed=seed)

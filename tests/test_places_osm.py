@@ -3,8 +3,6 @@
 import copy
 import json
 import re
-import subprocess
-import sys
 from contextlib import suppress
 from dataclasses import dataclass, field
 from xml.sax.saxutils import quoteattr
@@ -12,11 +10,12 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import pytest
 import shapely
+from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from parkenv import Scenario
+from parkenv import make_scenario
 from parkenv.cli import app
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case
@@ -35,7 +34,6 @@ AISLE = {"highway": "service", "service": "parking_aisle"}
 SERVICE = {"highway": "service"}
 STREET = {"highway": "residential", "name": "Hauptstraße"}
 SPACE = {"amenity": "parking_space"}
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 
 
 @dataclass
@@ -990,7 +988,7 @@ def test_a_search_runs_on_what_was_imported(tmp_path, name):
     write_lot(PLACES[name]().draft(tmp_path).lot(), tmp_path / "lot.geojson")
     assert check_lot(tmp_path / "lot.geojson") == []
     lot = read_lot(tmp_path / "lot.geojson")
-    scenario = Scenario.on_lot(lot)
+    scenario = make_scenario(lot)
     for agent in ("mdp", "greedy-drive"):
         rows = Case(scenario, agent).run(range(4))[0]
         assert all(row["parked"] for row in rows)
@@ -1020,7 +1018,7 @@ def test_the_command_line_draws_what_it_refuses_and_writes_no_lot(tmp_path):
     bare = Map().way([(0, 0), (50, 0)], AISLE).box(9, 3, 12, 8, SPACE)
     (tmp_path / "bare.osm").write_text(bare.xml(), encoding="utf-8")
     words = ["lot", "import", "bare.osm", "--out", "bare.geojson", "--picture", "bare.png"]
-    done = subprocess.run([*PARKENV, *words], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = parkenv(*words, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith("parkenv: error: bare.osm: no entry")
     assert done.stderr.count("\n") == 1

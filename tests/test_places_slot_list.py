@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import connected_components
 
-from parkenv import Scenario
+from parkenv import make_scenario
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.figures.import_picture import save_import_picture
@@ -75,7 +75,7 @@ def test_dragon_lake_is_found_again_from_its_slots_alone(tmp_path):
     # Aisles and the roads between them lie where the map's own waypoints are.
     nearest, _, _ = nearest_on_lanes(found.lanes, lot.vertex_xy[: lot.n_slots])
     assert np.hypot(*(nearest - lot.vertex_xy[: lot.n_slots]).T).max() < 3.0
-    scenario = Scenario.on_lot(found)
+    scenario = make_scenario(found)
     rows = Case(scenario, "greedy-drive").run(range(3))[0]
     assert all(r["parked"] for r in rows)
 
@@ -240,6 +240,21 @@ def test_it_says_how_to_give_an_entry_and_a_goal(tmp_path):
     assert of_lot(tmp_path, grid_lot(2, 8), entries=((x, y),), goals=((9.0, 9.0),)).lot().n_slots == 16
 
 
+def test_parking_costs_stay_with_their_slots(tmp_path):
+    lot = grid_lot(2, 8)
+    cost = np.arange(16) * 10.0
+    order = np.random.default_rng(3).permutation(16)
+    lines = [f"{lot.slot_ids[i]},{lot.slot_xy[i, 0]},{lot.slot_xy[i, 1]},{cost[i]}" for i in order]
+    (tmp_path / "slots.csv").write_text("\n".join(["id,x,y,parking_cost_s", *lines]))
+    ends = {"entries": (tuple(lot.entries[0]),), "goals": (tuple(lot.goals[0]),)}
+    west = Wishes(bounds=((-5.0, -20.0), (12.5, 20.0)), **ends)
+    for wishes, n in ((Wishes(**ends), 16), (west, 10)):
+        drawn = import_lot(tmp_path / "slots.csv", wishes).lot()
+        assert drawn.n_slots == n
+        costs = dict(zip(lot.slot_ids, cost, strict=True))
+        assert drawn.slot_parking_cost_s.tolist() == [costs[name] for name in drawn.slot_ids]
+
+
 # ---- faults ----
 
 FAULTS = [
@@ -256,6 +271,7 @@ FAULTS = [
     ("lat,lon\n91,2", "row 2: lat is '91', want a number from -90 to 90"),
     ("lat,lon\n1,-181", "row 2: lon is '-181', want a number from -180 to 180"),
     ("x,y,yaw\n1,2,", "row 2: yaw is '', want a number"),
+    ("x,y,parking_cost_s\n1,2,-3", "row 2: parking_cost_s is '-3', want a number from 0 to 1e\\+08"),
     ("id,x,y\na,1,2\na,9,2", "row 3: id 'a' stands already in row 2"),
     ("id,x,y\n,1,2", "row 2: id '' is empty"),
     ("x,y\n1,2\n9,9\n1.01,2", "row 4: slot '4' lies where slot '2' of row 2 does"),
@@ -287,6 +303,6 @@ def test_a_search_runs_on_a_list_of_slots(tmp_path):
     draft = of_lot(tmp_path, lot, entries=(tuple(lot.entries[0]),), goals=(tuple(lot.goals[0]),))
     write_lot(draft.lot(), tmp_path / "lot.geojson")
     assert check_lot(tmp_path / "lot.geojson") == []
-    scenario = Scenario.on_lot(read_lot(tmp_path / "lot.geojson"))
+    scenario = make_scenario(read_lot(tmp_path / "lot.geojson"))
     rows = Case(scenario, "mdp").run(range(4))[0]
     assert all(r["parked"] and r["walk_s"] > 0.0 for r in rows)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from parkenv import InputError, Scenario
+from parkenv import InputError, make_scenario
 from parkenv.lots import grid_lot
 from parkenv.world.lot import PARK
 from planners import CirclingWarning, ParkingMDP, label_setting, policy_iteration, value_iteration
@@ -92,7 +92,7 @@ def test_policy_iteration_agrees_with_value_iteration(seed, gamma, failure):
 def test_solvers_agree_on_random_lots(seed):
     rng = np.random.default_rng(seed)
     lot = grid_lot(int(rng.integers(1, 5)), int(rng.integers(2, 9)))
-    scenario = Scenario.on_lot(lot, failure_s=float(rng.uniform(0, 90)))
+    scenario = make_scenario(lot, failure_s=float(rng.uniform(0, 90)))
     mdp = ParkingMDP.from_belief(scenario, rng.uniform(0.0, 0.99, lot.n_slots), gamma=0.999)
     np.testing.assert_allclose(
         policy_iteration(mdp).values, value_iteration(mdp, tolerance=1e-10).values, atol=1e-9 * 1e3, rtol=0
@@ -100,7 +100,7 @@ def test_solvers_agree_on_random_lots(seed):
 
 
 def test_a_warm_start_ends_at_the_same_optimum_sooner():
-    scenario = Scenario.named("campus")
+    scenario = make_scenario("campus")
     belief = np.random.default_rng(0).uniform(0.5, 0.99, scenario.lot.n_slots)
     first = policy_iteration(ParkingMDP.from_belief(scenario, belief))
     belief[5] = 1.0
@@ -125,7 +125,7 @@ def test_an_unavailable_move_costs_its_wait_and_stays():
 
 def test_a_low_discount_is_warned_of():
     lot = grid_lot(2, 40)
-    scenario = Scenario.on_lot(lot, failure_s=90.0)
+    scenario = make_scenario(lot, failure_s=90.0)
     mdp = ParkingMDP.from_belief(scenario, np.full(lot.n_slots, 0.99), gamma=0.99)
     with pytest.warns(CirclingWarning, match=r"gamma 0\.99 is too low"):
         mdp.check_discount(policy_iteration(mdp).values)
@@ -136,7 +136,7 @@ def test_a_low_discount_is_warned_of():
 
 
 def test_a_failure_cost_at_which_trying_in_vain_looks_best_is_warned_of():
-    scenario = Scenario.named("jam", failure_s=0.0)
+    scenario = make_scenario("jam", failure_s=0.0)
     mdp = ParkingMDP.from_belief(scenario, np.ones(scenario.lot.n_slots))
     with pytest.warns(CirclingWarning, match="failure cost of 0 s"):
         mdp.check_discount(policy_iteration(mdp).values)

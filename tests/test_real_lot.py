@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from parkenv import OccupancyLog, RecordedOccupancy, Scenario
+from parkenv import OccupancyLog, RecordedOccupancy, make_scenario
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.lots import read_lot
@@ -21,7 +21,7 @@ needs_data = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def scenario():
     lot = read_lot(MAP)
-    return Scenario.on_lot(lot, RecordedOccupancy(OccupancyLog.read(LOG), lot.walk_m()))
+    return make_scenario(lot, RecordedOccupancy(OccupancyLog.read(LOG), lot.walk_m()))
 
 
 def totals(scenario, agent, episodes):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import parkenv  # noqa: F401  (registers the environments)
+from parkenv import make_scenario
 from parkenv.envs import rendering
 from parkenv.envs.rendering import SearchRenderer, belief_colors, clock
 from parkenv.envs.window import Window
@@ -14,7 +15,6 @@ from parkenv.errors import InputError
 from parkenv.lots import city_lot
 from parkenv.world.lot import PARK, Lane, ParkingLot
 from parkenv.world.occupancy import Arrival, OccupancyProcess
-from parkenv.world.scenario import Scenario
 
 
 def row_lot(goal=(40.0, 0.0), vertical=False):
@@ -38,7 +38,7 @@ def row_lot(goal=(40.0, 0.0), vertical=False):
 
 
 def start(lot, **fields):
-    env = gym.make("parkenv/Search-v0", scenario=Scenario.on_lot(lot, **fields), render_mode="rgb_array")
+    env = gym.make("parkenv/Search-v0", scenario=make_scenario(lot, **fields), render_mode="rgb_array")
     env.reset(seed=1)
     return env
 
@@ -106,7 +106,7 @@ def test_what_was_not_seen_is_paler():
 
 
 def test_a_lot_higher_than_wide_is_turned_and_drawn_as_large():
-    flat, high = (SearchRenderer(Scenario.on_lot(row_lot(vertical=v))) for v in (False, True))
+    flat, high = (SearchRenderer(make_scenario(row_lot(vertical=v))) for v in (False, True))
     assert high._whole.scale == pytest.approx(flat._whole.scale)
     north = high._whole(np.array([0.0, 30.0])) - high._whole(np.array([0.0, 0.0]))
     assert north[0] > 0
@@ -114,7 +114,7 @@ def test_a_lot_higher_than_wide_is_turned_and_drawn_as_large():
 
 
 def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
-    scenario = Scenario.on_lot(city_lot(4000, seed=2))
+    scenario = make_scenario(city_lot(4000, seed=2))
     renderer = SearchRenderer(scenario)
     assert renderer._whole is None
     env = gym.make("parkenv/Search-v0", scenario=scenario)
@@ -134,7 +134,7 @@ def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
 
 
 def test_a_goal_out_of_the_window_is_pointed_at():
-    scenario = Scenario.on_lot(city_lot(4000, seed=2))
+    scenario = make_scenario(city_lot(4000, seed=2))
     env = gym.make("parkenv/Search-v0", scenario=scenario, render_mode="rgb_array")
     env.reset(seed=0)
     away = scenario.lot.goals[0] - scenario.lot.vertex_xy[env.unwrapped.state.vertex]
@@ -198,7 +198,7 @@ def test_text_tells_place_time_and_surroundings():
 
 
 def test_text_of_a_large_lot_fits_the_terminal_too():
-    env = gym.make("parkenv/Search-v0", scenario=Scenario.on_lot(city_lot(4000, seed=2)), render_mode="ansi")
+    env = gym.make("parkenv/Search-v0", scenario=make_scenario(city_lot(4000, seed=2)), render_mode="ansi")
     env.reset(seed=0)
     lines = env.render().splitlines()
     assert len(lines) <= 22

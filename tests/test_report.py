@@ -4,33 +4,24 @@ import itertools
 import json
 import re
 import shutil
-import subprocess
-import sys
 
 import jsonschema
 import numpy as np
 import pytest
+from command_line import parkenv
 
-from parkenv import InputError, Scenario
+from parkenv import InputError, make_scenario
 from parkenv.cli.report import make_report
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.results import episode_key
-from parkenv.evaluation.report.intentions import Intentions
 from parkenv.evaluation.report.page import SCHEMA, page_data
+from parkenv.evaluation.report.plan_preview import PlanPreview
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.report.search_recording import Encounter, choose, record
 from parkenv.evaluation.report.tables import table_of
 from parkenv.lots import packaged_lot, write_lot
 from parkenv.world.lot import PARK
 from planners import make_agent
-
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
-
-
-def parkenv(*arguments):
-    return subprocess.run(
-        [*PARKENV, *map(str, arguments)], capture_output=True, text=True, timeout=600, check=False
-    )
 
 
 def data_of(page):
@@ -263,7 +254,7 @@ def test_text_in_the_data_cannot_end_its_element(tmp_path):
 
 
 def test_searches_are_chosen_in_turns_over_settings():
-    mini = Scenario.named("mini")
+    mini = make_scenario("mini")
     cases = [
         (Case(mini.replace(failure_s=cost), agent), range(5, 9))
         for cost in (1.0, 2.0)
@@ -278,7 +269,7 @@ def test_searches_are_chosen_in_turns_over_settings():
     "name", ["mdp", "mdp-tuned", "belief", "greedy-goal", "first-free", "oracle", "random"]
 )
 def test_plans_are_ways_that_can_be_driven_and_begin_with_what_is_done(name):
-    scenario = Scenario.named("campus")
+    scenario = make_scenario("campus")
     recorded = record(Encounter((Case(scenario, name),), 3), {})
     (search,), neighbors = recorded["searches"], scenario.lot.neighbors
     assert search["agrees"] is None
@@ -297,7 +288,7 @@ def test_plans_are_ways_that_can_be_driven_and_begin_with_what_is_done(name):
 
 
 def test_asking_belief_for_its_plan_changes_nothing():
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     case = Case(scenario, "belief")
     recorded = record(Encounter((case,), 11), {})["searches"][0]
     assert recorded["total_s"] == case.run([11])[0][0]["total_s"]
@@ -309,9 +300,7 @@ def test_asking_belief_for_its_plan_changes_nothing():
     }  # fmt: skip
     action, memory = agent.predict(observation)
     before = [np.array(v) for v in (memory.kind, memory.p_occupied, memory.targets)]
-    ahead = Intentions(scenario.public(), agent).ahead(
-        observation, int(observation["vertex"]), int(action), memory
-    )
+    ahead = PlanPreview(scenario.public(), agent).ahead(observation, int(action), memory)
     assert ahead
     for old, new in zip(before, (memory.kind, memory.p_occupied, memory.targets), strict=True):
         np.testing.assert_array_equal(old, new)

@@ -2,11 +2,10 @@
 
 import json
 import shutil
-import subprocess
-import sys
 import time
 
 import pytest
+from command_line import parkenv
 
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed (extra dev)")
 
@@ -40,11 +39,7 @@ def run(tmp_path_factory):
         "compare", "--scenario", "mini", "--agents", "mdp,first-free,greedy-goal,oracle", "--failure-cost", "10,30",
         "-n", "6", "--occupancy-levels", "none", "--jobs", "1", "--out", str(out),
     ]  # fmt: skip
-    subprocess.run(
-        [sys.executable, "-c", "from parkenv.cli import main; main()", *command],
-        check=True,
-        capture_output=True,
-    )
+    assert parkenv(*command).returncode == 0
     make_report(out, jobs=1)
     return out
 
@@ -240,11 +235,7 @@ def test_a_survey_drive_is_shown_in_step(browser, tmp_path):
         "--out",
         str(tmp_path),
     ]
-    subprocess.run(
-        [sys.executable, "-c", "from parkenv.cli import main; main()", *command],
-        check=True,
-        capture_output=True,
-    )
+    assert parkenv(*command).returncode == 0
     screen(browser, 1400)
     browser.get((tmp_path / "report.html").as_uri())
     (drive,) = json.loads(one(browser, "#report-data").get_attribute("textContent"))["drives"]

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 
-from parkenv import InputError, Lane, ParkingLot, Scenario
+from parkenv import InputError, Lane, ParkingLot, make_scenario
 from parkenv.lots import city_lot, grid_lot, packaged_lot
 from planners import make_agent
 from planners.routes import DriveRoutes
@@ -21,7 +21,7 @@ LOTS = {
 
 @pytest.fixture(scope="module", params=LOTS)
 def drives(request):
-    scenario = Scenario.on_lot(LOTS[request.param])
+    scenario = make_scenario(LOTS[request.param])
     return scenario, DriveRoutes(scenario), dijkstra(scenario.lot.drive_matrix() / scenario.v_drive)
 
 
@@ -50,7 +50,7 @@ def test_ways_are_as_long_as_they_should_be(drives):
 def test_the_nearest_are_all_that_are_as_near(seed, chance):
     rng = np.random.default_rng(seed)
     lot = LOTS["grid"]
-    routes = DriveRoutes(Scenario.on_lot(lot))
+    routes = DriveRoutes(make_scenario(lot))
     vertex, slots = int(rng.integers(lot.n_vertices)), rng.random(lot.n_slots) < chance
     seconds = np.where(slots, routes.seconds_from(vertex)[: lot.n_slots], np.inf)
     found, least = routes.nearest(vertex, slots)
@@ -76,7 +76,7 @@ def one_way_past_two_slots():
 
 def test_what_no_way_leads_to_is_left_out():
     lot = one_way_past_two_slots()
-    scenario = Scenario.on_lot(lot)
+    scenario = make_scenario(lot)
     routes, entry = DriveRoutes(scenario), int(lot.entry_vertices[0])
     assert routes.nearest(entry, np.array([True, False]))[1] == np.inf
     assert list(routes.nearest(entry, np.array([True, True]))[0]) == [1]
@@ -91,7 +91,7 @@ def test_what_no_way_leads_to_is_left_out():
 def test_agents_head_for_what_they_can_reach(name):
     """The slot with the shorter walk lies behind the entry, on a one-way lane."""
     lot = one_way_past_two_slots()
-    agent, vertex = make_agent(name, Scenario.on_lot(lot)), int(lot.entry_vertices[0])
+    agent, vertex = make_agent(name, make_scenario(lot)), int(lot.entry_vertices[0])
     observation = {"vertex": vertex, "p_occupied": np.full(2, 0.5, dtype=np.float32)}
     move, _ = agent.predict(observation)
     assert lot.neighbors[vertex, int(move)] == 1

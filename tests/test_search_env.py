@@ -16,14 +16,14 @@ from hypothesis import strategies as st
 from numba.core.errors import TypingError
 
 import parkenv
-from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
+from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.envs.search_alone import held
 from parkenv.envs.wrappers import ThesisReward
 from parkenv.lots import grid_lot
+from parkenv.scenarios.spec import SCENARIO_NAMES
 from parkenv.world.decay import decay_factor
 from parkenv.world.lot import PARK
-from parkenv.world.scenario import SCENARIO_NAMES
 
 ENV_IDS = [name for name in gym.registry if name.startswith("parkenv/Search")]
 
@@ -111,7 +111,7 @@ def test_resets_without_a_seed_go_through_other_worlds_of_the_same_seed():
 @settings(max_examples=20)
 def test_the_world_does_not_depend_on_who_drives(seed):
     """Two cars that behave differently meet the same slot states at the same times."""
-    scenario = Scenario.named("street")
+    scenario = make_scenario("street")
     worlds = []
     for policy in (0, 1):
         env = gym.make("parkenv/Search-v0", scenario=scenario)
@@ -268,7 +268,7 @@ def test_observations_are_not_live_buffers():
 
 def test_only_slots_in_view_are_learnt_of():
     """The belief of a slot that was never in view stays at its forecast, whatever stands there."""
-    scenario = Scenario.named("campus", sensor_model=SensorModel(view_range=6.0))
+    scenario = make_scenario("campus", sensor_model=SensorModel(view_range=6.0))
     env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
     observation, _ = env.reset(seed=0)
     lot, forecast = scenario.lot, env.state.belief.prior
@@ -353,7 +353,7 @@ def test_noisy_sight_errs_as_often_as_stated():
 
 
 def test_sight_differs_by_distance_and_side():
-    lot = Scenario.named("mini").lot
+    lot = make_scenario("mini").lot
     bands = (
         SensorBand(up_to=1.0, beside=True, seen_rate=1.0, hit_rate=1.0, false_alarm_rate=0.0),
         SensorBand(up_to=6.0, beside=True, seen_rate=0.5, hit_rate=0.9, false_alarm_rate=0.1),
@@ -413,7 +413,7 @@ def test_wrong_bands_are_named(wrong, message):
         ({"goal": 9}, "goal is 9"),
         ({"entry": -1}, "entry"),
         ({"sensor_model": 3}, "SensorModel"),
-        ({"scenario": "moon"}, "unknown scenario 'moon'; known: campus"),
+        ({"scenario": "moon"}, "unknown scenario 'moon', and no such file; known: campus"),
         ({"scenario": 3}, "want a Scenario"),
         ({"render_mode": "hologram"}, "render_mode"),
     ],

@@ -7,15 +7,15 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 import parkenv  # noqa: F401 - registers the ids
-from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
+from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots import city_lot, grid_lot
+from parkenv.scenarios.spec import SCENARIO_NAMES
 from parkenv.world.occupancy import Arrival, ArrivalWindow, Forecast
 from parkenv.world.occupancy_log import OccupancyLog
 from parkenv.world.recorded_occupancy import RecordedOccupancy
-from parkenv.world.scenario import SCENARIO_NAMES
 
 LIMIT = 40
 SIGHTS = {
@@ -148,17 +148,17 @@ def test_whatever_the_world_is(make, observation):
 
 @pytest.mark.parametrize("observation", ["full", "local"])
 def test_whatever_is_foreseen(observation):
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     assert_parity(scenario.replace(prior=Rumour(scenario.lot.n_slots)), observation)
 
 
 @pytest.mark.parametrize("observation", ["full", "local"])
 def test_different_lots_in_one_batch(observation):
-    assert_parity([recorded_scenario(), Scenario.named("mini"), Scenario.named("jam")], observation, n=6)
+    assert_parity([recorded_scenario(), make_scenario("mini"), make_scenario("jam")], observation, n=6)
 
 
 def test_different_lots_share_one_space():
-    small, large = Scenario.named("mini"), Scenario.named("street")
+    small, large = make_scenario("mini"), make_scenario("street")
     envs = make_batch(3, [small, large])
     observation, _ = envs.reset(seed=0)
     assert observation["p_occupied"].shape == (3, large.lot.n_slots)
@@ -337,7 +337,7 @@ def test_what_is_handed_out_is_not_live_unless_asked():
 
 
 def test_a_lot_of_ten_thousand_slots_touches_only_what_is_near():
-    scenario = Scenario.on_lot(city_lot(10_000))
+    scenario = make_scenario(city_lot(10_000))
     envs = make_batch(2, scenario, observation="local")
     observation, _ = envs.reset(seed=0)
     assert (
@@ -406,7 +406,7 @@ def test_a_world_of_another_kind_is_refused():
         def world(self, key, arrival):
             return None
 
-    scenario = Scenario.named("mini").replace(occupancy=Empty(10))
+    scenario = make_scenario("mini").replace(occupancy=Empty(10))
     with pytest.raises(
         InputError, match="occupancy is a Empty, want an OccupancyProcess or a RecordedOccupancy"
     ):

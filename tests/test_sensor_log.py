@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import parkenv
 
-from parkenv import Scenario
+from parkenv import Scenario, make_scenario
 from parkenv.envs.perception import SearchPerceptionEnv
 from parkenv.errors import InputError
 from parkenv.evaluation.trips.sensor_log import GRID_EVERY, record_search, record_session, sensor_log
@@ -30,7 +31,7 @@ def rows_of(path: Path) -> Counter[str]:
 
 @pytest.fixture(scope="module")
 def mini() -> Scenario:
-    return Scenario.named("mini")
+    return make_scenario("mini")
 
 
 def test_a_search_through_sensors_is_recorded_step_by_step(mini: Scenario, tmp_path: Path) -> None:
@@ -87,8 +88,7 @@ def test_without_the_viewer_it_says_how_to_get_it(
 
 
 def test_compare_records_its_first_search_where_it_looks_through_sensors(tmp_path: Path) -> None:
-    parkenv = [sys.executable, "-c", "from parkenv.cli import main; main()"]
-    command = [*parkenv, "compare", "--scenario", "mini", "--agents", "mdp", "-n", "1", "--no-figures"]
+    command = ["compare", "--scenario", "mini", "--agents", "mdp", "-n", "1", "--no-figures"]
     command += [
         "--occupancy-levels",
         "none",
@@ -97,8 +97,9 @@ def test_compare_records_its_first_search_where_it_looks_through_sensors(tmp_pat
         "--rerun",
         str(tmp_path / "s.rrd"),
     ]
-    refused = subprocess.run(command, capture_output=True, text=True)
+    refused = parkenv(*command)
     assert refused.returncode == 2
     assert "add --sensors laser" in refused.stderr
-    subprocess.run([*command, "--sensors", "laser", "--jobs", "1"], check=True, capture_output=True)
+    done = parkenv(*command, "--sensors", "laser", "--jobs", 1)
+    assert done.returncode == 0, done.stderr
     assert rows_of(tmp_path / "s.rrd")["/car/right/boxes"] > 1

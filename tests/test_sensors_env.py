@@ -9,7 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import data_equivalence
 
 import parkenv  # noqa: F401
-from parkenv import InputError, OccupancyProcess, Scenario, Traffic
+from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
 from parkenv.envs.lookout import Lookout
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.traffic import LotTraffic
@@ -161,8 +161,8 @@ def coming_and_going(lot):
 
 
 def test_scenes_follow_the_world_and_do_not_depend_on_when_one_looks():
-    lot = Scenario.named("mini").lot
-    scenario = Scenario.named("mini", occupancy=coming_and_going(lot))
+    lot = make_scenario("mini").lot
+    scenario = make_scenario("mini", occupancy=coming_and_going(lot))
     slots, key = slot_lot(lot), np.uint64(77)
     arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
 
@@ -190,7 +190,7 @@ def test_traffic_keeps_to_its_ways(name):
     from shapely import STRtree, box, polygons
     from shapely.affinity import rotate, translate
 
-    scenario = Scenario.named(name)
+    scenario = make_scenario(name)
     traffic = LotTraffic(
         scenario.lot, 0, Traffic(cars=6, pedestrians=0), np.uint64(3), slot_lot(scenario.lot)
     )
@@ -212,7 +212,7 @@ def test_traffic_keeps_to_its_ways(name):
 
 
 def test_people_walk_to_the_goal_and_back():
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     traffic = LotTraffic(
         scenario.lot, 0, Traffic(cars=0, pedestrians=3), np.uint64(5), slot_lot(scenario.lot)
     )
@@ -225,7 +225,7 @@ def test_people_walk_to_the_goal_and_back():
 
 
 def test_nobody_is_in_the_searching_cars_way():
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     traffic = LotTraffic(
         scenario.lot, 0, Traffic(cars=3, pedestrians=4), np.uint64(1), slot_lot(scenario.lot)
     )
@@ -238,7 +238,7 @@ def test_nobody_is_in_the_searching_cars_way():
 
 
 def test_movers_are_drawn_scanned_and_numbered_after_the_parked_cars():
-    lot = Scenario.named("mini").lot
+    lot = make_scenario("mini").lot
     parked = slot_lot(lot).scene(np.ones(lot.n_slots, bool))
     x, y = lot.vertex_xy[0]
     ahead = np.array([[x, y + 4.0, 0.3]])
@@ -261,7 +261,7 @@ def test_movers_are_drawn_scanned_and_numbered_after_the_parked_cars():
 
 
 def test_moving_shadows_are_those_of_a_scene_made_anew():
-    lot = Scenario.named("mini").lot
+    lot = make_scenario("mini").lot
     slots = slot_lot(lot)
     parked = slots.scene(np.ones(lot.n_slots, bool))
     x, y = lot.vertex_xy[0]
@@ -297,14 +297,14 @@ def test_bad_movers_are_named(movers, words):
 
 
 def test_a_mover_of_a_model_that_the_fleet_lacks_is_refused():
-    lot = Scenario.named("mini").lot
+    lot = make_scenario("mini").lot
     scene = slot_lot(lot).scene(np.zeros(lot.n_slots, bool))
     with pytest.raises(SensorError, match="vehicle_model: wanted 0 to 99"):
         scene.with_movers(Movers(np.zeros((1, 3)), np.array([100])))
 
 
 def test_lookouts_of_equal_worlds_see_the_same_whatever_was_looked_at_before():
-    scenario = Scenario.named("mini", traffic=BUSY)
+    scenario = make_scenario("mini", traffic=BUSY)
     env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
     env.reset(seed=0)
     eager, late = (Lookout(scenario, SMALL_RIG, None, 3, 0.5) for _ in range(2))
@@ -319,7 +319,7 @@ def test_lookouts_of_equal_worlds_see_the_same_whatever_was_looked_at_before():
 
 @pytest.mark.parametrize("name", ["campus", "jam", "street", "mini"])
 def test_cars_of_a_full_lot_do_not_touch(name):
-    lot = Scenario.named(name).lot
+    lot = make_scenario(name).lot
     for arrival in (0, 7919):
         scene = slot_lot(lot).scene(np.ones(lot.n_slots, bool), arrival)  # an overlap would warn
         assert len(scene.present) == lot.n_slots

@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from parkenv import InputError, Scenario, SensorBand, SensorModel, Traffic
+from parkenv import InputError, SensorBand, SensorModel, Traffic, make_scenario
 from parkenv.evaluation.experiments.compare import Case
-from parkenv.evaluation.experiments.sensor_model_fit import BAND_ENDS, LookCounts, count_looks
+from parkenv.evaluation.experiments.sensor_model_fit import BAND_ENDS, ObservationCounts, count_observations
 from parkenv.world.lot import PARK
 from parkenv.world.sensor_model import SENSOR_MODEL_NAMES
 from planners import make_agent
@@ -95,14 +95,14 @@ def test_unseen_slots_are_known_once_they_were_tried():
 )
 def test_counts_give_the_rates_that_they_were_drawn_from(hit, false_alarm, seen, seed):
     rng = np.random.default_rng(seed)
-    n, looks = 4000, LookCounts.none().looks
+    n, looks = 4000, ObservationCounts.none().counts
     for band in range(len(BAND_ENDS)):
         for side in (0, 1):
             for taken, rate in ((0, false_alarm), (1, hit)):
                 told = rng.binomial(n, seen)
                 said = rng.binomial(told, rate)
                 looks[band, side, taken] = n - told, told - said, said
-    model = LookCounts(looks).fitted()
+    model = ObservationCounts(looks).fitted()
     rates = model.rates(np.array(BAND_ENDS), np.ones(len(BAND_ENDS), dtype=bool))
     np.testing.assert_allclose(rates.seen, seen, atol=0.03)
     np.testing.assert_allclose(rates.hit, hit, atol=0.1)
@@ -111,21 +111,21 @@ def test_counts_give_the_rates_that_they_were_drawn_from(hit, false_alarm, seen,
 
 def test_too_few_looks_are_refused():
     with pytest.raises(InputError, match="want at least 20 of each"):
-        LookCounts.none().fitted()
+        ObservationCounts.none().fitted()
 
 
 def test_looks_of_a_real_search_are_counted():
     """Every slot in view after every step is counted once, and the stack is right about most that it speaks of."""
-    scenario = Scenario.named("mini")
-    looks = count_looks(scenario, "laser", "greedy-drive", range(3), "overcast").looks
+    scenario = make_scenario("mini")
+    looks = count_observations(scenario, "laser", "greedy-drive", range(3), "overcast").counts
     said = looks.sum(axis=(0, 1))
     assert said.sum() >= 10
     right = said[0, 1] + said[1, 2]
     assert right >= 0.9 * said[:, 1:].sum() > 0
-    again = count_looks(scenario, "laser", "greedy-drive", range(3), "overcast").looks
+    again = count_observations(scenario, "laser", "greedy-drive", range(3), "overcast").counts
     np.testing.assert_array_equal(looks, again)
     with pytest.raises(InputError, match="rig is 'sonar'"):
-        count_looks(scenario, "sonar", "mdp", [0])
+        count_observations(scenario, "sonar", "mdp", [0])
 
 
 def test_the_file_says_what_it_is(tmp_path):
@@ -136,7 +136,7 @@ def test_the_file_says_what_it_is(tmp_path):
 @pytest.mark.slow
 def test_the_fast_environment_stands_for_the_slow_one():
     """Through the sensors and with the model fitted to them: the same ranking, and means close to each other."""
-    scenario = Scenario.named("campus", sensor_model=SensorModel.named("laser"), traffic=Traffic(3, 5))
+    scenario = make_scenario("campus", sensor_model=SensorModel.named("laser"), traffic=Traffic(3, 5))
     means = {}
     for rig in ("laser", None):
         for agent in ("first-free", "greedy-drive", "greedy-goal"):
@@ -153,4 +153,4 @@ def test_the_fast_environment_stands_for_the_slow_one():
 @pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
 def test_agents_that_plan_on_what_they_see_refuse_to_search_blindly(name):
     with pytest.raises(InputError, match="slots are seen"):
-        make_agent(name, Scenario.named("mini", sensor_model=SensorModel.blind()))
+        make_agent(name, make_scenario("mini", sensor_model=SensorModel.blind()))

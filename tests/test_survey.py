@@ -2,14 +2,14 @@
 
 import json
 import subprocess
-import sys
 import time
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import PARKENV, parkenv
 
-from parkenv import InputError, OccupancyProcess, Scenario, Traffic
+from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
 from parkenv.evaluation.experiments.surveys import map_error, run_survey
 from parkenv.mapping.inference import SessionLog
 from parkenv.mapping.store import MapStore
@@ -20,16 +20,15 @@ from parkenv.world.occupancy import ArrivalWindow
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount, SensorRig
 
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 BUSY = Traffic(cars=2, pedestrians=4)
 
 
 def halves(name="mini"):
     """Every other slot taken for ever."""
-    lot = Scenario.named(name).lot
+    lot = make_scenario(name).lot
     taken = np.arange(lot.n_slots) % 2 == 0
     world = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
-    return Scenario.named(name, occupancy=world, traffic=BUSY), taken
+    return make_scenario(name, occupancy=world, traffic=BUSY), taken
 
 
 @pytest.mark.parametrize("rig", ["laser", "stereo"])
@@ -79,9 +78,6 @@ def test_the_maps_error_is_zero_where_it_is_right():
 
 
 def test_survey_and_map_on_the_command_line(tmp_path):
-    def parkenv(*words):
-        return subprocess.run([*PARKENV, *map(str, words)], capture_output=True, text=True)
-
     out = tmp_path / "s"
     done = parkenv(
         "survey", "--scenario", "mini", "-n", 1, "--weather", "sunny", "--every", 3, "--jobs", 1, "--out", out
@@ -170,7 +166,7 @@ def test_bad_settings_are_named(wrong, message):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "rig"), [("campus", "laser"), ("street", "laser"), ("campus", "stereo")])
 def test_held_out_sessions_are_as_right_as_promised(name, rig):
-    scenario = Scenario.named(name, traffic=BUSY)
+    scenario = make_scenario(name, traffic=BUSY)
     window = ArrivalWindow((1,), 36_000.0, 43_200.0)
     survey = Survey(scenario, SurveySettings(rig=rig, windows=(window,), seed=777))
     results = [survey.drive(0)]
@@ -180,7 +176,7 @@ def test_held_out_sessions_are_as_right_as_promised(name, rig):
 @pytest.mark.slow
 def test_a_killed_survey_loses_only_the_drive_under_way(tmp_path):
     """SIGKILL in the middle: what the map file holds is whole, and the same command goes on from there."""
-    scenario, out = Scenario.named("mini"), tmp_path / "s"
+    scenario, out = make_scenario("mini"), tmp_path / "s"
     command = [*PARKENV, "survey", "--scenario", "mini", "--every", "4", "--jobs", "1", "--out", str(out)]
     drive = subprocess.Popen([*command, "-n", "500"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
@@ -194,7 +190,7 @@ def test_a_killed_survey_loses_only_the_drive_under_way(tmp_path):
     with MapStore(out / "map.sqlite", scenario.lot, create=False) as store:
         before = store.sessions()
     assert 1 <= len(before) < 500
-    done = subprocess.run([*command, "-n", str(len(before) + 1)], capture_output=True, text=True)
+    done = parkenv(*command[len(PARKENV) :], "-n", len(before) + 1)
     assert done.returncode == 0, done.stderr
     with MapStore(out / "map.sqlite", scenario.lot, create=False) as store:
         after = {s.key: s for s in store.sessions()}

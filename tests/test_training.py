@@ -5,18 +5,19 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 import zipfile
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import PARKENV, parkenv
 from gymnasium.vector import AutoresetMode
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
+from parkenv import make_scenario
 from parkenv.cli.search_course import SearchCourse
 from parkenv.cli.training_course import curves_beside
 from parkenv.envs.local_observation import LocalObservation
@@ -29,12 +30,10 @@ from parkenv.evaluation.training.cloning import Demonstrations, clone
 from parkenv.evaluation.training.configs import DRIVE_RECIPES, MAX_STEPS, RECIPES
 from parkenv.evaluation.training.rl_training import read_curve, train_one, write_curve
 from parkenv.evaluation.training.search_training import SearchTraining, examined, search_times
-from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.learned import ALGORITHMS, LearnedAgent, ModelCard
 
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
-SCENARIO = Scenario.named("mini")
+SCENARIO = make_scenario("mini")
 EXAMINED = range(2_000_000, 2_000_020)
 
 
@@ -188,7 +187,7 @@ def test_a_planner_that_finishes_nothing_cannot_be_imitated(monkeypatch):
 
 @pytest.mark.slow
 def test_imitation_begins_near_the_planner():
-    campus = Scenario.named("campus")
+    campus = make_scenario("campus")
     shown = Demonstrations.collect("first-free", campus, range(5_000_000, 5_000_300))
     assert shown.local.shape == (len(shown.actions), 86)
     assert (shown.masks[np.arange(len(shown.actions)), shown.actions] == 1).all()
@@ -205,12 +204,12 @@ def test_imitation_begins_near_the_planner():
 
 def test_what_cannot_imitate_says_so():
     shown = Demonstrations.collect("mdp", SCENARIO, range(5_000_000, 5_000_002))
-    with pytest.raises(InputError, match="dqn cannot begin by imitation"):
+    with pytest.raises(InputError, match="dqn has no behaviour cloning"):
         SearchTraining("dqn", 10, 10, (SCENARIO,), EXAMINED, demonstrations=shown)
 
 
 def test_a_model_runs_on_lots_that_it_was_not_trained_on(trained):
-    campus = Scenario.named("campus")
+    campus = make_scenario("campus")
     row = search_times(LearnedAgent(campus, "maskable-ppo", trained / "model.zip"), campus, range(4))
     assert row["episodes"] == 4
 
@@ -306,12 +305,12 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
 @pytest.mark.parametrize("algorithm", sorted(RECIPES))
 def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp_path, algorithm):
     out = tmp_path / "out"
-    arguments = [
-        *PARKENV, "train", algorithm, "--scenario", "mini", "--steps", "40000", "--seeds", "2", "--examine-every",
+    command = [
+        "train", algorithm, "--scenario", "mini", "--steps", "40000", "--seeds", "2", "--examine-every",
         "8000", "--examined-on", "16", "--planners", "mdp", "--jobs", "2", "--out", str(out),
     ]  # fmt: skip
     process = subprocess.Popen(
-        arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        [*PARKENV, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
     )
     deadline = time.monotonic() + 600
     while time.monotonic() < deadline and len(read_curve(out / "seed_0" / "curve.csv")) < 2:
@@ -321,24 +320,23 @@ def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp
     process.wait()
     assert not (out / "summary.json").exists()
     survived = read_curve(out / "seed_0" / "curve.csv")
-    refused = subprocess.run(arguments, capture_output=True, text=True)
+    refused = parkenv(*command)
     assert (refused.returncode, "--resume" in refused.stderr) == (2, True)
-    subprocess.run([*arguments, "--resume"], check=True, capture_output=True)
+    assert parkenv(*command, "--resume").returncode == 0
     curve = read_curve(out / "seed_0" / "curve.csv")
     assert curve[: len(survived)] == survived
     assert [row["steps"] for row in curve] == sorted({row["steps"] for row in curve})
     summary = json.loads((out / "summary.json").read_text())
     assert [row["seed"] for row in summary["rows"]] == [0, 1]
     assert all(row["steps"] >= 40_000 for row in summary["rows"])
-    beside = [*arguments[:-1], str(tmp_path / "longer"), "--beside", str(out)]
-    subprocess.run([*beside, "--seeds", "1"], check=True, capture_output=True)
+    beside = [*command[:-1], str(tmp_path / "longer"), "--beside", str(out)]
+    assert parkenv(*beside, "--seeds", 1).returncode == 0
     summary = json.loads((tmp_path / "longer" / "summary.json").read_text())
     (means,) = summary["beside"].values()
     assert [row["steps"] for row in means] == [row["steps"] for row in curve]
-    compared = subprocess.run(
-        [*PARKENV, "compare", "--scenario", "mini", "--agents", f"mdp,{algorithm}:{out / 'seed_1' / 'model.zip'}",
-         "-n", "10", "--occupancy-levels", "none", "--out", str(tmp_path / "compared")],
-        capture_output=True, text=True,
+    compared = parkenv(
+        "compare", "--scenario", "mini", "--agents", f"mdp,{algorithm}:{out / 'seed_1' / 'model.zip'}", "-n", 10,
+        "--occupancy-levels", "none", "--out", tmp_path / "compared",
     )  # fmt: skip
     assert compared.returncode == 0, compared.stderr
 
@@ -422,12 +420,10 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
         ["ppo"],
     )
     for arguments in wrong:
-        done = subprocess.run(
-            [*PARKENV, "train", *arguments, "--scenario", "mini", "--out", str(out)], check=False
-        )
+        done = parkenv("train", *arguments, "--scenario", "mini", "--out", out)
         assert done.returncode == 2
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
-    done = subprocess.run([*PARKENV, "train", "dqn", "--imitate", "mdp", "--out", str(tmp_path / "new")])
+    done = parkenv("train", "dqn", "--imitate", "mdp", "--out", tmp_path / "new")
     assert done.returncode == 2
     assert not (tmp_path / "new").exists()
 
@@ -453,8 +449,6 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
     ],
 )
 def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):
-    done = subprocess.run(
-        [*PARKENV, "train", *arguments, "--out", str(tmp_path / "out")], capture_output=True, text=True
-    )
+    done = parkenv("train", *arguments, "--out", tmp_path / "out")
     assert done.returncode == 2
     assert wanted in " ".join(done.stderr.split())

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from parkenv import InputError, Scenario
+from parkenv import InputError, make_scenario
 from parkenv.cli import app
 from parkenv.driving.driven_lines import KEPT_RIGHT_M, DrivenLines
 from parkenv.driving.encounters import WATCHED_S
@@ -45,7 +45,7 @@ from planners.driving.path_tracking import TrackingSettings
 from sim_sensors.rig import SensorRig
 
 CAR = VehicleParameters()
-MINI = Scenario.named("mini")
+MINI = make_scenario("mini")
 LOTS = ("campus", "jam", "street", "mini")
 
 
@@ -57,13 +57,13 @@ def lines_of(name):
 
 @lru_cache
 def searched(name, blind=False, notice_m=2.0):
-    scenario = Scenario.named(name)
+    scenario = make_scenario(name)
     return DrivenSearch(unseen(scenario) if blind else scenario, style=DrivingStyle(notice_m=notice_m))
 
 
 def started(name, seed=0, **kinds):
     """A driver in the world of a seed, at the entry, and the world."""
-    scenario = Scenario.named(name)
+    scenario = make_scenario(name)
     driver = LotDriver(scenario, **kinds)
     key = world_key(seed, 0)
     arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
@@ -161,7 +161,7 @@ def test_a_lane_keeper_stays_near_its_path_at_any_speed_and_slows_down_in_turns(
 @pytest.mark.parametrize("name", ["mini", "campus"])
 def test_with_the_graphs_times_a_trip_is_the_search_itself(name):
     """Replace what was driven by what the graph says, and every decision and second is that of Search-v0."""
-    scenario = unseen(Scenario.named(name))
+    scenario = unseen(make_scenario(name))
     agent = make_agent("mdp", scenario)
     plain, driven = SearchEnv(scenario), DrivenSearchEnv(scenario, GraphDriver(scenario))
     failed = 0
@@ -293,7 +293,7 @@ def test_with_sensors_the_belief_is_what_the_stack_sees_and_not_what_is_so(monke
 @pytest.mark.slow
 def test_with_sensors_what_was_never_captured_changes_nothing():
     """Other cars in slots out of reach of every capture so far: the same beliefs, decisions and times."""
-    campus = Scenario.named("campus")
+    campus = make_scenario("campus")
     lot, taken = campus.lot, np.arange(campus.lot.n_slots) % 2 == 0
     entry = lot.vertex_xy[int(lot.entry_vertices[0])]
     away = np.hypot(*(lot.slot_xy - entry).T)
@@ -318,7 +318,7 @@ def test_with_sensors_what_was_never_captured_changes_nothing():
 
 
 def busy(name, cars, pedestrians):
-    return Scenario.named(name, traffic=Traffic(cars, pedestrians))
+    return make_scenario(name, traffic=Traffic(cars, pedestrians))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from small_lots import small_lot
 
-from parkenv import InputError, OccupancyProcess, Scenario
+from parkenv import InputError, OccupancyProcess, make_scenario
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from planners import make_agent
 from planners.thesis.expected_time import expected_time
@@ -33,7 +33,7 @@ def test_the_same_seed_gives_the_same_choice_and_another_one_other_worlds():
 
 def test_it_sees_the_forecast_and_not_the_world():
     """Two worlds that could not differ more, one map: the choice is the same."""
-    scenario = Scenario.named("jam")
+    scenario = make_scenario("jam")
     full = OccupancyProcess.from_demand(np.full(scenario.lot.n_slots, 9.0), np.zeros(168))
     chosen = []
     for s in (scenario, scenario.replace(occupancy=full, prior=scenario.prior)):
@@ -44,7 +44,7 @@ def test_it_sees_the_forecast_and_not_the_world():
 
 
 def test_it_is_the_planner_of_the_thesis_at_the_chosen_cost():
-    scenario = Scenario.named("campus")
+    scenario = make_scenario("campus")
     tuned = EpisodeRunner(scenario, "mdp-tuned", make_agent("mdp-tuned", scenario))
     for seed in range(3):
         row = tuned.run(seed).row
@@ -55,7 +55,7 @@ def test_it_is_the_planner_of_the_thesis_at_the_chosen_cost():
 
 
 def test_a_forecast_is_simulated_once():
-    scenario = Scenario.named("mini")
+    scenario = make_scenario("mini")
     agent = make_agent("mdp-tuned", scenario)
     entry = int(scenario.lot.entry_vertices[0])
     p = np.full(scenario.lot.n_slots, 0.7)

@@ -2,20 +2,18 @@
 
 import json
 import os
-import subprocess
-import sys
 import time
 from functools import partial
 from pathlib import Path
 
 import killed_once
 import pytest
+from command_line import parkenv
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.workers import HERE, Workers
 
 CLUSTERS = ("ray", "dask")
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
 
 
 @pytest.fixture(autouse=True)
@@ -112,14 +110,11 @@ def test_an_address_where_nobody_listens_is_refused_at_once(backend, address, wa
 
 
 def test_the_command_says_so_before_it_writes_anything(tmp_path):
-    done = subprocess.run(
-        [*PARKENV, "compare", "--scenario", "mini", "--out", tmp_path / "out", "--backend", "dask",
-         "--address", "tcp://127.0.0.1:9"],
-        capture_output=True, text=True,
-    )  # fmt: skip
+    out, address = tmp_path / "out", "tcp://127.0.0.1:9"
+    done = parkenv("compare", "--scenario", "mini", "--out", out, "--backend", "dask", "--address", address)
     assert done.returncode == 2
     assert "nobody listens there" in " ".join(done.stderr.split())
-    assert not (tmp_path / "out" / "episodes.csv").exists()
+    assert not (out / "episodes.csv").exists()
 
 
 @pytest.mark.slow
@@ -129,12 +124,11 @@ def test_a_comparison_is_the_same_on_processes_ray_and_dask(tmp_path):
     summaries, episodes = [], []
     for backend in ("loky", *CLUSTERS):
         out = tmp_path / backend
-        subprocess.run(
-            [*PARKENV, "compare", "--scenario", "mini,campus", "--agents", "mdp,greedy-goal,oracle",
-             "--episodes", "12", "--occupancy-levels", "none", "--no-figures", "--jobs", "2", "--out", out,
-             "--backend", backend],
-            check=True, capture_output=True,
+        done = parkenv(
+            "compare", "--scenario", "mini,campus", "--agents", "mdp,greedy-goal,oracle", "--episodes", 12,
+            "--occupancy-levels", "none", "--no-figures", "--jobs", 2, "--out", out, "--backend", backend,
         )  # fmt: skip
+        assert done.returncode == 0, done.stderr
         summary = json.loads((out / "summary.json").read_text())
         assert backend in summary.pop("command")
         for row in summary["rows"]:  # wall time is the machine's

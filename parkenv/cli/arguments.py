@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 
 from parkenv.errors import InputError
-from parkenv.lots import load_lot
-from parkenv.world.lot import ParkingLot
-from parkenv.world.occupancy import ArrivalWindow, OccupancyModel, OccupancyProcess
-from parkenv.world.scenario import Scenario
-from parkenv.world.sensor_model import SENSOR_MODEL_NAMES, SensorModel
+from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.workers import Workers
@@ -25,18 +19,41 @@ WORLD = "The world"
 COSTS = "Costs and speeds"
 MACHINES = "Machines"
 
-LotOption = Annotated[
-    Path | None,
+ScenarioOption = Annotated[
+    str | None,
     typer.Option(
-        "--lot", help="A lot file: native GeoJSON, or a Dragon Lake map (.yml).", rich_help_panel=WORLD
+        "--scenario",
+        metavar="NAME|FILE",
+        help="A packaged scenario (campus, jam, street, mini) or a scenario file (.toml).  [default: campus]",
+        rich_help_panel=WORLD,
+    ),
+]
+ScenariosOption = Annotated[
+    str | None,
+    typer.Option(
+        "--scenario",
+        metavar="NAME|FILE[,...]",
+        help="Packaged scenarios (campus, jam, street, mini) or scenario files (.toml).  [default: campus]",
+        rich_help_panel=WORLD,
+    ),
+]
+LotOption = Annotated[
+    str | None,
+    typer.Option(
+        "--lot",
+        metavar="NAME|FILE[,...]",
+        help="Instead of a scenario: a typical week on this lot; a packaged one, native GeoJSON, or a Dragon Lake map "
+        "(.yml).",
+        rich_help_panel=WORLD,
     ),
 ]
 OccupancyOption = Annotated[
     Path | None,
     typer.Option(
         "--occupancy",
-        help="What stands in the slots: a recorded log (.csv, .csv.gz; replayed day by day) or a process "
-        "written by `parkenv occupancy fit` (.json). A typical working week where none is given.",
+        metavar="FILE",
+        help="Which slots are taken when: a recorded log (.csv, .csv.gz; replayed day by day) or a process that "
+        "`parkenv occupancy fit` wrote (.json).  [default: the scenario's]",
         rich_help_panel=WORLD,
     ),
 ]
@@ -44,8 +61,9 @@ MappingOption = Annotated[
     Path | None,
     typer.Option(
         "--mapping",
-        help="CSV slot_id,log_slot_id that puts the log's slots on the lot's. Without it the log's fullest "
-        "slots go nearest to the goal.",
+        metavar="FILE",
+        help="CSV slot_id,log_slot_id that assigns the log's slots to the lot's. Without it the log's fullest slots "
+        "are placed nearest to the goal.",
         rich_help_panel=WORLD,
     ),
 ]
@@ -54,34 +72,39 @@ GoalOption = Annotated[
     typer.Option(
         "--goal",
         metavar="X,Y",
-        help="Walk to this point, m, not to the lot's own goal.",
+        help="Walk to this point, m, instead of the scenario's goal.",
         rich_help_panel=WORLD,
     ),
 ]
 ArrivalOption = Annotated[
-    str,
+    str | None,
     typer.Option(
-        "--arrival", metavar="HH:MM-HH:MM", help="Searches start between these hours.", rich_help_panel=WORLD
+        "--arrival",
+        metavar="HH:MM-HH:MM",
+        help="Searches start between these hours.  [default: the scenario's, 08:00-13:00]",
+        rich_help_panel=WORLD,
     ),
 ]
 DaysOption = Annotated[
-    str,
+    str | None,
     typer.Option(
-        "--days", help="On these days: weekdays, weekend, all, or e.g. mon,tue.", rich_help_panel=WORLD
+        "--days",
+        help="On these days: weekdays, weekend, all, or e.g. mon,tue.  [default: the scenario's, weekdays]",
+        rich_help_panel=WORLD,
     ),
 ]
 ViewRangeOption = Annotated[
     float | None,
-    typer.Option("--view-range", help="How far slots are seen from the car, m.", rich_help_panel=WORLD),
+    typer.Option("--view-range", help="How far slots are observed from the car, m.", rich_help_panel=WORLD),
 ]
-SightOption = Annotated[
+SensorModelOption = Annotated[
     str | None,
     typer.Option(
         "--sensor-model",
         metavar="perfect|laser|stereo|FILE",
-        help="How slots are seen: without error within --view-range; as the detection and mapping stack was "
-        "measured to see with a rig; or as a file of `parkenv fit-sensor-model` says.  "
-        "[default: perfect; with --sensors as measured of the rig]",
+        help="How slots are observed: without error within --view-range; as measured with a rig's detection and "
+        "mapping stack; or a file of `parkenv fit-sensor-model`.  "
+        "[default: the scenario's; with --sensors as measured with the rig]",
         rich_help_panel=WORLD,
     ),
 ]
@@ -210,57 +233,106 @@ def workers_of(jobs: int, backend: str, address: str | None) -> Workers:
     return Workers(jobs or None, backend, address)
 
 
-def lot_of(path: Path, goal: str | None = None) -> ParkingLot:
-    """The lot in a file, with another goal where one is given."""
-    lot = load_lot(path)
-    if goal is None:
-        return lot
-    try:
-        point = [float(word) for word in goal.split(",")]
-    except ValueError:
-        point = []
-    if len(point) != 2:
-        raise InputError(f"--goal is {goal!r}, want X,Y in metres, e.g. 80,-4")
-    return dataclasses.replace(lot, goals=np.array([point]))
+def scenario_specs(
+    scenario: str | None = None,
+    *,
+    lot: str | None = None,
+    occupancy: Path | None = None,
+    mapping: Path | None = None,
+    goal: str | None = None,
+    arrival: str | None = None,
+    days: str | None = None,
+    sensor_model: str | None = None,
+    view_range: float | None = None,
+    default: str = "campus",
+) -> list[ScenarioSpec]:
+    """The scenarios that options describe: each option changes what the scenario's own file says.
 
-
-def occupancy_of(path: Path, lot: ParkingLot, mapping: Path | None) -> OccupancyModel:
-    """The recorded log or the process in a file, laid on the lot's slots.
-
-    Raises:
-        InputError: the file is neither, or its record cannot be laid on the lot.
-    """
-    if path.suffix == ".json":
-        if mapping is not None:
-            raise InputError("--mapping goes with a recorded log, not with a process")
-        process = OccupancyProcess.from_file(path)
-        # A process carries no slot ids: one of the lot's size is taken to be the lot's own.
-        return process if process.n_slots == lot.n_slots else process.mapped_to_lot(lot.walk_m())
-    if not path.name.endswith((".csv", ".csv.gz")):
-        raise InputError(f"{path}: want a recorded log (.csv or .csv.gz) or a process (.json)")
-    from parkenv.world.occupancy_log import OccupancyLog
-    from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
-
-    log = OccupancyLog.read(path)
-    placed = None if mapping is None else read_mapping(mapping, lot.slot_ids, log)
-    return RecordedOccupancy(log, lot.walk_m(), placed)
-
-
-def sighting_of(word: str) -> SensorModel:
-    """The sighting model that a word or a file stands for.
+    Args:
+        scenario: names of packaged scenarios and scenario files, separated by commas.
+        lot: names of packaged lots and lot files, separated by commas, for a typical week there.
+        occupancy: a log or process file, instead of the scenario's.
+        mapping: of the log's slots to the lot's.
+        goal: a point, X,Y, or an index.
+        arrival: hours, HH:MM-HH:MM.
+        days: such as weekdays.
+        sensor_model: by name, or a file.
+        view_range: m.
+        default: the scenario where neither `scenario` nor `lot` is given.
 
     Raises:
-        InputError: neither a known word nor a file.
+        InputError: an unknown name, a file that cannot be used, or options that exclude each other.
     """
-    if word == "perfect":
-        return SensorModel()
-    if word in SENSOR_MODEL_NAMES:
-        return SensorModel.named(word)
-    if not Path(word).exists():
-        raise InputError(
-            f"--sensor-model is {word!r}, want perfect, {', '.join(SENSOR_MODEL_NAMES)}, or a file that is there"
+    if scenario is not None and lot is not None:
+        raise InputError("--scenario and --lot exclude each other: a scenario has its lot")
+    if mapping is not None and occupancy is None:
+        raise InputError("--mapping goes with --occupancy FILE.csv")
+    if lot is not None:
+        specs = [
+            ScenarioSpec.parse({"name": Path(word).stem, "lot": word}, "--lot")
+            for word in words("--lot", lot)
+        ]
+    else:
+        specs = [scenario_spec(word) for word in words("--scenario", scenario or default)]
+    return [
+        _changed(spec, occupancy, mapping, goal, arrival, days, sensor_model, view_range) for spec in specs
+    ]
+
+
+def _changed(
+    spec: ScenarioSpec,
+    occupancy: Path | None,
+    mapping: Path | None,
+    goal: str | None,
+    arrival: str | None,
+    days: str | None,
+    sensor_model: str | None,
+    view_range: float | None,
+) -> ScenarioSpec:
+    if occupancy is not None and mapping is not None:
+        spec = spec.changed(
+            "--mapping", occupancy={"log": str(occupancy), "mapping": str(mapping)}, forecast="own"
         )
-    return SensorModel.from_file(word)
+    elif occupancy is not None:
+        spec = spec.changed("--occupancy", occupancy=str(occupancy), forecast="own")
+    if goal is not None:
+        spec = spec.changed("--goal", goal=_point(goal))
+    if arrival is not None:
+        spec = spec.changed("--arrival", arrivals={"hours": arrival, "days": spec.arrivals.days})
+    if days is not None:
+        spec = spec.changed("--days", arrivals={"hours": spec.arrivals.hours, "days": days})
+    if sensor_model is not None:
+        spec = spec.changed("--sensor-model", sensor_model=sensor_model)
+    if view_range is not None:
+        spec = spec.changed(
+            "--view-range", sensor_model=spec.sensor_model.changed("--view-range", view_range=view_range)
+        )
+    return spec
+
+
+def _point(goal: str) -> list[float] | int:
+    try:
+        numbers = [float(word) for word in goal.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) == 1 and goal.isdecimal():
+        return int(goal)
+    if len(numbers) != 2:
+        raise InputError(
+            f"--goal is {goal!r}, want X,Y in metres, e.g. 80,-4, or the index of one of the lot's goals"
+        )
+    return numbers
+
+
+def one_scenario(specs: list[ScenarioSpec]) -> ScenarioSpec:
+    """The only scenario.
+
+    Raises:
+        InputError: there are several.
+    """
+    if len(specs) > 1:
+        raise InputError(f"--scenario names {len(specs)} scenarios, want one")
+    return specs[0]
 
 
 def rig_of(word: str | None) -> str | None:
@@ -270,48 +342,6 @@ def rig_of(word: str | None) -> str | None:
     if word is not None and word not in RIG_NAMES:
         raise InputError(f"--sensors is {word!r}, want one of {', '.join(RIG_NAMES)}")
     return word
-
-
-def scenarios_of(
-    scenario: str | None,
-    lot: Path | None,
-    occupancy: Path | None,
-    mapping: Path | None,
-    goal: str | None,
-    arrival: str,
-    days: str,
-    view_range: float | None,
-    sight: str = "perfect",
-) -> list[Scenario]:
-    """What the options of the world describe: packaged scenarios, or one on a lot file."""
-    if lot is None:
-        for option, value in (("--occupancy", occupancy), ("--mapping", mapping), ("--goal", goal)):
-            if value is not None:
-                raise InputError(f"{option} goes with --lot; packaged scenarios have their own")
-        made = [Scenario.named(name) for name in words("--scenario", scenario or "campus")]
-    else:
-        if scenario is not None:
-            raise InputError(
-                "--scenario and --lot exclude each other: name a packaged scenario or give a file"
-            )
-        if mapping is not None and occupancy is None:
-            raise InputError("--mapping goes with --occupancy")
-        its_lot = lot_of(lot, goal)
-        made = [
-            Scenario.on_lot(its_lot, None if occupancy is None else occupancy_of(occupancy, its_lot, mapping))
-        ]
-    try:
-        window = ArrivalWindow.parse(arrival, days)
-    except InputError as error:
-        raise InputError(
-            f"--arrival {arrival} --days {days}: {error}; a window lies within one day"
-        ) from error
-    changes: dict[str, Any] = {"arrival": window}
-    seeing = sighting_of(sight)
-    changes["sensor_model"] = (
-        seeing if view_range is None else dataclasses.replace(seeing, view_range=view_range)
-    )
-    return [s.replace(**changes) for s in made]
 
 
 def fingerprint(path: Path | None) -> str | None:

@@ -14,6 +14,7 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
+from parkenv.scenarios.build import make_scenario
 
 ScenarioOption = Annotated[
     str, typer.Option("--scenario", metavar="NAME", help="A packaged scenario: campus, jam, street, mini.")
@@ -80,10 +81,10 @@ def calibrate(
     from parkenv.evaluation.trips.calibration import calibrate as calibration_of
     from parkenv.evaluation.trips.driven_search import DrivenSearch
     from parkenv.evaluation.trips.lot_driver import DrivingStyle
-    from parkenv.world.scenario import KMH, Scenario
+    from parkenv.world.scenario import KMH
     from parkenv.world.traffic import Traffic
 
-    its = Scenario.named(scenario, traffic=Traffic(cars, pedestrians))
+    its = make_scenario(scenario, traffic=Traffic(cars, pedestrians))
     speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
     style = DrivingStyle(speed=speed, notice_m=notice_m)
     rig = args.rig_of(sensors)
@@ -178,7 +179,6 @@ def trip(
     from parkenv.evaluation.trips.driven_search import DrivenSearch
     from parkenv.evaluation.trips.lot_driver import DrivingStyle
     from parkenv.evaluation.trips.sensor_log import record_trip, require_viewer, sensor_log
-    from parkenv.world.scenario import Scenario
     from parkenv.world.traffic import Traffic
 
     if out.suffix.lower() != ".gif":
@@ -189,7 +189,7 @@ def trip(
         if sensors is None:
             raise InputError("--rerun records what sensors measure: add --sensors laser")
         require_viewer()
-    its = Scenario.named(scenario, traffic=Traffic(cars, pedestrians))
+    its = make_scenario(scenario, traffic=Traffic(cars, pedestrians))
     style = DrivingStyle(notice_m=notice_m)
     search = DrivenSearch(unseen(its) if blind else its, agent, style=style, rig=args.rig_of(sensors))
     make_folder(out.parent)

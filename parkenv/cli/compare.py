@@ -24,6 +24,7 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import WIDE, make_console, make_table
 from parkenv.errors import InputError
+from parkenv.scenarios.build import build
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.compare import Case
@@ -56,10 +57,10 @@ def compare(
     occupancy: args.OccupancyOption = None,
     mapping: args.MappingOption = None,
     goal: args.GoalOption = None,
-    arrival: args.ArrivalOption = "08:00-13:00",
-    days: args.DaysOption = "weekdays",
+    arrival: args.ArrivalOption = None,
+    days: args.DaysOption = None,
     view_range: args.ViewRangeOption = None,
-    sight: args.SightOption = None,
+    sight: args.SensorModelOption = None,
     sensors: args.SensorsOption = None,
     agents: Annotated[
         str,
@@ -189,7 +190,7 @@ def compare(
     settings = {
         "version": __version__,
         "scenarios": [s.name for s in scenarios],
-        "lot": args.fingerprint(lot),
+        "lot": lot,
         "occupancy": args.fingerprint(occupancy),
         "mapping": args.fingerprint(mapping),
         "goal": goal,
@@ -290,12 +291,12 @@ class Comparison:
 def comparison_of(
     *,
     scenario: str | None,
-    lot: Path | None,
+    lot: str | None,
     occupancy: Path | None,
     mapping: Path | None,
     goal: str | None,
-    arrival: str,
-    days: str,
+    arrival: str | None,
+    days: str | None,
     view_range: float | None,
     sight: str | None,
     sensors: str | None,
@@ -329,7 +330,13 @@ def comparison_of(
     levels = [] if sweeps or occupancy_levels == "none" else _levels(occupancy_levels)
     rig = args.rig_of(sensors)
     sight = sight or ("perfect" if rig is None else "stereo" if rig == "stereo" else "laser")
-    scenarios = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range, sight)
+    scenarios = [
+        build(spec)
+        for spec in args.scenario_specs(
+            scenario, lot=lot, occupancy=occupancy, mapping=mapping, goal=goal, arrival=arrival, days=days,
+            sensor_model=sight, view_range=view_range,
+        )
+    ]  # fmt: skip
     options: dict[str, dict[str, Any]] = {
         "mdp": {"solver": solver}, "mdp-static": {"solver": solver},
         "belief": {} if budget_ms is None else {"budget_ms": budget_ms},

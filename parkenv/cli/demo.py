@@ -13,6 +13,7 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.compare import result_tables
 from parkenv.cli.tables import make_console
+from parkenv.scenarios.build import make_scenario
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.compare import Case
@@ -127,12 +128,11 @@ def first_part(scenario: str, every: float, seed: int) -> tuple[Scenario, Survey
     """The world of the demo, and how it is surveyed."""
     from parkenv.mapping.survey import SurveySettings
     from parkenv.world.occupancy import ArrivalWindow
-    from parkenv.world.scenario import Scenario
     from parkenv.world.traffic import Traffic
 
     hours = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
     windows = tuple(ArrivalWindow.parse(h) for h in hours)
-    its = Scenario.named(scenario, traffic=Traffic(cars=3, pedestrians=5))
+    its = make_scenario(scenario, traffic=Traffic(cars=3, pedestrians=5))
     return its, SurveySettings(every=every, windows=windows, seed=seed)
 
 

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 from rich.console import Console
 
 from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
+
+if TYPE_CHECKING:
+    from parkenv.world.lot import ParkingLot
 
 app = typer.Typer(help="Show, check, import and convert lots.", no_args_is_help=True)
 
@@ -28,13 +32,26 @@ def show(
     its_lot = load_lot(lot)
     picture = out or Path(f"{its_lot.name}.png")
     save_lot_picture(its_lot, picture, show_graph=graph)
-    low_x, low_y, high_x, high_y = its_lot.bounds()
-    oneway = sum(lane.oneway for lane in its_lot.lanes)
-    make_console().print(
-        f"{its_lot.name}: {its_lot.n_slots} slots, {len(its_lot.lanes)} lanes ({oneway} one-way), "
-        f"{len(its_lot.entries)} entries, {len(its_lot.goals)} goals, {its_lot.n_vertices} vertices, "
-        f"{high_x - low_x:.0f} × {high_y - low_y:.0f} m. Drawn in {picture}",
-    )
+    make_console().print(f"{_summary(its_lot)}. Drawn in {picture}")
+
+
+def _summary(lot: ParkingLot) -> str:
+    low_x, low_y, high_x, high_y = lot.bounds()
+    oneway = sum(lane.oneway for lane in lot.lanes)
+    parts = [
+        f"{lot.name}: {lot.n_slots} slots",
+        f"{len(lot.lanes)} lanes ({oneway} one-way)",
+        f"{len(lot.entries)} entries",
+        f"{len(lot.goals)} goals",
+        f"{lot.n_vertices} vertices",
+        f"{high_x - low_x:.0f} × {high_y - low_y:.0f} m",
+    ]
+    cost = lot.slot_parking_cost_s
+    if cost.any():
+        parts.append(
+            f"parking costs {cost.min():g} to {cost.max():g} s ({np.count_nonzero(cost)} slots above 0)"
+        )
+    return ", ".join(parts)
 
 
 @app.command()
@@ -45,7 +62,8 @@ def check(
 
     Exit code 2 where there are errors; warnings alone leave it at 0.
     """
-    from parkenv.lots.checks import check_lot
+    from parkenv.lots import check_lot, read_lot
+    from parkenv.lots.file_formats import lot_format
 
     console = Console(highlight=False, soft_wrap=True)
     problems = check_lot(file)
@@ -63,6 +81,9 @@ def check(
         console.print(f"{file}: {errors} errors, {len(problems) - errors} warnings", markup=False)
     if errors:
         raise typer.Exit(2)
+    file_format = lot_format(file)
+    if file_format is not None and file_format.is_complete:
+        console.print(_summary(read_lot(file)), markup=False)
 
 
 @app.command("import")
@@ -132,7 +153,7 @@ def import_place(
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
     write_lot(lot, out)
-    console.print(f"Wrote {out}: {lot.n_slots} slots, {lot.n_vertices} vertices", markup=False)
+    console.print(f"Wrote {out}. {_summary(lot)}", markup=False)
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:

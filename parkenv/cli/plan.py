@@ -12,6 +12,7 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
+from parkenv.scenarios.build import build
 
 
 def plan(
@@ -27,8 +28,8 @@ def plan(
     occupancy: args.OccupancyOption = None,
     mapping: args.MappingOption = None,
     goal: args.GoalOption = None,
-    arrival: args.ArrivalOption = "08:00-13:00",
-    days: args.DaysOption = "weekdays",
+    arrival: args.ArrivalOption = None,
+    days: args.DaysOption = None,
     view_range: args.ViewRangeOption = None,
     agent: Annotated[str, typer.Option("--agent", help="A planning agent: mdp or mdp-static.")] = "mdp",
     failure_cost: args.FailureCostOption = "10",
@@ -60,9 +61,14 @@ def plan(
     failure = args.costs("--failure-cost", failure_cost)
     walk = args.speeds("--v-walk-kmh", v_walk_kmh)
     drive = args.speeds("--v-drive-kmh", v_drive_kmh)
-    base, *others = args.scenarios_of(scenario, lot, occupancy, mapping, goal, arrival, days, view_range)
-    if others:
-        raise InputError(f"--scenario is {scenario!r}, want one: plan draws one scenario at a time")
+    base = build(
+        args.one_scenario(
+            args.scenario_specs(
+                scenario, lot=lot, occupancy=occupancy, mapping=mapping, goal=goal, arrival=arrival, days=days,
+                view_range=view_range,
+            )
+        )
+    )  # fmt: skip
     if not isinstance(make_agent(agent, base), StaticAgent):
         raise InputError(f"--agent {agent!r} makes no plan; known: mdp, mdp-static")
     make_folder(out)

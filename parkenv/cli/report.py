@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
+from parkenv.scenarios.build import make_scenario
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.compare import Case
@@ -208,7 +209,7 @@ def _require_same_files(run: RunFolder) -> None:
 
     before = read_settings(run.path) or {}
     options = _parsed(run)
-    for name in ("lot", "occupancy", "mapping", "calibrated"):
+    for name in ("occupancy", "mapping", "calibrated"):
         if options[name] is not None and args.fingerprint(options[name]) != before.get(name):
             raise InputError(f"--{name} {options[name]} has changed since the run")
 
@@ -216,7 +217,7 @@ def _require_same_files(run: RunFolder) -> None:
 def _trained(run: RunFolder) -> Cases:
     """The best model and the best planners, where the models were tested; none where that was no search."""
     from parkenv.evaluation.experiments.compare import Case
-    from parkenv.world.scenario import SCENARIO_NAMES, Scenario
+    from parkenv.scenarios.spec import SCENARIO_NAMES
 
     rows = [
         r for r in run.summary["rows"] if r.get("scenario") in SCENARIO_NAMES and r.get("total_s") is not None
@@ -229,7 +230,7 @@ def _trained(run: RunFolder) -> Cases:
     model = run.path / f"seed_{best['seed']}" / "model.zip"
     cases: Cases = []
     for name in dict.fromkeys(row["test_scenario"] for row in run.summary["transfer"]):
-        scenario = Scenario.named(name)
+        scenario = make_scenario(name)
         planners = [row for row in run.summary.get("planners", []) if row["scenario"] == name]
         beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
         seeds = range(TESTED_FROM, TESTED_FROM + int(run.summary["transfer"][0]["episodes"]))

@@ -21,6 +21,7 @@ from parkenv.cli.training_course import (
     print_tests,
     row_of,
 )
+from parkenv.scenarios.build import make_scenario
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.workers import Workers
@@ -72,16 +73,12 @@ class SearchCourse(Course):
     @cached_property
     def worlds(self) -> list[Scenario]:
         """Where it is trained."""
-        from parkenv.world.scenario import Scenario
-
-        return [Scenario.named(name) for name in args.words("--scenario", self.scenario)]
+        return [make_scenario(name) for name in args.words("--scenario", self.scenario)]
 
     @cached_property
     def tested(self) -> list[Scenario]:
         """Where it is tested."""
-        from parkenv.world.scenario import Scenario
-
-        return [Scenario.named(name) for name in args.words("--test-on", self.test_on or self.scenario)]
+        return [make_scenario(name) for name in args.words("--test-on", self.test_on or self.scenario)]
 
     @property
     def examined(self) -> range:

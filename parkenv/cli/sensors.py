@@ -12,6 +12,7 @@ from rich.progress import track
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
+from parkenv.scenarios.build import make_scenario
 
 app = typer.Typer(help="Look through the simulated sensors.", no_args_is_help=True)
 
@@ -60,7 +61,6 @@ def preview(
     from parkenv.evaluation.figures.sensor_pictures import save_sensor_preview, with_boxes
     from parkenv.world.keyed_random import world_key
     from parkenv.world.lot_scene import LotScenes, slot_lot
-    from parkenv.world.scenario import Scenario
     from parkenv.world.traffic import Traffic
     from planners.routes import DriveRoutes
     from sim_sensors.camera.weather import PRESETS, Weather
@@ -71,7 +71,7 @@ def preview(
     for name in names:
         if name not in PRESETS:
             raise InputError(f"--weather has {name!r}, want all or some of {', '.join(PRESETS)}")
-    its = Scenario.named(scenario, traffic=Traffic(cars, pedestrians))
+    its = make_scenario(scenario, traffic=Traffic(cars, pedestrians))
     make_folder(out)
     console = make_console()
 

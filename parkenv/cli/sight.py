@@ -10,6 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
+from parkenv.scenarios.build import make_scenario
 
 
 def fit_sight(
@@ -22,8 +23,8 @@ def fit_sight(
     searches: Annotated[
         int, typer.Option("--searches", "-n", min=1, help="Of each of three agents in each scenario.")
     ] = 20,
-    arrival: args.ArrivalOption = "08:00-13:00",
-    days: args.DaysOption = "weekdays",
+    arrival: args.ArrivalOption = None,
+    days: args.DaysOption = None,
     weather: Annotated[
         str | None,
         typer.Option("--weather", help="sunny, overcast, low_sun, dusk, rain; drawn where not given."),
@@ -42,12 +43,12 @@ def fit_sight(
     Example:
     * `parkenv fit-sensor-model --rig stereo --out stereo.json`
     """
-    from parkenv.evaluation.experiments.sensor_model_fit import DRIVERS, measure_sight
+    from parkenv.evaluation.experiments.sensor_model_fit import AGENTS, measure_sensors
     from parkenv.world.traffic import Traffic
 
     scenarios = [
-        its.replace(traffic=Traffic(cars=3, pedestrians=5))
-        for its in args.scenarios_of(scenario, None, None, None, None, arrival, days, None)
+        make_scenario(spec, traffic=Traffic(cars=3, pedestrians=5))
+        for spec in args.scenario_specs(scenario, arrival=arrival, days=days)
     ]
     console = make_console()
     with args.workers_of(jobs, backend, address) as workers, Progress(
@@ -55,9 +56,9 @@ def fit_sight(
         console=console, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
         bar = progress.add_task(
-            "Searching through the sensors", total=searches * len(DRIVERS) * len(scenarios)
+            "Searching through the sensors", total=searches * len(AGENTS) * len(scenarios)
         )
-        counts = measure_sight(
+        counts = measure_sensors(
             scenarios,
             rig,
             searches,
@@ -72,11 +73,11 @@ def fit_sight(
         f"What the stack says of slots, rig {rig}",
         ["slots up to", "side", "looks", "told", "taken, said taken", "free, said taken"],
     )
-    for band, looks in zip(model.bands, counts.looks.reshape(-1, 2, 3), strict=True):
+    for band, seen in zip(model.bands, counts.counts.reshape(-1, 2, 3), strict=True):
         table.add_row(
             f"{band.up_to:g} m",
             "right" if band.beside else "elsewhere",
-            str(looks.sum()),
+            str(seen.sum()),
             f"{band.seen_rate:.0%}",
             f"{band.hit_rate:.3f}",
             f"{band.false_alarm_rate:.3f}",

@@ -13,6 +13,7 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
+from parkenv.scenarios.build import build
 
 if TYPE_CHECKING:
     from parkenv.mapping.survey import SurveySettings
@@ -39,7 +40,7 @@ def survey(
             "--hours", metavar="HH:MM-HH:MM[,...]", help="When drives begin; one window after the other."
         ),
     ] = "08:00-10:00,11:00-14:00,16:00-18:00",
-    days: args.DaysOption = "weekdays",
+    days: args.DaysOption = None,
     weather: Annotated[
         str | None,
         typer.Option("--weather", help="sunny, overcast, low_sun, dusk, rain; drawn where not given."),
@@ -171,11 +172,11 @@ def survey(
 def surveyed_by(
     *,
     scenario: str | None,
-    lot: Path | None,
+    lot: str | None,
     occupancy: Path | None,
     rig: str,
     hours: str,
-    days: str,
+    days: str | None,
     weather: str | None,
     every: float,
     pose_noise: float,
@@ -193,12 +194,12 @@ def surveyed_by(
     from parkenv.world.occupancy import ArrivalWindow
     from parkenv.world.traffic import Traffic
 
-    (its,) = args.scenarios_of(scenario, lot, occupancy, None, None, "08:00-13:00", days, None)
+    its = build(args.one_scenario(args.scenario_specs(scenario, lot=lot, occupancy=occupancy, days=days)))
     settings = SurveySettings(
         rig=rig,
         every=every,
         weather=weather,
-        windows=tuple(ArrivalWindow.parse(h, days) for h in hours.split(",")),
+        windows=tuple(ArrivalWindow.parse(h, days or "weekdays") for h in hours.split(",")),
         pose_noise=PoseNoise(pose_noise, 0.02 * pose_noise),
         seed=seed,
     )
@@ -240,7 +241,7 @@ def show_map(
     from parkenv.mapping.store import MapStore
     from parkenv.world.occupancy import DAY_NAMES, DAY_S, HOUR_S
 
-    (its,) = args.scenarios_of(scenario, lot, None, None, None, "08:00-13:00", "weekdays", None)
+    its = build(args.one_scenario(args.scenario_specs(scenario, lot=lot)))
     if weekday is not None and weekday not in DAY_NAMES:
         raise InputError(f"--weekday is {weekday!r}, want one of {', '.join(DAY_NAMES)}")
     ids = its.lot.slot_ids

@@ -16,6 +16,7 @@ from parkenv.envs.sensors import beside_the_lot
 from parkenv.mapping.slots import SlotFilter
 from parkenv.perception.detector import Detector
 from parkenv.perception.stack import Look, PerceptionStack
+from parkenv.scenarios.build import make_scenario
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 from sim_sensors.rig import SensorRig
@@ -163,7 +164,7 @@ class SearchPerceptionEnv(SearchEnv):
         detector: Detector | None = None,
         **changes: Any,
     ) -> None:
-        self.watcher = Watcher(Scenario.of(scenario, **changes), rig, weather, captures, every, detector)
+        self.watcher = Watcher(make_scenario(scenario, **changes), rig, weather, captures, every, detector)
         super().__init__(self.watcher.scenario, render_mode)
         self._before: tuple[int, float] | None = None
 

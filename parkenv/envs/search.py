@@ -21,6 +21,7 @@ from parkenv.envs.search_step import (
 )
 from parkenv.envs.search_tables import SearchTables
 from parkenv.errors import InputError
+from parkenv.scenarios.build import make_scenario
 from parkenv.world.keyed_random import seed_state
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.scenario import Scenario
@@ -141,7 +142,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise InputError(f"render_mode is {render_mode!r}, want one of {self.metadata['render_modes']}")
-        self.scenario = Scenario.of(scenario, **changes)
+        self.scenario = make_scenario(scenario, **changes)
         self.render_mode = render_mode
         lot = self.scenario.lot
         self.action_space = spaces.Discrete(len(ACTIONS))

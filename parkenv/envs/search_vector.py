@@ -40,6 +40,7 @@ from parkenv.envs.search_step import (
 )
 from parkenv.envs.search_tables import MASKS, N_ACTIONS, SearchTables
 from parkenv.errors import InputError
+from parkenv.scenarios.build import make_scenario
 from parkenv.world.keyed_random import seed_state
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy import BoolArray, FloatArray, IntArray
@@ -272,7 +273,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         given = [scenario] if isinstance(scenario, (str, Scenario)) else list(scenario)
         if not given:
             raise InputError("scenario is an empty sequence, want at least one scenario")
-        self.scenarios = [Scenario.of(one, **changes) for one in given]
+        self.scenarios = [make_scenario(one, **changes) for one in given]
         self.num_envs = int(num_envs)
         self.max_episode_steps = max_episode_steps
         self.metadata = self.metadata | {"autoreset_mode": mode}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from itertools import count
 from typing import Any, Self
 
@@ -34,19 +34,32 @@ BUILDING_SETBACK = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 2.9
 
 @dataclass(frozen=True, eq=False)
 class Slots:
-    """Geometry of n slots, one array a column of `ParkingLot`: its `slot_xy`, `slot_yaw` and so on."""
+    """The columns of n slots: each field `name` is the column `slot_name` of `ParkingLot`.
+
+    An empty `parking_cost_s` stands for zeros.
+    """
 
     xy: FloatArray
     yaw: FloatArray
     length: FloatArray
     width: FloatArray
     mouth: NDArray[np.int8]
+    parking_cost_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not len(self.parking_cost_s):
+            object.__setattr__(self, "parking_cost_s", np.zeros(len(self.xy)))
 
     def __len__(self) -> int:
         return len(self.xy)
 
     def __getitem__(self, index: NDArray[np.intp] | BoolArray | slice) -> Slots:
         return Slots(*(getattr(self, f.name)[index] for f in fields(self)))
+
+    @classmethod
+    def of_lot(cls, lot: ParkingLot) -> Self:
+        """The slots of a lot."""
+        return cls(*(getattr(lot, f"slot_{f.name}") for f in fields(cls)))
 
     @classmethod
     def joined(cls, parts: Sequence[Slots]) -> Self:

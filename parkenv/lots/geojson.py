@@ -7,7 +7,8 @@ of the middle of the features. `properties.kind` tells what a feature is:
 
 | kind | geometry | properties |
 |---|---|---|
-| `slot` | Polygon | `id`; all or none of `center`, `yaw`, `length`, `width`, `mouth` (rear, left, right) |
+| `slot` | Polygon | `id`; `parking_cost_s`, 0 if absent; all or none of `center`, `yaw`, `length`, `width`, \
+`mouth` (rear, left, right) |
 | `lane` | LineString | `oneway`, false if absent |
 | `entry`, `goal` | Point | |
 | `wall` | LineString or Polygon | |
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -101,9 +102,11 @@ def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
         (Mouth(mouth).name.lower() for mouth in lot.slot_mouth),
         strict=True,
     )
-    for slot_id, ring, shape in zip(lot.slot_ids, rings, shapes, strict=True):
+    costs = lot.slot_parking_cost_s.tolist()
+    for slot_id, ring, shape, cost in zip(lot.slot_ids, rings, shapes, costs, strict=True):
         exact = dict(zip(SLOT_SHAPE, shape, strict=True))
-        yield feature("Polygon", [ring], kind="slot", id=slot_id, **exact)
+        priced = {"parking_cost_s": cost} if cost else {}
+        yield feature("Polygon", [ring], kind="slot", id=slot_id, **priced, **exact)
     for lane in lot.lanes:
         yield feature("LineString", lane.points.tolist(), kind="lane", oneway=lane.oneway)
     for kind, points in (("entry", lot.entries), ("goal", lot.goals)):
@@ -328,6 +331,7 @@ def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, e
     sound: list[int] = []
     ids: list[str] = []
     shapes: list[tuple[float, ...] | None] = []
+    costs: list[float] = []
     for i, feature in enumerate(raw):
         try:
             slot_id = _slot_id(feature)
@@ -339,12 +343,14 @@ def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, e
             if not valid[i]:
                 reason = shapely.is_valid_reason(polygons[i])
                 raise InputError(f"slot {slot_id!r:.40}: the polygon is not a simple one: {reason}")
+            cost = _parking_cost(feature.properties, slot_id)
             shapes.append(_slot_shape(feature.properties, slot_id) if exact else None)
         except InputError as error:
             contents.error(feature.number, str(error))
             continue
         sound.append(i)
         ids.append(slot_id)
+        costs.append(cost)
 
     polygons = polygons[sound]
     bare = np.array([shape is None for shape in shapes], dtype=bool)
@@ -372,7 +378,7 @@ def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, e
             f"slot {ids[k]!r:.40}: the polygon is {slots.width[k]:.3f} m wide, want at least {SLOT_SIDE:g} m",
         )
     kept = np.flatnonzero(~disagrees & ~thin)
-    contents.slots = slots[kept]
+    contents.slots = replace(slots, parking_cost_s=np.array(costs, dtype=np.float64))[kept]
     contents.slot_ids = [ids[k] for k in kept]
     contents.numbers["slot"] = [raw[sound[k]].number for k in kept]
 
@@ -389,6 +395,14 @@ def _slot_id(feature: _RawFeature) -> str:
     if not isinstance(given, str) or not given:
         raise InputError(f"slot: id is {given!r:.40}, want a text")
     return given
+
+
+def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
+    """Seconds that parking in a slot costs; 0 where the file does not say."""
+    cost = properties.get("parking_cost_s", 0.0)
+    if not _is_number(cost) or cost < 0.0:
+        raise InputError(f"slot {slot_id!r:.40}: parking_cost_s is {cost!r:.40}, want seconds, at least 0")
+    return float(cost)
 
 
 def _slot_shape(properties: dict[str, Any], slot_id: str) -> tuple[float, ...] | None:

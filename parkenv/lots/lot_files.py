@@ -24,7 +24,7 @@ def load_lot(name_or_path: str | Path) -> ParkingLot:
 
     Examples:
         >>> load_lot("campus").n_slots
-        181
+        189
     """
     if not isinstance(name_or_path, str | Path):
         raise InputError(f"lot is a {type(name_or_path).__name__}, want a packaged lot's name or a lot file")

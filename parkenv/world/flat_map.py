@@ -23,7 +23,7 @@ class FlatMap:
 
     Examples:
         >>> from parkenv import Scenario
-        >>> mini = Scenario.named("mini")
+        >>> mini = make_scenario("mini")
         >>> FlatMap(1.0, mini.occupancy).forecast(Arrival(0.0)).p_occupied[:2].tolist()
         [0.999, 0.999]
     """

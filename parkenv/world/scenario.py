@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Self
@@ -14,14 +13,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from parkenv.errors import InputError
-from parkenv.lots import packaged_lot
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy import (
     Arrival,
     ArrivalWindow,
     Forecast,
     OccupancyModel,
-    OccupancyProcess,
     PriorModel,
 )
 from parkenv.world.sensor_model import SensorModel, SensorRates
@@ -182,114 +179,6 @@ class Scenario(SearchProblem):
     def forecast(self, arrival: Arrival) -> Forecast:
         """What the map predicts for a search that starts then."""
         return (self.prior or self.occupancy).forecast(arrival)
-
-    @classmethod
-    def named(cls, name: str, **changes: Any) -> Self:
-        """One of the scenarios that come with the package, with some fields changed.
-
-        Raises:
-            InputError: an unknown name; the message lists the known ones.
-
-        Examples:
-            >>> scenario = Scenario.named("campus", failure_s=90.0)
-            >>> scenario.lot.name, scenario.failure_s
-            ('campus', 90.0)
-        """
-        try:
-            make = _NAMED[name]
-        except KeyError:
-            raise InputError(f"unknown scenario {name!r}; known: {', '.join(_NAMED)}") from None
-        return cls(**{"name": name, **make()}).replace(**changes)
-
-    @classmethod
-    def of(cls, scenario: str | Scenario, **changes: Any) -> Scenario:
-        """A scenario, or the one that comes with the package under a name, with some fields changed."""
-        if isinstance(scenario, str):
-            return cls.named(scenario, **changes)
-        if not isinstance(scenario, Scenario):
-            raise InputError(f"scenario is a {type(scenario).__name__}, want a Scenario or the name of one")
-        return scenario.replace(**changes)
-
-    @classmethod
-    def on_lot(cls, lot: ParkingLot, occupancy: OccupancyModel | None = None, **fields: Any) -> Self:
-        """A scenario on any lot, with a typical day's occupancy where none is given."""
-        goal = fields.get("goal", 0)
-        return cls(name=lot.name, lot=lot, occupancy=occupancy or typical_occupancy(lot, goal=goal), **fields)
-
-
-# Logit of how much a weekday's hour asks for; the shape is that of a campus lot: empty at night, full
-# from mid-morning to mid-afternoon.
-_WEEKDAY_DEMAND = np.array(
-    [
-        *(-4.0, -4.0, -4.0, -4.0, -4.0, -3.5, -2.5, -0.8, 0.6, 1.3, 1.7, 1.9),
-        *(1.8, 1.7, 1.7, 1.5, 1.1, 0.2, -0.8, -1.6, -2.2, -2.8, -3.4, -3.8),
-    ]
-)
-_WEEKEND_DEMAND = np.full(24, -2.5)
-_WEEK_DEMAND = np.concatenate([np.tile(_WEEKDAY_DEMAND, 5), np.tile(_WEEKEND_DEMAND, 2)])
-
-
-def typical_occupancy(
-    lot: ParkingLot,
-    *,
-    goal: int = 0,
-    pull: float = 1.6,
-    unevenness: float = 0.6,
-    demand: float = 0.0,
-    mean_stay_s: float = 2 * 3600.0,
-) -> OccupancyProcess:
-    """A working week on any lot: full by day, empty by night, and the nearer to the goal the fuller.
-
-    Args:
-        lot: the lot.
-        goal: index of the goal that draws people.
-        pull: logits by which the nearest slot is asked for more, and the farthest less, than the middle.
-        unevenness: standard deviation, in logits, of what makes equally near slots differ. It is drawn
-            from a fixed seed: the same lot always has the same good and bad slots.
-        demand: logits added at every hour.
-        mean_stay_s: how long a car stays, s.
-    """
-    walk = lot.walk_m(goal)
-    span = float(np.ptp(walk)) or 1.0
-    nearness = 1.0 - 2.0 * (walk - walk.min()) / span
-    noise = np.random.default_rng(lot.n_slots).normal(0.0, unevenness, lot.n_slots)
-    return OccupancyProcess.from_demand(pull * nearness + noise, _WEEK_DEMAND + demand, mean_stay_s)
-
-
-def _campus() -> dict[str, Any]:
-    lot = packaged_lot("campus")
-    return {"lot": lot, "occupancy": typical_occupancy(lot, pull=2.5, demand=0.3)}
-
-
-def _jam() -> dict[str, Any]:
-    # The map knows ordinary days; today an event has filled whatever lies near the goal.
-    lot = packaged_lot("jam")
-    usual = typical_occupancy(lot, pull=1.0, demand=-0.3)
-    walk = lot.walk_m()
-    near = walk < np.quantile(walk, 0.75)
-    jammed = dataclasses.replace(usual, arrival_factor=usual.arrival_factor * np.where(near, 200.0, 1.0))
-    return {"lot": lot, "occupancy": jammed, "prior": usual}
-
-
-def _street() -> dict[str, Any]:
-    lot = packaged_lot("street")
-    return {"lot": lot, "occupancy": typical_occupancy(lot, pull=0.8, demand=0.8, mean_stay_s=1800.0)}
-
-
-def _mini() -> dict[str, Any]:
-    lot = packaged_lot("mini")
-    # Ten slots are now and then all taken; there is another car park five minutes away.
-    return {"lot": lot, "occupancy": typical_occupancy(lot, pull=1.0, demand=-0.8), "give_up_s": 300.0}
-
-
-_NAMED: dict[str, Callable[[], dict[str, Any]]] = {
-    "campus": _campus,
-    "jam": _jam,
-    "street": _street,
-    "mini": _mini,
-}
-
-SCENARIO_NAMES = tuple(_NAMED)
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:

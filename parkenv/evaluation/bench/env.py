@@ -14,6 +14,7 @@ import numpy as np
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.evaluation.bench.rows import BenchRow, absent, rate
 from parkenv.lots import city_lot, grid_lot
+from parkenv.scenarios.build import make_scenario
 from parkenv.world.lot import ACTIONS
 from parkenv.world.scenario import Scenario
 
@@ -48,8 +49,8 @@ def env_rows(
     """
     import parkenv  # noqa: F401 - registers the environments
 
-    scenario = Scenario.on_lot(grid_lot(*SLOTS))
-    city = Scenario.on_lot(city_lot(large, seed))
+    scenario = make_scenario(grid_lot(*SLOTS))
+    city = make_scenario(city_lot(large, seed))
     batches = {
         f"batch of {batch}, {scenario.lot.n_slots} slots, full belief, copy=False": _ours(
             scenario, batch, "full", False

@@ -22,8 +22,8 @@ from parkenv.perception.detector import CarModel, Detector, as_grey
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.stack import PerceptionStack
 from parkenv.perception.sweeps import laser_sweep
+from parkenv.scenarios.build import make_scenario
 from parkenv.world.lot_scene import slot_lot
-from parkenv.world.scenario import Scenario
 from sim_sensors.rig import SensorRig
 
 PEERS_PYTHON = "PARKENV_BENCH_PYTHON"
@@ -70,7 +70,7 @@ def perception_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     Raises:
         InputError: `PEERS_PYTHON` names no Python that runs.
     """
-    scenario = Scenario.named("campus")
+    scenario = make_scenario("campus")
     lot = scenario.lot
     rng = np.random.default_rng(seed)
     scene = slot_lot(lot).scene(rng.random(lot.n_slots) < 0.8, seed)
@@ -100,7 +100,7 @@ def perception_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     cars = np.array([[0.2, 3.0], [-0.3, 5.0]])
     update = seconds_each(lambda _: grid.update((pose[0], pose[1]), pose[2], 0.7, cars), seconds)
     rows += duration("mapping", "grid update, 0.25 m cells, 12 m", 1e3 * update, "ms")
-    survey = Survey(Scenario.named("mini"), SurveySettings(weather="sunny"), stack)
+    survey = Survey(make_scenario("mini"), SurveySettings(weather="sunny"), stack)
     session = seconds_each(survey.drive, 0.0, least=1)
     return rows + rate("mapping", "sessions of mini, pictures drawn and seen", 60.0 / session, "sessions/min")
 

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
 
 from parkenv.evaluation.bench.rows import BenchRow, duration, seconds_each
+from parkenv.evaluation.simulate import simulate
 from parkenv.lots import city_lot, packaged_lot
+from parkenv.scenarios.build import make_scenario
 from parkenv.world.lot import PARK, ParkingLot
-from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.thesis.label_repair import repair
 from planners.thesis.label_setting import (
@@ -150,21 +151,14 @@ def city_rows(
         seed: of the city and of the worlds.
         agents: who searches, by name.
     """
-    scenario = Scenario.on_lot(city_lot(n_slots, seed))
+    scenario = make_scenario(city_lot(n_slots, seed))
     env = gym.make("parkenv/Search-v0", scenario=scenario)
     rows: list[BenchRow] = []
     for name in agents:
         first, decisions = [], []
         agent = make_agent(name, scenario)
         for episode in range(CITY_SEARCHES):
-            observation, _ = env.reset(seed=seed + episode)
-            memory, over, times = None, False, []
-            while not over:
-                start = time.perf_counter()
-                action, memory = agent.predict(observation, memory)
-                times.append(time.perf_counter() - start)
-                observation, _, terminated, truncated, _ = env.step(action)
-                over = terminated or truncated
+            times = simulate(env, agent, seed + episode).decision_s
             first.append(times[0])
             decisions += times[1:]
         case = f"{name}, city, {n_slots:,} slots"
@@ -208,7 +202,7 @@ def drive(
 
 def forecast_process(lot: ParkingLot, seed: int) -> ParkingMDP:
     """What the planner faces who arrives on a typical working day."""
-    scenario = Scenario.on_lot(lot)
+    scenario = make_scenario(lot)
     arrival = scenario.occupancy.draw_arrival(scenario.arrival, np.uint64(seed))
     return ParkingMDP.from_belief(scenario, scenario.forecast(arrival).p_occupied)
 

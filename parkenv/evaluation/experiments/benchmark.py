@@ -21,6 +21,7 @@ from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case, at_occupancy, table
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.results import ResultFolder, Row
+from parkenv.scenarios.build import make_scenario
 from parkenv.world.occupancy import ArrivalWindow
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
@@ -58,7 +59,7 @@ class Task:
 
     def made(self, arrival: ArrivalWindow) -> Scenario:
         """The scenario itself, named after the task."""
-        made = Scenario.named(self.scenario).replace(name=self.name, arrival=arrival)
+        made = make_scenario(self.scenario).replace(name=self.name, arrival=arrival)
         if self.sight != "perfect":
             made = made.replace(sensor_model=SensorModel.named(self.sight))
         if self.v_walk_kmh is not None:

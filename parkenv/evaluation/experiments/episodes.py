@@ -1,9 +1,9 @@
-"""One search from arrival to goal: run it, time the decisions, and keep what a picture needs."""
+"""Episodes of one agent in one scenario: a table row each, and what a picture of the search needs."""
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -11,24 +11,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.envs.search_state import SearchState
+from parkenv.evaluation.simulate import Observer, Step, adapt_to_agent, simulate
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent
-from planners.bounds.oracle import OracleAgent, best_slot
+from planners.bounds.oracle import best_slot
 from planners.routes import DriveRoutes
 
 
 @dataclass
 class SearchTrace:
-    """What one search looked like.
+    """One search, as pictures show it.
 
     Attributes:
         scenario: where it took place.
-        agent: who searched, by name.
+        agent: name of the agent.
         path: vertices in the order driven, the entry first.
-        occupied: (n_slots,) bool, the truth at the arrival.
-        forecast: (n_slots,) float64, the prior that the car came with.
-        policy: (n_vertices,) int64, the plan before anything was seen on the way; None for agents without.
-        metrics: what the episode's last `info` told.
+        occupied: (n_slots,) bool, the true occupancy at the arrival.
+        forecast: (n_slots,) float64, the occupancy forecast at the arrival.
+        policy: (n_vertices,) int64, the plan at the first decision; None for agents without a policy.
+        metrics: `info` at the end of the episode.
     """
 
     scenario: Scenario
@@ -51,8 +52,28 @@ class Episode:
     """
 
     row: dict[str, Any]
+    decision_s: list[float]
     trace: SearchTrace
-    decision_s: list[float] = field(default_factory=list)
+
+
+class FirstPlan(Observer):
+    """Keeps the plan of the first decision.
+
+    Attributes:
+        policy: (n_vertices,) int64; None for agents without a policy.
+    """
+
+    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        """Start over."""
+        del env, observation
+        self.policy: NDArray[np.int64] | None = None
+        self._decided = False
+
+    def on_step(self, step: Step) -> None:
+        """Keep the first plan."""
+        if not self._decided:
+            self.policy = getattr(step.memory, "policy", None)
+            self._decided = True
 
 
 class EpisodeRunner:
@@ -62,79 +83,57 @@ class EpisodeRunner:
         scenario: the scenario, with the costs and speeds of the setting.
         name: the agent's name, for the trace.
         agent: the agent.
-        rig: of `parkenv/SearchPerception-v0`, to look through its sensors; None for `parkenv/Search-v0`.
+        rig: sensor rig of `parkenv/SearchPerception-v0`; None for `parkenv/Search-v0`.
     """
 
     def __init__(self, scenario: Scenario, name: str, agent: Agent, rig: str | None = None) -> None:
         self.scenario = scenario
         self.name = name
         self.agent = agent
-        self.env = (
+        env = (
             gym.make("parkenv/Search-v0", scenario=scenario)
             if rig is None
             else gym.make("parkenv/SearchPerception-v0", scenario=scenario, rig=rig)
         )
-        if (k := getattr(agent, "local_k", None)) is not None:
-            from parkenv.envs.local_observation import LocalObservation
-
-            self.env = LocalObservation(self.env, k)
+        self.env = adapt_to_agent(env, agent)
         self._routes = DriveRoutes(scenario)
 
     def bound_s(self, seed: int) -> float:
-        """Total time in the world of `seed` of one who knows it all: nobody is faster."""
+        """Return the clairvoyant lower bound of the total time, s, in the world of `seed`."""
         self.env.reset(seed=seed)
-        hidden = self.env.unwrapped.state  # type: ignore[attr-defined]
-        return self._bound_s(hidden)
+        return self._bound_s()
 
-    def _bound_s(self, start: SearchState) -> float:
-        choice = best_slot(self.scenario, self._routes, start.world, start.vertex, start.time)
-        return min(choice.total_s, self.scenario.give_up_s)
-
-    def run(self, seed: int) -> Episode:
-        """Search once in the world of `seed`.
-
-        A search that the step limit cuts off is charged `give_up_s`, as one that finds the lot full: not
-        to park must never look cheap.
-        """
-        env, scenario = self.env, self.scenario
-        observation, _ = env.reset(seed=seed)
-        hidden = env.unwrapped.state  # type: ignore[attr-defined]
-        everything = np.arange(scenario.lot.n_slots)
-        occupied = hidden.world.occupied(everything, hidden.time)
-        forecast = hidden.belief.prior
-        bound_s = self._bound_s(hidden)
-        if isinstance(self.agent, OracleAgent):
-            self.agent.reveal(hidden.world, hidden.time)
-
-        memory: Any = None
-        policy = None
-        decision_s = []
-        over = truncated = False
-        info: dict[str, Any] = {}
-        while not over:
-            start = time.perf_counter()
-            action, memory = self.agent.predict(observation, memory)
-            decision_s.append(time.perf_counter() - start)
-            if len(decision_s) == 1:
-                policy = getattr(memory, "policy", None)
-            observation, _, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
-        info = {k: v for k, v in info.items() if k != "reward_terms"}
-        if truncated:
-            info["gave_up_s"] += scenario.give_up_s
-            info["total_s"] += scenario.give_up_s
-        info["replans"] = int(getattr(memory, "replans", 0))
-        parked = bool(info["parked"])
+    def run(self, seed: int, observers: Sequence[Observer] = ()) -> Episode:
+        """Search once in the world of `seed`."""
+        scenario, first_plan = self.scenario, FirstPlan()
+        result = simulate(self.env, self.agent, seed, (first_plan, *observers))
+        metrics = {name: value for name, value in result.info.items() if name != "reward_terms"}
+        metrics["replans"] = int(getattr(result.memory, "replans", 0))
+        state = self._state
+        occupied = state.world.occupied(np.arange(scenario.lot.n_slots), state.arrival.time)
         row = {
             "seed": seed,
-            "day": hidden.arrival.day,
-            "arrival_s": round(hidden.arrival.time, 3),
+            "day": state.arrival.day,
+            "arrival_s": round(state.arrival.time, 3),
             "occupancy": float(occupied.mean()),
-            "slot": scenario.lot.slot_ids[hidden.vertex] if parked else "",
-            **info,
-            "steps": len(decision_s),
-            "truncated": bool(truncated),
-            "bound_s": bound_s,
+            "slot": scenario.lot.slot_ids[state.vertex] if metrics["parked"] else "",
+            **metrics,
+            "steps": result.steps,
+            "truncated": result.truncated,
+            "bound_s": self._bound_s(),
         }
-        trace = SearchTrace(scenario, self.name, list(hidden.path), occupied, forecast, policy, info)
-        return Episode(row, trace, decision_s)
+        forecast = scenario.forecast(state.arrival).p_occupied
+        trace = SearchTrace(
+            scenario, self.name, list(state.path), occupied, forecast, first_plan.policy, metrics
+        )
+        return Episode(row, result.decision_s, trace)
+
+    @property
+    def _state(self) -> SearchState:
+        state: SearchState = self.env.unwrapped.state  # type: ignore[attr-defined]
+        return state
+
+    def _bound_s(self) -> float:
+        state = self._state
+        choice = best_slot(self.scenario, self._routes, state.world, state.path[0], state.arrival.time)
+        return min(choice.total_s, self.scenario.give_up_s)

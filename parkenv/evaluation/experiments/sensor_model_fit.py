@@ -1,4 +1,4 @@
-"""How well the stack sees, counted in searches through the sensors, for the environment that does without them."""
+"""Fit a surrogate sensor model to the perception stack's errors, counted in searches with simulated sensors."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.workers import HERE, Workers
+from parkenv.evaluation.simulate import Observer, Step, simulate
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorBand, SensorModel
 from planners.agent import make_agent
@@ -20,106 +21,120 @@ from planners.agent import make_agent
 IntArray = NDArray[np.int64]
 
 BAND_ENDS = (0.5, 3.5, 6.5, 9.5, 12.5, 16.0)
-"""m, from the car to a slot's vertex; the first band is the slot that the car stands at."""
-DRIVERS = ("greedy-drive", "mdp", "first-free")
-"""Agents whose searches are watched: looks are where searches go."""
-LEAST_LOOKS = 20
-"""Looks in a band from which its own rates are taken, not those of all bands."""
-_AT_FIRST = SensorModel(BAND_ENDS[-1], 0.98, 0.02)
+"""m, from the car to a slot's vertex; the first band is the slot at which the car stands."""
+AGENTS = ("greedy-drive", "mdp", "first-free")
+"""Agents whose searches are counted: observations are made where searches go."""
+LEAST_OBSERVATIONS = 20
+"""Observations in a band from which its own rates are taken, not those of all bands."""
+_ASSUMED = SensorModel(BAND_ENDS[-1], 0.98, 0.02)
 
 
 @dataclass(frozen=True, eq=False)
-class LookCounts:
-    """Slots in view after a step, and what the stack said of them.
+class ObservationCounts:
+    """Slots in view after a step, and what the perception stack reported of them.
 
     Attributes:
-        looks: (bands, 2, 2, 3) int64, by distance, by whether the slot lies beside the car, by whether it is taken, and
-            by what was said: nothing, free, taken.
+        counts: (bands, 2, 2, 3) int64, by distance, by whether the slot lies beside the car, by whether it is taken,
+            and by what was reported: nothing, free, taken.
     """
 
-    looks: IntArray
+    counts: IntArray
 
     @classmethod
-    def none(cls) -> LookCounts:
-        """No look yet."""
+    def none(cls) -> ObservationCounts:
+        """Return zero counts."""
         return cls(np.zeros((len(BAND_ENDS), 2, 2, 3), dtype=np.int64))
 
-    def __add__(self, other: LookCounts) -> LookCounts:
-        return LookCounts(self.looks + other.looks)
+    def __add__(self, other: ObservationCounts) -> ObservationCounts:
+        return ObservationCounts(self.counts + other.counts)
 
     def fitted(self) -> SensorModel:
-        """The model with these rates; a band's errors are drawn to half an error each (Jeffreys's prior).
+        """Return the sensor model with these rates; half an error is added to each band's (Jeffreys prior).
 
         Raises:
-            InputError: too little was seen to tell.
+            InputError: too few observations.
         """
-        said = self.looks.sum(axis=(0, 1))[:, 1:]
-        if said.sum(axis=1).min() < LEAST_LOOKS:
+        reported = self.counts.sum(axis=(0, 1))[:, 1:]
+        if reported.sum(axis=1).min() < LEAST_OBSERVATIONS:
             raise InputError(
-                f"{said.sum(axis=1).tolist()} looks at free and at taken slots, want at least {LEAST_LOOKS} of each"
+                f"{reported.sum(axis=1).tolist()} observations of free and of taken slots, want at least "
+                f"{LEAST_OBSERVATIONS} of each"
             )
-        false_alarm, hit = _shares(said)
+        false_alarm, hit = _taken_rates(reported)
         bands = []
         for i, end in enumerate(BAND_ENDS):
             for beside in (False, True):
-                looks = self.looks[i, int(beside)]
-                there, told = looks.sum(), looks[:, 1:]
-                rates = _shares(told) if told.sum(axis=1).min() >= LEAST_LOOKS else (false_alarm, hit)
-                seen = float(told.sum() / there) if there else 0.0
+                counts = self.counts[i, int(beside)]
+                in_view, reported = counts.sum(), counts[:, 1:]
+                enough = reported.sum(axis=1).min() >= LEAST_OBSERVATIONS
+                rates = _taken_rates(reported) if enough else (false_alarm, hit)
+                seen = float(reported.sum() / in_view) if in_view else 0.0
                 bands.append(SensorBand(end, beside, round(seen, 4), round(rates[1], 4), round(rates[0], 4)))
         return SensorModel(BAND_ENDS[-1], round(hit, 4), round(false_alarm, 4), tuple(bands))
 
 
-def _shares(said: IntArray) -> tuple[float, float]:
-    """Share of looks that showed a taken slot: of free ones, and of taken ones."""
-    free, taken = (float((row[1] + 0.5) / (row.sum() + 1.0)) for row in said)
+def _taken_rates(reported: IntArray) -> tuple[float, float]:
+    """Share of the reports that say "taken": of free slots, and of taken ones."""
+    free, taken = (float((row[1] + 0.5) / (row.sum() + 1.0)) for row in reported)
     return free, taken
 
 
-def count_looks(
-    scenario: Scenario, rig: str, driver: str, seeds: Sequence[int], weather: str | None = None
-) -> LookCounts:
-    """Search through the sensors, and count what the stack says of slots against what is there.
+class _ObservationCounter(Observer):
+    """Counts what the perception stack reports after each step of a search, until the car is parked.
+
+    Args:
+        scenario: the world.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._starts, self._slots = scenario.slots_in_view
+        distance, beside = scenario.sight_lines
+        self._band = np.searchsorted(BAND_ENDS, distance)
+        self._beside = beside.astype(np.int64)
+        self.counts = ObservationCounts.none()
+
+    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        """Take the environment."""
+        del observation
+        self._env: Any = env.unwrapped
+
+    def on_step(self, step: Step) -> None:
+        """Compare the report with the true occupancy."""
+        if step.info["parked"]:
+            return
+        state, report = self._env.state, self._env.report
+        rows = slice(self._starts[state.vertex], self._starts[state.vertex + 1])
+        near = self._slots[rows]
+        reported = np.zeros(len(near), dtype=np.int64)
+        reported[np.searchsorted(near, report.slots)] = 1 + report.looks_taken
+        taken = state.world.occupied(near, state.time).astype(np.int64)
+        np.add.at(self.counts.counts, (self._band[rows], self._beside[rows], taken, reported), 1)
+
+
+def count_observations(
+    scenario: Scenario, rig: str, agent: str, seeds: Sequence[int], weather: str | None = None
+) -> ObservationCounts:
+    """Search with simulated sensors, and compare the perception stack's reports with the true occupancy.
 
     Args:
         scenario: the world.
         rig: `laser` or `stereo`.
-        driver: name of the agent that searches.
-        seeds: one a search.
+        agent: name of the agent that searches.
+        seeds: one per search.
         weather: drawn for each search where None.
 
     Raises:
         InputError: an unknown rig.
     """
-    scenario = scenario.replace(sensor_model=_AT_FIRST)
+    scenario = scenario.replace(sensor_model=_ASSUMED)
     env = gym.make("parkenv/SearchPerception-v0", scenario=scenario, rig=rig, weather=weather)
-    agent = make_agent(driver, scenario)
-    starts, slots = scenario.slots_in_view
-    distance, beside = scenario.sight_lines
-    band = np.searchsorted(BAND_ENDS, distance)
-    looks = LookCounts.none().looks
-    inner: Any = env.unwrapped
+    searcher, counter = make_agent(agent, scenario), _ObservationCounter(scenario)
     for seed in seeds:
-        observation, _ = env.reset(seed=seed)
-        memory: Any = None
-        over = False
-        while not over:
-            action, memory = agent.predict(observation, memory)
-            observation, _, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
-            if info["parked"]:
-                break
-            state, report = inner.state, inner.report
-            rows = slice(starts[state.vertex], starts[state.vertex + 1])
-            near = slots[rows]
-            said = np.zeros(len(near), dtype=np.int64)
-            said[np.searchsorted(near, report.slots)] = 1 + report.looks_taken
-            taken = state.world.occupied(near, state.time).astype(np.int64)
-            np.add.at(looks, (band[rows], beside[rows].astype(np.int64), taken, said), 1)
-    return LookCounts(looks)
+        simulate(env, searcher, seed, (counter,))
+    return counter.counts
 
 
-def measure_sight(
+def measure_sensors(
     scenarios: Sequence[Scenario],
     rig: str,
     searches: int,
@@ -128,26 +143,26 @@ def measure_sight(
     weather: str | None = None,
     workers: Workers = HERE,
     on_progress: Callable[[], None] = lambda: None,
-) -> LookCounts:
-    """`count_looks` of all drivers in all scenarios.
+) -> ObservationCounts:
+    """Sum `count_observations` over all agents of `AGENTS` and all scenarios.
 
     Args:
         scenarios: worlds.
         rig: `laser` or `stereo`.
-        searches: of each driver in each scenario.
+        searches: per agent and scenario.
         seed: of the first search.
         weather: drawn for each search where None.
-        workers: where they run; the result does not depend on it.
-        on_progress: called when a search is done.
+        workers: where the searches run; the result does not depend on it.
+        on_progress: called after each search.
     """
     tasks = [
-        partial(count_looks, scenario, rig, driver, [s], weather)
+        partial(count_observations, scenario, rig, agent, [s], weather)
         for scenario in scenarios
         for s in range(seed, seed + searches)
-        for driver in DRIVERS
+        for agent in AGENTS
     ]
-    counts = LookCounts.none()
-    for _, looks in workers.results(tasks):
-        counts += looks
+    counts = ObservationCounts.none()
+    for _, more in workers.results(tasks):
+        counts += more
         on_progress()
     return counts

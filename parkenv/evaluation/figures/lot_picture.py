@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, PathPatch, Polygon, Rectangle
 from matplotlib.path import Path as Outline
@@ -36,6 +37,8 @@ GRAPH = "#ffd98a"
 INK = "#333333"
 BELIEF_MAP = LinearSegmentedColormap.from_list("belief", [[c / 255 for c in rgb] for rgb in BELIEF_ANCHORS])
 """From free to taken."""
+COST_MAP = "viridis"
+"""Of parking costs."""
 SMALLEST_DISC = 6.0
 """Points."""
 
@@ -129,6 +132,8 @@ def points_per_m(ax: Axes) -> float:
 def save_lot_picture(lot: ParkingLot, path: str | Path, *, show_graph: bool = False) -> None:
     """Draw a lot into a file, whose suffix names the format (`.png`, `.pdf`, `.svg`).
 
+    Slots with a parking cost are filled with its colour, and a colour bar gives the scale.
+
     Raises:
         InputError: the format is not known, or the file cannot be written.
     """
@@ -137,7 +142,16 @@ def save_lot_picture(lot: ParkingLot, path: str | Path, *, show_graph: bool = Fa
     longer, shorter = max(x1 - x0, y1 - y0), min(x1 - x0, y1 - y0)
     short = 10.0 * min(1.0, (shorter + 0.15 * longer) / longer)
     figure = Figure(figsize=(10.0, short) if x1 - x0 >= y1 - y0 else (short, 10.0))
-    draw_lot(lot, figure.add_axes((0.0, 0.0, 1.0, 1.0)), show_graph=show_graph)
+    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    cost = lot.slot_parking_cost_s
+    if cost.any():
+        scale = ScalarMappable(Normalize(0.0, float(cost.max())), COST_MAP)
+        colors = scale.to_rgba(cost)
+        colors[cost == 0.0, 3] = 0.0
+        draw_lot(lot, ax, slot_color=colors, show_graph=show_graph)
+        figure.colorbar(scale, ax=ax, shrink=0.6, pad=0.01, label="parking cost, s")
+    else:
+        draw_lot(lot, ax, show_graph=show_graph)
     formats = figure.canvas.get_supported_filetypes()
     if path.suffix.removeprefix(".") not in formats:
         raise InputError(

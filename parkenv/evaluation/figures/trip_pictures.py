@@ -150,7 +150,7 @@ def film_trip(search: DrivenSearch, seed: int) -> tuple[Trip, list[Image]]:
             take()
         steps += 1
 
-    trip = search.run(seed, watch)
+    trip = search.run(seed, on_control=watch)
     take()
     return trip, frames + frames[-1:] * round(LAST_S * FPS)
 

@@ -6,18 +6,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.envs.search_state import SearchState
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
-from parkenv.evaluation.report.intentions import Intentions
+from parkenv.evaluation.report.plan_preview import PlanPreview
+from parkenv.evaluation.simulate import EpisodeResult, Observer, Step
 from parkenv.lots.generators import ONE_WAY_HALF_WIDTH, TWO_WAY_HALF_WIDTH
 from parkenv.world.lot import ParkingLot, is_building
 from parkenv.world.occupancy import World
 from planners.agent import make_agent
-from planners.bounds.oracle import OracleAgent
 
 MOST_SLOTS = 20_000
 """Lots with more are not drawn: a page with every slot of theirs would not load."""
@@ -93,15 +94,17 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
     """Run every agent of an encounter through its world again.
 
     Args:
-        encounter: whom, and where.
-        counted: total time, s, that each search came to before, by `Case.key`; what is not there is not compared.
+        encounter: the agents and their world.
+        counted: total time, s, of each search in the comparison, by `Case.key`; searches that are missing there are
+            not compared.
     """
     searches, moments = [], {0.0}
     state: SearchState | None = None
     for case in encounter.cases:
         agent = make_agent(case.agent, case.scenario, **case.options)
-        runner = EpisodeRunner(case.scenario, case.agent, agent, case.rig)
-        search, state = _search(runner, encounter.seed)
+        recorder = SearchRecorder(case.agent, PlanPreview(case.scenario.public(), agent))
+        EpisodeRunner(case.scenario, case.agent, agent, case.rig).run(encounter.seed, (recorder,))
+        state, search = recorder.state, recorder.recording
         before = counted.get(case.key(encounter.seed))
         search["counted_s"] = before
         search["agrees"] = None if before is None else abs(before - search["total_s"]) <= AGREES_S
@@ -141,67 +144,72 @@ def _truth(world: World, n_slots: int, start: float, moments: Sequence[float]) -
     return {"taken": np.flatnonzero(first).tolist(), "changes": changes}
 
 
-def _search(runner: EpisodeRunner, seed: int) -> tuple[Recording, SearchState]:
-    """One search; times in whole centiseconds since the arrival, beliefs in steps of 1/255."""
-    env, agent, scenario = runner.env, runner.agent, runner.scenario
-    intentions = Intentions(scenario.public(), agent)
-    observation, _ = env.reset(seed=seed)
-    hidden: SearchState = env.unwrapped.state  # type: ignore[attr-defined]
-    if isinstance(agent, OracleAgent):
-        agent.reveal(hidden.world, hidden.time)
-    start = hidden.time
-    known, seen = np.array(_bytes(hidden.belief.prior)), np.zeros(scenario.lot.n_slots, dtype=np.bool_)
-    rows: dict[str, list[Any]] = {
-        name: [] for name in ("t", "vertex", "failed", "belief", "seen", "action", "plan")
-    }
-    failed_s, planned = 0.0, [-1]
-    memory: Any = None
-    info: dict[str, Any] = {}
+class SearchRecorder(Observer):
+    """Records a search for the report: times in centiseconds since the arrival, beliefs in steps of 1/255.
 
-    def look() -> None:
-        nonlocal known, seen
-        belief = hidden.belief
+    Args:
+        name: of the agent.
+        preview: the agent's plan, see `PlanPreview`.
+
+    Attributes:
+        state: of the environment, hidden occupancy included.
+        recording: of the finished search.
+    """
+
+    state: SearchState
+    recording: Recording
+
+    def __init__(self, name: str, preview: PlanPreview) -> None:
+        self._name, self._preview = name, preview
+
+    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        """Record the arrival."""
+        del observation
+        self.state = env.unwrapped.state  # type: ignore[attr-defined]
+        belief = self.state.belief
+        self._known = np.array(_bytes(belief.prior))
+        self._seen = np.zeros(len(self._known), dtype=np.bool_)
+        self._plan = [-1]
+        self._rows: dict[str, list[Any]] = {
+            name: [] for name in ("t", "vertex", "failed", "belief", "seen", "action", "plan")
+        }
+        self._record_state(failed_s=0.0)
+
+    def on_step(self, step: Step) -> None:
+        """Record the decision, the plan behind it, and the state after it."""
+        plan = self._preview.ahead(step.observation, int(step.action), step.memory)
+        # Most plans are what is left of the last one.
+        self._rows["plan"].append(None if plan == self._plan[1:] else plan)
+        self._rows["action"].append(int(step.action))
+        moved = self.state.vertex != int(step.observation["vertex"])
+        self._plan = plan if moved else [-1, *plan]
+        self._record_state(step.info["failed_s"])
+
+    def on_end(self, result: EpisodeResult) -> None:
+        """Add the metrics."""
+        info, parked = result.info, bool(result.info["parked"])
+        self.recording = {
+            "agent": self._name,
+            **self._rows,
+            "parked": parked,
+            "slot": self.state.vertex if parked else None,
+            "truncated": result.truncated,
+            **{name: info[name] for name in ("drive_s", "failed_s", "walk_s", "gave_up_s", "total_s")},
+            "failed_parks": int(info["failed_parks"]),
+            "replans": int(getattr(result.memory, "replans", 0)),
+        }
+
+    def _record_state(self, failed_s: float) -> None:
+        state, rows = self.state, self._rows
+        belief = state.belief
         now = np.array(_bytes(belief.p_occupied))
-        changed = np.flatnonzero(now != known)
-        rows["t"].append(round(100 * (hidden.time - start)))
-        rows["vertex"].append(hidden.vertex)
+        changed = np.flatnonzero(now != self._known)
+        rows["t"].append(round(100 * (state.time - state.arrival.time)))
+        rows["vertex"].append(state.vertex)
         rows["failed"].append(round(100 * failed_s))
         rows["belief"].append(np.stack([changed, now[changed]], axis=1).ravel().tolist())
-        rows["seen"].append(np.flatnonzero(belief.seen & ~seen).tolist())
-        known, seen = now, seen | belief.seen
-
-    over = truncated = False
-    while not over:
-        look()
-        vertex = hidden.vertex
-        action, memory = agent.predict(observation, memory)
-        plan = intentions.ahead(observation, vertex, int(action), memory)
-        # Most plans are what is left of the last one.
-        rows["plan"].append(None if plan == planned[1:] else plan)
-        planned = plan
-        rows["action"].append(int(action))
-        observation, _, terminated, truncated, info = env.step(action)
-        failed_s = info["failed_s"]
-        if hidden.vertex == vertex:
-            planned = [-1, *plan]
-        over = terminated or truncated
-    look()
-    gave_up_s = info["gave_up_s"] + (scenario.give_up_s if truncated else 0.0)
-    parked = bool(info["parked"])
-    return {
-        "agent": runner.name,
-        **rows,
-        "parked": parked,
-        "slot": hidden.vertex if parked else None,
-        "truncated": bool(truncated),
-        "drive_s": info["drive_s"],
-        "failed_s": info["failed_s"],
-        "walk_s": info["walk_s"],
-        "gave_up_s": gave_up_s,
-        "total_s": info["total_s"] + (scenario.give_up_s if truncated else 0.0),
-        "failed_parks": int(info["failed_parks"]),
-        "replans": int(getattr(memory, "replans", 0)),
-    }, hidden
+        rows["seen"].append(np.flatnonzero(belief.seen & ~self._seen).tolist())
+        self._known, self._seen = now, self._seen | belief.seen
 
 
 def _bytes(p: NDArray[np.floating]) -> list[int]:

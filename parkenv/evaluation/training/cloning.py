@@ -1,9 +1,11 @@
-"""Learning by imitation: a planner's decisions, and a policy that is fitted to them before it learns on its own."""
+"""Behaviour cloning: a planner's demonstrations, and fitting a policy to them before reinforcement learning."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -12,41 +14,44 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.errors import InputError
+from parkenv.evaluation.simulate import EpisodeResult, Observer, Step, simulate
 from parkenv.evaluation.training.configs import MAX_STEPS, REWARD_SCALE
 from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.bounds.oracle import OracleAgent
 
 UPDATES = 3000
-"""Steps of the optimizer, enough for a policy that seldom strays from what it was shown."""
+"""Steps of the optimizer, enough for a policy that seldom deviates from the demonstrations."""
 IMITATORS = ("ppo", "maskable-ppo")
-"""Algorithms whose policies can be fitted to what was shown."""
+"""Algorithms whose policies can be cloned from demonstrations."""
 BATCH = 512
 LEARNING_RATE = 1e-3
 
 
 def require_imitable(algorithm: str, agent: str, scenario: Scenario) -> None:
-    """Refuse what cannot be imitated, before it is watched.
+    """Check that an algorithm can clone an agent, before demonstrations are collected.
 
     Raises:
-        InputError: an algorithm that does not imitate, no such agent, or the oracle.
+        InputError: an algorithm without behaviour cloning, an unknown agent, or the oracle.
     """
     if algorithm not in IMITATORS:
-        raise InputError(f"{algorithm} cannot begin by imitation; take {' or '.join(IMITATORS)}")
+        raise InputError(f"{algorithm} has no behaviour cloning; take {' or '.join(IMITATORS)}")
     if isinstance(make_agent(agent, scenario), OracleAgent):
-        raise InputError(f"{agent} cannot be imitated: it goes by what nobody can observe")
+        raise InputError(
+            f"{agent} cannot be imitated: it decides on the hidden occupancy, which no policy observes"
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class Demonstrations:
-    """Decisions of a planner.
+    """Decisions of an agent, to clone.
 
     Args:
         agent: its name.
-        local: (n, 46 + 8k) float32, what `LocalObservation` showed.
-        masks: (n, 5) int8, which actions the graph had.
-        actions: (n,) int64, what it did.
-        times: (n,) float64, s from each decision to the search's end.
+        local: (n, 46 + 8k) float32, observations of `LocalObservation`.
+        masks: (n, 5) int8, action masks.
+        actions: (n,) int64, the agent's actions.
+        times: (n,) float64, s from each decision to the end of the search.
     """
 
     agent: str
@@ -57,64 +62,83 @@ class Demonstrations:
 
     @classmethod
     def collect(cls, agent: str, scenario: Scenario, seeds: Sequence[int], k: int = 5) -> Demonstrations:
-        """Watch an agent search, once for each seed; searches that it cannot finish are left out.
+        """Simulate an agent, one search per seed; truncated searches are left out.
 
         Raises:
             InputError: it finished none.
         """
         planner = make_agent(agent, scenario)
         env = gym.make("parkenv/Search-v0", scenario=scenario, max_episode_steps=MAX_STEPS)
-        around = LocalObservation(env, k)
-        local: list[NDArray[np.float32]] = []
-        masks: list[NDArray[np.int8]] = []
-        actions: list[int] = []
-        times: list[NDArray[np.float64]] = []
+        recorder = _DecisionRecorder(LocalObservation(env, k))
         for seed in seeds:
-            observation, _ = env.reset(seed=seed)
-            memory, over, truncated = None, False, False
-            rewards: list[float] = []
-            first = len(actions)
-            while not (over or truncated):
-                local.append(around.observation(observation)["local"])
-                masks.append(observation["action_mask"])
-                action, memory = planner.predict(observation, memory)
-                actions.append(int(action))
-                observation, reward, over, truncated, _ = env.step(action)
-                rewards.append(float(reward))
-            if truncated and not over:
-                del local[first:], masks[first:], actions[first:]
-                continue
-            times.append(-np.cumsum(rewards[::-1])[::-1])
-        if not times:
+            simulate(env, planner, seed, (recorder,))
+        if not recorder.finished:
             raise InputError(
                 f"{agent} finished none of {len(seeds)} searches on {scenario.name}: nothing to imitate"
             )
+        local, masks, actions, rewards = zip(*itertools.chain.from_iterable(recorder.finished), strict=True)
+        lengths = np.cumsum([len(decisions) for decisions in recorder.finished])[:-1]
+        times = [-np.cumsum(r[::-1])[::-1] for r in np.split(np.array(rewards), lengths)]
         return cls(agent, np.stack(local), np.stack(masks), np.array(actions), np.concatenate(times))
 
 
-def clone(model: OnPolicyAlgorithm, shown: Demonstrations, seed: int, updates: int = UPDATES) -> None:
-    """Fit a model's policy to what was shown, and its values to how long the searches took from there.
+class _DecisionRecorder(Observer):
+    """Keeps (local observation, action mask, action, reward) of each decision of the searches that end by themselves.
+
+    Args:
+        local: computes the local observation from the environment's state.
+    """
+
+    def __init__(self, local: LocalObservation) -> None:
+        self._local = local
+        self.finished: list[list[tuple[NDArray[np.float32], NDArray[np.int8], int, float]]] = []
+
+    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        """Start a search."""
+        del env
+        self._decisions: list[tuple[NDArray[np.float32], NDArray[np.int8], int, float]] = []
+        self._now = self._local.observation(observation)["local"]
+
+    def on_step(self, step: Step) -> None:
+        """Keep the decision."""
+        mask = step.observation["action_mask"]
+        self._decisions.append((self._now, mask, int(step.action), step.reward))
+        self._now = self._local.observation(step.next_observation)["local"]
+
+    def on_end(self, result: EpisodeResult) -> None:
+        """Keep the search unless it was truncated."""
+        if not result.truncated:
+            self.finished.append(self._decisions)
+
+
+def clone(
+    model: OnPolicyAlgorithm, demonstrations: Demonstrations, seed: int, updates: int = UPDATES
+) -> None:
+    """Fit a model's policy to demonstrations, and its values to the remaining time of the searches.
 
     Args:
         model: fresh, of ppo or maskable-ppo.
-        shown: what to imitate.
-        seed: of the order in which it is looked at.
+        demonstrations: what to imitate.
+        seed: of the mini-batches.
         updates: steps of the optimizer.
     """
     import torch
 
     policy, rng = model.policy, np.random.default_rng(seed)
     optimizer = torch.optim.Adam(policy.parameters(), lr=LEARNING_RATE)
-    returns = torch.as_tensor(-REWARD_SCALE * shown.times, dtype=torch.float32)
-    actions = torch.as_tensor(shown.actions)
-    observed = {"local": torch.as_tensor(shown.local), "action_mask": torch.as_tensor(shown.masks)}
+    returns = torch.as_tensor(-REWARD_SCALE * demonstrations.times, dtype=torch.float32)
+    actions = torch.as_tensor(demonstrations.actions)
+    observed = {
+        "local": torch.as_tensor(demonstrations.local),
+        "action_mask": torch.as_tensor(demonstrations.masks),
+    }
     for _ in range(updates):
-        chosen = torch.as_tensor(rng.integers(len(actions), size=BATCH))
+        batch = torch.as_tensor(rng.integers(len(actions), size=BATCH))
         values, log_prob, _ = policy.evaluate_actions(
-            {name: values[chosen] for name, values in observed.items()}, actions[chosen]
+            {name: values[batch] for name, values in observed.items()}, actions[batch]
         )
-        misjudged = torch.nn.functional.mse_loss(values.flatten(), returns[chosen])
-        loss = 0.5 * misjudged - log_prob.mean()
+        value_loss = torch.nn.functional.mse_loss(values.flatten(), returns[batch])
+        loss = 0.5 * value_loss - log_prob.mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()

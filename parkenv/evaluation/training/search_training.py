@@ -15,6 +15,7 @@ from parkenv import __version__
 from parkenv.envs.search_sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.evaluation.experiments.statistics import mean_interval
+from parkenv.evaluation.simulate import charge_truncation
 from parkenv.evaluation.training.cloning import Demonstrations, clone, require_imitable
 from parkenv.evaluation.training.configs import MAX_STEPS, RECIPES, REWARD_SCALE, Recipe, recipe_of
 from parkenv.evaluation.training.rl_training import Row, Training
@@ -139,7 +140,7 @@ def examined(
         start = terminated | truncated
         first = start & np.isnan(times)
         if first.any():
-            late = truncated & ~terminated
-            times[first] = (info["total_s"] + late * scenario.give_up_s)[first]
+            charge_truncation(info, scenario, truncated & ~terminated)
+            times[first] = info["total_s"][first]
             parked[first] = info["parked"][first]
     return times, parked

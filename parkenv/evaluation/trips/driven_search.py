@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from gymnasium.wrappers import TimeLimit
 
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.envs.lookout import Station
@@ -28,18 +29,13 @@ from parkenv.envs.search_step import (
     touched,
 )
 from parkenv.errors import InputError
+from parkenv.evaluation.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
 from parkenv.evaluation.trips.driver import Driver, Leg, Try
 from parkenv.evaluation.trips.lot_driver import DrivingStyle, LotDriver
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent, make_agent
-from planners.bounds.oracle import OracleAgent
 from sim_sensors.rig import SensorRig
-
-Observation = dict[str, Any]
-
-MOST_STEPS = 2000
-"""Decisions, after which a trip is given up, as in `parkenv/Search-v0`."""
 
 
 class DrivenSearchEnv(SearchEnv):
@@ -205,7 +201,7 @@ class DrivenSearch:
 
     Example:
         >>> import math
-        >>> trip = DrivenSearch(Scenario.named("mini")).run(seed=1)
+        >>> trip = DrivenSearch(make_scenario("mini")).run(seed=1)
         >>> parts = trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.gave_up_s
         >>> trip.parked, math.isclose(trip.total_s, parts)
         (True, True)
@@ -227,48 +223,31 @@ class DrivenSearch:
         self._agent: Agent = make_agent(agent, self.scenario)
         self.driver = LotDriver(self.scenario, vehicle, style)
         self.env = DrivenSearchEnv(self.scenario, self.driver, watcher)
+        self._limited = adapt_to_agent(TimeLimit(self.env, STEP_LIMIT), self._agent)
 
     def run(
-        self,
-        seed: int,
-        watch: Callable[[], None] | None = None,
-        on_step: Callable[[Observation], None] = lambda _: None,
+        self, seed: int, observers: Sequence[Observer] = (), on_control: Callable[[], None] = lambda: None
     ) -> Trip:
-        """The trip in the world of a seed.
+        """Drive the trip in the world of a seed.
 
         Args:
             seed: 0 or more.
-            watch: called after every 0.1 s of driving; `driver` and `env` say where things stand.
-            on_step: called with what the agent observes at first, and after every decision that was carried out.
+            observers: of the decisions.
+            on_control: called after every 0.1 s of driving; `driver` and `env` hold the current state.
 
         Raises:
-            InputError: a seed that is no whole number of 0 or more.
+            InputError: a seed that is not a whole number of at least 0.
         """
         if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
             raise InputError(f"seed is {seed!r}, want a whole number of at least 0")
-        env, driver, scenario = self.env, self.driver, self.scenario
-        driver.watch = watch or (lambda: None)
-        observation, _ = env.reset(seed=int(seed))
-        if isinstance(self._agent, OracleAgent):
-            self._agent.reveal(env.state.world, env.state.time)
-        memory: Any = None
-        info: dict[str, Any] = {}
-        over = False
-        on_step(observation)
-        for _ in range(MOST_STEPS):
-            action, memory = self._agent.predict(observation, memory)
-            observation, _, over, _, info = env.step(action)
-            on_step(observation)
-            if over:
-                break
-        gave_up_s = float(info["gave_up_s"]) + (0.0 if over else scenario.give_up_s)
+        env, driver = self.env, self.driver
+        driver.watch = on_control
+        result = simulate(self._limited, self._agent, int(seed), observers)
+        info = result.info
         parked = env.manoeuvre
         manoeuvre_s = parked.seconds if parked else 0.0
-        lanes_s, failed_s, walk_s = (
-            float(info["drive_s"]) - manoeuvre_s,
-            float(info["failed_s"]),
-            float(info["walk_s"]),
-        )
+        lanes_s = float(info["drive_s"]) - manoeuvre_s
+        failed_s, walk_s, gave_up_s = (float(info[name]) for name in ("failed_s", "walk_s", "gave_up_s"))
         log = driver.log
         return Trip(
             seed=int(seed),

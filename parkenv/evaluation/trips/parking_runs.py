@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import csv
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 from scipy.stats import binomtest
 
-from parkenv.driving.vehicle import STEERING
+from parkenv.driving.vehicle import STEERING, YAW
+from parkenv.envs.drive import DriveEnv
 from parkenv.envs.drive_state import DriveState
 from parkenv.evaluation.experiments.workers import HERE, Workers
+from parkenv.evaluation.simulate import Observer, Step, simulate
 from parkenv.files.atomic_write import atomic_write
 from parkenv.world.lot import ParkingLot
 from planners.agent import Agent
@@ -75,6 +76,38 @@ class Parking:
     frames: list[Any] = field(default_factory=list)
 
 
+class _ParkingRecorder(Observer):
+    """Keeps steering angle and heading after every step, and frames.
+
+    Args:
+        every: steps between frames; 0 for none.
+    """
+
+    def __init__(self, every: int) -> None:
+        self._every = every
+        self.steering: list[float] = []
+        self.yaws: list[float] = []
+        self.frames: list[Any] = []
+
+    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        """Keep the start."""
+        del observation
+        self._env, self.drive = env, cast(DriveEnv, env.unwrapped)
+        self._record(frame=True)
+
+    def on_step(self, step: Step) -> None:
+        """Keep the step; the last one always has a frame."""
+        over = step.terminated or step.truncated
+        self._record(frame=over or (self._every > 0 and len(self.yaws) % self._every == 0))
+
+    def _record(self, *, frame: bool) -> None:
+        vehicle = self.drive.state.vehicle
+        self.steering.append(float(vehicle[STEERING]))
+        self.yaws.append(float(vehicle[YAW]))
+        if self._every and frame:
+            self.frames.append(self._env.render())
+
+
 def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0) -> Parking:
     """Drive one parking to its end.
 
@@ -89,24 +122,9 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
         wheel_rad (how far the wheels were turned in all), turned_rad (how far the heading was), position_error_m,
         angle_error_deg; of a planner also plans, planning_s (all of them), path_m, expansions, margin_m.
     """
-    observation, info = env.reset(seed=seed)
-    drive: Any = env.unwrapped
-    memory: Any = None
-    wheels = [float(drive.state.vehicle[STEERING])]
-    yaws = [float(drive.state.vehicle[2])]
-    frames = [env.render()] if every else []
-    over = truncated = False
-    decision_s = 0.0
-    while not over:
-        began = time.perf_counter()
-        action, memory = agent.predict(observation, memory)
-        decision_s += time.perf_counter() - began
-        observation, _, terminated, truncated, info = env.step(action)
-        wheels.append(float(drive.state.vehicle[STEERING]))
-        yaws.append(float(drive.state.vehicle[2]))
-        over = terminated or truncated
-        if every and (over or (len(wheels) - 1) % every == 0):
-            frames.append(env.render())
+    recorder = _ParkingRecorder(every)
+    result = simulate(env, agent, seed, (recorder,))
+    info, memory, drive = result.info, result.memory, recorder.drive
     state: DriveState = drive.get_state()[1]
     task = state.task
     reason = info["contact"] or ("" if info["is_success"] else "out of time")
@@ -120,9 +138,9 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
         "reason": reason,
         **{k: info[k] for k in ("time_s", "driven_m", "direction_changes", "position_error_m")},
         "angle_error_deg": float(np.degrees(info["angle_error_rad"])),
-        "wheel_rad": float(np.abs(np.diff(wheels)).sum()),
-        "turned_rad": float(np.abs(np.diff(yaws)).sum()),
-        "decision_ms": 1e3 * decision_s / (len(wheels) - 1),
+        "wheel_rad": float(np.abs(np.diff(recorder.steering)).sum()),
+        "turned_rad": float(np.abs(np.diff(recorder.yaws)).sum()),
+        "decision_ms": 1e3 * sum(result.decision_s) / result.steps,
     }
     if isinstance(memory, ParkingMemory):
         first = memory.paths[0] if memory.paths else None
@@ -136,7 +154,7 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
         }
         if not row["parked"] and not info["contact"] and not memory.paths:
             row["reason"] = "no path was found"
-    return Parking(row, state, frames)
+    return Parking(row, state, recorder.frames)
 
 
 def park_all(

@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
+import gymnasium as gym
 import numpy as np
+from gymnasium.wrappers import TimeLimit
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.evaluation.simulate import STEP_LIMIT, Observer, Step, simulate
 from parkenv.files.atomic_write import atomic_write
 from parkenv.world.lot import ParkingLot
 
 if TYPE_CHECKING:
     import rerun as rr
 
+    from parkenv.envs.lookout import Moment
     from parkenv.envs.perception import SearchPerceptionEnv
-    from parkenv.evaluation.trips.driven_search import DrivenSearch, Observation, Trip
+    from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
     from parkenv.mapping.grid import OccupancyGrid
     from parkenv.mapping.survey import Survey, SurveyMoment
     from parkenv.perception.stack import Look
@@ -263,27 +267,43 @@ def record_session(survey: Survey, number: int, log: SensorLog) -> None:
     survey.drive(number, on_moment=keep)
 
 
-def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: SensorLog) -> None:
-    """Search once through the sensors, and record it.
+class _SearchLogger(Observer):
+    """Records what the sensors of a search captured, and the belief, after every decision.
 
     Args:
-        env: the world.
-        agent: who searches, made for its scenario.
+        log: where to.
+        captures: of the last step.
+    """
+
+    def __init__(self, log: SensorLog, captures: Callable[[], list[tuple[Moment, Look]]]) -> None:
+        self._log, self._captures = log, captures
+
+    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        """Begin a drive."""
+        self._log.begin()
+        self._start = env.unwrapped.state.arrival.time  # type: ignore[attr-defined]
+        self._record(observation)
+
+    def on_step(self, step: Step) -> None:
+        """Record the captures of the step."""
+        self._record(step.next_observation)
+
+    def _record(self, observation: Any) -> None:
+        for moment, look in self._captures():
+            self._log.moment(moment.time - self._start, look)
+        self._log.slots(observation["p_occupied"].astype(np.float64))
+
+
+def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: SensorLog) -> None:
+    """Search once with simulated sensors, and record it.
+
+    Args:
+        env: the environment.
+        agent: made for its scenario.
         seed: of the world.
         log: where to; of the environment's lot and rig.
     """
-    log.begin()
-    observation, _ = env.reset(seed=seed)
-    begun, memory, over = env.state.arrival.time, None, False
-    while True:
-        for moment, look in env.looks:
-            log.moment(moment.time - begun, look)
-        log.slots(observation["p_occupied"].astype(np.float64))
-        if over:
-            return
-        action, memory = agent.predict(observation, memory)
-        observation, _, terminated, truncated, _ = env.step(int(action))
-        over = terminated or truncated
+    simulate(TimeLimit(env, STEP_LIMIT), agent, seed, (_SearchLogger(log, lambda: env.looks),))
 
 
 def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
@@ -297,17 +317,10 @@ def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
     Raises:
         InputError: a search without a rig.
     """
-    watcher, env = search.env.watcher, search.env
+    watcher = search.env.watcher
     if watcher is None:
-        raise InputError("a trip is recorded as its sensors see it, and this one has none: give it a rig")
-    log.begin()
-
-    def keep(observation: Observation) -> None:
-        for moment, look in watcher.looks:
-            log.moment(moment.time - env.state.arrival.time, look)
-        log.slots(observation["p_occupied"].astype(np.float64))
-
-    return search.run(seed, on_step=keep)
+        raise InputError("a recorded trip needs sensors: give it a rig")
+    return search.run(seed, (_SearchLogger(log, lambda: watcher.looks),))
 
 
 def _jpeg(image: NDArray[np.uint8]) -> bytes:

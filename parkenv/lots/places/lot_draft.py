@@ -74,7 +74,7 @@ class LotDraft:
         return cls(
             name=lot.name,
             slot_ids=lot.slot_ids,
-            slots=Slots(lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width, lot.slot_mouth),
+            slots=Slots.of_lot(lot),
             slot_source=("the lot file",) * lot.n_slots,
             lanes=lot.lanes,
             entries=lot.entries,

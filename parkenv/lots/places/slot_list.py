@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from parkenv.lots.places.slot_rows import UnsureError, lay_out
 
 FloatArray = NDArray[np.float64]
 
-COLUMNS = ("x", "y", "lat", "lon", "yaw", "id")
+COLUMNS = ("x", "y", "lat", "lon", "yaw", "id", "parking_cost_s")
 SAME_PLACE = 0.1
 """Slots whose centres lie closer than this, m, are one slot listed twice."""
 
@@ -30,12 +30,14 @@ class SlotList:
         ids: n_slots names.
         xy: (n_slots, 2) m.
         yaw: (n_slots,) rad, heading of a car that stands nose-in; None if the file does not say.
+        parking_cost_s: (n_slots,) s, at least 0.
         frame: where the metres lie on the globe; None for a file of metres.
     """
 
     ids: tuple[str, ...]
     xy: FloatArray
     yaw: FloatArray | None
+    parking_cost_s: FloatArray
     frame: LocalFrame | None
 
 
@@ -43,8 +45,8 @@ def read_slot_list(path: str | Path) -> SlotList:
     """Read a CSV file of slot centres.
 
     Its first line names the columns: `x,y` in metres east and north, or `lat,lon` in degrees; further `yaw`,
-    the heading in rad, counter-clockwise from east, of a car that stands nose-in, and `id`. Slots without ids
-    are called by their line.
+    the heading in rad, counter-clockwise from east, of a car that stands nose-in, `id`, and `parking_cost_s`, what
+    parking there costs in seconds (0 without the column). Slots without ids are called by their line.
 
     Raises:
         InputError: the file cannot be read, a column is missing or unknown, a value is no finite number or
@@ -65,7 +67,7 @@ def read_slot_list(path: str | Path) -> SlotList:
     pairs = [pair for pair in (("x", "y"), ("lat", "lon")) if set(pair) <= set(head)]
     if len(pairs) != 1 or unknown or len(set(head)) < len(head):
         raise InputError(
-            f"{path}: columns are {','.join(head)!r:.80}, want x,y or lat,lon, and perhaps yaw and id"
+            f"{path}: columns are {','.join(head)!r:.80}, want x,y or lat,lon, and perhaps yaw, id and parking_cost_s"
         )
     if len(rows) == 1:
         raise InputError(f"{path}: no slot below the line of columns")
@@ -88,9 +90,10 @@ def read_slot_list(path: str | Path) -> SlotList:
             except ValueError:
                 value = np.nan
             most = bounds.get(column, 1e8)
-            if not abs(value) <= most:
+            least = 0.0 if column == "parking_cost_s" else -most
+            if not least <= value <= most:
                 raise InputError(
-                    f"{path}: row {number}: {column} is {cells[column]!r:.40}, want a number from {-most:g} to {most:g}"
+                    f"{path}: row {number}: {column} is {cells[column]!r:.40}, want a number from {least:g} to {most:g}"
                 )
             values[column].append(value)
     points = np.column_stack([values[name] for name in pairs[0]])
@@ -100,7 +103,9 @@ def read_slot_list(path: str | Path) -> SlotList:
         points = frame.to_xy(points[:, ::-1])
     names = tuple(ids)
     _require_apart(path, points, names, tuple(ids.values()))
-    return SlotList(names, points, np.array(values["yaw"]) if "yaw" in values else None, frame)
+    yaw = np.array(values["yaw"]) if "yaw" in values else None
+    cost = np.array(values.get("parking_cost_s", [0.0] * len(names)))
+    return SlotList(names, points, yaw, cost, frame)
 
 
 def _require_apart(path: Path, xy: FloatArray, ids: tuple[str, ...], rows: tuple[int, ...]) -> None:
@@ -128,13 +133,13 @@ def slot_list_draft(path: str | Path, wishes: Wishes | None = None) -> LotDraft:
     wishes = wishes or Wishes()
     listed = read_slot_list(path)
     box = wishes.box(listed.frame)
-    xy, ids, yaw = listed.xy, listed.ids, listed.yaw
+    xy, ids, yaw, cost = listed.xy, listed.ids, listed.yaw, listed.parking_cost_s
     left_out: tuple[LeftOut, ...] = ()
     if box is not None:
         inside = np.asarray(((xy >= box[:2]) & (xy <= box[2:])).all(axis=1))
         if not inside.any():
             raise InputError(f"{path}: no slot within the bounds {', '.join(f'{b:g}' for b in box)} m")
-        xy, yaw = xy[inside], None if yaw is None else yaw[inside]
+        xy, yaw, cost = xy[inside], None if yaw is None else yaw[inside], cost[inside]
         ids = tuple(name for name, is_in in zip(ids, inside, strict=True) if is_in)
     how = "LAT,LON" if listed.frame else "X,Y"
     entries, goals = points_in(listed.frame, wishes.entries), points_in(listed.frame, wishes.goals)
@@ -175,7 +180,7 @@ def slot_list_draft(path: str | Path, wishes: Wishes | None = None) -> LotDraft:
     return LotDraft(
         name=path.stem,
         slot_ids=tuple(ids[i] for i in layout.index),
-        slots=layout.slots,
+        slots=replace(layout.slots, parking_cost_s=cost[list(layout.index)]),
         slot_source=("a list of slots",) * len(layout.index),
         lanes=layout.lanes,
         entries=entries,

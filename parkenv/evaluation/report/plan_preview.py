@@ -1,4 +1,4 @@
-"""Where an agent means to drive, read off what it remembers, for pictures."""
+"""Where an agent intends to drive next, read from its memory, for replays."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ from planners.routes import DriveRoutes
 from planners.thesis.tuning import TunedPlan
 
 MOST_HOPS = 400
-"""Vertices ahead that a plan is followed."""
-FORESEEN_S = 60.0
+"""Vertices ahead to which a policy is followed."""
+HORIZON_S = 60.0
 """s ahead that the plan of `belief` is followed."""
 
 
-class Intentions:
-    """Reads plans.
+class PlanPreview:
+    """Reads an agent's plan.
 
-    What a plan is differs: planners after the thesis have a policy, which is followed to the slot that it says to park
-    in; strategies and the oracle drive to a slot; `belief` drives a path as long as all that it comes to see is taken,
-    so it is asked where it would go if that were so. Others have no plan that could be shown.
+    Plans differ: the thesis's planners have a policy, which is followed to the slot where it parks; heuristic baselines
+    and the oracle drive to a slot; `belief` follows a path while all slots that come into view are taken, so it is
+    asked where it would go in that case. Other agents have no plan to show.
 
     Args:
-        problem: what the agent plans on.
-        agent: any.
+        problem: the agent's planning problem.
+        agent: any agent.
     """
 
     def __init__(self, problem: SearchProblem, agent: Any) -> None:
         self._problem, self._agent = problem, agent
         self._routes = DriveRoutes(problem)
 
-    def ahead(self, observation: Observation, vertex: int, action: int, memory: Any) -> list[int]:
-        """The vertices that the agent means to come to after this one, in order; none where it has no plan.
+    def ahead(self, observation: Observation, action: int, memory: Any) -> list[int]:
+        """Return the vertices that the agent intends to visit next, in order; none without a plan.
 
         Args:
-            observation: that it has just decided on.
-            vertex: where it is.
+            observation: what the agent has just decided on.
             action: what it decided.
-            memory: what it remembers.
+            memory: its memory after the decision.
         """
+        vertex = int(observation["vertex"])
         if action == PARK:
             return []
         if isinstance(memory, Search):
-            return self._while_all_is_taken(observation, vertex, action, memory)
+            return self._while_all_are_taken(observation, vertex, action, memory)
         gate = memory.gate if isinstance(memory, TunedPlan) else -1
         target = gate if gate >= 0 else getattr(memory, "target", getattr(memory, "slot", -1))
         policy = getattr(memory, "policy", None)
@@ -73,11 +73,11 @@ class Intentions:
     def _leads(self, vertex: int, target: int) -> bool:
         return bool(np.isfinite(self._routes.seconds_from(vertex)[target]))
 
-    def _while_all_is_taken(
+    def _while_all_are_taken(
         self, observation: Observation, vertex: int, action: int, memory: Search
     ) -> list[int]:
         assert isinstance(self._agent, BeliefAgent)
-        # What is known of the lot does not change; what is remembered of the search does.
+        # The neighbourhood does not change during a search; the rest of the memory does.
         imagined = copy.deepcopy(memory, {id(memory.near): memory.near})
         problem, path, passed = self._problem, [], {vertex}
         p, time = np.array(observation["p_occupied"]), np.array(observation["time"])
@@ -85,14 +85,14 @@ class Intentions:
         begun = float(time[1])
         while action != PARK:
             following = int(problem.lot.neighbors[vertex, action])
-            if following < 0 or following in passed or time[1] - begun > FORESEEN_S:
+            if following < 0 or following in passed or time[1] - begun > HORIZON_S:
                 break
             time = time + problem.move_s[vertex, action]
             vertex = following
             passed.add(vertex)
             path.append(vertex)
             shown = slots[starts[vertex] : starts[vertex + 1]]
-            # Slots that it knows to be free stay so.
+            # Slots that were observed free stay free.
             p[shown[p[shown] >= imagined.forecast[shown]]] = 1.0
             action = self._agent.decide({"vertex": vertex, "time": time, "p_occupied": p}, imagined)
         return path

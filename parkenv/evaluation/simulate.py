@@ -1,0 +1,148 @@
+"""Simulate one episode: an agent acts in an environment until the episode ends."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import MutableMapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+
+from parkenv.envs.local_observation import LocalObservation
+from parkenv.world.scenario import Scenario
+from planners.agent import Agent
+from planners.bounds.oracle import OracleAgent
+from sim_sensors.compilation import seconds_spent
+
+STEP_LIMIT = 2000
+"""Decisions after which environments that are not made by `gymnasium.make` truncate, as `parkenv/Search-v0` does."""
+
+
+class Step(NamedTuple):
+    """One decision and its outcome.
+
+    Attributes:
+        observation: what the agent decided on.
+        action: what it decided.
+        memory: the agent's state after the decision; it may change with the next decision.
+        reward: of the environment's step.
+        next_observation: what the environment returned.
+        terminated: whether the episode ended by itself.
+        truncated: whether the step limit ended it.
+        info: of the environment's step.
+    """
+
+    observation: Any
+    action: Any
+    memory: Any
+    reward: float
+    next_observation: Any
+    terminated: bool
+    truncated: bool
+    info: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """The outcome of one episode.
+
+    Attributes:
+        seed: of the world.
+        info: the last step's `info`. A truncated search is charged the give-up penalty, see `charge_truncation`.
+        truncated: whether the step limit ended the episode.
+        decision_s: wall time of each decision, s, without compiling and loading compiled code.
+        memory: the agent's state at the end.
+    """
+
+    seed: int
+    info: dict[str, Any]
+    truncated: bool
+    decision_s: list[float]
+    memory: Any
+
+    @property
+    def steps(self) -> int:
+        """Number of decisions."""
+        return len(self.decision_s)
+
+
+class Observer:
+    """Hooks into an episode; subclasses override what they need."""
+
+    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        """Called after the environment's reset, before the first decision."""
+
+    def on_step(self, step: Step) -> None:
+        """Called after each step of the environment."""
+
+    def on_end(self, result: EpisodeResult) -> None:
+        """Called once the episode is over."""
+
+
+def simulate(
+    env: gym.Env[Any, Any], agent: Agent, seed: int, observers: Sequence[Observer] = ()
+) -> EpisodeResult:
+    """Run one episode from reset to its end.
+
+    Args:
+        env: the environment, with a step limit if the agent may never finish; see `adapt_to_agent`.
+        agent: decides; the oracle is shown the world first.
+        seed: of the world.
+        observers: called in this order at each hook.
+    """
+    observation, _ = env.reset(seed=seed)
+    _prepare(agent, env)
+    for observer in observers:
+        observer.on_reset(env, observation)
+    memory: Any = None
+    info: dict[str, Any] = {}
+    decision_s: list[float] = []
+    terminated = truncated = False
+    while not (terminated or truncated):
+        start, compiling = time.perf_counter(), seconds_spent()
+        action, memory = agent.predict(observation, memory)
+        # The first decision of a process may compile, which says nothing about the agent.
+        decision_s.append(time.perf_counter() - start - (seconds_spent() - compiling))
+        decided_on = observation
+        observation, reward, terminated, truncated, info = env.step(action)
+        step = Step(decided_on, action, memory, float(reward), observation, terminated, truncated, info)
+        for observer in observers:
+            observer.on_step(step)
+    truncated = truncated and not terminated
+    scenario = getattr(env.unwrapped, "scenario", None)
+    if truncated and scenario is not None:
+        info = dict(info)
+        charge_truncation(info, scenario)
+    result = EpisodeResult(seed, info, truncated, decision_s, memory)
+    for observer in observers:
+        observer.on_end(result)
+    return result
+
+
+def charge_truncation(metrics: MutableMapping[str, Any], scenario: Scenario, truncated: Any = 1.0) -> None:
+    """Charge truncated searches the give-up penalty, like those that end in a full lot.
+
+    Otherwise an agent that never parks would look cheap.
+
+    Args:
+        metrics: of a search, or arrays with an element per search; `gave_up_s` and `total_s` rise.
+        scenario: has the penalty `give_up_s`.
+        truncated: which searches were truncated, as a number or a bool array.
+    """
+    penalty = truncated * scenario.give_up_s
+    metrics["gave_up_s"] = metrics["gave_up_s"] + penalty
+    metrics["total_s"] = metrics["total_s"] + penalty
+
+
+def adapt_to_agent(env: gym.Env[Any, Any], agent: Agent) -> gym.Env[Any, Any]:
+    """Return the environment with the observation that the agent needs: trained models have `local_k`."""
+    k = getattr(agent, "local_k", None)
+    return env if k is None else LocalObservation(env, k)
+
+
+def _prepare(agent: Agent, env: gym.Env[Any, Any]) -> None:
+    """Show the hidden occupancy to agents that are defined by knowing it."""
+    if isinstance(agent, OracleAgent):
+        state = env.unwrapped.state  # type: ignore[attr-defined]
+        agent.reveal(state.world, state.time)

@@ -1,0 +1,205 @@
+"""Files that describe a scenario or an experiment: TOML or JSON, validated by pydantic, refused in one line."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Self, TypeVar, get_args
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    ValidationError,
+    ValidationInfo,
+)
+from pydantic_core import ErrorDetails
+
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
+
+MAX_BYTES = 4_000_000
+"""Largest file that is read: a description holds no data."""
+_SHOWN = 60
+_FOLDER = "folder"
+
+_WANTED = {
+    "greater_than": "a number above {gt}",
+    "greater_than_equal": "a number of at least {ge}",
+    "less_than": "a number below {lt}",
+    "less_than_equal": "a number of at most {le}",
+    "model_type": "a table",
+    "float_type": "a number",
+    "int_type": "a whole number",
+    "string_type": "text",
+    "bool_type": "true or false",
+    "tuple_type": "a list",
+    "too_short": "at least {min_length} values",
+    "too_long": "at most {max_length} values",
+}
+"""What is wanted, by pydantic's kind of fault; its own words where they are plain already."""
+
+T = TypeVar("T")
+
+
+def _resolved(value: object, info: ValidationInfo) -> object:
+    """A path as an absolute one: relative to the folder of the file that it was read from."""
+    if not isinstance(value, str | Path):
+        return value
+    folder = (info.context or {}).get(_FOLDER, Path())
+    path = (Path(folder) / Path(value).expanduser()).absolute()
+    if not path.is_file():
+        raise ValueError(f"a file; there is none at {path}")
+    return path
+
+
+FilePath = Annotated[Path, BeforeValidator(_resolved)]
+"""An existing file; relative paths start at the folder of the file that names them."""
+
+Several = Annotated[tuple[T, ...], Strict(False)]
+"""A list in a file, a tuple in the object."""
+
+
+def _different(values: tuple[T, ...]) -> tuple[T, ...]:
+    repeated = [v for i, v in enumerate(values) if v in values[:i]]
+    if repeated:
+        raise ValueError(f"different values; {repeated[0]!r} is repeated")
+    return values
+
+
+Axis = Annotated[
+    tuple[T, ...], Strict(False), Field(min_length=1, max_length=10_000), AfterValidator(_different)
+]
+"""The values of one axis of a grid: at least one, none twice."""
+
+
+class Spec(BaseModel):
+    """Base of everything that is read from such a file: typed, bounded, frozen; unknown keys are refused."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """Read a TOML file, or a JSON file (`.json`).
+
+        Raises:
+            InputError: it cannot be read or is not valid; one line with file, field, value and what was wanted.
+        """
+        path = Path(path)
+        return cls.parse(read_tables(path), str(path), path.parent)
+
+    @classmethod
+    def parse(cls, tables: Mapping[str, Any], source: str, folder: str | Path = ".") -> Self:
+        """Validate what a file or an option says.
+
+        Args:
+            tables: nested mappings and lists.
+            source: named in messages, such as the file.
+            folder: relative paths start here.
+
+        Raises:
+            InputError: see `read`.
+        """
+        try:
+            return cls.model_validate(tables, context={_FOLDER: Path(folder)})
+        except ValidationError as error:
+            raise InputError(_message(cls, error, source)) from error
+
+    def changed(self, source: str = "", **changes: Any) -> Self:
+        """A copy with some fields changed, validated again.
+
+        Args:
+            source: named in messages.
+            changes: by name of field; plain values or specs.
+
+        Raises:
+            InputError: see `read`.
+        """
+        fields = {name: getattr(self, name) for name in type(self).model_fields} | changes
+        return type(self).parse(fields, source)
+
+    def write(self, path: Path) -> None:
+        """Write it as JSON, whole or not at all; fields at their defaults are written, too."""
+        with atomic_write(path) as beside:
+            beside.write_text(json.dumps(self.tables(), indent=2) + "\n", encoding="utf-8")
+
+    def tables(self) -> dict[str, Any]:
+        """Plain JSON values, without fields that are not set."""
+        return self.model_dump(mode="json", exclude_none=True)
+
+
+def read_tables(path: Path) -> dict[str, Any]:
+    """The content of a TOML or JSON file, not validated.
+
+    Raises:
+        InputError: it cannot be read, is too large, or its syntax is wrong.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: has {path.stat().st_size} bytes, want at most {MAX_BYTES}")
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file in UTF-8 ({error.reason})") from error
+    try:
+        tables = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        kind = "JSON" if path.suffix == ".json" else "TOML"
+        raise InputError(f"{path}: not {kind}: {error}") from error
+    if not isinstance(tables, dict):
+        raise InputError(f"{path}: is a {type(tables).__name__}, want a JSON object")
+    return tables
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A hint for a misspelt name: the nearest known one, and all of them."""
+    names = list(known)
+    close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
+    return (f"did you mean {close[0]!r}? " if close else "") + f"known: {', '.join(names)}"
+
+
+def _message(model: type[BaseModel], error: ValidationError, source: str) -> str:
+    details = error.errors(include_url=False)
+    # A misspelt key first: it explains a missing one.
+    first = min(details, key=lambda d: d["type"] != "extra_forbidden")
+    more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    return f"{source}{': ' if source else ''}{_fault(model, first)}{more}"
+
+
+def _fault(model: type[BaseModel], detail: ErrorDetails) -> str:
+    location, kind = detail["loc"], detail["type"]
+    field = ".".join(str(part) for part in location)
+    if kind == "extra_forbidden":
+        place = f" in [{field.rpartition('.')[0]}]" if len(location) > 1 else ""
+        return f"unknown key {location[-1]!r}{place}; {nearest(str(location[-1]), _keys_at(model, location[:-1]))}"
+    wanted = detail["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    if kind in _WANTED:
+        wanted = _WANTED[kind].format(**detail.get("ctx", {}))
+    if kind == "missing":
+        return f"{field} is missing"
+    value = repr(detail["input"])
+    shown = value if len(value) <= _SHOWN else f"{value[:_SHOWN]}..."
+    return f"{field} is {shown}, want {wanted}" if field else f"is {shown}, want {wanted}"
+
+
+def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> Iterator[str]:
+    """The keys that the table at a location of the file may have."""
+    at: type[BaseModel] = model
+    for part in location:
+        if isinstance(part, str) and part in at.model_fields:
+            at = next(_models_in(at.model_fields[part].annotation), at)
+    yield from at.model_fields
+
+
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _models_in(part)

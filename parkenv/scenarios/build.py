@@ -1,0 +1,181 @@
+"""From the description of a scenario to the scenario."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from parkenv.errors import InputError
+from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot
+from parkenv.scenarios.spec import (
+    ForecastSpec,
+    LotSpec,
+    OccupancySpec,
+    ScenarioSpec,
+    SensorModelSpec,
+    TypicalWeek,
+    scenario_spec,
+)
+from parkenv.world.flat_map import FlatMap
+from parkenv.world.lot import ParkingLot
+from parkenv.world.occupancy import OccupancyModel, OccupancyProcess, PriorModel
+from parkenv.world.scenario import KMH, Scenario
+from parkenv.world.sensor_model import SensorModel
+from parkenv.world.traffic import Traffic
+from parkenv.world.typical_week import typical_occupancy, with_event
+
+ScenarioSource = str | Path | ScenarioSpec | ParkingLot | Scenario
+
+
+def make_scenario(source: ScenarioSource, **changes: Any) -> Scenario:
+    """Make a scenario.
+
+    Args:
+        source: the name of a packaged scenario (campus, jam, street, mini), a scenario file (.toml), a lot file, a
+            `ScenarioSpec`, a `ParkingLot` (on which a typical week takes place), or a `Scenario`.
+        changes: fields of `Scenario` to replace.
+
+    Raises:
+        InputError: an unknown name or field, or what is wrong with a file; one line.
+
+    Examples:
+        >>> scenario = make_scenario("campus", failure_s=90.0)
+        >>> scenario.lot.name, scenario.failure_s
+        ('campus', 90.0)
+    """
+    if isinstance(source, Scenario):
+        return source.replace(**changes)
+    if isinstance(source, ParkingLot):
+        goal = changes.get("goal", 0)
+        fields = {
+            "name": source.name,
+            "occupancy": changes.get("occupancy") or typical_occupancy(source, goal=goal),
+        }
+        return Scenario(lot=source, **(fields | changes | {"occupancy": fields["occupancy"]}))
+    if isinstance(source, ScenarioSpec):
+        return build(source).replace(**changes)
+    if not isinstance(source, str | Path):
+        raise InputError(
+            f"scenario is a {type(source).__name__}, want a Scenario, its name or file, a ScenarioSpec or a ParkingLot"
+        )
+    spec = scenario_spec(source)
+    try:
+        made = build(spec)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from error
+    return made.replace(**changes)
+
+
+def build(spec: ScenarioSpec) -> Scenario:
+    """The scenario that a specification describes.
+
+    Raises:
+        InputError: a file that it names cannot be used, or does not fit the lot.
+    """
+    lot = _lot(spec.lot)
+    goal = 0
+    if isinstance(spec.goal, tuple):
+        lot = dataclasses.replace(lot, goals=np.array([spec.goal]))
+    else:
+        goal = spec.goal
+    name = spec.name or lot.name
+    try:
+        if not goal < len(lot.goals):
+            raise InputError(f"goal is {goal}, want an index from 0 to {len(lot.goals) - 1}")
+        occupancy = _occupancy(spec.occupancy, lot, goal)
+        return Scenario(
+            name=name,
+            lot=lot,
+            goal=goal,
+            entry=spec.entry,
+            v_drive=spec.speeds.v_drive_kmh * KMH,
+            v_walk=spec.speeds.v_walk_kmh * KMH,
+            failure_s=spec.costs.failure_s,
+            wait_s=spec.costs.wait_s,
+            give_up_s=spec.costs.give_up_s,
+            sensor_model=sensor_model(spec.sensor_model),
+            occupancy=occupancy,
+            prior=_prior(spec.forecast, occupancy, lot, goal),
+            arrival=spec.arrivals.window(),
+            traffic=Traffic(spec.traffic.cars, spec.traffic.pedestrians),
+        )
+    except InputError as error:
+        raise InputError(f"scenario {name!r}: {error}") from error
+
+
+def _lot(spec: LotSpec) -> ParkingLot:
+    if spec.name is not None:
+        return packaged_lot(spec.name)
+    if spec.file is not None:
+        return read_lot(spec.file)
+    if spec.grid is not None:
+        return grid_lot(**spec.grid.model_dump())
+    assert spec.city is not None
+    return city_lot(spec.city.slots, spec.city.seed)
+
+
+def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyModel:
+    if spec.log is not None:
+        from parkenv.world.occupancy_log import OccupancyLog
+        from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
+
+        log = OccupancyLog.read(spec.log)
+        mapped = None if spec.mapping is None else read_mapping(spec.mapping, lot.slot_ids, log)
+        return RecordedOccupancy(log, lot.walk_m(goal), mapped)
+    process = (
+        _typical(spec.typical or TypicalWeek(), lot, goal)
+        if spec.process is None
+        else _process(spec.process, lot, goal)
+    )
+    if spec.event is None:
+        return process
+    return with_event(process, lot, goal=goal, share=spec.event.share, factor=spec.event.factor)
+
+
+def _prior(spec: ForecastSpec, occupancy: OccupancyModel, lot: ParkingLot, goal: int) -> PriorModel | None:
+    if spec.typical is not None:
+        return _typical(spec.typical, lot, goal)
+    if spec.process is not None:
+        return _process(spec.process, lot, goal)
+    if spec.flat is not None:
+        return FlatMap(spec.flat, occupancy)
+    if spec.map is not None:
+        from parkenv.mapping.inference import MapPrior
+        from parkenv.mapping.store import MapStore
+
+        with MapStore(spec.map, lot, create=False) as store:
+            return MapPrior(store.log())
+    return None
+
+
+def _typical(spec: TypicalWeek, lot: ParkingLot, goal: int) -> OccupancyProcess:
+    parameters = spec.model_dump(exclude={"goal"})
+    return typical_occupancy(lot, goal=goal if spec.goal is None else spec.goal, **parameters)
+
+
+def _process(path: Path, lot: ParkingLot, goal: int) -> OccupancyProcess:
+    process = OccupancyProcess.from_file(path)
+    # A process carries no slot ids: one of the lot's size is taken to be the lot's own.
+    return process if process.n_slots == lot.n_slots else process.mapped_to_lot(lot.walk_m(goal))
+
+
+def sensor_model(spec: SensorModelSpec) -> SensorModel:
+    """The sensor model that a specification describes.
+
+    Raises:
+        InputError: its file cannot be used.
+    """
+    if spec.name == "blind":
+        model = SensorModel.blind()
+    elif spec.name in ("laser", "stereo"):
+        model = SensorModel.named(spec.name)
+    elif spec.file is not None:
+        model = SensorModel.from_file(spec.file)
+    elif spec.hit_rate is not None and spec.false_alarm_rate is not None:
+        model = SensorModel(hit_rate=spec.hit_rate, false_alarm_rate=spec.false_alarm_rate)
+    else:
+        model = SensorModel()
+    return model if spec.view_range is None else dataclasses.replace(model, view_range=spec.view_range)

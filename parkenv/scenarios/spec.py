@@ -1,0 +1,322 @@
+"""What a scenario file may say.
+
+Every table of the file is a class here; the classes validate it, and the published JSON schema is made from them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+
+from parkenv.errors import InputError
+from parkenv.files.spec_file import FilePath, Spec, nearest, read_tables
+from parkenv.world.occupancy import ArrivalWindow
+
+PackagedLot = Literal["campus", "jam", "street", "mini"]
+PACKAGED_LOTS: tuple[PackagedLot, ...] = ("campus", "jam", "street", "mini")
+RigName = Literal["laser", "stereo", "both_sides"]
+
+Speed = Annotated[float, Field(ge=0.1, le=300.0)]
+"""km/h."""
+Cost = Annotated[float, Field(ge=0.0, le=86_400.0)]
+"""s, at most a day."""
+Probability = Annotated[float, Field(ge=0.0, le=1.0)]
+Count = Annotated[int, Field(ge=0, le=1_000)]
+Size = Annotated[float, Field(ge=1.0, le=100.0)]
+"""m."""
+MAX_SLOTS = 1_000_000
+
+
+def _require_one(spec: Spec, names: tuple[str, ...], least: int = 1) -> None:
+    given = [name for name in names if getattr(spec, name) is not None]
+    if not least <= len(given) <= 1:
+        raise ValueError(f"{'exactly' if least else 'at most'} one of {', '.join(names)}")
+
+
+class GridLot(Spec):
+    """Rows of perpendicular slots along parallel two-way aisles."""
+
+    rows: int = Field(ge=1, le=10_000)
+    columns: int = Field(ge=1, le=10_000, description="Slots a row.")
+    pitch: Size = Field(2.5, description="Width of a slot, m.")
+    depth: Size = Field(5.0, description="Length of a slot, m.")
+    aisle: Size = Field(6.0, description="Width of an aisle, m.")
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        if self.rows * self.columns > MAX_SLOTS:
+            raise ValueError(f"rows times columns of at most {MAX_SLOTS} slots")
+        return self
+
+
+class CityLot(Spec):
+    """Kerbside slots around the blocks of a generated city."""
+
+    slots: int = Field(ge=1, le=MAX_SLOTS)
+    seed: int = Field(0, ge=0, lt=2**32)
+
+
+def _lot_tables(value: object) -> object:
+    """A word as the table it stands for: a packaged lot's name, or else a file."""
+    if isinstance(value, Path) or (isinstance(value, str) and value not in PACKAGED_LOTS):
+        return {"file": value}
+    return {"name": value} if isinstance(value, str) else value
+
+
+class LotSpec(Spec):
+    """Where the lot comes from: exactly one of the four."""
+
+    name: PackagedLot | None = Field(None, description="A packaged lot.")
+    file: FilePath | None = Field(
+        None, description="A lot file: native GeoJSON, or a Dragon Lake map (.yml)."
+    )
+    grid: GridLot | None = None
+    city: CityLot | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        _require_one(self, ("name", "file", "grid", "city"))
+        return self
+
+
+class TypicalWeek(Spec):
+    """A working week: full by day, empty by night, and fuller near the goal."""
+
+    pull: float = Field(
+        1.6, ge=-20, le=20, description="Logits by which demand rises from the middle to the goal."
+    )
+    unevenness: float = Field(
+        0.6, ge=0, le=20, description="Standard deviation between equally near slots, logits."
+    )
+    demand: float = Field(0.0, ge=-50, le=50, description="Logits added at every hour.")
+    mean_stay_s: float = Field(7200.0, ge=1.0, le=1e7)
+    goal: int | None = Field(
+        None, ge=0, description="Index of the goal with the demand; the scenario's own if absent."
+    )
+
+
+class Event(Spec):
+    """A day on which the slots nearest to the goal fill up."""
+
+    share: Probability = Field(description="Fraction of the slots that the event fills, the nearest ones.")
+    factor: float = Field(gt=0, le=1e6, description="Of their arrival rates.")
+
+
+def _occupancy_tables(value: object) -> object:
+    if isinstance(value, Path):
+        value = str(value)
+    if not isinstance(value, str):
+        return value
+    if value == "typical":
+        return {"typical": {}}
+    if value.endswith(".json"):
+        return {"process": value}
+    if value.endswith((".csv", ".csv.gz")):
+        return {"log": value}
+    raise ValueError("typical, a process (.json), a recorded log (.csv, .csv.gz), or a table")
+
+
+class OccupancySpec(Spec):
+    """Which slots are taken when: a typical week where nothing else is named."""
+
+    typical: TypicalWeek | None = None
+    process: FilePath | None = Field(None, description="Rates that `parkenv occupancy fit` wrote (.json).")
+    log: FilePath | None = Field(None, description="A recorded log (.csv, .csv.gz), replayed day by day.")
+    mapping: FilePath | None = Field(
+        None, description="CSV slot_id,log_slot_id: which slot of the log is which."
+    )
+    event: Event | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        _require_one(self, ("typical", "process", "log"), least=0)
+        if self.mapping is not None and self.log is None:
+            raise ValueError("mapping only together with a log")
+        if self.event is not None and self.log is not None:
+            raise ValueError("event only without a log: a recorded day is as full as it was")
+        return self
+
+
+def _forecast_tables(value: object) -> object:
+    if isinstance(value, Path):
+        value = str(value)
+    if not isinstance(value, str):
+        return value
+    if value == "own":
+        return {}
+    if value.endswith(".json"):
+        return {"process": value}
+    if value.endswith(".sqlite"):
+        return {"map": value}
+    raise ValueError("own, a process (.json), a map file (.sqlite), or a table")
+
+
+class ForecastSpec(Spec):
+    """What the car's map says before the search: the true occupancy's own forecast where nothing else is named."""
+
+    typical: TypicalWeek | None = None
+    process: FilePath | None = None
+    map: FilePath | None = Field(None, description="A map file that `parkenv survey` wrote (.sqlite).")
+    flat: Probability | None = Field(None, description="The same probability for every slot.")
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        _require_one(self, ("typical", "process", "map", "flat"), least=0)
+        return self
+
+
+def _hours(value: str) -> str:
+    try:
+        ArrivalWindow.parse(value)
+    except InputError:
+        raise ValueError("HH:MM-HH:MM within one day, e.g. 08:00-13:00") from None
+    return value
+
+
+def _days(value: object) -> object:
+    text = ",".join(value) if isinstance(value, list) and all(isinstance(v, str) for v in value) else value
+    try:
+        ArrivalWindow.parse("00:00-24:00", text if isinstance(text, str) else "")
+    except InputError:
+        raise ValueError("weekdays, weekend, all, or names of days such as mon,tue") from None
+    return text
+
+
+class Arrivals(Spec):
+    """When searches begin."""
+
+    days: Annotated[str, BeforeValidator(_days, json_schema_input_type=str | list[str])] = "weekdays"
+    hours: Annotated[str, AfterValidator(_hours)] = "08:00-13:00"
+
+    def window(self) -> ArrivalWindow:
+        """The arrival window."""
+        return ArrivalWindow.parse(self.hours, self.days)
+
+
+class Speeds(Spec):
+    """Speeds on the lanes and on foot."""
+
+    v_drive_kmh: Speed = 10.0
+    v_walk_kmh: Speed = 4.0
+
+
+class Costs(Spec):
+    """What a search is charged, s."""
+
+    failure_s: Cost = Field(10.0, description="Failed attempt to park; planners know it.")
+    wait_s: float = Field(1.0, gt=0.0, le=86_400.0, description="Move that the drive graph does not have.")
+    give_up_s: Cost = Field(1800.0, description="Give-up penalty: park elsewhere and walk.")
+
+
+def _sensor_tables(value: object) -> object:
+    if isinstance(value, str) and value in ("perfect", "blind", "laser", "stereo"):
+        return {"name": value}
+    return {"file": value} if isinstance(value, str | Path) else value
+
+
+class SensorModelSpec(Spec):
+    """How slots are observed from the lane."""
+
+    name: Literal["perfect", "blind", "laser", "stereo"] | None = Field(
+        None, description="perfect; blind: only by attempts; laser, stereo: as measured with that rig."
+    )
+    file: FilePath | None = Field(None, description="A sensor model that `parkenv fit-sensor-model` wrote.")
+    hit_rate: Probability | None = Field(None, description="P(observed taken | taken).")
+    false_alarm_rate: Probability | None = Field(None, description="P(observed taken | free).")
+    view_range: float | None = Field(None, ge=0.0, le=10_000.0, description="How far slots are observed, m.")
+
+    @model_validator(mode="after")
+    def _one(self) -> Self:
+        _require_one(self, ("name", "file", "hit_rate"), least=0)
+        if (self.hit_rate is None) != (self.false_alarm_rate is None):
+            raise ValueError("hit_rate and false_alarm_rate together")
+        if self.hit_rate is not None and self.hit_rate <= (self.false_alarm_rate or 0.0):
+            raise ValueError("a hit_rate above the false_alarm_rate")
+        return self
+
+
+class TrafficSpec(Spec):
+    """Other road users."""
+
+    cars: Count = 0
+    pedestrians: Count = 0
+
+
+def _goal(value: object) -> object:
+    if isinstance(value, int) and not isinstance(value, bool) and value >= 0:
+        return value
+    if isinstance(value, list | tuple) and len(value) == 2:
+        x, y = value
+        if all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= 1e7 for v in (x, y)):
+            return float(x), float(y)
+    raise ValueError("the index of one of the lot's goals, or a point [x, y] in m")
+
+
+def _name(value: str) -> str:
+    if len(value) > 80 or not value.isprintable() or set(value) & set("/\\,"):
+        raise ValueError("at most 80 printable characters without comma or slash")
+    return value
+
+
+class ScenarioSpec(Spec):
+    """A scenario file: a lot, its occupancy, what the car knows, the goal, and what time costs."""
+
+    name: Annotated[str, AfterValidator(_name)] = Field("", description="In tables; the file's by default.")
+    lot: Annotated[LotSpec, BeforeValidator(_lot_tables, json_schema_input_type=str | LotSpec)]
+    goal: Annotated[
+        int | tuple[float, float], BeforeValidator(_goal, json_schema_input_type=int | list[float])
+    ] = Field(0, description="Index of one of the lot's goals, or a point [x, y] in m.")
+    entry: int | None = Field(None, ge=0, description="Index of the entry; drawn for each search if absent.")
+    occupancy: Annotated[
+        OccupancySpec, BeforeValidator(_occupancy_tables, json_schema_input_type=str | OccupancySpec)
+    ] = OccupancySpec()
+    forecast: Annotated[
+        ForecastSpec, BeforeValidator(_forecast_tables, json_schema_input_type=str | ForecastSpec)
+    ] = ForecastSpec()
+    arrivals: Arrivals = Arrivals()
+    speeds: Speeds = Speeds()
+    costs: Costs = Costs()
+    sensor_model: Annotated[
+        SensorModelSpec, BeforeValidator(_sensor_tables, json_schema_input_type=str | SensorModelSpec)
+    ] = SensorModelSpec(name="perfect")
+    rig: RigName = Field("laser", description="The sensors of the car, where they are simulated.")
+    traffic: TrafficSpec = TrafficSpec()
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """Read a scenario file; without a name in it the scenario has the file's."""
+        path = Path(path)
+        return cls.parse({"name": path.stem, **read_tables(path)}, str(path), path.parent)
+
+
+SCENARIO_NAMES = ("campus", "jam", "street", "mini")
+"""Packaged scenarios."""
+_PACKAGED = Path(__file__).with_name("packaged")
+LOT_SUFFIXES = (".geojson", ".yml", ".yaml")
+
+
+def scenario_spec(source: str | Path) -> ScenarioSpec:
+    """The specification of a packaged scenario, of a scenario file, or of a typical week on a lot file.
+
+    Args:
+        source: the name of a packaged scenario, or a file.
+
+    Raises:
+        InputError: neither; or what is wrong with the file.
+
+    Examples:
+        >>> scenario_spec("jam").occupancy.event
+        Event(share=0.75, factor=200.0)
+    """
+    if str(source) in SCENARIO_NAMES:
+        return ScenarioSpec.read(_PACKAGED / f"{source}.toml")
+    path = Path(source)
+    if path.suffix in LOT_SUFFIXES:
+        return ScenarioSpec.parse({"name": path.stem, "lot": str(path)}, str(path))
+    if path.suffix in (".toml", ".json") or path.exists():
+        return ScenarioSpec.read(path)
+    raise InputError(
+        f"unknown scenario {str(source)!r}, and no such file; {nearest(str(source), SCENARIO_NAMES)}"
+    )

@@ -1,0 +1,167 @@
+"""Scenario files: what they make, and how bad ones are refused."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from parkenv import InputError, make_scenario
+from parkenv.lots import PACKAGED_LOTS, grid_lot, packaged_lot, write_lot
+from parkenv.mapping.inference import MapPrior
+from parkenv.mapping.store import MapStore, Session
+from parkenv.scenarios.spec import PACKAGED_LOTS as NAMED_LOTS
+from parkenv.scenarios.spec import SCENARIO_NAMES, ScenarioSpec, scenario_spec
+from parkenv.world.flat_map import FlatMap
+from parkenv.world.occupancy import Arrival
+from parkenv.world.recorded_occupancy import RecordedOccupancy
+from parkenv.world.typical_week import typical_occupancy
+
+TUESDAY_NOON = Arrival(86_400.0 + 12 * 3600.0)
+
+
+def written(folder, text, name="mine.toml"):
+    file = folder / name
+    file.write_text(text)
+    return file
+
+
+def refusal(folder, text):
+    with pytest.raises(InputError) as caught:
+        make_scenario(written(folder, text))
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(str(folder / "mine.toml"))
+    return message
+
+
+def test_packaged_scenarios_are_files_like_any_other():
+    assert NAMED_LOTS == PACKAGED_LOTS
+    for name in SCENARIO_NAMES:
+        assert make_scenario(name).name == name
+    jam = make_scenario("jam")
+    usual = typical_occupancy(packaged_lot("jam"), pull=1.0, demand=-0.3)
+    ratio = jam.occupancy.arrival_factor / usual.arrival_factor
+    assert set(np.round(ratio, 9)) == {1.0, 200.0}
+    assert 0.7 < np.mean(ratio > 1.0) <= 0.75
+    known = jam.forecast(TUESDAY_NOON).p_occupied
+    assert np.array_equal(known, usual.forecast(TUESDAY_NOON).p_occupied)
+
+
+def test_a_file_says_it_all(tmp_path):
+    write_lot(grid_lot(2, 6), tmp_path / "lot.geojson")
+    typical_occupancy(grid_lot(3, 5)).to_file(tmp_path / "rates.json")
+    file = written(
+        tmp_path,
+        """
+        lot = "lot.geojson"
+        goal = [3.0, 20.0]
+        entry = 0
+        occupancy = "rates.json"
+        forecast = { flat = 0.25 }
+        arrivals = { days = ["sat", "sun"], hours = "10:00-11:30" }
+        speeds = { v_drive_kmh = 18, v_walk_kmh = 3.6 }
+        costs = { failure_s = 90, wait_s = 2.0, give_up_s = 600 }
+        sensor_model = { hit_rate = 0.9, false_alarm_rate = 0.1, view_range = 12 }
+        traffic = { cars = 2 }
+        """,
+    )
+    made = make_scenario(file)
+    assert made.name == "mine"
+    assert made.lot.goals.tolist() == [[3.0, 20.0]]
+    assert made.occupancy.n_slots == made.lot.n_slots == 12, "rates of 15 slots, mapped to 12"
+    assert isinstance(made.prior, FlatMap)
+    assert set(made.forecast(TUESDAY_NOON).p_occupied) == {0.25}
+    assert made.arrival.weekdays == (5, 6)
+    assert made.arrival.end_s == 11.5 * 3600
+    assert (made.v_drive, made.v_walk) == pytest.approx((5.0, 1.0))
+    assert (made.failure_s, made.wait_s, made.give_up_s, made.entry) == (90.0, 2.0, 600.0, 0)
+    assert (made.sensor_model.hit_rate, made.sensor_model.view_range) == (0.9, 12.0)
+    assert made.traffic.cars == 2
+
+    env = gym.make("parkenv/Search-v0", scenario=str(file), failure_s=7.0)
+    env.reset(seed=3)
+    assert env.unwrapped.scenario.failure_s == 7.0
+    assert env.unwrapped.scenario.lot.n_slots == 12
+    assert make_scenario(tmp_path / "lot.geojson").name == "lot", "a typical week on a lot file"
+
+    # What was read can be written and read again, from anywhere.
+    scenario_spec(file).write(tmp_path / "copy.json")
+    assert ScenarioSpec.read(tmp_path / "copy.json") == scenario_spec(file)
+
+
+def test_logs_and_maps(tmp_path):
+    lines = [f"2016-01-{day}_{hour:02d}.00,{slot},{(slot + hour) % 2}" for day in (12, 13, 14) for hour in range(7, 20)
+             for slot in (1, 2)]  # fmt: skip
+    (tmp_path / "log.csv").write_text(
+        "datetime,slot_id,occupied\n" + "\n".join(lines).replace("_", "T").replace(".", ":")
+    )
+    mini = packaged_lot("mini")
+    pairs = [f"{slot},{1 + i % 2}" for i, slot in enumerate(mini.slot_ids)]
+    (tmp_path / "mapping.csv").write_text("slot_id,log_slot_id\n" + "\n".join(pairs))
+    with MapStore(tmp_path / "map.sqlite", mini) as store:
+        p_occupied = np.arange(10) % 2 * 0.98 + 0.01
+        store.add(Session("k", 86_400.0, "laser", "sunny", p_occupied, np.zeros((0, 3))))
+    made = make_scenario(
+        written(
+            tmp_path,
+            """
+            lot = "mini"
+            forecast = "map.sqlite"
+            [occupancy]
+            log = "log.csv"
+            mapping = "mapping.csv"
+            """,
+        )
+    )
+    assert isinstance(made.occupancy, RecordedOccupancy)
+    assert isinstance(made.prior, MapPrior)
+    assert made.forecast(TUESDAY_NOON).p_occupied.shape == (10,)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('lot = "mini"\n[costs]\nfailre_s = 5', "unknown key 'failre_s' in [costs]; did you mean 'failure_s'? known: "),
+        ('lto = "mini"', "unknown key 'lto'; did you mean 'lot'? known: name, lot, goal"),
+        ("goal = 0", "lot is missing"),
+        ('lot = "nowhere.geojson"', "lot.file is 'nowhere.geojson', want a file; there is none at /"),
+        ("lot = 5", "lot is 5, want a table"),
+        ('lot = { name = "mini", grid = { rows = 1, columns = 2 } }', "want exactly one of name, file, grid, city"),
+        ('lot = "mini"\nspeeds = { v_walk_kmh = -4 }', "speeds.v_walk_kmh is -4, want a number of at least 0.1"),
+        ('lot = "mini"\nspeeds = { v_drive_kmh = "fast" }', "speeds.v_drive_kmh is 'fast', want a number"),
+        ('lot = "mini"\nspeeds = { v_drive_kmh = true }', "speeds.v_drive_kmh is True, want a number"),
+        ('lot = "mini"\ncosts = { failure_s = nan }', "costs.failure_s is nan, want a finite number"),
+        ('lot = "mini"\ncosts = { give_up_s = inf }', "costs.give_up_s is inf, want a finite number"),
+        ("lot = { grid = { rows = 9000, columns = 9000 } }", "want rows times columns of at most 1000000 slots"),
+        ("lot = { city = { slots = 1000000000 } }", "lot.city.slots is 1000000000, want a number of at most 1000000"),
+        ('lot = "mini"\ngoal = 7', "goal is 7, want an index from 0 to 0"),
+        ('lot = "mini"\ngoal = [1.0]', "goal is [1.0], want the index of one of the lot's goals, or a point [x, y]"),
+        ('lot = "mini"\narrivals = { days = "mo" }', "arrivals.days is 'mo', want weekdays, weekend, all, or names"),
+        ('lot = "mini"\narrivals = { hours = "8-9" }', "arrivals.hours is '8-9', want HH:MM-HH:MM within one day"),
+        ('lot = "mini"\noccupancy = "busy"', "occupancy is 'busy', want typical, a process (.json), a recorded log"),
+        ('lot = "mini"\noccupancy = { mapping = "mine.toml" }', "want mapping only together with a log"),
+        ('lot = "mini"\nsensor_model = { hit_rate = 0.5 }', "want hit_rate and false_alarm_rate together"),
+        ('lot = "mini"\nname = "a/b"', "name is 'a/b', want at most 80 printable characters without comma or slash"),
+        ('lot = "mini', "not TOML: "),
+    ],
+)  # fmt: skip
+def test_bad_files_are_refused_in_one_line(tmp_path, text, message):
+    assert message in refusal(tmp_path, text)
+
+
+def test_files_that_are_none(tmp_path):
+    with pytest.raises(
+        InputError, match="unknown scenario 'campsu', and no such file; did you mean 'campus'"
+    ):
+        make_scenario("campsu")
+    with pytest.raises(InputError, match=r"nothing.toml: No such file"):
+        make_scenario(tmp_path / "nothing.toml")
+    (tmp_path / "mine.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(InputError, match="not a text file in UTF-8"):
+        make_scenario(tmp_path / "mine.toml")
+    with pytest.raises(InputError, match="has 5000000 bytes, want at most"):
+        make_scenario(written(tmp_path, " " * 5_000_000))
+    (tmp_path / "deep.json").write_text("[" * 100_000)
+    with pytest.raises(InputError, match="not JSON"):
+        make_scenario(tmp_path / "deep.json")
+    with pytest.raises(InputError, match="scenario is a int, want"):
+        make_scenario(5)
