@@ -1,4 +1,4 @@
-"""`parkenv/Drive-v0`: contract, goals, ends, tasks, determinism, state, faults."""
+"""`parkenv/Drive-v1`: contract, goals, ends, tasks, determinism, state, faults."""
 
 import json
 import math
@@ -23,7 +23,7 @@ from parkenv.lots import packaged_lot, write_lot
 from parkenv.world.lot import corner_points
 from sim_sensors.laser.scanner import LaserScanner
 
-ID = "parkenv/Drive-v0"
+ID = "parkenv/Drive-v1"
 LOTS = ("campus", "jam", "street", "mini")
 CAR = VehicleParameters()
 

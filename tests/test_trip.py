@@ -160,7 +160,7 @@ def test_a_lane_keeper_stays_near_its_path_at_any_speed_and_slows_down_in_turns(
 
 @pytest.mark.parametrize("name", ["mini", "campus"])
 def test_with_the_graphs_times_a_trip_is_the_search_itself(name):
-    """Replace what was driven by what the graph says, and every decision and second is that of Search-v0."""
+    """Replace what was driven by what the graph says, and every decision and second is that of Search-v1."""
     scenario = unseen(make_scenario(name))
     agent = make_agent("mdp", scenario)
     plain, driven = SearchEnv(scenario), DrivenSearchEnv(scenario, GraphDriver(scenario))

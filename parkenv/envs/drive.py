@@ -1,4 +1,4 @@
-"""`parkenv/Drive-v0`: drive the car into the slot."""
+"""`parkenv/Drive-v1`: drive the car into the slot."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
-    >>> env = gym.make("parkenv/Drive-v0", lot="campus", kinds=("oblique",))
+    >>> env = gym.make("parkenv/Drive-v1", lot="campus", kinds=("oblique",))
     >>> observation, info = env.reset(seed=0)
     >>> observation["achieved_goal"].shape
     (7,)
@@ -139,6 +139,7 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     ```
 
     ## Version history
+    - v1: the id rises with the other environments'.
     - v0: first version.
     """
 

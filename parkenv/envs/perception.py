@@ -1,4 +1,4 @@
-"""`parkenv/SearchPerception-v0`: the search with the real detection and mapping stack in the loop."""
+"""`parkenv/SearchPerception-v1`: the search with the real detection and mapping stack in the loop."""
 
 from __future__ import annotations
 
@@ -104,31 +104,31 @@ class Watcher:
 
 
 class SearchPerceptionEnv(SearchEnv):
-    """`parkenv/Search-v0` whose belief is what the detection and mapping stack makes of simulated sensors.
+    """`parkenv/Search-v1` whose belief is what the detection and mapping stack makes of simulated sensors.
 
     ## Description
-    World, decisions, rewards and observations are those of `parkenv/Search-v0`; equal seeds give equal worlds. But
+    World, decisions, rewards and observations are those of `parkenv/Search-v1`; equal seeds give equal worlds. But
     nobody tells the car which slots are taken: on the way of every step its camera and laser take pictures and scans
-    (as in `parkenv/SearchSensors-v0`), cars are detected and ranged, beams are followed into the slots, and what that
+    (as in `parkenv/SearchSensors-v1`), cars are detected and ranged, beams are followed into the slots, and what that
     says of each slot goes into the belief. So the car errs where its eyes do, and sees slots that no circle holds.
 
     ## Action space
-    `Discrete(5)`: up, down, left, right, park, as in `parkenv/Search-v0`.
+    `Discrete(5)`: up, down, left, right, park, as in `parkenv/Search-v1`.
 
     ## Observation space
-    As in `parkenv/Search-v0`: `vertex`, `time`, `p_occupied`, `action_mask`.
+    As in `parkenv/Search-v1`.
 
     ## Rewards
-    As in `parkenv/Search-v0`.
+    As in `parkenv/Search-v1`.
 
     ## Starting state
-    As in `parkenv/Search-v0`. The weather is drawn for each search unless it is given.
+    As in `parkenv/Search-v1`. The weather is drawn for each search unless it is given.
 
     ## Episode end
-    As in `parkenv/Search-v0`; *proven full* is what the stack takes for full.
+    As in `parkenv/Search-v1`; *proven full* is what the stack takes for full.
 
     ## Arguments
-    - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v0`. Its `sighting` is what the
+    - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v1`. Its `sighting` is what the
       car takes its eyes to be worth, and how far away slots may be of which it takes note; where that is perfect,
       what was measured of the rig (`SensorModel.named`).
     - `rig`: laser (the thesis's: a camera and a 270° laser), stereo, both_sides, or a `sim_sensors.rig.SensorRig`
@@ -141,7 +141,7 @@ class SearchPerceptionEnv(SearchEnv):
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
-    >>> env = gym.make("parkenv/SearchPerception-v0", scenario="mini", weather="sunny")
+    >>> env = gym.make("parkenv/SearchPerception-v1", scenario="mini", weather="sunny")
     >>> observation, info = env.reset(seed=0)
     >>> observation, reward, terminated, truncated, info = env.step(3)
     >>> observation["p_occupied"].shape
@@ -150,6 +150,7 @@ class SearchPerceptionEnv(SearchEnv):
     ```
 
     ## Version history
+    - v1: observations gain `belief`.
     - v0: first version.
     """
 

@@ -1,4 +1,4 @@
-"""`parkenv/SearchSensors-v0`: the search through raw sensors."""
+"""`parkenv/SearchSensors-v1`: the search through raw sensors."""
 
 from __future__ import annotations
 
@@ -18,20 +18,22 @@ from sim_sensors.rig import SensorRig
 FARTHEST = 1e7
 """Bound, m, of the observed positions: Gymnasium wants one, and no lot is as large."""
 
+_NOT_SENSED = ("p_occupied", "belief")
+
 
 class SearchSensorsEnv(SearchEnv):
-    """`parkenv/Search-v0` for those who bring their own eyes: images, scans and poses instead of a belief.
+    """`parkenv/Search-v1` for those who bring their own eyes: images, scans and poses instead of a belief.
 
     ## Description
-    World, decisions, rewards and ends are those of `parkenv/Search-v0`; equal seeds give equal worlds. What the
+    World, decisions, rewards and ends are those of `parkenv/Search-v1`; equal seeds give equal worlds. What the
     car sees is measured by simulated sensors on the way: up to `captures` times on every edge, evenly, the last
     time where it stops. The vehicle stands on its vertex (x, y) and looks along the lane; between two vertices
     it looks where it drives. One capture is made where the search starts, and one after waiting or a failed try.
 
-    Where nothing has been forecast, an agent can read the forecast in `parkenv/Search-v0`'s first observation.
+    Where nothing has been forecast, an agent can read the forecast in `parkenv/Search-v1`'s first observation.
 
     ## Action space
-    `Discrete(5)`: up, down, left, right, park, as in `parkenv/Search-v0`.
+    `Discrete(5)`: up, down, left, right, park, as in `parkenv/Search-v1`.
 
     ## Observation space
     A `Dict`; K = `captures`, newest last; rows from `count` on are 0.
@@ -52,16 +54,16 @@ class SearchSensorsEnv(SearchEnv):
     and how they are built is `env.unwrapped.rig`. The thesis's rig has `image.right` and `scan.laser`.
 
     ## Rewards
-    As in `parkenv/Search-v0`.
+    As in `parkenv/Search-v1`.
 
     ## Starting state
-    As in `parkenv/Search-v0`. The weather is drawn for each search unless it is given.
+    As in `parkenv/Search-v1`. The weather is drawn for each search unless it is given.
 
     ## Episode end
-    As in `parkenv/Search-v0`; the lot is proven full by that environment's perfect looks.
+    As in `parkenv/Search-v1`; the lot is proven full by that environment's perfect looks.
 
     ## Arguments
-    - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v0`. `traffic=Traffic(cars=4,
+    - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v1`. `traffic=Traffic(cars=4,
       pedestrians=6)` lets others drive and walk through the pictures.
     - `rig`: laser (the thesis's: a camera and a 270° laser), stereo, both_sides, or a `sim_sensors.rig.SensorRig`.
     - `weather`: sunny, overcast, low_sun, dusk or rain; None draws one.
@@ -71,7 +73,7 @@ class SearchSensorsEnv(SearchEnv):
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
-    >>> env = gym.make("parkenv/SearchSensors-v0", scenario="mini", captures=2)
+    >>> env = gym.make("parkenv/SearchSensors-v1", scenario="mini", captures=2)
     >>> observation, info = env.reset(seed=0)
     >>> observation["image.right"].shape, observation["scan.laser"].shape, int(observation["count"])
     ((2, 480, 640, 3), (2, 1081), 1)
@@ -79,6 +81,7 @@ class SearchSensorsEnv(SearchEnv):
     ```
 
     ## Version history
+    - v1: the id rises with `parkenv/Search-v1`.
     - v0: first version.
     """
 
@@ -98,7 +101,7 @@ class SearchSensorsEnv(SearchEnv):
         self._moments: list[Moment] = []
         k = self._lookout.captures
         seen: dict[str, spaces.Space[Any]] = {
-            name: space for name, space in self.observation_space.items() if name != "p_occupied"
+            name: space for name, space in self.observation_space.items() if name not in _NOT_SENSED
         }
         seen["count"] = spaces.Discrete(k + 1)
         seen["pose"] = spaces.Box(-FARTHEST, FARTHEST, (k, 3), np.float32)
@@ -132,7 +135,8 @@ class SearchSensorsEnv(SearchEnv):
     def _observation(self, state: SearchState) -> dict[str, Any]:
         self._moments = [] if state.parked else self._lookout.look(state, self._before)
         observation = super()._observation(state)
-        del observation["p_occupied"]
+        for name in _NOT_SENSED:
+            del observation[name]
         for name, space in self.observation_space.items():
             if name not in observation:
                 observation[name] = np.zeros(space.shape, space.dtype)

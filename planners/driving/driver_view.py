@@ -1,4 +1,4 @@
-"""What a driver that learns sees of `parkenv/Drive-v0`, and what its decisions make the car do.
+"""What a driver that learns sees of `parkenv/Drive-v1`, and what its decisions make the car do.
 
 It sees how much room there is in every direction, from a car's outline to the nearest of the others', and decides how
 fast to go and where to steer for the next 0.4 s. Where it is and where it is to stand, it reads off the goals.

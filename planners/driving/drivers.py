@@ -1,4 +1,4 @@
-"""Who can park in `parkenv/Drive-v0`, by name."""
+"""Who can park in `parkenv/Drive-v1`, by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A model that `parkenv train --env drive` made, at the wheel of `parkenv/Drive-v0`."""
+"""A model that `parkenv train --env drive` made, at the wheel of `parkenv/Drive-v1`."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class LearnedDriver:
         """stable-baselines3's interface: single observations, or batches of them with a leading axis.
 
         Args:
-            observation: from `parkenv/Drive-v0` with `obstacle_map=True`, or a vector of them.
+            observation: from `parkenv/Drive-v1` with `obstacle_map=True`, or a vector of them.
             state: what the last call returned; None at the start.
             episode_start: for each environment, whether its episode has just begun. With None, it has
                 where there is no state.

@@ -55,7 +55,7 @@ class ParkingMemory:
 
 
 class ParkingAgent:
-    """Parks in `parkenv/Drive-v0`: hybrid A*, Reeds-Shepp, and a tracking controller.
+    """Parks in `parkenv/Drive-v1`: hybrid A*, Reeds-Shepp, and a tracking controller.
 
     It knows the car, and of the world what the observation says: where the car and the slot are, and, with
     `obstacle_map=True`, the outlines of parked cars, kerbs and walls, and of those who move, for whom it waits.
@@ -88,7 +88,7 @@ class ParkingAgent:
         """stable-baselines3's interface: single observations, or batches of them with a leading axis.
 
         Args:
-            observation: from `parkenv/Drive-v0` with `obstacle_map=True`, or a vector of them.
+            observation: from `parkenv/Drive-v1` with `obstacle_map=True`, or a vector of them.
             state: what the last call returned; None at the start.
             episode_start: for each environment, whether its episode has just begun. With None, it has
                 where there is no state.

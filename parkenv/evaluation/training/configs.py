@@ -105,7 +105,7 @@ CURRICULUM = (
     Stage(WAY_IN, (8.0, 14.0), 0.0),
     Stage("lane", (4.0, 14.0), 0.0),
 )
-"""From a step before the slot to the task itself, that of `parkenv/Drive-v0` as it is.
+"""From a step before the slot to the task itself, that of `parkenv/Drive-v1` as it is.
 
 A random drive out of a parallel slot stays in it, and teaches to put right how one stands there; what lies between the
 slot and the lane is learned along the planner's way, from its end backward.

@@ -1,4 +1,4 @@
-"""Many drives of `parkenv/Drive-v0` at once, compiled: what learners practise on.
+"""Many drives of `parkenv/Drive-v1` at once, compiled: what learners practise on.
 
 The car, its limits, the tasks, the goals and the rewards are the environment's own. Contacts are not asked of pymunk,
 but counted where an outline crosses the car's, so that a touch within a hair may be judged otherwise. What learners

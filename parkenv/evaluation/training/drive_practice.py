@@ -56,7 +56,7 @@ class Place:
     def tasks(
         self, slack: float = 0.0, distance: tuple[float, float] = (4.0, 14.0), starts: str = "lane"
     ) -> ParkingTasks:
-        """Tasks there; by default those of `parkenv/Drive-v0`."""
+        """Tasks there; by default those of `parkenv/Drive-v1`."""
         return ParkingTasks(self.lot, kinds=(self.kind,), slack=slack, distance=distance, starts=starts)
 
 
@@ -103,7 +103,7 @@ class DrivePractice(SharedVecEnv):
 
     Each kind of slot is at a level of its own, and begins at the first. A level is mastered when of the last `TRIED`
     drives at it `MASTERED` parked. `SHARES` of the drives are of the level, of easier ones, and of the last one, which
-    is the task of `parkenv/Drive-v0` itself. The more levels a kind has before it, the more often it is driven into.
+    is the task of `parkenv/Drive-v1` itself. The more levels a kind has before it, the more often it is driven into.
     A drive that is not over after `MOST_DECISIONS`, or in which the car has stood for `STOOD` of them, is cut off.
 
     With the `sparse` reward, a decision costs its 0.4 s, whole, unless it ends in the slot, so that `compute_reward`

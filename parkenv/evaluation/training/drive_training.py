@@ -1,4 +1,4 @@
-"""Training for `parkenv/Drive-v0`: how many parkings succeed counts, by kind of slot."""
+"""Training for `parkenv/Drive-v1`: how many parkings succeed counts, by kind of slot."""
 
 from __future__ import annotations
 

@@ -39,17 +39,17 @@ from sim_sensors.rig import SensorRig
 
 
 class DrivenSearchEnv(SearchEnv):
-    """`parkenv/Search-v0` in which time passes as it does on the road.
+    """`parkenv/Search-v1` in which time passes as it does on the road.
 
-    World, observations and decisions are those of `parkenv/Search-v0`. What an edge, a try and the parking take is
+    World, observations and decisions are those of `parkenv/Search-v1`. What an edge, a try and the parking take is
     asked of a driver; a try fails as well where the car does not get into a free slot, which it then holds for taken.
     The time of the manoeuvre into the slot counts as driven.
 
     Args:
         scenario: the scenario.
-        driver: who drives; with a `GraphDriver` this is `parkenv/Search-v0` itself.
+        driver: who drives; with a `GraphDriver` this is `parkenv/Search-v1` itself.
         watcher: sensors that ride along, whose scenario this is: then the belief is what they make of what they measure
-            where the car really was, as in `parkenv/SearchPerception-v0`. Without, slots are seen from the vertices,
+            where the car really was, as in `parkenv/SearchPerception-v1`. Without, slots are seen from the vertices,
             as the scenario's sighting model has it.
     """
 
@@ -192,7 +192,7 @@ class DrivenSearch:
         style: how it is driven.
         rig: sensors that ride along and tell the car which slots are taken: laser, stereo, both_sides, or a
             `sim_sensors.rig.SensorRig`; None where the scenario's sighting model stands for them.
-        weather: as of `parkenv/SearchPerception-v0`.
+        weather: as of `parkenv/SearchPerception-v1`.
         captures: how many there are at most on an edge.
 
     Raises:
