@@ -86,7 +86,7 @@ def test_slots_have_the_colour_of_the_belief_and_cars_stand_where_the_truth_is_t
     state = stand_in(env, p_occupied=np.linspace(0, 1, 10), seen=np.arange(10) >= 5)
     occupied = np.arange(10) % 2 == 1
     frame = renderer.frame(state, occupied)
-    colors = belief_colors(state.belief.p_occupied, state.belief.seen)
+    colors = belief_colors(state.belief.p_occupied, state.belief.observed)
     for slot in range(10):
         edge = frame[middle_of_slot(renderer, state, slot, along=2.3)]
         assert np.abs(edge.astype(int) - colors[slot]).max() <= 2

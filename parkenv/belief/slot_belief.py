@@ -63,18 +63,21 @@ class SlotBelief:
             InputError: the observation is of another environment.
         """
         try:
-            return cls(
-                observation["forecast"],
-                observation["decay_rate"],
-                observation["p_occupied"],
-                observation["p_observed"],
-                observation["observed_at"],
-                float(observation["time"][1]),
-            )
+            forecast, decay_rate, p_observed, observed_at = observation["belief"].reshape(4, -1)
+            p_occupied, time = observation["p_occupied"], float(observation["time"][1])
         except KeyError as error:
             raise InputError(
                 f"observation has no {error.args[0]!r}; want one of parkenv/Search-v1, got {', '.join(observation)}"
             ) from None
+        return cls(forecast, decay_rate, p_occupied, p_observed, observed_at, time)
+
+    def to_observation(self) -> dict[str, NDArray[np.float32]]:
+        """Return the entries of an observation that state this belief: `p_occupied` and `belief`, float32."""
+        parts = (self.forecast, self.decay_rate, self.p_observed, self.observed_at)
+        return {
+            "p_occupied": self.p_occupied.astype(np.float32),
+            "belief": np.concatenate(parts).astype(np.float32),
+        }
 
     @classmethod
     def of_forecast(cls, p_occupied: ArrayLike, decay_rate: ArrayLike) -> Self:

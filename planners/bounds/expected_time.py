@@ -109,16 +109,9 @@ class _Histories:
         return slots[starts[vertex] : starts[vertex + 1]]
 
     def _observation(self, vertex: int, belief: SlotBelief) -> dict[str, Any]:
-        arrays = {
-            "forecast": belief.forecast,
-            "decay_rate": belief.decay_rate,
-            "p_occupied": belief.p_occupied,
-            "p_observed": belief.p_observed,
-            "observed_at": belief.observed_at,
-        }
         return {
             "vertex": np.int64(vertex),
             "time": np.array([belief.time, belief.time], dtype=np.float32),
             "action_mask": self.masks[vertex].copy(),
-            **{name: array.astype(np.float32) for name, array in arrays.items()},
+            **belief.to_observation(),
         }

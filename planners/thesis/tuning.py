@@ -222,7 +222,7 @@ class TunedAgent(SearchAgent[TunedPlan]):
         most_vertices: int = MOST_VERTICES,
     ) -> None:
         super().__init__(problem)
-        require_sight(self.name, problem)
+        require_observations(self.name, problem)
         if worlds < 1:
             raise InputError(f"worlds is {worlds}, want at least 1")
         self.worlds, self.seed, self.gamma = worlds, seed, gamma

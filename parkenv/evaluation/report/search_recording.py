@@ -125,7 +125,7 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
         "view_range_m": round(float(scenario.sensor_model.view_range), 2),
         "v_walk": round(float(scenario.v_walk), 4),
         "sensors": first.rig,
-        "forecast": _bytes(state.belief.prior),
+        "forecast": _bytes(state.belief.forecast),
         **_truth(state.world, scenario.lot.n_slots, start, sorted(moments)),
     }
     return {"lot": describe_lot(scenario.lot), "world": world, "searches": searches}
@@ -167,7 +167,7 @@ class SearchRecorder(Observer):
         del observation
         self.state = env.unwrapped.state  # type: ignore[attr-defined]
         belief = self.state.belief
-        self._known = np.array(_bytes(belief.prior))
+        self._known = np.array(_bytes(belief.forecast))
         self._seen = np.zeros(len(self._known), dtype=np.bool_)
         self._plan = [-1]
         self._rows: dict[str, list[Any]] = {
@@ -208,8 +208,8 @@ class SearchRecorder(Observer):
         rows["vertex"].append(state.vertex)
         rows["failed"].append(round(100 * failed_s))
         rows["belief"].append(np.stack([changed, now[changed]], axis=1).ravel().tolist())
-        rows["seen"].append(np.flatnonzero(belief.seen & ~self._seen).tolist())
-        self._known, self._seen = now, self._seen | belief.seen
+        rows["seen"].append(np.flatnonzero(belief.observed & ~self._seen).tolist())
+        self._known, self._seen = now, self._seen | belief.observed
 
 
 def _bytes(p: NDArray[np.floating]) -> list[int]:
