@@ -148,6 +148,7 @@ def test_figures_and_occupancy_levels(tmp_path):
     assert pictures == [
         "searches_mini_failure10_walk4_drive10.png",
         "time_against_occupancy_mini.png",
+        "time_distribution_failure10_walk4_drive10.png",
         "time_split_mini.png",
     ]
     swept = json.loads((tmp_path / "summary.json").read_text())["occupancy_rows"]

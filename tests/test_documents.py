@@ -1,5 +1,6 @@
 """What README, documentation and contributing guide print must be true."""
 
+import os
 import re
 import shlex
 import subprocess
@@ -46,21 +47,40 @@ def test_the_ten_lines_run_as_printed():
     subprocess.run([sys.executable, "-c", imports + more], timeout=600, check=True)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in PAGES if name != "README.md"])
-def test_the_code_of_a_page_runs_from_top_to_bottom(name, tmp_path):
-    """Blocks of `python` and `bash` are run; those of `sh` need data, an installation or hours."""
-    (tmp_path / "examples").symlink_to(ROOT / "examples")
-    program = ["import os, subprocess, sys"]
-    parkenv = f"{sys.executable} -c 'from parkenv.cli import main; main()'"
-    for language, block in blocks(PAGES[name], "python|bash"):
+def program_of(page):
+    """Blocks of `python` and `bash` as one program; those of `sh` need data, an installation or hours."""
+    program = []
+    for language, block in blocks(page, "python|bash"):
         if language == "python":
             program.append(block)
         elif "pip install" not in block:
-            script = f'set -e\nparkenv() {{ {parkenv} "$@"; }}\n{block}'
-            program.append(f"subprocess.run(['bash', '-c', {script!r}], check=True)")
+            for line in block.replace("\\\n", " ").splitlines():
+                name, *arguments = shlex.split(line, comments=True)
+                assert name == "parkenv", f"{line}: what is no command of ours stands in a block of sh"
+                program.append(
+                    f"done = run_parkenv(*{arguments!r})\nassert done.returncode == 0, done.stderr"
+                )
+    return "\n".join(program)
+
+
+PROGRAMS = {
+    name: program for name, page in PAGES.items() if name != "README.md" and (program := program_of(page))
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_the_code_of_a_page_runs_from_top_to_bottom(name, tmp_path):
+    """In a process of its own for each page, which has its own folder, modules and registered environments."""
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    path = os.pathsep.join(filter(None, [str(ROOT / "tests"), os.environ.get("PYTHONPATH")]))
     done = subprocess.run(
-        [sys.executable, "-c", "\n".join(program)], cwd=tmp_path, capture_output=True, text=True, timeout=1800
+        [sys.executable, "-c", f"from command_line import parkenv as run_parkenv\n{PROGRAMS[name]}"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        timeout=1800,
     )
     assert done.returncode == 0, f"{done.stdout[-1000:]}\n{done.stderr[-3000:]}"
 

@@ -7,11 +7,16 @@ from matplotlib.figure import Figure
 
 from parkenv import make_scenario
 from parkenv.errors import InputError
+from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.episodes import EpisodeRunner, SearchTrace
+from parkenv.evaluation.experiments.results import episode_key
 from parkenv.evaluation.figures import time_figures
+from parkenv.evaluation.figures.picture_files import INK, save_picture
 from parkenv.evaluation.figures.rates_picture import save_rates
-from parkenv.evaluation.figures.search_pictures import BELIEF_MAP, draw_search, save_searches
-from parkenv.evaluation.figures.time_figures import AGENT_COLORS, save_time_against_occupancy, save_time_split
+from parkenv.evaluation.figures.registry import FIGURES, ComparisonResults, draw_figures, remove_figures
+from parkenv.evaluation.figures.search_pictures import BELIEF_MAP, draw_search, draw_searches
+from parkenv.evaluation.figures.time_distribution import draw_time_distribution
+from parkenv.evaluation.figures.time_figures import AGENT_COLORS, draw_time_against_occupancy, draw_time_split
 from parkenv.lots import grid_lot
 from parkenv.world.occupancy import OccupancyProcess
 from planners.agent import AGENT_NAMES, make_agent
@@ -59,10 +64,10 @@ def test_time_split_has_a_panel_for_each_setting(tmp_path, panels, monkeypatch):
     titles = []
     monkeypatch.setattr(time_figures, "_draw_split", lambda ax, rows, limit: titles.append(len(rows)))
     rows = [row(name, failure_cost_s=float(c)) for c in range(panels) for name in ("mdp", "random", "oracle")]
-    save_time_split(rows, tmp_path / "split.png")
+    save_picture(draw_time_split(rows), tmp_path / "split.png")
     assert titles == [3] * panels
     monkeypatch.undo()
-    save_time_split(rows, tmp_path / "split.png")
+    save_picture(draw_time_split(rows), tmp_path / "split.png")
     height, width = picture(tmp_path / "split.png").shape[:2]
     assert 900 <= width <= 2000
     assert 200 <= height <= 2000
@@ -93,8 +98,8 @@ def test_nothing_is_cut_where_agents_are_alike():
 def test_a_single_search_has_no_interval(tmp_path, interval):
     alone = row(total_s_ci95=interval, episodes=1)
     assert time_figures._interval(alone) == (95.0, 95.0)
-    save_time_split([alone], tmp_path / "split.png")
-    save_time_against_occupancy([alone | {"occupancy": 0.9}], tmp_path / "occupancy.png")
+    save_picture(draw_time_split([alone]), tmp_path / "split.png")
+    save_picture(draw_time_against_occupancy([alone | {"occupancy": 0.9}]), tmp_path / "occupancy.png")
     picture(tmp_path / "split.png")
     picture(tmp_path / "occupancy.png")
 
@@ -102,7 +107,7 @@ def test_a_single_search_has_no_interval(tmp_path, interval):
 def test_rows_without_a_bound_are_drawn(tmp_path):
     rows = [row()]
     del rows[0]["bound_s"]
-    save_time_split(rows, tmp_path / "split.png")
+    save_picture(draw_time_split(rows), tmp_path / "split.png")
     picture(tmp_path / "split.png")
 
 
@@ -121,9 +126,8 @@ def test_lines_against_occupancy_are_labelled_where_they_end(tmp_path):
     assert [to_hex(line.get_color()) for line in ax.lines] == [
         AGENT_COLORS[a] for a in ("mdp", "oracle", "random")
     ]
-    save_time_against_occupancy(
-        [r | {"failure_cost_s": c} for r in rows for c in (10.0, 90.0)], tmp_path / "occupancy.png"
-    )
+    swept = [r | {"failure_cost_s": c} for r in rows for c in (10.0, 90.0)]
+    save_picture(draw_time_against_occupancy(swept), tmp_path / "occupancy.png")
     height, width = picture(tmp_path / "occupancy.png").shape[:2]
     assert width == 1500
     assert 400 < height < 800
@@ -186,18 +190,17 @@ def test_a_search_that_gave_up_or_never_moved_is_drawn(tmp_path):
         "parked": False,
     }
     still = SearchTrace(scenario, "random", [entry], np.ones(n, bool), np.full(n, 0.9), None, metrics)
-    save_searches([still], tmp_path / "search.png")
+    save_picture(draw_searches([still]), tmp_path / "search.png")
     picture(tmp_path / "search.png")
     ax = axes()
     draw_search(still, ax)
-    assert "1800 gave up" in ax.get_title(loc="left").replace("\n", " ")
+    assert "1800 give-up penalty" in ax.get_title(loc="left").replace("\n", " ")
 
 
 @pytest.mark.parametrize("n", [1, 2, 3, 4])
 def test_searches_of_any_number_are_laid_out(tmp_path, n):
-    save_searches(
-        [trace(name) for name in ("mdp", "greedy-goal", "first-free", "oracle")[:n]], tmp_path / "s.png"
-    )
+    traces = [trace(name) for name in ("mdp", "greedy-goal", "first-free", "oracle")[:n]]
+    save_picture(draw_searches(traces), tmp_path / "s.png")
     height, width = picture(tmp_path / "s.png").shape[:2]
     assert 1000 <= width <= 2400
     assert 600 <= height <= 2600
@@ -220,20 +223,75 @@ def test_rates_are_drawn(tmp_path):
     picture(tmp_path / "rates.png")
 
 
-@pytest.mark.parametrize("save", [save_time_split, save_time_against_occupancy, save_searches])
-def test_nothing_to_draw_is_refused(tmp_path, save):
+@pytest.mark.parametrize("draw", [draw_time_split, draw_time_against_occupancy, draw_searches])
+def test_nothing_to_draw_is_refused(draw):
     with pytest.raises(InputError, match="no "):
-        save([], tmp_path / "x.png")
-    assert not list(tmp_path.iterdir())
+        draw([])
 
 
 def test_a_place_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises(InputError, match=r"missing/x\.png: cannot be written"):
-        save_time_split([row()], tmp_path / "missing" / "x.png")
+        save_picture(draw_time_split([row()]), tmp_path / "missing" / "x.png")
 
 
 def test_figures_come_out_the_same_and_leave_nothing_beside(tmp_path):
     for name in ("a.png", "b.png"):
-        save_time_split([row(), row("oracle")], tmp_path / name)
+        save_picture(draw_time_split([row(), row("oracle")]), tmp_path / name)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.png", "b.png"]
+
+
+def test_the_distribution_rises_by_one_search_at_its_total_time_and_marks_the_mean():
+    quick, slow = np.array([30.0, 10.0, 20.0, 20.0]), np.array([40.0, 50.0, 60.0, 900.0])
+    ax = draw_time_distribution({"campus": {"mdp": quick, "oracle": slow}}).axes[0]
+    curves = {
+        to_hex(line.get_color()): line.get_xydata() for line in ax.lines if line.get_drawstyle() != "default"
+    }
+    dots = {to_hex(line.get_color()): line for line in ax.lines if line.get_drawstyle() == "default"}
+    end = ax.get_xlim()[1]
+    assert 60.0 < end < 200.0, "one long search does not squash the rest"
+    for name, times in (("mdp", quick), ("oracle", slow)):
+        color = AGENT_COLORS["mdp"] if name == "mdp" else INK
+        x, share = curves[color].T
+        for limit in (10.0, 20.0, 25.0, 55.0):
+            assert share[x <= limit][-1:].sum() == 100.0 * np.mean(times <= limit)
+        (at,), (height,) = dots[color].get_data()
+        assert at == min(times.mean(), end)
+        assert height == 100.0 * np.mean(times <= at)
+    assert dots[AGENT_COLORS["mdp"]].get_marker() == "o"
+    assert dots[INK].get_marker() == ">", "its mean is beyond the axis"
+    assert "12 % longer, up to 900 s" in ax.get_xlabel()
+
+
+@pytest.mark.parametrize("panels", [1, 2, 4, 5])
+def test_distributions_of_any_number_of_scenarios_are_laid_out(tmp_path, panels):
+    totals = {name: np.linspace(30.0, 90.0, 10) for name in ("mdp", "random", "oracle")}
+    save_picture(draw_time_distribution({f"lot {i}": totals for i in range(panels)}), tmp_path / "d.png")
+    height, width = picture(tmp_path / "d.png").shape[:2]
+    assert 600 <= width <= 1500
+    assert 400 <= height <= 1500
+
+
+def test_every_registered_figure_can_be_drawn_and_only_those_are_removed(tmp_path):
+    mini = make_scenario("mini")
+    cases = [(Case(mini, name), range(2)) for name in ("mdp", "first-free")]
+    rows = {case.agent: case.run(seeds)[0] for case, seeds in cases}
+    episodes = {episode_key(row): row for its in rows.values() for row in its}
+    table = [{**row(case.agent), "scenario": "mini"} for case, _ in cases]
+    results = ComparisonResults(cases, episodes, table)
+    files = draw_figures(results, tmp_path)
+    assert sorted(files) == sorted(tmp_path.iterdir())
+    drawn = {kind.name for kind in FIGURES if any(file.name.startswith(kind.name) for file in files)}
+    assert drawn == {kind.name for kind in FIGURES} - {"time_against_failure_cost", "time_against_map"}
+    (tmp_path / "map.png").touch()
+    remove_figures(tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["map.png"]
+
+
+def test_only_asked_for_figures_are_drawn(tmp_path):
+    flat = {"mini-map-says-0.5": ("mini", 0.5)}
+    table = [row(name, scenario=s) for name in ("mdp", "oracle") for s in ("mini", *flat)]
+    files = draw_figures(
+        ComparisonResults([], {}, table, (), flat), tmp_path, ("time_split", "time_against_map")
+    )
+    assert [file.name for file in files] == ["time_split_mini.png", "time_against_map_mini.png"]

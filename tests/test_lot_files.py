@@ -462,7 +462,7 @@ FAULTS = [
     (
         set_feature(0, "slot", "Polygon", box(10, 3, 12.5, 8), id="b"),
         1,
-        "slot: id 'b' stands already at feature 0",
+        "slot: id 'b' appears already in feature 0",
     ),
     (set_feature(0, "slot", "Polygon", box(10, 3, 12.5, 8), id=[1]), 0, "slot: id is [1], want a text"),
     (
@@ -631,8 +631,8 @@ def test_slots_that_cannot_be_reached_or_left_are_warned_of(tmp_path):
     ]
     problems = check_lot(written(tmp_path, doc))
     assert [(p.feature, p.message) for p in problems] == [
-        (9, "slot 'upstream': no way leads there from an entry"),
-        (7, "slot 'trap': no way leads on to another slot"),
+        (9, "slot 'upstream': cannot be reached from an entry"),
+        (7, "slot 'trap': no other slot can be reached from it"),
     ]
 
 
@@ -645,7 +645,7 @@ def test_entries_that_lead_to_no_slot_are_warned_of(tmp_path):
         feature("entry", "Point", [99, 0]),
     ]
     problems = check_lot(written(tmp_path, doc))
-    assert [(p.feature, p.message) for p in problems] == [(8, "entry: no way leads from it to a slot")]
+    assert [(p.feature, p.message) for p in problems] == [(8, "entry: no slot can be reached from it")]
 
 
 def test_lanes_that_share_a_point_are_not_warned_of(tmp_path):

@@ -299,7 +299,7 @@ def test_the_observed_belief_explains_p_occupied(noisy):
 def test_old_ids_are_not_registered():
     for name in ("Search", "SearchSensors", "SearchPerception", "Drive"):
         with (
-            pytest.warns(DeprecationWarning),
+            pytest.warns(DeprecationWarning, match="out of date"),
             pytest.raises(gym.error.DeprecatedEnv, match=f"parkenv/{name}-v1"),
         ):
             gym.make(f"parkenv/{name}-v0")

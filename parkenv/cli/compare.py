@@ -165,6 +165,7 @@ def compare(
     """
     from parkenv.evaluation.experiments.compare import check_worlds, table
     from parkenv.evaluation.experiments.results import ResultFolder
+    from parkenv.evaluation.figures.registry import ComparisonResults, draw_figures, remove_figures
     from parkenv.world.scenario import KMH
 
     if rerun is not None:
@@ -210,6 +211,7 @@ def compare(
     console = make_console()
     with args.workers_of(jobs, backend, address) as workers:
         folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)
+        remove_figures(out)
         interrupted = run_with_bar(console, cases + sweep, folder, workers)
 
     rows, sweep_rows = table(cases, folder), table(sweep, folder)
@@ -238,13 +240,8 @@ def compare(
         raise typer.Exit(130)
     if figures:
         with console.status("Drawing figures"):
-            if sweeps:
-                _draw_sweep(out, rows)
-            else:
-                drawn = [(case, its) for case, its in cases if case.scenario.name not in maps]
-                _draw(out, [r for r in rows if r["scenario"] not in maps], sweep_rows, drawn, folder, seed)
-            if maps:
-                _draw_maps(out, rows, {name: said for name, (_, said) in maps.items()})
+            flat = {name: (name.partition(MAP_SAYS)[0], said) for name, (_, said) in maps.items()}
+            draw_figures(ComparisonResults(cases, folder.episodes, rows, sweep_rows, flat, seed), out)
     console.print(f"Episodes, summary and figures are in {out}")
     if rerun is not None:
         with console.status(f"Searching the first search once more for {rerun}"):
@@ -496,65 +493,3 @@ def _interval(mean: float, ends: list[float], *, signed: bool = False) -> str:
 def _seconds(value: float, signed: bool = False) -> str:
     # Adding zero turns the -0.0 of a rounded difference into 0.0.
     return f"{round(value, 1) + 0.0:{'+' if signed else ''}{'.0f' if abs(value) >= 1000 else '.1f'}}"
-
-
-PICTURED = ("greedy-goal", "first-free", "oracle")
-"""Agents whose paths are drawn beside the first agent's."""
-
-
-def _draw_maps(out: Path, rows: list[Any], said: dict[str, float]) -> None:
-    from parkenv.evaluation.figures.time_figures import save_time_against_map
-
-    # At the first of the costs and speeds, whatever else was asked for.
-    setting = {c: rows[0][c] for c in ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")}
-    rows = [row for row in rows if setting.items() <= row.items()]
-    for name in dict.fromkeys(flat.partition(MAP_SAYS)[0] for flat in said):
-        flat = [
-            row for row in rows if row["scenario"].partition(MAP_SAYS)[0] == name and row["scenario"] in said
-        ]
-        own = [row for row in rows if row["scenario"] == name]
-        path = out / f"time_against_map_{name}.png"
-        save_time_against_map(flat, own, lambda row: said[row["scenario"]], path)
-
-
-def _draw_sweep(out: Path, rows: list[Any]) -> None:
-    from parkenv.evaluation.experiments.compare import UNSEEN
-    from parkenv.evaluation.figures.time_figures import save_time_against_failure_cost
-
-    for name in dict.fromkeys(row["scenario"].removesuffix(UNSEEN) for row in rows):
-        seen, unseen = ([r for r in rows if r["scenario"] == n] for n in (name, name + UNSEEN))
-        save_time_against_failure_cost(seen, unseen, out / f"time_against_failure_cost_{name}.png")
-
-
-def _draw(
-    out: Path, rows: list[Any], sweep_rows: list[Any], cases: list[Any], folder: Any, seed: int
-) -> None:
-    from parkenv.evaluation.experiments.compare import against_occupancy
-    from parkenv.evaluation.figures.search_pictures import save_searches
-    from parkenv.evaluation.figures.time_figures import save_time_against_occupancy, save_time_split
-
-    for name in dict.fromkeys(row["scenario"] for row in rows):
-        save_time_split([r for r in rows if r["scenario"] == name], out / f"time_split_{name}.png")
-        swept = [{**r, "occupancy": r["occupancy_level"]} for r in sweep_rows if r["scenario"] == name]
-        if not swept:
-            # As the sweep: at the first of the speeds, whatever else was asked for.
-            shown = [(c, seeds) for c, seeds in cases if c.scenario.name == name]
-            speeds = shown[0][0].scenario.v_walk, shown[0][0].scenario.v_drive
-            recorded = [
-                folder.episodes[c.key(s)]
-                for c, seeds in shown
-                for s in seeds
-                if (c.scenario.v_walk, c.scenario.v_drive) == speeds
-            ]
-            swept = against_occupancy(recorded, (0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001))
-        if swept:
-            save_time_against_occupancy(swept, out / f"time_against_occupancy_{name}.png")
-        settings: dict[tuple[Any, ...], list[Any]] = {}
-        for case, _ in cases:
-            if case.scenario.name == name:
-                c = case.columns
-                settings.setdefault((c["failure_cost_s"], c["v_walk_kmh"], c["v_drive_kmh"]), []).append(case)
-        for (failure, walk, drive), its_cases in settings.items():
-            drawn = [its_cases[0], *(c for c in its_cases[1:] if c.agent in PICTURED)]
-            file = out / f"searches_{name}_failure{failure:g}_walk{walk:g}_drive{drive:g}.png"
-            save_searches([case.trace(seed) for case in drawn], file)

@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from parkenv.world.scenario import Scenario
 
 AGENTS = ("mdp", "greedy-goal", "greedy-drive", "first-free")
+FIGURES = ("time_split", "time_distribution")
+"""Of `parkenv.evaluation.figures.registry`."""
 
 
 def demo(
@@ -56,8 +58,8 @@ def demo(
     from parkenv.evaluation.experiments.compare import run_cases, table
     from parkenv.evaluation.experiments.results import ResultFolder, make_folder
     from parkenv.evaluation.experiments.surveys import run_survey, summarize
+    from parkenv.evaluation.figures.registry import ComparisonResults, draw_figures
     from parkenv.evaluation.figures.survey_pictures import save_detections, save_map, save_session
-    from parkenv.evaluation.figures.time_figures import save_time_split
     from parkenv.evaluation.trips.sensor_log import require_viewer
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
@@ -103,7 +105,7 @@ def demo(
         "command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "rows": rows, "survey": surveyed,
     }  # fmt: skip
     folder.finish([case.key(s) for case, its_seeds in cases for s in its_seeds], summary)
-    save_time_split(rows, out / f"time_split_{its.name}.png")
+    draw_figures(ComparisonResults(cases, folder.episodes, rows), out, FIGURES)
     console.print(
         f"{sessions} drives past {its.lot.n_slots} slots: {surveyed['car_detection_rate']:.1%} of the parked cars were "
         f"found, {surveyed['slot_accuracy']:.1%} of the slots judged right. The map is off by "

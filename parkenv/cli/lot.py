@@ -128,10 +128,10 @@ def import_place(
     * `parkenv lot import slots.csv --out lot.geojson --entry 0,0 --goal 40,25`
     """
     from parkenv.lots import import_lot, write_lot
-    from parkenv.lots.places.lot_draft import Wishes
+    from parkenv.lots.importers.import_options import ImportOptions
 
     corners = None if bounds is None else _numbers("--bounds", bounds, 4)
-    wishes = Wishes(
+    wishes = ImportOptions(
         goals=tuple((p[0], p[1]) for p in (_numbers("--goal", text, 2) for text in goal or ())),
         entries=tuple((p[0], p[1]) for p in (_numbers("--entry", text, 2) for text in entry or ())),
         bounds=None if corners is None else ((corners[0], corners[1]), (corners[2], corners[3])),

@@ -54,7 +54,8 @@ def plan(
 
     from parkenv.evaluation.experiments.compare import Case, settings_of
     from parkenv.evaluation.experiments.results import make_folder, write_summary
-    from parkenv.evaluation.figures.search_pictures import save_searches
+    from parkenv.evaluation.figures.picture_files import save_picture
+    from parkenv.evaluation.figures.search_pictures import draw_searches
     from planners.agent import make_agent
     from planners.thesis.replanning import StaticAgent
 
@@ -119,7 +120,7 @@ def plan(
                 f"{row['walked_m']:.0f}",
                 str(row["replans"]),
             )
-        save_searches(traces, out / "plan.png")
+        save_picture(draw_searches(traces), out / "plan.png")
     summary = {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "rows": rows}
     write_summary(out, summary)
     console.print(table)

@@ -1,7 +1,7 @@
 """Make the packaged lots: `python -m parkenv.lots.build [FOLDER]`.
 
-Sizes are metres. Positions are rounded to a millimetre and angles to a nanoradian, so that the files are the
-same whatever mathematics library made them.
+Sizes are metres. Positions are rounded to a millimetre and angles to a nanoradian, so that the files do not
+depend on the mathematics library.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Row = tuple[str, Slots]
 
 
 def row(letter: str, start: tuple[float, float], heading: float, *runs: int, angle: float = np.pi / 2) -> Row:
-    """A row with planted islands: `runs` count slots where positive, slots left out where negative."""
+    """A row with planted islands: `runs` are numbers of slots where positive, of left-out slots where negative."""
     parts = []
     along = np.array([np.cos(heading), np.sin(heading)]) * PITCH / np.sin(angle)
     at = np.array(start)
@@ -40,7 +40,7 @@ def row(letter: str, start: tuple[float, float], heading: float, *runs: int, ang
 
 
 def rectangle(x0: float, y0: float, x1: float, y1: float) -> list[tuple[float, float]]:
-    """A closed outline."""
+    """A closed outline, m."""
     return [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
 
 
@@ -53,7 +53,7 @@ def lot(
     walls: Iterable[ArrayLike],
     turned: float = 0.0,
 ) -> ParkingLot:
-    """Number the slots row by row, turn everything by `turned` rad, and round it."""
+    """Make a lot: number the slots row by row, rotate everything by `turned` rad, and round it."""
     turn = np.array([[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]])
 
     def placed(points: ArrayLike) -> FloatArray:
@@ -162,9 +162,9 @@ def jam() -> ParkingLot:
 def street() -> ParkingLot:
     """Kerbside slots round six city blocks, three of the seven streets one-way.
 
-    Cars come in from the west and from the east. Houses stand along the streets, round courtyards
-    with one way in whose kerb is kept clear; some more slots have given way to trees. The goal is a door
-    in a courtyard.
+    Cars come in from the west and from the east. Houses line the streets, round courtyards with
+    one driveway each whose kerb is kept clear; trees replace some more slots. The goal is a door in a
+    courtyard.
     """
     crossings = np.array(
         [
@@ -201,7 +201,7 @@ def street() -> ParkingLot:
 
 
 def mini() -> ParkingLot:
-    """Ten slots on one aisle; cars come in from the west, people walk out to the east."""
+    """Ten slots on one aisle; cars come in from the west, the goal is in the east."""
     rows = [row("A", (15.0, -AISLE / 2), WEST, 6), row("B", (2.5, AISLE / 2), EAST, 2, -1, 2)]
     walls = [[(-1.0, -8.6), (16.0, -8.6)], rectangle(21.0, -7.0, 29.0, -2.0)]
     return lot("mini", rows, [([(-9.0, 0.0), (17.0, 0.0)], False)], [(-9.0, 0.0)], [(25.0, 0.0)], walls)

@@ -1,4 +1,4 @@
-"""Everything that is wrong, or looks wrong, with a lot file."""
+"""Check a lot file: errors that prevent reading it, and warnings about probable mistakes."""
 
 from __future__ import annotations
 
@@ -13,34 +13,33 @@ from parkenv.errors import InputError
 from parkenv.lots.dragon_lake import dragon_lake_lot
 from parkenv.lots.file_formats import LotFormat, lot_format
 from parkenv.lots.geojson import LotContents, LotProblem, graph_errors, read_contents
-from parkenv.lots.places.lot_import import import_lot
+from parkenv.lots.importers.lot_import import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
-from parkenv.world.drive_graph import places
+from parkenv.world.drive_graph import node_labels
 from parkenv.world.lot import Lane, ParkingLot, corner_points, mouth_heading, mouth_points
 
 LANE_GAP = 1.0
-"""A lane that ends this near to another, m, without a common point was probably meant to join it."""
+"""A lane that ends this close to another, m, without a common point was probably meant to join it."""
 SLOT_OVERLAP = 0.1
-"""Depth, m, from which an overlap of two slots is reported; less is drawing accuracy."""
+"""Least depth, m, of an overlap of two slots that is reported; less is drawing accuracy."""
 GOAL_REACH = 50.0
-"""Distance, m, from a goal to the nearest lane from which it is reported."""
+"""A goal farther from the nearest lane, m, is reported."""
 
 
 def check_lot(path: str | Path) -> list[LotProblem]:
-    """All that is wrong with a lot file, errors first; an empty list for a sound one. Does not raise.
+    """List all errors and warnings of a lot file, errors first; none for a valid file. Does not raise.
 
-    Of OpenStreetMap and lists of slots it tells what is missing before a search can run there, and what an
-    import leaves out.
+    A file with errors cannot be read. Warnings concern lots that can be driven but contain probable mistakes: goals
+    far from all lanes, lanes that cross or nearly touch without a common point, slots that overlap, face away from
+    their lane, cannot be reached from an entry or lead to no other slot, entries that lead to no slot.
 
-    A file with errors cannot be read. Warnings tell what can be driven but was hardly meant so: goals
-    far from all lanes, lanes that cross or nearly touch without a common point, slots that overlap,
-    that turn their mouth away from their lane, that no entry leads to or from which no other is reached,
-    entries that lead to no slot.
+    For OpenStreetMap files and lists of slots, errors state what is missing before a search can run there, and
+    warnings what an import leaves out.
     """
     path = Path(path)
     file_format = lot_format(path)
     if file_format is not None and not file_format.is_complete:
-        return _place_problems(path)
+        return _import_problems(path)
     if file_format is LotFormat.DRAGON_LAKE:
         try:
             dragon_lake_lot(path)
@@ -55,8 +54,8 @@ def check_lot(path: str | Path) -> list[LotProblem]:
     return problems
 
 
-def _place_problems(path: Path) -> list[LotProblem]:
-    """What a map or a list of slots lacks, and what of it makes no slot."""
+def _import_problems(path: Path) -> list[LotProblem]:
+    """What an importable file lacks, and what its import leaves out."""
     try:
         draft = import_lot(path)
     except InputError as error:
@@ -74,7 +73,7 @@ def _place_problems(path: Path) -> list[LotProblem]:
 
 
 def _drawing_warnings(contents: LotContents) -> list[LotProblem]:
-    """What looks like a slip of the pen."""
+    """Probable mistakes of drawing."""
 
     def warn(feature: int, message: str) -> None:
         warnings.append(LotProblem("warning", feature, message))
@@ -111,29 +110,31 @@ def _drawing_warnings(contents: LotContents) -> list[LotProblem]:
 
 
 def _loose_lanes(lanes: Sequence[Lane], numbers: Sequence[int]) -> Iterator[tuple[int, str]]:
-    """Lanes that cross, or end close to one another, without a common point: cars cannot turn there."""
+    """Lanes that cross or end close to one another without a common point: cars cannot turn there."""
     count = [len(lane.points) for lane in lanes]
     xy = np.concatenate([lane.points for lane in lanes])
     lane_of = np.repeat(np.arange(len(lanes)), count)
-    place = places(xy)
+    label = node_labels(xy)
     leg = np.flatnonzero(lane_of[:-1] == lane_of[1:])
     legs = np.asarray(shapely.linestrings(np.stack([xy[leg], xy[leg + 1]], axis=1)))
     tree = shapely.STRtree(legs)
 
     one, other = tree.query(legs, predicate="intersects")
     a, b = leg[one], leg[other]
-    joined = (place[a] == place[b]) | (place[a] == place[b + 1]) | (place[a + 1] == place[b])
-    apart = (a < b) & ~joined & (place[a + 1] != place[b + 1])
-    spot = shapely.point_on_surface(shapely.intersection(legs[one[apart]], legs[other[apart]]))
-    spot_xy = np.round(shapely.get_coordinates(spot), 1).tolist()
-    crossings = zip(lane_of[b[apart]].tolist(), lane_of[a[apart]].tolist(), map(tuple, spot_xy), strict=True)
+    joined = (label[a] == label[b]) | (label[a] == label[b + 1]) | (label[a + 1] == label[b])
+    apart = (a < b) & ~joined & (label[a + 1] != label[b + 1])
+    at = shapely.point_on_surface(shapely.intersection(legs[one[apart]], legs[other[apart]]))
+    crossed_at = np.round(shapely.get_coordinates(at), 1).tolist()
+    crossings = zip(
+        lane_of[b[apart]].tolist(), lane_of[a[apart]].tolist(), map(tuple, crossed_at), strict=True
+    )
     for i, j, (x, y) in sorted(set(crossings)):
         crossed = "itself" if i == j else f"the lane of feature {numbers[j]}"
         yield i, f"crosses {crossed} at ({x:.1f}, {y:.1f}) m without a common point"
 
     last = np.cumsum(count) - 1
     ends = np.r_[last - count + 1, last]
-    ends = ends[np.bincount(place)[place[ends]] == 1]
+    ends = ends[np.bincount(label)[label[ends]] == 1]
     points = np.asarray(shapely.points(xy[ends]))
     end, near = tree.query(points, predicate="dwithin", distance=LANE_GAP)
     gap = shapely.distance(points[end], legs[near])
@@ -155,11 +156,11 @@ def _loose_lanes(lanes: Sequence[Lane], numbers: Sequence[int]) -> Iterator[tupl
 def _reach_warnings(
     lot: ParkingLot, numbers: Sequence[int | None], entry_numbers: Sequence[int | None]
 ) -> Iterator[LotProblem]:
-    """Slots that no car gets to, slots from which a car gets to no other, entries that lead to none."""
+    """Slots that cannot be reached or that lead to no other slot, and entries that lead to no slot."""
     n = lot.n_slots
     graph = lot.drive_matrix()
     reached = np.isfinite(dijkstra(graph, indices=lot.entry_vertices, min_only=True))
-    # The same question on the reversed graph: which vertices lead to some slot, perhaps themselves?
+    # The same on the reversed graph: which vertices lead to some slot (or are one)?
     to_slot = np.isfinite(dijkstra(graph.T.tocsr(), indices=np.arange(n), min_only=True))
     _, component = connected_components(graph, connection="strong")
     slots_in = np.bincount(component[:n], minlength=component.max() + 1)
@@ -167,10 +168,10 @@ def _reach_warnings(
     leaves = (component[source] != component[target]) & to_slot[target]
     goes_on = (slots_in > 1) | (np.bincount(component[source[leaves]], minlength=len(slots_in)) > 0)
     for fault, message in (
-        (~reached[:n], "no way leads there from an entry"),
-        (~goes_on[component[:n]] & (n > 1), "no way leads on to another slot"),
+        (~reached[:n], "cannot be reached from an entry"),
+        (~goes_on[component[:n]] & (n > 1), "no other slot can be reached from it"),
     ):
         for i in np.flatnonzero(fault).tolist():
             yield LotProblem("warning", numbers[i], f"slot {lot.slot_ids[i]!r:.40}: {message}")
     for i in np.flatnonzero(~to_slot[lot.entry_vertices]).tolist():
-        yield LotProblem("warning", entry_numbers[i], "entry: no way leads from it to a slot")
+        yield LotProblem("warning", entry_numbers[i], "entry: no slot can be reached from it")

@@ -16,18 +16,17 @@ FloatArray = NDArray[np.float64]
 
 
 def dragon_lake_lot(path: Path) -> ParkingLot:
-    """The lot of the Dragon Lake Parking data set, from its `parking_map.yml`.
+    """Read the lot of the Dragon Lake Parking data set from its `parking_map.yml`.
 
-    Slots fill the `bounds` of each parking area in the rows and columns of its `shape`, and are called
-    "A-0-13": area, row from the north, column from the west. The rows of an area stand back to back and open
+    Slots fill the `bounds` of each parking area in the rows and columns of its `shape`, with ids such
+    as "A-0-13": area, row from the north, column from the west. The rows of an area are back to back and open
     to the aisles north and south of it; a single row opens to the nearer aisle. Aisles are the waypoint
-    rows R1 to R4 from column C1 to their east ends, which are dead ends; C1 and C2 join them, and EXT
-    leads in from the north. All are two-way. Cars enter at the outer end of EXT. The map names no place
-    that people walk to: the goal, a door at (80, -4), where the middle column C2 points to in the south, is
-    ours.
+    rows R1 to R4 from column C1 to their east ends, which are dead ends; C1 and C2 connect them, and EXT
+    leads in from the north. All are two-way. Cars enter at the outer end of EXT. The map has no goal; it is
+    set to (80, -4), a door at the southern end of the middle column C2.
 
     Raises:
-        InputError: the file cannot be read or is no such map.
+        InputError: the file cannot be read or is not such a map.
     """
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))

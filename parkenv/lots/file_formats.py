@@ -6,7 +6,7 @@ import json
 from enum import Enum
 from pathlib import Path
 
-from parkenv.lots.places.osm_elements import holds_osm
+from parkenv.lots.importers.osm_elements import holds_osm
 
 
 class LotFormat(Enum):

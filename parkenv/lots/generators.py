@@ -1,4 +1,4 @@
-"""Lots made by rule: a grid of rows and aisles, a city of streets, and the rows of slots in both."""
+"""Generate lots: a grid of rows and aisles, a city of streets, and the rows of slots in both."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TWO_WAY_HALF_WIDTH = 3.0
 ONE_WAY_HALF_WIDTH = 2.0
 """From the centre line of a one-way street to its parked cars, m."""
 CROSSING_CLEARANCE = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 5.0
-"""From the middle of a crossing to the first parked car, m: nobody parks within 5 m of the kerbs' corner."""
+"""From the middle of a crossing to the first parked car, m: parking is forbidden within 5 m of the kerbs' corner."""
 BUILDING_SETBACK = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 2.9
 """From the centre line of a street to the buildings, m: half the street, parked cars and a footway."""
 
@@ -63,7 +63,7 @@ class Slots:
 
     @classmethod
     def joined(cls, parts: Sequence[Slots]) -> Self:
-        """All slots of several rows, in order."""
+        """Concatenate the slots of several rows."""
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def columns(self) -> dict[str, Any]:
@@ -79,15 +79,15 @@ def bay_row(
     size: tuple[float, float] = BAY_SIZE,
     angle: float = np.pi / 2,
 ) -> Slots:
-    """A row of n perpendicular or angled slots on the left of a line, entered from that line.
+    """Make a row of n perpendicular or angled slots on the left of a line, entered from that line.
 
     Args:
-        start: (2,) m, where the line of the slots' mouths starts.
+        start: (2,) m, start of the line of the slots' mouths.
         heading: rad, direction of that line.
         n: number of slots.
         size: length and width of a slot, m.
         angle: rad, between the line and the parked cars; below a right angle, cars that drive along the
-            line turn in without a swing.
+            line can turn in directly.
     """
     length, width = size
     along = np.array([np.cos(heading), np.sin(heading)])
@@ -111,12 +111,12 @@ def bay_row(
 def kerb_rows(
     start: FloatArray, end: FloatArray, left: BoolArray, size: tuple[float, float] = KERB_SIZE
 ) -> tuple[Slots, NDArray[np.intp]]:
-    """As many kerbside slots as fit along each of m kerbs, spread evenly, and the kerb that each lies on.
+    """Make as many kerbside slots as fit along each of m kerbs, evenly spread; return them and the kerb of each.
 
     Args:
-        start: (m, 2) m, where the edge between carriageway and parked cars starts.
-        end: (m, 2) m, where it ends; cars pass from start to end.
-        left: (m,) bool, whether the cars stand on the left of that edge; on the right otherwise.
+        start: (m, 2) m, start of the edge between carriageway and parked cars.
+        end: (m, 2) m, end of that edge; traffic runs from start to end.
+        left: (m,) bool, whether the cars park on the left of that edge; on the right otherwise.
         size: length and width of a slot, m.
     """
     length, width = size
@@ -206,10 +206,10 @@ def city_lot(n_slots: int, seed: int = 0) -> ParkingLot:
     A million slots take seconds. The same seed gives the same city.
 
     Every street runs from one edge of the city to the other, and the streets along its edges are two-way:
-    whatever the one-way streets between them, every place can be reached from every other. Slots are
-    numbered crossing by crossing from the south-west, so neighbours have near numbers. Where more slots
-    fit than are wanted, some are left out here and there, as driveways are. The block in the middle
-    is a square without a building; the goal is its centre.
+    whatever the one-way streets between them, every slot can be reached from every other. Slots are
+    numbered crossing by crossing from the south-west, so neighbours have close numbers. Where more slots
+    fit than are wanted, random ones are left out, like driveways. The block in the middle is a square
+    without a building; the goal is its centre.
 
     Raises:
         InputError: `n_slots` is below one.
@@ -254,7 +254,7 @@ def _random_streets(n_blocks: int, rng: np.random.Generator) -> StreetGrid:
 
 @dataclass(frozen=True, eq=False)
 class StreetGrid:
-    """Streets that cross each other, `along` from west to east and `across` from south to north.
+    """A grid of streets, `along` from west to east and `across` from south to north.
 
     Args:
         crossings: (n_along, n_across, 2) m, where street i along crosses street j across.
@@ -281,11 +281,11 @@ class StreetGrid:
         return np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)
 
     def kerb_slots(self, outer: bool = True) -> Slots:
-        """Slots on both sides of all streets, crossing by crossing; `outer`: also outside the outermost."""
+        """Make slots on both sides of all streets, crossing by crossing; `outer`: also on the outer sides."""
         p = self.crossings
         n_along, n_across = p.shape[:2]
         row, column = np.indices((n_along, n_across))
-        # Each crossing owns the piece of street to its east and the piece to its north.
+        # Each crossing owns the segments of street to its east and to its north.
         start = np.concatenate([p[:, :-1].reshape(-1, 2), p[:-1].reshape(-1, 2)])
         end = np.concatenate([p[:, 1:].reshape(-1, 2), p[1:].reshape(-1, 2)])
         direction = np.concatenate([np.repeat(self.along, n_across - 1), np.tile(self.across, n_along - 1)])

@@ -1,9 +1,9 @@
-"""Lots as GeoJSON: what a file holds, and what is wrong with it.
+"""Native lot files (GeoJSON): writing, reading, and collecting all errors of a file.
 
 The native file is a GeoJSON FeatureCollection with the further members
 `"parkenv": {"format": "lot", "version": 1}`, `"name"` and `"frame": "local"` (metres). Without
-`frame`, positions are longitude and latitude as RFC 7946 has it, and are projected to metres east and north
-of the middle of the features. `properties.kind` tells what a feature is:
+`frame`, positions are longitude and latitude (RFC 7946), and are projected to metres east and north of the
+middle of the features. `properties.kind` is the kind of a feature:
 
 | kind | geometry | properties |
 |---|---|---|
@@ -44,19 +44,19 @@ KINDS = {
     "goal": ("Point",),
     "wall": ("LineString", "Polygon"),
 }
-"""The kinds of features, and the geometries that each may have."""
+"""The kinds of features, and the geometry types allowed for each."""
 SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")
-"""The properties that fix a slot exactly."""
+"""The properties that define a slot exactly."""
 MOUTHS = {mouth.name.lower(): mouth for mouth in Mouth}
 FARTHEST = 1e8
-"""Greatest coordinate, m: enough for any map grid, and far from where float64 loses the millimetre."""
+"""Greatest coordinate, m: enough for any map grid, and small enough for float64 to keep the millimetre."""
 SLOT_AGREEMENT = 0.01
-"""Farthest, m, that a slot's polygon may lie from the rectangle that its properties describe."""
+"""Greatest distance, m, between a slot's polygon and the rectangle that its properties describe."""
 
 
 @dataclass(frozen=True)
 class LotProblem:
-    """Something wrong with a lot file; `feature` is the 0-based index in the FeatureCollection."""
+    """An error or warning about a lot file; `feature` is the 0-based index in the FeatureCollection."""
 
     severity: Literal["error", "warning"]
     feature: int | None
@@ -119,12 +119,12 @@ def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
             yield feature("LineString", wall.tolist(), kind="wall")
 
 
-# ---- reading: all faults are gathered, so nothing below raises out of `read_contents` ----
+# ---- reading: all errors are collected, so nothing below raises out of `read_contents` ----
 
 
 @dataclass
 class LotContents:
-    """What a file holds, as far as it is sound; `numbers[kind]` are the feature numbers of what is held."""
+    """The valid features of a file; `numbers[kind]` are their feature numbers, `errors` the faults of the others."""
 
     name: str
     slot_ids: list[str] = field(default_factory=list)
@@ -149,13 +149,13 @@ class LotContents:
         }
 
     def error(self, feature: int | None, message: str) -> None:
-        """Note an error of a feature, or of the file as a whole."""
+        """Record an error of a feature, or of the file as a whole."""
         self.errors.append(LotProblem("error", feature, message))
 
 
 @dataclass(frozen=True)
 class _RawFeature:
-    """A feature whose geometry is sound so far: its parts are slices of one array of all positions."""
+    """A feature with a valid geometry: its parts are slices of one array of all positions."""
 
     number: int
     kind: str
@@ -165,7 +165,7 @@ class _RawFeature:
 
 
 def read_contents(path: Path) -> LotContents:
-    """All that a file holds and is sound, and all errors found on the way. Does not raise."""
+    """Read all valid features of a file, and record all errors. Does not raise."""
     contents = LotContents(path.stem)
     try:
         document = _load(path)
@@ -204,14 +204,14 @@ def read_contents(path: Path) -> LotContents:
 
     for feature in raw:
         if feature.kind != "slot":
-            _hold(contents, feature, [xy[part] for part in feature.parts])
+            _add_feature(contents, feature, [xy[part] for part in feature.parts])
     _read_slots(contents, [feature for feature in raw if feature.kind == "slot"], xy, exact=local)
     contents.errors.sort(key=lambda problem: -1 if problem.feature is None else problem.feature)
     return contents
 
 
-def _hold(contents: LotContents, feature: _RawFeature, parts: list[FloatArray]) -> None:
-    """Keep a lane, an entry, a goal, or a wall, which has a part for every ring."""
+def _add_feature(contents: LotContents, feature: _RawFeature, parts: list[FloatArray]) -> None:
+    """Add a lane, an entry, a goal, or a wall with one part per ring."""
     if feature.kind == "lane":
         try:
             contents.lanes.append(Lane(parts[0], feature.properties.get("oneway", False)))
@@ -242,16 +242,16 @@ def _load(path: Path) -> Any:
 
 
 def _check_head(document: Any, stem: str) -> tuple[str, bool]:
-    """The lot's name, and whether its positions are metres in a local frame."""
+    """Validate the head; return the lot's name, and whether positions are metres in a local frame."""
     if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
         kind = document.get("type") if isinstance(document, dict) else type(document).__name__
         raise InputError(f"type is {kind!r:.40}, want a GeoJSON 'FeatureCollection'")
     if not isinstance(document.get("features"), list):
         raise InputError(f"features is {document.get('features')!r:.40}, want a list of features")
-    made_as = document.get("parkenv", {"format": "lot", "version": LOT_VERSION})
-    if not isinstance(made_as, dict) or made_as.get("format") != "lot":
-        raise InputError(f'parkenv is {made_as!r:.60}, want {{"format": "lot", "version": {LOT_VERSION}}}')
-    version = made_as.get("version")
+    header = document.get("parkenv", {"format": "lot", "version": LOT_VERSION})
+    if not isinstance(header, dict) or header.get("format") != "lot":
+        raise InputError(f'parkenv is {header!r:.60}, want {{"format": "lot", "version": {LOT_VERSION}}}')
+    version = header.get("version")
     if type(version) is not int or version < 1:
         raise InputError(f"parkenv.version is {version!r:.40}, want {LOT_VERSION}")
     if version > LOT_VERSION:
@@ -267,7 +267,7 @@ def _check_head(document: Any, stem: str) -> tuple[str, bool]:
 def _check_feature(
     number: int, feature: Any, positions: list[tuple[float, float]], kinds_seen: set[object]
 ) -> _RawFeature:
-    """Append the feature's positions and say which they are."""
+    """Validate a feature and append its positions to `positions`."""
     if not isinstance(feature, dict) or feature.get("type") != "Feature":
         raise InputError("want a GeoJSON object of type 'Feature'")
     properties, geometry = (
@@ -318,9 +318,9 @@ def _is_number(value: Any) -> bool:
 
 
 def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, exact: bool) -> None:
-    """Check the slots of a file and hold the sound ones.
+    """Validate the slots of a file and add the valid ones.
 
-    The exact properties count where the frame is local: after a projection they cannot be told from stale.
+    Exact properties are used in a local frame only: after a projection stale ones would go unnoticed.
     """
     if not raw:
         return
@@ -328,7 +328,7 @@ def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, e
     area = shapely.area(shapely.convex_hull(polygons))
     valid = shapely.is_valid(polygons)
     first_with: dict[str, int] = {}
-    sound: list[int] = []
+    valid_rows: list[int] = []
     ids: list[str] = []
     shapes: list[tuple[float, ...] | None] = []
     costs: list[float] = []
@@ -336,7 +336,7 @@ def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, e
         try:
             slot_id = _slot_id(feature)
             if slot_id in first_with:
-                raise InputError(f"slot: id {slot_id!r:.40} stands already at feature {first_with[slot_id]}")
+                raise InputError(f"slot: id {slot_id!r:.40} appears already in feature {first_with[slot_id]}")
             first_with[slot_id] = feature.number
             if area[i] < SLOT_SIDE**2:
                 raise InputError(f"slot {slot_id!r:.40}: the polygon is flat, want an area to park on")
@@ -348,16 +348,16 @@ def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, e
         except InputError as error:
             contents.error(feature.number, str(error))
             continue
-        sound.append(i)
+        valid_rows.append(i)
         ids.append(slot_id)
         costs.append(cost)
 
-    polygons = polygons[sound]
+    polygons = polygons[valid_rows]
     bare = np.array([shape is None for shape in shapes], dtype=bool)
     slots = slots_from_polygons(polygons[bare], contents.lanes)
     if not bare.all():
         # x, y, yaw, length, width, mouth
-        table = np.empty((len(sound), 6))
+        table = np.empty((len(valid_rows), 6))
         table[bare] = np.column_stack([slots.xy, slots.yaw, slots.length, slots.width, slots.mouth])
         table[~bare] = [shape for shape in shapes if shape is not None]
         slots = Slots(table[:, :2], table[:, 2], table[:, 3], table[:, 4], table[:, 5].astype(np.int8))
@@ -368,19 +368,19 @@ def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, e
     thin = slots.width < SLOT_SIDE
     for k in np.flatnonzero(disagrees):
         contents.error(
-            raw[sound[k]].number,
+            raw[valid_rows[k]].number,
             f"slot {ids[k]!r:.40}: the polygon lies {apart[k]:.2f} m from what center, yaw, length and width "
             f"say, want at most {SLOT_AGREEMENT:g} m",
         )
     for k in np.flatnonzero(thin):
         contents.error(
-            raw[sound[k]].number,
+            raw[valid_rows[k]].number,
             f"slot {ids[k]!r:.40}: the polygon is {slots.width[k]:.3f} m wide, want at least {SLOT_SIDE:g} m",
         )
     kept = np.flatnonzero(~disagrees & ~thin)
     contents.slots = replace(slots, parking_cost_s=np.array(costs, dtype=np.float64))[kept]
     contents.slot_ids = [ids[k] for k in kept]
-    contents.numbers["slot"] = [raw[sound[k]].number for k in kept]
+    contents.numbers["slot"] = [raw[valid_rows[k]].number for k in kept]
 
 
 def _polygons(rings: Sequence[FloatArray]) -> NDArray[np.object_]:
@@ -406,7 +406,7 @@ def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
 
 
 def _slot_shape(properties: dict[str, Any], slot_id: str) -> tuple[float, ...] | None:
-    """Exact x, y, yaw, length, width and mouth, or None where a slot has its polygon only."""
+    """Exact x, y, yaw, length, width and mouth, or None for a slot with its polygon only."""
     absent = [name for name in SLOT_SHAPE if name not in properties]
     if len(absent) == len(SLOT_SHAPE):
         return None
@@ -426,7 +426,7 @@ def _slot_shape(properties: dict[str, Any], slot_id: str) -> tuple[float, ...] |
 
 
 def graph_errors(contents: LotContents) -> list[LotProblem]:
-    """Slots and entries that no lane serves, crowded junctions: what only the drive graph shows."""
+    """Errors of the drive graph: slots and entries that no lane serves, junctions of too many lanes."""
     lanes = [(lane.points, lane.oneway) for lane in contents.lanes]
     if not lanes:
         return []
@@ -436,7 +436,7 @@ def graph_errors(contents: LotContents) -> list[LotProblem]:
     entries = np.array(contents.entries).reshape(-1, 2)
     errors = []
     while True:
-        # What does not fit is left out and the rest is tried again, so that all faults are found.
+        # Faulty features are left out and the rest is tried again, so that all faults are found.
         try:
             build_drive_graph(lanes, mouth_xy[left["slot"]], entries[left["entry"]])
         except GraphError as error:

@@ -1,4 +1,4 @@
-"""Metres east and north of a place on the globe."""
+"""Local metric frames: metres east and north of a point on the globe."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class LocalFrame:
     """An azimuthal equidistant projection: distances and bearings from its middle are exact.
 
     Args:
-        lon: degrees, of the middle, WGS 84.
-        lat: degrees, of the middle.
+        lon: longitude of the middle, degrees, WGS 84.
+        lat: latitude of the middle, degrees.
 
     Raises:
-        InputError: no place on the globe.
+        InputError: coordinates that are not on the globe.
 
     Examples:
         >>> frame = LocalFrame(lon=7.85, lat=48.0)
@@ -39,14 +39,14 @@ class LocalFrame:
 
     def __post_init__(self) -> None:
         if not (abs(self.lon) <= 360.0 and abs(self.lat) <= 90.0):
-            raise InputError(f"frame at longitude {self.lon}, latitude {self.lat}: no place on the globe")
+            raise InputError(f"frame at longitude {self.lon}, latitude {self.lat}: not on the globe")
 
     @classmethod
     def around(cls, lonlat: ArrayLike) -> Self:
         """The frame in the middle of positions, (n, 2) degrees, longitude first; n ≥ 1."""
         lon, lat = np.asarray(lonlat, dtype=np.float64).T
         if np.ptp(lon) > 180.0:
-            lon = np.where(lon < 0.0, lon + 360.0, lon)  # a place on the date line
+            lon = np.where(lon < 0.0, lon + 360.0, lon)  # positions on both sides of the date line
         return cls(float(lon.min() + lon.max()) / 2, float(lat.min() + lat.max()) / 2)
 
     def to_xy(self, lonlat: ArrayLike) -> FloatArray:

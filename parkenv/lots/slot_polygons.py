@@ -1,4 +1,4 @@
-"""Slots of which nothing but the outline is known."""
+"""Slots whose outline alone is known: shape, yaw and mouth from polygons and lanes."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ BoolArray = NDArray[np.bool_]
 
 
 def slots_from_polygons(polygons: NDArray[np.object_], lanes: Sequence[Lane]) -> Slots:
-    """Length, width, yaw and mouth of slots of which nothing but the outline is known.
+    """Infer length, width, yaw and mouth of slots from their outlines.
 
     A slot is the smallest rectangle round its polygon. A side faces a lane if the lane's nearest point lies
-    within 60° of the side's outward normal. The car goes in by the short side that faces a lane (of two,
-    by the nearer one): a perpendicular or angled slot. If no short side faces a lane, as where the lane
-    runs along the slot, but a long side does, it is a kerbside slot, and the car stands there as traffic
-    runs: in the lane's direction on a one-way lane, else with the lane on its left. If no side faces a lane,
+    within 60° of the side's outward normal. The car enters by the short side that faces a lane (of two, by
+    the nearer one): a perpendicular or angled slot. If no short side faces a lane, as where the lane
+    runs along the slot, but a long side does, it is a kerbside slot, and the car faces the direction of
+    traffic: that of a one-way lane, else with the lane on its left. If no side faces a lane,
     the short side nearest to one counts.
 
     Args:
@@ -32,7 +32,7 @@ def slots_from_polygons(polygons: NDArray[np.object_], lanes: Sequence[Lane]) ->
     boxes = shapely.normalize(shapely.minimum_rotated_rectangle(polygons))
     corners = shapely.get_coordinates(boxes).reshape(len(polygons), 5, 2)[:, :4]
     side_length = np.hypot(*np.moveaxis(np.roll(corners, -1, axis=1) - corners, 2, 0))
-    # Sides 0 and 2 shall be the short ones.
+    # Make sides 0 and 2 the short ones.
     turn = (side_length[:, 0] > side_length[:, 1])[:, None, None]
     corners = np.where(turn, np.roll(corners, -1, axis=1), corners)
     middle = (corners + np.roll(corners, -1, axis=1)) / 2
@@ -45,7 +45,7 @@ def slots_from_polygons(polygons: NDArray[np.object_], lanes: Sequence[Lane]) ->
     to_lane = nearest.reshape(middle.shape) - middle
     distance = np.hypot(to_lane[..., 0], to_lane[..., 1])
     faced = np.where((to_lane * outward).sum(axis=2) >= 0.5 * distance, distance, np.inf)
-    # A lane that touches the side has no direction to it, and counts as faced.
+    # A lane that touches the side has no direction from it, and counts as faced.
     short_faced, long_faced = (np.isfinite(np.min(faced[:, sides], axis=1)) for sides in ([0, 2], [1, 3]))
     kerbside = np.asarray(~short_faced & long_faced)
     by = np.where(np.asarray(short_faced | long_faced)[:, None], faced, distance)
@@ -68,9 +68,9 @@ def slots_from_polygons(polygons: NDArray[np.object_], lanes: Sequence[Lane]) ->
 
 
 def nearest_on_lanes(lanes: Sequence[Lane], xy: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """The lanes' nearest point to each of `xy` (n, 2), the lane's direction there, and whether it is one-way.
+    """Nearest point on any lane to each of `xy` (n, 2) m, the lane's unit direction there, and whether it is one-way.
 
-    Without a lane, every point counts as its own nearest one.
+    Without lanes, each point is its own nearest point.
     """
     if not lanes or not len(xy):
         return xy, np.zeros_like(xy), np.zeros(len(xy), dtype=bool)

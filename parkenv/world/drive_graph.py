@@ -196,12 +196,12 @@ def linestrings(parts: Sequence[FloatArray]) -> NDArray[np.object_]:
     return np.atleast_1d(np.asarray(shapely.linestrings(np.concatenate(parts), indices=which)))
 
 
-def places(xy: FloatArray) -> IntArray:
-    """Number the places, (n,): points closer than `NODE_TOLERANCE` are at the same one."""
+def node_labels(xy: FloatArray) -> IntArray:
+    """Label points, (n, 2) m: those closer than `NODE_TOLERANCE` share a label, (n,) int64, and are one node."""
     near = cKDTree(xy).query_pairs(NODE_TOLERANCE, output_type="ndarray")
     graph = coo_array((np.ones(len(near), dtype=bool), (near[:, 0], near[:, 1])), shape=(len(xy), len(xy)))
-    _, place = connected_components(graph, directed=False)
-    return np.asarray(place, dtype=np.int64)
+    _, label = connected_components(graph, directed=False)
+    return np.asarray(label, dtype=np.int64)
 
 
 def _centrelines(lanes: Sequence[tuple[FloatArray, bool]]) -> _Centrelines:
@@ -214,10 +214,10 @@ def _centrelines(lanes: Sequence[tuple[FloatArray, bool]]) -> _Centrelines:
     is_end[last] = True
     is_end[last - count + 1] = True
 
-    place = places(xy)
-    is_node = is_end | (np.bincount(place)[place] > 1)
+    label = node_labels(xy)
+    is_node = is_end | (np.bincount(label)[label] > 1)
     cut = np.flatnonzero(is_node)
-    loops = (lane[cut[:-1]] == lane[cut[1:]]) & (place[cut[:-1]] == place[cut[1:]]) & (np.diff(cut) > 1)
+    loops = (lane[cut[:-1]] == lane[cut[1:]]) & (label[cut[:-1]] == label[cut[1:]]) & (np.diff(cut) > 1)
     # A lane that comes back to where it left would be an edge to itself: stop once on the way round.
     is_node[(cut[:-1][loops] + cut[1:][loops]) // 2] = True
     cut = np.flatnonzero(is_node)
@@ -232,7 +232,7 @@ def _centrelines(lanes: Sequence[tuple[FloatArray, bool]]) -> _Centrelines:
 
     in_segment = lane[cut[:-1]] == lane[cut[1:]]
     first, end = cut[:-1][in_segment], cut[1:][in_segment]
-    _, node = np.unique(place[cut], return_inverse=True)
+    _, node = np.unique(label[cut], return_inverse=True)
     node_of_point = np.full(len(xy), -1)
     node_of_point[cut] = node
     node_xy = np.empty((node.max() + 1, 2))

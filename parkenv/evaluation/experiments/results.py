@@ -49,14 +49,6 @@ _BOOL = {"parked", "truncated"}
 SETTINGS = "settings.json"
 SUMMARY = "summary.json"
 SUMMARY_PARTIAL = "summary.partial.json"
-PICTURES = (
-    "time_split_",
-    "time_against_occupancy_",
-    "time_against_failure_cost_",
-    "time_against_map_",
-    "searches_",
-)
-"""What the names of a comparison's figures begin with."""
 
 Row = dict[str, Any]
 Key = tuple[Any, ...]
@@ -184,9 +176,6 @@ class ResultFolder:
                 f"--out {path}: holds {state} comparison; add --resume to go on with it, --overwrite to replace it, "
                 "or name another folder"
             )
-        for picture in path.glob("*.png"):
-            if picture.name.startswith(PICTURES):
-                picture.unlink()
         (path / SUMMARY).unlink(missing_ok=True)
         write_settings(path, settings)
         # Rewritten from what could be read: a line that a crash tore is gone, and its episode runs again.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from parkenv.evaluation.figures.lot_picture import BUILDING, ENTRY, GOAL, GROUND, INK, WALL
 from parkenv.evaluation.figures.picture_files import save_picture
-from parkenv.lots.places.lot_draft import LotDraft
+from parkenv.lots.importers.lot_draft import LotDraft
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.lot import Lane, corner_points, is_building, mouth_points
 

@@ -1,4 +1,4 @@
-"""The style that all pictures share, and how they get into files."""
+"""The style of all figures, and writing them into files."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -35,20 +36,20 @@ STYLE: dict[Any, Any] = {
 INK = "#181b1f"
 TIME_COLORS = {
     "drive_s": ("drive", "#0072b2"),
-    "failed_s": ("failed tries", "#d55e00"),
+    "failed_s": ("failed attempts", "#d55e00"),
     "walk_s": ("walk", "#a6cfe8"),
-    "gave_up_s": ("gave up", "#8c8c8c"),
+    "gave_up_s": ("give-up penalty", "#8c8c8c"),
 }
-"""What the parts of a search's time are called, and their colours."""
+"""Names and colours of the parts of the total time."""
 
 
 def save_picture(figure: Figure, path: str | Path) -> None:
-    """Write a PNG, whole or not at all.
+    """Write a PNG atomically.
 
     Raises:
         InputError: the file cannot be written.
     """
-    with atomic_write(path) as beside:
+    with mpl.rc_context(STYLE), atomic_write(path) as beside:
         figure.savefig(beside, format="png", dpi=DPI)
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -17,25 +16,29 @@ from matplotlib.patheffects import Normal, Stroke
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.episodes import SearchTrace
 from parkenv.evaluation.figures.lot_picture import BELIEF_MAP, draw_discs, draw_lot, points_per_m
-from parkenv.evaluation.figures.picture_files import INK, STYLE, TIME_COLORS, save_picture
+from parkenv.evaluation.figures.picture_files import INK, STYLE, TIME_COLORS
+from parkenv.evaluation.figures.registry import ComparisonResults
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import KMH
 
 FloatArray = NDArray[np.float64]
 
 PATH, WALK = "#ffd000", "#1852ba"
+PICTURED = ("greedy-goal", "first-free", "oracle")
+"""Agents whose paths are drawn beside the first agent's."""
 POLICY_SCALE = 2.2
-"""Points a metre from which arrows at every vertex can be told apart."""
+"""Points per metre from which arrows at every vertex are legible."""
 
 
 def draw_search(trace: SearchTrace, ax: Axes) -> None:
     """Draw one search as in T Fig. 4.9 to 4.12.
 
-    At each slot an inner disc shows the truth and an outer ring the forecast; then the path from 1 to 2,
-    the walk, and, where there is room, what the first plan says at each vertex (T Fig. 4.8). Make the axes
-    as large as they will be: line widths and arrows follow from the scale.
+    At each slot an inner disc shows the true occupancy and an outer ring the forecast; then the path from 1 to 2,
+    the walk, and, where there is room, the first plan's action at each vertex (T Fig. 4.8). Give the axes
+    their final size before: line widths and arrows follow from the scale.
 
     Args:
         trace: the search.
@@ -53,20 +56,20 @@ def draw_search(trace: SearchTrace, ax: Axes) -> None:
 
 
 def _title(trace: SearchTrace, width: float) -> str:
-    """What the search was and came to, in lines that fit a width in inches at the current font size."""
+    """Describe the search in lines that fit a width in inches at the current font size."""
     scenario, metrics = trace.scenario, trace.metrics
     terms = [f"{metrics[key]:.0f} {name}" for key, (name, _) in TIME_COLORS.items()]
     if not metrics["gave_up_s"]:
         terms.pop()
     replans = metrics.get("replans", 0)
-    planned = f"; {replans} re-plan{'s' if replans > 1 else ''}" if replans else ""
-    told = (
+    planned = f"; {replans} replan{'s' if replans > 1 else ''}" if replans else ""
+    lines = (
         f"{trace.agent}: failure cost {scenario.failure_s:g} s, walk {scenario.v_walk / KMH:g}, "
         f"drive {scenario.v_drive / KMH:g} km/h",
         f"total {metrics['total_s']:.0f} s = {' + '.join(terms)}{planned}",
     )
     letters = int(width * 72 / (0.6 * mpl.rcParams["font.size"]))
-    return "\n".join(line for text in told for line in textwrap.wrap(text, max(letters, 10)))
+    return "\n".join(line for text in lines for line in textwrap.wrap(text, max(letters, 10)))
 
 
 def _draw_path(trace: SearchTrace, ax: Axes, scale: float) -> None:
@@ -167,20 +170,34 @@ def _draw_policy(trace: SearchTrace, ax: Axes, scale: float) -> None:
 
 
 def _placed(shape: FloatArray, at: FloatArray, ahead: FloatArray) -> list[FloatArray]:
-    """A shape, (k, 2) m with its nose to +x, at each point, turned ahead."""
+    """Place a shape, (k, 2) m with its nose to +x, at each point, turned ahead."""
     turn = np.stack([ahead, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)], axis=1)
     return list(at[:, None] + shape @ turn)
 
 
-def save_searches(traces: Sequence[SearchTrace], path: str | Path) -> None:
+def searches(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
+    """Yield `draw_searches` of each scenario and setting: the first agent and some others in the same world."""
+    settings: dict[str, list[Case]] = {}
+    for case, _ in results.cases:
+        if case.scenario.name in results.scenarios:
+            c = case.columns
+            name = "{}_failure{:g}_walk{:g}_drive{:g}".format(
+                c["scenario"], c["failure_cost_s"], c["v_walk_kmh"], c["v_drive_kmh"]
+            )
+            settings.setdefault(name, []).append(case)
+    for name, cases in settings.items():
+        drawn = [cases[0], *(case for case in cases[1:] if case.agent in PICTURED)]
+        yield name, draw_searches([case.trace(results.seed) for case in drawn])
+
+
+def draw_searches(traces: Sequence[SearchTrace]) -> Figure:
     """Draw searches side by side: agents, or settings, in the same world.
 
     Args:
         traces: at least one.
-        path: the PNG to write.
 
     Raises:
-        InputError: there are no traces, or the file cannot be written.
+        InputError: there are no traces.
     """
     if not traces:
         raise InputError("no search to draw")
@@ -210,11 +227,11 @@ def save_searches(traces: Sequence[SearchTrace], path: str | Path) -> None:
             draw_search(trace, figure.add_axes(box))
         policy = any(_shows_policy(t, points_per_m(ax)) for t, ax in zip(traces, figure.axes, strict=True))
         _draw_key(figure, key, zoom, policy=policy)
-        save_picture(figure, path)
+    return figure
 
 
 def _draw_key(figure: Figure, height: float, zoom: float, *, policy: bool) -> None:
-    """What the marks mean, along the lower edge."""
+    """Draw the legend along the lower edge."""
     disc: dict[str, Any] = {
         "linestyle": "none",
         "marker": "o",
@@ -224,7 +241,7 @@ def _draw_key(figure: Figure, height: float, zoom: float, *, policy: bool) -> No
     disc["markersize"] = 8 * zoom
     cased = [Stroke(linewidth=3.8, foreground=INK), Normal()]
     handles = [
-        Line2D([], [], color=BELIEF_MAP(0.0), label="truth: free", **disc),
+        Line2D([], [], color=BELIEF_MAP(0.0), label="true occupancy: free", **disc),
         Line2D([], [], color=BELIEF_MAP(1.0), label="taken", **disc),
         Line2D([], [], color=PATH, linewidth=2.2, path_effects=cased, label="driven, 1 to 2"),
         Line2D([], [], color=WALK, linewidth=1.8, linestyle=(0, (3, 2)), label="walk to the goal"),

@@ -1,9 +1,8 @@
-"""Figures of what agents achieved: where the time went, and how it grows as the lot fills."""
+"""Figures of mean total times: by their parts, and against occupancy, failure cost and forecast."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -15,7 +14,9 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.evaluation.figures.picture_files import INK, STYLE, TIME_COLORS, save_picture
+from parkenv.evaluation.experiments.compare import UNSEEN, against_occupancy
+from parkenv.evaluation.figures.picture_files import INK, STYLE, TIME_COLORS
+from parkenv.evaluation.figures.registry import ComparisonResults
 
 FloatArray = NDArray[np.float64]
 Row = Mapping[str, Any]
@@ -35,21 +36,70 @@ AGENT_COLORS = {
     "ppo": "#332288",
     "maskable-ppo": "#aa4499",
 }
-"""Each agent has its colour in every figure; told apart with any colour vision (Okabe-Ito and Tol)."""
+"""Each agent has one colour in all figures, distinguishable with any colour vision (Okabe-Ito and Tol)."""
 OTHER_AGENT = "#5c4a3d"
+OCCUPANCY_BINS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001)
+"""Ends of the bins in which episodes are averaged where no lots were made fuller and emptier."""
 OFF_SCALE = 3.0
 """Totals above this many times the median are cut off, so that they do not squash the rest."""
 
 
-def save_time_split(rows: Sequence[Row], path: str | Path) -> None:
-    """Where the time goes: a panel a setting, a bar an agent, split into drive, failed tries and walk.
+def time_splits(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
+    """Yield `draw_time_split` of each scenario."""
+    for name in results.scenarios:
+        yield name, draw_time_split(results.rows_of(name))
+
+
+def times_against_occupancy(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
+    """Yield `draw_time_against_occupancy` of each scenario, at the first of the speeds."""
+    for name in results.scenarios:
+        rows = [
+            {**row, "occupancy": row["occupancy_level"]}
+            for row in results.occupancy_rows
+            if row["scenario"] == name
+        ]
+        if not rows:
+            cases = [(case, seeds) for case, seeds in results.cases if case.scenario.name == name]
+            speeds = cases[0][0].scenario.v_walk, cases[0][0].scenario.v_drive
+            episodes = [
+                episode
+                for case, seeds in cases
+                if (case.scenario.v_walk, case.scenario.v_drive) == speeds
+                for episode in results.episodes_of(case, seeds)
+            ]
+            rows = against_occupancy(episodes, OCCUPANCY_BINS)
+        if rows:
+            yield name, draw_time_against_occupancy(rows)
+
+
+def times_against_failure_cost(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
+    """Yield `draw_time_against_failure_cost` of each scenario of a sweep."""
+    for name in results.failure_cost_sweeps:
+        yield name, draw_time_against_failure_cost(results.rows_of(name), results.rows_of(name + UNSEEN))
+
+
+def times_against_map(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
+    """Yield `draw_time_against_map` of each scenario with flat forecasts, at the first of the costs and speeds."""
+    forecasts = results.flat_forecasts
+    if not forecasts:
+        return
+    setting = {c: results.rows[0][c] for c in ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")}
+    rows = [row for row in results.rows if setting.items() <= row.items()]
+    for name in dict.fromkeys(varied for varied, _ in forecasts.values()):
+        probability = {flat: p for flat, (varied, p) in forecasts.items() if varied == name}
+        flat = [row for row in rows if row["scenario"] in probability]
+        own = [row for row in rows if row["scenario"] == name]
+        yield name, draw_time_against_map(flat, own, probability)
+
+
+def draw_time_split(rows: Sequence[Row]) -> Figure:
+    """Draw mean total times: a panel per setting, a bar per agent, split into drive, failed attempts and walk.
 
     Args:
         rows: of one scenario, as `parkenv compare` writes them into `summary.json`.
-        path: the PNG to write.
 
     Raises:
-        InputError: there are no rows, or the file cannot be written.
+        InputError: there are no rows.
     """
     _require_rows(rows)
     panels: dict[tuple[Any, ...], list[Row]] = {}
@@ -77,11 +127,11 @@ def save_time_split(rows: Sequence[Row], path: str | Path) -> None:
             axes[lowest, column].set_xlabel("mean total time, s; 95 % interval", color="#444444")
         handles: list[Any] = [Patch(color=color, label=name) for name, color in TIME_COLORS.values()]
         handles.append(
-            Line2D([], [], color=INK, linestyle=(0, (3, 2)), linewidth=1.2, label="clairvoyant bound")
+            Line2D([], [], color=INK, linestyle=(0, (3, 2)), linewidth=1.2, label="clairvoyant lower bound")
         )
         figure.legend(handles=handles, loc="outside lower center", ncols=5 if columns > 1 else 3)
         _name(figure, rows)
-        save_picture(figure, path)
+    return figure
 
 
 def _draw_split(ax: Axes, rows: Sequence[Row], limit: float) -> None:
@@ -130,22 +180,21 @@ def _draw_split(ax: Axes, rows: Sequence[Row], limit: float) -> None:
 
 
 def _draw_break(ax: Axes, y: float, limit: float) -> None:
-    """Two slanted cuts near the end of a bar that goes on."""
+    """Mark a bar that is cut off by two slanted lines near its end."""
     slant = np.array([[-0.008, 0.46], [0.008, -0.46]])
     for at in (0.925, 0.95):
         xy = np.array([at, y]) + slant
         ax.plot(limit * xy[:, 0], xy[:, 1], color="white", linewidth=2.6)
 
 
-def save_time_against_occupancy(rows: Sequence[Row], path: str | Path) -> None:
-    """How the total time grows as the lot fills: a panel a failure cost, a line an agent.
+def draw_time_against_occupancy(rows: Sequence[Row]) -> Figure:
+    """Draw the total time against occupancy: a panel per failure cost, a line per agent.
 
     Args:
         rows: with occupancy (0..1), agent, failure_cost_s, total_s, total_s_ci95.
-        path: the PNG to write.
 
     Raises:
-        InputError: there are no rows, or the file cannot be written.
+        InputError: there are no rows.
     """
     _require_rows(rows)
     costs = sorted({row["failure_cost_s"] for row in rows})
@@ -159,31 +208,30 @@ def save_time_against_occupancy(rows: Sequence[Row], path: str | Path) -> None:
             its = [row for row in rows if row["failure_cost_s"] == cost]
             _draw_lines(ax, its, limit, lambda row: 100.0 * float(row["occupancy"]))
             ax.set_title(f"failure cost {cost:g} s")
-            ax.set_xlabel("slots taken at the arrival, %")
+            ax.set_xlabel("occupancy at the arrival, %")
         for ax in axes.flat[len(costs) :]:
             ax.remove()
         for ax in axes[:, 0]:
             ax.set_ylabel("mean total time, s; 95 % interval")
         _name(figure, rows)
-        save_picture(figure, path)
+    return figure
 
 
-def save_time_against_failure_cost(seen: Sequence[Row], unseen: Sequence[Row], path: str | Path) -> None:
-    """How the total time depends on what a failed try costs, with and without sight of the slots before a try.
+def draw_time_against_failure_cost(seen: Sequence[Row], unseen: Sequence[Row]) -> Figure:
+    """Draw the total time against the failure cost, with and without observations of slots before an attempt.
 
     Args:
         seen: rows with failure_cost_s, agent, total_s, total_s_ci95, of one scenario.
-        unseen: the same where nobody sees a slot before trying it.
-        path: the PNG to write.
+        unseen: the same without observations from the lane.
 
     Raises:
-        InputError: there are no rows, or the file cannot be written.
+        InputError: there are no rows.
     """
     _require_rows(seen)
     _require_rows(unseen)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(11.0, 4.2), layout="constrained")
-        panels = (("slots seen from the lane", seen), ("slots seen only by trying", unseen))
+        panels = (("slots observed from the lane", seen), ("no observation before an attempt", unseen))
         for ax, (title, rows) in zip(figure.subplots(1, 2), panels, strict=True):
             _draw_lines(ax, rows, _limit(rows), lambda row: float(row["failure_cost_s"]))
             last = max(row["failure_cost_s"] for row in rows)
@@ -193,46 +241,41 @@ def save_time_against_failure_cost(seen: Sequence[Row], unseen: Sequence[Row], p
             ax.set(xlim=(0.0, 1.08 * last), xticks=ticks, xticklabels=[str(tick) for tick in ticks])
             ax.minorticks_off()
             ax.set_title(title)
-            ax.set_xlabel(
-                "failure cost, s: what a try at a taken slot takes, and what planners are told of it"
-            )
+            ax.set_xlabel("failure cost, s (in the world and in the planners' models)")
             ax.set_ylabel("mean total time, s; 95 % interval")
         _name(figure, seen)
-        save_picture(figure, path)
+    return figure
 
 
-def save_time_against_map(
-    rows: Sequence[Row], own: Sequence[Row], said: Callable[[Row], float], path: str | Path
-) -> None:
-    """How the total time depends on what the map says where it says the same of every slot.
+def draw_time_against_map(rows: Sequence[Row], own: Sequence[Row], forecast: Mapping[str, float]) -> Figure:
+    """Draw the total time against a forecast that is the same for every slot.
 
     Args:
-        rows: with agent, total_s, total_s_ci95, of one world under several maps.
-        own: of the same world under the map that it comes with: dashed.
-        said: what a row's map says, 0 to 1.
-        path: the PNG to write.
+        rows: with scenario, agent, total_s, total_s_ci95, of one world with several flat forecasts.
+        own: of the same world with its own forecast: dashed.
+        forecast: P(taken) of each flat forecast, by scenario.
 
     Raises:
-        InputError: there are no rows, or the file cannot be written.
+        InputError: there are no rows.
     """
     _require_rows(rows)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(6.6, 4.2), layout="constrained")
         ax = figure.subplots()
         limit = _limit(rows)
-        _draw_lines(ax, rows, limit, lambda row: 100.0 * said(row))
+        _draw_lines(ax, rows, limit, lambda row: 100.0 * forecast[row["scenario"]])
         for row in own:
             color = AGENT_COLORS.get(row["agent"], OTHER_AGENT)
             ax.axhline(row["total_s"], color=color, linewidth=0.9, linestyle=(0, (2, 3)), zorder=1)
-        ax.set_title("dashed: with the scenario's own map")
-        ax.set_xlabel("what the map says of every slot: taken with this probability, %")
+        ax.set_title("dashed: with the scenario's own forecast")
+        ax.set_xlabel("forecast P(taken) of every slot, %")
         ax.set_ylabel("mean total time, s; 95 % interval")
         _name(figure, own or rows)
-        save_picture(figure, path)
+    return figure
 
 
 def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Row], float]) -> None:
-    """A line an agent; `along` says where a row lies on the axis below."""
+    """Draw a line per agent; `along` gives a row's place on the x axis."""
     ends = []
     places = [along(row) for row in rows]
     for agent in dict.fromkeys(row["agent"] for row in rows):
@@ -242,7 +285,7 @@ def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Ro
         total = np.array([row["total_s"] for row in own])
         low, high = np.array([_interval(row) for row in own]).T
         dashes = (0, (4, 2)) if agent == "oracle" else "-"
-        # The band of a line that has left the picture would only cover the others.
+        # The band of a line that is off the scale would only cover the others.
         ax.fill_between(x, low, high, where=total <= limit, color=color, alpha=0.15, linewidth=0)
         ax.plot(x, total, color=color, linestyle=dashes, linewidth=1.8, marker="o", markersize=3.5)
         ends.append((total[-1], x[-1], agent, color))
@@ -268,7 +311,7 @@ def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Ro
 
 
 def spread(places: Sequence[float], gap: float) -> FloatArray:
-    """Move ascending places apart by at least `gap`, as little as will do, none above 1 where they fit."""
+    """Move ascending places apart to at least `gap`, as little as possible, none above 1 if they fit."""
     spread = np.array(places, dtype=np.float64)
     for i in range(1, len(spread)):
         spread[i] = max(spread[i], spread[i - 1] + gap)
@@ -279,14 +322,14 @@ def spread(places: Sequence[float], gap: float) -> FloatArray:
 
 
 def _limit(rows: Sequence[Row]) -> float:
-    """Where the axis of total times ends: beyond all that is within `OFF_SCALE` medians."""
+    """Return the end of the axis of total times: beyond all totals within `OFF_SCALE` medians."""
     total = np.array([row["total_s"] for row in rows])
     near = total[total <= OFF_SCALE * np.median(total)]
     return float(1.12 * near.max()) or 1.0
 
 
 def _interval(row: Row) -> tuple[float, float]:
-    """Ends of the interval of the total; the mean itself where there is none."""
+    """Return the confidence interval of the total; the mean twice where there is none."""
     low, high = (row["total_s"] if end is None or end != end else end for end in row["total_s_ci95"])
     return low, high
 
@@ -297,7 +340,7 @@ def _require_rows(rows: Sequence[Row]) -> None:
 
 
 def _name(figure: Figure, rows: Sequence[Row]) -> None:
-    """Head a figure with the scenario, where the rows are of one."""
+    """Title a figure with the scenario if all rows have the same."""
     names = {row.get("scenario") for row in rows} - {None}
     episodes = {row.get("episodes") for row in rows} - {None}
     if len(names) == 1:

@@ -15,6 +15,7 @@ from PIL import Image as PillowImage
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.results import Row
+from parkenv.evaluation.figures.registry import FIGURES
 from parkenv.evaluation.report.drive_recording import data_uri
 from parkenv.evaluation.report.learning import learning_of
 from parkenv.evaluation.report.run_folder import RunFolder
@@ -36,18 +37,14 @@ LOSSLESS = 150_000
 _QUALITY = 86
 _HERE = Path(__file__).parent
 _FIGURES = (
-    ("time_split_", "Where the time goes"),
-    ("time_against_occupancy_", "Time against how full the lot is"),
-    ("time_against_failure_cost_", "Time against the failure cost"),
-    ("time_against_map_", "Time against what the map says"),
-    ("searches_", "Searches in one world"),
-    ("session", "One survey drive: grid, sightings of cars, slots judged"),
-    ("detections", "Frames with what was detected"),
-    ("slots_found_", "Slots found without a map"),
-    ("reach_", "In which weather and how far away cars are missed"),
-    ("graph_", "The drive graph with what the map says"),
-    ("map", "What the map says of every slot"),
-    ("learning_curve", "Learning curves, and the planners in the same worlds"),
+    *((f"{kind.name}_", kind.caption) for kind in FIGURES),
+    ("session", "One survey drive: occupancy grid, detected cars, slot states"),
+    ("detections", "Camera frames with detections"),
+    ("slots_found_", "Slots discovered without a map"),
+    ("reach_", "Detection rate by weather and distance"),
+    ("graph_", "Drive graph with the map's P(taken)"),
+    ("map", "The map: P(taken) of every slot"),
+    ("learning_curve", "Learning curves, and planners in the same worlds"),
 )
 
 

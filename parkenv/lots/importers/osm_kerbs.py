@@ -1,8 +1,8 @@
 """Kerbside parking as OpenStreetMap tags it on streets.
 
-Both taggings are read: `parking:left|right|both` with `:orientation`, `:capacity`, `:restriction` and
-`:access`, and the deprecated `parking:lane:left|right|both` with `parking:condition:...`. What is true at
-certain hours only (`:conditional`) is not regarded. A capacity of `both` sides is that of each.
+Both tagging schemes are read: `parking:left|right|both` with `:orientation`, `:capacity`, `:restriction` and
+`:access`, and the deprecated `parking:lane:left|right|both` with `parking:condition:...`. Restrictions at
+certain hours (`:conditional`) are ignored. A capacity of `both` sides is that of each side.
 """
 
 from __future__ import annotations
@@ -14,9 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.lots.generators import KERB_SIZE, Slots
-from parkenv.lots.places.osm_roads import Rank, Road, metres, whole_number
-from parkenv.lots.places.osm_rows import ARRANGEMENTS, DRAWN, NO_SLOTS, Side, crowding, places_along, row_at
-from parkenv.world.drive_graph import places as same_places
+from parkenv.lots.importers.osm_roads import Rank, Road, metres, whole_number
+from parkenv.lots.importers.osm_rows import (
+    ARRANGEMENTS,
+    DRAWN,
+    NO_SLOTS,
+    Side,
+    bend_factor,
+    row_anchors,
+    row_at,
+)
+from parkenv.world.drive_graph import node_labels
 
 FloatArray = NDArray[np.float64]
 
@@ -36,7 +44,7 @@ DRIVEWAY_CLEARANCE = 1.0
 SHORTEST_KERB_SLOT = 5.0
 """Where a tagged capacity needs more slots than fit at the usual length, they are as short as this, m."""
 STRAIGHT_ON = np.radians(30.0)
-"""Arms that turn off by less are the street itself, tagged in pieces."""
+"""Arms that turn off by less are the street itself, split into several ways."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +54,7 @@ class Kerb:
     Args:
         orientation: a key of `ARRANGEMENTS`.
         capacity: how many slots; None where the tags do not say.
-        on_carriageway: whether cars stand within what `width` measures.
+        on_carriageway: whether parked cars are within `width`.
     """
 
     orientation: str
@@ -55,53 +63,53 @@ class Kerb:
 
 
 def kerb_of(tags: Mapping[str, str], side: Side) -> Kerb | str | None:
-    """What tags say of a side of a way: parking, why there is none though there is room, or nothing."""
+    """Parking on one side of a way by its tags; a reason where parking is tagged but unusable; None without tags."""
 
-    def said(start: str, end: str = "") -> str | None:
+    def tag(start: str, end: str = "") -> str | None:
         return tags.get(f"{start}:{side}{end}", tags.get(f"{start}:both{end}"))
 
-    kind = said("parking")
+    kind = tag("parking")
     if kind is not None:
         if kind in ("no", "separate"):
             return None
-        orientation = said("parking", ":orientation") or "parallel"
+        orientation = tag("parking", ":orientation") or "parallel"
         if kind not in PARKED or orientation not in ARRANGEMENTS:
             return f"kerbs with parking={kind}, orientation={orientation}, which is not known"
         for key, closed in (("restriction", FORBIDDEN), ("access", ("no", "private"))):
-            value = said("parking", f":{key}")
+            value = tag("parking", f":{key}")
             if value in closed:
                 return f"kerbs with {key}={value}"
-        return Kerb(orientation, whole_number(said("parking", ":capacity")), kind == "lane")
+        return Kerb(orientation, whole_number(tag("parking", ":capacity")), kind == "lane")
 
-    old = said("parking:lane")
+    old = tag("parking:lane")
     if old is None or old in ("no", "none", "separate"):
         return None
-    condition = said("parking:condition")
+    condition = tag("parking:condition")
     if old in FORBIDDEN or condition in FORBIDDEN:
         return f"kerbs with {old if old in FORBIDDEN else condition}"
     if old not in OLD_ORIENTATIONS:
         return f"kerbs with parking:lane={old}, which is not known"
-    where = said("parking:lane", f":{old}") or "on_street"
-    capacity = whole_number(said("parking:lane", ":capacity") or said("parking", ":capacity"))
+    where = tag("parking:lane", f":{old}") or "on_street"
+    capacity = whole_number(tag("parking:lane", ":capacity") or tag("parking", ":capacity"))
     return Kerb(OLD_ORIENTATIONS[old], capacity, where == "on_street")
 
 
 def kerb_slots(road: Road, side: Side, kerb: Kerb, closed: Sequence[tuple[float, float]]) -> Slots:
-    """The slots along one side of a road.
+    """Make the slots along one side of a road.
 
-    Cars stand as traffic runs, on the right. As many stand as fit at 6 m (2.5 m across the street), or as
-    many as are tagged, spread over the free stretches; more than fit at 5 m are not made. Where `width` is
-    tagged it includes cars that stand on the carriageway.
+    Cars face the direction of traffic, on the right. There are as many slots as fit at 6 m (2.5 m across the
+    street), or as are tagged, spread over the free intervals; but no more than fit at 5 m. A tagged `width`
+    includes cars parked on the carriageway.
 
     Args:
         road: the road.
         side: as seen in the order of its points.
-        kerb: how cars stand.
-        closed: stretches, from and to, m from the road's start, that stay free.
+        kerb: how cars park.
+        closed: intervals, from and to, m from the road's start, that stay free.
     """
     how = ARRANGEMENTS[kerb.orientation]
     total = float(np.hypot(*np.diff(road.points, axis=0).T).sum())
-    free = _free_stretches(total, closed)
+    free = _free_intervals(total, closed)
     parallel = how.angle == 0.0
     least = SHORTEST_KERB_SLOT if parallel and kerb.capacity is not None else how.pitch
     depth = how.width if parallel else how.length * float(np.sin(how.angle))
@@ -109,25 +117,25 @@ def kerb_slots(road: Road, side: Side, kerb: Kerb, closed: Sequence[tuple[float,
     width = metres(road.tags.get("width"))
     if width is not None:
         offset = max(width / 2 - depth, 1.5) if kerb.on_carriageway else width / 2
-    bend = [crowding(road.points, start, end, side, offset + depth) for start, end in free]
+    bend = [bend_factor(road.points, start, end, side, offset + depth) for start, end in free]
     fit = np.array(
         [int((end - start + DRAWN) / (least * more)) for (start, end), more in zip(free, bend, strict=True)],
         dtype=np.int64,
     )
-    count = fit if kerb.capacity is None else _shared_out(kerb.capacity, free, fit)
+    count = fit if kerb.capacity is None else _distribute(kerb.capacity, free, fit)
 
     rows = []
     for (start, end), n, more in zip(free, count.tolist(), bend, strict=True):
         step = (end - start) / max(n, 1) if parallel else how.pitch * more
         middle, ranks = (start + end) / 2, np.arange(n) - (n - 1) / 2
         fitted = replace(how, length=min(how.length, step / more)) if parallel else how
-        spots = places_along(road.points, middle + ranks * step, fitted.pitch, side)
+        anchors = row_anchors(road.points, middle + ranks * step, fitted.pitch, side)
         with_points = road.oneway or side == "right"
-        rows.append(row_at(spots, offset, fitted, with_points=with_points))
+        rows.append(row_at(anchors, offset, fitted, with_points=with_points))
     return Slots.joined(rows) if rows else NO_SLOTS
 
 
-def _free_stretches(total: float, closed: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+def _free_intervals(total: float, closed: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
     free, start = [], 0.0
     for begin, end in sorted(closed):
         if begin > start:
@@ -138,54 +146,54 @@ def _free_stretches(total: float, closed: Sequence[tuple[float, float]]) -> list
     return free
 
 
-def _shared_out(
+def _distribute(
     capacity: int, free: Sequence[tuple[float, float]], fit: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """At most `fit` slots a stretch, `capacity` in all, longer stretches getting more."""
+    """Distribute `capacity` slots over the intervals, at most `fit` in each, more in longer ones."""
     count = np.zeros(len(fit), dtype=np.int64)
     length = np.array([end - start for start, end in free])
     for _ in range(min(capacity, int(fit.sum()))):
-        # The next slot goes where there is most room for each one.
+        # The next slot goes to the interval with the most room per slot.
         room = np.where(count < fit, length / (count + 1), -1.0)
         count[int(np.argmax(room))] += 1
     return count
 
 
 class Junctions:
-    """Where roads meet, and which stretches of a kerb that keeps free.
+    """Where roads meet, and which parts of a kerb stay free because of it.
 
     Args:
         roads: all roads, whether cars may park there or not.
-        crossings: (n, 2) m, where pedestrians cross.
+        crossings: (n, 2) m, pedestrian crossings.
     """
 
     def __init__(self, roads: Sequence[Road], crossings: FloatArray) -> None:
         self._roads = roads
         xy = np.concatenate([road.points for road in roads] + [crossings])
-        place = same_places(xy)
+        label = node_labels(xy)
         self._first = np.cumsum([0] + [len(road.points) for road in roads])
-        self._place = place
-        self._crossings = set(place[self._first[-1] :].tolist())
-        # For every place the arms that leave it: road, unit vector.
+        self._label = label
+        self._crossings = set(label[self._first[-1] :].tolist())
+        # For every node the arms that leave it: road, unit vector.
         self._arms: dict[int, list[tuple[int, FloatArray]]] = {}
         for k, road in enumerate(roads):
-            for i, at in enumerate(place[self._first[k] : self._first[k + 1]].tolist()):
+            for i, at in enumerate(label[self._first[k] : self._first[k + 1]].tolist()):
                 for j in (i - 1, i + 1):
                     if 0 <= j < len(road.points):
                         away = road.points[j] - road.points[i]
                         self._arms.setdefault(at, []).append((k, away / np.hypot(*away)))
 
-    def closed_stretches(self, k: int, side: Side) -> list[tuple[float, float]]:
-        """Stretches of a side of road k, from and to, m from its start, where nobody may park.
+    def closed_intervals(self, k: int, side: Side) -> list[tuple[float, float]]:
+        """Intervals of a side of road k, from and to, m from its start, where parking is forbidden.
 
-        At crossings with streets both sides stay free for 5 m beyond the corner and the cars parked round
-        it, at service roads the side that they join, at pedestrian crossings 5 m before and after.
+        At junctions with streets both sides stay free for 5 m beyond the corner and the cars parked round it, at
+        service roads the side that they join, at pedestrian crossings 5 m before and after.
         """
         points = self._roads[k].points
         stations = np.r_[0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T))].tolist()
         closed = []
         for i, station in enumerate(stations):
-            at = int(self._place[self._first[k] + i])
+            at = int(self._label[self._first[k] + i])
             if at in self._crossings:
                 closed.append((station - CORNER_CLEARANCE, station + CORNER_CLEARANCE))
             if len(self._arms[at]) < 3:

@@ -15,16 +15,16 @@ from parkenv.evaluation.figures.import_picture import save_import_picture
 from parkenv.lots import grid_lot, read_lot, write_lot
 from parkenv.lots.checks import check_lot
 from parkenv.lots.generators import BAY_SIZE, Slots, bay_row
+from parkenv.lots.importers.import_options import ImportOptions
+from parkenv.lots.importers.lot_import import import_lot
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.places.lot_draft import Wishes
-from parkenv.lots.places.lot_import import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.lot import Mouth
 
 DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"
 
 
-def listed(tmp_path, xy, *, yaw=None, ids=None, order=None, **wishes):
+def listed(tmp_path, xy, *, yaw=None, ids=None, order=None, **options):
     """The draft of a list of slots."""
     ids = ids or [f"s{i}" for i in range(len(xy))]
     lines = ["id,x,y" + ("" if yaw is None else ",yaw")]
@@ -33,12 +33,12 @@ def listed(tmp_path, xy, *, yaw=None, ids=None, order=None, **wishes):
         lines.append(",".join(cells))
     path = tmp_path / "slots.csv"
     path.write_text("\n".join(lines), encoding="utf-8")
-    return import_lot(path, Wishes(**wishes))
+    return import_lot(path, ImportOptions(**options))
 
 
-def of_lot(tmp_path, lot, *, with_yaw=False, **wishes):
+def of_lot(tmp_path, lot, *, with_yaw=False, **options):
     yaw = lot.slot_yaw if with_yaw else None
-    return listed(tmp_path, lot.slot_xy, yaw=yaw, ids=list(lot.slot_ids), **wishes)
+    return listed(tmp_path, lot.slot_xy, yaw=yaw, ids=list(lot.slot_ids), **options)
 
 
 def row(n, y, *, x=0.0, pitch=2.5):
@@ -114,7 +114,7 @@ def test_latitudes_and_longitudes_are_metres_after_all(tmp_path):
     path = tmp_path / "slots.csv"
     path.write_text("\n".join(lines))
     lon, lat = frame.to_lonlat(lot.entries)[0].tolist()
-    draft = import_lot(path, Wishes(entries=((lat, lon),), goals=((lat, lon + 3e-4),)))
+    draft = import_lot(path, ImportOptions(entries=((lat, lon),), goals=((lat, lon + 3e-4),)))
     found = draft.lot()
     assert found.slot_ids[0] == "2"  # the row in the file
     back = frame.to_xy(draft.frame.to_lonlat(found.mouth_xy()))
@@ -133,7 +133,7 @@ def test_stray_slots_are_left_out_and_listed(tmp_path):
     lot = grid_lot(4, 8)
     xy = np.vstack([lot.slot_xy, [[60.0, 60.0]]])
     draft = listed(tmp_path, xy, entries=((-3.0, 0.0),), goals=((9.0, 9.0),))
-    assert [str(left) for left in draft.left_out] == ["slots that stand in no row: 1 (s32)"]
+    assert [str(left) for left in draft.left_out] == ["slots in no row: 1 (s32)"]
     assert draft.lot().n_slots == 32
 
 
@@ -193,10 +193,10 @@ UNSURE = {
     "a bend": ([(30 * np.sin(a), 30 * np.cos(a)) for a in np.arange(8) * 0.085], "bends by"),
     "aisles on both sides": (row(8, 0) + row(8, 11) + row(8, 22), "has room for an aisle on either side"),
     "a way in nowhere": (row(8, 0) + row(8, 5) + row(8, 10), "close by on either side, and no way in"),
-    "apart": (row(8, 0) + row(8, 11) + row(8, 300) + row(8, 311), "2 aisles, of which 1 are joined"),
+    "apart": (row(8, 0) + row(8, 11) + row(8, 300) + row(8, 311), "2 aisles, of which 1 are connected"),
     "scattered": (
         [(7.5 * i + 1.5 * (j % 2), 7.5 * j) for i in range(5) for j in range(5)],
-        "most slots stand alone|stand in no row|either side",
+        "most slots stand alone|are in no row|either side",
     ),
 }
 
@@ -247,9 +247,9 @@ def test_parking_costs_stay_with_their_slots(tmp_path):
     lines = [f"{lot.slot_ids[i]},{lot.slot_xy[i, 0]},{lot.slot_xy[i, 1]},{cost[i]}" for i in order]
     (tmp_path / "slots.csv").write_text("\n".join(["id,x,y,parking_cost_s", *lines]))
     ends = {"entries": (tuple(lot.entries[0]),), "goals": (tuple(lot.goals[0]),)}
-    west = Wishes(bounds=((-5.0, -20.0), (12.5, 20.0)), **ends)
-    for wishes, n in ((Wishes(**ends), 16), (west, 10)):
-        drawn = import_lot(tmp_path / "slots.csv", wishes).lot()
+    west = ImportOptions(bounds=((-5.0, -20.0), (12.5, 20.0)), **ends)
+    for options, n in ((ImportOptions(**ends), 16), (west, 10)):
+        drawn = import_lot(tmp_path / "slots.csv", options).lot()
         assert drawn.n_slots == n
         costs = dict(zip(lot.slot_ids, cost, strict=True))
         assert drawn.slot_parking_cost_s.tolist() == [costs[name] for name in drawn.slot_ids]
@@ -272,9 +272,9 @@ FAULTS = [
     ("lat,lon\n1,-181", "row 2: lon is '-181', want a number from -180 to 180"),
     ("x,y,yaw\n1,2,", "row 2: yaw is '', want a number"),
     ("x,y,parking_cost_s\n1,2,-3", "row 2: parking_cost_s is '-3', want a number from 0 to 1e\\+08"),
-    ("id,x,y\na,1,2\na,9,2", "row 3: id 'a' stands already in row 2"),
+    ("id,x,y\na,1,2\na,9,2", "row 3: id 'a' appears already in row 2"),
     ("id,x,y\n,1,2", "row 2: id '' is empty"),
-    ("x,y\n1,2\n9,9\n1.01,2", "row 4: slot '4' lies where slot '2' of row 2 does"),
+    ("x,y\n1,2\n9,9\n1.01,2", "row 4: slot '4' lies where slot '2' of row 2 is"),
 ]
 
 

@@ -1,4 +1,4 @@
-"""Lists of slots: a CSV file of their centres, and the lot that follows from the rows in which they stand."""
+"""Lists of slots: a CSV file of slot centres, and the lot inferred from it."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.lots.importers.import_options import ImportOptions, points_in_frame
+from parkenv.lots.importers.lot_draft import LeftOut, LotDraft
+from parkenv.lots.importers.osm_rows import NO_SLOTS
+from parkenv.lots.importers.slot_layout import infer_layout
+from parkenv.lots.importers.slot_rows import AmbiguousLayoutError
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.places.lot_draft import LeftOut, LotDraft, Wishes, points_in
-from parkenv.lots.places.osm_rows import NO_SLOTS
-from parkenv.lots.places.slot_rows import UnsureError, lay_out
 
 FloatArray = NDArray[np.float64]
 
@@ -24,14 +26,14 @@ SAME_PLACE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class SlotList:
-    """Slots of which the centres are known.
+    """Slots whose centres are known.
 
     Args:
         ids: n_slots names.
         xy: (n_slots, 2) m.
-        yaw: (n_slots,) rad, heading of a car that stands nose-in; None if the file does not say.
+        yaw: (n_slots,) rad, heading of a car parked nose-in; None without the column.
         parking_cost_s: (n_slots,) s, at least 0.
-        frame: where the metres lie on the globe; None for a file of metres.
+        frame: of the lot on the globe; None for a file in metres.
     """
 
     ids: tuple[str, ...]
@@ -44,13 +46,13 @@ class SlotList:
 def read_slot_list(path: str | Path) -> SlotList:
     """Read a CSV file of slot centres.
 
-    Its first line names the columns: `x,y` in metres east and north, or `lat,lon` in degrees; further `yaw`,
-    the heading in rad, counter-clockwise from east, of a car that stands nose-in, `id`, and `parking_cost_s`, what
-    parking there costs in seconds (0 without the column). Slots without ids are called by their line.
+    The first line names the columns: `x,y` in metres east and north, or `lat,lon` in degrees; optional are `yaw`,
+    the heading in rad, counter-clockwise from east, of a car parked nose-in, `id` (by default the row number), and
+    `parking_cost_s`, what parking there costs in seconds (by default 0).
 
     Raises:
-        InputError: the file cannot be read, a column is missing or unknown, a value is no finite number or
-            out of range, an id or a place stands twice.
+        InputError: the file cannot be read, a column is missing or unknown, a value is not a finite number or
+            out of range, an id or a position appears twice.
     """
     path = Path(path)
     try:
@@ -81,7 +83,7 @@ def read_slot_list(path: str | Path) -> SlotList:
         cells = dict(zip(head, (cell.strip() for cell in row), strict=True))
         name = cells.get("id", str(number))
         if not name or name in ids:
-            where = f"stands already in row {ids[name]}" if name else "is empty"
+            where = f"appears already in row {ids[name]}" if name else "is empty"
             raise InputError(f"{path}: row {number}: id {name!r:.40} {where}")
         ids[name] = number
         for column in values:
@@ -115,24 +117,23 @@ def _require_apart(path: Path, xy: FloatArray, ids: tuple[str, ...], rows: tuple
     if len(same):
         i, j = sorted(same[np.lexsort(np.sort(same, axis=1).T)[0]].tolist())
         raise InputError(
-            f"{path}: row {rows[j]}: slot {ids[j]!r:.40} lies where slot {ids[i]!r:.40} of row {rows[i]} does"
+            f"{path}: row {rows[j]}: slot {ids[j]!r:.40} lies where slot {ids[i]!r:.40} of row {rows[i]} is"
         )
 
 
-def slot_list_draft(path: str | Path, wishes: Wishes | None = None) -> LotDraft:
-    """The lot that a list of slots tells of.
+def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
+    """Draft a lot from a list of slots.
 
-    Rows and aisles are found as `parkenv.lots.places.slot_rows` says. Where that is not sure the draft has no slots'
-    shapes and says so; it draws nevertheless. A list tells neither where cars come in nor where people
-    walk to.
+    See `parkenv.lots.importers.slot_layout` for the rules. Where they are ambiguous the draft has slot centres
+    only, and says so; it can still be drawn. A list states neither entries nor goals.
 
     Raises:
         InputError: see `read_slot_list`.
     """
     path = Path(path)
-    wishes = wishes or Wishes()
+    options = options or ImportOptions()
     listed = read_slot_list(path)
-    box = wishes.box(listed.frame)
+    box = options.box(listed.frame)
     xy, ids, yaw, cost = listed.xy, listed.ids, listed.yaw, listed.parking_cost_s
     left_out: tuple[LeftOut, ...] = ()
     if box is not None:
@@ -142,14 +143,17 @@ def slot_list_draft(path: str | Path, wishes: Wishes | None = None) -> LotDraft:
         xy, yaw, cost = xy[inside], None if yaw is None else yaw[inside], cost[inside]
         ids = tuple(name for name, is_in in zip(ids, inside, strict=True) if is_in)
     how = "LAT,LON" if listed.frame else "X,Y"
-    entries, goals = points_in(listed.frame, wishes.entries), points_in(listed.frame, wishes.goals)
+    entries, goals = (
+        points_in_frame(listed.frame, options.entries),
+        points_in_frame(listed.frame, options.goals),
+    )
     missing = []
     found = [f"{len(ids)} slot centres"]
     if listed.frame is not None:
         found.append(f"frame: metres east and north of {listed.frame.lat:.7f}, {listed.frame.lon:.7f}")
     try:
-        layout = lay_out(xy, yaw, ids)
-    except UnsureError as error:
+        layout = infer_layout(xy, yaw, ids)
+    except AmbiguousLayoutError as error:
         return LotDraft(
             name=path.stem,
             slot_ids=(),
@@ -160,22 +164,22 @@ def slot_list_draft(path: str | Path, wishes: Wishes | None = None) -> LotDraft:
             goals=goals,
             outlines=tuple(np.stack([row[0], row[-1]]) for row in error.rows),
             loose=xy,
-            found=(*found, *error.saw),
+            found=(*found, *error.found),
             missing=(f"no aisles: {error}",),
             frame=listed.frame,
         )
     if layout.strays:
-        left_out = (LeftOut("slots that stand in no row", tuple(ids[i] for i in layout.strays)),)
+        left_out = (LeftOut("slots in no row", tuple(ids[i] for i in layout.strays)),)
     if not len(entries):
         ends = [lane.points[i] for lane in layout.lanes for i in (0, -1)]
         if listed.frame is not None:
             ends = list(listed.frame.to_lonlat(ends)[:, ::-1])
         digits = 6 if listed.frame else 1
         shown = " or ".join(f"{a:.{digits}f},{b:.{digits}f}" for a, b in ends[:2])
-        missing.append(f"no entry: a list of slots does not tell; give one by --entry {how}, e.g. {shown}")
+        missing.append(f"no entry: a list of slots has none; give one by --entry {how}, e.g. {shown}")
     if not len(goals):
         missing.append(
-            f"no goal: a list of slots does not tell; give the place people walk to by --goal {how}"
+            f"no goal: a list of slots has none; give the place that people walk to by --goal {how}"
         )
     return LotDraft(
         name=path.stem,
@@ -185,7 +189,7 @@ def slot_list_draft(path: str | Path, wishes: Wishes | None = None) -> LotDraft:
         lanes=layout.lanes,
         entries=entries,
         goals=goals,
-        found=(*found, *layout.saw),
+        found=(*found, *layout.found),
         left_out=left_out,
         missing=tuple(missing),
         frame=listed.frame,

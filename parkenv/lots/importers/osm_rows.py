@@ -18,7 +18,7 @@ Side = Literal["left", "right"]
 
 @dataclass(frozen=True)
 class Arrangement:
-    """How cars stand along a road.
+    """How cars park along a road.
 
     Args:
         angle: rad, between the road and the cars, from 0 (along it) to π/2 (across).
@@ -43,12 +43,12 @@ ARRANGEMENTS = {
 }
 """By the values of OpenStreetMap's `orientation`; diagonal cars stand at 60°."""
 DRAWN = 0.05
-"""Length, m, that a row may lack: OpenStreetMap's seven digits round to a centimetre."""
+"""Length, m, by which a row may be too short: OpenStreetMap's seven digits round to a centimetre."""
 NO_SLOTS = bay_row((0.0, 0.0), 0.0, 0)
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class RowAnchors:
     """Where the slots of a row meet the road: n points on its centre line.
 
     Args:
@@ -62,8 +62,8 @@ class Places:
     outward: FloatArray
 
 
-def places_along(points: FloatArray, stations: FloatArray, pitch: float, side: Side) -> Places:
-    """Places on a road, (k, 2) m, at distances from its start, (n,) m, each as wide as `pitch`."""
+def row_anchors(points: FloatArray, stations: FloatArray, pitch: float, side: Side) -> RowAnchors:
+    """Anchors on a road, points (k, 2) m, at stations, (n,) m from its start; a slot takes `pitch` m of the road."""
     run = np.r_[0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T))]
     ends = [
         np.stack([np.interp(stations + half, run, points[:, i]) for i in (0, 1)], axis=1)
@@ -72,29 +72,29 @@ def places_along(points: FloatArray, stations: FloatArray, pitch: float, side: S
     chord = ends[1] - ends[0]
     along = chord / np.hypot(chord[:, 0], chord[:, 1])[:, None]
     left = np.stack([-along[:, 1], along[:, 0]], axis=1)
-    return Places((ends[0] + ends[1]) / 2, along, left if side == "left" else -left)
+    return RowAnchors((ends[0] + ends[1]) / 2, along, left if side == "left" else -left)
 
 
-def row_at(places: Places, offset: FloatArray | float, how: Arrangement, *, with_points: bool) -> Slots:
-    """The slots of a row.
+def row_at(anchors: RowAnchors, offset: FloatArray | float, how: Arrangement, *, with_points: bool) -> Slots:
+    """Make the slots of a row.
 
     Args:
-        places: where the row meets its road.
+        anchors: where the row meets its road.
         offset: m, (n,) or one for all, from the centre line to the near edge of the slots.
-        how: how cars stand.
+        how: how cars park.
         with_points: whether cars pass the row in the order of the road's points.
     """
-    heading = places.along if with_points else -places.along
-    outward = places.outward
+    heading = anchors.along if with_points else -anchors.along
+    outward = anchors.outward
     reach = np.broadcast_to(np.asarray(offset, dtype=np.float64), len(outward))[:, None]
     nose = np.cos(how.angle) * heading + np.sin(how.angle) * outward
     if how.angle == 0.0:
-        center = places.xy + (reach + how.width / 2) * outward
+        center = anchors.xy + (reach + how.width / 2) * outward
         on_right = heading[:, 1] * outward[:, 0] - heading[:, 0] * outward[:, 1] > 0.0
         mouth = np.where(on_right, Mouth.LEFT, Mouth.RIGHT)
     else:
         # The near corner of an angled slot touches the edge, so the middle of its mouth lies behind it.
-        center = places.xy + (reach + how.width / 2 * np.cos(how.angle)) * outward + how.length / 2 * nose
+        center = anchors.xy + (reach + how.width / 2 * np.cos(how.angle)) * outward + how.length / 2 * nose
         mouth = np.full(len(outward), int(Mouth.REAR))
     return Slots(
         xy=center,
@@ -105,16 +105,16 @@ def row_at(places: Places, offset: FloatArray | float, how: Arrangement, *, with
     )
 
 
-def crowding(points: FloatArray, start: float, end: float, side: Side, reach: float) -> float:
-    """How much longer a stretch of a road is than its parallel `reach` m to a side; at least 1.
+def bend_factor(points: FloatArray, start: float, end: float, side: Side, reach: float) -> float:
+    """How much longer a part of a road is than its parallel `reach` m to a side; at least 1.
 
-    On the inside of a bend slots need so much more room along the road.
+    On the inside of a bend slots need more room along the road by this factor.
     """
     n = max(int((end - start) / 2.0), 2)
     step = (end - start) / n
     stations = np.asarray(start + (np.arange(n) + 0.5) * step, dtype=np.float64)
-    spots = places_along(points, stations, step, side)
-    beside = np.diff(spots.xy + reach * spots.outward, axis=0)
+    anchors = row_anchors(points, stations, step, side)
+    beside = np.diff(anchors.xy + reach * anchors.outward, axis=0)
     length = float(np.hypot(beside[:, 0], beside[:, 1]).sum())
     return max(1.0, (end - start) * (n - 1) / n / max(length, 0.1))
 
@@ -128,7 +128,7 @@ def boxes_of(slots: Slots, shrink: float = 0.0) -> NDArray[np.object_]:
 
 
 def without_overlaps(boxes: NDArray[np.object_]) -> NDArray[np.bool_]:
-    """Which rectangles, (n,), to keep so that none overlaps an earlier one that is kept."""
+    """Mask, (n,), of the rectangles to keep so that no two of them overlap; earlier ones take precedence."""
     kept = np.ones(len(boxes), dtype=bool)
     if len(boxes) < 2:
         return kept

@@ -1,4 +1,4 @@
-"""Crossings of more roads than a drive graph has moves."""
+"""Junctions of more lanes than a drive graph has moves."""
 
 from __future__ import annotations
 
@@ -7,48 +7,48 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.world.drive_graph import places
+from parkenv.world.drive_graph import node_labels
 from parkenv.world.lot import MOVES, Lane
 
 FloatArray = NDArray[np.float64]
 
-STEP_ASIDE = 4.0
-"""How far along its neighbour, m, a lane joins that finds no room at a crossing; half of a shorter neighbour."""
+JOIN_DISTANCE = 4.0
+"""Where on its neighbour, m from the junction, a lane joins that has no room at it; half of a shorter neighbour."""
 
 
-def uncrowded(lanes: Sequence[Lane]) -> list[Lane]:
-    """Lanes such that at most four lead away from every crossing.
+def limit_junctions(lanes: Sequence[Lane]) -> list[Lane]:
+    """Change lanes so that at most four lead away from every junction.
 
-    Where more do, a lane that ends there joins the arm next to it a few metres before the crossing instead.
-    A crossing at which too few lanes end stays as it is.
+    Where more do, a lane that ends there joins the neighbouring arm a few metres before the junction instead.
+    A junction at which too few lanes end stays as it is.
     """
     lines = [lane.points for lane in lanes]
     oneway = [lane.oneway for lane in lanes]
     for _ in range(sum(map(len, lines))):
-        crowded = _crowded_place(lines, oneway)
-        if crowded is None or not _step_aside(lines, crowded):
+        crowded = _crowded_node(lines, oneway)
+        if crowded is None or not _move_lane_end(lines, crowded):
             break
     return [Lane(points, one) for points, one in zip(lines, oneway, strict=True)]
 
 
 def _leaving(lines: Sequence[FloatArray], oneway: Sequence[bool], at: set[tuple[int, int]]) -> int:
-    """How many ways lead away from a place, given as (lane, point) pairs."""
+    """The number of ways that lead away from a node, given as (lane, point) pairs."""
     forward = sum(i + 1 < len(lines[k]) for k, i in at)
     return forward + sum(i > 0 and not oneway[k] for k, i in at)
 
 
-def _crowded_place(lines: Sequence[FloatArray], oneway: Sequence[bool]) -> set[tuple[int, int]] | None:
+def _crowded_node(lines: Sequence[FloatArray], oneway: Sequence[bool]) -> set[tuple[int, int]] | None:
     pairs = [(k, i) for k, line in enumerate(lines) for i in range(len(line))]
     at: dict[int, set[tuple[int, int]]] = {}
-    for place, pair in zip(places(np.concatenate(lines)).tolist(), pairs, strict=True):
-        at.setdefault(place, set()).add(pair)
+    for label, pair in zip(node_labels(np.concatenate(lines)).tolist(), pairs, strict=True):
+        at.setdefault(label, set()).add(pair)
     for users in at.values():
         if _leaving(lines, oneway, users) > len(MOVES) and any(i in (0, len(lines[k]) - 1) for k, i in users):
             return users
     return None
 
 
-def _step_aside(lines: list[FloatArray], users: set[tuple[int, int]]) -> bool:
+def _move_lane_end(lines: list[FloatArray], users: set[tuple[int, int]]) -> bool:
     """Move the end of the lane that lies closest to another arm onto that arm."""
     arms = []  # lane, point, neighbouring point, whether the lane ends here
     for k, i in sorted(users):
@@ -69,7 +69,7 @@ def _step_aside(lines: list[FloatArray], users: set[tuple[int, int]]) -> bool:
     other, i_b, j_b, _ = arms[best[2]]
     arm = lines[other][j_b] - lines[other][i_b]
     length = float(np.hypot(*arm))
-    joint = lines[other][i_b] + min(STEP_ASIDE, length / 2) / length * arm
+    joint = lines[other][i_b] + min(JOIN_DISTANCE, length / 2) / length * arm
     lines[other] = np.insert(lines[other], max(i_b, j_b), joint, axis=0)
     moved = lines[k].copy()
     moved[i] = joint

@@ -1,4 +1,4 @@
-"""Roads that cars may drive, as OpenStreetMap tags them, and the ways in which they meet."""
+"""Roads that cars may drive, as OpenStreetMap tags them."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ AISLE_WIDTH = 6.0
 LANE_WIDTH = 3.0
 """Of each lane that `lanes` counts, m."""
 NOT_FOR_PARKING = ("drive-through", "emergency_access", "bus")
-"""Kinds of `highway=service` on which nobody searches."""
+"""Kinds of `highway=service` that are no lanes."""
 
 
 class Rank(IntEnum):
-    """Which road a slot opens to where it faces several: the least rank."""
+    """Kind of road; a slot that faces several roads opens to the one of least rank."""
 
     AISLE = 0
     SERVICE = 1
@@ -52,7 +52,7 @@ class Road:
         points: (k, 2) m, in the direction of traffic where it is one-way.
         rank: what kind of road.
         oneway: whether cars drive in the order of the points only.
-        turned: whether the points run against the way's own order, so that its left is on their right.
+        turned: whether the points are in reverse order of the way, so that its tags for left and right swap.
     """
 
     id: str
@@ -64,7 +64,7 @@ class Road:
 
     @property
     def half_width(self) -> float:
-        """From the centre line to the edge of the carriageway, m, parked cars aside."""
+        """From the centre line to the edge of the carriageway without parked cars, m."""
         width = metres(self.tags.get("width"))
         if width is not None and not self.has_kerb_parking:
             return width / 2
@@ -79,12 +79,12 @@ class Road:
 
     @property
     def has_kerb_parking(self) -> bool:
-        """Whether the tags say anything of parking along the road; `width` then includes parked cars."""
+        """Whether parking along the road is tagged; `width` then includes parked cars."""
         return any(key.startswith("parking:") for key in self.tags)
 
 
 def road_of(element_id: str, tags: Mapping[str, str], points: FloatArray) -> Road | str | None:
-    """The road that a way is, why it is none though it carries cars, or None for any other way."""
+    """Make a road of a way; a reason where a road is left out; None for any other way."""
     kind = tags.get("highway", "").removesuffix("_link")
     if kind not in STREET_WIDTH or tags.get("area") == "yes":
         return None
@@ -114,7 +114,7 @@ def road_of(element_id: str, tags: Mapping[str, str], points: FloatArray) -> Roa
 
 
 def closed_to_cars(tags: Mapping[str, str]) -> str | None:
-    """The tag that keeps cars out, the most specific one deciding; None where there is none."""
+    """The tag that excludes cars (the most specific access tag decides), or None."""
     for key in ("motorcar", "motor_vehicle", "vehicle", "access"):
         if key in tags:
             return f"{key}={tags[key]}" if tags[key] in ("no", "private") else None
@@ -122,7 +122,7 @@ def closed_to_cars(tags: Mapping[str, str]) -> str | None:
 
 
 def off_the_ground(tags: Mapping[str, str]) -> str | None:
-    """The tag that puts a thing below the ground or on a deck; None where there is none."""
+    """The tag that places an element below the ground or on a deck, or None."""
     if tags.get("tunnel", "no") not in ("no", "building_passage"):
         return f"tunnel={tags['tunnel']}"
     if tags.get("location") in ("underground", "indoor", "roof"):
@@ -137,12 +137,12 @@ def off_the_ground(tags: Mapping[str, str]) -> str | None:
 
 
 def metres(text: str | None) -> float | None:
-    """A tag's positive number, `6`, `6.5 m`; None for anything else."""
+    """Parse a length, m, such as `6` or `6.5 m`; None for anything else."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*m?\s*", text or "")
     value = float(match[1]) if match else 0.0
     return value if 0.0 < value < 100.0 else None
 
 
 def whole_number(text: str | None) -> int | None:
-    """A tag's count; None for anything else."""
+    """Parse a count; None for anything else."""
     return int(text) if text is not None and re.fullmatch(r"\d{1,6}", text.strip()) else None

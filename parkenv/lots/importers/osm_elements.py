@@ -1,4 +1,4 @@
-"""OpenStreetMap elements in a file: nodes, ways and multipolygons with their tags and places.
+"""Read OpenStreetMap files: nodes, ways and multipolygons with their tags and positions.
 
 Three formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `out;`), Overpass
 JSON (`elements`, with node references or `out geom;`), and GeoJSON as overpass-turbo and osmtogeojson write
@@ -28,16 +28,16 @@ FloatArray = NDArray[np.float64]
 
 OSM_ID = re.compile(r"(node|way|relation)/-?\d+")
 MAPPED_KEYS = ("amenity", "highway", "building", "entrance")
-"""Keys that tell an element of OpenStreetMap from other GeoJSON."""
+"""Keys that distinguish elements of OpenStreetMap from other GeoJSON."""
 
 
 @dataclass(frozen=True, eq=False)
 class OsmElement:
-    """Something on the map.
+    """A node, way or multipolygon.
 
     Attributes:
-        id: as the map's own addresses have it, `way/123`.
-        tags: what it is.
+        id: such as `way/123`, as in the map's own addresses.
+        tags: its keys and values.
         lines: (k, 2) degrees, longitude first: a node's one position, a way's line, a multipolygon's outer
             rings. A closed line ends where it starts.
         holes: a multipolygon's inner rings.
@@ -55,16 +55,16 @@ class OsmElement:
 
     @property
     def is_closed(self) -> bool:
-        """Whether all of its lines come back to where they start, round an area."""
+        """Whether all of its lines end where they start, round an area."""
         return all(len(line) >= 4 and np.array_equal(line[0], line[-1]) for line in self.lines)
 
 
 def read_elements(path: Path) -> list[OsmElement]:
-    """All tagged nodes, ways and multipolygons of a file, in its order.
+    """Read all tagged nodes, ways and multipolygons of a file, in its order.
 
     Raises:
-        InputError: the file cannot be read, is torn or of another kind, a position is none on the globe, or
-            a tagged way refers to a node that the file does not hold, or an element stands twice and differs.
+        InputError: the file cannot be read, is incomplete or of another format, a position is not on the globe,
+            a tagged way refers to a node that is not in the file, or an element appears twice and differs.
     """
     try:
         if path.suffix.lower() in (".osm", ".xml"):
@@ -85,7 +85,7 @@ def read_elements(path: Path) -> list[OsmElement]:
 
 
 def holds_osm(document: object) -> bool:
-    """Whether parsed JSON is Overpass's or GeoJSON made from OpenStreetMap, not a native lot."""
+    """Whether parsed JSON is Overpass JSON or GeoJSON made from OpenStreetMap, not a native lot."""
     if not isinstance(document, dict):
         return False
     if isinstance(document.get("elements"), list):
@@ -99,7 +99,7 @@ def holds_osm(document: object) -> bool:
     )
 
 
-# ---- what all formats share: references are put in place when everything has been read ----
+# ---- common to all formats: references are resolved when everything has been read ----
 
 
 @dataclass
@@ -117,7 +117,7 @@ class _Relation:
 
 @dataclass
 class _Raw:
-    """Elements as they stand in a file."""
+    """Elements as read, with unresolved references."""
 
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
     node_tags: dict[int, dict[str, str]] = field(default_factory=dict)
@@ -125,21 +125,21 @@ class _Raw:
     relations: dict[int, _Relation] = field(default_factory=dict)
 
     def add_node(self, number: int, position: tuple[float, float], tags: dict[str, str]) -> None:
-        """Take in a node. It may stand in a file again, with or without its tags, as Overpass writes it."""
+        """Add a node; Overpass may write it again, with or without its tags."""
         before = self.positions.setdefault(number, position)
         if before != position:
             raise InputError(
-                f"node/{number} stands twice, at {before[1]}, {before[0]} and at {position[1]}, {position[0]}"
+                f"node/{number} appears twice, at {before[1]}, {before[0]} and at {position[1]}, {position[0]}"
             )
         if tags:
             self.node_tags[number] = tags
 
     def add_way(self, number: int, way: _Way) -> None:
-        """Take in a way, which may stand in a file again, too."""
+        """Add a way, which may also appear again."""
         before = self.ways.get(number)
         if before is not None:
             if before.refs and way.refs and before.refs != way.refs:
-                raise InputError(f"way/{number} stands twice, with other nodes")
+                raise InputError(f"way/{number} appears twice, with other nodes")
             line = before.line if way.line is None else way.line
             way = _Way(way.tags or before.tags, way.refs or before.refs, line)
         self.ways[number] = way
@@ -218,7 +218,7 @@ def _is_area_relation(tags: Mapping[str, str]) -> bool:
 
 
 class _XmlReader:
-    """Gathers elements from an `ElementTree.XMLParser`, without a tree."""
+    """Collects elements from an `ElementTree.XMLParser`, without a tree."""
 
     def __init__(self) -> None:
         self.raw = _Raw()
@@ -358,7 +358,7 @@ def _geometry(name: str, holder: Mapping[str, Any]) -> FloatArray | None:
 
 
 def _feature_element(index: int, feature: Any) -> OsmElement | None:
-    """A feature of GeoJSON; None for one without a geometry that a lot could be made of."""
+    """Convert a GeoJSON feature; None without a geometry that an import can use."""
     if not isinstance(feature, dict):
         raise InputError(f"features[{index}] is {feature!r:.40}, want a GeoJSON feature")
     properties = feature["properties"] if _is_object(feature, "properties") else {}

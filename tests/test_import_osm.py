@@ -22,9 +22,9 @@ from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.figures.import_picture import save_import_picture
 from parkenv.lots import packaged_lot, read_lot, write_lot
 from parkenv.lots.checks import check_lot
+from parkenv.lots.importers.import_options import ImportOptions
+from parkenv.lots.importers.lot_import import import_lot
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.places.lot_draft import Wishes
-from parkenv.lots.places.lot_import import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import Mouth
@@ -140,10 +140,10 @@ class Map:
                 feature(f"node/{number[point]}", tags, "Point", at[number[point]])
         return json.dumps({"type": "FeatureCollection", "features": features})
 
-    def draft(self, tmp_path, **wishes):
+    def draft(self, tmp_path, **options):
         path = tmp_path / "place.osm"
         path.write_text(self.xml(), encoding="utf-8")
-        return import_lot(path, Wishes(**wishes))
+        return import_lot(path, ImportOptions(**options))
 
 
 def car_park():
@@ -241,10 +241,10 @@ def test_native_lots_pass_through(tmp_path):
     lot = packaged_lot("mini")
     write_lot(lot, tmp_path / "mini.geojson")
     assert import_lot(tmp_path / "mini.geojson").lot() == lot
-    moved = import_lot(tmp_path / "mini.geojson", Wishes(goals=((3.0, 4.0),))).lot()
+    moved = import_lot(tmp_path / "mini.geojson", ImportOptions(goals=((3.0, 4.0),))).lot()
     assert moved.goals.tolist() == [[3.0, 4.0]]
-    with pytest.raises(InputError, match="bounds go with OpenStreetMap"):
-        import_lot(tmp_path / "mini.geojson", Wishes(bounds=((0, 0), (9, 9))))
+    with pytest.raises(InputError, match="bounds apply to OpenStreetMap"):
+        import_lot(tmp_path / "mini.geojson", ImportOptions(bounds=((0, 0), (9, 9))))
 
 
 def test_a_map_is_no_lot_and_the_error_says_what_makes_one_of_it(tmp_path):
@@ -364,7 +364,7 @@ def test_slots_that_no_way_leads_to_are_listed(tmp_path):
     # A one-way aisle from the lot's far side to the service road: nobody gets onto it.
     place.way([(-40, 20), (0, 20)], AISLE, oneway="yes").box(-20, 23, -17.5, 28, SPACE)
     draft = place.draft(tmp_path)
-    assert reasons(draft)["slots that no way leads to from an entry"] == ("way/31",)
+    assert reasons(draft)["slots that cannot be reached from an entry"] == ("way/31",)
     assert draft.lot().n_slots == 22
 
 
@@ -783,12 +783,12 @@ FAULTS = [
     (
         "a.osm",
         with_text(lambda t: t.replace("<way", '<node id="1" lat="48.1" lon="7.8"/><way', 1)),
-        r"node/1 stands twice, at 4\d\.\d+, 7\.\d+ and at 48\.1, 7\.8",
+        r"node/1 appears twice, at 4\d\.\d+, 7\.\d+ and at 48\.1, 7\.8",
     ),
     (
         "a.osm",
         with_text(lambda t: t.replace("</osm>", '<way id="1"><nd ref="2"/><nd ref="1"/></way></osm>')),
-        "way/1 stands twice, with other nodes",
+        "way/1 appears twice, with other nodes",
     ),
     (
         "a.osm",

@@ -1,4 +1,4 @@
-"""Parking areas of which OpenStreetMap knows the outline alone: rows of slots by rule."""
+"""Parking areas of which only the outline is mapped: rows of slots by rule."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.lots.generators import Slots
-from parkenv.lots.places.osm_roads import Road
-from parkenv.lots.places.osm_rows import (
+from parkenv.lots.importers.osm_roads import Road
+from parkenv.lots.importers.osm_rows import (
     ARRANGEMENTS,
     DRAWN,
     NO_SLOTS,
     Arrangement,
     Side,
     boxes_of,
-    places_along,
+    row_anchors,
     row_at,
     without_overlaps,
 )
@@ -41,13 +41,13 @@ def fill_outline(
     orientation: str | None,
     capacity: int | None,
 ) -> Slots:
-    """Slots in an area by rule: rows of 2.5 × 5 m along both sides of every aisle.
+    """Fill an area with slots by rule: rows of 2.5 × 5 m along both sides of every aisle.
 
     Cars stand across the aisle unless an orientation is given; where they do not fit and 6 × 2.1 m along the
-    aisle do, these. Rows begin at the edge of the carriageway, or at the outline where the road passes
+    aisle do, they park along it. Rows begin at the edge of the carriageway, or at the outline where the road passes
     outside. A slot lies in the outline, clear of the roads and of all that blocks, and the road that it
-    opens to is the nearest to its mouth. Rows that hold most come first; where there are more
-    slots than the capacity, the last ones go.
+    opens to is the nearest to its mouth. Rows with more slots are placed first; slots beyond the capacity are
+    dropped from the end.
 
     Args:
         outline: the area, m.
@@ -57,7 +57,7 @@ def fill_outline(
         capacity: how many cars the area holds, or None.
 
     Returns:
-        The slots; none where no road comes near.
+        The slots; none without a road nearby.
     """
     if not roads:
         return NO_SLOTS
@@ -73,7 +73,7 @@ def fill_outline(
 
     rows: list[Slots] = []
     for k, road in enumerate(roads):
-        for start, end in _stretches(lines[k], outline):
+        for start, end in _intervals(lines[k], outline):
             for side in ("left", "right"):
                 tries = [
                     _fitting(
@@ -90,7 +90,7 @@ def fill_outline(
     return slots if capacity is None else slots[:capacity]
 
 
-def _stretches(line: shapely.LineString, outline: shapely.Geometry) -> list[tuple[float, float]]:
+def _intervals(line: shapely.LineString, outline: shapely.Geometry) -> list[tuple[float, float]]:
     """The parts of a road that pass the outline, from and to, m from its start."""
     parts = shapely.get_parts(shapely.intersection(line, shapely.buffer(outline, SLOT_REACH)))
     ends = [
@@ -108,13 +108,13 @@ def _row(
     """All slots between two stations of a road, as near to it as road and outline allow."""
     n = max(int((end - start + DRAWN) / how.pitch), 0)
     stations = np.asarray(start + (np.arange(n) + 0.5) * how.pitch, dtype=np.float64)
-    spots = places_along(road.points, stations, how.pitch, side)
-    rays = shapely.linestrings(np.stack([spots.xy, spots.xy + SLOT_REACH * spots.outward], axis=1))
-    hit = shapely.distance(shapely.points(spots.xy), shapely.intersection(rays, outline))
+    anchors = row_anchors(road.points, stations, how.pitch, side)
+    rays = shapely.linestrings(np.stack([anchors.xy, anchors.xy + SLOT_REACH * anchors.outward], axis=1))
+    hit = shapely.distance(shapely.points(anchors.xy), shapely.intersection(rays, outline))
     reached = np.isfinite(np.atleast_1d(hit))
     offset = np.maximum(np.where(reached, hit, 0.0), road.half_width)
     with_points = road.oneway or side == "right"
-    return row_at(spots, offset, how, with_points=with_points)[np.flatnonzero(reached)]
+    return row_at(anchors, offset, how, with_points=with_points)[np.flatnonzero(reached)]
 
 
 def _fitting(

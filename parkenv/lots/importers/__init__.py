@@ -1,0 +1,1 @@
+"""Import lots of real places: OpenStreetMap files and lists of slots."""

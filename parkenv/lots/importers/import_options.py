@@ -1,0 +1,69 @@
+"""What the user of an import adds to what the file says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.lots.local_frame import LocalFrame
+
+FloatArray = NDArray[np.float64]
+
+NEAR_ON_GLOBE = 1.0
+"""Degrees: a pair of numbers this near to a place on the globe is a latitude and a longitude, else metres."""
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """What the user adds to a file of a real place, or wants instead of what it says.
+
+    Args:
+        goals: places that people walk to, pairs of numbers: metres east and north in the lot's frame or, in a file
+            with latitudes and longitudes, a latitude and a longitude (any pair within a degree of the place).
+        entries: places where cars enter, likewise.
+        bounds: two corners, likewise; elements outside are not read.
+        with_disabled: whether slots for disabled drivers count as slots.
+
+    Raises:
+        InputError: a pair that is not two finite numbers.
+    """
+
+    goals: tuple[tuple[float, float], ...] = ()
+    entries: tuple[tuple[float, float], ...] = ()
+    bounds: tuple[tuple[float, float], tuple[float, float]] | None = None
+    with_disabled: bool = False
+
+    def __post_init__(self) -> None:
+        for what, points in (("goal", self.goals), ("entry", self.entries), ("bounds", self.bounds or ())):
+            for point in points:
+                if len(point) != 2 or not np.isfinite(point).all():
+                    raise InputError(f"{what} is {point!r}, want two finite numbers")
+
+    def box(self, frame: LocalFrame | None) -> tuple[float, float, float, float] | None:
+        """The bounds in the lot's frame: least x and y, greatest x and y, m; None without bounds.
+
+        Raises:
+            InputError: bounds without an area.
+        """
+        if self.bounds is None:
+            return None
+        corners = points_in_frame(frame, self.bounds)
+        (x0, y0), (x1, y1) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+        if x1 - x0 < 1.0 or y1 - y0 < 1.0:
+            raise InputError(f"bounds are {x1 - x0:.2f} × {y1 - y0:.2f} m, want an area")
+        return x0, y0, x1, y1
+
+
+def points_in_frame(frame: LocalFrame | None, pairs: tuple[tuple[float, float], ...]) -> FloatArray:
+    """Convert pairs of numbers to metres, (n, 2), in the lot's frame.
+
+    A pair within a degree of the frame's origin on the globe is a latitude and a longitude, any other metres.
+    """
+    points = np.array(pairs, dtype=np.float64).reshape(-1, 2)
+    if frame is None or not len(points):
+        return points
+    on_globe = np.all(np.abs(points - [frame.lat, frame.lon]) <= NEAR_ON_GLOBE, axis=1, keepdims=True)
+    return np.where(on_globe, frame.to_xy(points[:, ::-1]), points)

@@ -1,0 +1,127 @@
+"""The result of an import: a lot, or what a lot still lacks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import dijkstra
+
+from parkenv.errors import InputError
+from parkenv.lots.generators import Slots
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.world.drive_graph import GraphError
+from parkenv.world.lot import Lane, ParkingLot
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Elements that an import did not use: the reason, and their ids in the file."""
+
+    reason: str
+    ids: tuple[str, ...]
+
+    def __str__(self) -> str:
+        shown = ", ".join(self.ids[:5]) + (", ..." if len(self.ids) > 5 else "")
+        return f"{self.reason}: {len(self.ids)} ({shown})"
+
+
+@dataclass(frozen=True, eq=False)
+class LotDraft:
+    """Slots, lanes, entries and goals found in a file; any may be missing.
+
+    Args:
+        name: the lot's name.
+        slot_ids: n_slots names.
+        slots: their geometry, lot frame.
+        slot_source: n_slots names of what each slot was made from.
+        lanes: centre lines.
+        entries: (n_entries, 2) m.
+        goals: (n_goals, 2) m.
+        walls: (k, 2) m each.
+        outlines: (k, 2) m each, parking areas in the file; for pictures.
+        found: what was found, a line each.
+        left_out: elements that were not used.
+        missing: what a search needs and the file lacks, a sentence each that says how to give it.
+        frame: of the lot on the globe; None if the file has none.
+        loose: (k, 2) m, centres of slots whose shape is unknown; for pictures.
+    """
+
+    name: str
+    slot_ids: tuple[str, ...]
+    slots: Slots
+    slot_source: tuple[str, ...]
+    lanes: tuple[Lane, ...]
+    entries: FloatArray
+    goals: FloatArray
+    walls: tuple[FloatArray, ...] = ()
+    outlines: tuple[FloatArray, ...] = ()
+    found: tuple[str, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
+    missing: tuple[str, ...] = ()
+    frame: LocalFrame | None = None
+    loose: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+
+    @classmethod
+    def of_lot(cls, lot: ParkingLot) -> LotDraft:
+        """The draft of a lot that is complete already."""
+        return cls(
+            name=lot.name,
+            slot_ids=lot.slot_ids,
+            slots=Slots.of_lot(lot),
+            slot_source=("the lot file",) * lot.n_slots,
+            lanes=lot.lanes,
+            entries=lot.entries,
+            goals=lot.goals,
+            walls=lot.walls,
+            found=(f"{lot.n_slots} slots and {len(lot.lanes)} lanes of a lot file",),
+        )
+
+    def lot(self) -> ParkingLot:
+        """Make the lot.
+
+        Raises:
+            InputError: something is missing or the parts do not fit together; the message states what.
+        """
+        if self.missing:
+            raise InputError("; ".join(self.missing))
+        try:
+            return ParkingLot(
+                name=self.name,
+                slot_ids=self.slot_ids,
+                **self.slots.columns(),
+                lanes=self.lanes,
+                entries=self.entries,
+                goals=self.goals,
+                walls=self.walls,
+            )
+        except GraphError as error:
+            problem = error.problems[0]
+            what = f"slot {self.slot_ids[problem.index]!r}" if problem.kind == "slot" else problem.kind
+            raise InputError(f"{what} {problem.message}") from error
+
+    def searchable(self) -> LotDraft:
+        """Leave out the slots that cannot be reached from an entry, and list them.
+
+        An incomplete draft is returned as it is.
+        """
+        try:
+            lot = self.lot()
+        except InputError:
+            return self
+        far = ~np.isfinite(dijkstra(lot.drive_matrix(), indices=lot.entry_vertices, min_only=True))
+        lost = far[: lot.n_slots]
+        if not lost.any() or lost.all():
+            return self
+        kept = np.flatnonzero(~lost)
+        ids = tuple(self.slot_ids[i] for i in np.flatnonzero(lost))
+        return replace(
+            self,
+            slot_ids=tuple(self.slot_ids[i] for i in kept),
+            slots=self.slots[kept],
+            slot_source=tuple(self.slot_source[i] for i in kept),
+            left_out=(*self.left_out, LeftOut("slots that cannot be reached from an entry", ids)),
+        )

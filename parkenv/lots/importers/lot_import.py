@@ -1,0 +1,56 @@
+"""Import a lot from any supported file: choose the reader, return a draft of the lot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from parkenv.errors import InputError
+from parkenv.lots.file_formats import LotFormat, lot_format
+from parkenv.lots.importers.import_options import ImportOptions, points_in_frame
+from parkenv.lots.importers.lot_draft import LotDraft
+from parkenv.lots.importers.osm import osm_draft
+from parkenv.lots.importers.slot_list import slot_list_draft
+from parkenv.lots.lot_files import read_lot
+
+
+def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
+    """Draft a lot from a file of a real place.
+
+    Supported are OpenStreetMap (`.osm`, `.xml`, Overpass JSON, overpass-turbo GeoJSON; see
+    `parkenv.lots.importers.osm`), lists of slot centres (`.csv`; see
+    `parkenv.lots.importers.slot_list`), the Dragon Lake map and native lots.
+    Files in latitude and longitude are projected to metres east and north of their middle.
+
+    Args:
+        path: the file.
+        options: goals, entries and bounds that the user gives.
+
+    Returns:
+        A draft; `LotDraft.lot()` makes it a lot, or says what is missing.
+
+    Raises:
+        InputError: the file cannot be read, holds no parking, or is of an unknown kind.
+    """
+    path = Path(path)
+    options = options or ImportOptions()
+    file_format = lot_format(path)
+    if file_format is LotFormat.OSM:
+        return osm_draft(path, options)
+    if file_format is LotFormat.SLOT_LIST:
+        return slot_list_draft(path, options)
+    if file_format is None:
+        raise InputError(
+            f"{path}: unknown kind of file {path.suffix!r}, want .osm or .xml (OpenStreetMap; convert .pbf first), "
+            ".json or .geojson (Overpass, overpass-turbo, a native lot), .csv (slot centres) or a Dragon Lake .yml"
+        )
+    if options.bounds is not None:
+        raise InputError(
+            f"{path}: bounds apply to OpenStreetMap and lists of slots; this file is a whole lot"
+        )
+    draft = LotDraft.of_lot(read_lot(path))
+    if options.goals:
+        draft = replace(draft, goals=points_in_frame(None, options.goals))
+    if options.entries:
+        draft = replace(draft, entries=points_in_frame(None, options.entries))
+    return draft

@@ -1,0 +1,100 @@
+"""Rows of slots and the aisles between them, inferred from the slots' centres.
+
+1. A slot's row runs toward its nearest neighbour. Neighbours at about that distance whose rows have the same
+   direction form one row, which must be straight. Single slots and pairs join a row in line with them.
+2. With a yaw, the angle between cars and row tells how cars park. Without, rows with a slot every 3.7 m or less
+   are taken for perpendicular, with one every 4.8 m or more for parallel parking.
+3. Two parallel rows with 2.8 to 10 m between them face each other across an aisle; closer ones stand back to
+   back. A row opens to the side on which it faces another or, where it faces none, to the side without a
+   neighbour. A yaw decides the side for cars that are not parallel to the aisle; parallel cars have it on their
+   left where no row is faced.
+4. Aisles run midway between the rows that open to them (3 m from a row that faces none), and continue across
+   gaps of up to 15 m. Roads connect them at their ends and through gaps in the rows, where no slot is in the way.
+   All are two-way.
+
+Where a step is ambiguous, `infer_layout` refuses and states what it found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from parkenv.lots.generators import Slots
+from parkenv.lots.importers.facing_rows import FacingRows, open_sides
+from parkenv.lots.importers.slot_aisles import extended_aisle, find_aisles, lanes_through
+from parkenv.lots.importers.slot_rows import (
+    AmbiguousLayoutError,
+    describe_rows,
+    find_rows,
+    row_slots,
+    with_arrangement,
+)
+from parkenv.world.lot import Lane, corner_points, mouth_points
+
+FloatArray = NDArray[np.float64]
+
+MOST_STRAYS = 0.1
+"""Greatest share of slots that may be in no row."""
+
+
+@dataclass(frozen=True, eq=False)
+class SlotLayout:
+    """Slots and lanes inferred from slot centres.
+
+    Args:
+        index: indices, in the list, of the slots that are part of a row.
+        slots: these slots.
+        lanes: aisles and the roads that connect them, all two-way.
+        strays: indices of the slots in no row.
+        found: what was found, a line each.
+    """
+
+    index: tuple[int, ...]
+    slots: Slots
+    lanes: tuple[Lane, ...]
+    strays: tuple[int, ...]
+    found: tuple[str, ...]
+
+
+def infer_layout(xy: FloatArray, yaw: FloatArray | None, names: Sequence[str]) -> SlotLayout:
+    """Infer slots and lanes from slot centres.
+
+    Args:
+        xy: (n, 2) m.
+        yaw: (n,) rad, heading of a car parked nose-in, or None.
+        names: n names for messages.
+
+    Raises:
+        AmbiguousLayoutError: several layouts of rows or aisles are possible.
+    """
+    rows, strays = find_rows(xy, names)
+    rows = [with_arrangement(row, rows, xy, yaw, names) for row in rows]
+    if len(strays) > MOST_STRAYS * len(xy):
+        shown = ", ".join(names[i] for i in strays[:5])
+        raise AmbiguousLayoutError(f"{len(strays)} of {len(xy)} slots are in no row ({shown})", rows, xy)
+    if 2 * sum(len(row.members) for row in rows if len(row.members) > 2) < len(xy):
+        raise AmbiguousLayoutError("most slots are single or in pairs, want rows of at least 3", rows, xy)
+    faced = FacingRows(rows)
+    sides = open_sides(rows, faced, xy, yaw, names)
+    slots = Slots.joined([row_slots(row, side, xy, yaw) for row, side in zip(rows, sides, strict=True)])
+    index = np.concatenate([row.members for row in rows])
+    order = np.argsort(index)
+    slots, index = slots[order], index[order]
+    boxes = np.asarray(
+        shapely.polygons(corner_points(slots.xy, slots.yaw, slots.length - 0.1, slots.width - 0.1))
+    )
+    mouth_xy = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+    aisles = [extended_aisle(aisle, mouth_xy) for aisle in find_aisles(rows, sides, faced)]
+    lanes = lanes_through(aisles, rows, boxes, mouth_xy, xy)
+    return SlotLayout(
+        index=tuple(index.tolist()),
+        slots=slots,
+        lanes=tuple(lanes),
+        strays=tuple(strays),
+        found=(*describe_rows(rows), f"{len(lanes)} lanes, two-way"),
+    )

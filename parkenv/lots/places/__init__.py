@@ -1,1 +1,0 @@
-"""Lots of real places: maps and lists of slots that others made."""
