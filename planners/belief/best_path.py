@@ -67,7 +67,7 @@ class Budget(NamedTuple):
     depth: int
 
 
-@compiled
+@compiled(error_model="numpy")
 def best_path(
     vertex: int,
     targets: IntArray,
@@ -174,7 +174,7 @@ def best_path(
     return PathChoice(best, then_s, at_hand_s, slot, next_vertex, n_kept, base, work)
 
 
-@compiled
+@compiled(error_model="numpy")
 def _options_at_hand(
     vertex: int,
     failure_s: float,
@@ -224,7 +224,7 @@ def _options_at_hand(
     return options, n_options, fallback_s
 
 
-@compiled
+@compiled(error_model="numpy")
 def _first_step(onward_s: float, path: PathBuffer) -> tuple[int, float]:
     """Return `next_vertex` and `then_s` of a path; `onward_s` as it would be if nothing were observed."""
     stops = path.stops
@@ -236,7 +236,7 @@ def _first_step(onward_s: float, path: PathBuffer) -> tuple[int, float]:
     return following, onward_s
 
 
-@compiled
+@compiled(error_model="numpy")
 def _shows_news(vertex: int, graph: PlanningGraph, belief: BeliefSnapshot) -> bool:
     """Return whether a slot in view of a vertex was not observed yet, or may have come free."""
     for i in range(graph.view_starts[vertex], graph.view_starts[vertex + 1]):
@@ -249,7 +249,7 @@ def _shows_news(vertex: int, graph: PlanningGraph, belief: BeliefSnapshot) -> bo
     return False
 
 
-@compiled
+@compiled(error_model="numpy")
 def _mark_route(
     on_route: NDArray[np.bool_],
     vertex: int,

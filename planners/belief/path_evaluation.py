@@ -19,6 +19,7 @@ from planners.belief.planning_graph import (
     IntArray,
     PathBuffer,
     PlanningGraph,
+    copy_weights,
     decayed_part,
 )
 from sim_sensors.compilation import compiled
@@ -27,7 +28,7 @@ KEPT_IN_MIND = 32
 """Stops along which a free slot that was passed is kept in mind."""
 
 
-@compiled
+@compiled(error_model="numpy")
 def expected_cost_to_slot(
     vertex: int,
     slot: int,
@@ -57,7 +58,7 @@ def expected_cost_to_slot(
     return expected
 
 
-@compiled
+@compiled(error_model="numpy")
 def evaluate_path(
     n_stops: int,
     left_s: float,
@@ -100,18 +101,17 @@ def evaluate_path(
     return value, then_s
 
 
-@compiled
+@compiled(error_model="numpy")
 def _set_first_looks(n_stops: int, belief: BeliefSnapshot, path: PathBuffer) -> None:
     """Set P(free) of the first observations along a path, each given that the car did not park before."""
-    weights = path.weights[: len(belief.weights)]
-    weights[:] = belief.weights
+    weights = copy_weights(belief, path)
     for j in range(path.stops[n_stops].first):
         look = path.looks[j]
         if look.is_first:
             look.p_free = p_free_at_first_look(weights, belief.p_free_if[look.slot], look.parks)
 
 
-@compiled
+@compiled(error_model="numpy")
 def _stop_optimally(
     n_stops: int,
     left_s: float,
@@ -188,7 +188,7 @@ def _stop_optimally(
     return onward + nothing, then_s
 
 
-@compiled
+@compiled(error_model="numpy")
 def _sort_looks(first: int, last: int, path: PathBuffer) -> None:
     """Sort the observations made at one stop by the expected time of driving to their slots."""
     looks = path.looks

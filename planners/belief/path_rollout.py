@@ -19,6 +19,7 @@ from planners.belief.planning_graph import (
     PlanningGraph,
     decayed_part,
     is_hidden,
+    copy_weights,
     needs_attempt,
 )
 from sim_sensors.compilation import compiled
@@ -31,7 +32,7 @@ LOOK_AGAIN_S = 10.0
 """s that must pass before a slot is observed once more; a later observation makes up for those left out."""
 
 
-@compiled
+@compiled(error_model="numpy")
 def rollout_path(
     vertex: int,
     targets: IntArray,
@@ -72,8 +73,7 @@ def rollout_path(
     stops[0].vertex, stops[0].time, stops[0].first, stops[1].first = vertex, 0.0, 0, 0
     k, n_looks, time, n_passed = 0, 0, 0.0, 0
     choose, target = True, -1
-    weights = path.weights[: len(belief.weights)]
-    weights[:] = belief.weights
+    weights = copy_weights(belief, path)
     while k + 3 < len(stops) and n_looks < len(looks):
         while n_passed < n_targets and _is_settled(targets[n_passed], vertex, time, graph, belief, path):
             n_passed += 1
@@ -150,7 +150,7 @@ def rollout_path(
     return k + 1, min(left_s, _repeat_path(k, n_looks, graph, belief, path), graph.give_up_s)
 
 
-@compiled
+@compiled(error_model="numpy")
 def _is_settled(
     target: int, vertex: int, time: float, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> bool:
@@ -160,7 +160,7 @@ def _is_settled(
     return not _is_attempt_due(vertex, time, graph, belief, path)
 
 
-@compiled
+@compiled(error_model="numpy")
 def is_worth_an_attempt(
     vertex: int, time: float, observed_at: float, graph: PlanningGraph, belief: BeliefSnapshot
 ) -> bool:
@@ -172,7 +172,7 @@ def is_worth_an_attempt(
     return bool(_p_free_again(vertex, time, observed_at, belief) > 0.0)
 
 
-@compiled
+@compiled(error_model="numpy")
 def _is_attempt_due(
     vertex: int, time: float, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> bool:
@@ -182,7 +182,7 @@ def _is_attempt_due(
     return bool(is_worth_an_attempt(vertex, time, path.marks[vertex].observed_at, graph, belief))
 
 
-@compiled
+@compiled(error_model="numpy")
 def _repeat_path(
     last: int, n_looks: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> float:
@@ -205,7 +205,7 @@ def _repeat_path(
     return best
 
 
-@compiled
+@compiled(error_model="numpy")
 def _repeat_part(
     first: int, last: int, n_looks: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> float:
@@ -237,7 +237,7 @@ def _repeat_part(
     return period / found + cost_s / found if found > 0.0 else np.inf
 
 
-@compiled
+@compiled(error_model="numpy")
 def _extrapolate(last: int, n_looks: int, graph: PlanningGraph, path: PathBuffer) -> float:
     """Return the expected time, s, of going on to unobserved slots that are as good as those of the second half."""
     stops, looks = path.stops, path.looks
@@ -249,7 +249,7 @@ def _extrapolate(last: int, n_looks: int, graph: PlanningGraph, path: PathBuffer
     return (stops[last].time - stops[first].time) / found + cost_s / found if found > 0.0 else np.inf
 
 
-@compiled
+@compiled(error_model="numpy")
 def _p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnapshot) -> float:
     """Return P(free) some time from now of a slot observed taken, really or along the path; 0 if not worth a look."""
     at = belief.slots[slot]
@@ -262,7 +262,7 @@ def _p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnap
     return float(p_free) if p_free >= WORTH_A_LOOK * at.p_free_usual else 0.0
 
 
-@compiled
+@compiled(error_model="numpy")
 def _next_target(
     vertex: int,
     time: float,
@@ -296,7 +296,7 @@ def _next_target(
     return chosen, best
 
 
-@compiled
+@compiled(error_model="numpy")
 def p_free_at_first_look(weights: FloatArray, p_free_if: FloatArray, taken_follows: bool) -> float:
     """Return P(free) of a slot at its first observation, given the hypotheses.
 
@@ -315,7 +315,7 @@ def p_free_at_first_look(weights: FloatArray, p_free_if: FloatArray, taken_follo
     return free / (free + taken)
 
 
-@compiled
+@compiled(error_model="numpy")
 def _p_nothing_found(
     vertex: int, value_s: float, n_looks: int, graph: PlanningGraph, path: PathBuffer
 ) -> float:

@@ -140,7 +140,16 @@ def path_buffer(n_slots: int, n_vertices: int) -> PathBuffer:
     )
 
 
-@compiled
+@compiled(error_model="numpy")
+def copy_weights(belief: BeliefSnapshot, path: PathBuffer) -> FloatArray:
+    """Return the scratch weights of a path, set to those of the belief."""
+    weights = path.weights[: len(belief.weights)]
+    for h in range(len(weights)):
+        weights[h] = belief.weights[h]
+    return weights
+
+
+@compiled(error_model="numpy")
 def decayed_part(rate: float, seconds: float) -> float:
     """Return 1 - exp(-rate · seconds), fast where it is small."""
     x = rate * seconds
@@ -149,7 +158,7 @@ def decayed_part(rate: float, seconds: float) -> float:
     return 1.0 - math.exp(-x)
 
 
-@compiled
+@compiled(error_model="numpy")
 def detects_missed(rate: float, missed_rate: float) -> bool:
     """Return whether a view is likelier than not to detect a slot that another one has missed.
 
@@ -162,7 +171,7 @@ def detects_missed(rate: float, missed_rate: float) -> bool:
     return rate > missed_rate and rate - missed_rate >= 0.5 * (1.0 - missed_rate)
 
 
-@compiled
+@compiled(error_model="numpy")
 def is_hidden(slot: int, rate: float, belief: BeliefSnapshot) -> bool:
     """Return whether a view with some detection rate is expected not to show a slot."""
     if belief.slots[slot].state == UNOBSERVED:
@@ -171,7 +180,7 @@ def is_hidden(slot: int, rate: float, belief: BeliefSnapshot) -> bool:
     return bool(rate <= belief.slots[slot].missed_rate)
 
 
-@compiled
+@compiled(error_model="numpy")
 def needs_attempt(vertex: int, graph: PlanningGraph, belief: BeliefSnapshot) -> bool:
     """Return whether only a parking attempt shows if the slot at a vertex is free.
 
