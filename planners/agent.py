@@ -53,11 +53,9 @@ class PlanPreview:
 
     Attributes:
         path: vertices ahead, in order, without the present one; empty where the agent has no plan to show.
-        policy: (n_vertices,) int64, the action for every vertex, of agents that plan one; else None.
     """
 
     path: tuple[int, ...] = ()
-    policy: NDArray[np.int64] | None = None
 
 
 class SearchAgent(ABC, Generic[Memory]):

@@ -86,7 +86,7 @@ class TargetAgent(SearchAgent[GreedyState]):
         return np.asarray(np.isfinite(self.routes.seconds_from(vertex)[: self.problem.lot.n_slots]))
 
     def cheapest(self, candidates: NDArray[np.bool_], vertex: int) -> NDArray[np.bool_]:
-        """Return the reachable candidates, (n_slots,) bool, with the least arrival cost; none where none is reachable."""
+        """Return the reachable candidates, (n_slots,) bool, with the least arrival cost; none if none is reachable."""
         cost_s = np.where(candidates, self.problem.arrival_cost_s, np.inf)
         best = np.asarray(candidates & (cost_s == cost_s.min()))
         if not len(self.routes.nearest(vertex, best)[0]):
@@ -147,8 +147,8 @@ class FirstFreeAgent(TargetAgent):
 
     Args:
         problem: lot, goal, speeds and costs.
-        within_m: greatest distance from the goal, m, at which a free slot is good enough; the lot's median where None. A
-            slot's price counts as the metres that one walks in as many seconds.
+        within_m: greatest distance from the goal, m, at which a free slot is good enough; the lot's median where
+            None. A slot's price counts as the metres that one walks in as many seconds.
     """
 
     name: ClassVar[str] = "first-free"

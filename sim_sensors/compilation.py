@@ -79,8 +79,8 @@ def _compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
 def _ignore_literals(dispatcher: Any) -> None:
     """Let compiled callers share one version of a function for `f(0)` and `f(n)`.
 
-    Numba types a constant, and a variable whose first value is one, as a type of its own, and would compile the function,
-    and all that it calls, once more for it.
+    Numba types a constant, and a variable whose first value is one, as a type of its own, and would compile the
+    function, and all that it calls, once more for it.
     """
     template_of = dispatcher.get_call_template
 

@@ -23,7 +23,7 @@ from parkenv.lots import packaged_lot
 from parkenv.world.scenario import SearchProblem
 from planners import make_agent
 from planners.bounds.exact import ExactSolution
-from planners.thesis.expected_time import expected_time
+from planners.bounds.expected_time import expected_time
 
 BLIND = SensorModel(view_range=0.0)
 

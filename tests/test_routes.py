@@ -37,7 +37,7 @@ def test_ways_are_as_long_as_they_should_be(drives):
     for _ in range(100):
         vertex, target = rng.integers(scenario.lot.n_vertices, size=2)
         here, took = int(vertex), 0.0
-        for move, following in routes.way(int(vertex), int(target)):
+        for move, following in routes.hops(int(vertex), int(target)):
             assert scenario.lot.neighbors[here, move] == following
             took += scenario.move_s[here, move]
             here = following
@@ -84,7 +84,7 @@ def test_what_no_way_leads_to_is_left_out():
         routes.move_toward(entry, 0)
     with pytest.raises(InputError, match="no way leads on"):
         routes.move_toward(1, 1)
-    assert list(routes.way(1, 1)) == []
+    assert list(routes.hops(1, 1)) == []
 
 
 @pytest.mark.parametrize("name", ["greedy-goal", "greedy-drive", "first-free"])

@@ -61,7 +61,9 @@ class ForecastErrorModel:
     def __post_init__(self) -> None:
         probabilities = [*self.shifts.values(), *self.events.values(), *self.uninformed.values()]
         if not all(p >= 0.0 for p in probabilities) or not sum(probabilities) < 1.0:
-            raise InputError("forecast error model: want prior probabilities of at least 0 and below 1 in sum")
+            raise InputError(
+                "forecast error model: want prior probabilities of at least 0 and below 1 in sum"
+            )
         if not 0.0 < self.p_occupied_at_event < 1.0:
             raise InputError(f"p_occupied_at_event is {self.p_occupied_at_event}, want a number in (0, 1)")
         if not self.half_events_at >= 0.0:
@@ -127,7 +129,9 @@ class DayBelief:
 
     def update(self, slots: NDArray[np.int64], taken: NDArray[np.bool_]) -> None:
         """Update the weights by the first observations of slots, (k,) int64, that were taken or not, (k,) bool."""
-        likelihood = self._log_taken[:, slots[taken]].sum(axis=1) + self._log_free[:, slots[~taken]].sum(axis=1)
+        likelihood = self._log_taken[:, slots[taken]].sum(axis=1) + self._log_free[:, slots[~taken]].sum(
+            axis=1
+        )
         self._log_weight = self._log_weight + likelihood
 
     def mixture(self) -> tuple[FloatArray, FloatArray]:

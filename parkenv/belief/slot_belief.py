@@ -143,10 +143,15 @@ class SlotBelief:
         observed = np.asarray(slots, dtype=np.int64)
         reports, hits, false_alarms = (
             np.broadcast_to(np.asarray(values, dtype=kind), observed.shape)
-            for values, kind in ((looks_taken, np.bool_), (hit_rate, np.float64), (false_alarm_rate, np.float64))
+            for values, kind in (
+                (looks_taken, np.bool_),
+                (hit_rate, np.float64),
+                (false_alarm_rate, np.float64),
+            )
         )
         p_occupied, p_observed, observed_at = (
-            np.array(array, dtype=np.float64) for array in (self.p_occupied, self.p_observed, self.observed_at)
+            np.array(array, dtype=np.float64)
+            for array in (self.p_occupied, self.p_observed, self.observed_at)
         )
         _update_slots(p_occupied, observed, reports, hits, false_alarms)
         p_observed[observed], observed_at[observed] = p_occupied[observed], self.time

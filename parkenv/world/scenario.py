@@ -75,8 +75,13 @@ class SearchProblem:
 
     @cached_property
     def arrival_cost_s(self) -> FloatArray:
-        """What parking in each slot costs on arrival, (n_slots,) s: the walk."""
-        return self.walk_s
+        """What parking in each slot costs on arrival, (n_slots,) s: the walk and the price."""
+        return _read_only(self.walk_s + self.parking_cost_s)
+
+    @property
+    def parking_cost_s(self) -> FloatArray:
+        """Price of each slot times the inverse value of time, (n_slots,) s."""
+        return self.lot.slot_parking_cost_s
 
     @cached_property
     def move_s(self) -> FloatArray:

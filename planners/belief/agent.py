@@ -114,10 +114,10 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
     is as near to the best path as this one. Allowing for forecast errors costs a little on such days; where an event
     has filled a lot against the forecast, drivers who take the first free slot still do better. One path at a time is
     evaluated, so it is not foreseen that the car leaves the path for another one after an observation. Estimates differ
-    by where the car is, so that it could turn round between two paths for ever: until it observes something, it keeps to
-    its path unless another is better than what that one had promised. Where a sensor misses slots, a slot that was in
-    view and not detected is looked for only from where it is likelier than not to be detected; one that is not detected
-    from its own vertex either is attempted.
+    by where the car is, so that it could turn round between two paths for ever: until it observes something, it keeps
+    to its path unless another is better than what that one had promised. Where a sensor misses slots, a slot that was
+    in view and not detected is looked for only from where it is likelier than not to be detected; one that is not
+    detected from its own vertex either is attempted.
 
     Args:
         problem: lot, goal, speeds and costs.

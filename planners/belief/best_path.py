@@ -96,13 +96,11 @@ def best_path(
         belief: the belief.
         path: room for one path.
     """
-    options, n_options, fallback_s = _options_at_hand(vertex, failure_s, budget, graph, belief, path)
+    options, n_options, fallback_s = _options_at_hand(vertex, budget, graph, belief, path)
     at_hand_s, slot = np.inf, -1
     for i in range(n_options):
         s = options[i]
-        value = expected_cost_to_slot(
-            vertex, s, belief.slots[s].p_free, 0.0, fallback_s[s], graph, belief
-        )
+        value = expected_cost_to_slot(vertex, s, belief.slots[s].p_free, 0.0, fallback_s[s], graph, belief)
         if value < at_hand_s:
             at_hand_s, slot = value, s
 
@@ -118,9 +116,7 @@ def best_path(
         n_tried = n_targets if i < 0 else 0
         cost = failure_s if i < 0 else budget.failure_costs[i]
         n_stops, left_s = rollout_path(vertex, targets, n_tried, cost, graph, belief, path)
-        value, onward_s = evaluate_path(
-            n_stops, left_s, options, n_options, fallback_s, graph, belief, path
-        )
+        value, onward_s = evaluate_path(n_stops, left_s, options, n_options, fallback_s, graph, belief, path)
         if i < 0 and promise_s < value:
             value, onward_s = promise_s, promise_s - path.stops[1].time
         if value < best - 1e-9:
@@ -177,7 +173,6 @@ def best_path(
 @compiled(error_model="numpy")
 def _options_at_hand(
     vertex: int,
-    failure_s: float,
     budget: Budget,
     graph: PlanningGraph,
     belief: BeliefSnapshot,

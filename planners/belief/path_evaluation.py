@@ -4,8 +4,8 @@ A path says where to observe next while everything observed is taken. At every s
 passed, and either settles for the best free slot so far, which may mean driving back, or goes on. The value follows
 exactly by going through the path backwards; the state is which slot is the best so far, or none.
 
-A car that comes too late to a slot goes on searching, for a time that is estimated once a decision, or tries the next of
-the slots that it knows to be free.
+A car that comes too late to a slot goes on searching, for a time that is estimated once a decision, or tries the next
+of the slots that it knows to be free.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ def evaluate_path(
     """Return the least expected time, s, of following a path and stopping at will.
 
     What an observation says about the day depends on what it leads to. Where the car would park if the slot were free,
-    going on means that it was taken; where the car drives past in any case, the observation may have been either, and on
-    average says nothing. So the path is evaluated twice: without any such evidence, which shows where the car would
+    going on means that it was taken; where the car drives past in any case, the observation may have been either, and
+    on average says nothing. So the path is evaluated twice: without any such evidence, which shows where the car would
     park, and with the evidence of the observations there.
 
     Args:
@@ -136,9 +136,7 @@ def _stop_optimally(
     for k in range(1, n_stops):
         for j in range(stops[k].first, stops[k + 1].first):
             slot = looks[j].slot
-            at_once = expected_cost_to_slot(
-                stops[k].vertex, slot, 1.0, 0.0, fallback_s[slot], graph, belief
-            )
+            at_once = expected_cost_to_slot(stops[k].vertex, slot, 1.0, 0.0, fallback_s[slot], graph, belief)
             looks[j].kept_until = k if at_once <= stops[k].ahead_s else min(k + KEPT_IN_MIND, n_stops - 1)
     nothing, onward, then_s = left_s, 0.0, left_s
     for k in range(n_stops - 1, 0, -1):

@@ -17,9 +17,9 @@ from planners.belief.planning_graph import (
     IntArray,
     PathBuffer,
     PlanningGraph,
+    copy_weights,
     decayed_part,
     is_hidden,
-    copy_weights,
     needs_attempt,
 )
 from sim_sensors.compilation import compiled
@@ -211,8 +211,8 @@ def _repeat_part(
 ) -> float:
     """Return the expected time, s, of driving a part of a path again and again until a slot on it has come free.
 
-    All its slots were just observed taken. Each observation finds the slot free with the probability that the time since
-    the one before gives, so that many observations of few slots do not count for more than they are worth.
+    All its slots were just observed taken. Each observation finds the slot free with the probability that the time
+    since the one before gives, so that many observations of few slots do not count for more than they are worth.
     """
     stops, looks, marks = path.stops, path.looks, path.marks
     start, end = stops[first].vertex, stops[last].vertex

@@ -33,38 +33,40 @@ VIEW = np.dtype([("slot", np.int64), ("rate", np.float64)])
 
 SLOT = np.dtype(
     [
-        ("p_free", np.float64),
-        ("p_free_usual", np.float64),
-        ("decay_rate", np.float64),
-        ("odds", np.float64),
-        ("least_odds", np.float64),
-        ("missed_rate", np.float64),
-        ("state", np.int64),
+        ("p_free", np.float64),  # now
+        ("p_free_usual", np.float64),  # the value to which it decays,
+        ("decay_rate", np.float64),  # 1/s, at this rate
+        ("odds", np.float64),  # P(taken)/P(free) about when the car could be there; inf where hopeless
+        ("least_odds", np.float64),  # the value to which those decay
+        ("missed_rate", np.float64),  # greatest detection rate of a view from which it was not detected
+        ("state", np.int64),  # of its last observation
     ]
 )
-"""What is believed of a slot at a decision: `p_free` now; `p_free_usual`, to which it decays, at `decay_rate`, 1/s; `odds`,
-P(taken)/P(free) about when the car could be there, inf where hopeless; `least_odds`, those to which they decay;
-`missed_rate`, the greatest detection rate of a view from which the slot was not detected; `state`, of its last observation."""
+"""What is believed of a slot at a decision."""
 
-STOP = np.dtype([("vertex", np.int64), ("time", np.float64), ("first", np.int64), ("ahead_s", np.float64)])
-"""A stop of a path: its vertex, the time, the number of its first observation (its last one is before that of the next
-stop), and, as scratch, the least time that any later observation leaves to the goal."""
+STOP = np.dtype(
+    [
+        ("vertex", np.int64),
+        ("time", np.float64),
+        ("first", np.int64),  # number of its first look; its last one is before that of the next stop
+        ("ahead_s", np.float64),  # scratch: least time that any later look leaves to the goal
+    ]
+)
+"""A stop of a path."""
 
 LOOK = np.dtype(
     [
         ("slot", np.int64),
-        ("p_free", np.float64),
+        ("p_free", np.float64),  # given that the search has come so far
         ("time", np.float64),
-        ("expected_s", np.float64),
-        ("value", np.float64),
-        ("kept_until", np.int64),
-        ("is_first", np.bool_),
-        ("parks", np.bool_),
+        ("expected_s", np.float64),  # scratch: expected time of driving to the slot
+        ("value", np.float64),  # scratch: value of what follows
+        ("kept_until", np.int64),  # scratch: the last stop at which the slot is kept in mind
+        ("is_first", np.bool_),  # whether the slot was not observed before, really or along the path
+        ("parks", np.bool_),  # whether the car parks in the slot if it is free
     ]
 )
-"""An observation along a path: which slot, P(free) given that the search has come so far, when, whether the slot was not
-observed before, really or along the path, and whether the car parks if it is free. Scratch of the evaluation: the expected
-time of driving to the slot, the value of what follows, and the last stop at which the slot is kept in mind."""
+"""An observation of a slot along a path."""
 
 MARK = np.dtype([("observed_at", np.float64), ("scratch", np.float64)])
 """When a path last observed a slot; -1 where it has not yet, -inf where it need not: the slot is known to be free."""

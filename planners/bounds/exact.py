@@ -516,9 +516,7 @@ class ExactAgent(SearchAgent[ExactState]):
             memory.target = decision[1]
         return self._move_on(vertex, memory)
 
-    def _solution(
-        self, forecast: NDArray[np.floating], vertex: int, seen: int, free: int
-    ) -> ExactSolution:
+    def _solution(self, forecast: NDArray[np.floating], vertex: int, seen: int, free: int) -> ExactSolution:
         slots = np.arange(len(forecast))
         as_bool = [((bits >> slots) & 1).astype(np.bool_) for bits in (seen, free)]
         return ExactSolution(
@@ -535,7 +533,7 @@ class ExactAgent(SearchAgent[ExactState]):
         n_vertices, lot = self.problem.lot.n_vertices, self.problem.lot
         masks = memory.solution._masks
         reach, came_from = np.empty(n_vertices), np.empty(n_vertices, np.int64)
-        _drive_drive_within_known(
+        _drive_within_known(
             vertex,
             memory.seen,
             masks.shows,

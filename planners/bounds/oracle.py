@@ -43,9 +43,10 @@ def best_slot(
     """Find the slot that minimises drive, wait and arrival cost.
 
     Occupancy does not depend on the car, so arriving as early as possible and waiting is never worse than arriving
-    later: with waits of any length (`wait_s` 0) the minimum over slots bounds every search that ends in a slot. An agent
-    that does not park pays `give_up_s`, so no agent's total is below the smaller of the two. With `wait_s` above 0 waits
-    come in such steps, as in the environment, and a slot that is free for less than a step in between is missed.
+    later: with waits of any length (`wait_s` 0) the minimum over slots bounds every search that ends in a slot. An
+    agent that does not park pays `give_up_s`, so no agent's total is below the smaller of the two. With `wait_s`
+    above 0 waits come in such steps, as in the environment, and a slot that is free for less than a step in between
+    is missed.
 
     Args:
         problem: lot, goal, speeds and costs.
@@ -102,8 +103,8 @@ class OracleAgent(SearchAgent[OracleState]):
 
     It is shown the world by `prepare` before each episode; no other agent sees hidden state. Where no slot comes free
     for so long that giving up is cheaper, it proves the lot full by a tour from each slot to the nearest one not yet
-    observed. It waits in steps of `wait_s`, as every agent must, and its tour need not be the shortest, so its total may
-    exceed the bound that `best_slot` gives.
+    observed. It waits in steps of `wait_s`, as every agent must, and its tour need not be the shortest, so its total
+    may exceed the bound that `best_slot` gives.
     """
 
     name: ClassVar[str] = "oracle"

@@ -1,8 +1,8 @@
 """The thesis's MDP as a stopping problem, solved exactly by one pass of label setting.
 
 A failed attempt leads back to the slot that it was made at, so repeating it until it succeeds has a closed-form value,
-Q(u) = (p·(r_max - r_u) - (1-p)·c) / (1 - γ(1-p)), r being the arrival cost and c the failure cost. What is left to decide
-is where to stop: with costs J = -V,
+Q(u) = (p·(r_max - r_u) - (1-p)·c) / (1 - γ(1-p)), r being the arrival cost and c the failure cost. What is left to
+decide is where to stop: with costs J = -V,
 
     J(u) = min( h(u), min over edges u→v of d + γ·J(v) ),
 

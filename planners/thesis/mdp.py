@@ -105,8 +105,8 @@ class ParkingMDP:
         Args:
             problem: lot, goal, speeds and costs.
             p_occupied: (n_slots,) probability that each slot is taken.
-            failure_s: s, what the planner believes a failed attempt to cost; what the world charges (`problem.failure_s`)
-                where None.
+            failure_s: s, what the planner believes a failed attempt to cost; what the world charges
+                (`problem.failure_s`) where None.
             gamma: discount a decision.
         """
         n, n_slots = problem.lot.n_vertices, problem.lot.n_slots

@@ -129,20 +129,21 @@ class StaticAgent(SearchAgent[Plan]):
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: Plan) -> int:
         """Follow the plan."""
+        del belief
         labels = memory.labels
         return int(best_move(self._graph, labels.p_free, labels.cost, int(observation["vertex"])))
 
     def plan_preview(self, observation: Observation, action: int, memory: Plan) -> PlanPreview:
-        """Return the policy, and the path that it leads along to a slot."""
-        del action
-        policy, vertex = memory.policy, int(observation["vertex"])
+        """Return the path along which the plan leads to a slot."""
+        labels, vertex = memory.labels, int(observation["vertex"])
         path: list[int] = []
-        while len(path) < MOST_HOPS and policy[vertex] != PARK:
-            vertex = int(self.problem.lot.neighbors[vertex, policy[vertex]])
+        while len(path) < MOST_HOPS and action != PARK:
+            vertex = int(self.problem.lot.neighbors[vertex, action])
             if vertex < 0 or vertex in path or vertex == observation["vertex"]:
                 break
             path.append(vertex)
-        return PlanPreview(tuple(path), policy)
+            action = best_move(self._graph, labels.p_free, labels.cost, vertex)
+        return PlanPreview(tuple(path))
 
     def _settled(self, labels: Labels) -> Labels:
         """Return the plan; by policy iteration where label setting did not terminate, since circling pays."""

@@ -2,7 +2,8 @@
 
 The failure cost is the one parameter of the thesis's planner that has no right value (T §4.3 shows 10 s to be too bold
 and 90 s too careful). Here it is chosen by simulation: worlds are drawn from the forecast alone, with slots that are
-independent and do not change, the planner searches all of them at each cost, and the cost with the least mean time wins.
+independent and do not change, the planner searches all of them at each cost, and the cost with the least mean time
+wins.
 """
 
 from __future__ import annotations
@@ -101,7 +102,7 @@ def tune_failure_cost(
 def _mean_times(
     vertex: int, taken: NDArray[np.bool_], p_occupied: FloatArray, costs: FloatArray, graph: PlanningGraph
 ) -> FloatArray:
-    """Return the mean total time, (k,) s, of the planner at each failure cost, over worlds, (n_worlds, n_slots) bool."""
+    """Return the planner's mean total time, (k,) s, at each failure cost, in worlds, (n_worlds, n_slots) bool."""
     n_worlds, n = taken.shape
     mean = np.zeros(len(costs))
     odds, observed = np.empty(n), np.empty(n, np.bool_)
@@ -270,9 +271,7 @@ class TunedAgent(SearchAgent[TunedPlan]):
         return self._planners[memory.failure_s].decide(observation, belief, memory.plan)
 
     def plan_preview(self, observation: Observation, action: int, memory: TunedPlan) -> PlanPreview:
-        """Return the route to the entry, and then the plan at the chosen cost."""
-        vertex = int(observation["vertex"])
-        preview = self._planners[memory.failure_s].plan_preview(observation, action, memory.plan)
+        """Return the route to the entry, or the plan at the chosen cost."""
         if memory.entry >= 0:
-            return PlanPreview(self._routes.path(vertex, memory.entry), preview.policy)
-        return preview
+            return PlanPreview(self._routes.path(int(observation["vertex"]), memory.entry))
+        return self._planners[memory.failure_s].plan_preview(observation, action, memory.plan)

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from parkenv.envs.search_state import SearchState
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
-from parkenv.evaluation.report.plan_preview import PlanPreview
 from parkenv.evaluation.simulate import EpisodeResult, Observer, Step
 from parkenv.lots.generators import ONE_WAY_HALF_WIDTH, TWO_WAY_HALF_WIDTH
 from parkenv.world.lot import ParkingLot, is_building
 from parkenv.world.occupancy import World
-from planners.agent import make_agent
+from planners.agent import Agent, make_agent
 
 MOST_SLOTS = 20_000
 """Lots with more are not drawn: a page with every slot of theirs would not load."""
@@ -102,7 +101,7 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
     state: SearchState | None = None
     for case in encounter.cases:
         agent = make_agent(case.agent, case.scenario, **case.options)
-        recorder = SearchRecorder(case.agent, PlanPreview(case.scenario.public(), agent))
+        recorder = SearchRecorder(case.agent, agent)
         EpisodeRunner(case.scenario, case.agent, agent, case.rig).run(encounter.seed, (recorder,))
         state, search = recorder.state, recorder.recording
         before = counted.get(case.key(encounter.seed))
@@ -149,7 +148,7 @@ class SearchRecorder(Observer):
 
     Args:
         name: of the agent.
-        preview: the agent's plan, see `PlanPreview`.
+        agent: whose plans are recorded, if it has `plan_preview`.
 
     Attributes:
         state: of the environment, hidden occupancy included.
@@ -159,8 +158,9 @@ class SearchRecorder(Observer):
     state: SearchState
     recording: Recording
 
-    def __init__(self, name: str, preview: PlanPreview) -> None:
-        self._name, self._preview = name, preview
+    def __init__(self, name: str, agent: Agent) -> None:
+        self._name = name
+        self._preview_of = getattr(agent, "plan_preview", None)
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
         """Record the arrival."""
@@ -177,7 +177,9 @@ class SearchRecorder(Observer):
 
     def on_step(self, step: Step) -> None:
         """Record the decision, the plan behind it, and the state after it."""
-        plan = self._preview.ahead(step.observation, int(step.action), step.memory)
+        plan: list[int] = []
+        if self._preview_of is not None:
+            plan = list(self._preview_of(step.observation, int(step.action), step.memory).path)
         # Most plans are what is left of the last one.
         self._rows["plan"].append(None if plan == self._plan[1:] else plan)
         self._rows["action"].append(int(step.action))
