@@ -1,6 +1,6 @@
 """Heuristic baselines: how people search. They use what they observe, and no forecast.
 
-A slot is a candidate unless it was observed taken. Heuristics that look at the goal rank slots by what parking costs
+A slot is a candidate unless it was observed taken not long ago. Heuristics that look at the goal rank slots by what parking costs
 there on arrival (`SearchProblem.arrival_cost_s`): the walk, and the price where slots have one.
 """
 
@@ -47,7 +47,9 @@ class TargetAgent(SearchAgent[GreedyState]):
     def decide(self, observation: Observation, belief: SlotBelief, memory: GreedyState) -> int:
         """Keep the target while it is a candidate, else choose another; park on arrival."""
         vertex = int(observation["vertex"])
-        taken, free = belief.observed_taken, belief.observed_free
+        # An observation that has decayed to the forecast says nothing any more: the slot is a candidate again.
+        decayed = (belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast)
+        taken, free = belief.observed_taken & ~decayed, belief.observed_free
         previous = memory.target
         if previous < 0 or taken[previous] or self.drops_target(free, previous):
             memory.target = self.choose(~taken, free, vertex, previous)

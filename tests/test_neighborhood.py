@@ -45,7 +45,7 @@ def test_a_part_holds_the_vertices_that_may_do_best_and_the_ways_to_them(name):
     assert (near.table.seconds >= seconds[np.ix_(near.vertices, near.vertices)] - 1e-9).all()
     for v, vertex in enumerate(near.vertices):
         starts, slots = problem.slots_in_view
-        here = near.slots[near.view_slots[near.view_starts[v] : near.view_starts[v + 1]]]
+        here = near.slots[near.in_view(v)["slot"]]
         seen = slots[starts[vertex] : starts[vertex + 1]]
         np.testing.assert_array_equal(here, seen[inside[seen]])
         assert near.index(int(vertex)) == v
