@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
+from parkenv.files.user_class import file_of_class, load_class
 from parkenv.world.occupancy import World
 from parkenv.world.scenario import Scenario, SearchProblem
 from planners.learned import ALGORITHMS
@@ -200,7 +200,12 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
         return learned
     agent: Callable[..., Agent]
     if colon:
-        agent = _class_of(before, after)
+        agent = load_class(
+            name,
+            "agent",
+            "predict(observation, state, episode_start, deterministic)",
+            alternatives=f"; nor is it an algorithm ({', '.join(ALGORITHMS)})",
+        )
         scenario = scenario.public() if isinstance(scenario, Scenario) else scenario
     elif name in _AGENTS:
         module, class_name = _AGENTS[name]
@@ -229,32 +234,4 @@ def agent_file(name: str) -> Path | None:
         return None
     if before in ALGORITHMS:
         return Path(after)
-    file = sys.modules[before].__file__
-    return None if file is None else Path(file)
-
-
-def _class_of(module: str, class_name: str) -> Callable[..., Agent]:
-    """Return the class of an agent from a user's module."""
-    name = f"{module}:{class_name}"
-    here = str(Path.cwd())
-    # An installed command has its own folder on the path, not the working directory.
-    if here not in sys.path:
-        sys.path.insert(0, here)
-    try:
-        found = getattr(import_module(module), class_name)
-    except ModuleNotFoundError as error:
-        if error.name != module.partition(".")[0]:
-            raise
-        algorithms = ", ".join(ALGORITHMS)
-        raise InputError(
-            f"agent {name!r}: {module!r} is neither a module (searched {here} and Python's path) nor an "
-            f"algorithm; algorithms: {algorithms}"
-        ) from None
-    except AttributeError:
-        raise InputError(f"agent {name!r}: module {module!r} has no {class_name!r}") from None
-    if not callable(getattr(found, "predict", None)):
-        raise InputError(
-            f"agent {name!r}: has no method predict(observation, state, episode_start, deterministic)"
-        )
-    agent: Callable[..., Agent] = found
-    return agent
+    return file_of_class(name)

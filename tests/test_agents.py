@@ -72,7 +72,7 @@ def test_an_agent_of_your_own_is_named_by_module_and_class(tmp_path, monkeypatch
     for name, told in (
         ("my_agents:Driver", "no 'Driver'"),
         ("my_agents:nothing", "no method predict"),
-        ("no_such_module:Agent", "neither a module .* nor an algorithm"),
+        ("no_such_module:Agent", "no module 'no_such_module' in .*; nor is it an algorithm"),
         ("my_agents:Parker", "no option 'speed'; known: action"),
     ):
         options = {"speed": 1} if "speed" in told else {}

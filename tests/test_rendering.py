@@ -48,7 +48,7 @@ def middle_of_slot(renderer, state, slot, along=0.0):
     lot = renderer.scenario.lot
     yaw = lot.slot_yaw[slot]
     point = lot.slot_xy[slot] + along * np.array([np.cos(yaw), np.sin(yaw)])
-    column, row = np.floor(renderer._ground_for(state).view(point)).astype(int)
+    column, row = np.floor(renderer.still_layer(state).view(point)).astype(int)
     return row, column
 
 
@@ -125,12 +125,12 @@ def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
     for vertex in (0, 2000, 3999, 0):
         state = stand_in(env, vertex=vertex, path=[vertex])
         frame = renderer.frame(state, nothing)
-        column, row = renderer._ground.view(scenario.lot.vertex_xy[vertex])
+        column, row = renderer._still.view(scenario.lot.vertex_xy[vertex])
         assert 0.2 * 640 < column < 0.8 * 640
         assert 0.2 * 446 < row < 0.8 * 446
         assert (frame == rendering.CAR).all(axis=2).any()
         assert np.array_equal(frames.setdefault(vertex, frame), frame)
-        assert len(renderer._ground.slots) < 1000
+        assert len(renderer._still.slots) < 1000
 
 
 def test_a_goal_out_of_the_window_is_pointed_at():

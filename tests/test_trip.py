@@ -263,8 +263,8 @@ def test_with_sensors_equal_seeds_give_equal_trips_and_captures_are_where_the_ca
 def test_with_sensors_the_belief_is_what_the_stack_sees_and_not_what_is_so(monkeypatch):
     """A car whose sensors are shown an empty lot believes it, however full the lot is."""
     search = with_sensors(captures=1)
-    env, lookout, lot = search.env, search.env.watcher.lookout, MINI.lot
-    measure, scene = lookout.measure, LotScenes.at
+    env, sampler, lot = search.env, search.env.perception.sampler, MINI.lot
+    measure, scene = sampler.sample, LotScenes.at
 
     def emptied(self, time, ego=None):
         seen = scene(self, time, ego)
@@ -279,7 +279,7 @@ def test_with_sensors_the_belief_is_what_the_stack_sees_and_not_what_is_so(monke
 
     for show_all in (True, False):
         if not show_all:
-            monkeypatch.setattr(lookout, "measure", measured)
+            monkeypatch.setattr(sampler, "sample", measured)
         env.reset(seed=1)
         truth = env.state.world.occupied(np.arange(lot.n_slots), env.state.time)
         for _ in range(3):
