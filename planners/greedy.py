@@ -1,7 +1,7 @@
 """Heuristic baselines: how people search. They use what they observe, and no forecast.
 
-A slot is a candidate unless it was observed taken not long ago. Heuristics that look at the goal rank slots by what parking costs
-there on arrival (`SearchProblem.arrival_cost_s`): the walk, and the price where slots have one.
+A slot is a candidate unless it was observed taken not long ago. Heuristics that look at the goal rank slots by what
+parking costs there on arrival (`SearchProblem.arrival_cost_s`): the walk, and the price where slots have one.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The belief about slots: one law in plain arithmetic, in the environment's compiled code, and in every agent's input."""
+"""The belief about slots: one law, in plain arithmetic, in the compiled environment, and in each agent's input."""
 
 import gymnasium as gym
 import numpy as np
