@@ -13,10 +13,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from parkenv.driving.lot_space import LotSpace, Thing
+from parkenv.driving.collision_world import CollisionWorld, ObstacleKind
 from parkenv.driving.parking_task import AREA, KINDS, REACH, ParkingTask, ParkingTasks
-from parkenv.driving.polite_traffic import PoliteTraffic
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters, advance, placed
+from parkenv.driving.yielding_traffic import YieldingTraffic
 from parkenv.envs.drive_state import DriveState
 from parkenv.errors import InputError
 from parkenv.lots import load_lot
@@ -268,7 +268,7 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._state.trail.append(tuple(task.start[:3].tolist()))
         self._enter(self._state)
         if self._n_movers:
-            self._state.clocks = self._others.started(self.vehicle.corners(task.start[:3]))
+            self._state.clocks = self._others.initial_clocks(self.vehicle.corners(task.start[:3]))
             self._state.movers = self._others.poses(self._state.clocks)
             self._space.move(self._state.movers)
         if self.render_mode == "human":
@@ -287,7 +287,9 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         touched = 0
         if self._n_movers:
             before = state.movers
-            state.clocks = self._others.onward(state.clocks, CONTROL_S, self.vehicle.corners(vehicle[:3]))
+            state.clocks = self._others.advance_clocks(
+                state.clocks, CONTROL_S, self.vehicle.corners(vehicle[:3])
+            )
             state.movers = self._others.poses(state.clocks)
         for k in range(SUBSTEPS):
             if self._n_movers:
@@ -301,7 +303,7 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
                 state.direction = direction
             state.time += PHYSICS_S
             if touched:
-                state.contact = Thing(touched).words
+                state.contact = ObstacleKind(touched).label
                 break
         state.trail.append(tuple(vehicle[:3].tolist()))
         observation = self._observation()
@@ -377,11 +379,11 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def _enter(self, state: DriveState) -> None:
         """Put the world of an episode in place."""
         task = state.task
-        movers: list[tuple[Thing, FloatArray]] = []
+        movers: list[tuple[ObstacleKind, FloatArray]] = []
         if self._n_movers:
-            self._others = PoliteTraffic(self.tasks.lot, self._traffic, state.key, self.tasks.slot_cars)
+            self._others = YieldingTraffic(self.tasks.lot, self._traffic, state.key, self.tasks.slot_cars)
             movers = self._others.outlines
-        self._space = LotSpace(self.vehicle, task.obstacles, movers)
+        self._space = CollisionWorld(self.vehicle, task.obstacles, movers)
         if len(state.movers):
             self._space.move(state.movers)
         self._slot = np.array([*task.slot.tolist(), *task.room.tolist()])
@@ -414,7 +416,7 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
                 observation["movers"] = seen.astype(np.float32)
         return observation
 
-    def _moving(self) -> list[tuple[Thing, FloatArray]]:
+    def _moving(self) -> list[tuple[ObstacleKind, FloatArray]]:
         return self._others.outlines if self._n_movers else []
 
     def _judge(self, observation: dict[str, Any]) -> bool:
@@ -510,8 +512,8 @@ def scan_plane(task: ParkingTask, movers: int = 0) -> ScanPlane:
         task: what stands there.
         movers: places kept after the cars for outlines that move.
     """
-    cars = task.obstacles.only(Thing.PARKED_CAR)
-    lines = task.obstacles.only(Thing.KERB, Thing.WALL)
+    cars = task.obstacles.only(ObstacleKind.PARKED_CAR)
+    lines = task.obstacles.only(ObstacleKind.KERB, ObstacleKind.WALL)
     corners = np.zeros((len(cars) + movers, _CORNERS, 2))
     corners[: len(cars), : cars.corners.shape[1]] = cars.corners
     n_corners = np.r_[cars.n_corners, np.zeros(movers, dtype=np.int64)]
@@ -530,10 +532,10 @@ def obstacle_map(task: ParkingTask) -> tuple[NDArray[np.float32], NDArray[np.flo
     """`cars` and `lines` of the observation; see `DriveEnv`. What does not fit is the farthest, and left out."""
     cars = np.full((MOST_CARS, _CORNERS, 2), FAR, dtype=np.float32)
     lines = np.full((MOST_LINES, 2, 2), FAR, dtype=np.float32)
-    parked = task.in_slot_frame(task.obstacles.only(Thing.PARKED_CAR).corners[:MOST_CARS])
+    parked = task.in_slot_frame(task.obstacles.only(ObstacleKind.PARKED_CAR).corners[:MOST_CARS])
     cars[: len(parked), : parked.shape[1]] = parked
     cars[: len(parked), parked.shape[1] :] = parked[:, -1:]
-    drawn = task.in_slot_frame(task.obstacles.only(Thing.KERB, Thing.WALL).corners[:, :2])
+    drawn = task.in_slot_frame(task.obstacles.only(ObstacleKind.KERB, ObstacleKind.WALL).corners[:, :2])
     drawn = drawn[np.argsort(np.hypot(*drawn.mean(axis=1).T), kind="stable")][:MOST_LINES]
     lines[: len(drawn)] = drawn
     return cars, lines

@@ -1,4 +1,4 @@
-"""Practice for drivers that learn: drives in a batch for stable-baselines3, whose tasks become harder as they park."""
+"""Training environment for parking agents: a batch of drives for stable-baselines3, with a curriculum."""
 
 from __future__ import annotations
 
@@ -16,39 +16,38 @@ from parkenv.driving.vehicle import SPEED, VehicleParameters
 from parkenv.envs.drive import CONTROL_S, STANDING, goal_errors
 from parkenv.envs.shared_vec_env import SharedVecEnv
 from parkenv.errors import InputError
-from parkenv.evaluation.training.configs import WAY_IN, DriveRecipe
-from parkenv.evaluation.training.drive_batch import CONTACT, PARKED, UNDER_WAY, DriveBatch, PreparedTask
+from parkenv.evaluation.training.configs import WAY_IN, DriveTrainingConfig
+from parkenv.evaluation.training.drive_batch import CONTACT, PARKED, RUNNING, DriveBatch, PreparedTask
 from parkenv.world.lot import ParkingLot
-from planners.driving.driver_view import HOLD, N_SEEN
 from planners.driving.hybrid_astar import plan_path
+from planners.driving.policy_interface import ACTION_REPEAT, OBSERVATION_SIZE
 
 FloatArray = NDArray[np.float64]
 Observations = dict[str, NDArray[np.float32]]
 
-DECISION_S = HOLD * CONTROL_S
+DECISION_S = ACTION_REPEAT * CONTROL_S
 """s, from one decision to the next."""
 MOST_DECISIONS = 80
-"""In one drive: half a minute, in which whoever knows how parks from anywhere."""
+"""Step limit of a drive: half a minute, enough for a trained agent from any start."""
 STOOD = 5
-"""Decisions, one after another, with which a drive ends after which the car stands: who has learned little as yet
-stops where it knows no way on, and would not move again."""
+"""A drive is cut off after so many consecutive decisions at a standstill: an untrained agent would not move again."""
 TRIED = 100
-"""Drives at a level by which is judged whether it is mastered."""
+"""Number of the latest drives at a level that decide whether it is mastered."""
 MASTERED = 0.7
-"""Share of them that must have parked."""
+"""Fraction of them that must have parked."""
 SHARES = (0.5, 0.25, 0.25)
-"""How often a drive is of the level that is being learned, of any up to it, and of the last one."""
+"""Probability that a drive is of the current level, of a random level up to it, and of the last level."""
 TIMES_DRIVEN = 20
-"""How often a task is driven, on the average: to draw one takes as long as to drive it a few times."""
+"""Mean number of drives per drawn task: drawing a task takes as long as driving it a few times."""
 KEPT = 128
-"""Tasks of each kind, lot and level that are at hand."""
+"""Number of cached tasks per kind, lot and level."""
 
 _STEP_M = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """The slots of a kind on a lot."""
+class SlotGroup:
+    """The slots of one kind on one lot."""
 
     lot: ParkingLot
     kind: str
@@ -56,40 +55,40 @@ class Place:
     def tasks(
         self, slack: float = 0.0, distance: tuple[float, float] = (4.0, 14.0), starts: str = "lane"
     ) -> ParkingTasks:
-        """Tasks there; by default those of `parkenv/Drive-v0`."""
+        """Tasks in these slots; by default those of `parkenv/Drive-v0`."""
         return ParkingTasks(self.lot, kinds=(self.kind,), slack=slack, distance=distance, starts=starts)
 
 
-def places_of(lots: Sequence[ParkingLot]) -> tuple[Place, ...]:
-    """All kinds of slots that some lots have and the car fits into, kind by kind.
+def slot_groups(lots: Sequence[ParkingLot]) -> tuple[SlotGroup, ...]:
+    """The groups of slots on some lots that the car fits into, sorted by kind.
 
     Raises:
         InputError: a lot has none.
     """
     vehicle = VehicleParameters()
-    places = []
+    groups = []
     for lot in lots:
         fits = (lot.slot_length >= vehicle.length) & (lot.slot_width >= vehicle.width)
         kinds = np.array(ParkingTasks(lot).slot_kinds)[fits]
-        places += [Place(lot, kind) for kind in KINDS if kind in kinds]
-    return tuple(sorted(places, key=lambda place: KINDS.index(place.kind)))
+        groups += [SlotGroup(lot, kind) for kind in KINDS if kind in kinds]
+    return tuple(sorted(groups, key=lambda group: KINDS.index(group.kind)))
 
 
-class Exercise(NamedTuple):
-    """A task, and where to begin with it.
+class CurriculumTask(NamedTuple):
+    """A task and the poses at which a drive may start.
 
     Attributes:
-        task: as a batch takes it.
-        way: (n, 3) x, y in m and yaw in rad of the rear axle, slot frame: along the planner's way into the slot, from
-            its end backward, a pose every 0.1 m or less; None to begin at the task's own start.
+        task: in the slot's frame.
+        path: (n, 3) x, y in m and yaw in rad of the rear axle, slot frame: along the planned path into the slot, from
+            its end backwards, at most 0.1 m apart; None to start at the task's own start.
     """
 
     task: PreparedTask
-    way: FloatArray | None
+    path: FloatArray | None
 
 
-def way_in(task: ParkingTask) -> FloatArray:
-    """The `way` of an exercise; the task's start alone where the planner finds none."""
+def planned_path(task: ParkingTask) -> FloatArray:
+    """The `path` of a curriculum task; the start alone where the planner finds no path."""
     around, target = task.obstacles, task.vehicle.at_rear_axle(task.target)
     path = plan_path(task.vehicle, around.corners, around.n_corners, task.start[:3], target)
     way = task.start[None, :3].copy() if path is None else path.sampled(_STEP_M)[0][::-1].copy()
@@ -98,53 +97,52 @@ def way_in(task: ParkingTask) -> FloatArray:
     return way
 
 
-class DrivePractice(SharedVecEnv):
-    """Drives with decisions as in `planners.driving.driver_view`, at the levels of a recipe's curriculum.
+class DriveTrainingEnv(SharedVecEnv):
+    """A batch of drives with the decisions of `planners.driving.policy_interface` and a curriculum.
 
-    Each kind of slot is at a level of its own, and begins at the first. A level is mastered when of the last `TRIED`
-    drives at it `MASTERED` parked. `SHARES` of the drives are of the level, of easier ones, and of the last one, which
-    is the task of `parkenv/Drive-v0` itself. The more levels a kind has before it, the more often it is driven into.
-    A drive that is not over after `MOST_DECISIONS`, or in which the car has stood for `STOOD` of them, is cut off.
+    Each kind of slot has its own level, and starts at the first. A level is mastered when the fraction `MASTERED` of
+    its last `TRIED` drives parked. `SHARES` of the drives are at the level, at easier ones, and at the last one, which
+    is the task of `parkenv/Drive-v0` itself. The more levels a kind has left, the more often it is drawn.
+    A drive is truncated after `MOST_DECISIONS`, or after `STOOD` consecutive decisions at a standstill.
 
-    With the `sparse` reward, a decision costs its 0.4 s, whole, unless it ends in the slot, so that `compute_reward`
-    can tell it from the goals and from whether there was a contact. With the `dense` one it costs what the environment
-    says.
+    With the `sparse` reward, a decision costs 0.4 s unless it ends in the slot, so that `compute_reward` follows from
+    goals and contact alone. With the `dense` reward it costs the environment's reward.
 
     Args:
-        num_envs: how many drives at once.
-        places: where.
-        recipe: rewards and curriculum.
-        levels: of each kind to begin with.
+        num_envs: number of drives.
+        groups: slots to park in.
+        config: rewards and curriculum.
+        levels: level of each kind at the start.
 
     Raises:
-        InputError: no places, or a level that there is not.
+        InputError: no groups, or an unknown level.
     """
 
     def __init__(
         self,
         num_envs: int,
-        places: Sequence[Place],
-        recipe: DriveRecipe,
+        groups: Sequence[SlotGroup],
+        config: DriveTrainingConfig,
         levels: Mapping[str, int] | None = None,
     ) -> None:
         if num_envs < 1:
             raise InputError(f"num_envs is {num_envs}, want at least 1")
-        if not places:
-            raise InputError("places: want at least one kind of slots on one lot")
-        self.recipe, self._last = recipe, len(recipe.curriculum) - 1
-        self._places: dict[str, list[Place]] = {}
-        for place in places:
-            self._places.setdefault(place.kind, []).append(place)
-        self.levels = dict.fromkeys(self._places, 0) | dict(levels or {})
+        if not groups:
+            raise InputError("groups: want at least one kind of slots on one lot")
+        self.config, self._last = config, len(config.curriculum) - 1
+        self._groups: dict[str, list[SlotGroup]] = {}
+        for group in groups:
+            self._groups.setdefault(group.kind, []).append(group)
+        self.levels = dict.fromkeys(self._groups, 0) | dict(levels or {})
         for kind, level in self.levels.items():
             if not 0 <= level <= self._last:
                 raise InputError(f"level of {kind} slots is {level}, want 0 to {self._last}")
-        self._lately: dict[str, deque[bool]] = {kind: deque(maxlen=TRIED) for kind in self._places}
-        self._tasks: dict[tuple[Place, int], ParkingTasks] = {}
-        self._at_hand: dict[tuple[Place, int], list[Exercise]] = {}
+        self._recent: dict[str, deque[bool]] = {kind: deque(maxlen=TRIED) for kind in self._groups}
+        self._tasks: dict[tuple[SlotGroup, int], ParkingTasks] = {}
+        self._cached: dict[tuple[SlotGroup, int], list[CurriculumTask]] = {}
         self.batch = DriveBatch(num_envs)
         goal = spaces.Box(-np.inf, np.inf, (7,), np.float32)
-        seen = spaces.Box(-np.inf, np.inf, (N_SEEN,), np.float32)
+        seen = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
         shown: dict[str, spaces.Space[Any]] = {
             "observation": seen,
             "achieved_goal": goal,
@@ -157,33 +155,33 @@ class DrivePractice(SharedVecEnv):
         self._stood = np.zeros(num_envs, dtype=np.int64)
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Fix the tasks that are drawn from now on."""
+        """Seed the drawing of tasks."""
         self._rng = np.random.default_rng(seed)
         return [seed] * self.num_envs
 
     def reset(self) -> Observations:
-        """Begin anew everywhere; the levels stay."""
+        """Start a new episode in every drive; levels are kept."""
         for i in range(self.num_envs):
-            self._begin(i)
+            self._start_episode(i)
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         return self.batch.observation()
 
     def step_wait(
         self,
     ) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Do it. Where a drive ends, `info` has what `Monitor` tells, `is_success` and `contact`."""
+        """Step all drives. Where one ends, `info` has the keys of `Monitor`, `is_success` and `contact`."""
         batch = self.batch
         batch.drive(np.asarray(self.actions, dtype=np.float32))
         observations = batch.observation()
         failed = batch.status >= CONTACT
-        if self.recipe.reward == "sparse":
+        if self.config.reward == "sparse":
             rewards = self._sparse(batch.status == PARKED, failed)
         else:
             rewards = self._scaled(batch.took + batch.approach, failed)
         self._returns += rewards
         self._lengths += 1
         self._stood = np.where(np.abs(batch.state[:, SPEED]) <= STANDING, self._stood + 1, 0)
-        over = batch.status != UNDER_WAY
+        over = batch.status != RUNNING
         done = over | (self._lengths >= MOST_DECISIONS) | (self._stood >= STOOD)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(done).tolist():
@@ -195,8 +193,8 @@ class DrivePractice(SharedVecEnv):
                 "is_success": parked,
                 "contact": bool(failed[i]),
             }
-            self._note(*self._at[i], parked)
-            self._begin(i)
+            self._record_outcome(*self._at[i], parked)
+            self._start_episode(i)
         for name, values in batch.observation(np.flatnonzero(done)).items():
             observations[name][done] = values
         return observations, rewards, done, infos
@@ -204,12 +202,12 @@ class DrivePractice(SharedVecEnv):
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
     ) -> NDArray[np.float32]:
-        """The sparse rewards of decisions that led to goals, (n,) float32.
+        """Sparse rewards, (n,) float32, of decisions that led to goals.
 
         Args:
             achieved_goal: (n, 7) float32, after the decision.
             desired_goal: (n, 7) float32.
-            info: of each; one without `contact` counts as without a contact.
+            info: of each decision; a missing `contact` means none.
         """
         achieved, desired = (np.asarray(g, dtype=np.float32) for g in (achieved_goal, desired_goal))
         _, _, parked = goal_errors(achieved, desired, self.batch.view.half)
@@ -219,53 +217,55 @@ class DrivePractice(SharedVecEnv):
         return self._scaled(np.where(parked & ~failed, 0.0, DECISION_S), failed)
 
     def _scaled(self, seconds: FloatArray, failed: NDArray[np.bool_]) -> NDArray[np.float32]:
-        recipe = self.recipe
-        rewards = -recipe.reward_scale * (seconds + recipe.contact_cost * failed)
+        config = self.config
+        rewards = -config.reward_scale * (seconds + config.contact_cost * failed)
         return rewards.astype(np.float32)
 
-    def _note(self, kind: str, level: int, parked: bool) -> None:
-        """Count how a drive ended; go up a level where this one is mastered."""
+    def _record_outcome(self, kind: str, level: int, parked: bool) -> None:
+        """Record how a drive ended; advance to the next level when this one is mastered."""
         if level != self.levels[kind] or level == self._last:
             return
-        lately = self._lately[kind]
-        lately.append(parked)
-        if len(lately) == TRIED and sum(lately) >= MASTERED * TRIED:
+        recent = self._recent[kind]
+        recent.append(parked)
+        if len(recent) == TRIED and sum(recent) >= MASTERED * TRIED:
             self.levels[kind] += 1
-            lately.clear()
+            recent.clear()
 
-    def _begin(self, i: int) -> None:
+    def _start_episode(self, i: int) -> None:
         rng = self._rng
-        ahead = np.array([1.0 + self._last - self.levels[kind] for kind in self._places])
-        kind = list(self._places)[rng.choice(len(ahead), p=ahead / ahead.sum())]
-        places = self._places[kind]
-        place = places[rng.integers(len(places))]
+        ahead = np.array([1.0 + self._last - self.levels[kind] for kind in self._groups])
+        kind = list(self._groups)[rng.choice(len(ahead), p=ahead / ahead.sum())]
+        groups = self._groups[kind]
+        group = groups[rng.integers(len(groups))]
         now = self.levels[kind]
         level = (now, int(rng.integers(now + 1)), self._last)[rng.choice(3, p=SHARES)]
-        task, way = self._exercise(place, level)
+        task, path = self._draw_task(group, level)
         pose = None
-        if way is not None:
-            left = rng.uniform(*self.recipe.curriculum[level].distance)
-            pose = way[min(round(left / _STEP_M), len(way) - 1)]
+        if path is not None:
+            left = rng.uniform(*self.config.curriculum[level].distance)
+            pose = path[min(round(left / _STEP_M), len(path) - 1)]
         self.batch.start(i, task, pose)
         self._at[i] = kind, level
         self._returns[i], self._lengths[i], self._stood[i] = 0.0, 0, 0
 
-    def _exercise(self, place: Place, level: int) -> Exercise:
-        key, rng = (place, level), self._rng
-        stage = self.recipe.curriculum[level]
-        inward = stage.starts == WAY_IN
+    def _draw_task(self, group: SlotGroup, level: int) -> CurriculumTask:
+        key, rng = (group, level), self._rng
+        stage = self.config.curriculum[level]
+        on_path = stage.starts == WAY_IN
         if key not in self._tasks:
             self._tasks[key] = (
-                place.tasks(stage.slack) if inward else place.tasks(stage.slack, stage.distance, stage.starts)
+                group.tasks(stage.slack)
+                if on_path
+                else group.tasks(stage.slack, stage.distance, stage.starts)
             )
-            self._at_hand[key] = []
-        at_hand = self._at_hand[key]
-        if at_hand and rng.random() * TIMES_DRIVEN >= 1.0:
-            return at_hand[rng.integers(len(at_hand))]
+            self._cached[key] = []
+        cached = self._cached[key]
+        if cached and rng.random() * TIMES_DRIVEN >= 1.0:
+            return cached[rng.integers(len(cached))]
         task = self._tasks[key].draw(int(rng.integers(1 << 62)))
-        exercise = Exercise(PreparedTask(task), way_in(task) if inward else None)
-        if len(at_hand) < KEPT:
-            at_hand.append(exercise)
+        drawn = CurriculumTask(PreparedTask(task), planned_path(task) if on_path else None)
+        if len(cached) < KEPT:
+            cached.append(drawn)
         else:
-            at_hand[rng.integers(KEPT)] = exercise
-        return exercise
+            cached[rng.integers(KEPT)] = drawn
+        return drawn
