@@ -10,7 +10,7 @@ import parkenv
 from planners import make_agent
 
 scenario = parkenv.make_scenario("mini")
-venv = make_vec_env(lambda: gym.make("parkenv/Search-v0", scenario=scenario), n_envs=4, seed=0)
+venv = make_vec_env(lambda: gym.make("parkenv/Search-v1", scenario=scenario), n_envs=4, seed=0)
 
 mean, spread = evaluate_policy(make_agent("mdp", scenario), venv, n_eval_episodes=100)
 print(f"mdp: {-mean:.1f} s on average, standard deviation {spread:.1f} s")

@@ -9,7 +9,7 @@ import parkenv  # noqa: F401 - registers the environments
 
 N, ROLLOUT, UPDATES = 256, 32, 40
 envs = gym.make_vec(
-    "parkenv/Search-v0", N, vectorization_mode="vector_entry_point", scenario="mini", observation="local",
+    "parkenv/Search-v1", N, vectorization_mode="vector_entry_point", scenario="mini", observation="local",
     autoreset_mode=AutoresetMode.SAME_STEP,
 )  # fmt: skip
 torch.manual_seed(0)

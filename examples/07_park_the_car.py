@@ -8,7 +8,7 @@ from planners.driving.parking import ParkingAgent
 driver = ParkingAgent()
 for kind in ("perpendicular", "oblique", "parallel"):
     lot = "street" if kind == "parallel" else "campus"
-    env = gym.make("parkenv/Drive-v0", lot=lot, kinds=(kind,), obstacle_map=True)
+    env = gym.make("parkenv/Drive-v1", lot=lot, kinds=(kind,), obstacle_map=True)
     for seed in range(2):
         observation, info = env.reset(seed=seed)
         memory, over = None, False

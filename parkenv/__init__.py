@@ -66,12 +66,12 @@ def __getattr__(name: str) -> Any:
 
 for _name, _entry_point, _vector_entry_point in (
     (
-        "parkenv/Search-v0",
+        "parkenv/Search-v1",
         "parkenv.envs.search:SearchEnv",
         "parkenv.envs.search_vector:ParkSearchVectorEnv",
     ),
-    ("parkenv/SearchSensors-v0", "parkenv.envs.sensors:SearchSensorsEnv", None),
-    ("parkenv/SearchPerception-v0", "parkenv.envs.perception:SearchPerceptionEnv", None),
+    ("parkenv/SearchSensors-v1", "parkenv.envs.sensors:SearchSensorsEnv", None),
+    ("parkenv/SearchPerception-v1", "parkenv.envs.perception:SearchPerceptionEnv", None),
 ):
     if _name not in registry:
         register(
@@ -82,5 +82,5 @@ for _name, _entry_point, _vector_entry_point in (
             # They themselves refuse to step or to render what has not begun.
             order_enforce=False,
         )
-if "parkenv/Drive-v0" not in registry:
-    register(id="parkenv/Drive-v0", entry_point="parkenv.envs.drive:DriveEnv", max_episode_steps=600)
+if "parkenv/Drive-v1" not in registry:
+    register(id="parkenv/Drive-v1", entry_point="parkenv.envs.drive:DriveEnv", max_episode_steps=600)

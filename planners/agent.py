@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.user_class import file_of_class, load_class
 from parkenv.world.scenario import Scenario, SearchProblem
 from planners.learned import ALGORITHMS
 
@@ -36,7 +36,7 @@ class Agent(Protocol):
 
 
 class SearchAgent(ABC, Generic[Memory]):
-    """Base of the agents for `parkenv/Search-v0`: one decision at a time, batches handled here.
+    """Base of the agents for `parkenv/Search-v1`: one decision at a time, batches handled here.
 
     An agent object holds what it knows of the problem and never changes; what it remembers of an episode
     travels in `state`, so one object may serve many episodes at once.
@@ -66,7 +66,7 @@ class SearchAgent(ABC, Generic[Memory]):
         """stable-baselines3's interface: single observations, or batches of them with a leading axis.
 
         Args:
-            observation: from `parkenv/Search-v0` or a vector of them.
+            observation: from `parkenv/Search-v1` or a vector of them.
             state: what the last call returned; None at the start.
             episode_start: for each environment, whether its episode has just begun. With None, it has
                 where there is no state.
@@ -148,7 +148,12 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
         return learned
     agent: Callable[..., Agent]
     if colon:
-        agent = _class_of(before, after)
+        agent = load_class(
+            name,
+            "agent",
+            "predict(observation, state, episode_start, deterministic)",
+            alternatives=f"; nor is it an algorithm ({', '.join(ALGORITHMS)})",
+        )
         scenario = scenario.public() if isinstance(scenario, Scenario) else scenario
     elif name in _AGENTS:
         module, class_name = _AGENTS[name]
@@ -177,32 +182,4 @@ def agent_file(name: str) -> Path | None:
         return None
     if before in ALGORITHMS:
         return Path(after)
-    file = sys.modules[before].__file__
-    return None if file is None else Path(file)
-
-
-def _class_of(module: str, class_name: str) -> Callable[..., Agent]:
-    """An agent's class from a user's module."""
-    name = f"{module}:{class_name}"
-    here = str(Path.cwd())
-    # As `python -m` does; an installed command looks in its own folder instead.
-    if here not in sys.path:
-        sys.path.insert(0, here)
-    try:
-        found = getattr(import_module(module), class_name)
-    except ModuleNotFoundError as error:
-        if error.name != module.partition(".")[0]:
-            raise
-        algorithms = ", ".join(ALGORITHMS)
-        raise InputError(
-            f"agent {name!r}: {module!r} is neither a module (looked in {here} and where Python does) nor an "
-            f"algorithm; algorithms: {algorithms}"
-        ) from None
-    except AttributeError:
-        raise InputError(f"agent {name!r}: module {module!r} has no {class_name!r}") from None
-    if not callable(getattr(found, "predict", None)):
-        raise InputError(
-            f"agent {name!r}: has no method predict(observation, state, episode_start, deterministic)"
-        )
-    agent: Callable[..., Agent] = found
-    return agent
+    return file_of_class(name)

@@ -2,7 +2,7 @@
 
 Numba's own cache checks the file of the compiled function alone: after an edit of a function that it calls, or of a
 constant that it reads, in another file, callers would go on running the old code. Here the key is the content of the
-function's module and of every module of our packages that it imports, directly or not.
+function's module and of every module that it imports, directly or not. Libraries count by numba's version alone.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from numba.core.serialize import dumps
 from platformdirs import user_cache_path
 
 _PACKAGES = ("sim_sensors", "parkenv", "planners")
+_HOME = Path(__file__).resolve().parents[1]
+"""The folder in which these packages are."""
 _KEPT_DAYS = 30
 """Code of other versions of a module is deleted once it is older than this."""
 _LOGGER = logging.getLogger("parkenv")
@@ -67,9 +69,9 @@ def _compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     if numba.config.DISABLE_JIT:
         return dispatcher
     try:
-        dispatcher._cache = _SourceKeyedCache(function)
+        dispatcher._cache = _SourceKeyedCache(function, options)
     except (OSError, RuntimeError):
-        dispatcher._cache = NullCache()  # no folder can be written, or the function stands in no file
+        dispatcher._cache = NullCache()  # the function stands in no file that can be read
     return dispatcher
 
 
@@ -103,7 +105,7 @@ class _Clock:
 _CLOCK = _Clock()
 
 
-class _CompileListener(event.Listener):
+class _CompileListener(event.Listener):  # type: ignore[misc]
     def on_start(self, event: Any) -> None:  # noqa: ARG002 - numba's interface
         _CLOCK.start()
 
@@ -124,16 +126,30 @@ def seconds_spent() -> float:
 
 @functools.cache
 def _announce() -> None:
-    """Say once that functions are being compiled, since the first call of many takes seconds."""
-    _LOGGER.warning("compiling for this machine, once; kept in %s", cache_folder())
+    """Say once in a process that functions are being compiled, since the first call of many takes seconds."""
+    _LOGGER.warning(
+        "compiling functions for this machine, which takes some seconds the first time; kept in %s",
+        cache_folder(),
+    )
 
 
-class _SourceKeyedLocator(_CacheLocator):
+@functools.cache
+def _warn_of_unwritable_cache(reason: str) -> None:
+    """Say once in a process that the next one will compile again."""
+    _LOGGER.warning(
+        "compiled functions cannot be kept in %s (%s): every process compiles them again; set NUMBA_CACHE_DIR to a "
+        "folder that can be written",
+        cache_folder(),
+        reason,
+    )
+
+
+class _SourceKeyedLocator(_CacheLocator):  # type: ignore[misc]
     """Names the folder of a module's compiled code after the content of all the sources it is made from."""
 
     def __init__(self, py_func: Any, py_file: str) -> None:
         self._py_file = py_file
-        self._qualname = py_func.__qualname__
+        self._name = f"{py_func.__qualname__} {py_func.__code__.co_firstlineno}"
         self._folder = cache_folder() / f"{py_func.__module__}-{source_key(py_file)}"
 
     @classmethod
@@ -148,7 +164,7 @@ class _SourceKeyedLocator(_CacheLocator):
 
     def get_disambiguator(self) -> str:
         # Two functions of one module may have the same name, one after the other.
-        return hashlib.sha256(self._qualname.encode()).hexdigest()[:8]
+        return _short_hash(self._name)
 
     def ensure_cache_path(self) -> None:
         if not self._folder.exists():
@@ -161,13 +177,13 @@ class _SourceKeyedImpl(CompileResultCacheImpl):  # type: ignore[misc]
 
 
 class _CodeFiles:
-    """One file for each signature, written whole: processes that compile at the same time cannot mix theirs."""
+    """One file for each signature, replaced as a whole: processes that compile at the same time cannot mix theirs."""
 
     def __init__(self, folder: str, name: str) -> None:
         self._folder, self._name = Path(folder), name
 
     def _path(self, key: Any) -> Path:
-        return self._folder / f"{self._name}-{hashlib.sha256(str(key).encode()).hexdigest()[:16]}.nbc"
+        return self._folder / f"{self._name}-{_short_hash(str(key))}.nbc"
 
     def load(self, key: Any) -> Any:
         try:
@@ -193,9 +209,10 @@ class _CodeFiles:
 class _SourceKeyedCache(FunctionCache):  # type: ignore[misc]
     _impl_class = _SourceKeyedImpl
 
-    def __init__(self, py_func: Any) -> None:
+    def __init__(self, py_func: Any, options: dict[str, Any]) -> None:
         super().__init__(py_func)
-        self._cache_file = _CodeFiles(self._cache_path, self._impl.filename_base)
+        name = f"{self._impl.filename_base}-{_short_hash(str(sorted(options.items())))}"
+        self._cache_file = _CodeFiles(self._cache_path, name)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         with _CLOCK.running():
@@ -209,10 +226,7 @@ class _SourceKeyedCache(FunctionCache):  # type: ignore[misc]
             with _CLOCK.running():
                 super().save_overload(sig, data)
         except OSError as error:
-            _LOGGER.warning(
-                "compiled code cannot be kept in %s: %s", self._cache_path, error.strerror or error
-            )
-            self.disable()
+            _warn_of_unwritable_cache(error.strerror or str(error))
 
 
 def _delete_old_versions(folder: Path) -> None:
@@ -226,30 +240,52 @@ def _delete_old_versions(folder: Path) -> None:
             continue  # another process deletes it, too
 
 
+def _short_hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
 def source_key(file: str | os.PathLike[str]) -> str:
-    """Return the key of compiled code: of numba's version, a source file, and all that it imports of our packages."""
-    return _closure_key(Path(file).resolve())
+    """Return the key of code compiled from a file: a hash of numba's version, the file, and all that it imports.
+
+    Sources count as they were when this process first asked for them, which is when it imported them.
+    """
+    path = Path(file).resolve()
+    status = path.stat()
+    if _STATUS.setdefault(path, (status.st_mtime_ns, status.st_size)) != (status.st_mtime_ns, status.st_size):
+        # The module was edited and is imported again, as in a notebook.
+        _STATUS.clear()
+        _content.cache_clear()
+        _imported_files.cache_clear()
+        _closure_key.cache_clear()
+    return _closure_key(path)
+
+
+_STATUS: dict[Path, tuple[int, int]] = {}
 
 
 @functools.cache
 def _closure_key(file: Path) -> str:
-    digest = hashlib.sha256(f"{numba.__version__} {sys.version_info[:2]}".encode())
-    for path in sorted(_closure(file), key=str):
-        digest.update(_content(path)[0])
+    settings = (numba.__version__, sys.version_info[:2], numba.config.OPT, numba.config.BOUNDSCHECK)
+    digest = hashlib.sha256(str(settings).encode())
+    for content in sorted(_content(path)[0] for path in _closure(file)):
+        digest.update(content)
     return digest.hexdigest()[:16]
 
 
 def _closure(file: Path) -> set[Path]:
-    """The file and all files of its own package and ours that it imports, directly or not."""
+    """Return the file and all files that it imports, directly or not, but those of libraries."""
     found = {file}
     waiting = [file]
     while waiting:
-        for module in _content(waiting.pop())[1]:
-            for path in _module_files(module):
-                if path not in found:
-                    found.add(path)
-                    waiting.append(path)
+        new = _imported_files(waiting.pop()) - found
+        found |= new
+        waiting += new
     return found
+
+
+@functools.cache
+def _imported_files(file: Path) -> frozenset[Path]:
+    return frozenset(path for module in _content(file)[1] for path in _module_files(module, file))
 
 
 _IMPORT = re.compile(
@@ -260,36 +296,44 @@ _NAME = re.compile(rb"[\w.]+")
 
 @functools.cache
 def _content(file: Path) -> tuple[bytes, tuple[str, ...]]:
-    """Hash of a file, and the modules that it may import."""
+    """Return the hash of a file, and the names of modules that it may import, relative ones with their dots."""
     content = file.read_bytes()
-    modules = []
-    for source, names, plain in _IMPORT.findall(content):
+    modules = set()
+    for source, names, plain in _IMPORT.findall(content.replace(b"\\\n", b" ")):
         if source:
-            modules.append(source.decode())
-            modules += [f"{source.decode()}.{name.decode()}" for name in _NAME.findall(names)]
+            parent = source.decode()
+            modules.add(parent)
+            prefix = parent if parent.endswith(".") else f"{parent}."
+            modules |= {prefix + name.decode() for name in _NAME.findall(names)}
         else:
-            modules += [name.decode() for name in _NAME.findall(plain)]
-    return hashlib.sha256(content).digest(), tuple(modules)
+            modules |= {name.decode() for name in _NAME.findall(plain)}
+    return hashlib.sha256(content).digest(), tuple(sorted(modules))
+
+
+def _module_files(module: str, importer: Path) -> tuple[Path, ...]:
+    """Return the file of a module that compiled code may depend on; none for modules of libraries.
+
+    Libraries carry their version in their metadata; their sources do not change under us. Those of a user's own
+    modules, and ours, do.
+    """
+    name = module.lstrip(".")
+    if module != name:
+        return _source_files(importer.parents[len(module) - len(name) - 1], name)
+    top, _, rest = name.partition(".")
+    if top in _PACKAGES:
+        return _source_files(_HOME, name)
+    package = sys.modules.get(top)
+    file = getattr(package, "__file__", None)
+    if file is None or "site-packages" in file or top in sys.stdlib_module_names:
+        return ()
+    folders = getattr(package, "__path__", None)
+    if folders is None:
+        return (Path(file).resolve(),)
+    return tuple(path for folder in folders for path in _source_files(Path(folder), rest))
 
 
 @functools.cache
-def _module_files(module: str) -> tuple[Path, ...]:
-    """Where a module of a package is whose compiled code depends on others; nothing for libraries' modules."""
-    top, *rest = module.split(".")
-    package = sys.modules.get(top)
-    # Libraries carry their version in their metadata, not in sources that change under us; but for a user's own
-    # modules, and for ours, the content is what counts.
-    if package is None or not _is_followed(top, package):
-        return ()
-    places = [Path(folder).joinpath(*rest) for folder in getattr(package, "__path__", ())]
-    candidates = [place.with_suffix(".py") for place in places] + [place / "__init__.py" for place in places]
+def _source_files(folder: Path, name: str) -> tuple[Path, ...]:
+    place = folder.joinpath(*name.split("."))
+    candidates = (*([place.with_suffix(".py")] if name else []), place / "__init__.py")
     return tuple(path.resolve() for path in candidates if path.is_file())
-
-
-def _is_followed(top: str, package: Any) -> bool:
-    file = getattr(package, "__file__", None)
-    return top in _PACKAGES or (file is not None and "site-packages" not in file and not _is_standard(top))
-
-
-def _is_standard(top: str) -> bool:
-    return top in sys.stdlib_module_names

@@ -1,4 +1,4 @@
-"""`parkenv/Drive-v0`: contract, goals, ends, tasks, determinism, state, faults."""
+"""`parkenv/Drive-v1`: contract, goals, ends, tasks, determinism, state, faults."""
 
 import json
 import math
@@ -18,12 +18,13 @@ from parkenv.driving.collision_world import CollisionWorld, ObstacleKind
 from parkenv.driving.drivable_area import DrivableArea
 from parkenv.driving.parking_task import AREA, ParkingTasks
 from parkenv.driving.vehicle import VehicleParameters
-from parkenv.envs.drive import CONTROL_S, DriveEnv, goal_errors
+from parkenv.envs.drive import CONTROL_S, DriveEnv
+from parkenv.envs.drive_goals import goal_errors
 from parkenv.lots import packaged_lot, write_lot
 from parkenv.world.lot import corner_points
 from sim_sensors.laser.scanner import LaserScanner
 
-ID = "parkenv/Drive-v0"
+ID = "parkenv/Drive-v1"
 LOTS = ("campus", "jam", "street", "mini")
 CAR = VehicleParameters()
 
@@ -383,7 +384,7 @@ def test_a_state_with_others_goes_on_the_same():
     two.set_state(kept)
     for a in rest:
         np.testing.assert_equal(two.step([0.2, 0.3]), a)
-    with pytest.raises(InputError, match="state has 14 who move, this environment 0"):
+    with pytest.raises(InputError, match="state has 14 road users, this environment 0"):
         make("street").unwrapped.set_state(kept)
 
 

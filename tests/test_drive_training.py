@@ -204,7 +204,7 @@ def test_a_decision_asks_for_a_speed_and_gets_it(asked, reached):
     task = DriveEnv(lot=MINI).tasks.draw(0)
     batch = DriveBatch(1)
     batch.start(0, PreparedTask(task))
-    batch._things[0] = 0  # nothing in the way
+    batch._obstacles[0] = 0  # nothing in the way
     batch.state[0, SPEED] = 0.7
     for _ in range(6):
         batch.drive(np.array([[asked, 0.0]], np.float32))
@@ -249,14 +249,14 @@ def test_equal_seeds_give_equal_practice_and_ends_are_told():
 def test_a_level_is_mastered_by_parking_and_by_nothing_else():
     env = practice_of("ppo")
     for _ in range(TRIED):
-        env._note("parallel", 0, True)
-        env._note("perpendicular", 5, True)  # of another level
+        env._record_outcome("parallel", 0, True)
+        env._record_outcome("perpendicular", 5, True)  # of another level
     assert env.levels == {"perpendicular": 0, "parallel": 1}
     for k in range(3 * TRIED):
-        env._note("parallel", 1, k % 100 < 100 * MASTERED - 1)
+        env._record_outcome("parallel", 1, k % 100 < 100 * MASTERED - 1)
     assert env.levels["parallel"] == 1
     for _ in range(TRIED * 20):
-        env._note("parallel", env.levels["parallel"], True)
+        env._record_outcome("parallel", env.levels["parallel"], True)
     assert env.levels["parallel"] == len(DRIVE_CONFIGS["ppo"].curriculum) - 1
 
 
@@ -499,7 +499,7 @@ def test_models_of_another_task_are_refused(trained, name):
     other = "ppo" if algorithm != "ppo" else "sac"
     with pytest.raises(InputError, match=f"is a model of {algorithm}, not of {other}"):
         make_parking_agent(f"{other}:{folder / name}")
-    with pytest.raises(InputError, match="unknown driver 'mdp'; known: planner"):
+    with pytest.raises(InputError, match="unknown agent 'mdp'; known: planner"):
         make_parking_agent("mdp")
 
 
@@ -608,7 +608,7 @@ def test_a_short_training_learns_to_park_from_nearby(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     ("agents", "wanted"),
-    [("robot", "unknown driver 'robot'; known: planner"), ("sac:nowhere.zip", "nowhere.zip: no model file")],
+    [("robot", "unknown agent 'robot'; known: planner"), ("sac:nowhere.zip", "nowhere.zip: no model file")],
 )
 def test_park_refuses_who_cannot_drive(tmp_path, agents, wanted):
     result = CliRunner().invoke(app, ["park", "--agents", agents, "--out", str(tmp_path / "p")])

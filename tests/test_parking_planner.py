@@ -241,7 +241,7 @@ def test_stable_baselines_evaluates_the_planner():
     from stable_baselines3.common.vec_env import DummyVecEnv
 
     def made():
-        return gym.make("parkenv/Drive-v0", lot="mini", obstacle_map=True)
+        return gym.make("parkenv/Drive-v1", lot="mini", obstacle_map=True)
 
     rewards, lengths = evaluate_policy(
         ParkingAgent(), DummyVecEnv([made, made]), n_eval_episodes=4, warn=False, return_episode_rewards=True
@@ -253,7 +253,7 @@ def test_stable_baselines_evaluates_the_planner():
 
 def test_the_planner_waits_for_those_who_move():
     env = gym.make(
-        "parkenv/Drive-v0", lot="campus", obstacle_map=True, traffic=Traffic(cars=6, pedestrians=10)
+        "parkenv/Drive-v1", lot="campus", obstacle_map=True, traffic=Traffic(cars=6, pedestrians=10)
     )
     rows = [park_once(env, ParkingAgent(), seed).row for seed in range(8)]
     assert all(row["reason"] in ("", "out of time") for row in rows)
@@ -261,7 +261,7 @@ def test_the_planner_waits_for_those_who_move():
 
 
 def test_an_observation_without_the_map_is_refused():
-    env = gym.make("parkenv/Drive-v0", lot="mini")
+    env = gym.make("parkenv/Drive-v1", lot="mini")
     observation, _ = env.reset(seed=0)
     with pytest.raises(InputError, match="no 'cars': make the environment with obstacle_map=True"):
         ParkingAgent().predict(observation)

@@ -37,13 +37,13 @@ def played(
 
 
 def test_search_is_played_with_five_keys(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = gym.make("parkenv/Search-v0", scenario="campus", render_mode="rgb_array")
+    env = gym.make("parkenv/Search-v1", scenario="campus", render_mode="rgb_array")
     keys = [[pygame.K_w], [pygame.K_s], [pygame.K_a], [pygame.K_d], [pygame.K_SPACE]]
     assert played(env, keys, 4, monkeypatch) == [0, 1, 2, 3, 4]
 
 
 def test_drive_is_played_with_four_keys_and_two_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = gym.make("parkenv/Drive-v0", render_mode="rgb_array")
+    env = gym.make("parkenv/Drive-v1", render_mode="rgb_array")
     keys = [[pygame.K_w], [pygame.K_w, pygame.K_a], [pygame.K_d, pygame.K_s]]
     actions = played(env, keys, np.zeros(2, dtype=np.float32), monkeypatch)
     assert np.array_equal(actions, [[1, 0], [1, 1], [-1, -1]])

@@ -9,8 +9,8 @@ import pytest
 
 from parkenv.evaluation.experiments.detector_scores import score_on
 from parkenv.perception.car_datasets import LabelledImage, read_crop_folder, read_uiuc_training
+from parkenv.perception.car_model import CarModel
 from parkenv.perception.cross_validation import FALSE_POSITIVES, cross_validated, score_on_crops
-from parkenv.perception.detector import CarModel
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.training import TrainingSettings
 

@@ -191,7 +191,7 @@ def test_a_world_that_has_changed_since_is_not_replayed_but_told(tmp_path):
     lot.write_text(lot.read_text() + "\n")
     make_report(out, jobs=1)
     data = data_of(out / "report.html")
-    assert data["run"]["notes"] == [f"There is no replay: --lot {lot} has changed since the run"]
+    assert data["run"]["notes"] == [f"There is no replay: {lot} has changed since the run"]
     assert data["worlds"] == []
     assert len(data["tables"][0]["rows"]) == 2
 

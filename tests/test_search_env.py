@@ -1,4 +1,4 @@
-"""`parkenv/Search-v0`: contract, determinism, rewards, ends, sight."""
+"""`parkenv/Search-v1`: contract, determinism, rewards, ends, sight."""
 
 import copy
 import hashlib
@@ -80,7 +80,7 @@ def test_importing_twice_does_no_harm_and_specs_have_a_limit(env_id):
 
 @pytest.mark.parametrize("scenario", SCENARIO_NAMES)
 def test_equal_seeds_give_equal_episodes(scenario):
-    one, two = (gym.make("parkenv/Search-v0", scenario=scenario) for _ in range(2))
+    one, two = (gym.make("parkenv/Search-v1", scenario=scenario) for _ in range(2))
     for seed in (0, 1, 2**40):
         assert digest(one, seed) == digest(two, seed)
     assert digest(one, 0) != digest(one, 1)
@@ -89,16 +89,16 @@ def test_equal_seeds_give_equal_episodes(scenario):
 def test_equal_seeds_give_equal_episodes_in_another_process():
     program = (
         "import sys; sys.path.insert(0, 'tests'); import gymnasium as gym, parkenv;"
-        "from test_search_env import digest; print(digest(gym.make('parkenv/Search-v0', scenario='street'), 5))"
+        "from test_search_env import digest; print(digest(gym.make('parkenv/Search-v1', scenario='street'), 5))"
     )
     theirs = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout
-    assert theirs.strip() == digest(gym.make("parkenv/Search-v0", scenario="street"), 5)
+    assert theirs.strip() == digest(gym.make("parkenv/Search-v1", scenario="street"), 5)
 
 
 def test_resets_without_a_seed_go_through_other_worlds_of_the_same_seed():
-    env = gym.make("parkenv/Search-v0", scenario="mini")
+    env = gym.make("parkenv/Search-v1", scenario="mini")
     runs = []
     for _ in range(2):
         env.reset(seed=4)
@@ -114,7 +114,7 @@ def test_the_world_does_not_depend_on_who_drives(seed):
     scenario = make_scenario("street")
     worlds = []
     for policy in (0, 1):
-        env = gym.make("parkenv/Search-v0", scenario=scenario)
+        env = gym.make("parkenv/Search-v1", scenario=scenario)
         env.reset(seed=seed)
         rng = np.random.default_rng(policy)
         for _ in range(20 * policy):
@@ -127,7 +127,7 @@ def test_the_world_does_not_depend_on_who_drives(seed):
 
 @pytest.mark.parametrize("scenario", SCENARIO_NAMES)
 def test_reward_terms_add_up_and_the_return_is_minus_the_total_time(scenario):
-    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    env = gym.make("parkenv/Search-v1", scenario=scenario)
     for seed in range(5):
         steps = random_episode(env, seed, steps=2000)[1:]
         for _, reward, _, _, info in steps:
@@ -140,7 +140,7 @@ def test_reward_terms_add_up_and_the_return_is_minus_the_total_time(scenario):
 
 
 def test_the_thesis_reward_differs_by_r_max_on_success():
-    env = ThesisReward(gym.make("parkenv/Search-v0", scenario="mini"))
+    env = ThesisReward(gym.make("parkenv/Search-v1", scenario="mini"))
     observation, _ = env.reset(seed=1)
     rng = np.random.default_rng(0)
     done = False
@@ -163,7 +163,7 @@ def two_slots(taken):
 
 def test_moves_tries_and_parking_cost_what_they_should():
     scenario = two_slots([True, False])
-    env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+    env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
     observation, _ = env.reset(seed=0)
     lot = scenario.lot
     missing = int(np.flatnonzero(observation["action_mask"] == 0)[0])
@@ -190,7 +190,7 @@ def test_moves_tries_and_parking_cost_what_they_should():
 
 def test_a_lot_proven_full_ends_the_search_with_the_cost_of_going_elsewhere():
     scenario = two_slots([True, True]).replace(give_up_s=300.0, sensor_model=SensorModel(view_range=0.0))
-    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    env = gym.make("parkenv/Search-v1", scenario=scenario)
     observation, _ = env.reset(seed=0)
     seen_before_the_end = set()
     for _ in range(20):
@@ -207,7 +207,7 @@ def test_a_lot_proven_full_ends_the_search_with_the_cost_of_going_elsewhere():
 
 
 def test_the_time_limit_truncates_and_does_not_terminate():
-    env = gym.make("parkenv/Search-v0", scenario="mini", max_episode_steps=3)
+    env = gym.make("parkenv/Search-v1", scenario="mini", max_episode_steps=3)
     env.reset(seed=0)
     for step in range(3):
         _, _, terminated, truncated, info = env.step(2)
@@ -218,7 +218,7 @@ def test_the_time_limit_truncates_and_does_not_terminate():
 
 
 def test_the_mask_tells_what_the_graph_has():
-    env = gym.make("parkenv/Search-v0", scenario="mini").unwrapped
+    env = gym.make("parkenv/Search-v1", scenario="mini").unwrapped
     observation, _ = env.reset(seed=0)
     lot = env.scenario.lot
     for _ in range(30):
@@ -230,14 +230,14 @@ def test_the_mask_tells_what_the_graph_has():
 
 
 def test_arrays_of_other_types_are_not_held():
-    search = gym.make("parkenv/Search-v0", scenario="mini").unwrapped.search
+    search = gym.make("parkenv/Search-v1", scenario="mini").unwrapped.search
     other = search._replace(place=search.place.astype(np.int64))
     with pytest.raises(TypingError):
         held(other, np.zeros(2, dtype=np.float32))
 
 
 def test_state_deepcopy_and_pickle_bring_an_episode_back():
-    env = gym.make("parkenv/Search-v0", scenario="campus").unwrapped
+    env = gym.make("parkenv/Search-v1", scenario="campus").unwrapped
     env.reset(seed=3)
     actions = np.random.default_rng(0).integers(0, 4, 60)
     for a in actions[:20]:
@@ -253,11 +253,11 @@ def test_state_deepcopy_and_pickle_bring_an_episode_back():
     assert rest(twin) == expected
     assert rest(thawed) == expected
     with pytest.raises(InputError, match="slots"):
-        gym.make("parkenv/Search-v0", scenario="mini").unwrapped.set_state(saved)
+        gym.make("parkenv/Search-v1", scenario="mini").unwrapped.set_state(saved)
 
 
 def test_observations_are_not_live_buffers():
-    env = gym.make("parkenv/Search-v0", scenario="campus").unwrapped
+    env = gym.make("parkenv/Search-v1", scenario="campus").unwrapped
     before, _ = env.reset(seed=0)
     kept = copy.deepcopy(before)
     for _ in range(10):
@@ -266,10 +266,49 @@ def test_observations_are_not_live_buffers():
         np.testing.assert_array_equal(before[key], value)
 
 
+@pytest.mark.parametrize("noisy", [False, True])
+def test_the_observed_belief_explains_p_occupied(noisy):
+    """`belief` holds all that `p_occupied` is computed from, and its constants are those of the forecast."""
+    model = SensorModel(8.0, hit_rate=0.9, false_alarm_rate=0.2) if noisy else SensorModel()
+    env = gym.make("parkenv/Search-v1", scenario="campus", sensor_model=model).unwrapped
+    observation, _ = env.reset(seed=4)
+    foreseen = env.scenario.forecast(env.state.arrival)
+    rng = np.random.default_rng(1)
+    observed = np.zeros(env.scenario.lot.n_slots, dtype=bool)
+    before = observation["belief"].reshape(4, -1)[2:]
+    assert (before[1] == -1.0).all()
+    for _ in range(60):
+        forecast, decay_rate, p_observed, observed_at = observation["belief"].reshape(4, -1)
+        np.testing.assert_array_equal(forecast, foreseen.p_occupied.astype(np.float32))
+        np.testing.assert_array_equal(decay_rate, foreseen.decay_rate.astype(np.float32))
+        age = np.where(observed_at >= 0.0, observation["time"][1] - observed_at, 0.0)
+        expected = forecast + (p_observed - forecast) * np.exp(-decay_rate * age)
+        np.testing.assert_allclose(observation["p_occupied"], expected, atol=1e-6)
+        np.testing.assert_array_equal(p_observed[observed_at < 0.0], forecast[observed_at < 0.0])
+        # Only slots that were just observed may have changed.
+        changed = (observation["belief"].reshape(4, -1)[2:] != before).any(axis=0)
+        assert (observed_at[changed] == observation["time"][1]).all()
+        observed |= changed
+        np.testing.assert_array_equal(observed_at >= 0.0, env.state.belief.seen)
+        before = observation["belief"].reshape(4, -1)[2:]
+        moves = np.flatnonzero(observation["action_mask"][:PARK])
+        observation, *_ = env.step(rng.choice(moves))
+    assert observed.sum() > 10
+
+
+def test_old_ids_are_not_registered():
+    for name in ("Search", "SearchSensors", "SearchPerception", "Drive"):
+        with (
+            pytest.warns(DeprecationWarning, match="out of date"),
+            pytest.raises(gym.error.DeprecatedEnv, match=f"parkenv/{name}-v1"),
+        ):
+            gym.make(f"parkenv/{name}-v0")
+
+
 def test_only_slots_in_view_are_learnt_of():
     """The belief of a slot that was never in view stays at its forecast, whatever stands there."""
     scenario = make_scenario("campus", sensor_model=SensorModel(view_range=6.0))
-    env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+    env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
     observation, _ = env.reset(seed=0)
     lot, forecast = scenario.lot, env.state.belief.prior
     np.testing.assert_array_equal(observation["p_occupied"], forecast.astype(np.float32))
@@ -304,7 +343,7 @@ def test_the_belief_in_a_slot_left_behind_grows_old():
     lot = grid_lot(1, 12)
     process = OccupancyProcess.from_demand(np.zeros(12), np.zeros(168), 600.0)
     scenario = Scenario(name="a", lot=lot, occupancy=process, sensor_model=SensorModel(view_range=0.0))
-    env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+    env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
     observation, _ = env.reset(seed=0)
     rng = np.random.default_rng(0)
     last = {}
@@ -323,7 +362,7 @@ def test_the_belief_in_a_slot_left_behind_grows_old():
 
 
 def test_a_seed_holds_after_going_on_from_another_search():
-    one, other = (gym.make("parkenv/Search-v0", scenario="mini").unwrapped for _ in range(2))
+    one, other = (gym.make("parkenv/Search-v1", scenario="mini").unwrapped for _ in range(2))
     wanted, _ = one.reset(seed=1)
     other.reset(seed=2)
     one.set_state(other.get_state())
@@ -340,7 +379,7 @@ def test_noisy_sight_errs_as_often_as_stated():
         occupancy=always(lot, taken),
         sensor_model=SensorModel(view_range=1e3, hit_rate=0.8, false_alarm_rate=0.3),
     )
-    env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+    env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
     looks_taken = np.zeros(lot.n_slots)
     seeds = 100
     for seed in range(seeds):
@@ -371,7 +410,7 @@ def test_sight_differs_by_distance_and_side():
     across = lot.slot_yaw[slots[rows]] != lot.slot_yaw[0]
     assert across.any()
     np.testing.assert_array_equal(rates.seen[across], 0.25)
-    env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+    env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
     seen, looked_taken = np.zeros(lot.n_slots), np.zeros(lot.n_slots)
     way_to_0 = next(c for c in range(4) for v in [lot.neighbors[lot.entry_vertices[0], c]] if v >= 0)
     seeds = 400
@@ -426,7 +465,7 @@ def test_wrong_options_are_refused_by_name(changes, message):
 
 
 def test_wrong_use_is_refused():
-    env = gym.make("parkenv/Search-v0", scenario="mini").unwrapped
+    env = gym.make("parkenv/Search-v1", scenario="mini").unwrapped
     with pytest.raises(gym.error.ResetNeeded):
         env.step(0)
     with pytest.raises(InputError, match="no options"):

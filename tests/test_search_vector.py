@@ -1,4 +1,4 @@
-"""The compiled batch of `parkenv/Search-v0`: parity with the single environment, resets, ends, bad input."""
+"""The compiled batch of `parkenv/Search-v1`: parity with the single environment, resets, ends, bad input."""
 
 import gymnasium as gym
 import numpy as np
@@ -73,7 +73,7 @@ def restless_scenario():
 
 def make_batch(n, scenario, **options):
     return gym.make_vec(
-        "parkenv/Search-v0", n, vectorization_mode="vector_entry_point", scenario=scenario, **options
+        "parkenv/Search-v1", n, vectorization_mode="vector_entry_point", scenario=scenario, **options
     )
 
 
@@ -82,7 +82,7 @@ def assert_parity(scenarios, observation="full", n=4, steps=250, k=5, **changes)
     envs = make_batch(n, scenarios, observation=observation, max_episode_steps=LIMIT, k=k, **changes)
     each = scenarios if isinstance(scenarios, list) else [scenarios]
     singles = [
-        gym.make("parkenv/Search-v0", scenario=each[i % len(each)], max_episode_steps=LIMIT, **changes)
+        gym.make("parkenv/Search-v1", scenario=each[i % len(each)], max_episode_steps=LIMIT, **changes)
         for i in range(n)
     ]
     if observation == "local":
@@ -95,9 +95,11 @@ def assert_parity(scenarios, observation="full", n=4, steps=250, k=5, **changes)
         for i in range(n):
             for name, value in alone[i].items():
                 there = batch[name][i]
-                if name == "p_occupied":
-                    assert (there[len(value) :] == 1.0).all()
-                    there = there[: len(value)]
+                if name in ("p_occupied", "belief"):
+                    past_the_last = {"p_occupied": [[1.0]], "belief": [[1.0], [0.0], [1.0], [-1.0]]}[name]
+                    there, n_slots = there.reshape(len(past_the_last), -1), len(alone[i]["p_occupied"])
+                    assert (there[:, n_slots:] == past_the_last).all()
+                    there = there[:, :n_slots].ravel()
                 np.testing.assert_array_equal(there, value, err_msg=name)
         # Mostly what the graph has, and now and then what it does not.
         actions = np.array(
@@ -170,7 +172,7 @@ def test_different_lots_share_one_space():
 def test_what_the_car_finds_is_what_the_world_says():
     """The compiled search draws worlds lazily in its own way; `World` is asked for the same slots and times."""
     for scenario in (restless_scenario(), recorded_scenario()):
-        env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+        env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
         rng = np.random.default_rng(1)
         starts, slots = scenario.slots_in_view
         looks = 0
@@ -188,6 +190,17 @@ def test_what_the_car_finds_is_what_the_world_says():
                 if terminated:
                     break
         assert looks > 1000
+
+
+def test_occupancy_is_the_full_observation_without_what_it_was_computed_from():
+    full, lean = (make_batch(3, "mini", observation=name) for name in ("full", "occupancy"))
+    assert set(full.observation_space) - set(lean.observation_space) == {"belief"}
+    pairs = [(full.reset(seed=2)[0], lean.reset(seed=2)[0])]
+    pairs += [tuple(envs.step(np.full(3, action))[0] for envs in (full, lean)) for action in (3, 1, 4, 2)]
+    for more, less in pairs:
+        assert lean.observation_space.contains(less)
+        for name, value in less.items():
+            np.testing.assert_array_equal(more[name], value)
 
 
 @pytest.mark.parametrize("observation", ["full", "local"])
@@ -208,7 +221,7 @@ def test_equal_seeds_give_equal_batches_of_any_size(observation):
 def test_gymnasium_s_own_batch_of_single_environments_says_the_same():
     ours = make_batch(3, "mini", max_episode_steps=LIMIT)
     theirs = gym.make_vec(
-        "parkenv/Search-v0", 3, vectorization_mode="sync", scenario="mini", max_episode_steps=LIMIT
+        "parkenv/Search-v1", 3, vectorization_mode="sync", scenario="mini", max_episode_steps=LIMIT
     )
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
@@ -280,7 +293,7 @@ def test_a_sequence_of_seeds_and_resets_without_one():
     envs = make_batch(3, "mini")
     first, _ = envs.reset(seed=[9, 9, 4])
     np.testing.assert_array_equal(first["time"][0], first["time"][1])
-    single = gym.make("parkenv/Search-v0", scenario="mini")
+    single = gym.make("parkenv/Search-v1", scenario="mini")
     single.reset(seed=4)
     np.testing.assert_array_equal(envs.reset()[0]["time"][2], single.reset()[0]["time"])
     kept, _ = envs.reset(seed=[None, 9, None])
@@ -301,7 +314,7 @@ def test_a_generator_that_was_set_by_hand_is_drawn_from():
     times = []
     for make in (
         lambda: make_batch(2, "mini"),
-        lambda: gym.make("parkenv/Search-v0", scenario="mini").unwrapped,
+        lambda: gym.make("parkenv/Search-v1", scenario="mini").unwrapped,
     ):
         for k in (3, 3, 4):
             env = make()
@@ -312,7 +325,7 @@ def test_a_generator_that_was_set_by_hand_is_drawn_from():
 
 
 def test_a_refused_action_skips_no_world():
-    single = gym.make("parkenv/Search-v0", scenario="mini")
+    single = gym.make("parkenv/Search-v1", scenario="mini")
     single.reset(seed=0)
     envs = make_batch(1, "mini", max_episode_steps=1)
     envs.reset(seed=0)

@@ -14,7 +14,7 @@ from parkenv import Scenario, make_scenario
 from parkenv.envs.perception import SearchPerceptionEnv
 from parkenv.errors import InputError
 from parkenv.evaluation.trips.sensor_log import GRID_EVERY, record_search, record_session, sensor_log
-from parkenv.mapping.survey import Survey, SurveyMoment, SurveySettings
+from parkenv.mapping.survey import Survey, SurveyFrame, SurveySettings
 from planners import make_agent
 
 
@@ -48,8 +48,8 @@ def test_a_search_through_sensors_is_recorded_step_by_step(mini: Scenario, tmp_p
 
 def test_two_drives_follow_each_other_on_one_time_line(mini: Scenario, tmp_path: Path) -> None:
     survey = Survey(mini, SurveySettings(every=8.0, weather="overcast"))
-    moments: list[SurveyMoment] = []
-    survey.drive(0, on_moment=moments.append)
+    moments: list[SurveyFrame] = []
+    survey.drive(0, on_frame=moments.append)
     with sensor_log(tmp_path / "one.rrd", mini.lot, survey.stack.rig) as log:
         record_session(survey, 0, log)
     with sensor_log(tmp_path / "two.rrd", mini.lot, survey.stack.rig) as log:
@@ -63,8 +63,8 @@ def test_two_drives_follow_each_other_on_one_time_line(mini: Scenario, tmp_path:
 
 def test_who_watches_a_session_changes_nothing_and_sees_the_truth(mini: Scenario) -> None:
     survey = Survey(mini, SurveySettings(every=8.0, weather="overcast"))
-    moments: list[SurveyMoment] = []
-    watched, alone = survey.drive(0, on_moment=moments.append), survey.drive(0)
+    moments: list[SurveyFrame] = []
+    watched, alone = survey.drive(0, on_frame=moments.append), survey.drive(0)
     assert np.array_equal(watched.states.p_occupied, alone.states.p_occupied)
     assert np.array_equal(watched.truth, alone.truth)
     assert [m.time for m in moments] == sorted(m.time for m in moments)

@@ -1,4 +1,4 @@
-"""`parkenv/SearchSensors-v0`: raw observations of the same searches, and what else moves in the lot."""
+"""`parkenv/SearchSensors-v1`: raw observations of the same searches, and what else moves in the lot."""
 
 import copy
 import pickle
@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import data_equivalence
 
 import parkenv  # noqa: F401
 from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
-from parkenv.envs.lookout import Lookout
+from parkenv.envs.sensor_sampler import SensorSampler
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.traffic import LotTraffic
 from sim_sensors.camera.models import PinholeCamera
@@ -29,7 +29,7 @@ BUSY = Traffic(cars=4, pedestrians=6)
 
 
 def make(**options):
-    return gym.make("parkenv/SearchSensors-v0", **{"scenario": "mini", "rig": SMALL_RIG, **options})
+    return gym.make("parkenv/SearchSensors-v1", **{"scenario": "mini", "rig": SMALL_RIG, **options})
 
 
 def drive(env, seed, actions):
@@ -45,7 +45,7 @@ def test_the_same_seed_shows_the_same_pictures_to_everyone():
 
 
 def test_the_search_is_that_of_the_search_environment():
-    sensors, plain = make(rig=LASER_ONLY), gym.make("parkenv/Search-v0", scenario="mini")
+    sensors, plain = make(rig=LASER_ONLY), gym.make("parkenv/Search-v1", scenario="mini")
     sensors.reset(seed=5)
     observation, _ = plain.reset(seed=5)
     rng = np.random.default_rng(0)
@@ -55,7 +55,7 @@ def test_the_search_is_that_of_the_search_environment():
         observation, *plain_rest = plain.step(action)
         assert rest == plain_rest
         assert raw["vertex"] == observation["vertex"]
-        assert "p_occupied" not in raw
+        assert not {"p_occupied", "belief"} & set(raw)
         if rest[1]:
             assert (raw["count"] == 0) == rest[-1]["parked"]
             break
@@ -303,16 +303,16 @@ def test_a_mover_of_a_model_that_the_fleet_lacks_is_refused():
         scene.with_movers(Movers(np.zeros((1, 3)), np.array([100])))
 
 
-def test_lookouts_of_equal_worlds_see_the_same_whatever_was_looked_at_before():
+def test_samplers_of_equal_worlds_see_the_same_whatever_was_looked_at_before():
     scenario = make_scenario("mini", traffic=BUSY)
-    env = gym.make("parkenv/Search-v0", scenario=scenario).unwrapped
+    env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
     env.reset(seed=0)
-    eager, late = (Lookout(scenario, SMALL_RIG, None, 3, 0.5) for _ in range(2))
+    eager, late = (SensorSampler(scenario, SMALL_RIG, None, 3, 0.5) for _ in range(2))
     for action in (3, 3, 3):
         before = env.state.vertex, env.state.time
         env.step(action)
-        last = eager.look(env.state, before)
-    for a, b in zip(last, late.look(env.state, before), strict=True):
+        last = eager.sample_step(env.state, before)
+    for a, b in zip(last, late.sample_step(env.state, before), strict=True):
         np.testing.assert_array_equal(a.capture.images["right"].image, b.capture.images["right"].image)
         np.testing.assert_array_equal(a.capture.scans["laser"], b.capture.scans["laser"])
 

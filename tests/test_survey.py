@@ -14,8 +14,8 @@ from parkenv.evaluation.experiments.surveys import map_error, run_survey
 from parkenv.mapping.inference import SessionLog
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import Survey, SurveySettings
-from parkenv.mapping.survey_score import WAYS
-from parkenv.perception.stack import PerceptionStack
+from parkenv.mapping.survey_score import METHODS
+from parkenv.perception.pipeline import PerceptionPipeline
 from parkenv.world.occupancy import ArrivalWindow
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount, SensorRig
@@ -40,10 +40,10 @@ def test_a_session_finds_which_slots_are_taken(rig):
     assert result.slot_accuracy_seen >= 0.9
     assert result.found >= 0.8 * result.parked
     assert result.score.right >= 0.6 * result.score.detections > 0
-    fitted, thesis = (np.median(result.score.errors(way), axis=0) for way in WAYS)
+    fitted, thesis = (np.median(result.score.errors(method), axis=0) for method in METHODS)
     assert fitted[0] < (0.1 if rig == "laser" else 0.4)
     assert (fitted < thesis).all(), "distance, place and heading are all better than the thesis's way"
-    assert len(result.looks) == 2
+    assert len(result.shown) == 2
     assert result.grid.seen.any()
 
 
@@ -117,7 +117,7 @@ def test_survey_and_map_on_the_command_line(tmp_path):
 
 def test_the_search_sees_what_is_there_and_nothing_else():
     scenario, taken = halves()
-    env = gym.make("parkenv/SearchPerception-v0", scenario=scenario, weather="sunny").unwrapped
+    env = gym.make("parkenv/SearchPerception-v1", scenario=scenario, weather="sunny").unwrapped
     prior = env.reset(seed=0)[0]["p_occupied"]
     lot = scenario.lot
     for _ in range(6):
@@ -131,8 +131,8 @@ def test_the_search_sees_what_is_there_and_nothing_else():
 
 
 def test_the_search_and_its_worlds_are_the_same_as_without_sensors():
-    plain = gym.make("parkenv/Search-v0", scenario="mini")
-    seeing = gym.make("parkenv/SearchPerception-v0", scenario="mini", weather="overcast")
+    plain = gym.make("parkenv/Search-v1", scenario="mini")
+    seeing = gym.make("parkenv/SearchPerception-v1", scenario="mini", weather="overcast")
     first, _ = plain.reset(seed=4)
     second, _ = seeing.reset(seed=4)
     np.testing.assert_array_equal(first["p_occupied"], second["p_occupied"])
@@ -145,8 +145,8 @@ def test_the_search_and_its_worlds_are_the_same_as_without_sensors():
 
 def test_a_rig_that_cannot_see_or_range_is_refused():
     laser = SensorRig(lasers=(("laser", LaserScanner(), Mount(z=0.5)),))
-    with pytest.raises(InputError, match="no camera, or nothing to measure distances with"):
-        PerceptionStack(laser)
+    with pytest.raises(InputError, match="no camera, or no ranging sensor"):
+        PerceptionPipeline(laser, make_scenario("mini").lot)
 
 
 @pytest.mark.parametrize(

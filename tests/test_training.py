@@ -119,7 +119,7 @@ def test_a_model_learns_to_park_and_evaluate_policy_agrees_with_compare(trained)
     assert times.mean() == pytest.approx(best)
     rows, _ = Case(SCENARIO, name).run(EXAMINED)
     assert [row["total_s"] for row in rows] == pytest.approx(times)
-    env = LocalObservation(gym.make("parkenv/Search-v0", scenario=SCENARIO))
+    env = LocalObservation(gym.make("parkenv/Search-v1", scenario=SCENARIO))
     env.reset(seed=EXAMINED[0])
     returns, _ = evaluate_policy(agent, env, n_eval_episodes=5, return_episode_rewards=True, warn=False)
     assert len(returns) == 5
@@ -266,7 +266,7 @@ def test_models_that_do_not_fit_are_refused(trained, tmp_path, spoil, algorithm,
 
 def test_observations_of_another_kind_are_refused(trained):
     agent = LearnedAgent(SCENARIO, "maskable-ppo", trained / "model.zip")
-    env = gym.make("parkenv/Search-v0", scenario=SCENARIO)
+    env = gym.make("parkenv/Search-v1", scenario=SCENARIO)
     plain, _ = env.reset(seed=0)
     with pytest.raises(InputError, match=r"observes what .*LocalObservation says, got vertex, time"):
         agent.predict(plain)

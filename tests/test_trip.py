@@ -160,7 +160,7 @@ def test_a_lane_keeper_stays_near_its_path_at_any_speed_and_slows_down_in_turns(
 
 @pytest.mark.parametrize("name", ["mini", "campus"])
 def test_with_the_graphs_times_a_trip_is_the_search_itself(name):
-    """Replace what was driven by what the graph says, and every decision and second is that of Search-v0."""
+    """Replace what was driven by what the graph says, and every decision and second is that of Search-v1."""
     scenario = unseen(make_scenario(name))
     agent = make_agent("mdp", scenario)
     plain, driven = SearchEnv(scenario), DrivenSearchEnv(scenario, GraphDriver(scenario))
@@ -263,8 +263,8 @@ def test_with_sensors_equal_seeds_give_equal_trips_and_captures_are_where_the_ca
 def test_with_sensors_the_belief_is_what_the_stack_sees_and_not_what_is_so(monkeypatch):
     """A car whose sensors are shown an empty lot believes it, however full the lot is."""
     search = with_sensors(captures=1)
-    env, lookout, lot = search.env, search.env.watcher.lookout, MINI.lot
-    measure, scene = lookout.measure, LotScenes.at
+    env, sampler, lot = search.env, search.env.perception.sampler, MINI.lot
+    measure, scene = sampler.sample, LotScenes.at
 
     def emptied(self, time, ego=None):
         seen = scene(self, time, ego)
@@ -279,7 +279,7 @@ def test_with_sensors_the_belief_is_what_the_stack_sees_and_not_what_is_so(monke
 
     for show_all in (True, False):
         if not show_all:
-            monkeypatch.setattr(lookout, "measure", measured)
+            monkeypatch.setattr(sampler, "sample", measured)
         env.reset(seed=1)
         truth = env.state.world.occupied(np.arange(lot.n_slots), env.state.time)
         for _ in range(3):

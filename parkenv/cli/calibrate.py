@@ -45,7 +45,7 @@ def calibrate(
     agent: AgentOption = "mdp",
     notice_m: NoticeOption = 2.0,
     v_drive_kmh: SpeedOption = None,
-    sensors: args.SensorsOption = None,
+    rig: args.RigOption = None,
     cars: args.CarsOption = 0,
     pedestrians: args.PedestriansOption = 0,
     seed: args.SeedOption = 0,
@@ -71,6 +71,7 @@ def calibrate(
 
     * `parkenv compare --calibrated results/calibrate/calibrated.json`
     """
+    from parkenv.evaluation.experiments.experiment import agent_fingerprints
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.trips.calibration import (
         TripFolder,
@@ -87,13 +88,13 @@ def calibrate(
     its = make_scenario(scenario, traffic=Traffic(cars, pedestrians))
     speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
     style = DrivingStyle(speed=speed, notice_m=notice_m)
-    rig = args.rig_of(sensors)
+    rig = args.rig_of(rig)
     DrivenSearch(its, agent, style=style, rig=rig)  # complains before anything is driven
     make_folder(out)
     settings = {
         "version": __version__, "scenario": scenario, "agent": agent, "style": dataclasses.asdict(style),
-        "sensors": rig,
-        "traffic": dataclasses.asdict(its.traffic), "agent files": args.agent_fingerprints([agent]),
+        "rig": rig,
+        "traffic": dataclasses.asdict(its.traffic), "agent files": agent_fingerprints([agent]),
     }  # fmt: skip
     folder = TripFolder(out, settings, resume=resume)
     console = make_console()
@@ -156,7 +157,7 @@ def trip(
         bool, typer.Option("--unseen", help="Let no slot be seen before a try, so that tries fail.")
     ] = False,
     notice_m: NoticeOption = 2.0,
-    sensors: args.SensorsOption = None,
+    rig: args.RigOption = None,
     cars: args.CarsOption = 0,
     pedestrians: args.PedestriansOption = 0,
     seed: args.SeedOption = 0,
@@ -168,7 +169,7 @@ def trip(
     Examples:
     * `parkenv trip --scenario campus --seed 7 --unseen --out trip.gif`
 
-    * `parkenv trip --scenario campus --sensors laser --rerun trip.rrd`
+    * `parkenv trip --scenario campus --rig laser --rerun trip.rrd`
 
     * `parkenv trip --scenario campus --cars 6 --pedestrians 8`
     """
@@ -183,15 +184,17 @@ def trip(
 
     if out.suffix.lower() != ".gif":
         raise InputError(f"--out is {out}, want a file that ends in .gif")
-    if blind and sensors is not None:
-        raise InputError("--unseen and --sensors: what no one sees needs no sensors; name one of the two")
+    if blind and rig is not None:
+        raise InputError(
+            "--unseen and --rig: without observations no sensors are needed; name one of the two"
+        )
     if rerun is not None:
-        if sensors is None:
-            raise InputError("--rerun records what sensors measure: add --sensors laser")
+        if rig is None:
+            raise InputError("--rerun records what sensors measure: add --rig laser")
         require_viewer()
     its = make_scenario(scenario, traffic=Traffic(cars, pedestrians))
     style = DrivingStyle(notice_m=notice_m)
-    search = DrivenSearch(unseen(its) if blind else its, agent, style=style, rig=args.rig_of(sensors))
+    search = DrivenSearch(unseen(its) if blind else its, agent, style=style, rig=args.rig_of(rig))
     make_folder(out.parent)
     console = make_console()
     with console.status("Driving and drawing"):
@@ -200,10 +203,10 @@ def trip(
     _show(console, driven)
     console.print(f"The film is {out}")
     if rerun is not None:
-        assert search.env.watcher is not None
+        assert search.env.perception is not None
         with (
             console.status(f"Driving once more for {rerun}"),
-            sensor_log(rerun, its.lot, search.env.watcher.lookout.rig) as recording,
+            sensor_log(rerun, its.lot, search.env.perception.sampler.rig) as recording,
         ):
             record_trip(search, seed, recording)
         console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")

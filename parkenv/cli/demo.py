@@ -35,6 +35,7 @@ def demo(
     every: Annotated[
         float, typer.Option("--every", min=0.1, help="Metres between captures of the survey.")
     ] = 2.5,
+    detector: args.DetectorOption = "hog",
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 0,
     rerun: args.RerunOption = None,
@@ -67,7 +68,7 @@ def demo(
 
     if rerun is not None:
         require_viewer()
-    its, settings = first_part(scenario, every, seed)
+    its, settings = survey_spec(scenario, every, seed, detector)
     make_folder(out)
     console = make_console()
     map_file = out / "map.sqlite"
@@ -94,7 +95,7 @@ def demo(
             save_session(its.lot, run.shown, out / "session.png")
         progress.advance(bar)
 
-        cases = last_part(its, log, searches, seed)
+        cases = search_spec(its, log, searches, seed, detector)
         bar = progress.add_task("3/3 searching through the sensors", total=len(AGENTS) * searches)
         run_cases(
             cases, folder, workers=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n)
@@ -126,7 +127,7 @@ def demo(
         make_report(out, jobs=jobs)
 
 
-def first_part(scenario: str, every: float, seed: int) -> tuple[Scenario, SurveySettings]:
+def survey_spec(scenario: str, every: float, seed: int, detector: str) -> tuple[Scenario, SurveySettings]:
     """The world of the demo, and how it is surveyed."""
     from parkenv.mapping.survey import SurveySettings
     from parkenv.world.occupancy import ArrivalWindow
@@ -135,10 +136,12 @@ def first_part(scenario: str, every: float, seed: int) -> tuple[Scenario, Survey
     hours = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
     windows = tuple(ArrivalWindow.parse(h) for h in hours)
     its = make_scenario(scenario, traffic=Traffic(cars=3, pedestrians=5))
-    return its, SurveySettings(every=every, windows=windows, seed=seed)
+    return its, SurveySettings(every=every, windows=windows, seed=seed, detector=detector)
 
 
-def last_part(its: Scenario, log: SessionLog, searches: int, seed: int) -> list[tuple[Case, range]]:
+def search_spec(
+    its: Scenario, log: SessionLog, searches: int, seed: int, detector: str
+) -> list[tuple[Case, range]]:
     """Who searches in it, knowing what the survey tells, with the seeds of the searches."""
     from parkenv.evaluation.experiments.compare import Case
     from parkenv.mapping.inference import MapPrior
@@ -147,7 +150,7 @@ def last_part(its: Scenario, log: SessionLog, searches: int, seed: int) -> list[
     known = its.replace(prior=MapPrior(log), sensor_model=SensorModel.named("laser"))
     # Worlds of the searches are others than those of the survey: their seeds lie far from its own.
     seeds = range(seed + 1_000_000, seed + 1_000_000 + searches)
-    return [(Case(known, name, rig="laser"), seeds) for name in AGENTS]
+    return [(Case(known, name, rig="laser", detector=detector), seeds) for name in AGENTS]
 
 
 def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:
@@ -157,7 +160,7 @@ def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) ->
     from parkenv.mapping.survey import Survey
     from planners.agent import make_agent
 
-    env = SearchPerceptionEnv(known, rig="laser")
+    env = SearchPerceptionEnv(known, rig="laser", detector=settings.detector)
     with sensor_log(path, known.lot, env.rig) as log:
         record_session(Survey(known, settings), 0, log)
         record_search(env, make_agent(AGENTS[0], env.scenario), seed, log)
@@ -165,12 +168,15 @@ def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) ->
 
 def _settings(its: Scenario, settings: SurveySettings, sessions: int, seed: int) -> dict[str, Any]:
     """What decides the outcome of the searches."""
+    from parkenv.perception.detector_registry import detector_version
+
     return {
         "version": __version__,
         "demo": its.name,
         "every": settings.every,
         "sessions": sessions,
         "seed": seed,
+        "detector": detector_version(settings.detector),
     }
 
 

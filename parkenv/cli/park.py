@@ -53,7 +53,7 @@ def park(
         Path, typer.Option("--out", "-o", help="Folder for pictures, episodes.csv and summary.json.")
     ] = Path("results/park"),
 ) -> None:
-    """Let drivers park in `parkenv/Drive-v0`: how often they do, how long they plan and drive.
+    """Let drivers park in `parkenv/Drive-v1`: how often they do, how long they plan and drive.
 
     Writes a picture of one parking for each kind of slot and way of standing in it, an animation of one, and
     pictures of failures where there are any; of several agents, into a folder for each.

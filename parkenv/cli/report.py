@@ -155,27 +155,36 @@ def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
         InputError, OSError: it cannot be done again.
     """
     if run.kind == "compare":
-        from parkenv.cli.compare import comparison_of
+        from parkenv.evaluation.experiments.experiment import Experiment, require_unchanged
+        from parkenv.evaluation.experiments.results import read_settings
+        from parkenv.evaluation.experiments.spec import SPEC_FILE, ExperimentSpec
 
-        _require_same_files(run)
-        return None, [*comparison_of(**_options(run, comparison_of)).cases]
+        spec = ExperimentSpec.read(run.path / SPEC_FILE)
+        require_unchanged(spec, read_settings(run.path) or {})
+        return None, [*Experiment(spec).cases]
+    if run.kind == "benchmark":
+        from parkenv.evaluation.experiments.benchmark import Suite
+        from parkenv.evaluation.experiments.spec import SPEC_FILE, BenchmarkSpec
+
+        suite = BenchmarkSpec.read(run.path / SPEC_FILE)
+        return None, [*Suite.named(suite.suite).cases(suite.agents)]
     if run.kind == "survey":
-        from parkenv.cli.survey import surveyed_by
+        from parkenv.cli.survey import survey_of_options
 
         return (
-            partial(_survey, *surveyed_by(**_options(run, surveyed_by))),
+            partial(_survey, *survey_of_options(**_options(run, survey_of_options))),
             len(run.table("sessions.csv")),
         ), []
     if run.kind == "demo":
-        from parkenv.cli.demo import first_part, last_part
+        from parkenv.cli.demo import search_spec, survey_spec
         from parkenv.cli.survey import MAP_FILE
         from parkenv.mapping.store import MapStore
 
-        its, settings = first_part(**_options(run, first_part))
+        its, settings = survey_spec(**_options(run, survey_spec))
         with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:
             log = store.log()
-        numbers = {k: v for k, v in _parsed(run).items() if k in ("searches", "seed")}
-        return (partial(_survey, its, settings), len(log.time)), [*last_part(its, log, **numbers)]
+        numbers = {k: v for k, v in _parsed(run).items() if k in ("searches", "seed", "detector")}
+        return (partial(_survey, its, settings), len(log.time)), [*search_spec(its, log, **numbers)]
     if run.kind == "train":
         return None, _trained(run)
     return None, []
@@ -201,17 +210,6 @@ def _parsed(run: RunFolder) -> dict[str, Any]:
             return dict(context.params)
     except typer.TyperException as error:
         raise InputError(f"{run.path}: its command cannot be read: {error.format_message()}") from error
-
-
-def _require_same_files(run: RunFolder) -> None:
-    """Refuse files that are no longer those that the comparison read."""
-    from parkenv.evaluation.experiments.results import read_settings
-
-    before = read_settings(run.path) or {}
-    options = _parsed(run)
-    for name in ("occupancy", "mapping", "calibrated"):
-        if options[name] is not None and args.fingerprint(options[name]) != before.get(name):
-            raise InputError(f"--{name} {options[name]} has changed since the run")
 
 
 def _trained(run: RunFolder) -> Cases:
@@ -242,11 +240,13 @@ def _trained(run: RunFolder) -> Cases:
 def _chosen(cases: Cases, seeds: str | None, agents: str | None) -> Cases:
     """The searches that were asked for."""
     if agents is not None:
-        known = list(dict.fromkeys(case.agent for case, _ in cases))
-        for name in (names := args.words("--agents", agents)):
+        from parkenv.evaluation.experiments.agent_spec import split_agents
+
+        known = list(dict.fromkeys(case.label for case, _ in cases))
+        for name in (names := split_agents(agents)):
             if name not in known:
                 raise InputError(f"--agents has {name!r}; in this run: {', '.join(known) or 'none'}")
-        cases = [(case, numbers) for case, numbers in cases if case.agent in names]
+        cases = [(case, numbers) for case, numbers in cases if case.label in names]
     if seeds is not None:
         its_seeds: Sequence[int] = cases[0][1] if cases else range(0)
         theirs = f"{its_seeds[0]} to {its_seeds[-1]}" if its_seeds else "none"

@@ -34,6 +34,7 @@ def survey(
     rig: Annotated[
         str, typer.Option("--rig", help="laser: a camera and a 270° laser; stereo: a stereo pair alone.")
     ] = "laser",
+    detector: args.DetectorOption = "hog",
     hours: Annotated[
         str,
         typer.Option(
@@ -94,9 +95,11 @@ def survey(
 
     if rerun is not None:
         require_viewer()
-    its, settings = surveyed_by(
-        scenario=scenario, lot=lot, occupancy=occupancy, rig=rig, hours=hours, days=days, weather=weather, every=every,
-        pose_noise=pose_noise, cars=cars, pedestrians=pedestrians, seed=seed,
+    its, settings = survey_of_options(
+        scenario=scenario, lot=lot, occupancy=occupancy, rig=rig, detector=detector,
+        hours=hours, days=days, weather=weather, every=every,
+        pose_noise=pose_noise,
+        cars=cars, pedestrians=pedestrians, seed=seed,
     )  # fmt: skip
     make_folder(out)
     console = make_console()
@@ -164,17 +167,18 @@ def survey(
     if rerun is not None:
         with console.status(f"Driving the first session once more for {rerun}"):
             first = Survey(its, settings)
-            with sensor_log(rerun, its.lot, first.stack.rig) as recording:
+            with sensor_log(rerun, its.lot, first.pipeline.rig) as recording:
                 record_session(first, 0, recording)
         console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
 
 
-def surveyed_by(
+def survey_of_options(
     *,
     scenario: str | None,
     lot: str | None,
     occupancy: Path | None,
     rig: str,
+    detector: str,
     hours: str,
     days: str | None,
     weather: str | None,
@@ -202,6 +206,7 @@ def surveyed_by(
         windows=tuple(ArrivalWindow.parse(h, days or "weekdays") for h in hours.split(",")),
         pose_noise=PoseNoise(pose_noise, 0.02 * pose_noise),
         seed=seed,
+        detector=detector,
     )
     return its.replace(traffic=Traffic(cars, pedestrians)), settings
 

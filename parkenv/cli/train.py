@@ -41,7 +41,7 @@ def train(
         typer.Option(
             "--env",
             metavar="search|drive",
-            help="What to learn: to search (parkenv/Search-v0), or to drive into slots (parkenv/Drive-v0).",
+            help="What to learn: to search (parkenv/Search-v1), or to drive into slots (parkenv/Drive-v1).",
             rich_help_panel=args.WORLD,
         ),
     ] = "search",

@@ -170,10 +170,10 @@ def local_space(k: int) -> spaces.Dict:
 class LocalObservation(
     gym.ObservationWrapper[dict[str, Any], np.int64, dict[str, Any]], gym.utils.RecordConstructorArgs
 ):
-    """`parkenv/Search-v0` observed as `local` and `action_mask`; see the module for what `local` says.
+    """`parkenv/Search-v1` observed as `local` and `action_mask`; see the module for what `local` says.
 
     Args:
-        env: `parkenv/Search-v0`, or one that observes what it does.
+        env: `parkenv/Search-v1`, or one that observes what it does.
         k: how many slots it tells of.
 
     Raises:
@@ -183,7 +183,7 @@ class LocalObservation(
     Examples:
         >>> import gymnasium as gym
         >>> import parkenv
-        >>> env = LocalObservation(gym.make("parkenv/Search-v0", scenario="mini"), k=5)
+        >>> env = LocalObservation(gym.make("parkenv/Search-v1", scenario="mini"), k=5)
         >>> observation, info = env.reset(seed=0)
         >>> observation["local"].shape
         (86,)
@@ -193,7 +193,7 @@ class LocalObservation(
         gym.utils.RecordConstructorArgs.__init__(self, k=k)
         super().__init__(env)
         if not isinstance(env.unwrapped, SearchEnv):
-            raise TypeError(f"LocalObservation wraps parkenv/Search-v0, not {type(env.unwrapped).__name__}")
+            raise TypeError(f"LocalObservation wraps parkenv/Search-v1, not {type(env.unwrapped).__name__}")
         self._surroundings = Surroundings.of([env.unwrapped.scenario], k)
         self.observation_space = local_space(k)
 

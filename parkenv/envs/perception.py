@@ -1,59 +1,47 @@
-"""`parkenv/SearchPerception-v0`: the search with the real detection and mapping stack in the loop."""
+"""`parkenv/SearchPerception-v1`: the search with the real detection and mapping stack in the loop."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.envs.lookout import Lookout, Moment
 from parkenv.envs.search import SearchEnv
 from parkenv.envs.search_state import SearchState
 from parkenv.envs.search_step import VERTEX, Search, drive_or_park, renew, settle, take_in, tell_time
-from parkenv.envs.sensors import beside_the_lot
-from parkenv.mapping.slots import SlotFilter
+from parkenv.envs.sensor_sampler import SensorSampler
+from parkenv.envs.sensors import with_camera_images
+from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector import Detector
-from parkenv.perception.stack import Look, PerceptionStack
+from parkenv.perception.pipeline import PerceptionPipeline, PerceptionResult
+from parkenv.perception.slot_filter import SlotObservation
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 from sim_sensors.rig import SensorRig
 
 
-class Report(NamedTuple):
-    """What the stack said of the slots after a step.
-
-    Attributes:
-        slots: (k,) int64, those of which it could tell, ascending.
-        looks_taken: (k,) bool.
-    """
-
-    slots: NDArray[np.int64]
-    looks_taken: NDArray[np.bool_]
-
-
-_NOTHING = Report(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.bool_))
-
-
-class Watcher:
-    """A rig, the stack behind it, and what both tell a belief.
+class OnboardPerception:
+    """Sensors and perception pipeline of a searching car, and the belief update from what they observe.
 
     Args:
-        scenario: the world; where its sensor_model is perfect, what was measured of the rig takes its place.
-        rig, weather, captures, every: as in `Lookout`.
-        detector: the shipped models where None.
+        scenario: the world. If its sensor model is perfect, the fitted model of the rig replaces it, because the belief
+            update needs the error rates of the real observations.
+        rig, weather, captures, every: as in `SensorSampler`.
+        detector: a detector, or its name as in `make_detector`; None: the packaged HOG detector.
 
     Attributes:
-        scenario: with what the car takes its eyes to be worth.
-        lookout: what measures.
-        stack: what sees.
-        looks: what was captured last, oldest first, and what the stack made of it.
-        report: what that said of the slots.
+        scenario: the scenario with the sensor model of the belief update.
+        sampler: the simulated sensors.
+        pipeline: detection, ranging and slot filter.
+        results: what the pipeline made of the captures of the last step, oldest first.
+        observation: the slots observed in the last step, and their observed states.
 
     Raises:
-        InputError: an unknown rig or weather, a rig that cannot see or range, a number out of its range.
+        InputError: an unknown rig, weather or detector, a rig without camera or ranging sensor, or a number outside its
+            range.
     """
 
     def __init__(
@@ -63,72 +51,66 @@ class Watcher:
         weather: str | None = None,
         captures: int = 2,
         every: float = 1.25,
-        detector: Detector | None = None,
+        detector: str | Detector | None = None,
     ) -> None:
-        self.lookout = Lookout(scenario, rig, weather, captures, every)
-        self.stack = PerceptionStack(self.lookout.rig, detector)
+        self.sampler = SensorSampler(scenario, rig, weather, captures, every)
+        self.pipeline = PerceptionPipeline(self.sampler.rig, scenario.lot, detector)
         if scenario.sensor_model.perfect:
-            measured = SensorModel.named("laser" if self.lookout.rig.lasers else "stereo")
-            scenario = scenario.replace(sensor_model=measured)
+            fitted = SensorModel.named("laser" if self.sampler.rig.lasers else "stereo")
+            scenario = scenario.replace(sensor_model=fitted)
         self.scenario = scenario
         self._view_starts, self._view_slots = scenario.slots_in_view
         self._rates = scenario.sensor_rates
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
-        """Nothing has been captured."""
-        self.looks: list[tuple[Moment, Look]] = []
-        self.report = _NOTHING
+    def reset(self) -> None:
+        """Clear the results of the last step."""
+        self.results: tuple[PerceptionResult, ...] = ()
+        self.observation = SlotObservation.none()
 
-    def tell(self, search: Search, moments: Sequence[Moment]) -> None:
-        """See what was captured on the way to the vertex where the car is, and take it into the belief.
+    def update_belief(self, search: Search, captures: Sequence[TimedCapture]) -> None:
+        """Run the pipeline on the captures of a step, and update the belief with the observed slots.
 
         Args:
-            search: of this scenario, under way; its first.
-            moments: oldest first.
+            search: of this scenario; the belief of its first episode is updated.
+            captures: measured on the way to the current vertex, oldest first.
         """
-        self.looks = [(moment, self.stack.look(moment.capture)) for moment in moments]
-        slots = SlotFilter(self.scenario.lot)
-        for _, look in self.looks:
-            for sweep in look.sweeps:
-                slots.see_through(sweep)
-            for view in look.views:
-                slots.see_cars(view.cars)
-        states = slots.states()
+        self.results, observed = self.pipeline.observe(captures)
         vertex = search.counts[0, VERTEX]
         rows = slice(self._view_starts[vertex], self._view_starts[vertex + 1])
-        near, rates = self._view_slots[rows], self._rates.of(rows)
-        told = states.in_view[near] & (states.p_occupied[near] != 0.5)
-        self.report = Report(near[told], states.occupied[near[told]])
-        take_in(search, 0, *self.report, rates.hit[told], rates.false_alarm[told])
+        # The sensor model has rates for the slots within its range only.
+        in_range, rates = self._view_slots[rows], self._rates.of(rows)
+        rated, used = np.isin(in_range, observed.slots), np.isin(observed.slots, in_range)
+        self.observation = SlotObservation(observed.slots[used], observed.taken[used])
+        take_in(search, 0, *self.observation, rates.hit[rated], rates.false_alarm[rated])
 
 
 class SearchPerceptionEnv(SearchEnv):
-    """`parkenv/Search-v0` whose belief is what the detection and mapping stack makes of simulated sensors.
+    """`parkenv/Search-v1` whose belief is what the detection and mapping stack makes of simulated sensors.
 
     ## Description
-    World, decisions, rewards and observations are those of `parkenv/Search-v0`; equal seeds give equal worlds. But
+    World, decisions, rewards and observations are those of `parkenv/Search-v1`; equal seeds give equal worlds. But
     nobody tells the car which slots are taken: on the way of every step its camera and laser take pictures and scans
-    (as in `parkenv/SearchSensors-v0`), cars are detected and ranged, beams are followed into the slots, and what that
+    (as in `parkenv/SearchSensors-v1`), cars are detected and ranged, beams are followed into the slots, and what that
     says of each slot goes into the belief. So the car errs where its eyes do, and sees slots that no circle holds.
 
     ## Action space
-    `Discrete(5)`: up, down, left, right, park, as in `parkenv/Search-v0`.
+    `Discrete(5)`: up, down, left, right, park, as in `parkenv/Search-v1`.
 
     ## Observation space
-    As in `parkenv/Search-v0`: `vertex`, `time`, `p_occupied`, `action_mask`.
+    As in `parkenv/Search-v1`.
 
     ## Rewards
-    As in `parkenv/Search-v0`.
+    As in `parkenv/Search-v1`.
 
     ## Starting state
-    As in `parkenv/Search-v0`. The weather is drawn for each search unless it is given.
+    As in `parkenv/Search-v1`. The weather is drawn for each search unless it is given.
 
     ## Episode end
-    As in `parkenv/Search-v0`; *proven full* is what the stack takes for full.
+    As in `parkenv/Search-v1`; *proven full* is what the stack takes for full.
 
     ## Arguments
-    - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v0`. Its `sighting` is what the
+    - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v1`. Its `sighting` is what the
       car takes its eyes to be worth, and how far away slots may be of which it takes note; where that is perfect,
       what was measured of the rig (`SensorModel.named`).
     - `rig`: laser (the thesis's: a camera and a 270° laser), stereo, both_sides, or a `sim_sensors.rig.SensorRig`
@@ -141,7 +123,7 @@ class SearchPerceptionEnv(SearchEnv):
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
-    >>> env = gym.make("parkenv/SearchPerception-v0", scenario="mini", weather="sunny")
+    >>> env = gym.make("parkenv/SearchPerception-v1", scenario="mini", weather="sunny")
     >>> observation, info = env.reset(seed=0)
     >>> observation, reward, terminated, truncated, info = env.step(3)
     >>> observation["p_occupied"].shape
@@ -150,6 +132,7 @@ class SearchPerceptionEnv(SearchEnv):
     ```
 
     ## Version history
+    - v1: observations gain `belief`.
     - v0: first version.
     """
 
@@ -161,51 +144,44 @@ class SearchPerceptionEnv(SearchEnv):
         weather: str | None = None,
         captures: int = 2,
         every: float = 1.25,
-        detector: Detector | None = None,
+        detector: str | Detector | None = None,
         **changes: Any,
     ) -> None:
-        self.watcher = Watcher(make_scenario(scenario, **changes), rig, weather, captures, every, detector)
-        super().__init__(self.watcher.scenario, render_mode)
+        world = make_scenario(scenario, **changes)
+        self.perception = OnboardPerception(world, rig, weather, captures, every, detector)
+        super().__init__(self.perception.scenario, render_mode)
         self._before: tuple[int, float] | None = None
 
     @property
     def rig(self) -> SensorRig:
-        """The sensors, where they sit, and how they are built."""
-        return self.watcher.lookout.rig
-
-    @property
-    def report(self) -> Report:
-        """What the stack said of the slots after the last step."""
-        return self.watcher.report
-
-    @property
-    def looks(self) -> list[tuple[Moment, Look]]:
-        """What was captured on the way of the last step, oldest first, and what the stack made of it."""
-        return list(self.watcher.looks)
+        """The sensors, their poses on the car, and their models."""
+        return self.perception.sampler.rig
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start a search; see the class."""
+        """Start an episode; see the class."""
         self._before = None
-        self.watcher.forget()
+        self.perception.reset()
         return super().reset(seed=seed, options=options)
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drive along an edge, or try to park; see the class."""
+        """Drive along an edge, or attempt to park; see the class."""
         self._before = (self.state.vertex, self.state.time)
         return super().step(action)
 
     def _advance(self, action: int) -> None:
-        """Act; capture, detect, range, and tell the belief what the slots look like."""
+        """Act, measure on the way, and update the belief from the measurements."""
         drive_or_park(self.search, 0, action)
         self._state.come_along()
         if not self._state.parked:
-            self.watcher.tell(self.search, self.watcher.lookout.look(self._state, self._before))
+            captures = self.perception.sampler.sample_step(self._state, self._before)
+            self.perception.update_belief(self.search, captures)
         settle(self.search, 0)
         renew(self.search, 0)
         tell_time(self.search, 0, self._clock)
 
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
-        """The lot from above, and beside it the newest pictures."""
-        return beside_the_lot(super()._frame(state), [moment for moment, _ in self.watcher.looks], self.rig)
+        """Return the lot from above, with the newest camera images beside it."""
+        newest = self.perception.results[-1].captured if self.perception.results else None
+        return with_camera_images(super()._frame(state), newest, self.rig)

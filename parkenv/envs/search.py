@@ -1,4 +1,4 @@
-"""`parkenv/Search-v0`: decide at every stop where to drive, or to park."""
+"""`parkenv/Search-v1`: decide at every stop where to drive, or to park."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from parkenv.envs.search_alone import begin_alone, held, step_alone
 from parkenv.envs.search_state import SearchState
 from parkenv.envs.search_step import (
     EPISODE,
+    NEVER_OBSERVED,
     SEED_STATE,
     STEP_GAVE_UP,
     VERTEX,
@@ -31,12 +32,15 @@ if TYPE_CHECKING:
 
 LATEST = 1e8
 """Bound, s, of the observed times: Gymnasium wants one, and three years are more than any search takes."""
+MAX_DECAY_RATE = 1e6
+"""Bound, 1/s, of `decay_rate`."""
 _REBUILT = (
     "search",
     "_state",
     "_numbers",
     "_counts",
     "_p_occupied",
+    "_belief",
     "_clock",
     "_held",
     "_seeded_with",
@@ -80,10 +84,22 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     |-----|-------|---------|
     | `vertex` | `Discrete(n_vertices)` | where the car is; vertex i < n_slots lies before slot i |
     | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
-    | `p_occupied` | `Box(0, 1, (n_slots,), float32)` | belief that each slot is taken |
+    | `p_occupied` | `Box(0, 1, (n_slots,), float32)` | belief that each slot is taken, now |
+    | `belief` | `Box((4 * n_slots,), float32)` | what `p_occupied` is computed from, four parts as below |
     | `action_mask` | `Box(0, 1, (5,), int8)` | which actions the graph has here |
 
-    The belief in a slot is the forecast until the slot is seen, then what was seen, relaxing to the forecast.
+    The parts of `belief`, n_slots numbers each, to be unpacked as
+    `forecast, decay_rate, p_observed, observed_at = observation["belief"].reshape(4, -1)`:
+
+    | Part | Name | Bounds | Meaning |
+    |------|------|--------|---------|
+    | 0 | `forecast` | 0, 1 | P(taken) foreseen at the arrival; constant in an episode |
+    | 1 | `decay_rate` | 0, 1e6 | 1/s, decay to the forecast; constant in an episode |
+    | 2 | `p_observed` | 0, 1 | P(taken) right after the last observation of the slot; the forecast before the first |
+    | 3 | `observed_at` | -1, 1e8 | s since the search began, of that observation; -1 before the first |
+
+    An observation updates the belief in a slot by Bayes' rule; then the belief decays to the forecast:
+    `p_occupied = forecast + (p_observed - forecast) * exp(-decay_rate * (time[1] - observed_at))`.
 
     ## Rewards
     Minus the seconds that the step took; parking adds minus the seconds of the walk, so the return is
@@ -117,7 +133,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
-    >>> env = gym.make("parkenv/Search-v0", scenario="mini", failure_s=5.0)
+    >>> env = gym.make("parkenv/Search-v1", scenario="mini", failure_s=5.0)
     >>> observation, info = env.reset(seed=0)
     >>> observation["p_occupied"].shape, env.action_space.n
     ((10,), np.int64(5))
@@ -128,6 +144,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     ```
 
     ## Version history
+    - v1: observations gain `belief`.
     - v0: first version.
     """
 
@@ -160,6 +177,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self._numbers = self.search.numbers[0, : STEP_GAVE_UP + 1]
         self._counts = self.search.counts[0, : VERTEX + 1]
         self._p_occupied = self.search.p_occupied[0]
+        self._belief = self.search.belief[0].reshape(-1)
         self._clock = np.zeros(2, dtype=np.float32)
         self._held = held(self.search, self._clock)
         self._seeded_with: int | None = None
@@ -311,17 +329,22 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             "vertex": self._vertices[vertex],
             "time": self._clock.copy(),
             "p_occupied": self._p_occupied.copy(),
+            "belief": self._belief.copy(),
             "action_mask": self._masks[vertex].copy(),
         }
 
 
 def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
     """What is observed in a lot of some size; see `SearchEnv`."""
+    # Of forecast, decay_rate, p_observed, observed_at.
+    low, high = [0.0, 0.0, 0.0, NEVER_OBSERVED], [1.0, MAX_DECAY_RATE, 1.0, LATEST]
+    bounds = (np.repeat(np.array(row, np.float32), n_slots) for row in (low, high))
     return spaces.Dict(
         {
             "vertex": spaces.Discrete(n_vertices),
             "time": spaces.Box(0.0, LATEST, (2,), np.float32),
             "p_occupied": spaces.Box(0.0, 1.0, (n_slots,), np.float32),
+            "belief": spaces.Box(*bounds, dtype=np.float32),
             "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
         }
     )

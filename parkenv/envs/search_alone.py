@@ -21,12 +21,12 @@ _SEARCH = types.NamedTuple(
     (
         int64[:, ::1], int32[::1], float64[::1], float64[::1],
         float64[:, ::1], int64[:, ::1], float64[:, ::1], int32[:, :, ::1], int32[:, ::1],
-        float64[:, :, ::1], float32[:, ::1],
+        float64[:, :, ::1], float32[:, ::1], float32[:, :, ::1],
     ),
     Search,
 )  # fmt: skip
 _HELD = types.Tuple((_SEARCH, float32[::1]))
-_ROOM = 128
+_ROOM = 160
 """Words that hold all of that, with some to spare: an array is its address, its shape, its strides and 4 more."""
 
 

@@ -25,7 +25,7 @@ class SearchVecEnv(SharedVecEnv):
     """`ParkSearchVectorEnv` for stable-baselines3 and sb3-contrib.
 
     Where a search ends, its `info` has `terminal_observation`, `TimeLimit.truncated`, `episode` (return in seconds, and
-    length, as `Monitor` has them) and the metrics of `parkenv/Search-v0`. sb3-contrib finds `action_masks`.
+    length, as `Monitor` has them) and the metrics of `parkenv/Search-v1`. sb3-contrib finds `action_masks`.
 
     Args:
         num_envs: how many searches at once.

@@ -23,7 +23,7 @@ from parkenv.envs.search_step import (
     VERTEX,
     WHO,
     Search,
-    belief,
+    belief_now,
 )
 from parkenv.world.occupancy import Arrival, World
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -119,7 +119,7 @@ class SearchState:
 def _read_belief(search: Search, p: NDArray[np.float64], seen: NDArray[np.bool_]) -> None:
     for column in range(1, search.counts[0, N_TOUCHED] + 1):
         slot = search.marks[0, column, WHO]
-        p[slot] = belief(search, 0, column)
+        p[slot] = belief_now(search, 0, column)
         seen[slot] = search.marks[0, column, FLAGS] & SEEN != 0
 
 

@@ -1,6 +1,6 @@
 """The compiled search: what one action does to the car, the slots in view, and the belief.
 
-`parkenv/Search-v0` and its batch are this code, so they agree to the bit. Nothing in it costs more in a larger lot:
+`parkenv/Search-v1` and its batch are this code, so they agree to the bit. Nothing in it costs more in a larger lot:
 only slots that were touched in a search, that is looked at or asked for, take any memory that has to be reset.
 """
 
@@ -116,6 +116,10 @@ NOBODY = 0
 # In FLAGS: it is taken; UNTIL is exactly when that ends; it was seen; it looked taken; the car stopped there.
 TAKEN, EXACT, SEEN, LOOKED_TAKEN, PASSED = 1, 2, 4, 8, 16
 
+FORECAST, DECAY_RATE, P_OBSERVED, OBSERVED_AT = range(4)
+"""Rows of `Search.belief`."""
+NEVER_OBSERVED = -1.0
+"""`observed_at` of a slot that was not observed in this search."""
 _SAFE = 1.0 - 1e-6
 _MOMENT = 1e-6
 
@@ -142,7 +146,9 @@ class Search(NamedTuple):
         marks: (n, m + 1, 3) int32, a column a touched slot, likewise; m is the slots of the largest lot.
         place: (n, m) int32, a slot's column.
         asked: (n, 2, m) float64, forecast and relaxation rate of priors that are asked in Python; (0, 2, 0) without.
-        p_occupied: (n, m) float32, belief in every slot, if it is kept up; (0, 0) if not.
+        p_occupied: (n, m) float32, belief in every slot now, if it is kept up; (0, 0) if not.
+        belief: (n, 4, m) float32, as observed, likewise: forecast, decay rate, belief after the last observation,
+            time of it.
     """
 
     at: IntArray
@@ -156,6 +162,7 @@ class Search(NamedTuple):
     place: NDArray[np.int32]
     asked: FloatArray
     p_occupied: NDArray[np.float32]
+    belief: NDArray[np.float32]
 
     @classmethod
     def on(cls, tables: SearchTables, scenario_of: IntArray, full_belief: bool) -> Search:
@@ -164,12 +171,17 @@ class Search(NamedTuple):
         Args:
             tables: of the scenarios.
             scenario_of: (n,) which scenario each search is in.
-            full_belief: whether to keep up `p_occupied`.
+            full_belief: whether to keep up `p_occupied` and `belief`.
         """
         n, m = len(scenario_of), int(tables.at[:, N_SLOTS].max())
         counts = np.zeros((n, N_COUNTS), dtype=np.int64)
         counts[:, SCENARIO] = scenario_of
         asked = bool((tables.at[:, PRIOR_KIND] == ASKED).any())
+        shape = (n, m) if full_belief else (0, 0)
+        # Past the last slot of a smaller lot: taken, never observed, constant.
+        belief = np.zeros((shape[0], 4, shape[1]), dtype=np.float32)
+        belief[:, FORECAST] = belief[:, P_OBSERVED] = 1.0
+        belief[:, OBSERVED_AT] = NEVER_OBSERVED
         return cls(
             *tables,
             np.zeros((n, N_NUMBERS)),
@@ -178,12 +190,13 @@ class Search(NamedTuple):
             np.zeros((n, m + 1, N_MARKS), dtype=np.int32),
             np.zeros((n, m), dtype=np.int32),
             np.zeros((n, 2, m) if asked else (0, 2, 0)),
-            np.ones((n, m) if full_belief else (0, 0), dtype=np.float32),
+            np.ones(shape, dtype=np.float32),
+            belief,
         )
 
     def changing(self) -> tuple[NDArray[Any], ...]:
         """The arrays that a step changes."""
-        return self.numbers, self.counts, self.memory, self.marks, self.place, self.asked, self.p_occupied
+        return self[Search._fields.index("numbers") :]
 
 
 @kernel
@@ -312,6 +325,8 @@ def look_perfectly(search: Search, e: int) -> None:
         if time >= memory[spot(column) + UNTIL]:
             column = see_anew(search, e, ints[i])
         memory[spot(column) + LOOKED] = time
+        if len(search.belief) > 0:
+            search.belief[e, OBSERVED_AT, ints[i]] = time - search.numbers[e, ARRIVAL]
     pass_by(search, e)
 
 
@@ -347,7 +362,7 @@ def look_badly(search: Search, e: int) -> None:
             e,
             column,
             looks_taken,
-            bayes_update(belief(search, e, column), looks_taken, hit, false_alarm),
+            bayes_update(belief_now(search, e, column), looks_taken, hit, false_alarm),
         )
 
 
@@ -359,7 +374,7 @@ def take_in(
     pass_by(search, e)
     for i in range(slots.size):
         column = touched(search, e, slots[i])
-        said = bayes_update(belief(search, e, column), looks_taken[i], hit[i], false_alarm[i])
+        said = bayes_update(belief_now(search, e, column), looks_taken[i], hit[i], false_alarm[i])
         learn(search, e, column, looks_taken[i], said)
 
 
@@ -400,10 +415,14 @@ def learn(search: Search, e: int, column: int, looks_taken: bool, said: float) -
     search.marks[e, column, FLAGS] = (flags & ~LOOKED_TAKEN) | looked_taken | SEEN
     search.memory[e, spot(column) + SAID] = said
     search.memory[e, spot(column) + LOOKED] = search.numbers[e, TIME]
+    if len(search.belief) > 0:
+        slot = search.marks[e, column, WHO]
+        search.belief[e, P_OBSERVED, slot] = said
+        search.belief[e, OBSERVED_AT, slot] = search.numbers[e, TIME] - search.numbers[e, ARRIVAL]
 
 
 @inlined
-def belief(search: Search, e: int, column: int) -> float:
+def belief_now(search: Search, e: int, column: int) -> float:
     """The belief in a touched slot, now."""
     memory, at = search.memory[e], spot(column)
     elapsed = search.numbers[e, TIME] - memory[at + LOOKED]
@@ -625,12 +644,22 @@ def _log_forecast(search: Search, e: int, slot: int) -> tuple[float, float]:
 
 @kernel
 def foresee(search: Search, e: int) -> None:
-    """Write the forecast of every slot into the full belief."""
-    at, row, out = search.at, search.counts[e, SCENARIO], search.p_occupied[e]
+    """Write the forecast of every slot into the full belief; none has been observed."""
+    at, row = search.at, search.counts[e, SCENARIO]
     n = at[row, N_SLOTS]
+    _foresee_each(search, e, row, n)
+    belief = search.belief[e]
+    for s in range(n):
+        search.p_occupied[e, s] = belief[P_OBSERVED, s] = belief[FORECAST, s]
+        belief[OBSERVED_AT, s] = NEVER_OBSERVED
+
+
+@inlined
+def _foresee_each(search: Search, e: int, row: int, n: int) -> None:
+    at = search.at
     if at[row, PRIOR_KIND] != PROCESS:
         for s in range(n):
-            out[s] = forecast(search, e, s)[0]
+            search.belief[e, FORECAST, s], search.belief[e, DECAY_RATE, s] = forecast(search, e, s)
         return
     hour, model = search.counts[e, HOUR], at[row, PRIOR_REALS]
     marginals = at[row, PRIOR_KEPT] + hour * n
@@ -648,7 +677,8 @@ def foresee(search: Search, e: int) -> None:
         search.reals[model + WEEK_HOURS + hour],
         search.kept[marginals : marginals + n],
         search.numbers[e, SECOND_OF_HOUR],
-        out,
+        search.belief[e, FORECAST],
+        search.belief[e, DECAY_RATE],
     )
 
 
@@ -661,6 +691,7 @@ def _foresee_all(
     start: FloatArray,
     second: float,
     out: NDArray[np.float32],
+    out_rate: NDArray[np.float32],
 ) -> None:
     """`forecast` of many slots, whose marginals at the full hour are known, by vector instructions."""
     for s in range(len(start)):
@@ -668,3 +699,4 @@ def _foresee_all(
         rate = arrival + go[s] * going
         p = marginal_later(start[s], arrival, rate, second)
         out[s] = min(max(p, MIN_PROBABILITY), MAX_PROBABILITY)
+        out_rate[s] = rate

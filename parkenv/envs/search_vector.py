@@ -1,4 +1,4 @@
-"""Many searches at once, compiled: the `vector_entry_point` of `parkenv/Search-v0`."""
+"""Many searches at once, compiled: the `vector_entry_point` of `parkenv/Search-v1`."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy import BoolArray, FloatArray, IntArray
 from parkenv.world.scenario import Scenario
 
-OBSERVATIONS = ("full", "local")
+OBSERVATIONS = ("full", "occupancy", "local")
 TIME_METRICS = ("drive_s", "failed_s", "walk_s", "gave_up_s", "total_s", "driven_m", "walked_m")
 COUNT_METRICS = ("failed_parks", "slots_passed")
 # Gymnasium's names of the arrays that say which searches a metric is of.
@@ -182,10 +182,10 @@ def _report(search: Search, e: int, fresh: bool, limit: int, steps: Steps, mask:
 
 
 class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]]):
-    """`parkenv/Search-v0` many times over, in one compiled step.
+    """`parkenv/Search-v1` many times over, in one compiled step.
 
     ## Description
-    World, decisions, rewards, ends and observations are those of `parkenv/Search-v0`: search i of a batch that was
+    World, decisions, rewards, ends and observations are those of `parkenv/Search-v1`: search i of a batch that was
     reset with `seed=s` is the single environment that was reset with `seed=s + i`, bit for bit, through all the
     episodes that follow.
 
@@ -193,21 +193,23 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     `MultiDiscrete([5, ...])`: up, down, left, right, park.
 
     ## Observation space
-    With `observation="full"` a `Dict` of `vertex`, `time`, `p_occupied` and `action_mask`, each as in
-    `parkenv/Search-v0` with a row a search. Where lots differ in size, `p_occupied` is 1 past a lot's last slot.
+    With `observation="full"` the `Dict` of `parkenv/Search-v1`, with a row for each search. Where lots differ in size,
+    slots past a lot's last one are taken (1) and never observed, and `belief` has four parts of the largest lot's size.
+
+    With `observation="occupancy"` the same without `belief`, which saves its copying.
 
     With `observation="local"` a `Dict` of `local` and `action_mask`; see `parkenv.envs.local_observation`. It has the
     same size on every lot, and costs the same.
 
     ## Rewards
-    As in `parkenv/Search-v0`, float64. `reward_terms` holds the last step's terms.
+    As in `parkenv/Search-v1`, float64. `reward_terms` holds the last step's terms.
 
     ## Starting state
-    As in `parkenv/Search-v0`. `reset(seed=s)` gives search i the seed s + i; a sequence gives each its own. Without a
+    As in `parkenv/Search-v1`. `reset(seed=s)` gives search i the seed s + i; a sequence gives each its own. Without a
     seed every search goes on to the next world of its seed.
 
     ## Episode end
-    As in `parkenv/Search-v0`; truncated after `max_episode_steps`. What then happens is `autoreset_mode`: NEXT_STEP,
+    As in `parkenv/Search-v1`; truncated after `max_episode_steps`. What then happens is `autoreset_mode`: NEXT_STEP,
     whatever is done in the next step begins a new search, for a reward of 0; SAME_STEP, a new search begins at once,
     and the last observations and infos are `info["final_obs"]` and `info["final_info"]`; DISABLED, those to begin anew
     are named in `reset(options={"reset_mask": ...})`. Where a search ends, `info` has its metrics, as the single
@@ -217,7 +219,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     - `num_envs`: how many.
     - `scenario`: a `Scenario` or the name of a packaged one; or a sequence of such, of which search i gets the one at
       i modulo their number.
-    - `observation`: full or local.
+    - `observation`: full, occupancy or local.
     - `k`: how many slots `local` tells of.
     - `max_episode_steps`: 2000 from `make_vec`.
     - `autoreset_mode`: NEXT_STEP, SAME_STEP or DISABLED of `gymnasium.vector.AutoresetMode`, or its value.
@@ -227,7 +229,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
-    >>> envs = gym.make_vec("parkenv/Search-v0", 3, vectorization_mode="vector_entry_point", scenario="mini")
+    >>> envs = gym.make_vec("parkenv/Search-v1", 3, vectorization_mode="vector_entry_point", scenario="mini")
     >>> observations, infos = envs.reset(seed=0)
     >>> observations["p_occupied"].shape
     (3, 10)
@@ -278,11 +280,14 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self.max_episode_steps = max_episode_steps
         self.metadata = self.metadata | {"autoreset_mode": mode}
         self.single_action_space = spaces.Discrete(N_ACTIONS)
-        self._full = observation == "full"
+        self._full = observation != "local"
         if self._full:
             lots = [one.lot for one in self.scenarios]
             n_slots, n_vertices = max(lot.n_slots for lot in lots), max(lot.n_vertices for lot in lots)
-            self.single_observation_space = search_space(n_slots, n_vertices)
+            space = search_space(n_slots, n_vertices)
+            if observation == "occupancy":
+                space = spaces.Dict({name: one for name, one in space.items() if name != "belief"})
+            self.single_observation_space = space
             self._surroundings: Surroundings | None = None
         else:
             self._surroundings = Surroundings.of(self.scenarios, k)
@@ -294,8 +299,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._search = Search.on(SearchTables.of(self.scenarios), scenario_of, self._full)
         empty: Any = create_empty_array(self.single_observation_space, n)
         self._seen: dict[str, NDArray[Any]] = empty
-        if self._full:
-            self._seen["p_occupied"] = self._search.p_occupied
+        kept_up = {"p_occupied": self._search.p_occupied, "belief": self._search.belief.reshape(n, -1)}
+        self._seen |= {name: array for name, array in kept_up.items() if name in self._seen}
         self._steps = Steps.of(n)
         self._limit = max_episode_steps or np.iinfo(np.int64).max
         self._mode, self._copy = mode, copy
@@ -313,7 +318,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     def bytes_each(self) -> float:
         """Memory of one search, bytes, in a lot of whose slots all have been looked at; the tables are shared."""
         buffers = (*self._seen.values(), *self._steps, *self._search.changing())
-        return sum({id(a): a.nbytes for a in buffers}.values()) / self.num_envs
+        return sum({a.ctypes.data: a.nbytes for a in buffers}.values()) / self.num_envs
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None

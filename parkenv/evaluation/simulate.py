@@ -16,7 +16,7 @@ from planners.bounds.oracle import OracleAgent
 from sim_sensors.compilation import seconds_spent
 
 STEP_LIMIT = 2000
-"""Decisions after which environments that are not made by `gymnasium.make` truncate, as `parkenv/Search-v0` does."""
+"""Decisions after which environments that are not made by `gymnasium.make` truncate, as `parkenv/Search-v1` does."""
 
 
 class Step(NamedTuple):

@@ -81,7 +81,7 @@ def build(spec: ScenarioSpec) -> Scenario:
         lot = dataclasses.replace(lot, goals=np.array([spec.goal]))
     else:
         goal = spec.goal
-    name = spec.name or lot.name
+    name = spec.title
     try:
         if not goal < len(lot.goals):
             raise InputError(f"goal is {goal}, want an index from 0 to {len(lot.goals) - 1}")
@@ -100,7 +100,9 @@ def build(spec: ScenarioSpec) -> Scenario:
             occupancy=occupancy,
             prior=_prior(spec.forecast, occupancy, lot, goal),
             arrival=spec.arrivals.window(),
-            traffic=Traffic(spec.traffic.cars, spec.traffic.pedestrians),
+            traffic=Traffic()
+            if spec.traffic is None
+            else Traffic(spec.traffic.cars, spec.traffic.pedestrians),
         )
     except InputError as error:
         raise InputError(f"scenario {name!r}: {error}") from error

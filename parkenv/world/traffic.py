@@ -39,7 +39,7 @@ class Traffic:
     """How much moves in a lot besides the car that searches.
 
     It takes no slot. On the slot graph it blocks no way, and is there to be seen. Where the car really drives, on whole
-    trips and in `parkenv/Drive-v0`, each waits for the other.
+    trips and in `parkenv/Drive-v1`, each waits for the other.
 
     Args:
         cars: how many drive about, along the lanes in rounds.

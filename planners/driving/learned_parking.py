@@ -1,4 +1,4 @@
-"""Parking agent with a model of `parkenv train --env drive`, for `parkenv/Drive-v0`."""
+"""Parking agent with a model of `parkenv train --env drive`, for `parkenv/Drive-v1`."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class LearnedParkingAgent:
         """Decide on single observations, or on batches with a leading axis (stable-baselines3's interface).
 
         Args:
-            observation: from `parkenv/Drive-v0` with `obstacle_map=True`, or a vector of them.
+            observation: from `parkenv/Drive-v1` with `obstacle_map=True`, or a vector of them.
             state: returned by the previous call; None at the start.
             episode_start: per environment, whether its episode has just started; None: where there is no state.
             deterministic: whether to use the mode of the policy instead of a sample.

@@ -56,7 +56,7 @@ class ParkingMemory:
 
 
 class ParkingAgent:
-    """Park in `parkenv/Drive-v0`: hybrid A*, Reeds-Shepp shots, and a tracking controller.
+    """Park in `parkenv/Drive-v1`: hybrid A*, Reeds-Shepp shots, and a tracking controller.
 
     The agent knows the car and the observation: the poses of car and slot and, with `obstacle_map=True`, the outlines
     of parked cars, kerbs and walls, and of moving road users, for which it waits.
@@ -89,7 +89,7 @@ class ParkingAgent:
         """Decide on single observations, or on batches with a leading axis (stable-baselines3's interface).
 
         Args:
-            observation: from `parkenv/Drive-v0` with `obstacle_map=True`, or a vector of them.
+            observation: from `parkenv/Drive-v1` with `obstacle_map=True`, or a vector of them.
             state: returned by the previous call; None at the start.
             episode_start: per environment, whether its episode has just started; None: where there is no state.
             deterministic: part of the interface; this agent is always deterministic.

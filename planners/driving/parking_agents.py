@@ -1,4 +1,4 @@
-"""Parking agents of `parkenv/Drive-v0`, by name."""
+"""Parking agents of `parkenv/Drive-v1`, by name."""
 
 from __future__ import annotations
 

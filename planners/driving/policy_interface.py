@@ -1,4 +1,4 @@
-"""Observation and action of learned parking agents, on top of `parkenv/Drive-v0`.
+"""Observation and action of learned parking agents, on top of `parkenv/Drive-v1`.
 
 The policy observes the free distance in every direction, from the car's outline to the nearest obstacle, and decides
 speed and steering for the next 0.4 s. Its own pose and the wanted one are in the goals.

@@ -21,7 +21,7 @@ MOST_STEPS = 2000
 def expected_time(agent: Agent, problem: SearchProblem, p_occupied: ArrayLike, vertex: int) -> float:
     """Mean total time, s, of an agent's search where slots last and the forecast is right.
 
-    The rules are those of `parkenv/Search-v0` in a world in which each slot is taken with its probability,
+    The rules are those of `parkenv/Search-v1` in a world in which each slot is taken with its probability,
     independently of the others, and nothing changes. The agent decides in every history of sightings that it can
     bring about, so this is for lots of about a dozen slots.
 

@@ -38,11 +38,11 @@ def drive_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     if find_spec("highway_env") is not None:
         peers["highway-env parking-v0"] = highway_parking(seed, seconds)
     plain = environment_steps({}, seed, seconds)
-    rows += rate("drive", "parkenv/Drive-v0", SUBSTEPS * plain, "physics steps/s", **peers)
+    rows += rate("drive", "parkenv/Drive-v1", SUBSTEPS * plain, "physics steps/s", **peers)
     scan = environment_steps({"laser": True}, seed, seconds)
-    rows += rate("drive", "parkenv/Drive-v0, 1081 beams a step", SUBSTEPS * scan, "physics steps/s", **peers)
+    rows += rate("drive", "parkenv/Drive-v1, 1081 beams a step", SUBSTEPS * scan, "physics steps/s", **peers)
     mapped = environment_steps({"obstacle_map": True}, seed, seconds)
-    rows += rate("drive", "parkenv/Drive-v0, obstacle map", SUBSTEPS * mapped, "physics steps/s", **peers)
+    rows += rate("drive", "parkenv/Drive-v1, obstacle map", SUBSTEPS * mapped, "physics steps/s", **peers)
     for lot in ("campus", "street"):
         reset, plan = reset_and_plan(lot, seed, seconds)
         rows += duration("drive", f"reset, {lot}", 1e3 * reset, "ms")
@@ -68,8 +68,8 @@ def bare_physics(seed: int, seconds: float) -> float:
 
 
 def environment_steps(arguments: dict[str, Any], seed: int, seconds: float) -> float:
-    """Steps a second of `parkenv/Drive-v0` as `gymnasium.make` gives it, two of the physics in each."""
-    env = gym.make("parkenv/Drive-v0", disable_env_checker=True, **arguments)
+    """Steps a second of `parkenv/Drive-v1` as `gymnasium.make` gives it, two of the physics in each."""
+    env = gym.make("parkenv/Drive-v1", disable_env_checker=True, **arguments)
     env.reset(seed=seed)
     return _steps(env, _pedalling(seed), seconds)
 
@@ -86,7 +86,7 @@ def highway_parking(seed: int, seconds: float) -> float:
 
 def reset_and_plan(lot: str, seed: int, seconds: float) -> tuple[float, float]:
     """Median time, s, of a reset, and of a plan from where it starts."""
-    env = gym.make("parkenv/Drive-v0", lot=lot, obstacle_map=True, disable_env_checker=True)
+    env = gym.make("parkenv/Drive-v1", lot=lot, obstacle_map=True, disable_env_checker=True)
     agent = ParkingAgent()
     reset = seconds_each(lambda i: env.reset(seed=seed + i), seconds, least=20)
     seen = [env.reset(seed=seed + i)[0] for i in range(20)]

@@ -152,7 +152,7 @@ def city_rows(
         agents: who searches, by name.
     """
     scenario = make_scenario(city_lot(n_slots, seed))
-    env = gym.make("parkenv/Search-v0", scenario=scenario)
+    env = gym.make("parkenv/Search-v1", scenario=scenario)
     rows: list[BenchRow] = []
     for name in agents:
         first, decisions = [], []

@@ -21,7 +21,7 @@ from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
 from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
-from parkenv.mapping.survey_score import DISTANCE_ENDS, WAYS
+from parkenv.mapping.survey_score import DISTANCE_ENDS, METHODS
 from parkenv.world.occupancy import DAY_S, Arrival, ArrivalWindow
 from parkenv.world.scenario import Scenario
 
@@ -59,7 +59,7 @@ def session_row(result: SessionResult) -> Row:
             (
                 result.session.key, result.session.weather, result.arrival.time, result.parked, result.found,
                 score.detections, score.right,
-                *(value for way in WAYS for value in _error_columns(score.errors(way))),
+                *(value for method in METHODS for value in _error_columns(score.errors(method))),
                 result.slot_accuracy, result.slot_accuracy_seen, float(1.0 - result.states.in_view.mean()),
                 float(result.truth.mean()), float(np.median(result.frame_s)),
                 *(" ".join(map(str, counts.tolist())) for counts in score.in_frame.T),

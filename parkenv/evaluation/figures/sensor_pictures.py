@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from parkenv.envs.drawing import write_text
 from parkenv.evaluation.figures.lot_picture import draw_lot
 from parkenv.evaluation.figures.picture_files import STYLE, save_picture
-from parkenv.perception.sweeps import disparity
+from parkenv.perception.range_scan import disparity
 from parkenv.world.lot import ParkingLot
 from sim_sensors.ground_truth import VehicleBoxes, View
 from sim_sensors.rig import Capture, SensorRig

@@ -49,7 +49,7 @@ def draw_detections(
         placed: rows of those that stand somewhere; others are drawn thin and grey. All of them where None.
     """
     drawn = image.copy()
-    for i, (box, p, end) in enumerate(zip(found.boxes, found.probability, found.ends, strict=True)):
+    for i, (box, p, end) in enumerate(zip(found.boxes, found.probability, found.end_on, strict=True)):
         left, top, right, bottom = (round(float(v)) for v in box)
         if placed is not None and i not in placed:
             cv2.rectangle(drawn, (left, top), (right, bottom), NOWHERE_COLOR, 1, cv2.LINE_AA)
@@ -66,14 +66,14 @@ def save_detections(result: SessionResult, path: Path) -> None:
     Yellow are sides, blue fronts and rears, thin and grey what no beam met or what is seen too little of.
     """
     with mpl.rc_context(STYLE):
-        n = len(result.looks)
+        n = len(result.shown)
         figure = Figure(figsize=(4.2 * n, 3.5))
         figure.suptitle(
             f"Detections, {result.session.weather.replace('_', ' ')}", x=0.01, ha="left", weight="bold"
         )
-        for i, (_, look) in enumerate(result.looks):
+        for i, shown in enumerate(result.shown):
             ax = figure.add_subplot(1, n, i + 1)
-            view = look.views[0]
+            view = shown.views[0]
             ax.imshow(draw_detections(view.image, view.detections, view.cars.detection))
             ax.set_axis_off()
         figure.subplots_adjust(0.01, 0.01, 0.99, 0.9, wspace=0.02)

@@ -19,11 +19,11 @@ from parkenv.envs.rendering import (
     INK,
     WHITE,
     WIDTH,
+    MapView,
     SearchRenderer,
-    View,
-    _Ground,
-    _lay_out,
+    StillLayer,
     clock,
+    draw_still_layer,
 )
 from parkenv.envs.search_state import SearchState
 from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
@@ -72,19 +72,22 @@ class TripRenderer(SearchRenderer):
     def _middle(self) -> FloatArray:
         return self._driver.vehicle.at_middle(self._driver.state[:3])
 
-    def _ground_for(self, state: SearchState) -> _Ground:
+    def still_layer(self, state: SearchState) -> StillLayer:
+        """Return the layer of the lot's part near the car, or of the whole lot."""
         if not self._near:
-            return super()._ground_for(state)
+            return super().still_layer(state)
         scale = _SLOT_PX / self._slot_width
         stride = np.array(self._size) / scale / 3
         column, row = np.round(self._middle()[:2] / stride).astype(int)
-        if self._ground is None or self._window_at != (column, row):
+        if self._still is None or self._window_at != (column, row):
             self._window_at = column, row
             center = np.array([column, row]) * stride
-            self._ground = _lay_out(self.scenario, View.around(center, self._size, scale))
-        return self._ground
+            self._still = draw_still_layer(
+                self.scenario.lot, self.outline, MapView.around(center, self._size, scale)
+            )
+        return self._still
 
-    def _draw_trail(self, image: Image, view: View, state: SearchState) -> None:
+    def _draw_trail(self, image: Image, view: MapView, state: SearchState) -> None:
         del state  # where the car has been is not part of it
         if len(self.trail) > 1:
             points = fixed_point(view(np.array(self.trail)))
@@ -93,7 +96,7 @@ class TripRenderer(SearchRenderer):
                 image, [points], False, mixed_color(ASPHALT, CAR, 0.7), thickness, cv2.LINE_AA, SUBPIXEL_BITS
             )
 
-    def _draw_car(self, image: Image, view: View, state: SearchState) -> None:
+    def _draw_car(self, image: Image, view: MapView, state: SearchState) -> None:
         del state
         others = self._driver.others
         if others is not None:

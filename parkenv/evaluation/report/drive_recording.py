@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from parkenv.evaluation.report.search_recording import describe_lot
+from parkenv.evaluation.report.lot_data import describe_lot
 from parkenv.mapping.grid import OccupancyGrid
-from parkenv.mapping.survey import Survey, SurveyMoment
-from parkenv.perception.stack import View
+from parkenv.mapping.survey import Survey, SurveyFrame
+from parkenv.perception.pipeline import CameraView, PerceptionResult
 from sim_sensors.rig import poses_along
 
 PICTURE_WIDTH = 480
@@ -44,23 +44,23 @@ def record_drive(survey: Survey, number: int, most_frames: int) -> Recording:
     known = np.full(survey.scenario.lot.n_slots, -1)
     taken = np.zeros(survey.scenario.lot.n_slots, dtype=np.bool_)
 
-    def watch(moment: SurveyMoment) -> None:
+    def watch(frame: SurveyFrame) -> None:
         nonlocal count, first_time, known, taken
-        first_time = first_time if count else moment.time
+        first_time = first_time if count else frame.result.captured.time
         if count % step == 0 or count == captures - 1:
-            states = moment.slots.states()
+            states = frame.slots.states()
             now = np.where(states.in_view, np.round(255 * states.p_occupied), -1).astype(np.int64)
             frames.append(
                 {
-                    **_frame(moment, first_time),
+                    **_frame(frame, first_time),
                     "belief": _changes(known, now),
-                    "truth": _changes(taken.astype(np.int64), moment.truth.astype(np.int64)),
+                    "truth": _changes(taken.astype(np.int64), frame.truth.astype(np.int64)),
                 }
             )
-            known, taken = now, moment.truth.copy()
+            known, taken = now, frame.truth.copy()
         count += 1
 
-    result = survey.drive(number, on_moment=watch)
+    result = survey.drive(number, on_frame=watch)
     grid = result.grid
     rows, columns = grid.log_odds.shape
     return {
@@ -87,26 +87,26 @@ def record_drive(survey: Survey, number: int, most_frames: int) -> Recording:
     }
 
 
-def _frame(moment: SurveyMoment, first_time: float) -> Recording:
-    look = moment.look
-    x, y, yaw = (round(float(v), 3) for v in look.vehicle)
-    view = look.views[0]
+def _frame(frame: SurveyFrame, first_time: float) -> Recording:
+    result = frame.result
+    x, y, yaw = (round(float(v), 3) for v in result.vehicle)
+    view = result.views[0]
     return {
-        "t": round(moment.time - first_time, 2),
+        "t": round(result.captured.time - first_time, 2),
         "pose": [x, y, yaw],
         "picture": _jpeg(view.image),
         "boxes": _boxes(view),
         "cars": [
             [round(float(v), 2) for v in (*xy, yaw, *size)]
-            for its in look.views
+            for its in result.views
             for xy, yaw, size in zip(its.cars.xy, its.cars.yaw, its.cars.size, strict=True)
         ],
-        "scan": _scan(moment),
-        "map": _grid_png(moment.grid),
+        "scan": _scan(result),
+        "map": _grid_png(frame.grid),
     }
 
 
-def _boxes(view: View) -> list[list[float]]:
+def _boxes(view: CameraView) -> list[list[float]]:
     """Left, top, right, bottom as shares of the picture; probability; whether it is an end; whether it is placed."""
     height, width = view.image.shape[:2]
     found = view.detections
@@ -115,16 +115,16 @@ def _boxes(view: View) -> list[list[float]]:
         left, top, right, bottom = found.boxes[i].tolist()
         box = (left / width, top / height, right / width, bottom / height, float(found.probability[i]))
         placed = int(i in view.cars.detection)
-        made.append([*(round(v, 3) for v in box), int(found.ends[i]), placed])
+        made.append([*(round(v, 3) for v in box), int(found.end_on[i]), placed])
     return made
 
 
-def _scan(moment: SurveyMoment) -> list[int]:
+def _scan(result: PerceptionResult) -> list[int]:
     """Where beams end, decimetres from the car, x and y in turns."""
-    x, y, _ = moment.look.vehicle
+    x, y, _ = result.vehicle
     points = [
-        sweep.points(np.flatnonzero(np.nan_to_num(sweep.distance, nan=np.inf) < SCAN_REACH))[::2]
-        for sweep in moment.look.sweeps
+        scan.points(np.flatnonzero(np.nan_to_num(scan.distance, nan=np.inf) < SCAN_REACH))[::2]
+        for scan in result.scans
     ]
     away = np.concatenate(points) - [x, y] if points else np.empty((0, 2))
     whole: list[int] = np.round(10 * away).astype(np.int64).ravel().tolist()

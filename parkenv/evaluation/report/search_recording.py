@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from parkenv.envs.search_state import SearchState
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
+from parkenv.evaluation.report.lot_data import describe_lot
 from parkenv.evaluation.report.plan_preview import PlanPreview
 from parkenv.evaluation.simulate import EpisodeResult, Observer, Step
-from parkenv.lots.generators import ONE_WAY_HALF_WIDTH, TWO_WAY_HALF_WIDTH
-from parkenv.world.lot import ParkingLot, is_building
 from parkenv.world.occupancy import World
 from planners.agent import make_agent
 
@@ -67,29 +66,6 @@ def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[E
     return chosen
 
 
-def describe_lot(lot: ParkingLot) -> Recording:
-    """A lot as the page draws it: m, to the centimetre."""
-    return {
-        "name": lot.name,
-        "bounds": _rounded(np.array(lot.bounds())),
-        "slot_ids": list(lot.slot_ids),
-        "slots": [_rounded(c.ravel()) for c in lot.slot_corners()],
-        "vertices": [_rounded(xy) for xy in lot.vertex_xy],
-        "yaw": [round(float(a), 3) for a in lot.vertex_yaw],
-        "lanes": [
-            {
-                "points": _rounded(lane.points.ravel()),
-                "half_width": ONE_WAY_HALF_WIDTH if lane.oneway else TWO_WAY_HALF_WIDTH,
-                "oneway": lane.oneway,
-            }
-            for lane in lot.lanes
-        ],
-        "walls": [{"points": _rounded(w.ravel()), "building": is_building(w)} for w in lot.walls],
-        "entries": [_rounded(xy) for xy in lot.entries],
-        "goals": [_rounded(xy) for xy in lot.goals],
-    }
-
-
 def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Recording:
     """Run every agent of an encounter through its world again.
 
@@ -102,8 +78,10 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
     state: SearchState | None = None
     for case in encounter.cases:
         agent = make_agent(case.agent, case.scenario, **case.options)
-        recorder = SearchRecorder(case.agent, PlanPreview(case.scenario.public(), agent))
-        EpisodeRunner(case.scenario, case.agent, agent, case.rig).run(encounter.seed, (recorder,))
+        recorder = SearchRecorder(case.label, PlanPreview(case.scenario.public(), agent))
+        EpisodeRunner(case.scenario, case.label, agent, case.rig, case.detector).run(
+            encounter.seed, (recorder,)
+        )
         state, search = recorder.state, recorder.recording
         before = counted.get(case.key(encounter.seed))
         search["counted_s"] = before
@@ -215,7 +193,3 @@ class SearchRecorder(Observer):
 def _bytes(p: NDArray[np.floating]) -> list[int]:
     whole: list[int] = np.round(FULL * np.asarray(p, dtype=np.float64)).astype(np.int64).tolist()
     return whole
-
-
-def _rounded(values: NDArray[np.float64]) -> list[float]:
-    return [round(float(v), 2) for v in values]

@@ -105,7 +105,7 @@ CURRICULUM = (
     CurriculumLevel(WAY_IN, (8.0, 14.0), 0.0),
     CurriculumLevel("lane", (4.0, 14.0), 0.0),
 )
-"""Levels from a start just outside the slot to the full task of `parkenv/Drive-v0`.
+"""Levels from a start just outside the slot to the full task of `parkenv/Drive-v1`.
 
 A random drive out of a parallel slot ends inside it, so these starts teach to correct the pose in the slot; the part
 between slot and lane is learned along the planned path, from its end backwards.

@@ -1,4 +1,4 @@
-"""Many drives of `parkenv/Drive-v0` at once, compiled: the training environment's engine.
+"""Many drives of `parkenv/Drive-v1` at once, compiled: the training environment's engine.
 
 Car, limits, tasks, goals and rewards are those of the environment. A contact is an outline that crosses the car's,
 not a collision in pymunk, so that grazing contacts may be judged differently. Trained models are tested in the
@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from parkenv.driving.parking_task import AREA, KINDS, ParkingTask
 from parkenv.driving.vehicle import SPEED, YAW, VehicleParameters, advance
-from parkenv.envs.drive import CONTROL_S, MOST_CARS, MOST_LINES, SUBSTEPS, goal_error, obstacle_map
+from parkenv.envs.drive import CONTROL_S, SUBSTEPS
+from parkenv.envs.drive_goals import goal_error
+from parkenv.envs.drive_observation import MOST_CARS, MOST_LINES, obstacle_map
 from planners.driving.policy_interface import (
     ACTION_REPEAT,
     OBSERVATION_SIZE,

@@ -1,4 +1,4 @@
-"""Training for `parkenv/Drive-v0`: the score is the success rate, by kind of slot."""
+"""Training for `parkenv/Drive-v1`: the score is the success rate, by kind of slot."""
 
 from __future__ import annotations
 

@@ -13,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from parkenv.driving.parking_task import KINDS, ParkingTask, ParkingTasks
 from parkenv.driving.vehicle import SPEED, VehicleParameters
-from parkenv.envs.drive import CONTROL_S, STANDING, goal_errors
+from parkenv.envs.drive import CONTROL_S
+from parkenv.envs.drive_goals import STANDING, goal_errors
 from parkenv.envs.shared_vec_env import SharedVecEnv
 from parkenv.errors import InputError
 from parkenv.evaluation.training.configs import WAY_IN, DriveTrainingConfig
@@ -55,7 +56,7 @@ class SlotGroup:
     def tasks(
         self, slack: float = 0.0, distance: tuple[float, float] = (4.0, 14.0), starts: str = "lane"
     ) -> ParkingTasks:
-        """Tasks in these slots; by default those of `parkenv/Drive-v0`."""
+        """Tasks in these slots; by default those of `parkenv/Drive-v1`."""
         return ParkingTasks(self.lot, kinds=(self.kind,), slack=slack, distance=distance, starts=starts)
 
 
@@ -102,7 +103,7 @@ class DriveTrainingEnv(SharedVecEnv):
 
     Each kind of slot has its own level, and starts at the first. A level is mastered when the fraction `MASTERED` of
     its last `TRIED` drives parked. `SHARES` of the drives are at the level, at easier ones, and at the last one, which
-    is the task of `parkenv/Drive-v0` itself. The more levels a kind has left, the more often it is drawn.
+    is the task of `parkenv/Drive-v1` itself. The more levels a kind has left, the more often it is drawn.
     A drive is truncated after `MOST_DECISIONS`, or after `STOOD` consecutive decisions at a standstill.
 
     With the `sparse` reward, a decision costs 0.4 s unless it ends in the slot, so that `compute_reward` follows from

@@ -1,4 +1,4 @@
-"""Training for `parkenv/Search-v0`: total time counts."""
+"""Training for `parkenv/Search-v1`: total time counts."""
 
 from __future__ import annotations
 

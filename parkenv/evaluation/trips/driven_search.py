@@ -10,8 +10,7 @@ import numpy as np
 from gymnasium.wrappers import TimeLimit
 
 from parkenv.driving.vehicle import VehicleParameters
-from parkenv.envs.lookout import Station
-from parkenv.envs.perception import Watcher
+from parkenv.envs.perception import OnboardPerception
 from parkenv.envs.search import SearchEnv
 from parkenv.envs.search_step import (
     DRIVEN_M,
@@ -28,6 +27,7 @@ from parkenv.envs.search_step import (
     settle,
     touched,
 )
+from parkenv.envs.sensor_sampler import Station
 from parkenv.errors import InputError
 from parkenv.evaluation.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
 from parkenv.evaluation.trips.driver import Driver, Leg, Try
@@ -39,23 +39,25 @@ from sim_sensors.rig import SensorRig
 
 
 class DrivenSearchEnv(SearchEnv):
-    """`parkenv/Search-v0` in which time passes as it does on the road.
+    """`parkenv/Search-v1` in which time passes as it does on the road.
 
-    World, observations and decisions are those of `parkenv/Search-v0`. What an edge, a try and the parking take is
+    World, observations and decisions are those of `parkenv/Search-v1`. What an edge, a try and the parking take is
     asked of a driver; a try fails as well where the car does not get into a free slot, which it then holds for taken.
     The time of the manoeuvre into the slot counts as driven.
 
     Args:
         scenario: the scenario.
-        driver: who drives; with a `GraphDriver` this is `parkenv/Search-v0` itself.
-        watcher: sensors that ride along, whose scenario this is: then the belief is what they make of what they measure
-            where the car really was, as in `parkenv/SearchPerception-v0`. Without, slots are seen from the vertices,
-            as the scenario's sighting model has it.
+        driver: who drives; with a `GraphDriver` this is `parkenv/Search-v1` itself.
+        perception: sensors on the car, whose scenario this is: the belief is updated from what they measure on the
+            driven path, as in `parkenv/SearchPerception-v1`. None: slots are observed from the vertices, with the
+            scenario's sensor model.
     """
 
-    def __init__(self, scenario: Scenario, driver: Driver, watcher: Watcher | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, driver: Driver, perception: OnboardPerception | None = None
+    ) -> None:
         super().__init__(scenario)
-        self.driver, self.watcher = driver, watcher
+        self.driver, self.perception = driver, perception
         self._refused: set[int] = set()
         self.manoeuvre: Try | None = None
 
@@ -63,8 +65,8 @@ class DrivenSearchEnv(SearchEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start a search, and the car at the entry."""
-        if self.watcher is not None:
-            self.watcher.forget()
+        if self.perception is not None:
+            self.perception.reset()
         result = super().reset(seed=seed, options=options)
         state = self.state
         self._refused.clear()
@@ -98,18 +100,18 @@ class DrivenSearchEnv(SearchEnv):
 
     def _see(self, *, on_the_way: bool) -> None:
         """Tell the belief what the slots look like from where the car is, and from where it has been on its way."""
-        watcher = self.watcher
-        if watcher is None:
+        perception = self.perception
+        if perception is None:
             look(self.search, 0)
             return
         # After a try, or a wait, the car looks around once more; what it saw from amid the manoeuvre is of no use.
         track = self.driver.track if on_the_way else self.driver.track[-1:]
         stations: list[Station] = []
         if track:
-            chosen = watcher.lookout.chosen(np.array([spot.driven_m for spot in track]))
+            chosen = perception.sampler.select_stations(np.array([spot.driven_m for spot in track]))
             spots = [track[i] for i in chosen.tolist()]
             stations = [Station(s.time, s.pose, self.driver.movers_at(s)) for s in spots]
-        watcher.tell(self.search, watcher.lookout.measure(self._state, stations))
+        perception.update_belief(self.search, perception.sampler.sample(self._state, stations))
 
     def _park(self, slot: int, before: float) -> None:
         search, state = self.search, self._state
@@ -192,7 +194,7 @@ class DrivenSearch:
         style: how it is driven.
         rig: sensors that ride along and tell the car which slots are taken: laser, stereo, both_sides, or a
             `sim_sensors.rig.SensorRig`; None where the scenario's sighting model stands for them.
-        weather: as of `parkenv/SearchPerception-v0`.
+        weather: as of `parkenv/SearchPerception-v1`.
         captures: how many there are at most on an edge.
 
     Raises:
@@ -217,12 +219,12 @@ class DrivenSearch:
         weather: str | None = None,
         captures: int = 2,
     ) -> None:
-        watcher = None if rig is None else Watcher(scenario, rig, weather, captures)
-        self.scenario = scenario if watcher is None else watcher.scenario
+        perception = None if rig is None else OnboardPerception(scenario, rig, weather, captures)
+        self.scenario = scenario if perception is None else perception.scenario
         self.agent = agent
         self._agent: Agent = make_agent(agent, self.scenario)
         self.driver = LotDriver(self.scenario, vehicle, style)
-        self.env = DrivenSearchEnv(self.scenario, self.driver, watcher)
+        self.env = DrivenSearchEnv(self.scenario, self.driver, perception)
         self._limited = adapt_to_agent(TimeLimit(self.env, STEP_LIMIT), self._agent)
 
     def run(

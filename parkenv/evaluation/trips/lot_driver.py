@@ -19,7 +19,8 @@ from parkenv.driving.parking_task import KINDS, ParkingTasks
 from parkenv.driving.road_users import RoadUsers
 from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
 from parkenv.driving.yielding_traffic import YieldingTraffic
-from parkenv.envs.drive import ANGLE_TOLERANCE, CONTROL_S, POSITION_TOLERANCE, SUBSTEPS
+from parkenv.envs.drive import CONTROL_S, SUBSTEPS
+from parkenv.envs.drive_goals import ANGLE_TOLERANCE, POSITION_TOLERANCE
 from parkenv.errors import InputError
 from parkenv.evaluation.trips.driver import ACROSS, ALONG, NO_ROOM, NO_WAY, ROUND, TAKEN, TURN, Leg, Spot, Try
 from parkenv.world.occupancy import World

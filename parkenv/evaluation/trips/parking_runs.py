@@ -47,9 +47,9 @@ class ParkingCase:
     slack: float = 0.0
 
     def environment(self, render_mode: str | None = None) -> gym.Env[Any, Any]:
-        """`parkenv/Drive-v0` with the obstacle map."""
+        """`parkenv/Drive-v1` with the obstacle map."""
         return gym.make(
-            "parkenv/Drive-v0",
+            "parkenv/Drive-v1",
             lot=self.lot,
             kinds=self.kinds,
             ways=self.ways,
@@ -112,7 +112,7 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
     """Drive one parking to its end.
 
     Args:
-        env: `parkenv/Drive-v0`; with `render_mode="rgb_array"` for pictures.
+        env: `parkenv/Drive-v1`; with `render_mode="rgb_array"` for pictures.
         agent: the driver.
         seed: of the task.
         every: steps from picture to picture; 0 for none.

@@ -1,4 +1,4 @@
-"""`parkenv fit-sensor-model`: how well the stack sees, as a model for the environment without sensors."""
+"""`parkenv fit-sensor-model`: measure the error rates of the perception pipeline."""
 
 from __future__ import annotations
 
@@ -13,32 +13,37 @@ from parkenv.cli.tables import make_console, make_table
 from parkenv.scenarios.build import make_scenario
 
 
-def fit_sight(
+def fit_sensor_model(
     scenario: Annotated[
-        str, typer.Option("--scenario", metavar="NAME[,NAME...]", help="Where to look.")
+        str, typer.Option("--scenario", metavar="NAME[,NAME...]", help="Scenarios to search in.")
     ] = "campus,street",
     rig: Annotated[
-        str, typer.Option("--rig", help="laser: a camera and a 270° laser; stereo: a stereo pair alone.")
+        str, typer.Option("--rig", help="laser: a camera and a 270° laser; stereo: a stereo camera alone.")
     ] = "laser",
     searches: Annotated[
-        int, typer.Option("--searches", "-n", min=1, help="Of each of three agents in each scenario.")
+        int,
+        typer.Option("--searches", "-n", min=1, help="Searches of each of three agents in each scenario."),
     ] = 20,
     arrival: args.ArrivalOption = None,
     days: args.DaysOption = None,
     weather: Annotated[
         str | None,
-        typer.Option("--weather", help="sunny, overcast, low_sun, dusk, rain; drawn where not given."),
+        typer.Option(
+            "--weather", help="sunny, overcast, low_sun, dusk, rain; default: drawn for each search."
+        ),
     ] = None,
     seed: args.SeedOption = 500_000,
     jobs: args.JobsOption = 0,
     backend: args.BackendOption = "loky",
     address: args.AddressOption = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The JSON file to write.")] = Path("sight.json"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="The JSON file to write.")] = Path(
+        "sensor_model.json"
+    ),
 ) -> None:
-    """Search through the sensors, and count how often the stack is right about slots, by distance and side.
+    """Search with simulated sensors, and count how often slots are observed correctly, by distance and side.
 
-    The rates become a sensor model: `parkenv compare --sensor-model FILE` then sees as the stack does, at a thousandth
-    of the cost.
+    The rates become a sensor model: `parkenv compare --sensor-model FILE` then makes the same errors as the perception
+    pipeline, a thousand times as fast.
 
     Example:
     * `parkenv fit-sensor-model --rig stereo --out stereo.json`
@@ -56,7 +61,7 @@ def fit_sight(
         console=console, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
         bar = progress.add_task(
-            "Searching through the sensors", total=searches * len(AGENTS) * len(scenarios)
+            "Searching with simulated sensors", total=searches * len(AGENTS) * len(scenarios)
         )
         counts = measure_sensors(
             scenarios,
@@ -70,14 +75,14 @@ def fit_sight(
     model = counts.fitted()
     model.to_file(out)
     table = make_table(
-        f"What the stack says of slots, rig {rig}",
-        ["slots up to", "side", "looks", "told", "taken, said taken", "free, said taken"],
+        f"Observations of slots, rig {rig}",
+        ["slots up to", "side", "slots in range", "observed", "hit rate", "false-alarm rate"],
     )
-    for band, seen in zip(model.bands, counts.counts.reshape(-1, 2, 3), strict=True):
+    for band, in_band in zip(model.bands, counts.counts.reshape(-1, 2, 3), strict=True):
         table.add_row(
             f"{band.up_to:g} m",
             "right" if band.beside else "elsewhere",
-            str(seen.sum()),
+            str(in_band.sum()),
             f"{band.seen_rate:.0%}",
             f"{band.hit_rate:.3f}",
             f"{band.false_alarm_rate:.3f}",

@@ -1,0 +1,195 @@
+"""Compiled code is kept, is never stale, is announced once, and is not counted as work."""
+
+import importlib
+import logging
+import os
+import pkgutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numba
+import pytest
+from numba.core.dispatcher import Dispatcher
+
+import parkenv
+import planners
+import sim_sensors
+from sim_sensors import compilation
+from sim_sensors.compilation import cache_folder, compiled, seconds_spent
+
+ROOT = Path(__file__).parents[1]
+COMPILES, CANNOT_KEEP = "compiling functions for this machine", "compiled functions cannot be kept in"
+OWN = {
+    "callee.py": "from sim_sensors.compilation import compiled\n@compiled\ndef f(x):\n    return x + 1.0\n",
+    "package/__init__.py": "from .rates import RATE\n",
+    "package/rates.py": "RATE = 2.0\n",
+    "caller.py": (
+        "from callee import f\nfrom package import \\\n    RATE\nfrom sim_sensors.compilation import compiled\n"
+        "@compiled\ndef g(x):\n    return RATE * f(x)\n"
+    ),
+}
+"""A user's own modules: g(1.0) is 4."""
+
+
+@pytest.fixture
+def own(tmp_path):
+    """The modules, with times of long ago, in a folder of their own."""
+    for name, text in OWN.items():
+        write(tmp_path / "own" / name, text)
+    return tmp_path / "own"
+
+
+def write(path, text):
+    """Write a file whose time never changes, as installers do that keep the times of an archive."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    os.utime(path, (1e9, 1e9))
+
+
+def start(own, cache, **environment):
+    """A new process that prints g(1.0)."""
+    variables = {
+        **os.environ, "PYTHONPATH": os.pathsep.join([str(own), str(ROOT)]), "PYTHONDONTWRITEBYTECODE": "1",
+        "NUMBA_CACHE_DIR": str(cache), **environment,
+    }  # fmt: skip
+    program = [sys.executable, "-c", "from caller import g; print(g(1.0))"]
+    return subprocess.Popen(
+        program, env=variables, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=own.parent
+    )
+
+
+def result(process):
+    """What it printed, and its lines on standard error."""
+    output, errors = process.communicate(timeout=120)
+    assert process.returncode == 0, errors
+    return float(output), errors.splitlines()
+
+
+def kept(folder):
+    return {path: path.stat().st_mtime_ns for path in Path(folder).rglob("*.nbc")}
+
+
+def test_a_caller_is_compiled_again_when_what_it_calls_or_reads_changes(own, tmp_path):
+    cache = tmp_path / "cache"
+    value, told = result(start(own, cache))
+    assert (value, len(told)) == (4.0, 1)
+    assert COMPILES in told[0]
+    assert str(cache) in told[0]
+    first = kept(cache)
+    assert len(first) == 2
+    assert result(start(own, cache)) == (4.0, []), "nothing is compiled, and nothing said"
+    assert kept(cache) == first
+
+    # Of the same length, and with the same time.
+    write(own / "callee.py", OWN["callee.py"].replace("1.0", "2.0"))
+    assert result(start(own, cache))[0] == 6.0
+    write(own / "package/rates.py", "RATE = 3.0\n")
+    assert result(start(own, cache))[0] == 9.0
+    for name, text in OWN.items():
+        write(own / name, text)
+    assert result(start(own, cache)) == (4.0, []), "what was compiled from these sources is still there"
+    assert not kept(own), "nothing is written beside the sources, which may be read-only"
+
+
+def test_a_folder_that_cannot_be_written_costs_time_and_is_told_of_once(own, tmp_path):
+    (tmp_path / "file").write_text("")
+    value, told = result(start(own, tmp_path / "file" / "cache"))
+    assert value == 4.0
+    assert [CANNOT_KEEP in line for line in told] == [False, True]
+    assert "NUMBA_CACHE_DIR" in told[1]
+
+
+def test_processes_that_compile_at_once_leave_code_that_is_whole(own, tmp_path):
+    cache = tmp_path / "cache"
+    together = [start(own, cache) for _ in range(3)]
+    assert [result(process)[0] for process in together] == [4.0] * 3
+    assert result(start(own, cache)) == (4.0, [])
+    assert not list(cache.rglob("*.part"))
+    # A disk that was full, or a machine that lost its power, leaves less than was written.
+    for path in kept(cache):
+        path.write_bytes(path.read_bytes()[:100])
+    assert result(start(own, cache))[0] == 4.0
+
+
+def test_without_compilation_functions_run_as_they_are_written(own, tmp_path):
+    assert result(start(own, tmp_path / "cache", NUMBA_DISABLE_JIT="1")) == (4.0, [])
+    assert not kept(tmp_path)
+
+
+def test_code_is_kept_in_the_users_folder_unless_another_is_named(monkeypatch, tmp_path):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder().name == "compiled"
+    assert cache_folder().parent.name == "parkenv"
+    assert sys.platform != "linux" or cache_folder().is_relative_to(tmp_path)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "mine"))
+    assert cache_folder() == tmp_path / "mine"
+
+
+@pytest.fixture
+def caller(own, tmp_path, monkeypatch):
+    """The user's module in this process, with an empty cache."""
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.syspath_prepend(own)
+    yield importlib.import_module("caller")
+    for name in ("caller", "callee", "package", "package.rates"):
+        del sys.modules[name]
+
+
+def test_seconds_of_compiling_and_loading_are_counted_and_no_others(caller, monkeypatch, caplog):
+    compilation._announce.cache_clear()
+    before = seconds_spent()
+    with caplog.at_level(logging.WARNING, logger="parkenv"):
+        caller.g(1.0)
+        compiling = seconds_spent() - before
+        caller.g(1.0)
+        assert seconds_spent() - before == compiling > 0.0
+        caller.g(1)  # other types are other code
+    assert seconds_spent() - before > compiling
+    assert sum(COMPILES in message for message in caplog.messages) == 1, "one line in a process"
+
+    again = importlib.reload(caller)
+    before = seconds_spent()
+    again.g(1.0)
+    assert 0.0 < seconds_spent() - before < compiling, "loading is counted, and takes less"
+
+
+def test_a_module_that_is_edited_and_imported_again_runs_its_new_code(caller, own):
+    assert caller.g(1.0) == 4.0
+    (own / "caller.py").write_text(OWN["caller.py"].replace("RATE * f(x)", "RATE * f(x) + 0.5"))
+    importlib.invalidate_caches()
+    assert importlib.reload(caller).g(1.0) == 4.5
+
+
+def test_functions_of_one_name_and_line_are_told_apart_by_their_options(tmp_path, monkeypatch):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    halves = [compiled(error_model=model)(one_over) for model in ("python", "numpy")]
+    with pytest.raises(ZeroDivisionError):
+        halves[0](0.0)
+    assert halves[1](0.0) == float("inf")
+
+
+def one_over(x):
+    return 1.0 / x
+
+
+def test_every_compiled_function_is_kept_under_a_key_of_all_functions_that_it_calls():
+    """Else an edit of the callee would go unnoticed."""
+    checked = 0
+    for package in (sim_sensors, parkenv, planners):
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            module = importlib.import_module(found.name)
+            for function in vars(module).values():
+                if not isinstance(function, Dispatcher) or function.__module__ != found.name:
+                    continue
+                sources = compilation._closure(Path(module.__file__).resolve())
+                for name in function.py_func.__code__.co_names:
+                    called = function.py_func.__globals__.get(name)
+                    if isinstance(called, Dispatcher):
+                        assert Path(called.py_func.__code__.co_filename).resolve() in sources, (
+                            function,
+                            name,
+                        )
+                        checked += 1
+    assert checked > 50
