@@ -366,7 +366,7 @@ class StandingTraffic:
     def poses(self, clocks):
         return np.repeat(self.at, len(clocks), axis=0)
 
-    def onward(self, clocks, seconds, car):
+    def advance_clocks(self, clocks, seconds, car):
         del seconds, car
         return clocks
 
