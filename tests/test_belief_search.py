@@ -28,27 +28,31 @@ def gap(seed, **options):
     return 100.0 * (expected_time(agent, problem, p, entry) / best - 1.0)
 
 
+LOTS = range(0, 324, 7)
+"""Seven divides none of the rounds of slot chances, pitch, view and shape: they are mixed as in all 324."""
+
+
+def has_large_trees(seed):
+    """Two aisles, where each slot is seen from its own place only."""
+    return seed % 6 not in (3, 5) and seed // 18 % 2 == 0
+
+
 def test_it_stays_near_the_optimum_on_small_lots():
-    """One of each kind of slot chances, pitch, view and shape, without two-aisle lots, whose trees are large."""
-    seeds = [s for s in range(0, 324, 5) if s % 6 in (3, 5) or s // 18 % 2 == 1]
-    gaps = np.array([gap(s, trusting=True) for s in seeds])
+    gaps = np.array([gap(seed, trusting=True) for seed in LOTS if not has_large_trees(seed)])
+    assert len(gaps) > 25
     assert gaps.min() > -1e-3
     assert gaps.mean() < 0.02
     assert np.quantile(gaps, 0.95) < 0.1
 
 
 @pytest.mark.slow
-def test_the_gap_to_the_optimum_on_324_small_lots():
-    gaps = np.array([gap(seed, trusting=True) for seed in range(324)])
+def test_it_stays_near_the_optimum_where_there_is_much_to_choose_and_doubting_a_right_map_costs_little():
+    gaps = np.array([gap(seed, trusting=True) for seed in LOTS if has_large_trees(seed)])
+    assert len(gaps) > 10
     assert gaps.min() > -1e-3
     assert gaps.mean() < 0.5
     assert np.quantile(gaps, 0.95) < 2.0
-
-
-@pytest.mark.slow
-def test_doubting_a_map_that_is_right_costs_little():
-    gaps = np.array([gap(seed) for seed in range(0, 324, 3)])
-    assert gaps.mean() < 2.0
+    assert np.mean([gap(seed) for seed in LOTS]) < 2.0
 
 
 def world(lot, taken, prior_logit=0.0, stay_s=1e9, **changes):

@@ -21,8 +21,8 @@ from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
 from parkenv.evaluation.experiments.compare import unseen
 from parkenv.evaluation.trips.calibration import (
-    SEEN,
-    UNSEEN,
+    OBSERVED,
+    UNOBSERVED,
     Calibration,
     TripFolder,
     TripPlan,
@@ -547,8 +547,8 @@ def test_bad_input_is_one_clear_error():
     with pytest.raises(InputError, match="this one has none: give it a rig"):
         record_trip(searched("mini"), 0, None)
     for words, message in (
-        (["--rerun", "trip.rrd"], "add --sensors laser"),
-        (["--unseen", "--sensors", "laser"], "--unseen and --sensors"),
+        (["--rerun", "trip.rrd"], "add --rig laser"),
+        (["--unseen", "--rig", "laser"], "--unseen and --rig"),
     ):
         result = CliRunner().invoke(app, ["trip", "--scenario", "mini", *words])
         assert isinstance(result.exception, InputError)
@@ -561,10 +561,10 @@ def test_bad_input_is_one_clear_error():
         Calibration("mini", 0, 5.0, 10.0, 3, 2.7)
 
 
-def row(sight, seed, graph_m, lanes_s, tries):
+def row(slots, seed, graph_m, lanes_s, tries):
     failed = sum(t[3] for t in tries if t[4])
     return {
-        "sight": sight, "seed": seed, "graph_m": graph_m, "lanes_s": lanes_s, "failed_s": failed,
+        "slots": slots, "seed": seed, "graph_m": graph_m, "lanes_s": lanes_s, "failed_s": failed,
         "legs": [["along", graph_m, lanes_s]], "tries": tries,
     }  # fmt: skip
 
@@ -573,9 +573,9 @@ def test_a_calibration_is_metres_over_seconds_and_what_failed_tries_lose():
     done = ["A1", "perpendicular", "back-in", 12.0, "", 0.0]
     failed = [["A2", "perpendicular", "back-in", s, TAKEN, 5.0] for s in (16.0, 20.0)]
     rows = [
-        row(SEEN, 0, 100.0, 40.0, [done]),
-        row(SEEN, 1, 50.0, 35.0, [done]),
-        row(UNSEEN, 0, 80.0, 90.0, [*failed, done]),
+        row(OBSERVED, 0, 100.0, 40.0, [done]),
+        row(OBSERVED, 1, 50.0, 35.0, [done]),
+        row(UNOBSERVED, 0, 80.0, 90.0, [*failed, done]),
     ]
     made, table = calibrate(rows, MINI, 2.5)
     assert made.v_drive == pytest.approx(150.0 / 75.0)
@@ -586,7 +586,7 @@ def test_a_calibration_is_metres_over_seconds_and_what_failed_tries_lose():
     low, high = by_name["v_drive_kmh"]["mean_ci95"]
     assert low <= 7.2 <= high
     assert made.applied(MINI).v_drive == made.v_drive
-    with pytest.raises(InputError, match="no try has failed"):
+    with pytest.raises(InputError, match="no attempt has failed"):
         calibrate(rows[:2], MINI, 2.5)
 
 
@@ -637,7 +637,9 @@ def test_trips_are_gone_on_with_where_they_were_left(tmp_path):
 def test_the_commands_calibrate_compare_and_film(tmp_path):
     run = CliRunner().invoke
     out = tmp_path / "calibrate"
-    result = run(app, ["calibrate", "--scenario", "mini", "--trips", "3", "--seed", "0", "--out", str(out)])
+    result = run(
+        app, ["calibrate", "--scenario", "mini", "--episodes", "3", "--seed", "0", "--out", str(out)]
+    )
     assert result.exit_code == 0, result.output
     summary = json.loads((out / "summary.json").read_text())
     made = Calibration.from_file(out / "calibrated.json")
@@ -698,7 +700,7 @@ def test_the_commands_calibrate_compare_and_film(tmp_path):
         assert picture.size == (640, 480)
         assert picture.n_frames > 40
     recording = tmp_path / "trip.rrd"
-    words = ["trip", "--scenario", "mini", "--seed", "3", "--sensors", "laser", "--rerun", str(recording)]
+    words = ["trip", "--scenario", "mini", "--seed", "3", "--rig", "laser", "--rerun", str(recording)]
     result = run(app, [*words, "--out", str(film)])
     assert result.exit_code == 0, result.output
     assert recording.stat().st_size > 50_000
