@@ -99,16 +99,16 @@ length and width over the car's |
     distance; outlines of fewer corners are padded with their last corner, unused rows with 1000 m.
 
     ## Rewards
-    - `sparse`: minus the duration of the step, -0.1 (shorter only by a contact); 0 for the step that parks.
+    - `sparse`: -0.1 per step, its duration in seconds; 0 for the step that parks.
     - `dense`: in addition -0.1 s × (distance to the goal / 10 m + angle to it / π).
 
-    A contact costs `contact_cost`, s. `info["reward_terms"]` holds the terms `time`, `approach` and `contact`, which add
-    up to the reward. `compute_reward(achieved_goal, desired_goal, info)` returns the same for batches of goals, with the
-    contact from `info["contact"]`.
+    A contact costs `contact_cost`, s. `info["reward_terms"]` holds the terms `time`, `approach` and `contact`, which
+    add up to the reward. `compute_reward(achieved_goal, desired_goal, info)` returns the same for batches of goals,
+    with the contact from `info["contact"]`.
 
     ## Starting State
     The car stands on the lane, `distance` before the slot, up to 0.2 m beside the driving line and up to 4° askew, with
-    straight wheels. `reset(seed=s)` determines all of it; later `reset()` calls continue with further tasks of the seed.
+    straight wheels. `reset(seed=s)` determines all of it; later `reset()` calls draw further tasks of the seed.
     Option of `reset`: `start`, x, y (m) and yaw (rad) of the rear axle in the lot's frame.
 
     ## Episode End
