@@ -99,7 +99,7 @@ def test_compare_records_its_first_search_where_it_looks_through_sensors(tmp_pat
     ]
     refused = parkenv(*command)
     assert refused.returncode == 2
-    assert "add --sensors laser" in refused.stderr
-    done = parkenv(*command, "--sensors", "laser", "--jobs", 1)
+    assert "add --rig laser" in refused.stderr
+    done = parkenv(*command, "--rig", "laser", "--jobs", 1)
     assert done.returncode == 0, done.stderr
     assert rows_of(tmp_path / "s.rrd")["/car/right/boxes"] > 1

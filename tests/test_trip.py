@@ -13,16 +13,16 @@ from typer.testing import CliRunner
 
 from parkenv import InputError, make_scenario
 from parkenv.cli import app
+from parkenv.driving.collision_world import ObstacleKind
 from parkenv.driving.driven_lines import KEPT_RIGHT_M, DrivenLines
-from parkenv.driving.encounters import WATCHED_S
-from parkenv.driving.lot_space import Thing
-from parkenv.driving.road_users import ROOM_M, RoadUsers
+from parkenv.driving.encounters import PREDICTION_TIMES_S
+from parkenv.driving.road_users import CLEAR_RADIUS_M, RoadUsers
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
 from parkenv.evaluation.experiments.compare import unseen
 from parkenv.evaluation.trips.calibration import (
-    SEEN,
-    UNSEEN,
+    OBSERVED,
+    UNOBSERVED,
     Calibration,
     TripFolder,
     TripPlan,
@@ -39,7 +39,7 @@ from parkenv.world.lot_scene import LotScenes
 from parkenv.world.occupancy import OccupancyProcess
 from parkenv.world.traffic import Traffic
 from planners.agent import make_agent
-from planners.driving.hybrid_astar import CarPath
+from planners.driving.car_path import CarPath
 from planners.driving.lane_keeping import LaneKeeper, joined, rounded
 from planners.driving.path_tracking import TrackingSettings
 from sim_sensors.rig import SensorRig
@@ -358,7 +358,7 @@ def test_among_others_equal_seeds_give_equal_trips():
 class StandingTraffic:
     """One car across the lane of a car that drives east from the origin, which waits for that for ever."""
 
-    outlines = ((Thing.MOVING_CAR, np.array([[2.0, 0.9], [-2.0, 0.9], [-2.0, -0.9], [2.0, -0.9]])),)
+    outlines = ((ObstacleKind.MOVING_CAR, np.array([[2.0, 0.9], [-2.0, 0.9], [-2.0, -0.9], [2.0, -0.9]])),)
 
     def __init__(self, x):
         self.at = np.array([[x, 0.0, 0.5 * math.pi]])
@@ -366,7 +366,7 @@ class StandingTraffic:
     def poses(self, clocks):
         return np.repeat(self.at, len(clocks), axis=0)
 
-    def onward(self, clocks, seconds, car):
+    def advance_clocks(self, clocks, seconds, car):
         del seconds, car
         return clocks
 
@@ -374,24 +374,28 @@ class StandingTraffic:
 def test_who_gives_way_is_out_of_sight_until_the_car_has_gone():
     others = RoadUsers(StandingTraffic(5.0), CAR)
     own = np.column_stack(
-        [np.linspace(0.0, 3.0, len(WATCHED_S)), np.zeros(len(WATCHED_S)), np.zeros(len(WATCHED_S))]
+        [
+            np.linspace(0.0, 3.0, len(PREDICTION_TIMES_S)),
+            np.zeros(len(PREDICTION_TIMES_S)),
+            np.zeros(len(PREDICTION_TIMES_S)),
+        ]
     )
-    when = others.in_way(own)
+    when = others.encounter_times(own)
     reached = own[:, 0] + 0.5 * CAR.length > 5.0 - 0.9 - 0.05
-    assert when[0] == WATCHED_S[reached.argmax()]
-    assert np.isinf(others.in_way(own - np.array([1.2, 0.0, 0.0]))), "it would stop short of it"
-    assert np.isinf(others.in_way(own + np.array([9.0, 0.0, 0.0]))), "it has passed it"
-    others.give_way(np.array([True]))
-    assert np.isinf(others.in_way(own))
+    assert when[0] == PREDICTION_TIMES_S[reached.argmax()]
+    assert np.isinf(others.encounter_times(own - np.array([1.2, 0.0, 0.0]))), "it would stop short of it"
+    assert np.isinf(others.encounter_times(own + np.array([9.0, 0.0, 0.0]))), "it has passed it"
+    others.hide_standing(np.array([True]))
+    assert np.isinf(others.encounter_times(own))
     assert np.isnan(others.clocks).all()
     seen = []
     for x in np.arange(0.0, 30.0, 0.5):
-        others.onward(0.1, CAR.corners(np.array([x, 0.0, 0.0])))
+        others.advance(0.1, CAR.corners(np.array([x, 0.0, 0.0])))
         middle = x + CAR.middle
         there = bool(np.isfinite(others.clocks).all())
         assert there == (np.abs(others.poses[0, 0]) < 100.0)
         seen.append((there, abs(middle - 5.0)))
-    assert all(there == (away >= ROOM_M) for there, away in seen)
+    assert all(there == (away >= CLEAR_RADIUS_M) for there, away in seen)
     assert {there for there, _ in seen} == {True, False}
 
 
@@ -543,8 +547,8 @@ def test_bad_input_is_one_clear_error():
     with pytest.raises(InputError, match="this one has none: give it a rig"):
         record_trip(searched("mini"), 0, None)
     for words, message in (
-        (["--rerun", "trip.rrd"], "add --sensors laser"),
-        (["--unseen", "--sensors", "laser"], "--unseen and --sensors"),
+        (["--rerun", "trip.rrd"], "add --rig laser"),
+        (["--unseen", "--rig", "laser"], "--unseen and --rig"),
     ):
         result = CliRunner().invoke(app, ["trip", "--scenario", "mini", *words])
         assert isinstance(result.exception, InputError)
@@ -557,10 +561,10 @@ def test_bad_input_is_one_clear_error():
         Calibration("mini", 0, 5.0, 10.0, 3, 2.7)
 
 
-def row(sight, seed, graph_m, lanes_s, tries):
+def row(slots, seed, graph_m, lanes_s, tries):
     failed = sum(t[3] for t in tries if t[4])
     return {
-        "sight": sight, "seed": seed, "graph_m": graph_m, "lanes_s": lanes_s, "failed_s": failed,
+        "slots": slots, "seed": seed, "graph_m": graph_m, "lanes_s": lanes_s, "failed_s": failed,
         "legs": [["along", graph_m, lanes_s]], "tries": tries,
     }  # fmt: skip
 
@@ -569,9 +573,9 @@ def test_a_calibration_is_metres_over_seconds_and_what_failed_tries_lose():
     done = ["A1", "perpendicular", "back-in", 12.0, "", 0.0]
     failed = [["A2", "perpendicular", "back-in", s, TAKEN, 5.0] for s in (16.0, 20.0)]
     rows = [
-        row(SEEN, 0, 100.0, 40.0, [done]),
-        row(SEEN, 1, 50.0, 35.0, [done]),
-        row(UNSEEN, 0, 80.0, 90.0, [*failed, done]),
+        row(OBSERVED, 0, 100.0, 40.0, [done]),
+        row(OBSERVED, 1, 50.0, 35.0, [done]),
+        row(UNOBSERVED, 0, 80.0, 90.0, [*failed, done]),
     ]
     made, table = calibrate(rows, MINI, 2.5)
     assert made.v_drive == pytest.approx(150.0 / 75.0)
@@ -582,7 +586,7 @@ def test_a_calibration_is_metres_over_seconds_and_what_failed_tries_lose():
     low, high = by_name["v_drive_kmh"]["mean_ci95"]
     assert low <= 7.2 <= high
     assert made.applied(MINI).v_drive == made.v_drive
-    with pytest.raises(InputError, match="no try has failed"):
+    with pytest.raises(InputError, match="no attempt has failed"):
         calibrate(rows[:2], MINI, 2.5)
 
 
@@ -633,7 +637,9 @@ def test_trips_are_gone_on_with_where_they_were_left(tmp_path):
 def test_the_commands_calibrate_compare_and_film(tmp_path):
     run = CliRunner().invoke
     out = tmp_path / "calibrate"
-    result = run(app, ["calibrate", "--scenario", "mini", "--trips", "3", "--seed", "0", "--out", str(out)])
+    result = run(
+        app, ["calibrate", "--scenario", "mini", "--episodes", "3", "--seed", "0", "--out", str(out)]
+    )
     assert result.exit_code == 0, result.output
     summary = json.loads((out / "summary.json").read_text())
     made = Calibration.from_file(out / "calibrated.json")
@@ -694,7 +700,7 @@ def test_the_commands_calibrate_compare_and_film(tmp_path):
         assert picture.size == (640, 480)
         assert picture.n_frames > 40
     recording = tmp_path / "trip.rrd"
-    words = ["trip", "--scenario", "mini", "--seed", "3", "--sensors", "laser", "--rerun", str(recording)]
+    words = ["trip", "--scenario", "mini", "--seed", "3", "--rig", "laser", "--rerun", str(recording)]
     result = run(app, [*words, "--out", str(film)])
     assert result.exit_code == 0, result.output
     assert recording.stat().st_size > 50_000

@@ -1,4 +1,4 @@
-"""Searches run again and written down, step by step, for a page that shows them."""
+"""Record searches step by step for the replay of a report."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from parkenv.world.occupancy import World
 from planners.agent import Agent, make_agent
 
 MOST_SLOTS = 20_000
-"""Lots with more are not drawn: a page with every slot of theirs would not load."""
+"""Lots with more slots have no replay: the page would not load."""
 STEADY_S = 600.0
-"""s up to which the truth is written down second by second; later on at the decisions alone."""
+"""s up to which the true occupancy is recorded every second; later only at decisions."""
 FULL = 255
-"""What a belief of 1 is written as."""
+"""The recorded value of a belief of 1."""
 AGREES_S = 1e-6
 
 Recording = dict[str, Any]
@@ -31,10 +31,10 @@ Recording = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Encounter:
-    """Agents that meet the same world.
+    """Agents in the same world.
 
     Attributes:
-        cases: one for each agent, of one setting.
+        cases: one per agent, of one setting.
         seed: of the world.
     """
 
@@ -43,11 +43,11 @@ class Encounter:
 
 
 def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[Encounter]:
-    """The first searches of every setting, in turns, until there are about so many; at least one world.
+    """Choose the first searches of each setting in turn, up to a number; at least one world.
 
     Args:
-        cases: with the seeds of their searches.
-        episodes: how many searches are wanted.
+        cases: each with the seeds of its searches.
+        episodes: how many searches to choose.
     """
     settings: dict[tuple[Any, ...], list[tuple[Case, Sequence[int]]]] = {}
     for case, seeds in cases:
@@ -57,11 +57,11 @@ def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[E
     count = 0
     for number in range(max((len(seeds) for _, seeds in cases), default=0)):
         for its in settings.values():
-            there = tuple(case for case, seeds in its if number < len(seeds))
-            if not there or (chosen and count + len(there) > episodes):
+            present = tuple(case for case, seeds in its if number < len(seeds))
+            if not present or (chosen and count + len(present) > episodes):
                 continue
-            chosen.append(Encounter(there, its[0][1][number]))
-            count += len(there)
+            chosen.append(Encounter(present, its[0][1][number]))
+            count += len(present)
     return chosen
 
 
@@ -109,7 +109,7 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
 
 
 def _truth(world: World, n_slots: int, start: float, moments: Sequence[float]) -> Recording:
-    """What stood in the slots at the arrival, and when that changed: [centiseconds, slot, ...]."""
+    """Record the occupancy at the arrival, and its changes: [centiseconds, slot, ...]."""
     everything = np.arange(n_slots)
     taken = world.occupied(everything, start)
     first, changes = taken, []
