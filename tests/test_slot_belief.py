@@ -24,9 +24,7 @@ def test_an_observation_is_bayes_rule_and_decays_to_the_forecast(p, rate, taken,
     np.testing.assert_allclose(after.p_occupied, [p, posterior], atol=1e-12)
     assert after.age.tolist() == [np.inf, 0.0]
     later = after.decay(30.0).decay(70.0)
-    np.testing.assert_allclose(
-        later.p_occupied, [p, p + (posterior - p) * np.exp(-rate * 100.0)], atol=1e-12
-    )
+    np.testing.assert_allclose(later.p_occupied, [p, p + (posterior - p) * np.exp(-rate * 100.0)], atol=1e-12)
     assert later.age.tolist() == [np.inf, 100.0]
     # What was observed is not forgotten however far it has decayed, and the first belief is unchanged.
     assert later.observed.tolist() == [False, True]
@@ -51,9 +49,7 @@ def test_an_observation_states_the_belief_that_the_same_reports_lead_to(sensor_m
     assert not belief.observed.any()
     np.testing.assert_array_equal(belief.p_occupied, belief.forecast)
     for _ in range(60):
-        observation, _, over, _, _ = env.step(
-            int(rng.choice(np.flatnonzero(observation["action_mask"][:4])))
-        )
+        observation, _, over, _, _ = env.step(int(rng.choice(np.flatnonzero(observation["action_mask"][:4]))))
         now = SlotBelief.of_observation(observation)
         apart = now.observed_at == belief.observed_at
         expected = belief.decay(now.time - belief.time)
@@ -70,7 +66,9 @@ def test_an_observation_states_the_belief_that_the_same_reports_lead_to(sensor_m
 
 
 def test_parts_and_observations_keep_the_belief():
-    belief = SlotBelief.of_forecast([0.2, 0.5, 0.8], np.full(3, 1e-3)).decay(10.0).update([2], [True]).decay(5.0)
+    belief = (
+        SlotBelief.of_forecast([0.2, 0.5, 0.8], np.full(3, 1e-3)).decay(10.0).update([2], [True]).decay(5.0)
+    )
     part = belief.take(np.array([2, 0]))
     assert (part.age.tolist(), part.observed_taken.tolist()) == ([5.0, np.inf], [True, False])
     observation = {"time": np.array([0.0, 15.0]), **belief.to_observation()}
