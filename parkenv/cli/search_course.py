@@ -66,9 +66,9 @@ class SearchCourse(Course):
 
     def recipe(self) -> Any:
         """See `Course`."""
-        from parkenv.evaluation.training.configs import RECIPES, recipe_of
+        from parkenv.evaluation.training.configs import SEARCH_CONFIGS, config_of
 
-        return recipe_of(self.algorithm, RECIPES, "search")
+        return config_of(self.algorithm, SEARCH_CONFIGS, "search")
 
     @cached_property
     def worlds(self) -> list[Scenario]:
