@@ -28,9 +28,9 @@ from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.spec import TrainingSpec
 from parkenv.evaluation.figures.learning_curves import across_seeds, save_learning_curves
 from parkenv.evaluation.training.cloning import Demonstrations, clone
-from parkenv.evaluation.training.configs import DRIVE_RECIPES, MAX_STEPS, RECIPES
+from parkenv.evaluation.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
 from parkenv.evaluation.training.rl_training import read_curve, train_one, write_curve
-from parkenv.evaluation.training.search_training import SearchTraining, examined, search_times
+from parkenv.evaluation.training.search_training import SearchTraining, episode_times, search_times
 from parkenv.scenarios.spec import scenario_spec
 from planners.agent import make_agent
 from planners.learned import ALGORITHMS, LearnedAgent, ModelCard
@@ -117,7 +117,7 @@ def test_a_model_learns_to_park_and_evaluate_policy_agrees_with_compare(trained)
     assert best < 60.0 < curve[0]["total_s"], "it parks now, and did not when it began"
     name = f"maskable-ppo:{trained / 'model.zip'}"
     agent = make_agent(name, SCENARIO)
-    times, _ = examined(agent.model, SCENARIO, EXAMINED, 5)
+    times, _ = episode_times(agent.model, SCENARIO, EXAMINED, 5)
     assert times.mean() == pytest.approx(best)
     rows, _ = Case(SCENARIO, name).run(EXAMINED)
     assert [row["total_s"] for row in rows] == pytest.approx(times)
@@ -196,9 +196,9 @@ def test_imitation_begins_near_the_planner():
     assert (shown.times > 0.0).all()
     venv = SearchVecEnv(4, campus, reward_scale=0.01, max_episode_steps=MAX_STEPS)
     model = MaskablePPO("MultiInputPolicy", venv, seed=0, policy_kwargs={"net_arch": [64, 64]})
-    fresh, _ = examined(model, campus, EXAMINED, 5)
+    fresh, _ = episode_times(model, campus, EXAMINED, 5)
     clone(model, shown, 0, updates=2000)
-    cloned, _ = examined(model, campus, EXAMINED, 5)
+    cloned, _ = episode_times(model, campus, EXAMINED, 5)
     planner = np.mean([row["total_s"] for row in Case(campus, "first-free").run(EXAMINED)[0]])
     # The mean would be of those few searches in which a clone drives in circles.
     assert np.median(cloned) < 1.2 * planner < np.median(fresh)
@@ -284,7 +284,7 @@ def test_a_mask_that_allows_nothing_is_refused(trained):
 
 
 def test_every_algorithm_has_a_recipe():
-    assert RECIPES.keys() | DRIVE_RECIPES.keys() == ALGORITHMS.keys()
+    assert SEARCH_CONFIGS.keys() | DRIVE_CONFIGS.keys() == ALGORITHMS.keys()
 
 
 def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
@@ -304,7 +304,7 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", sorted(RECIPES))
+@pytest.mark.parametrize("algorithm", sorted(SEARCH_CONFIGS))
 def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp_path, algorithm):
     out = tmp_path / "out"
     command = [

@@ -13,10 +13,10 @@ from typer.testing import CliRunner
 
 from parkenv import InputError, make_scenario
 from parkenv.cli import app
+from parkenv.driving.collision_world import ObstacleKind
 from parkenv.driving.driven_lines import KEPT_RIGHT_M, DrivenLines
-from parkenv.driving.encounters import WATCHED_S
-from parkenv.driving.lot_space import Thing
-from parkenv.driving.road_users import ROOM_M, RoadUsers
+from parkenv.driving.encounters import PREDICTION_TIMES_S
+from parkenv.driving.road_users import CLEAR_RADIUS_M, RoadUsers
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
 from parkenv.evaluation.experiments.compare import unseen
@@ -39,7 +39,7 @@ from parkenv.world.lot_scene import LotScenes
 from parkenv.world.occupancy import OccupancyProcess
 from parkenv.world.traffic import Traffic
 from planners.agent import make_agent
-from planners.driving.hybrid_astar import CarPath
+from planners.driving.car_path import CarPath
 from planners.driving.lane_keeping import LaneKeeper, joined, rounded
 from planners.driving.path_tracking import TrackingSettings
 from sim_sensors.rig import SensorRig
@@ -358,7 +358,7 @@ def test_among_others_equal_seeds_give_equal_trips():
 class StandingTraffic:
     """One car across the lane of a car that drives east from the origin, which waits for that for ever."""
 
-    outlines = ((Thing.MOVING_CAR, np.array([[2.0, 0.9], [-2.0, 0.9], [-2.0, -0.9], [2.0, -0.9]])),)
+    outlines = ((ObstacleKind.MOVING_CAR, np.array([[2.0, 0.9], [-2.0, 0.9], [-2.0, -0.9], [2.0, -0.9]])),)
 
     def __init__(self, x):
         self.at = np.array([[x, 0.0, 0.5 * math.pi]])
@@ -366,7 +366,7 @@ class StandingTraffic:
     def poses(self, clocks):
         return np.repeat(self.at, len(clocks), axis=0)
 
-    def onward(self, clocks, seconds, car):
+    def advance_clocks(self, clocks, seconds, car):
         del seconds, car
         return clocks
 
@@ -374,24 +374,28 @@ class StandingTraffic:
 def test_who_gives_way_is_out_of_sight_until_the_car_has_gone():
     others = RoadUsers(StandingTraffic(5.0), CAR)
     own = np.column_stack(
-        [np.linspace(0.0, 3.0, len(WATCHED_S)), np.zeros(len(WATCHED_S)), np.zeros(len(WATCHED_S))]
+        [
+            np.linspace(0.0, 3.0, len(PREDICTION_TIMES_S)),
+            np.zeros(len(PREDICTION_TIMES_S)),
+            np.zeros(len(PREDICTION_TIMES_S)),
+        ]
     )
-    when = others.in_way(own)
+    when = others.encounter_times(own)
     reached = own[:, 0] + 0.5 * CAR.length > 5.0 - 0.9 - 0.05
-    assert when[0] == WATCHED_S[reached.argmax()]
-    assert np.isinf(others.in_way(own - np.array([1.2, 0.0, 0.0]))), "it would stop short of it"
-    assert np.isinf(others.in_way(own + np.array([9.0, 0.0, 0.0]))), "it has passed it"
-    others.give_way(np.array([True]))
-    assert np.isinf(others.in_way(own))
+    assert when[0] == PREDICTION_TIMES_S[reached.argmax()]
+    assert np.isinf(others.encounter_times(own - np.array([1.2, 0.0, 0.0]))), "it would stop short of it"
+    assert np.isinf(others.encounter_times(own + np.array([9.0, 0.0, 0.0]))), "it has passed it"
+    others.hide_standing(np.array([True]))
+    assert np.isinf(others.encounter_times(own))
     assert np.isnan(others.clocks).all()
     seen = []
     for x in np.arange(0.0, 30.0, 0.5):
-        others.onward(0.1, CAR.corners(np.array([x, 0.0, 0.0])))
+        others.advance(0.1, CAR.corners(np.array([x, 0.0, 0.0])))
         middle = x + CAR.middle
         there = bool(np.isfinite(others.clocks).all())
         assert there == (np.abs(others.poses[0, 0]) < 100.0)
         seen.append((there, abs(middle - 5.0)))
-    assert all(there == (away >= ROOM_M) for there, away in seen)
+    assert all(there == (away >= CLEAR_RADIUS_M) for there, away in seen)
     assert {there for there, _ in seen} == {True, False}
 
 

@@ -55,9 +55,9 @@ class DriveCourse(Course):
 
     def config(self) -> Any:
         """See `Course`."""
-        from parkenv.evaluation.training.configs import DRIVE_RECIPES, recipe_of
+        from parkenv.evaluation.training.configs import DRIVE_CONFIGS, config_of
 
-        return recipe_of(self.algorithm, DRIVE_RECIPES, "drive")
+        return config_of(self.algorithm, DRIVE_CONFIGS, "drive")
 
     @property
     def steps(self) -> int:
@@ -81,12 +81,12 @@ class DriveCourse(Course):
 
     def check(self) -> None:
         """See `Course`."""
-        from parkenv.evaluation.training.drive_practice import places_of
-        from planners.driving.drivers import PLANNER
+        from parkenv.evaluation.training.drive_training_env import slot_groups
+        from planners.driving.parking_agents import PLANNER
 
         super().check()
         for lots in (self.lots, self.tested):
-            places_of(lots)
+            slot_groups(lots)
         if any(agent.label != PLANNER for agent in self.spec.planners or ()):
             raise InputError(
                 f"--planners names other agents than {PLANNER}; with --env drive want {PLANNER} or none"
@@ -107,9 +107,9 @@ class DriveCourse(Course):
     @property
     def measures(self) -> tuple[str, ...]:
         """See `Course`."""
-        from parkenv.evaluation.training.drive_practice import places_of
+        from parkenv.evaluation.training.drive_training_env import slot_groups
 
-        return tuple(f"{place.kind}_success" for place in places_of(self.lots))
+        return tuple(f"{group.kind}_success" for group in slot_groups(self.lots))
 
     def training(self, console: Console) -> DriveTraining:
         """See `Course`."""
@@ -136,7 +136,7 @@ class DriveCourse(Course):
         from parkenv.evaluation.figures.learning_curves import across_seeds, save_success_curves
         from parkenv.evaluation.training.drive_training import parked_on
         from parkenv.evaluation.trips.parking_runs import parking_table
-        from planners.driving.drivers import PLANNER
+        from planners.driving.parking_agents import PLANNER
 
         examined = range(EXAMINED_FROM, EXAMINED_FROM + self.evaluation_episodes)
         at_test = range(TESTED_FROM, TESTED_FROM + 2 * self.evaluation_episodes)

@@ -69,7 +69,7 @@ def park(
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, parking_table, write_parkings
     from parkenv.lots import load_lot
-    from planners.driving.drivers import make_driver
+    from planners.driving.parking_agents import make_parking_agent
 
     kinds = None if kind == "all" else _chosen("--kind", kind, KINDS)
     ways = WAYS if way == "both" else _chosen("--way", way, WAYS)
@@ -79,7 +79,7 @@ def park(
         case.environment().close()  # complains before anything is driven
         cases.append(case)
     labels = _labels(args.words("--agents", agents))
-    drivers = {label: make_driver(name) for label, name in labels.items()}
+    drivers = {label: make_parking_agent(name) for label, name in labels.items()}
     make_folder(out)
     console = make_console()
     progress = Progress(

@@ -49,9 +49,9 @@ class SearchCourse(Course):
 
     def config(self) -> Any:
         """See `Course`."""
-        from parkenv.evaluation.training.configs import RECIPES, recipe_of
+        from parkenv.evaluation.training.configs import SEARCH_CONFIGS, config_of
 
-        return recipe_of(self.algorithm, RECIPES, "search")
+        return config_of(self.algorithm, SEARCH_CONFIGS, "search")
 
     @property
     def algorithm(self) -> str:

@@ -284,7 +284,7 @@ def _train_all(
             tasks = [partial(train_one, training, k, out / f"seed_{k}", tensorboard) for k in seeds]
             curves: dict[int, list[Row]] = {}
             for i, trained in workers.results(tasks):
-                trained.keep_in(out / f"seed_{seeds[i]}")
+                trained.save(out / f"seed_{seeds[i]}")
                 curves[i] = trained.curve
         except KeyboardInterrupt:
             console.print(f"Interrupted. Checkpoints are in {out}; the same command with --resume goes on.")

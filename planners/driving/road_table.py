@@ -1,4 +1,4 @@
-"""Every drive of a lot, or of a part of it, at once: times between all vertices, and the way from each to each."""
+"""All shortest drives of a lot or of a part of it: times between all vertices, and the routes."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class RoadTable:
-    """All drives of a lot.
+    """Shortest drives between all vertices.
 
     Attributes:
-        seconds: (n_vertices, n_vertices) float64, s, from row to column; inf where no way leads.
-        following: (n_vertices, n_vertices) int16, the vertex that comes next on a shortest way from row to
-            column, -1 where no way leads and on the diagonal.
-        neighbors: (n_vertices, 4) int32, where each move leads, or -1.
-        move_s: (n_vertices, 4) float64, s, of each of them.
+        seconds: (n_vertices, n_vertices) float64, s, from row to column; inf where unreachable.
+        following: (n_vertices, n_vertices) int16, the next vertex on a shortest route from row to column, -1
+            where unreachable and on the diagonal.
+        neighbors: (n_vertices, 4) int32, target of each move, or -1.
+        move_s: (n_vertices, 4) float64, s, duration of each move.
     """
 
     seconds: FloatArray
@@ -56,7 +56,7 @@ class RoadTable:
         return cls(seconds, following, neighbors, move_s)
 
     def move(self, vertex: int, target: int) -> int:
-        """The first move of a shortest way.
+        """The first move of a shortest route.
 
         Raises:
             InputError: no way leads to the target, or the car is there already.

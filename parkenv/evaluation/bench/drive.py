@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from parkenv.driving.lot_space import LotSpace
+from parkenv.driving.collision_world import CollisionWorld
 from parkenv.driving.parking_task import ParkingTasks
 from parkenv.driving.vehicle import advance
 from parkenv.envs.drive import SUBSTEPS
@@ -55,7 +55,7 @@ def drive_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
 def bare_physics(seed: int, seconds: float) -> float:
     """Return steps per second of a car that drives back and forth among parked ones, with contacts."""
     task = ParkingTasks(packaged_lot("campus")).draw(seed)
-    space, limits = LotSpace(task.vehicle, task.obstacles), task.vehicle.limits
+    space, limits = CollisionWorld(task.vehicle, task.obstacles), task.vehicle.limits
     state = task.start.copy()
 
     def work(i: int) -> None:

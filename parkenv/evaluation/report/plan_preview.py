@@ -45,9 +45,10 @@ class PlanPreview:
             action: what it decided.
             memory: its memory after the decision.
         """
-        vertex = int(observation["vertex"])
-        if action == PARK:
+        # A learned agent's local observation names no vertex, and there is no plan behind it.
+        if action == PARK or "vertex" not in observation:
             return []
+        vertex = int(observation["vertex"])
         if isinstance(memory, Search):
             return self._while_all_are_taken(observation, vertex, action, memory)
         gate = memory.gate if isinstance(memory, TunedPlan) else -1

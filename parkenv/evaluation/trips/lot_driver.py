@@ -11,20 +11,22 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
 from parkenv.driving.driven_lines import DrivenEdge, DrivenLine, DrivenLines
-from parkenv.driving.encounters import SLOWEST, WATCHED_S
-from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
-from parkenv.driving.lot_surroundings import REACH_M, LotSurroundings
+from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED
+from parkenv.driving.lot_obstacles import REACH_M, LotObstacles
 from parkenv.driving.parking_task import KINDS, ParkingTasks
-from parkenv.driving.polite_traffic import PoliteTraffic
 from parkenv.driving.road_users import RoadUsers
 from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
-from parkenv.envs.drive import ANGLE_TOLERANCE, CONTROL_S, POSITION_TOLERANCE, SUBSTEPS
+from parkenv.driving.yielding_traffic import YieldingTraffic
+from parkenv.envs.drive import CONTROL_S, SUBSTEPS
+from parkenv.envs.drive_goals import ANGLE_TOLERANCE, POSITION_TOLERANCE
 from parkenv.errors import InputError
 from parkenv.evaluation.trips.driver import ACROSS, ALONG, NO_ROOM, NO_WAY, ROUND, TAKEN, TURN, Leg, Spot, Try
 from parkenv.world.occupancy import World
 from parkenv.world.scenario import Scenario
-from planners.driving.hybrid_astar import CarPath, SearchSettings, plan_path
+from planners.driving.car_path import CarPath
+from planners.driving.hybrid_astar import SearchSettings, plan_path
 from planners.driving.lane_keeping import LaneKeeper, joined, rounded
 from planners.driving.parking import STRAYED_M, STRAYED_RAD
 from planners.driving.path_tracking import PathTracker, TrackingSettings
@@ -162,7 +164,7 @@ class LotDriver:
             )
         lot = scenario.lot
         self._lines = DrivenLines(lot)
-        self._around = LotSurroundings(scenario)
+        self._around = LotObstacles(scenario)
         self._kinds = ParkingTasks(lot).slot_kinds
         self._on_lane = TrackingSettings(
             speed=speed, acceleration=self.style.acceleration, blend_m=2.0, firmness=0.5
@@ -192,7 +194,7 @@ class LotDriver:
         self.others = None
         traffic = self.scenario.traffic
         if traffic.cars or traffic.pedestrians:
-            rounds = PoliteTraffic(self.scenario.lot, traffic, key, self._around.slots)
+            rounds = YieldingTraffic(self.scenario.lot, traffic, key, self._around.slots)
             self.others = RoadUsers(rounds, self.vehicle)
         self._enter(self._standing(self.scenario.lot.vertex_xy[vertex]))
 
@@ -266,7 +268,7 @@ class LotDriver:
         self.state[:3] = line.pose(edge.start - self.vehicle.middle)
         self.state[SPEED] = self._on_lane.speed
         self._placed = True
-        self._make_room()
+        self._clear_area()
 
     def _take(self, edge: DrivenEdge) -> str:
         """Lay the way along an edge from where the car is; the edge's kind."""
@@ -309,7 +311,7 @@ class LotDriver:
             leave = math.ceil(2.0 * (now + 0.2)) / 2.0
         key = before, edge.line, round(10 * leave), round(10 * edge.start)
         if key not in self._turns:
-            there = self._around.at_worst(here.pose(at)[:2])
+            there = self._around.worst_case(here.pose(at)[:2])
             path = self._planned_onto(here.pose(leave), line, edge.start, _ONTO, there, _WIDE)
             if path is not None:
                 ends = line.station_of(path.sampled()[0][-1, :2])
@@ -512,27 +514,27 @@ class LotDriver:
         self.time += RESCUE_S
         pose = line.pose(line.station_of(self.state[:2]))
         self.state = np.r_[pose, np.zeros(STATE_SIZE - 3)]
-        self._make_room()
+        self._clear_area()
 
-    def _make_room(self) -> None:
+    def _clear_area(self) -> None:
         """Have nobody stand where the car was put."""
         if self.others is not None:
-            self.others.make_room(self.vehicle.corners(self.state[:3]))
+            self.others.clear_area(self.vehicle.corners(self.state[:3]))
 
     def _lets_go_first(self, tracker: PathTracker) -> bool:
         """Brake, or stand, for a step if somebody is in the way along a path; whether so."""
         if self.others is None:
             return False
         speed = abs(float(self.state[SPEED]))
-        ahead = tracker.poses_ahead(WATCHED_S * max(speed, SLOWEST))
-        when = self.others.in_way(self.vehicle.at_middle(ahead))
+        ahead = tracker.poses_ahead(PREDICTION_TIMES_S * max(speed, START_SPEED))
+        when = self.others.encounter_times(self.vehicle.at_middle(ahead))
         if np.isinf(when).all():
             self._stood_s = 0.0
             return False
         if speed == 0.0:
             self._stood_s += CONTROL_S
             if self._stood_s >= PATIENCE_S:
-                self.others.give_way(np.isfinite(when))
+                self.others.hide_standing(np.isfinite(when))
                 self._stood_s = 0.0
         self.log.waited_s += CONTROL_S
         self._brake(self.vehicle.max_braking if when.min() < _SOON_S else self.style.braking, tracker)
@@ -558,15 +560,15 @@ class LotDriver:
         """Drive for a step of the control."""
         others = self.others
         if others is not None:
-            others.onward(CONTROL_S, self.vehicle.corners(self.state[:3]))
+            others.advance(CONTROL_S, self.vehicle.corners(self.state[:3]))
         for step in range(SUBSTEPS):
             if others is not None:
-                self._space.move(others.between((step + 1) / SUBSTEPS))
+                self._space.move(others.interpolate((step + 1) / SUBSTEPS))
             way = advance(self.state, acceleration, steering, self.vehicle.limits)
             self.log.driven_m += abs(way)
             touched = self._space.touched(*self.state[:3].tolist())
             if touched and not self._touches:
-                self.log.contacts.append(Thing(touched).words)
+                self.log.contacts.append(ObstacleKind(touched).label)
             self._touches = bool(touched)
             self.time += PHYSICS_S
         clocks = _NOBODY if others is None else others.clocks
@@ -587,22 +589,22 @@ class LotDriver:
             close = np.hypot(*(self.scenario.lot.slot_xy[new] - self.state[:2]).T) < _WAITS_M
             taken -= set(new[close].tolist())
         self._knew = taken
-        return self._around.now(center, self.time, sorted(taken - {looks_free}))
+        return self._around.at_time(center, self.time, sorted(taken - {looks_free}))
 
     def _enter(self, there: Obstacles) -> None:
         """Drive among these."""
         if self.others is None:
-            self._space = LotSpace(self.vehicle, there)
+            self._space = CollisionWorld(self.vehicle, there)
         else:
-            self._space = LotSpace(self.vehicle, there, self.others.outlines)
+            self._space = CollisionWorld(self.vehicle, there, self.others.outlines)
             self._space.move(self.others.poses)
         self._space_at = self.state[:2].copy()
 
 
 def _with(there: Obstacles, outline: FloatArray) -> Obstacles:
     """Obstacles, and a parked car."""
-    things = [(Thing(t), o) for t, o in zip(there.thing.tolist(), there.outlines(), strict=True)]
-    return Obstacles.of([*things, (Thing.PARKED_CAR, outline)])
+    things = [(ObstacleKind(t), o) for t, o in zip(there.kind.tolist(), there.outlines(), strict=True)]
+    return Obstacles.of([*things, (ObstacleKind.PARKED_CAR, outline)])
 
 
 def _seconds_of(path: CarPath) -> float:
