@@ -79,9 +79,9 @@ def test_unseen_slots_are_known_once_they_were_tried():
         if slot < lot.n_slots and env.state.world.occupied(np.array([slot]), env.state.time)[0]:
             break
         env.step(int(np.flatnonzero(lot.neighbors[slot] >= 0)[-1]))
-    assert not env.state.belief.seen.any()
+    assert not env.state.belief.observed.any()
     observation, *_ = env.step(PARK)
-    assert env.state.belief.seen.tolist() == [s == slot for s in range(lot.n_slots)]
+    assert env.state.belief.observed.tolist() == [s == slot for s in range(lot.n_slots)]
     assert observation["p_occupied"][slot] > 0.99  # the try took its time, in which cars may leave
     others = np.arange(lot.n_slots) != slot
     np.testing.assert_array_equal(observation["p_occupied"][others], prior[others])

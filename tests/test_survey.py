@@ -135,7 +135,7 @@ def test_the_search_sees_what_is_there_and_nothing_else():
     for _ in range(6):
         action = int(np.flatnonzero(lot.neighbors[env.state.vertex] >= 0)[-1])
         observation, *_ = env.step(action)
-    seen = env.state.belief.seen
+    seen = env.state.belief.observed
     assert seen.sum() >= 4
     believed = observation["p_occupied"] > 0.5
     assert (believed == taken)[seen].mean() >= 0.9

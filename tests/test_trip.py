@@ -284,7 +284,7 @@ def test_with_sensors_the_belief_is_what_the_stack_sees_and_not_what_is_so(monke
         truth = env.state.world.occupied(np.arange(lot.n_slots), env.state.time)
         for _ in range(3):
             observation, *_ = env.step(int(np.flatnonzero(lot.neighbors[env.state.vertex] >= 0)[-1]))
-        seen = env.state.belief.seen
+        seen = env.state.belief.observed
         believed = observation["p_occupied"] > 0.5
         assert (seen & truth).sum() >= 2, "or nothing is shown"
         assert ((believed == truth) if show_all else ~believed)[seen & truth].mean() >= 0.75
