@@ -99,7 +99,7 @@ def brute_force(problem, p, entry):
         if len(seen) == n and not free:
             return problem.give_up_s
         seconds = reach(vertex, seen)
-        best = min((seconds[s] + problem.walk_s[s] for s in free if s in seconds), default=np.inf)
+        best = min((seconds[s] + problem.arrival_cost_s[s] for s in free if s in seconds), default=np.inf)
         for v, drive in seconds.items():
             new = sorted(view[v] - seen)
             if not new:

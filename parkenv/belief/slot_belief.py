@@ -102,7 +102,7 @@ class SlotBelief:
 
         Where the forecast is certain, an observation that confirms it counts.
         """
-        return self.observed & ((self.p_observed < self.forecast) | (self.p_observed == 0.0))
+        return np.asarray(self.observed & ((self.p_observed < self.forecast) | (self.p_observed == 0.0)))
 
     @cached_property
     def observed_taken(self) -> BoolArray:
@@ -110,7 +110,7 @@ class SlotBelief:
 
         Where the forecast is certain, an observation that confirms it counts.
         """
-        return self.observed & ((self.p_observed > self.forecast) | (self.p_observed == 1.0))
+        return np.asarray(self.observed & ((self.p_observed > self.forecast) | (self.p_observed == 1.0)))
 
     @cached_property
     def age(self) -> FloatArray:
@@ -119,11 +119,14 @@ class SlotBelief:
 
     def take(self, slots: NDArray[np.integer]) -> Self:
         """Return the belief of some of the slots, (k,), in float64."""
-        arrays = (
-            np.asarray(array[slots], dtype=np.float64)
-            for array in (self.forecast, self.decay_rate, self.p_occupied, self.p_observed, self.observed_at)
+        return type(self)(
+            self.forecast[slots].astype(np.float64),
+            self.decay_rate[slots].astype(np.float64),
+            self.p_occupied[slots].astype(np.float64),
+            self.p_observed[slots].astype(np.float64),
+            self.observed_at[slots].astype(np.float64),
+            self.time,
         )
-        return type(self)(*arrays, self.time)
 
     def update(
         self,

@@ -13,7 +13,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
-from parkenv.scenarios.build import make_scenario
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.compare import Case
@@ -189,25 +188,26 @@ def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
 def _trained(run: RunFolder) -> Cases:
     """The best model and the best planners, where the models were tested; none where that was no search."""
     from parkenv.evaluation.experiments.compare import Case
-    from parkenv.scenarios.spec import SCENARIO_NAMES
+    from parkenv.evaluation.experiments.spec import SPEC_FILE, TrainingSpec
 
-    rows = [
-        r for r in run.summary["rows"] if r.get("scenario") in SCENARIO_NAMES and r.get("total_s") is not None
-    ]
-    if not rows or not run.summary.get("transfer"):
+    spec = TrainingSpec.read(run.path / SPEC_FILE)
+    if spec.env != "search" or not run.summary.get("transfer"):
         return []
+    from parkenv.cli.search_course import SearchCourse
     from parkenv.cli.training_course import TESTED_FROM
 
-    best = min(rows, key=lambda row: float(row["total_s"]))
+    best = min(run.summary["rows"], key=lambda row: float(row["total_s"]))
     model = run.path / f"seed_{best['seed']}" / "model.zip"
+    course = SearchCourse(spec)
+    agents = {agent.label: agent for agent in course.compared}
+    seeds = range(TESTED_FROM, TESTED_FROM + int(run.summary["transfer"][0]["episodes"]))
     cases: Cases = []
-    for name in dict.fromkeys(row["test_scenario"] for row in run.summary["transfer"]):
-        scenario = make_scenario(name)
-        planners = [row for row in run.summary.get("planners", []) if row["scenario"] == name]
+    for scenario in course.tested:
+        planners = [row for row in run.summary.get("planners", []) if row["scenario"] == scenario.name]
         beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
-        seeds = range(TESTED_FROM, TESTED_FROM + int(run.summary["transfer"][0]["episodes"]))
-        names = [f"{best['agent']}:{model}", *(row["agent"] for row in beside)]
-        cases += [(Case(scenario, agent), seeds) for agent in names]
+        cases.append((Case(scenario, f"{best['agent']}:{model}"), seeds))
+        shown = [agents[row["agent"]] for row in beside if row["agent"] in agents]
+        cases += [(Case(scenario, agent.name, options=agent.options), seeds) for agent in shown]
     return cases
 
 

@@ -14,6 +14,7 @@ from parkenv.cli.compare import run_comparison
 from parkenv.cli.demo import run_demo
 from parkenv.cli.report import make_report
 from parkenv.cli.survey import run_survey_of
+from parkenv.cli.train import run_training
 from parkenv.errors import InputError
 from parkenv.files.spec_file import nearest, read_tables
 
@@ -35,6 +36,7 @@ KINDS: Mapping[str, Kind] = {
     "benchmark": Kind("BenchmarkSpec", run_suite),
     "survey": Kind("SurveySpec", run_survey_of),
     "demo": Kind("DemoSpec", run_demo),
+    "train": Kind("TrainingSpec", run_training),
 }
 
 

@@ -190,3 +190,46 @@ class DemoSpec(Workplace):
     every: CaptureDistance = 2.5
     detector: str = "hog"
     seed: int = Field(0, ge=0, lt=2**31)
+
+
+class TrainingSpec(Workplace):
+    """Training by reinforcement learning, one model for each seed; values that are absent are the environment's."""
+
+    kind: Literal["train"] = "train"
+    env: Literal["search", "drive"] = Field("search", description="Search for a slot, or drive into one.")
+    algorithm: str | None = Field(None, description="maskable-ppo for search, ppo for drive if absent.")
+    scenarios: Several[ScenarioItem] | None = Field(
+        None, min_length=1, max_length=1_000, description="Trained on in turns; evaluations use the first."
+    )
+    test_on: Several[ScenarioItem] | None = Field(
+        None, min_length=1, max_length=1_000, description="Tested on in the end; the same if absent."
+    )
+    steps: int | None = Field(None, ge=1, le=10**12, description="Decisions of a training.")
+    seeds: int = Field(5, ge=1, le=10_000, description="How many trainings.")
+    seed: int = Field(0, ge=0, lt=2**31, description="Of the first.")
+    clone: str | None = Field(
+        None, description="Behaviour cloning of this planner first (search; ppo, maskable-ppo)."
+    )
+    demonstrations: int | None = Field(
+        None, ge=1, le=MAX_EPISODES, description="Searches of the planner to clone."
+    )
+    k: int | None = Field(None, ge=1, le=1_000, description="Slots in an observation (search).")
+    evaluate_every: int | None = Field(None, ge=1, le=10**12, description="Decisions between evaluations.")
+    evaluation_episodes: int | None = Field(
+        None,
+        ge=2,
+        le=1_000_000,
+        description="Episodes of an evaluation; the test in the end has twice as many.",
+    )
+    planners: Several[AgentItem] | None = Field(None, max_length=1_000, description="Drawn for comparison.")
+    tensorboard: bool = False
+
+    @model_validator(mode="after")
+    def _of_env(self) -> Self:
+        if self.env == "drive":
+            for name in ("clone", "demonstrations", "k"):
+                if getattr(self, name) is not None:
+                    raise PydanticCustomError("whole", "{name} goes with env search", {"name": name})
+        if self.demonstrations is not None and self.clone is None:
+            raise PydanticCustomError("whole", "demonstrations goes with clone")
+        return self

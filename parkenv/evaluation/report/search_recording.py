@@ -148,6 +148,7 @@ class SearchRecorder(Observer):
         self._known = np.array(_bytes(belief.forecast))
         self._seen = np.zeros(len(self._known), dtype=np.bool_)
         self._plan = [-1]
+        self._vertex = self.state.vertex
         self._rows: dict[str, list[Any]] = {
             name: [] for name in ("t", "vertex", "failed", "belief", "seen", "action", "plan")
         }
@@ -161,8 +162,8 @@ class SearchRecorder(Observer):
         # Most plans are what is left of the last one.
         self._rows["plan"].append(None if plan == self._plan[1:] else plan)
         self._rows["action"].append(int(step.action))
-        moved = self.state.vertex != int(step.observation["vertex"])
-        self._plan = plan if moved else [-1, *plan]
+        self._plan = plan if self.state.vertex != self._vertex else [-1, *plan]
+        self._vertex = self.state.vertex
         self._record_state(step.info["failed_s"])
 
     def on_end(self, result: EpisodeResult) -> None:
