@@ -16,7 +16,11 @@ hypothesis.settings.load_profile("parkenv")
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config, log):
-    """A file's tests stay together: what one of them has compiled, or set up, serves the others."""
-    from xdist.scheduler import LoadFileScheduling
+    """Files stay together until a process has nothing left to do and takes over half of what waits for another.
 
-    return LoadFileScheduling(config, log)
+    So what a test has compiled or set up serves the others of its file, processes do not begin by compiling the same,
+    and none is idle at the end.
+    """
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from parkenv.perception.detector import Detections
-from parkenv.perception.sweeps import laser_sweep
+from parkenv.perception.range_scan import scan_from_laser
 from sim_sensors.rig import SensorRig
 
 _RIG = SensorRig.thesis()
@@ -19,7 +19,7 @@ END_LIMIT = math.radians(60.0)
 def look(scene, pose, believed=None, rng=None):
     """A sweep from a pose, taken to be at `believed`, detections, and the place of each one's car."""
     scan, ids = LASER.scan_with_ids(scene.scan_plane, MOUNT.in_world(pose), rng)
-    sweep = laser_sweep(LASER, MOUNT, pose if believed is None else believed, scan)
+    sweep = scan_from_laser(LASER, MOUNT, pose if believed is None else believed, scan)
     found, places = seen_cars(scene, pose, scan, ids)
     return sweep, found, places
 
@@ -43,7 +43,7 @@ def seen_cars(scene, pose, scan, ids):
         places.append(int(car) - 1)
     boxes = np.array(boxes, dtype=np.float32).reshape(-1, 4)
     sure = np.ones(len(boxes), dtype=np.float32)
-    return Detections(boxes, sure, sure, np.array(ends, dtype=bool), boxes), np.array(places, dtype=int)
+    return Detections(boxes, sure, np.array(ends, dtype=bool)), np.array(places, dtype=int)
 
 
 def turned_off(yaw, true):

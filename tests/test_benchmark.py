@@ -8,6 +8,7 @@ from command_line import parkenv
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments import benchmark
+from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.benchmark import Suite, check_result, result_of
 from parkenv.evaluation.experiments.compare import run_cases
 from parkenv.evaluation.experiments.results import ResultFolder, write_summary
@@ -25,7 +26,7 @@ def small():
 @pytest.fixture(scope="module")
 def result(small, tmp_path_factory):
     folder = ResultFolder(tmp_path_factory.mktemp("benchmark") / "run", {})
-    cases = small.cases(AGENTS)
+    cases = small.cases([AgentSpec(name=name) for name in AGENTS])
     run_cases(cases, folder)
     return result_of(small, cases, folder, ["parkenv", "benchmark", "run"])
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from toy_scene import ToyScene, box_mesh, parked_cars, random_boxes, toy_scene
 
-from parkenv.perception.sweeps import disparity
+from parkenv.perception.range_scan import disparity
 from sim_sensors.camera.image_sensor import ImageSensor
 from sim_sensors.camera.light_maps import light_maps, open_sky, sunlit
 from sim_sensors.camera.models import PinholeCamera, StereoCamera, camera_pose

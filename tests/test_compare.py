@@ -111,7 +111,7 @@ def test_a_killed_run_leaves_what_was_done_and_resumes(tmp_path):
 
     other = parkenv(*small(out, "--resume", "--days", "weekend"))
     assert other.returncode == 2
-    assert "days was 'weekdays'" in other.stderr
+    assert "mini.arrivals.days was 'weekdays'" in other.stderr
 
 
 def test_interrupting_writes_what_is_done(tmp_path):
@@ -132,7 +132,7 @@ def test_interrupting_writes_what_is_done(tmp_path):
     process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=300)
     assert process.returncode == 130, errors
-    assert "--resume goes on" in " ".join(output.split())
+    assert f"--resume --out {out} goes on" in " ".join(output.split())
     summary = json.loads((out / "summary.partial.json").read_text())
     assert summary["complete"] is False
     assert summary["rows"][0]["episodes"] == len(episodes_of(out)) >= 20
@@ -200,9 +200,11 @@ def test_where_the_optimum_is_known_the_table_says_how_far_off_others_are(tmp_pa
 
 def test_both_solvers_search_alike(tmp_path):
     for solver in ("label_setting", "policy_iteration"):
-        done = parkenv(*small(tmp_path / solver, "--solver", solver, agents="mdp"))
+        done = parkenv(*small(tmp_path / solver, agents=f"mdp(solver={solver})"))
         assert done.returncode == 0, done.stderr
     fast, plain = (episodes_of(tmp_path / s) for s in ("label_setting", "policy_iteration"))
+    assert {row.pop("agent") for row in fast} == {"mdp(solver=label_setting)"}
+    assert {row.pop("agent") for row in plain} == {"mdp(solver=policy_iteration)"}
     assert fast == plain
 
 
@@ -285,22 +287,26 @@ def assert_one_line_and_exit_2(done, *wanted):
     ("arguments", "wanted"),
     [
         (["--agents", "mdp,gredy"], ["unknown agent 'gredy'", "known: mdp, mdp-static, greedy-goal"]),
-        (["--v-walk-kmh=-4"], ["--v-walk-kmh is -4", "above 0"]),
+        (["--v-walk-kmh=-4"], ["--v-walk-kmh is -4", "at least 0.1"]),
         (["--v-drive-kmh", "0"], ["--v-drive-kmh is 0"]),
         (["--v-drive-kmh", "fast"], ["--v-drive-kmh", "'fast'"]),
         (["--failure-cost=-1"], ["--failure-cost is -1"]),
         (["--failure-cost", "nan"], ["--failure-cost is nan"]),
         (["--scenario", "moon"], ["unknown scenario 'moon'", "campus"]),
         (["--lot", "nowhere.geojson"], ["nowhere.geojson"]),
-        (["--occupancy", "log.csv"], ["--occupancy goes with --lot"]),
-        (["--occupancy-levels", "1.5"], ["--occupancy-levels has 1.5"]),
+        (["--occupancy", "log.csv"], ["--occupancy is 'log.csv', want a file; there is none at"]),
+        (["--occupancy-levels", "1.5"], ["--occupancy-levels is 1.5, want a number below 1"]),
         (["--arrival", "late"], ["late"]),
-        (["--arrival", "22:00-02:00"], ["--arrival 22:00-02:00", "within one day"]),
+        (["--arrival", "22:00-02:00"], ["--arrival is '22:00-02:00'", "within one day"]),
         (["-n", "0"], ["--episodes", "--help"]),
         (["--speed", "3"], ["--speed"]),
         (["--v-drive-kmh", "1e-300"], ["--v-drive-kmh is 1e-300"]),
         (["--days", "someday"], ["someday"]),
-        (["--resume"], ["holds no comparison"]),
+        (["--resume"], ["holds no run to go on with"]),
+        (["--agents", "mdp(failure_s=90"], ["agent 'mdp(failure_s=90', want NAME or NAME(OPTION=VALUE,...)"]),
+        (["--agents", "mdp(failre_s=90)"], ["has no option 'failre_s'", "failure_s"]),
+        (["--agents", "mdp,mdp"], ["agents has 'mdp' twice"]),
+        (["-n", "1000000000"], ["episodes is 1000000000, want a number of at most"]),
     ],
 )
 def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):
@@ -428,12 +434,12 @@ def test_words_for_sight_are_checked(tmp_path):
     for words, message in (
         (
             ("--sensor-model", "keen"),
-            "--sensor-model is 'keen', want perfect, laser, stereo, or a file that is there",
+            "--sensor-model is 'keen', want perfect, blind, laser, stereo or a file (.json)",
         ),
         (("--sensor-model", tmp_path / "odd.json"), "odd.json: want a sighting model, a JSON object"),
-        (("--sensors", "radar"), "--sensors is 'radar', want one of laser, stereo, both_sides"),
-        (("--solver", "guess"), "solver is 'guess', want one of"),
-        (("--budget-ms", "-1"), "budget_ms is -1"),
+        (("--rig", "radar"), "rig is 'radar', want 'laser', 'stereo' or 'both_sides'"),
+        (("--agents", "mdp(solver=guess)"), "solver is 'guess', want one of"),
+        (("--agents", "belief(budget_ms=-1)"), "budget_ms is -1"),
     ):
         assert_one_line_and_exit_2(parkenv(*small(tmp_path / "x", *words, agents="mdp,belief")), message)
 
@@ -445,7 +451,9 @@ def test_agents_are_checked_in_every_world_before_the_first_search(tmp_path):
     assert not out.exists()
     sweep = ("--agents", "belief,mdp-tuned", "--failure-cost", "sweep")
     refused = parkenv("compare", "--scenario", "mini", *sweep, "-n", 2, "--out", out)
-    assert_one_line_and_exit_2(refused, "belief, mdp-tuned goes by sight; add an agent that does not")
+    assert_one_line_and_exit_2(
+        refused, "all agents plan on observations: belief, mdp-tuned; add one that does not"
+    )
 
 
 def test_help_names_every_command():

@@ -10,10 +10,11 @@ from command_line import parkenv
 
 from parkenv import InputError
 from parkenv.perception.car_datasets import Crops, read_crop_folder, read_uiuc_test, read_uiuc_training
+from parkenv.perception.car_model import CarModel
 from parkenv.perception.cross_validation import cross_validated
 from parkenv.perception.detection_scores import matches, recall_at, recall_precision
-from parkenv.perception.detector import CarModel, Detector, as_grey, best_boxes
 from parkenv.perception.hog import Descriptor
+from parkenv.perception.hog_detector import HogDetector, as_grey, best_boxes
 from parkenv.perception.image_files import images_in, read_image
 from parkenv.perception.training import TrainingSettings, train
 
@@ -58,12 +59,12 @@ def street(rng, places):
 def test_cars_are_found_where_they_are_at_every_size(model):
     rng = np.random.default_rng(5)
     places = [(20, 30, 100), (200, 20, 180), (60, 120, 130)]
-    found = Detector((model,), scale_step=1.1, threshold=0.5).detect(street(rng, places))
+    found = HogDetector((model,), scale_step=1.1, threshold=0.5).detect(street(rng, places))
     truth = np.array([[x, y, x + w, y + 0.4 * w] for x, y, w in places], float)
     hit = matches(found.regions.astype(float), truth)
     assert hit[:3].all()
     assert (np.diff(found.probability) <= 0).all()
-    assert not len(Detector((model,), threshold=0.5).detect(street(rng, [])))
+    assert not len(HogDetector((model,), threshold=0.5).detect(street(rng, [])))
 
 
 def test_equal_training_gives_equal_files(crops, model, tmp_path):
@@ -97,9 +98,9 @@ def test_bad_model_files_are_told_apart(model, tmp_path):
         archive.writestr("weights.npy", weights)
         archive.writestr("settings.npy", raw[:start] + text)
     for name, message in (
-        ("text.npz", "is no car model"),
-        ("other.npz", "is no car model"),
-        ("new.npz", "is a model of version 9, want 2"),
+        ("text.npz", "not a car model"),
+        ("other.npz", "not a car model"),
+        ("new.npz", "format version 9, want 2"),
         ("none.npz", "no such model; want side, front, or an .npz file"),
     ):
         with pytest.raises(InputError, match=message):
@@ -109,13 +110,13 @@ def test_bad_model_files_are_told_apart(model, tmp_path):
 def test_the_shipped_models_are_small_and_say_what_they_know():
     side, front = CarModel.load("side"), CarModel.load("front")
     assert (side.descriptor.size, front.descriptor.size) == (1152, 2304)
-    assert front.ends
-    assert not side.ends
+    assert front.end_on
+    assert not side.end_on
     assert "simulated" in side.trained_on
 
 
 def test_any_size_and_colour_is_looked_at(model):
-    detector = Detector((model,))
+    detector = HogDetector((model,))
     assert len(detector.detect(np.zeros((3, 5), np.uint8))) == 0
     assert len(detector.detect(np.zeros((9, 9, 3), np.uint8))) == 0
     detector.detect(np.zeros((1500, 2000), np.uint8))
@@ -268,7 +269,7 @@ def test_too_little_to_train_on_is_said(crops):
 )
 def test_bad_detectors_are_named(model, settings, message):
     with pytest.raises(InputError, match=message):
-        Detector(**{"models": (model,), **settings})
+        HogDetector(**{"models": (model,), **settings})
 
 
 def test_a_model_wants_weights_of_its_window():

@@ -109,5 +109,5 @@ def test_commands_have_options_that_exist(words):
 def test_agents_in_the_table_are_the_agents_there_are():
     from planners.agent import AGENT_NAMES, SMALL_LOTS_ONLY
 
-    listed = re.findall(r"^\| `([a-z-]+)` \|", README, flags=re.MULTILINE)
+    listed = re.findall(r"^\| `([a-z-]+)` \|", PAGES["docs/agents.md"], flags=re.MULTILINE)
     assert sorted(listed) == sorted((*AGENT_NAMES, *SMALL_LOTS_ONLY))

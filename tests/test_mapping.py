@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 from parkenv import InputError, make_scenario
 from parkenv.lots import packaged_lot
 from parkenv.mapping.discovery import discover, score_discovery
-from parkenv.mapping.grid import P_FREE, P_OCCUPIED, OccupancyGrid
+from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.inference import MapPrior, SessionLog, counted, predict
 from parkenv.mapping.odometry import PoseNoise
-from parkenv.mapping.slots import SlotFilter
 from parkenv.mapping.store import VERSION, MapStore, Session
-from parkenv.perception.ranging import CarSightings
-from parkenv.perception.sweeps import laser_sweep
+from parkenv.perception.range_scan import scan_from_laser
+from parkenv.perception.ranging import LocatedCars
+from parkenv.perception.slot_filter import P_FREE, P_OCCUPIED, SlotFilter
 from parkenv.world.lot_scene import slot_lot
 from parkenv.world.occupancy import Arrival
 from sim_sensors.laser.scanner import LaserScanner
@@ -85,7 +85,7 @@ def drive_by(lot, scene, noise=None, step=1.0):
     slots = SlotFilter(lot)
     for x in np.arange(lot.vertex_xy[:, 0].min(), lot.vertex_xy[:, 0].max(), step):
         pose = np.array([x, lot.vertex_xy[:, 1].mean(), 0.0])
-        slots.see_through(laser_sweep(LASER, MOUNT, pose, LASER.scan(scene.scan_plane, pose, noise)))
+        slots.update_from_scan(scan_from_laser(LASER, MOUNT, pose, LASER.scan(scene.scan_plane, pose, noise)))
     return slots
 
 
@@ -111,7 +111,7 @@ def test_a_slot_that_nobody_saw_stays_unknown(mini):
     slots = SlotFilter(mini)
     pose = np.array([*mini.vertex_xy[0], 0.0])
     wall = np.full(LASER.n_beams, 0.5, np.float32)
-    slots.see_through(laser_sweep(LASER, MOUNT, pose, wall))
+    slots.update_from_scan(scan_from_laser(LASER, MOUNT, pose, wall))
     states = slots.states()
     assert not states.in_view.any()
     assert (states.p_occupied == 0.5).all()
@@ -121,8 +121,8 @@ def test_a_slot_that_nobody_saw_stays_unknown(mini):
 def test_a_detection_goes_to_its_slot_and_one_elsewhere_to_none(mini):
     slots = SlotFilter(mini)
     xy = np.array([mini.slot_xy[3] + [0.3, -0.4], mini.slot_xy[3] + [0.0, 50.0]])
-    cars = CarSightings(xy, np.zeros(2), np.ones((2, 2)), np.ones(2), np.ones(2, np.float32), np.arange(2))
-    assert slots.see_cars(cars).tolist() == [3, -1]
+    cars = LocatedCars(xy, np.zeros(2), np.ones((2, 2)), np.ones(2), np.ones(2, np.float32), np.arange(2))
+    assert slots.update_from_cars(cars).tolist() == [3, -1]
     states = slots.states()
     assert states.occupied.tolist() == [i == 3 for i in range(mini.n_slots)]
     assert states.p_occupied[3] == pytest.approx(P_OCCUPIED)
@@ -134,7 +134,7 @@ def test_a_car_that_leaves_during_the_drive_is_noticed(mini):
     empty = slot_lot(mini).scene(np.zeros(mini.n_slots, bool))
     for x in np.linspace(mini.vertex_xy[:, 0].min(), mini.vertex_xy[:, 0].max(), 20):
         pose = np.array([x, mini.vertex_xy[:, 1].mean(), 0.0])
-        slots.see_through(laser_sweep(LASER, MOUNT, pose, LASER.scan(empty.scan_plane, pose)))
+        slots.update_from_scan(scan_from_laser(LASER, MOUNT, pose, LASER.scan(empty.scan_plane, pose)))
     assert not slots.states().occupied.any()
 
 
@@ -148,13 +148,13 @@ def test_a_car_that_leaves_during_the_drive_is_noticed(mini):
 )
 def test_bad_scans_are_named(scan, message):
     with pytest.raises(InputError, match=message):
-        laser_sweep(LASER, MOUNT, np.zeros(3), scan)
+        scan_from_laser(LASER, MOUNT, np.zeros(3), scan)
 
 
 def test_a_scan_without_a_return_sees_through_everything(mini):
     slots = SlotFilter(mini)
     pose = np.array([*mini.vertex_xy[0], 0.0])
-    slots.see_through(laser_sweep(LASER, MOUNT, pose, np.full(LASER.n_beams, np.inf, np.float32)))
+    slots.update_from_scan(scan_from_laser(LASER, MOUNT, pose, np.full(LASER.n_beams, np.inf, np.float32)))
     assert slots.in_view[0]
     assert not slots.states().occupied.any()
 
@@ -383,7 +383,9 @@ def test_half_a_metre_of_pose_error_is_borne_and_two_are_not(mini):
             xs = np.arange(mini.vertex_xy[:, 0].min(), mini.vertex_xy[:, 0].max(), 1.0)
             true = np.column_stack([xs, np.full(len(xs), mini.vertex_xy[:, 1].mean()), np.zeros(len(xs))])
             for pose, belief in zip(true, PoseNoise(position).estimated(true, rng), strict=True):
-                slots.see_through(laser_sweep(LASER, MOUNT, belief, LASER.scan(scene.scan_plane, pose)))
+                slots.update_from_scan(
+                    scan_from_laser(LASER, MOUNT, belief, LASER.scan(scene.scan_plane, pose))
+                )
             right.append((slots.states().occupied == taken).mean())
         return np.mean(right)
 

@@ -13,19 +13,18 @@ from parkenv.lots import packaged_lot
 from parkenv.mapping.route import survey_route
 from parkenv.perception.box_fit import fit_box
 from parkenv.perception.detector import Detections
+from parkenv.perception.range_scan import RangeScan, disparity, scan_from_laser, scan_from_stereo
 from parkenv.perception.ranging import (
-    CarSightings,
+    LocatedCars,
     beams_between,
     bearings,
-    body_depth,
     car_beams,
-    locate,
-    locate_by_disparity,
-    locate_plainly,
+    localize_cars,
+    localize_disparity,
+    localize_median,
     median_depth,
     median_distance,
 )
-from parkenv.perception.sweeps import Sweep, disparity, laser_sweep, stereo_sweep
 from parkenv.world.lot_scene import slot_lot
 from sim_sensors.ground_truth import View, vehicle_boxes
 from sim_sensors.laser.footprints import ScanPlane
@@ -43,13 +42,13 @@ def rectangle(x, y, yaw, length, width):
 def swept(*cars, pose=(0.0, 0.0, 0.0), rng=None):
     """What the laser sees of cars, each x, y, yaw, length, width."""
     plane = ScanPlane(np.array([rectangle(*car) for car in cars]))
-    return laser_sweep(LASER, MOUNT, np.array(pose), LASER.scan(plane, pose, rng))
+    return scan_from_laser(LASER, MOUNT, np.array(pose), LASER.scan(plane, pose, rng))
 
 
 def boxes_of(*boxes, ends=True):
     table = np.array(boxes, dtype=np.float32).reshape(-1, 4)
     sure = np.ones(len(table), dtype=np.float32)
-    return Detections(table, sure, sure, np.full(len(table), ends), table)
+    return Detections(table, sure, np.full(len(table), ends))
 
 
 # Which beams (eq. 3.2)
@@ -57,21 +56,21 @@ def boxes_of(*boxes, ends=True):
 
 def test_the_middle_of_the_image_is_the_beam_to_the_right():
     """Camera along -π/2 of the laser, first beam at -3π/4, steps of a quarter degree: beam 180 looks straight."""
-    sweep = swept((0.0, -5.0, 0.0, 4.0, 2.0))
+    scan = swept((0.0, -5.0, 0.0, 4.0, 2.0))
     box = np.array([[CAMERA.cx - 4.0, 0.0, CAMERA.cx + 4.0, 9.0]], dtype=np.float32)
     left, right = bearings(CAMERA, EYE, ORIGIN, box)[0]
     assert left > -math.pi / 2 > right
-    beams = beams_between(sweep, left, right)
+    beams = beams_between(scan, left, right)
     assert beams.tolist() == list(range(178, 183))
 
 
 @given(yaw=st.floats(-10, 10), u=st.floats(0, 639), v=st.floats(0, 639))
 def test_beams_of_a_box_are_those_that_the_camera_sees_in_it(yaw, u, v):
     pose = np.array([3.0, -2.0, yaw])
-    sweep = laser_sweep(LASER, MOUNT, pose, np.full(LASER.n_beams, 5.0, np.float32))
+    scan = scan_from_laser(LASER, MOUNT, pose, np.full(LASER.n_beams, 5.0, np.float32))
     left, right = min(u, v), max(u, v)
     margins = bearings(CAMERA, EYE, pose, np.array([[left, 0.0, right, 9.0]]))[0]
-    beams = beams_between(sweep, *margins)
+    beams = beams_between(scan, *margins)
     column = CAMERA.cx - CAMERA.fx * np.tan(LASER.angles - EYE.yaw)
     ahead = np.abs(LASER.angles - EYE.yaw) < math.pi / 2
     inside = ahead & (column > left + 1e-6) & (column < right - 1e-6)
@@ -84,42 +83,42 @@ def test_beams_of_a_box_are_those_that_the_camera_sees_in_it(yaw, u, v):
 
 def test_beams_that_pass_the_car_do_not_count():
     """The box is too wide by a half on either side: the median is the wall's, the run the car's."""
-    sweep = swept((0.0, -4.0, 0.0, 1.8, 2.0), (0.0, -11.0, 0.0, 60.0, 2.0))
-    beams = beams_between(sweep, -math.pi / 2 + 0.7, -math.pi / 2 - 0.7)
-    assert median_distance(sweep, beams) > 10.0
-    run = car_beams(sweep, beams)
-    assert np.median(sweep.distance[run.beams]) == pytest.approx(3.0, abs=0.1)
+    scan = swept((0.0, -4.0, 0.0, 1.8, 2.0), (0.0, -11.0, 0.0, 60.0, 2.0))
+    beams = beams_between(scan, -math.pi / 2 + 0.7, -math.pi / 2 - 0.7)
+    assert median_distance(scan, beams) > 10.0
+    run = car_beams(scan, beams)
+    assert np.median(scan.distance[run.beams]) == pytest.approx(3.0, abs=0.1)
     assert run.cut == (False, False)
 
 
 def test_a_neighbour_at_the_margin_does_not_count():
     """Something stands a metre nearer, before the car's left edge, and fills a third of the box."""
-    sweep = swept((0.0, -8.0, 0.0, 1.8, 4.0), (1.6, -4.0, 0.0, 2.0, 2.0))
+    scan = swept((0.0, -8.0, 0.0, 1.8, 4.0), (1.6, -4.0, 0.0, 2.0, 2.0))
     left, right = math.atan2(-6.0, 1.6), math.atan2(-6.0, -1.0)
-    run = car_beams(sweep, beams_between(sweep, left, right))
-    assert np.median(sweep.distance[run.beams]) == pytest.approx(6.03, abs=0.03)
+    run = car_beams(scan, beams_between(scan, left, right))
+    assert np.median(scan.distance[run.beams]) == pytest.approx(6.03, abs=0.03)
     assert run.cut == (False, True), "the van hides where the car ends"
 
 
 def test_a_run_goes_on_where_the_image_ends():
-    sweep = swept((0.0, -3.6, 0.0, 4.4, 1.8))
+    scan = swept((0.0, -3.6, 0.0, 4.4, 1.8))
     left, right = -math.pi / 2 + 0.2, -math.pi / 2 - 0.2
-    inside = beams_between(sweep, left, right)
-    short, whole = car_beams(sweep, inside), car_beams(sweep, inside, (True, True))
+    inside = beams_between(scan, left, right)
+    short, whole = car_beams(scan, inside), car_beams(scan, inside, (True, True))
     assert set(short.beams) <= set(inside)
-    ends = sweep.points(whole.beams[[0, -1]])[:, 0]
+    ends = scan.points(whole.beams[[0, -1]])[:, 0]
     assert ends == pytest.approx([-2.2, 2.2], abs=0.05)
 
 
 def test_what_no_beam_meets_has_no_distance():
-    sweep = laser_sweep(LASER, MOUNT, ORIGIN, np.full(LASER.n_beams, np.inf, np.float32))
-    beams = beams_between(sweep, -1.0, -2.0)
+    scan = scan_from_laser(LASER, MOUNT, ORIGIN, np.full(LASER.n_beams, np.inf, np.float32))
+    beams = beams_between(scan, -1.0, -2.0)
     assert len(beams)
-    assert math.isnan(median_distance(sweep, beams))
-    assert not len(car_beams(sweep, beams).beams)
+    assert math.isnan(median_distance(scan, beams))
+    assert not len(car_beams(scan, beams).beams)
     box = boxes_of([300, 200, 340, 300])
-    assert len(locate(box, sweep, CAMERA, EYE, ORIGIN)) == 0
-    assert len(locate_plainly(box, sweep, CAMERA, EYE, ORIGIN)) == 0
+    assert len(localize_cars(box, scan, CAMERA, EYE, ORIGIN)) == 0
+    assert len(localize_median(box, scan, CAMERA, EYE, ORIGIN)) == 0
 
 
 @pytest.mark.parametrize(
@@ -129,31 +128,31 @@ def test_what_no_beam_meets_has_no_distance():
 )
 def test_what_does_not_stand_on_the_ground_as_cars_do_is_none(top, bottom, stands):
     """The car's face is 4 m away and the eye 1.3 m high, so the ground there is 104 px below the horizon."""
-    sweep = swept((0.0, -5.0, 0.0, 4.0, 2.0))
-    found = locate(boxes_of([180, top, 460, bottom], ends=False), sweep, CAMERA, EYE, ORIGIN)
+    scan = swept((0.0, -5.0, 0.0, 4.0, 2.0))
+    found = localize_cars(boxes_of([180, top, 460, bottom], ends=False), scan, CAMERA, EYE, ORIGIN)
     assert len(found) == stands
 
 
 def test_no_detection_is_no_car():
-    sweep = swept((0.0, -5.0, 0.0, 4.0, 2.0))
-    for way in (locate, locate_plainly):
-        assert len(way(boxes_of(), sweep, CAMERA, EYE, ORIGIN)) == 0
+    scan = swept((0.0, -5.0, 0.0, 4.0, 2.0))
+    for way in (localize_cars, localize_median):
+        assert len(way(boxes_of(), scan, CAMERA, EYE, ORIGIN)) == 0
 
 
 def test_sensors_must_stand_on_one_axis():
-    sweep = swept((0.0, -5.0, 0.0, 4.0, 2.0))
-    for way in (locate, locate_plainly):
-        with pytest.raises(InputError, match=r"camera and sweep are 2\.00 m apart"):
-            way(boxes_of([300, 200, 340, 300]), sweep, CAMERA, Mount(x=2.0, z=1.3, yaw=EYE.yaw), ORIGIN)
+    scan = swept((0.0, -5.0, 0.0, 4.0, 2.0))
+    for way in (localize_cars, localize_median):
+        with pytest.raises(InputError, match=r"camera and ranging sensor are 2\.00 m apart"):
+            way(boxes_of([300, 200, 340, 300]), scan, CAMERA, Mount(x=2.0, z=1.3, yaw=EYE.yaw), ORIGIN)
 
 
 def test_sightings_are_checked():
-    good = CarSightings(
+    good = LocatedCars(
         np.zeros((1, 2)), np.zeros(1), np.ones((1, 2)), np.ones(1), np.ones(1, np.float32), np.zeros(1, int)
     )
     assert good.poses.tolist() == [[0.0, 0.0, 0.0]]
-    with pytest.raises(InputError, match=r"xy of car sightings is \(2, 2\), want \(1, 2\)"):
-        CarSightings(
+    with pytest.raises(InputError, match=r"xy of located cars is \(2, 2\), want \(1, 2\)"):
+        LocatedCars(
             np.zeros((2, 2)),
             np.zeros(1),
             np.ones((1, 2)),
@@ -161,8 +160,8 @@ def test_sightings_are_checked():
             np.ones(1, np.float32),
             np.zeros(1, int),
         )
-    with pytest.raises(InputError, match="yaw of car sightings"):
-        CarSightings(
+    with pytest.raises(InputError, match="yaw of located cars"):
+        LocatedCars(
             np.zeros((1, 2)),
             np.full(1, np.nan),
             np.ones((1, 2)),
@@ -190,13 +189,11 @@ def test_two_sides_tell_the_pose_from_anywhere(bearing, away, yaw, length, width
     aside = abs(y * math.cos(yaw) - x * math.sin(yaw)) - 0.5 * width
     if min(ahead, aside) < 1.0:
         return  # the sensor sees one side only, or the other at a grazing angle
-    sweep = swept((x, y, yaw, length, width), rng=np.random.default_rng(seed))
-    car = fit_box(sweep.points(np.flatnonzero(np.isfinite(sweep.distance))), np.zeros(2), end_on=False)
+    scan = swept((x, y, yaw, length, width), rng=np.random.default_rng(seed))
+    car = fit_box(scan.points(np.flatnonzero(np.isfinite(scan.distance))), np.zeros(2), end_on=False)
     assert turned_off(car.yaw, yaw) < math.radians(3)
-    assert math.hypot(car.x - x, car.y - y) < 0.15 + 0.5 * max(0.0, 4.4 - length) + 0.5 * max(
-        0.0, 1.8 - width
-    )
-    # A side that is looked along keeps its last half metre to itself.
+    # The last half metre of a side at a grazing angle may have no return: half of that is the centre's error.
+    assert math.hypot(car.x - x, car.y - y) < 0.15 + 0.5 * (abs(car.length - length) + abs(car.width - width))
     for seen, true in ((car.seen_length, length), (car.seen_width, width)):
         assert true - 0.5 < seen < true + 0.15
 
@@ -231,18 +228,18 @@ def test_fitted_cars_stand_where_the_cars_do(name):
     lot = packaged_lot(name)
     rng = np.random.default_rng(1)
     scene = slot_lot(lot, 1).scene(rng.random(lot.n_slots) < 0.6)
-    off = {locate: [], locate_plainly: []}
+    off = {localize_cars: [], localize_median: []}
     for pose in poses_along(survey_route(lot).path, 8.0):
-        sweep, found, places = look(scene, pose, rng=rng)
+        scan, found, places = look(scene, pose, rng=rng)
         for k in range(len(found)):
             true = scene.vehicle_pose[places[k]]
             for way, errors in off.items():
-                car = way(found.chosen(np.array([k])), sweep, CAMERA, EYE, pose)
+                car = way(found.select(np.array([k])), scan, CAMERA, EYE, pose)
                 errors += [
                     (np.hypot(*(xy - true[:2])), turned_off(yaw, true[2]))
                     for xy, yaw in zip(car.xy, car.yaw, strict=True)
                 ]
-    fitted, plain = (np.array(off[way]) for way in (locate, locate_plainly))
+    fitted, plain = (np.array(off[way]) for way in (localize_cars, localize_median))
     assert len(fitted) > 25
     assert np.median(fitted[:, 0]) < 0.3 < np.median(plain[:, 0])
     assert (fitted[:, 0] > 1.0).mean() < 0.05 < (plain[:, 0] > 1.0).mean()
@@ -268,38 +265,20 @@ def pairs():
             boxes = vehicle_boxes(stereo.camera, scene, mount.camera_pose(pose), pair.left)
             near = (boxes.visible_fraction > 0.6) & (boxes.distance < 10.0) & (boxes.ids <= scene.n_vehicles)
             found = boxes_of(*boxes.visible_box[near].tolist(), ends=False)
-            found.ends[:] = boxes.view[near] != View.SIDE
+            found.end_on[:] = boxes.view[near] != View.SIDE
             looks.append((scene, pose, pair, disparity(pair, stereo), found, boxes.ids[near] - 1))
     return stereo, mount, looks
-
-
-def test_the_mode_low_in_the_box_is_not_biased_as_the_median_is(pairs):
-    """Windows, ground and background pull the median of a box away from the car (T §3.2.3)."""
-    stereo, mount, looks = pairs
-    far_off, near_off = [], []
-    for scene, pose, _, disparities, found, places in looks:
-        exact, ids = LASER.scan_with_ids(scene.scan_plane, mount.in_world(pose))
-        for box, place in zip(found.boxes, places, strict=True):
-            hit = ids == place + 1
-            if hit.sum() >= 10:
-                true = np.median((exact * np.cos(LASER.angles))[hit])
-                far_off.append(median_depth(disparities, box, stereo) - true)
-                near_off.append(body_depth(disparities, box, stereo) - true)
-    assert len(near_off) >= 15
-    assert np.median(far_off) > 0.1
-    assert abs(np.median(near_off)) < 0.5 * np.median(far_off)
-    assert np.median(np.abs(near_off)) < 0.7 * np.median(np.abs(far_off))
 
 
 def test_cars_are_placed_from_stereo_alone(pairs):
     stereo, mount, looks = pairs
     errors = {"fitted": [], "thesis": []}
     for scene, pose, _, disparities, found, places in looks:
-        sweep = stereo_sweep(stereo, mount, pose, disparities)
+        scan = scan_from_stereo(stereo, mount, pose, disparities)
         for k, place in enumerate(places):
-            one, true = found.chosen(np.array([k])), scene.vehicle_pose[place]
-            fitted = locate(one, sweep, stereo.camera, mount, pose)
-            plain = locate_by_disparity(one, disparities, stereo, mount, pose)
+            one, true = found.select(np.array([k])), scene.vehicle_pose[place]
+            fitted = localize_cars(one, scan, stereo.camera, mount, pose)
+            plain = localize_disparity(one, disparities, stereo, mount, pose)
             if len(fitted) and len(plain):
                 for name, car in (("fitted", fitted), ("thesis", plain)):
                     errors[name].append((np.hypot(*(car.xy[0] - true[:2])), turned_off(car.yaw[0], true[2])))
@@ -314,18 +293,17 @@ def test_a_box_without_a_match_has_no_depth(pairs):
     nothing = np.full((480, 640), np.nan, np.float32)
     box = boxes_of([100, 100, 300, 300])
     assert math.isnan(median_depth(nothing, box.boxes[0], stereo))
-    assert math.isnan(body_depth(nothing, box.boxes[0], stereo))
-    assert len(locate_by_disparity(box, nothing, stereo, mount, ORIGIN)) == 0
-    sweep = stereo_sweep(stereo, mount, ORIGIN, nothing)
-    assert np.isnan(sweep.distance).all()
-    assert len(locate(box, sweep, stereo.camera, mount, ORIGIN)) == 0
+    assert len(localize_disparity(box, nothing, stereo, mount, ORIGIN)) == 0
+    scan = scan_from_stereo(stereo, mount, ORIGIN, nothing)
+    assert np.isnan(scan.distance).all()
+    assert len(localize_cars(box, scan, stereo.camera, mount, ORIGIN)) == 0
 
 
-def test_a_wall_fills_a_stereo_sweep(pairs):
+def test_a_wall_fills_a_scan_from_stereo(pairs):
     """Every pixel at 6 m: what stands at bumper height is met there in every direction, and angles ascend."""
     stereo, mount, _ = pairs
     disparities = np.full((480, 640), stereo.camera.fx * stereo.baseline / 6.0, np.float32)
-    sweep = stereo_sweep(stereo, mount, ORIGIN, disparities)
-    assert (np.diff(sweep.angle) > 0.0).all()
-    assert sweep.points(np.arange(len(sweep.angle)))[:, 1] == pytest.approx(-6.0, abs=1e-4)
-    assert isinstance(sweep, Sweep)
+    scan = scan_from_stereo(stereo, mount, ORIGIN, disparities)
+    assert (np.diff(scan.angle) > 0.0).all()
+    assert scan.points(np.arange(len(scan.angle)))[:, 1] == pytest.approx(-6.0, abs=1e-4)
+    assert isinstance(scan, RangeScan)

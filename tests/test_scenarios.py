@@ -125,6 +125,7 @@ def test_logs_and_maps(tmp_path):
         ("goal = 0", "lot is missing"),
         ('lot = "nowhere.geojson"', "lot.file is 'nowhere.geojson', want a file; there is none at /"),
         ("lot = 5", "lot is 5, want a table"),
+        ('lot = "campsu"', "lot is 'campsu', want a packaged lot (campus, jam, street, mini) or a lot file (.geojson"),
         ('lot = { name = "mini", grid = { rows = 1, columns = 2 } }', "want exactly one of name, file, grid, city"),
         ('lot = "mini"\nspeeds = { v_walk_kmh = -4 }', "speeds.v_walk_kmh is -4, want a number of at least 0.1"),
         ('lot = "mini"\nspeeds = { v_drive_kmh = "fast" }', "speeds.v_drive_kmh is 'fast', want a number"),

@@ -10,7 +10,7 @@ from gymnasium.utils.env_checker import data_equivalence
 
 import parkenv  # noqa: F401
 from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
-from parkenv.envs.lookout import Lookout
+from parkenv.envs.sensor_sampler import SensorSampler
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.traffic import LotTraffic
 from sim_sensors.camera.models import PinholeCamera
@@ -303,16 +303,16 @@ def test_a_mover_of_a_model_that_the_fleet_lacks_is_refused():
         scene.with_movers(Movers(np.zeros((1, 3)), np.array([100])))
 
 
-def test_lookouts_of_equal_worlds_see_the_same_whatever_was_looked_at_before():
+def test_samplers_of_equal_worlds_see_the_same_whatever_was_looked_at_before():
     scenario = make_scenario("mini", traffic=BUSY)
     env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
     env.reset(seed=0)
-    eager, late = (Lookout(scenario, SMALL_RIG, None, 3, 0.5) for _ in range(2))
+    eager, late = (SensorSampler(scenario, SMALL_RIG, None, 3, 0.5) for _ in range(2))
     for action in (3, 3, 3):
         before = env.state.vertex, env.state.time
         env.step(action)
-        last = eager.look(env.state, before)
-    for a, b in zip(last, late.look(env.state, before), strict=True):
+        last = eager.sample_step(env.state, before)
+    for a, b in zip(last, late.sample_step(env.state, before), strict=True):
         np.testing.assert_array_equal(a.capture.images["right"].image, b.capture.images["right"].image)
         np.testing.assert_array_equal(a.capture.scans["laser"], b.capture.scans["laser"])
 

@@ -14,8 +14,8 @@ from parkenv.evaluation.experiments.surveys import map_error, run_survey
 from parkenv.mapping.inference import SessionLog
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import Survey, SurveySettings
-from parkenv.mapping.survey_score import WAYS
-from parkenv.perception.stack import PerceptionStack
+from parkenv.mapping.survey_score import METHODS
+from parkenv.perception.pipeline import PerceptionPipeline
 from parkenv.world.occupancy import ArrivalWindow
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount, SensorRig
@@ -40,10 +40,10 @@ def test_a_session_finds_which_slots_are_taken(rig):
     assert result.slot_accuracy_seen >= 0.9
     assert result.found >= 0.8 * result.parked
     assert result.score.right >= 0.6 * result.score.detections > 0
-    fitted, thesis = (np.median(result.score.errors(way), axis=0) for way in WAYS)
+    fitted, thesis = (np.median(result.score.errors(method), axis=0) for method in METHODS)
     assert fitted[0] < (0.1 if rig == "laser" else 0.4)
     assert (fitted < thesis).all(), "distance, place and heading are all better than the thesis's way"
-    assert len(result.looks) == 2
+    assert len(result.shown) == 2
     assert result.grid.seen.any()
 
 
@@ -80,7 +80,19 @@ def test_the_maps_error_is_zero_where_it_is_right():
 def test_survey_and_map_on_the_command_line(tmp_path):
     out = tmp_path / "s"
     done = parkenv(
-        "survey", "--scenario", "mini", "-n", 1, "--weather", "sunny", "--every", 3, "--jobs", 1, "--out", out
+        "survey",
+        "--scenario",
+        "mini",
+        "--sessions",
+        1,
+        "--weather",
+        "sunny",
+        "--every",
+        3,
+        "--jobs",
+        1,
+        "--out",
+        out,
     )
     assert done.returncode == 0, done.stderr
     (row,) = json.loads((out / "summary.json").read_text())["rows"]
@@ -105,7 +117,7 @@ def test_survey_and_map_on_the_command_line(tmp_path):
         (["map", tmp_path / "none", "--scenario", "mini"], "no such map file"),
         (
             ["survey", "--rig", "sonar", "--out", tmp_path / "x"],
-            "rig is 'sonar', want one of laser, stereo, both_sides",
+            "rig is 'sonar', want 'laser', 'stereo' or 'both_sides'",
         ),
         (["survey", "--weather", "snow", "--out", tmp_path / "x"], "weather is 'snow'"),
     ):
@@ -123,7 +135,7 @@ def test_the_search_sees_what_is_there_and_nothing_else():
     for _ in range(6):
         action = int(np.flatnonzero(lot.neighbors[env.state.vertex] >= 0)[-1])
         observation, *_ = env.step(action)
-    seen = env.state.belief.seen
+    seen = env.state.belief.observed
     assert seen.sum() >= 4
     believed = observation["p_occupied"] > 0.5
     assert (believed == taken)[seen].mean() >= 0.9
@@ -145,8 +157,8 @@ def test_the_search_and_its_worlds_are_the_same_as_without_sensors():
 
 def test_a_rig_that_cannot_see_or_range_is_refused():
     laser = SensorRig(lasers=(("laser", LaserScanner(), Mount(z=0.5)),))
-    with pytest.raises(InputError, match="no camera, or nothing to measure distances with"):
-        PerceptionStack(laser)
+    with pytest.raises(InputError, match="no camera, or no ranging sensor"):
+        PerceptionPipeline(laser, make_scenario("mini").lot)
 
 
 @pytest.mark.parametrize(
@@ -164,13 +176,12 @@ def test_bad_settings_are_named(wrong, message):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "rig"), [("campus", "laser"), ("street", "laser"), ("campus", "stereo")])
-def test_held_out_sessions_are_as_right_as_promised(name, rig):
-    scenario = make_scenario(name, traffic=BUSY)
+@pytest.mark.parametrize(("name", "rig", "accuracy"), [("campus", "laser", 0.97), ("street", "stereo", 0.94)])
+def test_held_out_sessions_are_as_right_as_promised(name, rig, accuracy):
+    """With a fifth of the captures that a survey makes unless it is asked for others."""
     window = ArrivalWindow((1,), 36_000.0, 43_200.0)
-    survey = Survey(scenario, SurveySettings(rig=rig, windows=(window,), seed=777))
-    results = [survey.drive(0)]
-    assert np.mean([r.slot_accuracy for r in results]) >= (0.97 if rig == "laser" else 0.94)
+    settings = SurveySettings(rig=rig, windows=(window,), seed=777, every=6.0)
+    assert Survey(make_scenario(name, traffic=BUSY), settings).drive(0).slot_accuracy >= accuracy
 
 
 @pytest.mark.slow
@@ -178,7 +189,9 @@ def test_a_killed_survey_loses_only_the_drive_under_way(tmp_path):
     """SIGKILL in the middle: what the map file holds is whole, and the same command goes on from there."""
     scenario, out = make_scenario("mini"), tmp_path / "s"
     command = [*PARKENV, "survey", "--scenario", "mini", "--every", "4", "--jobs", "1", "--out", str(out)]
-    drive = subprocess.Popen([*command, "-n", "500"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    drive = subprocess.Popen(
+        [*command, "--sessions", "500"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     try:
         table = out / "sessions.csv"
         while not (table.exists() and len(table.read_text().splitlines()) > 2):
@@ -190,7 +203,7 @@ def test_a_killed_survey_loses_only_the_drive_under_way(tmp_path):
     with MapStore(out / "map.sqlite", scenario.lot, create=False) as store:
         before = store.sessions()
     assert 1 <= len(before) < 500
-    done = parkenv(*command[len(PARKENV) :], "-n", len(before) + 1)
+    done = parkenv(*command[len(PARKENV) :], "--sessions", len(before) + 1)
     assert done.returncode == 0, done.stderr
     with MapStore(out / "map.sqlite", scenario.lot, create=False) as store:
         after = {s.key: s for s in store.sessions()}

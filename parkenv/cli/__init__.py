@@ -19,8 +19,9 @@ from parkenv.cli import (
     park,
     plan,
     report,
+    run,
+    sensor_model,
     sensors,
-    sight,
     survey,
     train,
 )
@@ -37,6 +38,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 app.command("compare")(compare.compare)
+app.command("run")(run.run)
 app.command("plan")(plan.plan)
 app.command("park")(park.park)
 app.command("trip")(calibrate.trip)
@@ -47,7 +49,7 @@ app.add_typer(sensors.app, name="sensors")
 app.command("demo")(demo.demo)
 app.command("survey")(survey.survey)
 app.command("map")(survey.show_map)
-app.command("fit-sensor-model")(sight.fit_sight)
+app.command("fit-sensor-model")(sensor_model.fit_sensor_model)
 app.command("detect")(detect.detect)
 app.command("train-detector")(detect.train_detector)
 app.command("evaluate-detector")(detect.evaluate_detector)

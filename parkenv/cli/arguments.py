@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterable
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
 from parkenv.errors import InputError
-from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
+from parkenv.files.spec_file import Spec
+from parkenv.scenarios.spec import ScenarioSpec, TrafficSpec, scenario_spec
 
 if TYPE_CHECKING:
+    from parkenv.evaluation.experiments.spec import Grid
     from parkenv.evaluation.experiments.workers import Workers
+
+SpecT = TypeVar("SpecT", bound=Spec)
 
 WORLD = "The world"
 COSTS = "Costs and speeds"
@@ -104,23 +107,54 @@ SensorModelOption = Annotated[
         metavar="perfect|laser|stereo|FILE",
         help="How slots are observed: without error within --view-range; as measured with a rig's detection and "
         "mapping stack; or a file of `parkenv fit-sensor-model`.  "
-        "[default: the scenario's; with --sensors as measured with the rig]",
+        "[default: the scenario's; with --rig as measured with the rig]",
         rich_help_panel=WORLD,
     ),
 ]
-CarsOption = Annotated[int, typer.Option("--cars", metavar="N", min=0, help="Other cars that drive about.")]
-PedestriansOption = Annotated[
-    int, typer.Option("--pedestrians", metavar="M", min=0, help="People who walk about.")
+CarsOption = Annotated[
+    int | None,
+    typer.Option(
+        "--cars", metavar="N", min=0, help="Other cars that drive about.  [default: the scenario's]"
+    ),
 ]
-SensorsOption = Annotated[
+PedestriansOption = Annotated[
+    int | None,
+    typer.Option("--pedestrians", metavar="N", min=0, help="Pedestrians.  [default: the scenario's]"),
+]
+WeatherOption = Annotated[
+    str | None,
+    typer.Option("--weather", help="sunny, overcast, low_sun, dusk or rain.  [default: drawn each time]"),
+]
+SurveyRigOption = Annotated[
     str | None,
     typer.Option(
-        "--sensors",
+        "--rig",
         metavar="laser|stereo|both_sides",
-        help="Look through this rig's simulated sensors, detector and all, where the sighting model would stand for "
-        "them: about a second a step.",
+        help="Simulated sensors: laser, a camera and a 270° laser; stereo, a stereo camera alone; both_sides, a laser "
+        "and a camera to each side.  [default: the scenario's, laser]",
+    ),
+]
+RigOption = Annotated[
+    str | None,
+    typer.Option(
+        "--rig",
+        metavar="laser|stereo|both_sides",
+        help="Observe slots through this rig's simulated sensors, detector and all, instead of the sensor model: about "
+        "a second a step.",
         rich_help_panel=WORLD,
     ),
+]
+AgentsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--agents",
+        metavar="NAME[,NAME...]",
+        help="Agents, with options in brackets: mdp(failure_s=90). A name; ALGORITHM:FILE for a trained model; or "
+        "MODULE:CLASS for an agent of your own. Differences are to the first.  [default: all but exact]",
+    ),
+]
+ReportOption = Annotated[
+    bool, typer.Option("--report", help="Also write report.html, as `parkenv report` does.")
 ]
 RerunOption = Annotated[
     Path | None,
@@ -132,19 +166,31 @@ RerunOption = Annotated[
     ),
 ]
 FailureCostOption = Annotated[
-    str,
+    str | None,
     typer.Option(
         "--failure-cost",
         metavar="S[,S...]",
-        help="Seconds lost by a try at a taken slot.",
+        help="Seconds that a failed attempt costs.  [default: the scenario's, 10]",
         rich_help_panel=COSTS,
     ),
 ]
 WalkOption = Annotated[
-    str, typer.Option("--v-walk-kmh", metavar="V[,V...]", help="Walking speed, km/h.", rich_help_panel=COSTS)
+    str | None,
+    typer.Option(
+        "--v-walk-kmh",
+        metavar="V[,V...]",
+        help="Walking speed, km/h.  [default: the scenario's, 4]",
+        rich_help_panel=COSTS,
+    ),
 ]
 DriveOption = Annotated[
-    str, typer.Option("--v-drive-kmh", metavar="V[,V...]", help="Driving speed, km/h.", rich_help_panel=COSTS)
+    str | None,
+    typer.Option(
+        "--v-drive-kmh",
+        metavar="V[,V...]",
+        help="Driving speed, km/h.  [default: the scenario's, 10]",
+        rich_help_panel=COSTS,
+    ),
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="First seed; episode i uses seed + i.")]
 JobsOption = Annotated[
@@ -190,26 +236,20 @@ def numbers(option: str, text: str) -> list[float]:
     return values
 
 
-SWEEP = (0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0)
-"""s, the failure costs of `--failure-cost sweep`."""
+def changed_axes(grid: Grid, options: Mapping[str, tuple[str, str | None]]) -> Grid:
+    """A grid with those axes replaced that options give as comma-separated numbers.
 
+    Args:
+        grid: the grid.
+        options: the axis and the text of each option; None for one that is not given.
 
-def speeds(option: str, text: str) -> list[float]:
-    """Comma-separated speeds, km/h, that a person or a car may have."""
-    return _between(option, text, 0.1, 300.0, "a speed above 0: 0.1 to 300 km/h")
-
-
-def costs(option: str, text: str) -> list[float]:
-    """Comma-separated costs, s, of at most a day."""
-    return _between(option, text, 0.0, 86400.0, "seconds from 0 to 86400")
-
-
-def _between(option: str, text: str, least: float, most: float, wanted: str) -> list[float]:
-    values = numbers(option, text)
-    for value in values:
-        if not least <= value <= most:
-            raise InputError(f"{option} is {value:g}, want {wanted}")
-    return values
+    Raises:
+        InputError: no numbers, or some out of their range.
+    """
+    for option, (axis, text) in options.items():
+        if text is not None:
+            grid = grid.changed(option, **{axis: numbers(option, text)})
+    return grid
 
 
 def words(option: str, text: str) -> list[str]:
@@ -244,6 +284,10 @@ def scenario_specs(
     days: str | None = None,
     sensor_model: str | None = None,
     view_range: float | None = None,
+    cars: int | None = None,
+    pedestrians: int | None = None,
+    traffic: TrafficSpec | None = None,
+    base: Sequence[ScenarioSpec] | None = None,
     default: str = "campus",
 ) -> list[ScenarioSpec]:
     """The scenarios that options describe: each option changes what the scenario's own file says.
@@ -258,7 +302,11 @@ def scenario_specs(
         days: such as weekdays.
         sensor_model: by name, or a file.
         view_range: m.
-        default: the scenario where neither `scenario` nor `lot` is given.
+        cars: that drive about.
+        pedestrians: that walk about.
+        traffic: where the scenario names none.
+        base: the scenarios to change where neither `scenario` nor `lot` is given.
+        default: names, where there is no base either.
 
     Raises:
         InputError: an unknown name, a file that cannot be used, or options that exclude each other.
@@ -272,11 +320,34 @@ def scenario_specs(
             ScenarioSpec.parse({"name": Path(word).stem, "lot": word}, "--lot")
             for word in words("--lot", lot)
         ]
+    elif scenario is None and base is not None:
+        specs = list(base)
     else:
         specs = [scenario_spec(word) for word in words("--scenario", scenario or default)]
     return [
-        _changed(spec, occupancy, mapping, goal, arrival, days, sensor_model, view_range) for spec in specs
+        _with_traffic(
+            _changed(spec, occupancy, mapping, goal, arrival, days, sensor_model, view_range),
+            cars,
+            pedestrians,
+            traffic or TrafficSpec(),
+        )
+        for spec in specs
     ]
+
+
+def _with_traffic(
+    spec: ScenarioSpec, cars: int | None, pedestrians: int | None, default: TrafficSpec
+) -> ScenarioSpec:
+    if cars is None and pedestrians is None:
+        return spec
+    usual = spec.traffic or default
+    return spec.changed(
+        "--cars, --pedestrians",
+        traffic={
+            "cars": usual.cars if cars is None else cars,
+            "pedestrians": usual.pedestrians if pedestrians is None else pedestrians,
+        },
+    )
 
 
 def _changed(
@@ -335,23 +406,31 @@ def one_scenario(specs: list[ScenarioSpec]) -> ScenarioSpec:
     return specs[0]
 
 
+DetectorOption = Annotated[
+    str,
+    typer.Option(
+        "--detector",
+        help="hog: the packaged models; side or front: one of them; a model file; MODULE:CLASS: your own.",
+    ),
+]
+
+
 def rig_of(word: str | None) -> str | None:
     """A rig's name, checked."""
     from sim_sensors.rig import RIG_NAMES
 
     if word is not None and word not in RIG_NAMES:
-        raise InputError(f"--sensors is {word!r}, want one of {', '.join(RIG_NAMES)}")
+        raise InputError(f"--rig is {word!r}, want one of {', '.join(RIG_NAMES)}")
     return word
 
 
-def fingerprint(path: Path | None) -> str | None:
-    """A short hash of a file's content, so that a resumed run notices a changed file."""
-    return None if path is None else hashlib.sha256(path.read_bytes()).hexdigest()[:16]
+def saved(folder: Path, name: str, kind: type[SpecT]) -> SpecT:
+    """The specification that a run left in its folder.
 
-
-def agent_fingerprints(names: Iterable[str]) -> dict[str, str]:
-    """Fingerprints, by name, of those agents that are read from files: trained models and agents of one's own."""
-    from planners.agent import agent_file
-
-    prints = {name: fingerprint(agent_file(name)) for name in dict.fromkeys(names)}
-    return {name: its for name, its in prints.items() if its is not None}
+    Raises:
+        InputError: there is none.
+    """
+    file = folder / name
+    if not file.exists():
+        raise InputError(f"--resume: {folder} holds no run to go on with: no {name}")
+    return kind.read(file)

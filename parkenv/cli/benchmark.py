@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
-from parkenv.cli.compare import run_with_bar
+from parkenv.cli.compare import episode_progress
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
 
+if TYPE_CHECKING:
+    from parkenv.evaluation.experiments.spec import BenchmarkSpec
+
 RESULT = "result.json"
-AGENTS = "belief,mdp-tuned,mdp,first-free,greedy-drive,greedy-goal"
 
 app = typer.Typer(
     help="Run a fixed benchmark suite, and check the results of others.",
@@ -27,59 +29,86 @@ app = typer.Typer(
 
 @app.command("run")
 def run(
-    suite: Annotated[str, typer.Argument(help="The suite; `parkenv benchmark show v1` tells of it.")] = "v1",
-    agents: Annotated[str, typer.Option("--agents", metavar="NAME[,NAME...]", help="Who searches.")] = AGENTS,
+    suite: Annotated[str, typer.Argument(help="The suite; `parkenv benchmark show v1` describes it.")] = "v1",
+    agents: args.AgentsOption = None,
     jobs: args.JobsOption = 0,
     backend: args.BackendOption = "loky",
     address: args.AddressOption = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help=f"Folder for {RESULT} and the searches.  [default: results/SUITE]"),
+        typer.Option("--out", "-o", help=f"Folder for {RESULT} and the episodes.  [default: results/SUITE]"),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the run in --out: add what is missing.")
+        bool, typer.Option("--resume", help="Finish the run in --out. It needs no other option.")
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results in --out.")] = False,
 ) -> None:
-    """Run agents through all searches of a suite, and write a result that others can check.
+    """Run agents through all episodes of a suite, and write a result that others can check.
 
-    Scenarios, costs, speeds and seeds are the suite's. An agent's score in a task is the mean time of one who knows
-    every slot's future over the agent's own; the score of the suite is the mean over its tasks, 1 at best.
+    Scenarios, costs, speeds and seeds are the suite's. An agent's score in a task is the mean total time of the
+    clairvoyant bound divided by the agent's own; the score of the suite is the mean over its tasks, at most 1.
 
     Examples:
     * `parkenv benchmark run v1 --agents belief,mdp --out results/v1`
 
     * `parkenv benchmark check results/v1/result.json`
     """
-    from parkenv.evaluation.experiments.benchmark import Suite, result_of
-    from parkenv.evaluation.experiments.results import ResultFolder, write_summary
+    from parkenv.evaluation.experiments.agent_spec import split_agents
+    from parkenv.evaluation.experiments.spec import SPEC_FILE, BenchmarkSpec
 
-    its = Suite.named(suite)
-    cases = its.cases(args.words("--agents", agents))
     out = out or Path("results") / suite
+    base = args.saved(out, SPEC_FILE, BenchmarkSpec) if resume else BenchmarkSpec()
+    given = {} if agents is None else {"agents": split_agents(agents)}
+    spec = base.changed(suite=suite, jobs=jobs, backend=backend, address=address, **given)
+    run_suite(spec, out, resume=resume, overwrite=overwrite)
+
+
+def run_suite(spec: BenchmarkSpec, out: Path, *, resume: bool = False, overwrite: bool = False) -> None:
+    """Run a suite with a progress bar, write its result and print the scores.
+
+    Raises:
+        InputError: an agent that cannot be made, or a folder that cannot be used.
+    """
+    from parkenv.evaluation.experiments.benchmark import Suite, result_of
+    from parkenv.evaluation.experiments.compare import run_cases
+    from parkenv.evaluation.experiments.experiment import agent_fingerprints
+    from parkenv.evaluation.experiments.results import ResultFolder, write_summary
+    from parkenv.evaluation.experiments.spec import SPEC_FILE
+
+    suite = Suite.named(spec.suite)
+    cases = suite.cases(spec.agents)
     settings = {
         "version": __version__,
-        "suite": its.name,
-        "suite_sha256": its.fingerprint,
-        "agent files": args.agent_fingerprints(case.agent for case, _ in cases),
+        "suite": suite.name,
+        "suite_sha256": suite.fingerprint,
+        "agent files": agent_fingerprints(case.agent for case, _ in cases),
     }
     console = make_console()
-    with args.workers_of(jobs, backend, address) as workers:
+    complete = True
+    with (
+        args.workers_of(spec.jobs, spec.backend, spec.address) as workers,
+        episode_progress(console) as progress,
+    ):
         folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)
-        interrupted = run_with_bar(console, cases, folder, workers)
+        spec.write(out / SPEC_FILE)
+        bar = progress.add_task("Searching", total=sum(len(seeds) for _, seeds in cases))
+        try:
+            run_cases(cases, folder, workers=workers, on_progress=lambda n: progress.advance(bar, n))
+        except KeyboardInterrupt:
+            complete = False
     order = [case.key(seed) for case, seeds in cases for seed in seeds]
     command = ["parkenv", *sys.argv[1:]]
-    if interrupted:
+    if not complete:
         folder.finish(order, {"command": command, "complete": False}, complete=False)
-        console.print(f"Interrupted. What was finished is in {out}; the same command with --resume goes on.")
+        console.print(f"Interrupted. What was finished is in {out}; --resume --out {out} goes on.")
         raise typer.Exit(130)
-    result = result_of(its, cases, folder, command)
+    result = result_of(suite, cases, folder, command)
     folder.finish(
         order, {"command": command, "version": __version__, "complete": True, "rows": result["rows"]}
     )
     write_summary(out, result, RESULT)
     _print(console, [result])
-    console.print(f"Written: {out / RESULT}, and every search beside it")
+    console.print(f"Written: {out / RESULT}, and every episode beside it")
 
 
 @app.command("check")

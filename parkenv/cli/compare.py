@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,45 +13,33 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
 from rich.table import Table
 
-from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import WIDE, make_console, make_table
 from parkenv.errors import InputError
-from parkenv.scenarios.build import build
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.compare import Case
-    from parkenv.evaluation.trips.calibration import Calibration
-    from parkenv.world.scenario import Scenario
+    from parkenv.evaluation.experiments.spec import ExperimentSpec
 
 Row = dict[str, Any]
 
-ON_SIGHT = ("belief", "mdp-tuned", "exact")
-"""Agents that refuse problems in which slots are seen only by trying."""
-DEFAULT_AGENTS = "mdp,mdp-static,mdp-tuned,belief,greedy-goal,greedy-drive,first-free,random,oracle"
 SWEEP = "sweep"
 """The failure cost that stands for many."""
-MAP_SAYS = "-map-says-"
-"""What stands between the names of scenarios with maps that are wrong on purpose and what these say."""
-LEVELS = "0.5,0.7,0.8,0.9,0.95,0.99"
+LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
+"""Occupancy levels of a comparison that names none."""
+MOST_TABLES = 12
+"""Settings that are printed; a larger grid is for its figures and files."""
 
 
 def compare(
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            "--scenario",
-            metavar="NAME[,NAME...]",
-            help="Packaged scenarios: campus, jam, street, mini.  [default: campus]",
-            rich_help_panel=args.WORLD,
-        ),
-    ] = None,
+    scenario: args.ScenariosOption = None,
     lot: args.LotOption = None,
     occupancy: args.OccupancyOption = None,
     mapping: args.MappingOption = None,
@@ -60,73 +47,62 @@ def compare(
     arrival: args.ArrivalOption = None,
     days: args.DaysOption = None,
     view_range: args.ViewRangeOption = None,
-    sight: args.SensorModelOption = None,
-    sensors: args.SensorsOption = None,
-    agents: Annotated[
-        str,
-        typer.Option(
-            "--agents",
-            metavar="NAME[,NAME...]",
-            help="Who searches; a name, ALGORITHM:FILE for a trained model, or MODULE:CLASS for an agent of your own. "
-            "Differences are to the first.",
-        ),
-    ] = DEFAULT_AGENTS,
+    sensor_model: args.SensorModelOption = None,
+    rig: args.RigOption = None,
+    agents: args.AgentsOption = None,
     episodes: Annotated[
-        int, typer.Option("--episodes", "-n", min=1, help="Searches a setting and agent.")
-    ] = 200,
+        int | None,
+        typer.Option(
+            "--episodes", "-n", min=1, help="Episodes of each agent in each setting.  [default: 200]"
+        ),
+    ] = None,
     failure_cost: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--failure-cost",
             metavar="S[,S...]|sweep",
-            help="Seconds lost by a try at a taken slot. `sweep` draws total time against it from 0 to 120 s, with and "
-            "without sight of the slots before a try; agents that plan on what they see are left out there.",
+            help="Seconds that the world charges for a failed attempt, and that planners expect to be charged unless "
+            "their own options say otherwise: `--agents 'mdp,mdp(failure_s=90)'`. `sweep`: from 0 to 120 s, with and "
+            "without observations of slots before an attempt, drawn as a curve.  [default: the scenario's, 10]",
             rich_help_panel=args.COSTS,
         ),
-    ] = "10",
-    v_walk_kmh: args.WalkOption = "4",
-    v_drive_kmh: args.DriveOption = "10",
+    ] = None,
+    v_walk_kmh: args.WalkOption = None,
+    v_drive_kmh: args.DriveOption = None,
     calibrated: Annotated[
         Path | None,
         typer.Option(
             "--calibrated",
             metavar="FILE",
-            help="Also compare under the failure cost and driving speed that `parkenv calibrate` measured: FILE is its "
-            "calibrated.json. Searches are the same as under the costs given here.",
+            help="Also compare at the failure cost and driving speed that `parkenv calibrate` measured: FILE is its "
+            "calibrated.json. The worlds are the same.",
             rich_help_panel=args.COSTS,
         ),
     ] = None,
     occupancy_levels: Annotated[
-        str,
+        str | None,
         typer.Option(
             "--occupancy-levels",
             metavar="P[,P...]|none",
-            help="Also make the lot this full on average, with a third as many searches each, for the figure of "
-            "time against occupancy. A recorded world is as full as it is: its searches are binned instead.",
+            help="Also set the lot's mean occupancy to these values, with a third of the episodes each, for the figure "
+            "of time against occupancy. A recorded log cannot be changed: its searches are binned instead.  "
+            f"[default: {','.join(f'{level:g}' for level in LEVELS)}]",
         ),
-    ] = LEVELS,
+    ] = None,
     map_says: Annotated[
         str | None,
         typer.Option(
             "--map-says",
             metavar="P[,P...]",
-            help="Also with maps that are wrong on purpose: they say of every slot that it is taken with this "
-            "probability. Draws total time against it.",
+            help="Also with wrong maps, which give this probability of being taken for every slot. Draws total time "
+            "against it.",
             rich_help_panel=args.WORLD,
         ),
     ] = None,
-    solver: Annotated[
-        str,
-        typer.Option(
-            "--solver",
-            help="Of mdp and mdp-static: label_setting, or the thesis's policy_iteration; the plans are the same.",
-        ),
-    ] = "label_setting",
-    budget_ms: Annotated[
-        float | None,
-        typer.Option("--budget-ms", help="About how long belief may take for a decision, ms.  [default: 5]"),
+    seed: Annotated[
+        int | None,
+        typer.Option("--seed", min=0, help="First seed; episode i uses seed + i.  [default: 0]"),
     ] = None,
-    seed: args.SeedOption = 0,
     jobs: args.JobsOption = 0,
     backend: args.BackendOption = "loky",
     address: args.AddressOption = None,
@@ -135,27 +111,31 @@ def compare(
         typer.Option(
             "--out",
             "-o",
-            help="Folder for episodes.csv, summary.json and the figures.  [default: results/compare]",
+            help="Folder for experiment.json, episodes.csv, summary.json and the figures.  [default: results/compare]",
         ),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the run in --out: add what is missing.")
+        bool,
+        typer.Option(
+            "--resume",
+            help="Finish the run in --out. It needs no other option; those given change it, such as more --episodes.",
+        ),
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results in --out.")] = False,
-    figures: Annotated[bool, typer.Option(help="Draw figures.")] = True,
+    figures: Annotated[bool | None, typer.Option(help="Draw figures.  [default: figures]")] = None,
     rerun: args.RerunOption = None,
-    report: Annotated[
-        bool, typer.Option("--report", help="Also write report.html, as `parkenv report` does.")
-    ] = False,
+    report: args.ReportOption = False,
 ) -> None:
     """Compare agents over failure costs and speeds, all in the same worlds.
 
-    Every agent meets the same cars at the same times: episode i of each has the same seed. The table
-    gives mean total time (drive + failed tries + walk) with its 95 % interval, the paired difference to the
-    first agent, and the regret to the clairvoyant bound.
+    Episode i has the same seed for every agent, and so the same cars at the same times. The table gives mean total
+    time (drive + failed attempts + walk) with its 95 % interval, the paired difference to the first agent, and the
+    regret to the clairvoyant bound. Options are short cuts for an experiment file, which `parkenv run` takes.
 
     Examples:
     * `parkenv compare --scenario campus,jam --failure-cost 10,90 --out results`
+
+    * `parkenv compare --scenario my_lot.toml --agents "mdp(failure_s=90),belief(budget_ms=2),oracle"`
 
     * `parkenv compare --failure-cost sweep --agents mdp,mdp-tuned,belief,oracle`
 
@@ -163,98 +143,121 @@ def compare(
 
     * `parkenv compare --lot lot.geojson --occupancy log.csv.gz --agents mdp,greedy-goal,oracle -n 300`
     """
-    from parkenv.evaluation.experiments.compare import check_worlds, table
-    from parkenv.evaluation.experiments.results import ResultFolder
-    from parkenv.evaluation.figures.registry import ComparisonResults, draw_figures, remove_figures
+    from parkenv.evaluation.experiments.agent_spec import split_agents
+    from parkenv.evaluation.experiments.spec import FAILURE_COST_SWEEP, SPEC_FILE, ExperimentSpec
+
+    out = out or Path("results/compare")
+    if resume:
+        base = args.saved(out, SPEC_FILE, ExperimentSpec)
+    else:
+        base = ExperimentSpec().changed(grid={"occupancy_levels": list(LEVELS)})
+    grid = base.grid
+    if failure_cost == SWEEP:
+        grid = grid.changed(failure_s=FAILURE_COST_SWEEP, blind=True, occupancy_levels=())
+        failure_cost, occupancy_levels = None, None
+    if occupancy_levels == "none":
+        grid, occupancy_levels = grid.changed(occupancy_levels=()), None
+    if calibrated is not None:
+        grid = grid.changed("--calibrated", calibrated=calibrated)
+    grid = args.changed_axes(
+        grid,
+        {
+            "--failure-cost": ("failure_s", failure_cost),
+            "--v-walk-kmh": ("v_walk_kmh", v_walk_kmh),
+            "--v-drive-kmh": ("v_drive_kmh", v_drive_kmh),
+            "--occupancy-levels": ("occupancy_levels", occupancy_levels),
+            "--map-says": ("map_says", map_says),
+        },
+    )
+    specs = args.scenario_specs(
+        scenario, lot=lot, occupancy=occupancy, mapping=mapping, goal=goal, arrival=arrival, days=days,
+        sensor_model=sensor_model, view_range=view_range, base=base.scenarios,
+    )  # fmt: skip
+    given = {
+        "agents": None if agents is None else split_agents(agents), "episodes": episodes, "seed": seed, "rig": rig,
+        "figures": figures,
+    }  # fmt: skip
+    spec = base.changed(
+        scenarios=tuple(specs),
+        grid=grid,
+        jobs=jobs, backend=backend, address=address,
+        **{name: value for name, value in given.items() if value is not None},
+    )  # fmt: skip
+    run_comparison(spec, out, resume=resume, overwrite=overwrite, rerun=rerun, report=report)
+
+
+def run_comparison(
+    spec: ExperimentSpec,
+    out: Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    rerun: Path | None = None,
+    report: bool = False,
+) -> None:
+    """Run an experiment with a progress bar, print its tables and draw its figures.
+
+    Raises:
+        InputError: what cannot be run, or a folder that cannot be used.
+    """
+    from parkenv.evaluation.experiments.experiment import run_experiment
+    from parkenv.evaluation.figures.registry import draw_figures
     from parkenv.world.scenario import KMH
 
     if rerun is not None:
         from parkenv.evaluation.trips.sensor_log import require_viewer
 
-        if sensors is None:
-            raise InputError("--rerun records what sensors measure: add --sensors laser")
+        if spec.rig is None:
+            raise InputError("--rerun records what sensors measure: add --rig laser")
         require_viewer()
-    asked = comparison_of(
-        scenario=scenario, lot=lot, occupancy=occupancy, mapping=mapping, goal=goal, arrival=arrival, days=days,
-        view_range=view_range, sight=sight, sensors=sensors, agents=agents, episodes=episodes,
-        failure_cost=failure_cost, v_walk_kmh=v_walk_kmh, v_drive_kmh=v_drive_kmh, calibrated=calibrated,
-        occupancy_levels=occupancy_levels, map_says=map_says, solver=solver, budget_ms=budget_ms, seed=seed,
-    )  # fmt: skip
-    cases, sweep, scenarios, maps, measured = (
-        asked.cases,
-        asked.sweep,
-        asked.scenarios,
-        asked.maps,
-        asked.measured,
-    )
-    sweeps = failure_cost == SWEEP
-    settings = {
-        "version": __version__,
-        "scenarios": [s.name for s in scenarios],
-        "lot": lot,
-        "occupancy": args.fingerprint(occupancy),
-        "mapping": args.fingerprint(mapping),
-        "goal": goal,
-        "arrival": arrival,
-        "days": days,
-        "view_range": view_range,
-        "sight": repr(scenarios[0].sensor_model),
-        "sensors": sensors,
-        "map_says": map_says,
-        "options": asked.options,
-        "calibrated": args.fingerprint(calibrated),
-        "agent files": args.agent_fingerprints(case.agent for case, _ in cases),
-    }
-    out = out or Path("results/compare")
-    for s in scenarios:
-        check_worlds(s, range(seed, seed + episodes))
     console = make_console()
-    with args.workers_of(jobs, backend, address) as workers:
-        folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)
-        remove_figures(out)
-        interrupted = run_with_bar(console, cases + sweep, folder, workers)
-
-    rows, sweep_rows = table(cases, folder), table(sweep, folder)
-    summary = {
-        "command": ["parkenv", *sys.argv[1:]],
-        "version": __version__,
-        "seed": seed,
-        "complete": not interrupted,
-        "rows": rows,
-        "occupancy_rows": sweep_rows,
-        "calibrated": None if measured is None else dataclasses.asdict(measured),
-    }
-    order = [case.key(s) for case, its_seeds in cases + sweep for s in its_seeds]
-    folder.finish(order, summary, complete=not interrupted)
-    # A sweep is to be looked at: it would print two tables for every cost.
-    for printed in [] if sweeps else result_tables(rows, console.width):
+    with episode_progress(console) as progress:
+        bars: list[TaskID] = []
+        result = run_experiment(
+            spec,
+            out,
+            command=["parkenv", *sys.argv[1:]],
+            resume=resume,
+            overwrite=overwrite,
+            workers=args.workers_of(spec.jobs, spec.backend, spec.address),
+            on_start=lambda n: bars.append(progress.add_task("Searching", total=n)),
+            on_progress=lambda n: progress.advance(bars[0], n),
+        )
+    tables = setting_count(result.rows) <= MOST_TABLES
+    for printed in result_tables(result.rows, console.width) if tables else []:
         console.print(printed)
-    if measured is not None:
+    if not tables:
+        console.print(f"{setting_count(result.rows)} settings: their tables are in summary.json")
+    if (measured := result.experiment.calibration) is not None:
         console.print(
             f"Calibrated over {measured.trips} trips: failure cost {measured.failure_s:.4g} s, drive "
-            f"{measured.v_drive / KMH:.4g} km/h. Whoever parks needs {measured.manoeuvre_s:.1f} s more to get into the "
-            "slot, under either cost; the tables leave that out."
+            f"{measured.v_drive / KMH:.4g} km/h. Parking takes {measured.manoeuvre_s:.1f} s more for the manoeuvre "
+            "into the slot, under either cost; the tables leave that out."
         )
-    if interrupted:
-        console.print(f"Interrupted. What was finished is in {out}; the same command with --resume goes on.")
+    if not result.complete:
+        console.print(f"Interrupted. What was finished is in {out}; --resume --out {out} goes on.")
         raise typer.Exit(130)
-    if figures:
+    if spec.figures:
         with console.status("Drawing figures"):
-            flat = {name: (name.partition(MAP_SAYS)[0], said) for name, (_, said) in maps.items()}
-            draw_figures(ComparisonResults(cases, folder.episodes, rows, sweep_rows, flat, seed), out)
+            draw_figures(result.figure_data(), out)
     console.print(f"Episodes, summary and figures are in {out}")
     if rerun is not None:
         with console.status(f"Searching the first search once more for {rerun}"):
-            _record(*cases[0], rerun)
+            _record(*result.experiment.cases[0], rerun)
         console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
     if report:
         from parkenv.cli.report import make_report
 
-        make_report(out, jobs=jobs)
+        make_report(out, jobs=spec.jobs)
+
+
+def setting_count(rows: list[Row]) -> int:
+    """How many scenarios and settings rows are of."""
+    return len({(r["scenario"], r["failure_cost_s"], r["v_walk_kmh"], r["v_drive_kmh"]) for r in rows})
 
 
 def _record(case: Case, seeds: range, path: Path) -> None:
-    """The first search of a case, through its sensors."""
+    """Record the first episode of a case through its sensors."""
     from parkenv.envs.perception import SearchPerceptionEnv
     from parkenv.evaluation.trips.sensor_log import record_search, sensor_log
     from planners.agent import make_agent
@@ -264,160 +267,9 @@ def _record(case: Case, seeds: range, path: Path) -> None:
         record_search(env, make_agent(case.agent, env.scenario, **case.options), seeds[0], log)
 
 
-@dataclasses.dataclass(frozen=True)
-class Comparison:
-    """What a comparison is to run.
-
-    Attributes:
-        cases: each with its seeds.
-        sweep: the same of lots made fuller and emptier.
-        scenarios: all that there are.
-        maps: scenarios whose maps are wrong on purpose, and what these say, by name.
-        measured: the calibration; None where none is given.
-        options: of the agents, by name.
-    """
-
-    cases: list[tuple[Case, range]]
-    sweep: list[tuple[Case, range]]
-    scenarios: list[Scenario]
-    maps: dict[str, tuple[Scenario, float]]
-    measured: Calibration | None
-    options: dict[str, dict[str, Any]]
-
-
-def comparison_of(
-    *,
-    scenario: str | None,
-    lot: str | None,
-    occupancy: Path | None,
-    mapping: Path | None,
-    goal: str | None,
-    arrival: str | None,
-    days: str | None,
-    view_range: float | None,
-    sight: str | None,
-    sensors: str | None,
-    agents: str,
-    episodes: int,
-    failure_cost: str,
-    v_walk_kmh: str,
-    v_drive_kmh: str,
-    calibrated: Path | None,
-    occupancy_levels: str,
-    map_says: str | None,
-    solver: str,
-    budget_ms: float | None,
-    seed: int,
-) -> Comparison:
-    """What the options of `parkenv compare` ask for.
-
-    Raises:
-        InputError: options that cannot be used, by name.
-    """
-    from parkenv.evaluation.experiments.compare import UNSEEN, Case, at_occupancy, settings_of, unseen
-    from parkenv.world.occupancy import OccupancyProcess
-    from parkenv.world.scenario import KMH
-    from planners.agent import make_agent
-
-    names = args.words("--agents", agents)
-    sweeps = failure_cost == SWEEP
-    failure = list(args.SWEEP) if sweeps else args.costs("--failure-cost", failure_cost)
-    walk = args.speeds("--v-walk-kmh", v_walk_kmh)
-    drive = args.speeds("--v-drive-kmh", v_drive_kmh)
-    levels = [] if sweeps or occupancy_levels == "none" else _levels(occupancy_levels)
-    rig = args.rig_of(sensors)
-    sight = sight or ("perfect" if rig is None else "stereo" if rig == "stereo" else "laser")
-    scenarios = [
-        build(spec)
-        for spec in args.scenario_specs(
-            scenario, lot=lot, occupancy=occupancy, mapping=mapping, goal=goal, arrival=arrival, days=days,
-            sensor_model=sight, view_range=view_range,
-        )
-    ]  # fmt: skip
-    options: dict[str, dict[str, Any]] = {
-        "mdp": {"solver": solver}, "mdp-static": {"solver": solver},
-        "belief": {} if budget_ms is None else {"budget_ms": budget_ms},
-    }  # fmt: skip
-    for s in scenarios:
-        for name in names:
-            make_agent(name, s, **options.get(name, {}))
-    if sweeps and not set(names) - set(ON_SIGHT):
-        raise InputError(
-            f"--failure-cost sweep draws searches without sight, too, and {', '.join(names)} goes by sight; add an "
-            "agent that does not, such as mdp"
-        )
-    maps = _maps(map_says, scenarios)
-    scenarios += [flat for flat, _ in maps.values()]
-    if sweeps:
-        scenarios = [s for its in scenarios for s in (its, unseen(its))]
-
-    measured = None if calibrated is None else _calibration(calibrated, scenarios)
-
-    seeds = range(seed, seed + episodes)
-    cases = [
-        (Case(setting, name, rig=rig, options=options.get(name, {})), seeds)
-        for s in scenarios
-        for setting in settings_of(s, failure, walk, drive)
-        + (
-            settings_of(measured.applied(s), [measured.failure_s], walk, [measured.v_drive / KMH])
-            if measured
-            else []
-        )
-        for name in names
-        if not (s.name.endswith(UNSEEN) and name in ON_SIGHT)
-    ]
-    fewer = seeds[: max(1, episodes // 3)]
-    sweep = [
-        (Case(setting, name, level, rig, options.get(name, {})), fewer)
-        for s in scenarios
-        if isinstance(s.occupancy, OccupancyProcess) and s.name not in maps
-        for level in levels
-        for setting in settings_of(at_occupancy(s, level), failure, walk[:1], drive[:1])
-        for name in names
-    ]
-    return Comparison(cases, sweep, scenarios, maps, measured, options)
-
-
-def _maps(text: str | None, scenarios: list[Any]) -> dict[str, tuple[Any, float]]:
-    """Scenarios with flat maps and what these say, by name."""
-    from parkenv.world.flat_map import FlatMap
-
-    made = {}
-    for said in [] if text is None else sorted(args.numbers("--map-says", text)):
-        if not 0.0 <= said <= 1.0:
-            raise InputError(f"--map-says has {said:g}, want probabilities from 0 to 1")
-        for s in scenarios:
-            name = f"{s.name}{MAP_SAYS}{said:g}"
-            made[name] = (s.replace(name=name, prior=FlatMap(said, s.prior or s.occupancy)), said)
-    return made
-
-
-def _calibration(path: Path, scenarios: list[Any]) -> Any:
-    from parkenv.evaluation.trips.calibration import Calibration
-
-    measured = Calibration.from_file(path)
-    names = [s.name for s in scenarios]
-    if names != [measured.scenario]:
-        raise InputError(
-            f"--calibrated {path} was measured on {measured.scenario!r}, here are {', '.join(names)}; compare that "
-            "scenario alone, and without --failure-cost sweep"
-        )
-    return measured
-
-
-def _levels(text: str) -> list[float]:
-    levels = args.numbers("--occupancy-levels", text)
-    for level in levels:
-        if not 0.0 < level < 1.0:
-            raise InputError(f"--occupancy-levels has {level:g}, want fractions between 0 and 1, or none")
-    return sorted(levels)
-
-
-def run_with_bar(console: Console, cases: list[Any], folder: Any, workers: Any) -> bool:
-    """Run with a progress bar; whether Ctrl-C ended it."""
-    from parkenv.evaluation.experiments.compare import run_cases
-
-    progress = Progress(
+def episode_progress(console: Console) -> Progress:
+    """A progress bar that counts episodes."""
+    return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
@@ -426,13 +278,6 @@ def run_with_bar(console: Console, cases: list[Any], folder: Any, workers: Any) 
         TimeRemainingColumn(),
         console=console,
     )
-    with progress:
-        bar = progress.add_task("Searching", total=sum(len(seeds) for _, seeds in cases))
-        try:
-            run_cases(cases, folder, workers=workers, on_progress=lambda n: progress.advance(bar, n))
-        except KeyboardInterrupt:
-            return True
-    return False
 
 
 Column = tuple[str, Callable[[Row], str]]

@@ -49,10 +49,10 @@ def detect(
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.figures.survey_pictures import draw_detections
     from parkenv.files.atomic_write import atomic_write
-    from parkenv.perception.detector import Detector
+    from parkenv.perception.hog_detector import HogDetector
     from parkenv.perception.image_files import images_in, read_image
 
-    detector = Detector.load(*(model or ()), threshold=threshold, least_height=least_height)
+    detector = HogDetector.load(*(model or ()), threshold=threshold, least_height=least_height)
     chosen = [f for path in files for f in (images_in(path) if path.is_dir() else [path])]
     if out is not None:
         make_folder(out)
@@ -63,7 +63,7 @@ def detect(
         image = read_image(file)
         found = detector.detect(image)
         for box, p, end in zip(
-            found.boxes.tolist(), found.probability.tolist(), found.ends.tolist(), strict=True
+            found.boxes.tolist(), found.probability.tolist(), found.end_on.tolist(), strict=True
         ):
             view = "end" if end else "side"
             rows.append({"file": str(file), "box": box, "probability": p, "view": view})
@@ -151,7 +151,7 @@ def train_detector(
                 folds=folds,
                 seed=seed,
                 descriptor=descriptor,
-                ends=front,
+                end_on=front,
                 settings=settings,
                 progress=status.update,
             )
@@ -160,7 +160,7 @@ def train_detector(
             data.positives,
             data.negatives,
             descriptor=descriptor,
-            ends=front,
+            end_on=front,
             settings=settings,
             trained_on=f"{len(data.positives)} crops and {len(data.negatives)} others in {uiuc or crops}",
             progress=status.update,
@@ -205,7 +205,7 @@ def evaluate_detector(
     """
     from parkenv.evaluation.experiments.detector_scores import save_curves, score_on_uiuc
     from parkenv.evaluation.experiments.results import make_folder, write_summary
-    from parkenv.perception.detector import CarModel
+    from parkenv.perception.car_model import CarModel
 
     loaded = CarModel.load(model)
     make_folder(out)

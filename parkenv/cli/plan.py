@@ -16,14 +16,7 @@ from parkenv.scenarios.build import build
 
 
 def plan(
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            "--scenario",
-            help="A packaged scenario: campus, jam, street, mini.  [default: campus]",
-            rich_help_panel=args.WORLD,
-        ),
-    ] = None,
+    scenario: args.ScenarioOption = None,
     lot: args.LotOption = None,
     occupancy: args.OccupancyOption = None,
     mapping: args.MappingOption = None,
@@ -32,9 +25,9 @@ def plan(
     days: args.DaysOption = None,
     view_range: args.ViewRangeOption = None,
     agent: Annotated[str, typer.Option("--agent", help="A planning agent: mdp or mdp-static.")] = "mdp",
-    failure_cost: args.FailureCostOption = "10",
-    v_walk_kmh: args.WalkOption = "4",
-    v_drive_kmh: args.DriveOption = "10",
+    failure_cost: args.FailureCostOption = None,
+    v_walk_kmh: args.WalkOption = None,
+    v_drive_kmh: args.DriveOption = None,
     seed: args.SeedOption = 0,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for plan.png and summary.json.")] = Path(
         "results/plan"
@@ -54,14 +47,20 @@ def plan(
 
     from parkenv.evaluation.experiments.compare import Case, settings_of
     from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.spec import Grid
     from parkenv.evaluation.figures.picture_files import save_picture
     from parkenv.evaluation.figures.search_pictures import draw_searches
     from planners.agent import make_agent
     from planners.thesis.replanning import StaticAgent
 
-    failure = args.costs("--failure-cost", failure_cost)
-    walk = args.speeds("--v-walk-kmh", v_walk_kmh)
-    drive = args.speeds("--v-drive-kmh", v_drive_kmh)
+    grid = args.changed_axes(
+        Grid(),
+        {
+            "--failure-cost": ("failure_s", failure_cost),
+            "--v-walk-kmh": ("v_walk_kmh", v_walk_kmh),
+            "--v-drive-kmh": ("v_drive_kmh", v_drive_kmh),
+        },
+    )
     base = build(
         args.one_scenario(
             args.scenario_specs(
@@ -89,7 +88,7 @@ def plan(
     table = make_table(f"{base.name}: plans of {agent}, seed {seed}", headings)
     rows, traces = [], []
     with console.status("Planning"):
-        for setting in settings_of(base, failure, walk, drive):
+        for setting in settings_of(base, grid.failure_s, grid.v_walk_kmh, grid.v_drive_kmh):
             case = Case(setting, agent)
             trace = case.trace(seed)
             planner = make_agent(agent, setting)

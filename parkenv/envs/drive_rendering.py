@@ -1,4 +1,4 @@
-"""Pictures of a parking manoeuvre, from above."""
+"""Render a parking manoeuvre from above."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from parkenv.driving.drivable_area import DrivableArea
-from parkenv.driving.lot_space import Thing
+from parkenv.driving.collision_world import ObstacleKind
+from parkenv.driving.lot_outline import LotOutline
 from parkenv.driving.parking_task import REACH, ParkingTask
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, placed
 from parkenv.envs.drawing import (
@@ -28,7 +28,6 @@ from parkenv.envs.drive_state import DriveState
 from parkenv.envs.rendering import (
     ASPHALT,
     BELIEF_ANCHORS,
-    BUILDING,
     CAR,
     GAVE_UP,
     GLASS,
@@ -42,10 +41,11 @@ from parkenv.envs.rendering import (
     WALL,
     WHITE,
     WIDTH,
-    View,
+    MapView,
+    draw_outline,
 )
 from parkenv.envs.window import Window
-from parkenv.world.lot import ParkingLot, is_building
+from parkenv.world.lot import ParkingLot
 
 FloatArray = NDArray[np.float64]
 
@@ -68,7 +68,7 @@ _BODY = 0.5 * np.stack([np.sign(f) * np.abs(f) ** 0.3 for f in (np.cos(_ANGLE), 
 
 
 class DriveRenderer:
-    """Draws the manoeuvres on one lot, true to scale.
+    """Renderer of the manoeuvres on one lot, to scale.
 
     Args:
         lot: the lot.
@@ -76,17 +76,17 @@ class DriveRenderer:
 
     def __init__(self, lot: ParkingLot) -> None:
         self._lot = lot
-        self._area = DrivableArea(lot)
+        self._outline = LotOutline.of(lot)
         self._task: ParkingTask | None = None
         self._center: tuple[float, float] | None = None
         self.window = Window(f"parkenv: driving on {lot.name}")
 
     def frame(self, state: DriveState, outlines: Sequence[FloatArray] = ()) -> Image:
-        """The manoeuvre as it stands, (480, 640, 3) uint8 RGB.
+        """Render the current state, (480, 640, 3) uint8 RGB.
 
         Args:
             state: of an environment on the renderer's lot.
-            outlines: (k, 2) m, in their own frames, of those who move; where there are any.
+            outlines: (k, 2) m, in their own frames, of the moving road users, if there are any.
         """
         task = state.task
         if task is not self._task:
@@ -94,12 +94,12 @@ class DriveRenderer:
             ends = np.concatenate([task.vehicle.corners(task.start[:3]), _box(task.slot, *task.size)])
             low, high = ends.min(axis=0) - _MARGIN, ends.max(axis=0) + _MARGIN
             size = (float(WIDTH), float(HEIGHT - HUD))
-            self._view = View.fit(np.array([low, high]), size, LARGEST_SCALE)
+            self._view = MapView.fit(np.array([low, high]), size, LARGEST_SCALE)
         middle = task.vehicle.at_middle(state.vehicle[:3])[:2]
         inside = self._view(middle)
         center = (0.0, 0.0)
         if not ((inside > 30.0) & (inside < np.array([WIDTH, HEIGHT - HUD]) - 30.0)).all():
-            # The window moves on by steps, and where it lies follows from where the car is alone.
+            # The window moves in steps and depends on the car's place alone: equal states, equal frames.
             stride = np.array([WIDTH, HEIGHT - HUD]) / self._view.scale / 2
             along = (middle - task.slot[:2]) @ self._view.turn
             center = tuple((np.round(along / stride) * stride).tolist())
@@ -109,10 +109,10 @@ class DriveRenderer:
             if center != (0.0, 0.0):
                 at = task.slot[:2] + np.array(center) @ self._view.turn.T
                 turned = bool(self._view.turn[0, 0] == 0.0)
-                self._shown = View.around(
+                self._shown = MapView.around(
                     at, (float(WIDTH), float(HEIGHT - HUD)), self._view.scale, turned=turned
                 )
-            self._ground = _ground(self._lot, self._area, task, self._shown)
+            self._ground = _ground(self._lot, self._outline, task, self._shown)
         image = self._ground.copy()
         view = self._shown
         _draw_trail(image, view, state)
@@ -123,8 +123,8 @@ class DriveRenderer:
         return image
 
 
-def draw_movers(image: Image, view: View, poses: FloatArray, outlines: Sequence[FloatArray]) -> None:
-    """Who moves: cars and people, told apart by their size."""
+def draw_movers(image: Image, view: MapView, poses: FloatArray, outlines: Sequence[FloatArray]) -> None:
+    """Draw moving cars and people, distinguished by their size."""
     for outline, pose in zip(outlines, poses, strict=False):
         size = np.ptp(outline, axis=0)
         fill_polygon(image, view(placed(outline, pose)), MOVING)
@@ -133,12 +133,14 @@ def draw_movers(image: Image, view: View, poses: FloatArray, outlines: Sequence[
                 fill_polygon(image, view(placed(pane * size, pose)), GLASS)
 
 
-def draw_car(image: Image, view: View, vehicle: VehicleParameters, state: FloatArray, color: Color) -> None:
-    """A car with its wheels as they are steered.
+def draw_car(
+    image: Image, view: MapView, vehicle: VehicleParameters, state: FloatArray, color: Color
+) -> None:
+    """Draw a car with its steered wheels.
 
     Args:
         image: (h, w, 3) uint8, drawn upon.
-        view: how metres become pixels.
+        view: maps metres to pixels.
         vehicle: the car.
         state: (6,) as in `parkenv.driving.vehicle`.
         color: of its body.
@@ -156,8 +158,8 @@ def draw_car(image: Image, view: View, vehicle: VehicleParameters, state: FloatA
         fill_polygon(image, view(placed(pane * size, middle)), INK)
 
 
-def _draw_trail(image: Image, view: View, state: DriveState) -> None:
-    """Where the car's middle has been, and the car's outline where it started and where it changed direction."""
+def _draw_trail(image: Image, view: MapView, state: DriveState) -> None:
+    """Draw the path of the car's middle, and its outline at the start and at changes of direction."""
     vehicle, poses = state.task.vehicle, np.array(state.trail)
     color = mixed_color(ASPHALT, CAR, 0.75)
     step = np.diff(poses[:, :2], axis=0)
@@ -171,48 +173,42 @@ def _draw_trail(image: Image, view: View, state: DriveState) -> None:
     cv2.polylines(image, [points], False, color, 2, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
-def _ground(lot: ParkingLot, area: DrivableArea, task: ParkingTask, view: View) -> Image:
-    """All that stays, drawn at `SUPERSAMPLING` times the size and averaged down."""
-    fine = View(view.turn, view.scale * SUPERSAMPLING, view.shift * SUPERSAMPLING)
+def _ground(lot: ParkingLot, outline: LotOutline, task: ParkingTask, view: MapView) -> Image:
+    """Draw all that does not move at `SUPERSAMPLING` times the resolution, and average it down."""
+    fine = MapView(view.turn, view.scale * SUPERSAMPLING, view.shift * SUPERSAMPLING)
     shape = ((HEIGHT - HUD) * SUPERSAMPLING, WIDTH * SUPERSAMPLING)
     image = np.full((*shape, 3), GROUND, dtype=np.uint8)
 
     def thick(metres: float) -> int:
         return max(SUPERSAMPLING, round(metres * fine.scale))
 
-    def outline(points: FloatArray, color: Color, metres: float, *, closed: bool = False) -> None:
+    def stroke(points: FloatArray, color: Color, metres: float, *, closed: bool = False) -> None:
         pixels = fixed_point(fine(points))
         cv2.polylines(image, [pixels], closed, color, thick(metres), cv2.LINE_8, SUBPIXEL_BITS)
 
-    for wall in lot.walls:
-        if is_building(wall):
-            cv2.fillPoly(image, [fixed_point(fine(wall))], BUILDING, cv2.LINE_8, SUBPIXEL_BITS)
-    for part in shapely.get_parts(area.around(task.slot[:2], REACH)):
-        rings = [part.exterior, *part.interiors]
-        pixels = [fixed_point(fine(shapely.get_coordinates(ring))) for ring in rings]
-        cv2.fillPoly(image, pixels, ASPHALT, cv2.LINE_8, SUBPIXEL_BITS)
+    draw_outline(image, fine, outline, task.slot[:2], REACH, apron=0.0)
     near = np.flatnonzero(np.abs(lot.slot_xy - task.slot[:2]).max(axis=1) < REACH)
     for i in near.tolist():
-        outline(_box(np.array([*lot.slot_xy[i], lot.slot_yaw[i]]), lot.slot_length[i], lot.slot_width[i]), WHITE, _LINE,
+        stroke(_box(np.array([*lot.slot_xy[i], lot.slot_yaw[i]]), lot.slot_length[i], lot.slot_width[i]), WHITE, _LINE,
                 closed=True)  # fmt: skip
     own = fixed_point(fine(_box(task.slot, *task.size)))
     cv2.fillConvexPoly(image, own, mixed_color(ASPHALT, FREE, 0.75), cv2.LINE_8, SUBPIXEL_BITS)
-    outline(_box(task.slot, *task.size), WHITE, _LINE, closed=True)
+    stroke(_box(task.slot, *task.size), WHITE, _LINE, closed=True)
     nose = np.array([[0.5, 0.0], [-0.3, 0.55], [-0.1, 0.0], [-0.3, -0.55]])
     cv2.fillPoly(image, [fixed_point(fine(placed(nose, task.target)))], WHITE, cv2.LINE_8, SUBPIXEL_BITS)
-    for thing, points in zip(task.obstacles.thing.tolist(), task.obstacles.outlines(), strict=True):
-        if thing == Thing.PARKED_CAR:
+    for kind, points in zip(task.obstacles.kind.tolist(), task.obstacles.outlines(), strict=True):
+        if kind == ObstacleKind.PARKED_CAR:
             _draw_parked(image, fine, points)
-        elif thing == Thing.KERB:
-            outline(points, KERB, 0.2)
+        elif kind == ObstacleKind.KERB:
+            stroke(points, KERB, 0.2)
         else:
-            outline(points, WALL, 0.3)
+            stroke(points, WALL, 0.3)
     small = cv2.resize(image, (WIDTH, HEIGHT - HUD), interpolation=cv2.INTER_AREA)
     return np.vstack([small, np.full((HUD, WIDTH, 3), INK, np.uint8)])
 
 
-def _draw_parked(image: Image, view: View, outline: FloatArray) -> None:
-    """A parked car by its footprint alone: it is longer than wide, and its panes look the same both ways."""
+def _draw_parked(image: Image, view: MapView, outline: FloatArray) -> None:
+    """Draw a parked car from its footprint: longer than wide, its windows alike at both ends."""
     cv2.fillConvexPoly(image, fixed_point(view(outline)), PARKED_CAR, cv2.LINE_8, SUBPIXEL_BITS)
     box = shapely.get_coordinates(shapely.minimum_rotated_rectangle(shapely.Polygon(outline)))
     side = np.diff(box[:3], axis=0)
@@ -255,6 +251,6 @@ def _draw_hud(image: Image, state: DriveState) -> None:
 
 
 def _box(pose: FloatArray, length: float, width: float) -> FloatArray:
-    """Corners, (4, 2) m, of a rectangle."""
+    """Return the corners, (4, 2) m, of a rectangle."""
     half = 0.5 * np.array([length, width])
     return placed(half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]), pose)

@@ -3,57 +3,45 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.envs.lookout import Lookout, Moment
 from parkenv.envs.search import SearchEnv
 from parkenv.envs.search_control import SearchControl
 from parkenv.envs.search_state import SearchState
-from parkenv.envs.sensors import beside_the_lot
-from parkenv.mapping.slots import SlotFilter
+from parkenv.envs.sensor_sampler import SensorSampler
+from parkenv.envs.sensors import with_camera_images
+from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector import Detector
-from parkenv.perception.stack import Look, PerceptionStack
+from parkenv.perception.pipeline import PerceptionPipeline, PerceptionResult
+from parkenv.perception.slot_filter import SlotObservation
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 from sim_sensors.rig import SensorRig
 
 
-class Report(NamedTuple):
-    """What the stack said of the slots after a step.
-
-    Attributes:
-        slots: (k,) int64, those of which it could tell, ascending.
-        looks_taken: (k,) bool.
-    """
-
-    slots: NDArray[np.int64]
-    looks_taken: NDArray[np.bool_]
-
-
-_NOTHING = Report(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.bool_))
-
-
-class Watcher:
-    """A rig, the stack behind it, and what both tell a belief.
+class OnboardPerception:
+    """Sensors and perception pipeline of a searching car, and the belief update from what they observe.
 
     Args:
-        scenario: the world; where its sensor_model is perfect, what was measured of the rig takes its place.
-        rig, weather, captures, every: as in `Lookout`.
-        detector: the shipped models where None.
+        scenario: the world. If its sensor model is perfect, the fitted model of the rig replaces it, because the belief
+            update needs the error rates of the real observations.
+        rig, weather, captures, every: as in `SensorSampler`.
+        detector: a detector, or its name as in `make_detector`; None: the packaged HOG detector.
 
     Attributes:
-        scenario: with what the car takes its eyes to be worth.
-        lookout: what measures.
-        stack: what sees.
-        looks: what was captured last, oldest first, and what the stack made of it.
-        report: what that said of the slots.
+        scenario: the scenario with the sensor model of the belief update.
+        sampler: the simulated sensors.
+        pipeline: detection, ranging and slot filter.
+        results: what the pipeline made of the captures of the last step, oldest first.
+        observation: the slots observed in the last step, and their observed states.
 
     Raises:
-        InputError: an unknown rig or weather, a rig that cannot see or range, a number out of its range.
+        InputError: an unknown rig, weather or detector, a rig without camera or ranging sensor, or a number outside its
+            range.
     """
 
     def __init__(
@@ -63,44 +51,38 @@ class Watcher:
         weather: str | None = None,
         captures: int = 2,
         every: float = 1.25,
-        detector: Detector | None = None,
+        detector: str | Detector | None = None,
     ) -> None:
-        self.lookout = Lookout(scenario, rig, weather, captures, every)
-        self.stack = PerceptionStack(self.lookout.rig, detector)
+        self.sampler = SensorSampler(scenario, rig, weather, captures, every)
+        self.pipeline = PerceptionPipeline(self.sampler.rig, scenario.lot, detector)
         if scenario.sensor_model.perfect:
-            measured = SensorModel.named("laser" if self.lookout.rig.lasers else "stereo")
-            scenario = scenario.replace(sensor_model=measured)
+            fitted = SensorModel.named("laser" if self.sampler.rig.lasers else "stereo")
+            scenario = scenario.replace(sensor_model=fitted)
         self.scenario = scenario
         self._view_starts, self._view_slots = scenario.slots_in_view
         self._rates = scenario.sensor_rates
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
-        """Nothing has been captured."""
-        self.looks: list[tuple[Moment, Look]] = []
-        self.report = _NOTHING
+    def reset(self) -> None:
+        """Clear the results of the last step."""
+        self.results: tuple[PerceptionResult, ...] = ()
+        self.observation = SlotObservation.none()
 
-    def tell(self, control: SearchControl, vertex: int, moments: Sequence[Moment]) -> None:
-        """See what was captured on the way to the vertex where the car is, and take it into the belief.
+    def update_belief(self, control: SearchControl, vertex: int, captures: Sequence[TimedCapture]) -> None:
+        """Run the pipeline on the captures of a step, and update the belief with the observed slots.
 
         Args:
             control: of a search in this scenario.
             vertex: where the car is.
-            moments: oldest first.
+            captures: measured on the way there, oldest first.
         """
-        self.looks = [(moment, self.stack.look(moment.capture)) for moment in moments]
-        slots = SlotFilter(self.scenario.lot)
-        for _, look in self.looks:
-            for sweep in look.sweeps:
-                slots.see_through(sweep)
-            for view in look.views:
-                slots.see_cars(view.cars)
-        states = slots.states()
+        self.results, observed = self.pipeline.observe(captures)
         rows = slice(self._view_starts[vertex], self._view_starts[vertex + 1])
-        near, rates = self._view_slots[rows], self._rates.of(rows)
-        told = states.in_view[near] & (states.p_occupied[near] != 0.5)
-        self.report = Report(near[told], states.occupied[near[told]])
-        control.apply_observations(*self.report, rates.hit[told], rates.false_alarm[told])
+        # The sensor model has rates for the slots within its range only.
+        in_range, rates = self._view_slots[rows], self._rates.of(rows)
+        rated, used = np.isin(in_range, observed.slots), np.isin(observed.slots, in_range)
+        self.observation = SlotObservation(observed.slots[used], observed.taken[used])
+        control.apply_observations(*self.observation, rates.hit[rated], rates.false_alarm[rated])
 
 
 class SearchPerceptionEnv(SearchEnv):
@@ -162,50 +144,43 @@ class SearchPerceptionEnv(SearchEnv):
         weather: str | None = None,
         captures: int = 2,
         every: float = 1.25,
-        detector: Detector | None = None,
+        detector: str | Detector | None = None,
         **changes: Any,
     ) -> None:
-        self.watcher = Watcher(make_scenario(scenario, **changes), rig, weather, captures, every, detector)
-        super().__init__(self.watcher.scenario, render_mode)
+        world = make_scenario(scenario, **changes)
+        self.perception = OnboardPerception(world, rig, weather, captures, every, detector)
+        super().__init__(self.perception.scenario, render_mode)
         self._before: tuple[int, float] | None = None
 
     @property
     def rig(self) -> SensorRig:
-        """The sensors, where they sit, and how they are built."""
-        return self.watcher.lookout.rig
-
-    @property
-    def report(self) -> Report:
-        """What the stack said of the slots after the last step."""
-        return self.watcher.report
-
-    @property
-    def looks(self) -> list[tuple[Moment, Look]]:
-        """What was captured on the way of the last step, oldest first, and what the stack made of it."""
-        return list(self.watcher.looks)
+        """The sensors, their poses on the car, and their models."""
+        return self.perception.sampler.rig
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start a search; see the class."""
+        """Start an episode; see the class."""
         self._before = None
-        self.watcher.forget()
+        self.perception.reset()
         return super().reset(seed=seed, options=options)
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drive along an edge, or try to park; see the class."""
+        """Drive along an edge, or attempt to park; see the class."""
         self._before = (self.state.vertex, self.state.time)
         return super().step(action)
 
     def _advance(self, action: int) -> tuple[Any, ...]:
-        """Act; capture, detect, range, and tell the belief what the slots look like."""
+        """Act, measure on the way, and update the belief from the measurements."""
         control, state = self._control, self._state
         control.drive_or_park(action)
         state.extend_path()
         if not state.parked:
-            self.watcher.tell(control, state.vertex, self.watcher.lookout.look(state, self._before))
+            captures = self.perception.sampler.sample_step(state, self._before)
+            self.perception.update_belief(control, state.vertex, captures)
         return control.finish_step()
 
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
-        """The lot from above, and beside it the newest pictures."""
-        return beside_the_lot(super()._frame(state), [moment for moment, _ in self.watcher.looks], self.rig)
+        """Return the lot from above, with the newest camera images beside it."""
+        newest = self.perception.results[-1].captured if self.perception.results else None
+        return with_camera_images(super()._frame(state), newest, self.rig)

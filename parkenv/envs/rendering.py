@@ -1,4 +1,4 @@
-"""Pictures of a search, from above: frames for videos and windows, and text for terminals."""
+"""Render a search from above: frames for videos and windows, and text for terminals."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.driving.lot_outline import APRON, LotOutline
 from parkenv.envs.drawing import (
     SUBPIXEL_BITS,
     Color,
@@ -27,7 +28,7 @@ from parkenv.envs.drawing import (
 )
 from parkenv.envs.search_state import SearchState
 from parkenv.envs.window import Window
-from parkenv.world.lot import ParkingLot, is_building
+from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy import DAY_NAMES
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S
@@ -38,15 +39,15 @@ HUD = 34
 """Height, px, of the line of text below the map."""
 HUD_MARGIN = 14
 KEY_WIDTH = 172
-"""Place, px, that the key to the colours takes at the right of that line."""
+"""Width, px, of the colour key at the right of that line."""
 MARGIN = 8
-"""Ground, px, left around the lot."""
+"""Margin, px, around the lot."""
 SMALLEST_SLOT = 4.0
-"""Width, px, below which the map no longer shows the whole lot but a window that moves with the car."""
+"""Slot width, px, below which a frame shows a window that moves with the car instead of the whole lot."""
 WINDOW_SLOT = 9.0
 """Width, px, of a slot in such a window."""
 LARGEST_SCALE = 22.0
-"""px/m; a handful of slots need not fill the picture."""
+"""px/m; a few slots need not fill the frame."""
 SUPERSAMPLING = 4
 
 BELIEF_ANCHORS: tuple[Color, ...] = (
@@ -56,7 +57,7 @@ BELIEF_ANCHORS: tuple[Color, ...] = (
     (240, 150, 95),
     (192, 50, 25),
 )
-"""Colours of P(taken) = 0, 1/4, 1/2, 3/4, 1: greenish to red, told apart with any colour vision."""
+"""Colours of P(taken) = 0, 1/4, 1/2, 3/4, 1: greenish to red, distinguishable with any colour vision."""
 
 GROUND: Color = (226, 228, 221)
 ASPHALT: Color = (112, 116, 122)
@@ -70,21 +71,18 @@ WALK: Color = (24, 82, 186)
 GAVE_UP: Color = (255, 140, 90)
 WHITE: Color = (255, 255, 255)
 
-_LANE_WIDTH = 5.5  # m
 _LINE_WIDTH = 0.14  # m, paint between slots
-_APRON = 0.6  # m, by which asphalt is longer and wider than the slot on it
-_ASPHALT_GAP = 2.0  # m, what is narrower between asphalt is asphalt
 _EDGE = 3.0  # m, around the lot's features
 _PALENESS = 0.62
 
 TEXT_WIDTH, TEXT_ROWS = 78, 17
-"""Cells of the map in text: with its lines above and below it fits a terminal of 80 by 24."""
+"""Cells of the text map: with the lines above and below it fits a terminal of 80 by 24."""
 TEXT_CELL_LEAST, TEXT_CELL = 1.25, 3.5
-"""Width, m, of a cell; wider ones would lump slots together, so larger lots show a window around the car."""
+"""Least and largest width, m, of a cell; larger lots show a window around the car, so that slots stay apart."""
 
 
 def _belief_scale() -> Image:
-    """Colours, (2, 256, 3), of P(taken) = i/255: pale for slots not seen yet, full for those seen."""
+    """Colours, (2, 256, 3), of P(taken) = i/255: pale for unobserved slots, full for observed ones."""
     anchors = np.array(BELIEF_ANCHORS, dtype=np.float64)
     at = np.linspace(0.0, len(anchors) - 1.0, 256)
     full = np.stack([np.interp(at, np.arange(len(anchors)), channel) for channel in anchors.T], axis=1)
@@ -96,7 +94,7 @@ _BELIEF_SCALE = _belief_scale()
 
 
 def belief_colors(p_occupied: NDArray[np.floating], seen: NDArray[np.bool_]) -> Image:
-    """Colours, (n, 3) uint8 RGB, of slots that are taken with these probabilities, (n,)."""
+    """Return the colours, (n, 3) uint8 RGB, of slots with these probabilities of being taken, (n,)."""
     colors: Image = _BELIEF_SCALE[seen.astype(np.intp), np.round(255.0 * p_occupied).astype(np.intp)]
     return colors
 
@@ -116,8 +114,8 @@ def clock(time: float) -> str:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """How the lot is laid on a picture: `pixels = xy @ turn * scale + shift`.
+class MapView:
+    """Maps the lot's coordinates to pixels: `pixels = xy @ turn * scale + shift`.
 
     Attributes:
         turn: (2, 2), north up, or north to the right.
@@ -131,9 +129,9 @@ class View:
 
     @classmethod
     def fit(cls, xy: FloatArray, size: tuple[float, float], largest_scale: float = np.inf) -> Self:
-        """Show all points, (k, 2) m, in the middle of a picture of this width and height, px.
+        """Show all points, (k, 2) m, centred in a picture of this width and height, px.
 
-        North is up unless the points then come out a good deal smaller than with north to the right.
+        North is up, or to the right where that makes the lot more than 20 % larger.
         """
         low, high = xy.min(axis=0), xy.max(axis=0)
         extent = np.maximum(high - low, 1e-6)
@@ -145,7 +143,7 @@ class View:
     def around(
         cls, center: FloatArray, size: tuple[float, float], scale: float, *, turned: bool = False
     ) -> Self:
-        """Show the surroundings of a point, (2,) m, which comes to lie in the middle."""
+        """Show the surroundings of a point, (2,) m, which is the picture's centre."""
         turn = np.array([[0.0, 1.0], [1.0, 0.0]] if turned else [[1.0, 0.0], [0.0, -1.0]])
         return cls(turn, scale, np.array(size) / 2 - center @ turn * scale)
 
@@ -156,11 +154,11 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class _Ground:
-    """What stays the same from frame to frame, and where the slots' colours go.
+class StillLayer:
+    """What stays the same from frame to frame, and the pixels of the slots.
 
     Attributes:
-        view: where it lies.
+        view: of the frame.
         image: (HEIGHT, WIDTH, 3) uint8, the picture without slots.
         slots: (m,) int64, the slots in the picture.
         pixel: (k,) int64, index of each pixel that shows a slot, in the flattened picture.
@@ -170,7 +168,7 @@ class _Ground:
         car_cover: (k,) float32, the share of the pixel that it takes.
     """
 
-    view: View
+    view: MapView
     image: Image
     slots: NDArray[np.int64]
     pixel: NDArray[np.int64]
@@ -203,39 +201,44 @@ def _paint_slots(
 class SearchRenderer:
     """Draws the searches of one scenario.
 
-    Ground, slots and cars are laid out once with high resolution; a frame then only mixes colours, so its
-    cost does not grow with the number of slots. A lot whose slots would come out less than
-    `SMALLEST_SLOT` px wide is shown through a window around the car, which moves on in half its size.
+    Asphalt, slots and cars are drawn once with high resolution; a frame then only mixes colours, so its
+    cost does not grow with the number of slots. Of a lot whose slots would be less than `SMALLEST_SLOT` px
+    wide, a window around the car is shown, which moves in steps of half its size.
 
     Args:
         scenario: where the searches take place.
+
+    Attributes:
+        outline: the lot's shapes.
+        window: shows frames on the screen.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
-        self._ground: _Ground | None = None
+        self.outline = LotOutline.of(scenario.lot)
+        self._still: StillLayer | None = None
         self._window_at: tuple[int, int] | None = None
         self.window = Window(f"parkenv: {scenario.name}")
         self._size = (float(WIDTH), float(HEIGHT - HUD))
         lot = scenario.lot
         room = (self._size[0] - 2 * MARGIN, self._size[1] - 2 * MARGIN)
-        fitted = View.fit(_corners(lot), room, LARGEST_SCALE)
+        fitted = MapView.fit(_corners(lot), room, LARGEST_SCALE)
         self._slot_width = float(np.median(np.minimum(lot.slot_width, lot.slot_length)))
-        self._whole: View | None = None
+        self._whole: MapView | None = None
         if fitted.scale * self._slot_width >= SMALLEST_SLOT:
-            self._whole = View(fitted.turn, fitted.scale, fitted.shift + MARGIN)
+            self._whole = MapView(fitted.turn, fitted.scale, fitted.shift + MARGIN)
 
     def frame(self, state: SearchState, occupied: NDArray[np.bool_]) -> Image:
-        """The search as it stands, (480, 640, 3) uint8 RGB.
+        """Render the current state, (480, 640, 3) uint8 RGB.
 
-        A slot's colour is what the car believes, pale until it has seen the slot; the cars in the slots
-        are what is true, so this is a picture for spectators.
+        A slot's colour is the belief, pale until the slot has been observed; parked cars are the true
+        occupancy, so frames are for spectators, not for agents.
 
         Args:
             state: of an environment with the renderer's scenario.
-            occupied: (n_slots,) bool, the truth.
+            occupied: (n_slots,) bool, the true occupancy.
         """
-        ground = self._ground_for(state)
+        ground = self.still_layer(state)
         image = ground.image.copy()
         slots = ground.slots
         _paint_slots(
@@ -245,7 +248,7 @@ class SearchRenderer:
             ground.cover,
             ground.car,
             ground.car_cover,
-            belief_colors(state.belief.p_occupied[slots], state.belief.seen[slots]),
+            belief_colors(state.belief.p_occupied[slots], state.belief.observed[slots]),
             occupied[slots],
         )
         self._draw_trail(image, ground.view, state)
@@ -255,40 +258,45 @@ class SearchRenderer:
         return image
 
     def text(self, state: SearchState) -> str:
-        """The search as it stands, in at most 22 lines of 78 characters. Only what the car may know."""
+        """Render what the car knows as text, at most 22 lines of 78 characters."""
         lot, belief = self.scenario.lot, state.belief
         starts, seen_from = self.scenario.slots_in_view
         near = seen_from[starts[state.vertex] : starts[state.vertex + 1]]
-        looks = [f"{lot.slot_ids[s]} {'taken' if belief.p_occupied[s] > 0.5 else 'free'}" for s in near]
-        around = _fitting(looks, TEXT_WIDTH - len("in view: ")) or "no slot"
+        observations = [
+            f"{lot.slot_ids[s]} {'taken' if belief.p_occupied[s] > 0.5 else 'free'}" for s in near
+        ]
+        around = _fitting(observations, TEXT_WIDTH - len("in view: ")) or "no slot"
         lines = [
             f"{lot.name}: {self._place(state)}",
             f"{clock(state.time)}  elapsed {state.time - state.arrival.time:.1f} s  "
-            f"failed tries {state.failed_parks}  seen {int(belief.seen.sum())}/{lot.n_slots}",
+            f"failed attempts {state.failed_parks}  observed {int(belief.observed.sum())}/{lot.n_slots}",
             f"in view: {around}",
             *self._text_map(state),
-            "seen: o free  # taken   not seen: . likely free  : open  % likely taken",
+            "observed: o free  # taken   not: . likely free  : undecided  % likely taken",
             "<>^v car   + driven   G goal   E entry",
         ]
         return "\n".join(line[:TEXT_WIDTH] for line in lines)
 
-    def _ground_for(self, state: SearchState) -> _Ground:
+    def still_layer(self, state: SearchState) -> StillLayer:
+        """Return the layer of the lot's part that a frame shows."""
         if self._whole is not None:
-            if self._ground is None:
-                self._ground = _lay_out(self.scenario, self._whole)
-            return self._ground
-        # Where the window lies follows from where the car is alone: equal states, equal frames.
+            if self._still is None:
+                self._still = draw_still_layer(self.scenario.lot, self.outline, self._whole)
+            return self._still
+        # The window depends on the car's place alone: equal states, equal frames.
         scale = WINDOW_SLOT / self._slot_width
         stride = np.array(self._size) / scale / 2
         column, row = np.round(self.scenario.lot.vertex_xy[state.vertex] / stride).astype(int)
-        if self._ground is None or self._window_at != (column, row):
+        if self._still is None or self._window_at != (column, row):
             self._window_at = column, row
             center = np.array([column, row]) * stride
-            self._ground = _lay_out(self.scenario, View.around(center, self._size, scale))
-        return self._ground
+            self._still = draw_still_layer(
+                self.scenario.lot, self.outline, MapView.around(center, self._size, scale)
+            )
+        return self._still
 
     def _pose(self, state: SearchState) -> tuple[FloatArray, float]:
-        """Where the car stands, (2,) m, and its yaw."""
+        """Return the car's position, (2,) m, and yaw."""
         lot, vertex = self.scenario.lot, state.vertex
         if state.parked:
             return lot.slot_xy[vertex], float(lot.slot_yaw[vertex])
@@ -308,9 +316,9 @@ class SearchRenderer:
     def _text_map(self, state: SearchState) -> list[str]:
         lot, belief = self.scenario.lot, state.belief
         size = (TEXT_WIDTH - 1.0, 2.0 * TEXT_ROWS - 1.0)  # a character is twice as high as wide
-        view = View.fit(_corners(lot), size, 1 / TEXT_CELL_LEAST)
+        view = MapView.fit(_corners(lot), size, 1 / TEXT_CELL_LEAST)
         if view.scale < 1 / TEXT_CELL:
-            view = View.around(lot.vertex_xy[state.vertex], size, 1 / TEXT_CELL)
+            view = MapView.around(lot.vertex_xy[state.vertex], size, 1 / TEXT_CELL)
         rows = np.full((TEXT_ROWS, TEXT_WIDTH), " ")
 
         def put(xy: FloatArray, glyphs: NDArray[np.str_]) -> None:
@@ -321,7 +329,7 @@ class SearchRenderer:
         # Where slots share a cell, the one most likely free is written last.
         order = np.argsort(-belief.p_occupied, kind="stable")
         likely = np.searchsorted([1 / 3, 2 / 3], belief.p_occupied)
-        glyphs = np.where(belief.seen, np.array(list("oo#"))[likely], np.array(list(".:%"))[likely])
+        glyphs = np.where(belief.observed, np.array(list("oo#"))[likely], np.array(list(".:%"))[likely])
         put(lot.vertex_xy[state.path], np.full(len(state.path), "+"))
         put(lot.slot_xy[order], glyphs[order])
         put(lot.entries, np.full(len(lot.entries), "E"))
@@ -332,7 +340,7 @@ class SearchRenderer:
         put(xy[None], np.array([">v<^"[quarter]]))
         return ["".join(row).rstrip() for row in rows]
 
-    def _draw_trail(self, image: Image, view: View, state: SearchState) -> None:
+    def _draw_trail(self, image: Image, view: MapView, state: SearchState) -> None:
         xy = self.scenario.lot.vertex_xy[state.path]
         if state.parked:
             xy = np.vstack([xy, self.scenario.lot.slot_xy[state.vertex]])
@@ -346,7 +354,7 @@ class SearchRenderer:
                 image, [points[first : last + 1]], False, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS
             )
 
-    def _draw_goal(self, image: Image, view: View, state: SearchState) -> None:
+    def _draw_goal(self, image: Image, view: MapView, state: SearchState) -> None:
         lot = self.scenario.lot
         goal = view(lot.goals[self.scenario.goal])
         if state.parked:
@@ -370,7 +378,7 @@ class SearchRenderer:
         room = np.abs(ahead) @ [text_width(text, 13, 700) / 2, 6.0] + 16.0
         write_label(image, text, edge - room * ahead, WALK, 13, 700, halo=True)
 
-    def _draw_car(self, image: Image, view: View, state: SearchState) -> None:
+    def _draw_car(self, image: Image, view: MapView, state: SearchState) -> None:
         xy, yaw = self._pose(state)
         at = view(xy)
         if not state.parked:
@@ -379,7 +387,7 @@ class SearchRenderer:
             cv2.circle(image, tuple(center), radius, WHITE, 1, cv2.LINE_AA, SUBPIXEL_BITS)
         heading = np.array([np.cos(yaw), np.sin(yaw)]) @ view.turn
         turn = rotation(float(np.arctan2(heading[1], heading[0])))
-        # A car that is not to be lost from sight may come out larger than life.
+        # A small car is drawn larger than to scale, to stay visible.
         length = max(4.4 * view.scale, 17.0)
         for part, color, swell in (
             (_BODY, INK, 3.0),
@@ -409,7 +417,7 @@ class SearchRenderer:
 
 
 def _fitting(words: list[str], width: int) -> str:
-    """As many words as fit, and how many more there are."""
+    """Join as many words as fit, and the number of the others."""
     for n in range(len(words), 0, -1):
         text = ", ".join(words[:n]) + (f", +{len(words) - n}" if n < len(words) else "")
         if len(text) <= width:
@@ -423,7 +431,7 @@ def _corners(lot: ParkingLot) -> FloatArray:
 
 
 def _way_in(lot: ParkingLot, vertex: int) -> FloatArray:
-    """Unit vector, (2,), along the edge out of a vertex that leads most toward the slots."""
+    """Return the unit vector, (2,), of the edge out of a vertex that leads most toward the slots."""
     ahead = lot.vertex_xy[lot.neighbors[vertex][lot.neighbors[vertex] >= 0]] - lot.vertex_xy[vertex]
     if not len(ahead):
         return np.array([1.0, 0.0])
@@ -432,10 +440,38 @@ def _way_in(lot: ParkingLot, vertex: int) -> FloatArray:
     return best
 
 
-def _lay_out(scenario: Scenario, view: View) -> _Ground:
-    """Draw all that stays, at `SUPERSAMPLING` times the size, and average it down."""
-    lot = scenario.lot
-    fine = View(view.turn, view.scale * SUPERSAMPLING, view.shift * SUPERSAMPLING)
+def draw_outline(
+    image: Image,
+    view: MapView,
+    outline: LotOutline,
+    center: FloatArray,
+    reach: float,
+    *,
+    apron: float = APRON,
+) -> None:
+    """Draw buildings, asphalt and walls.
+
+    Args:
+        image: (h, w, 3) uint8, drawn upon.
+        view: of the image, which has `SUPERSAMPLING` times the resolution of the frame.
+        outline: of the lot.
+        center: (2,) m, of the part to draw.
+        reach: m, how far from there along both axes it has to be complete.
+        apron: m, of asphalt beyond the kerbs.
+    """
+    for building in outline.buildings:
+        cv2.fillPoly(image, [fixed_point(view(building))], BUILDING, cv2.LINE_8, SUBPIXEL_BITS)
+    for rings in outline.paved(center, reach, apron=apron):
+        pixels = [fixed_point(view(ring)) for ring in rings]
+        cv2.fillPoly(image, pixels, ASPHALT, cv2.LINE_8, SUBPIXEL_BITS)
+    thickness = max(SUPERSAMPLING, round(0.3 * view.scale))
+    for wall in (*outline.buildings, *outline.walls):
+        cv2.polylines(image, [fixed_point(view(wall))], False, WALL, thickness, 8, SUBPIXEL_BITS)
+
+
+def draw_still_layer(lot: ParkingLot, outline: LotOutline, view: MapView) -> StillLayer:
+    """Draw all that does not move, at `SUPERSAMPLING` times the resolution, and average it down."""
+    fine = MapView(view.turn, view.scale * SUPERSAMPLING, view.shift * SUPERSAMPLING)
     shape = ((HEIGHT - HUD) * SUPERSAMPLING, WIDTH * SUPERSAMPLING)
     at = view(lot.slot_xy)
     reach = view.scale * float(np.hypot(lot.slot_length, lot.slot_width).max()) / 2
@@ -446,33 +482,17 @@ def _lay_out(scenario: Scenario, view: View) -> _Ground:
     length, width = lot.slot_length[slots, None, None], lot.slot_width[slots, None, None]
 
     def placed(part: FloatArray, long: FloatArray, wide: FloatArray) -> NDArray[np.int32]:
-        """A part of unit size, (k, 2), at every slot, (m, k, 2) fixed-point pixels."""
+        """Place a part of unit size, (k, 2), in every slot; (m, k, 2) fixed-point pixels."""
         xy = lot.slot_xy[slots, None] + part[:, :1] * long * along + part[:, 1:] * wide * left
         return fixed_point(fine(xy))
 
     image = np.full((*shape, 3), GROUND, dtype=np.uint8)
-    for wall in lot.walls:
-        if is_building(wall):
-            cv2.fillPoly(image, [fixed_point(fine(wall))], BUILDING, cv2.LINE_8, SUBPIXEL_BITS)
-    asphalt = np.zeros(shape, dtype=np.uint8)
-    lane_width = max(1, round(_LANE_WIDTH * fine.scale))
-    for lane in lot.lanes:
-        cv2.polylines(asphalt, [fixed_point(fine(lane.points))], False, 1, lane_width, 8, SUBPIXEL_BITS)
-    mouths = fixed_point(fine(lot.vertex_xy[slots]))[:, None]
-    for corners in np.concatenate([placed(_BOX, length + _APRON, width + _APRON), mouths], axis=1):
-        cv2.fillConvexPoly(asphalt, cv2.convexHull(corners), 1, 8, SUBPIXEL_BITS)
-    gap = max(1, round(_ASPHALT_GAP * fine.scale))
-    # Closing fills whatever is narrow, also between asphalt and the picture's edge: keep that away.
-    asphalt = cv2.copyMakeBorder(asphalt, gap, gap, gap, gap, cv2.BORDER_REPLICATE)
-    asphalt = cv2.morphologyEx(asphalt, cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8))
-    image[asphalt[gap:-gap, gap:-gap] > 0] = ASPHALT
-    for wall in lot.walls:
-        thickness = max(SUPERSAMPLING, round(0.3 * fine.scale))
-        cv2.polylines(image, [fixed_point(fine(wall))], False, WALL, thickness, 8, SUBPIXEL_BITS)
-    for xy, vertex in zip(lot.entries, lot.entry_vertices, strict=True):
-        way = _way_in(lot, int(vertex)) @ view.turn
-        arrow = SUPERSAMPLING * _ENTRY_MARK @ rotation(float(np.arctan2(way[1], way[0])))
-        fill_polygon(image, fine(xy) + arrow, WHITE)
+    center = (np.array([WIDTH, HEIGHT - HUD]) / 2 - view.shift) @ view.turn.T / view.scale
+    draw_outline(image, fine, outline, center, max(WIDTH, HEIGHT) / 2 / view.scale)
+    for x, y, yaw in outline.entries:
+        onward = np.array([np.cos(yaw), np.sin(yaw)]) @ view.turn
+        arrow = SUPERSAMPLING * _ENTRY_MARK @ rotation(float(np.arctan2(onward[1], onward[0])))
+        fill_polygon(image, fine(np.array([x, y])) + arrow, WHITE)
 
     label = np.full(shape, -1, dtype=np.int32)
     cars = np.zeros((*shape, 3), dtype=np.uint8)
@@ -495,31 +515,31 @@ def _lay_out(scenario: Scenario, view: View) -> _Ground:
     pixel = np.flatnonzero(owner >= 0)
     owner = owner.ravel()[pixel]
     blocks = blocks.reshape(len(blocks) * WIDTH, -1)[pixel]
-    mine = blocks == owner[:, None]
+    own = blocks == owner[:, None]
     cars_here = _blocks(has_car).reshape(-1, SUPERSAMPLING**2)[pixel]
     colors = np.stack([_blocks(cars[..., c]).reshape(-1, SUPERSAMPLING**2)[pixel] for c in range(3)], axis=-1)
     small = cv2.resize(image, (WIDTH, HEIGHT - HUD), interpolation=cv2.INTER_AREA)
-    return _Ground(
+    return StillLayer(
         view=view,
-        image=_furnished(np.vstack([small, np.full((HUD, WIDTH, 3), INK, np.uint8)]), view),
+        image=_with_key(np.vstack([small, np.full((HUD, WIDTH, 3), INK, np.uint8)]), view),
         slots=slots,
         pixel=pixel,
         slot=owner.astype(np.int64),
-        cover=mine.mean(axis=1, dtype=np.float32),
+        cover=own.mean(axis=1, dtype=np.float32),
         car=(colors * cars_here[..., None]).mean(axis=1, dtype=np.float32),
         car_cover=cars_here.mean(axis=1, dtype=np.float32),
     )
 
 
 def _blocks(fine: NDArray[Any]) -> NDArray[Any]:
-    """The fine pixels of each pixel, (rows, columns, SUPERSAMPLING ** 2)."""
+    """Group the fine pixels by pixel, (rows, columns, SUPERSAMPLING ** 2)."""
     rows, columns = fine.shape[0] // SUPERSAMPLING, fine.shape[1] // SUPERSAMPLING
     split = fine.reshape(rows, SUPERSAMPLING, columns, SUPERSAMPLING)
     return split.swapaxes(1, 2).reshape(rows, columns, SUPERSAMPLING**2)
 
 
-def _furnished(image: Image, view: View) -> Image:
-    """Add what belongs to the picture, not to the lot: the colours' key and the north."""
+def _with_key(image: Image, view: MapView) -> Image:
+    """Add the colour key and the north arrow."""
     top = HEIGHT - HUD // 2 - 6
     right = WIDTH - HUD_MARGIN
     write_label(image, "taken", np.array([right - 18.0, top + 6.0]), WHITE, 13, 400)

@@ -148,13 +148,18 @@ def finish_step_in(address: int) -> tuple[Any, ...]:
 
 
 @kernel
-def read_belief(address: int, p: FloatArray, observed: BoolArray) -> None:
-    """Write the belief in observed slots, and which they are, over a forecast, (n_slots,) each."""
+def read_belief(
+    address: int, p_occupied: FloatArray, p_observed: FloatArray, observed_at: FloatArray
+) -> None:
+    """Write the belief in observed slots over arrays that hold the forecast, (n_slots,) each."""
     search = search_at(address, 0)
     for column in range(1, search.n_columns + 1):
-        record = slot_at(search.slots, column)
-        p[record.slot] = belief_now(search, column)
-        observed[record.slot] = record.observed
+        record, i = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
+        p_occupied[record.slot] = belief_now(search, column)
+        if record.observed:
+            block = block_at(search.blocks, column >> BLOCK_BITS)
+            p_observed[record.slot] = block.p_observed[i]
+            observed_at[record.slot] = block.observed_at[i] - search.arrival
 
 
 # ---- an episode

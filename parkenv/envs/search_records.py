@@ -150,7 +150,7 @@ SLOT = np.dtype(
     ],
     align=True,
 )
-"""A slot with a column: its truth as in CURSOR; whether it was observed, and taken at last; if the car stopped there."""
+"""A slot with a column: its truth as in CURSOR; if it was observed, and taken at last; if the car stopped there."""
 
 BLOCK_BITS = 3
 BLOCK_SIZE = 1 << BLOCK_BITS

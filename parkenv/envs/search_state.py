@@ -49,12 +49,13 @@ class SearchState:
 
     @property
     def belief(self) -> SlotBelief:
-        """What the car believes now, a copy."""
+        """The belief about the slots now, a copy, in float64."""
         forecast = self._scenario.forecast(self.arrival)
-        p, seen = forecast.p_occupied.copy(), np.zeros(len(forecast.p_occupied), dtype=np.bool_)
-        read_belief(self._searches.address, p, seen)
-        n_known_taken = int(self._record["n_known_taken"])
-        return SlotBelief(forecast.p_occupied, forecast.decay_rate, p, seen, n_known_taken)
+        belief = SlotBelief.of_forecast(forecast.p_occupied, forecast.decay_rate)
+        belief.p_occupied, belief.p_observed = belief.forecast.copy(), belief.forecast.copy()
+        read_belief(self._searches.address, belief.p_occupied, belief.p_observed, belief.observed_at)
+        belief.time = self.time - self.arrival.time
+        return belief
 
     @property
     def vertex(self) -> int:

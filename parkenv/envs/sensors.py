@@ -9,9 +9,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.envs.lookout import Lookout, Moment
 from parkenv.envs.search import LATEST, SearchEnv
 from parkenv.envs.search_state import SearchState
+from parkenv.envs.sensor_sampler import SensorSampler
+from parkenv.perception.capture import TimedCapture
 from parkenv.world.scenario import Scenario
 from sim_sensors.rig import SensorRig
 
@@ -96,10 +97,10 @@ class SearchSensorsEnv(SearchEnv):
         **changes: Any,
     ) -> None:
         super().__init__(scenario, render_mode, **changes)
-        self._lookout = Lookout(self.scenario, rig, weather, captures, every)
+        self._sampler = SensorSampler(self.scenario, rig, weather, captures, every)
         self._before: tuple[int, float] | None = None
-        self._moments: list[Moment] = []
-        k = self._lookout.captures
+        self._captures: list[TimedCapture] = []
+        k = self._sampler.captures
         seen: dict[str, spaces.Space[Any]] = {
             name: space for name, space in self.observation_space.items() if name not in _NOT_SENSED
         }
@@ -117,31 +118,31 @@ class SearchSensorsEnv(SearchEnv):
 
     @property
     def rig(self) -> SensorRig:
-        """The sensors, where they sit, and how they are built."""
-        return self._lookout.rig
+        """The sensors, their poses on the car, and their models."""
+        return self._sampler.rig
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start a search; see the class."""
+        """Start an episode; see the class."""
         self._before = None
         return super().reset(seed=seed, options=options)
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drive along an edge, or try to park; see the class."""
+        """Drive along an edge, or attempt to park; see the class."""
         self._before = (self.state.vertex, self.state.time)
         return super().step(action)
 
     def _observation(self, state: SearchState) -> dict[str, Any]:
-        self._moments = [] if state.parked else self._lookout.look(state, self._before)
+        self._captures = [] if state.parked else self._sampler.sample_step(state, self._before)
         observation = super()._observation(state)
         for name in _NOT_SENSED:
             del observation[name]
         for name, space in self.observation_space.items():
             if name not in observation:
                 observation[name] = np.zeros(space.shape, space.dtype)
-        observation["count"] = np.int64(len(self._moments))
-        for i, (time, capture) in enumerate(self._moments):
+        observation["count"] = np.int64(len(self._captures))
+        for i, (time, capture) in enumerate(self._captures):
             observation["pose"][i] = capture.pose
             observation["captured_at"][i] = time - state.arrival.time
             for name, frame in capture.images.items():
@@ -153,19 +154,24 @@ class SearchSensorsEnv(SearchEnv):
         return observation
 
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
-        """The lot from above, and beside it the newest pictures."""
-        return beside_the_lot(super()._frame(state), self._moments, self.rig)
+        """Return the lot from above, with the newest camera images beside it."""
+        newest = self._captures[-1] if self._captures else None
+        return with_camera_images(super()._frame(state), newest, self.rig)
 
 
-def beside_the_lot(view: NDArray[np.uint8], moments: list[Moment], rig: SensorRig) -> NDArray[np.uint8]:
-    """A frame, (h, w, 3), with the newest picture of every camera of the rig on its right."""
+def with_camera_images(
+    frame: NDArray[np.uint8], newest: TimedCapture | None, rig: SensorRig
+) -> NDArray[np.uint8]:
+    """Append the newest image of every camera of the rig to the right of a frame, (h, w, 3).
+
+    Without a capture the images are black: every frame of a video must have the same width.
+    """
     pictures = []
-    for _, capture in moments[-1:]:
-        pictures += [frame.image for frame in capture.images.values()]
-        pictures += [pair.left.image for pair in capture.pairs.values()]
-    height = view.shape[0]
-    # Every frame of a video must be as wide as the first, whatever is there to be seen.
+    if newest is not None:
+        pictures += [image.image for image in newest.capture.images.values()]
+        pictures += [pair.left.image for pair in newest.capture.pairs.values()]
+    height = frame.shape[0]
     while len(pictures) < len(rig.cameras) + len(rig.stereo_cameras):
-        pictures.append(np.zeros_like(view))
-    beside = [cv2.resize(p, (round(p.shape[1] * height / p.shape[0]), height)) for p in pictures]
-    return np.concatenate([view, *beside], axis=1)
+        pictures.append(np.zeros_like(frame))
+    resized = [cv2.resize(p, (round(p.shape[1] * height / p.shape[0]), height)) for p in pictures]
+    return np.concatenate([frame, *resized], axis=1)

@@ -111,7 +111,7 @@ class Spec(BaseModel):
         except ValidationError as error:
             raise InputError(_message(cls, error, source)) from error
 
-    def changed(self, source: str = "", **changes: Any) -> Self:
+    def changed(self, source: str = "", /, **changes: Any) -> Self:
         """A copy with some fields changed, validated again.
 
         Args:
@@ -128,6 +128,18 @@ class Spec(BaseModel):
         """Write it as JSON, whole or not at all; fields at their defaults are written, too."""
         with atomic_write(path) as beside:
             beside.write_text(json.dumps(self.tables(), indent=2) + "\n", encoding="utf-8")
+
+    def files(self) -> list[Path]:
+        """Every file that it names, at any depth."""
+        found: list[Path] = []
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            for part in value if isinstance(value, tuple) else (value,):
+                if isinstance(part, Path):
+                    found.append(part)
+                elif isinstance(part, Spec):
+                    found += part.files()
+        return list(dict.fromkeys(found))
 
     def tables(self) -> dict[str, Any]:
         """Plain JSON values, without fields that are not set."""
@@ -167,21 +179,33 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 def _message(model: type[BaseModel], error: ValidationError, source: str) -> str:
     details = error.errors(include_url=False)
+    # A list is also too short without its invalid items.
+    details = [d for d in details if d["type"] != "too_short"] or details
     # A misspelt key first: it explains a missing one.
     first = min(details, key=lambda d: d["type"] != "extra_forbidden")
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
-    return f"{source}{': ' if source else ''}{_fault(model, first)}{more}"
+    if source.startswith("--"):
+        # An option is the field.
+        return _fault(model, first, source)
+    field = ".".join(str(part) for part in first["loc"])
+    return f"{source}{': ' if source else ''}{_fault(model, first, field)}{more}"
 
 
-def _fault(model: type[BaseModel], detail: ErrorDetails) -> str:
+def _fault(model: type[BaseModel], detail: ErrorDetails, field: str) -> str:
     location, kind = detail["loc"], detail["type"]
-    field = ".".join(str(part) for part in location)
     if kind == "extra_forbidden":
         place = f" in [{field.rpartition('.')[0]}]" if len(location) > 1 else ""
         return f"unknown key {location[-1]!r}{place}; {nearest(str(location[-1]), _keys_at(model, location[:-1]))}"
     wanted = detail["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    context = detail.get("ctx", {})
     if kind in _WANTED:
-        wanted = _WANTED[kind].format(**detail.get("ctx", {}))
+        wanted = _WANTED[kind].format(
+            **{k: f"{v:.7g}" for k, v in context.items() if isinstance(v, int | float)}
+        )
+    if isinstance(context.get("error"), InputError):
+        return f"{field}: {wanted}"
+    if kind == "whole":
+        return wanted
     if kind == "missing":
         return f"{field} is missing"
     value = repr(detail["input"])

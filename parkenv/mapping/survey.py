@@ -1,4 +1,4 @@
-"""Drive past every slot, see, and remember: a session of the survey (T §3.3, §4)."""
+"""One survey session: drive past every slot, and estimate which are taken (T §3.3, §4)."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from parkenv.errors import InputError
 from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.odometry import PoseNoise
 from parkenv.mapping.route import SurveyRoute, survey_route
-from parkenv.mapping.slots import SlotFilter, SlotStates
 from parkenv.mapping.store import Session
 from parkenv.mapping.survey_score import SurveyScore
-from parkenv.perception.ranging import CarSightings
-from parkenv.perception.stack import Look, PerceptionStack
+from parkenv.perception.capture import TimedCapture
+from parkenv.perception.detector_registry import DEFAULT_DETECTOR, detector_version
+from parkenv.perception.pipeline import CameraView, PerceptionPipeline, PerceptionResult, localize_as_thesis
+from parkenv.perception.slot_filter import SlotFilter, SlotStates
 from parkenv.world.keyed_random import world_key
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.occupancy import Arrival, ArrivalWindow
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
-from sim_sensors.rig import RIG_NAMES, Capture, SensorRig, poses_along
+from sim_sensors.rig import RIG_NAMES, SensorRig, poses_along
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -37,13 +38,14 @@ class SurveySettings:
     """How a survey is driven.
 
     Args:
-        rig: `laser`: the thesis's camera and 270° laser; `stereo`: a stereo pair alone; `both_sides`: a second camera,
-            to the left, beside the laser, so that aisles with slots on either side are driven once.
+        rig: `laser`: the thesis's camera and 270° laser; `stereo`: a stereo camera alone; `both_sides`: a laser, a
+            camera to the right and one to the left, so that aisles with slots on both sides are driven once.
         every: m between captures.
-        weather: one of the presets; None draws one for each session.
-        windows: when sessions begin; the k-th session takes the k-th, round and round.
-        pose_noise: how wrong the car is about where it is.
+        weather: one of `sim_sensors.camera.weather.PRESETS`; None draws one for each session.
+        windows: when sessions begin; the k-th session uses the k-th window, cyclically.
+        pose_noise: the vehicle's localisation error.
         seed: of worlds, weather and noise.
+        detector: as `make_detector` takes it: `hog`, `side`, `front`, a model file or `MODULE:CLASS`.
 
     Raises:
         InputError: an unknown rig or weather, no window, or a distance that is not positive.
@@ -55,6 +57,7 @@ class SurveySettings:
     windows: tuple[ArrivalWindow, ...] = (ArrivalWindow(),)
     pose_noise: PoseNoise = field(default_factory=PoseNoise)
     seed: int = 0
+    detector: str = DEFAULT_DETECTOR
 
     def __post_init__(self) -> None:
         if self.rig not in RIG_NAMES:
@@ -69,18 +72,18 @@ class SurveySettings:
 
 @dataclass(frozen=True, eq=False)
 class SessionResult:
-    """A session, what it found, and how right that is.
+    """A session, its estimates, and their errors.
 
     Attributes:
-        session: for the map file.
-        arrival: when it began.
-        states: what the filter knows at the end.
-        truth: (n_slots,) bool, taken at the last look at it; when the drive began where there was none.
-        parked: how many cars stood in slots then, and `found`, how many of them were detected.
-        score: what else was right and wrong.
-        frame_s: (f,) s, that each capture took to be understood.
-        grid: of the session.
-        looks: some captures that show many cars, with what was made of them, for pictures.
+        session: the record for the map file.
+        arrival: when the session began.
+        states: the filter's estimate at the end.
+        truth: (n_slots,) bool, taken when the slot was last observed, or when the drive began if it never was.
+        parked: number of cars that stood in slots then; `found`: how many of them were detected.
+        score: errors of detection and localisation.
+        frame_s: (f,) s, processing time of each capture.
+        grid: the occupancy grid of the session.
+        shown: results of some captures with many cars, for pictures.
     """
 
     session: Session
@@ -92,75 +95,71 @@ class SessionResult:
     score: SurveyScore
     frame_s: FloatArray
     grid: OccupancyGrid
-    looks: tuple[tuple[Capture, Look], ...]
+    shown: tuple[PerceptionResult, ...]
 
     @property
     def slot_accuracy(self) -> float:
-        """Share of all slots whose state is right; unknown ones are not."""
+        """Fraction of all slots whose state is right; unknown slots count as wrong."""
         return float(((self.states.occupied == self.truth) & self.states.in_view).mean())
 
     @property
     def slot_accuracy_seen(self) -> float:
-        """Share of the slots in view whose state is right."""
+        """Fraction of the slots with evidence whose state is right."""
         seen = self.states.in_view
         return float((self.states.occupied == self.truth)[seen].mean()) if seen.any() else float("nan")
 
 
-class SurveyMoment(NamedTuple):
-    """What a session has come to after one capture.
+class SurveyFrame(NamedTuple):
+    """The state of a session after one capture.
 
-    Grid and slots are the session's own, which go on changing; who keeps them copies them.
+    Grid and slots are those of the session, which keep changing: copy them to keep them.
 
     Attributes:
-        time: s since Monday 00:00.
-        capture: what was measured.
-        look: what was made of it.
-        grid: of the session so far.
-        slots: what is known of the slots so far.
-        truth: (n_slots,) bool, what stands in the slots now; for pictures and scores only.
+        result: what the pipeline made of the capture.
+        grid: the occupancy grid so far.
+        slots: the slot filter so far.
+        truth: (n_slots,) bool, which slots are taken now; for pictures and scores only.
     """
 
-    time: float
-    capture: Capture
-    look: Look
+    result: PerceptionResult
     grid: OccupancyGrid
     slots: SlotFilter
     truth: BoolArray
 
 
 class Survey:
-    """Sessions in a scenario's world.
+    """Survey sessions in a scenario's world.
 
     Args:
         scenario: lot, occupancy and traffic.
         settings: how to drive.
-        stack: of the settings' rig; made with the shipped models where None.
     """
 
-    def __init__(
-        self, scenario: Scenario, settings: SurveySettings | None = None, stack: PerceptionStack | None = None
-    ) -> None:
+    def __init__(self, scenario: Scenario, settings: SurveySettings | None = None) -> None:
         self.scenario = scenario
         self.settings = settings or SurveySettings()
-        self.stack = stack or PerceptionStack(SensorRig.named(self.settings.rig))
+        rig = SensorRig.named(self.settings.rig)
+        self.pipeline = PerceptionPipeline(rig, scenario.lot, self.settings.detector)
         self.route: SurveyRoute = survey_route(scenario.lot, both_sides=self.settings.rig == "both_sides")
         self._slots = slot_lot(scenario.lot)
 
     def key_of(self, number: int) -> str:
-        """What the map file calls a session: equal for equal drives."""
+        """Return the key of a session in the map file, equal for equal drives."""
         s = self.settings
         noise = f"{s.pose_noise.position:g}m{s.pose_noise.heading:g}rad"
-        return f"{self.scenario.name}/{s.rig}/{s.weather or 'any'}/{s.every:g}m/{noise}/seed{s.seed}/{number:05d}"
+        detector = "" if s.detector == DEFAULT_DETECTOR else f"{detector_version(s.detector)}/"
+        drive = f"{s.rig}/{s.weather or 'any'}/{s.every:g}m/{noise}/{detector}seed{s.seed}"
+        return f"{self.scenario.name}/{drive}/{number:05d}"
 
     def drive(
-        self, number: int, *, pictures: int = 0, on_moment: Callable[[SurveyMoment], None] | None = None
+        self, number: int, *, pictures: int = 0, on_frame: Callable[[SurveyFrame], None] | None = None
     ) -> SessionResult:
-        """Drive one session: at every pose detect, range, and update grid and slots.
+        """Drive one session: capture at every pose, run the pipeline, and update the grid.
 
         Args:
             number: 0 or more; equal numbers are equal drives.
-            pictures: how many captures to keep.
-            on_moment: told of every capture, for those who watch.
+            pictures: how many results to keep for pictures.
+            on_frame: called after every capture.
         """
         scenario, settings, lot = self.scenario, self.settings, self.scenario.lot
         key = world_key(settings.seed, number)
@@ -173,43 +172,37 @@ class Survey:
         weather = Weather.draw(preset, int(key) % _SEEDS)
 
         poses = poses_along(self.route.path, settings.every)
-        believed = settings.pose_noise.estimated(poses, rng)
+        estimated = settings.pose_noise.estimated(poses, rng)
         times = arrival.time + settings.every / scenario.v_drive * np.arange(len(poses))
-        # Of each stretch of the way, the capture that shows most.
-        shown: dict[int, tuple[int, Capture, Look]] = {}
+        # Of each section of the route, the capture with most cars.
+        shown: dict[int, PerceptionResult] = {}
 
         slots, score = SlotFilter(lot), SurveyScore(lot.n_slots)
-        last_look = np.full(lot.n_slots, arrival.time)
+        observed_at = np.full(lot.n_slots, arrival.time)
         low_x, low_y, high_x, high_y = lot.bounds()
         grid = OccupancyGrid((low_x - 2.0, low_y - 2.0), (high_x + 2.0, high_y + 2.0), 0.25)
         cars: list[FloatArray] = []
         frame_s = []
-        for i, (pose, belief, time) in enumerate(zip(poses, believed, times.tolist(), strict=True)):
+        for i, (pose, vehicle, time) in enumerate(zip(poses, estimated, times.tolist(), strict=True)):
             scene = scenes.at(time, pose)
-            capture = self.stack.rig.capture(scene, pose, weather, int(rng.integers(_SEEDS)))
-            slots.told[:] = False
+            capture = self.pipeline.rig.capture(scene, pose, weather, int(rng.integers(_SEEDS)))
+            slots.updated[:] = False
             begun = clock.perf_counter()
-            look = self.stack.look(capture, belief)
-            for sweep in look.sweeps:
-                slots.see_through(sweep)
-            placed = [slots.see_cars(view.cars) for view in look.views]
-            for view in look.views:
-                _update_grid(
-                    grid, view.cars, view.mount.in_world(belief), view.camera.width / view.camera.fx / 2.0
-                )
-                cars.append(np.column_stack([view.cars.xy, view.cars.yaw]))
+            result = self.pipeline.process(TimedCapture(time, capture), slots, vehicle)
+            for view in result.views:
+                _update_grid(grid, view, vehicle)
+                cars.append(view.cars.poses)
             frame_s.append(clock.perf_counter() - begun)
-            last_look[slots.told] = time
-            if on_moment is not None:
+            observed_at[slots.updated] = time
+            if on_frame is not None:
                 taken = world.occupied(np.arange(lot.n_slots), time)
-                on_moment(SurveyMoment(time, capture, look, grid, slots, taken))
-            plainly = [self.stack.locate_plainly(view, belief) for view in look.views]
-            score.take(scene, capture, look, placed, plainly)
-            stretch, cars_there = i * pictures // len(poses), sum(len(view.cars) for view in look.views)
-            if pictures and (stretch not in shown or cars_there > shown[stretch][0]):
-                shown[stretch] = cars_there, capture, look
+                on_frame(SurveyFrame(result, grid, slots, taken))
+            score.add(scene, result, [localize_as_thesis(view, vehicle) for view in result.views])
+            section = i * pictures // len(poses)
+            if pictures and (section not in shown or result.n_cars > shown[section].n_cars):
+                shown[section] = result
         truth = np.array(
-            [world.occupied([s], t)[0] for s, t in enumerate(last_look.tolist())], dtype=np.bool_
+            [world.occupied([s], t)[0] for s, t in enumerate(observed_at.tolist())], dtype=np.bool_
         )
         states = slots.states()
         found_cars = np.concatenate(cars) if cars else np.empty((0, 3))
@@ -218,15 +211,14 @@ class Survey:
         return SessionResult(
             session, arrival, states, truth,
             int(truth.sum()), int((truth & score.found).sum()), score, np.array(frame_s), grid,
-            tuple((capture, look) for _, capture, look in shown.values()),
+            tuple(shown.values()),
         )  # fmt: skip
 
 
-def _update_grid(
-    grid: OccupancyGrid, cars: CarSightings, camera: tuple[float, float, float], half_width: float
-) -> None:
-    x, y, yaw = camera
-    away = cars.xy - np.array([x, y])
-    angle = np.arctan2(away[:, 1], away[:, 0]) - yaw
-    polar = np.column_stack([(angle + np.pi) % (2 * np.pi) - np.pi, cars.distance])
-    grid.update((x, y), yaw, float(np.arctan(half_width)), polar)
+def _update_grid(grid: OccupancyGrid, view: CameraView, vehicle: FloatArray) -> None:
+    x, y, yaw = view.mount.in_world(vehicle)
+    away = view.cars.xy - np.array([x, y])
+    bearing = np.arctan2(away[:, 1], away[:, 0]) - yaw
+    polar = np.column_stack([(bearing + np.pi) % (2 * np.pi) - np.pi, view.cars.distance])
+    half_angle = float(np.arctan(view.camera.width / view.camera.fx / 2.0))
+    grid.update((x, y), yaw, half_angle, polar)

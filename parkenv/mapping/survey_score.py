@@ -1,4 +1,4 @@
-"""What a survey drive gets right and wrong, counted by one who knows the truth."""
+"""Errors of detection and localisation in a survey session, measured against the simulated truth."""
 
 from __future__ import annotations
 
@@ -8,87 +8,78 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.perception.ranging import CarSightings
-from parkenv.perception.stack import Look, View
+from parkenv.perception.pipeline import CameraView, PerceptionResult
+from parkenv.perception.ranging import LocatedCars
 from sim_sensors.ground_truth import VehicleBoxes, vehicle_boxes
 from sim_sensors.laser.scanner import LaserScanner
-from sim_sensors.rig import Capture
 from sim_sensors.scene import Scene
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MATCH = 0.3
-"""Intersection over union from which a detection is of a car."""
+"""Intersection over union from which a detection matches a car."""
 DISTANCE_ENDS = (4.0, 6.0, 8.0, 10.0, 12.0, 15.0)
-"""m, from the camera to a car's middle: ends of the bins in which detections are counted."""
+"""m, from the camera to a car's centre: upper ends of the bins in which detections are counted."""
 CLEAR = 0.6
-"""Visible share of a car in the picture from which a frame without a detection of it is a miss."""
-WAYS = ("fitted", "thesis")
-"""How cars are located: `PerceptionStack.look`'s way, and `PerceptionStack.locate_plainly`."""
+"""Visible fraction of a car in an image from which a frame without its detection counts as a miss."""
+METHODS = ("fitted", "thesis")
+"""How cars are located: by `localize_cars`, and by the median range as in the thesis (`localize_as_thesis`)."""
 _TRUTH = LaserScanner()
 _LEAST_BEAMS = 3
 
 
 class SurveyScore:
-    """Counts over the looks of a session.
+    """Counts over the captures of a session.
 
     Args:
-        n_slots: of the lot.
+        n_slots: number of slots of the lot.
 
     Attributes:
-        found: (n_slots,) bool, whether the car in a slot was detected and put into a slot.
-        detections: how many there were, and `right`, how many of them were of vehicles.
-        in_frame: (bins, 2) int64, by distance (`DISTANCE_ENDS`), how many times a parked car stood whole and clear
-            (`CLEAR`) in a frame, and in how many of these it was detected.
+        found: (n_slots,) bool, whether the car in a slot was detected and assigned to a slot.
+        detections: number of detections; `right`: how many of them match a vehicle.
+        in_frame: (bins, 2) int64, by distance (`DISTANCE_ENDS`): how often a parked car was completely inside a frame
+            and mostly visible (`CLEAR`), and how often it was detected then.
     """
 
     def __init__(self, n_slots: int) -> None:
         self.found = np.zeros(n_slots, dtype=np.bool_)
         self.detections = self.right = 0
         self.in_frame = np.zeros((len(DISTANCE_ENDS), 2), dtype=np.int64)
-        self._errors: dict[str, list[tuple[float, float, float]]] = {way: [] for way in WAYS}
+        self._errors: dict[str, list[tuple[float, float, float]]] = {method: [] for method in METHODS}
 
-    def errors(self, way: str) -> FloatArray:
-        """Errors of parked cars located in one of the `WAYS`, (k, 3): of distance, m; of place, m; of heading, rad.
+    def errors(self, method: str) -> FloatArray:
+        """Return the errors of parked cars located by one of `METHODS`, (k, 3): distance, m; position, m; heading, rad.
 
-        Distances are compared with the median of the exact beams that end on the car.
+        Distances are compared with the median of the noise-free beams that end on the car.
         """
-        return np.array(self._errors[way]).reshape(-1, 3)
+        return np.array(self._errors[method]).reshape(-1, 3)
 
-    def take(
-        self,
-        scene: Scene,
-        capture: Capture,
-        look: Look,
-        placed: Sequence[IntArray],
-        plainly: Sequence[CarSightings],
-    ) -> None:
-        """Count one look.
+    def add(self, scene: Scene, result: PerceptionResult, by_median: Sequence[LocatedCars]) -> None:
+        """Count one capture.
 
         Args:
-            scene: what was there.
-            capture: what was measured of it, and from where in truth.
-            look: what was made of that.
-            placed: of each view, the slots that its cars were put into; -1 where none.
-            plainly: of each view, where the thesis's way puts its cars.
+            scene: the true scene.
+            result: what the pipeline made of the capture.
+            by_median: for each view, its cars as located by the thesis's method.
         """
-        for view, slots, plain in zip(look.views, placed, plainly, strict=True):
+        capture = result.captured.capture
+        for view, median_cars in zip(result.views, by_median, strict=True):
             pairs = capture.pairs
             frame = pairs[view.name].left if view.name in pairs else capture.images[view.name]
             boxes = vehicle_boxes(view.camera, scene, view.mount.camera_pose(capture.pose), frame)
             matched = _matched(view.detections.boxes, boxes)
             self.detections += len(matched)
             self.right += int((matched > 0).sum())
-            slots = slots[slots >= 0]
+            slots = view.slots[view.slots >= 0]
             self.found[slots[np.isin(slots, scene.present)]] = True
             self._count(boxes, view, scene.n_vehicles, matched)
             if (matched > 0).any():
                 exact, ids = _TRUTH.scan_with_ids(scene.scan_plane, view.mount.in_world(capture.pose))
-                for way, cars in zip(WAYS, (view.cars, plain), strict=True):
-                    self._locate(way, cars, matched, scene, exact, ids)
+                for method, cars in zip(METHODS, (view.cars, median_cars), strict=True):
+                    self._add_errors(method, cars, matched, scene, exact, ids)
 
-    def _count(self, boxes: VehicleBoxes, view: View, n_parked: int, matched: IntArray) -> None:
+    def _count(self, boxes: VehicleBoxes, view: CameraView, n_parked: int, matched: IntArray) -> None:
         clear = (boxes.visible_fraction >= CLEAR) & (boxes.ids <= n_parked)
         clear &= (boxes.box[:, 0] > 0) & (boxes.box[:, 2] < view.camera.width)
         clear &= boxes.distance < DISTANCE_ENDS[-1]
@@ -97,10 +88,10 @@ class SurveyScore:
         self.in_frame[:, 0] += np.bincount(place, minlength=len(DISTANCE_ENDS))
         self.in_frame[:, 1] += np.bincount(place[detected], minlength=len(DISTANCE_ENDS))
 
-    def _locate(
+    def _add_errors(
         self,
-        way: str,
-        cars: CarSightings,
+        method: str,
+        cars: LocatedCars,
         matched: IntArray,
         scene: Scene,
         exact: NDArray[np.float32],
@@ -112,7 +103,7 @@ class SurveyScore:
                 continue
             x, y, yaw = scene.vehicle_pose[car - 1]
             turned = (cars.yaw[k] - yaw + math.pi / 2) % math.pi - math.pi / 2
-            self._errors[way].append(
+            self._errors[method].append(
                 (
                     abs(float(cars.distance[k]) - float(np.median(exact[on_it]))),
                     math.hypot(cars.xy[k, 0] - x, cars.xy[k, 1] - y),
@@ -122,7 +113,7 @@ class SurveyScore:
 
 
 def _matched(found: NDArray[np.float32], boxes: VehicleBoxes) -> NDArray[np.int64]:
-    """(n,) the id of the vehicle that each detection is of; 0 where it is of none."""
+    """Return the id of the vehicle that each detection matches, (n,); 0 for none."""
     match = np.zeros(len(found), dtype=np.int64)
     best = np.full(len(found), MATCH)
     area = (found[:, 2] - found[:, 0]) * (found[:, 3] - found[:, 1])

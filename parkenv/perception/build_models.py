@@ -11,7 +11,7 @@ from pathlib import Path
 import typer
 from rich.progress import track
 
-from parkenv.perception.detector import CarModel
+from parkenv.perception.car_model import CarModel
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.simulated_photos import (
     END_ASPECT,
@@ -51,7 +51,7 @@ def build(photos: list[SimulatedPhoto], seed: int, progress: Callable[[str], Non
         descriptor=Descriptor(128, 128),
         region_aspect=END_ASPECT,
         car=END_CAR,
-        ends=True,
+        end_on=True,
         settings=settings,
         trained_on=told,
         progress=progress,

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.perception.detector import as_grey
+from parkenv.perception.hog_detector import as_grey
 from parkenv.perception.image_files import decode_image, images_in, natural_order, read_image
 
 Image = NDArray[np.uint8]

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.perception.car_datasets import Crops
+from parkenv.perception.car_model import CarModel
 from parkenv.perception.detection_scores import recall_at
-from parkenv.perception.detector import CarModel
 from parkenv.perception.training import train
 
 BLOCKS = 30

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from parkenv.perception.backdrops import with_backdrop
 from parkenv.perception.car_datasets import LabelledImage
-from parkenv.perception.detector import as_grey
+from parkenv.perception.hog_detector import as_grey
 from parkenv.perception.simulated_streets import Street
 from sim_sensors.camera.models import PinholeCamera, camera_pose
 from sim_sensors.camera.weather import PRESETS, Weather

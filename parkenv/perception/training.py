@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.perception.car_datasets import LabelledImage
-from parkenv.perception.detector import CarModel, Detector, best_boxes
+from parkenv.perception.car_model import CarModel
 from parkenv.perception.hog import Descriptor
+from parkenv.perception.hog_detector import HogDetector, best_boxes
 
 Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
@@ -70,7 +71,7 @@ def train(
     descriptor: Descriptor | None = None,
     region_aspect: float | None = None,
     car: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0),
-    ends: bool = False,
+    end_on: bool = False,
     settings: TrainingSettings | None = None,
     trained_on: str = "",
     progress: Progress = lambda _: None,
@@ -88,7 +89,7 @@ def train(
         descriptor: the side view's 128×64 where None.
         region_aspect: width over height of the crops; the first one's where None.
         car: where the car lies in the crops, as shares.
-        ends: whether these are fronts and rears.
+        end_on: whether the crops show fronts and rears rather than sides.
         settings: the defaults where None.
         trained_on: a line for people.
         progress: called with a line for each stage.
@@ -118,7 +119,7 @@ def train(
     no = np.stack([descriptor.describe(c) for c in others])
 
     model = CarModel(
-        descriptor, np.zeros(descriptor.shape, np.float32), 0.0, aspect, car, (1.0, 0.0), ends, trained_on
+        descriptor, np.zeros(descriptor.shape, np.float32), 0.0, aspect, car, (1.0, 0.0), end_on, trained_on
     )
     for round_number in range(settings.rounds + 1):
         progress(f"round {round_number}: {len(yes)} positives, {len(no)} negatives")
@@ -146,13 +147,13 @@ def mined(model: CarModel, images: Sequence[LabelledImage], per_image: int) -> F
     for labelled in images:
         image = labelled.image
         least = min(image.shape[0], image.shape[1] / model.region_aspect, 40.0)
-        scan = Detector(
+        scan = HogDetector(
             (model,), least_height=max(8.0, 0.8 * least), scale_step=1.15, threshold=0.4, margin=0.1
         )
         seen = scan.scan(model, image)
-        seen = seen.chosen(np.argsort(-seen.score, kind="stable")[: 40 * per_image])
-        seen = seen.chosen(~_overlap_any(seen.boxes, labelled.boxes))
-        seen = seen.chosen(best_boxes(seen.regions, seen.score, 0.6)[:per_image])
+        seen = seen.select(np.argsort(-seen.score, kind="stable")[: 40 * per_image])
+        seen = seen.select(~_overlap_any(seen.boxes, labelled.boxes))
+        seen = seen.select(best_boxes(seen.regions, seen.score, 0.6)[:per_image])
         cuts = [_cut(image, (r[0], r[1]), (r[2], r[3]), size) for r in seen.regions.tolist()]
         found += [window.describe(cut)[None] for cut in cuts]
     return np.concatenate(found)

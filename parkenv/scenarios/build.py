@@ -50,11 +50,9 @@ def make_scenario(source: ScenarioSource, **changes: Any) -> Scenario:
         return source.replace(**changes)
     if isinstance(source, ParkingLot):
         goal = changes.get("goal", 0)
-        fields = {
-            "name": source.name,
-            "occupancy": changes.get("occupancy") or typical_occupancy(source, goal=goal),
-        }
-        return Scenario(lot=source, **(fields | changes | {"occupancy": fields["occupancy"]}))
+        occupancy = changes.get("occupancy") or typical_occupancy(source, goal=goal)
+        made = Scenario(name=source.name, lot=source, goal=goal, occupancy=occupancy)
+        return made.replace(**changes | {"occupancy": occupancy})
     if isinstance(source, ScenarioSpec):
         return build(source).replace(**changes)
     if not isinstance(source, str | Path):
@@ -81,7 +79,7 @@ def build(spec: ScenarioSpec) -> Scenario:
         lot = dataclasses.replace(lot, goals=np.array([spec.goal]))
     else:
         goal = spec.goal
-    name = spec.name or lot.name
+    name = spec.title
     try:
         if not goal < len(lot.goals):
             raise InputError(f"goal is {goal}, want an index from 0 to {len(lot.goals) - 1}")
@@ -100,7 +98,9 @@ def build(spec: ScenarioSpec) -> Scenario:
             occupancy=occupancy,
             prior=_prior(spec.forecast, occupancy, lot, goal),
             arrival=spec.arrivals.window(),
-            traffic=Traffic(spec.traffic.cars, spec.traffic.pedestrians),
+            traffic=Traffic()
+            if spec.traffic is None
+            else Traffic(spec.traffic.cars, spec.traffic.pedestrians),
         )
     except InputError as error:
         raise InputError(f"scenario {name!r}: {error}") from error

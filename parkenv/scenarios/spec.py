@@ -16,6 +16,9 @@ from parkenv.world.occupancy import ArrivalWindow
 
 PackagedLot = Literal["campus", "jam", "street", "mini"]
 PACKAGED_LOTS: tuple[PackagedLot, ...] = ("campus", "jam", "street", "mini")
+LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")
+"""Endings of the names of lot files."""
+SENSOR_MODELS = ("perfect", "blind", "laser", "stereo")
 RigName = Literal["laser", "stereo", "both_sides"]
 
 Speed = Annotated[float, Field(ge=0.1, le=300.0)]
@@ -60,9 +63,17 @@ class CityLot(Spec):
 
 def _lot_tables(value: object) -> object:
     """A word as the table it stands for: a packaged lot's name, or else a file."""
-    if isinstance(value, Path) or (isinstance(value, str) and value not in PACKAGED_LOTS):
+    if isinstance(value, Path):
         return {"file": value}
-    return {"name": value} if isinstance(value, str) else value
+    if not isinstance(value, str):
+        return value
+    if value in PACKAGED_LOTS:
+        return {"name": value}
+    if not value.endswith(LOT_SUFFIXES):
+        raise ValueError(
+            f"a packaged lot ({', '.join(PACKAGED_LOTS)}) or a lot file ({', '.join(LOT_SUFFIXES)})"
+        )
+    return {"file": value}
 
 
 class LotSpec(Spec):
@@ -175,6 +186,10 @@ def _hours(value: str) -> str:
     return value
 
 
+Hours = Annotated[str, AfterValidator(_hours)]
+"""HH:MM-HH:MM."""
+
+
 def _days(value: object) -> object:
     text = ",".join(value) if isinstance(value, list) and all(isinstance(v, str) for v in value) else value
     try:
@@ -188,7 +203,7 @@ class Arrivals(Spec):
     """When searches begin."""
 
     days: Annotated[str, BeforeValidator(_days, json_schema_input_type=str | list[str])] = "weekdays"
-    hours: Annotated[str, AfterValidator(_hours)] = "08:00-13:00"
+    hours: Hours = "08:00-13:00"
 
     def window(self) -> ArrivalWindow:
         """The arrival window."""
@@ -211,9 +226,15 @@ class Costs(Spec):
 
 
 def _sensor_tables(value: object) -> object:
-    if isinstance(value, str) and value in ("perfect", "blind", "laser", "stereo"):
+    if isinstance(value, Path):
+        return {"file": value}
+    if not isinstance(value, str):
+        return value
+    if value in SENSOR_MODELS:
         return {"name": value}
-    return {"file": value} if isinstance(value, str | Path) else value
+    if not value.endswith(".json"):
+        raise ValueError(f"{', '.join(SENSOR_MODELS)} or a file (.json)")
+    return {"file": value}
 
 
 class SensorModelSpec(Spec):
@@ -282,7 +303,15 @@ class ScenarioSpec(Spec):
         SensorModelSpec, BeforeValidator(_sensor_tables, json_schema_input_type=str | SensorModelSpec)
     ] = SensorModelSpec(name="perfect")
     rig: RigName = Field("laser", description="The sensors of the car, where they are simulated.")
-    traffic: TrafficSpec = TrafficSpec()
+    traffic: TrafficSpec | None = Field(
+        None, description="Other road users; none if absent, some in surveys."
+    )
+
+    @property
+    def title(self) -> str:
+        """The name that the scenario has in tables: its own, or else the lot's."""
+        lot = self.lot
+        return self.name or lot.name or (lot.file.stem if lot.file else "city" if lot.city else "grid")
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
@@ -294,7 +323,6 @@ class ScenarioSpec(Spec):
 SCENARIO_NAMES = ("campus", "jam", "street", "mini")
 """Packaged scenarios."""
 _PACKAGED = Path(__file__).with_name("packaged")
-LOT_SUFFIXES = (".geojson", ".yml", ".yaml")
 
 
 def scenario_spec(source: str | Path) -> ScenarioSpec:
@@ -313,7 +341,7 @@ def scenario_spec(source: str | Path) -> ScenarioSpec:
     if str(source) in SCENARIO_NAMES:
         return ScenarioSpec.read(_PACKAGED / f"{source}.toml")
     path = Path(source)
-    if path.suffix in LOT_SUFFIXES:
+    if path.suffix in LOT_SUFFIXES and path.suffix != ".json":
         return ScenarioSpec.parse({"name": path.stem, "lot": str(path)}, str(path))
     if path.suffix in (".toml", ".json") or path.exists():
         return ScenarioSpec.read(path)

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from parkenv.errors import InputError
 from parkenv.evaluation.bench.rows import BenchRow, duration, rate, seconds_each
 from parkenv.mapping.grid import OccupancyGrid
-from parkenv.mapping.slots import SlotFilter
 from parkenv.mapping.survey import Survey, SurveySettings
-from parkenv.perception.detector import CarModel, Detector, as_grey
+from parkenv.perception.capture import TimedCapture
+from parkenv.perception.car_model import CarModel
 from parkenv.perception.hog import Descriptor
-from parkenv.perception.stack import PerceptionStack
-from parkenv.perception.sweeps import laser_sweep
+from parkenv.perception.hog_detector import HogDetector, as_grey
+from parkenv.perception.pipeline import PerceptionPipeline
+from parkenv.perception.range_scan import scan_from_laser
+from parkenv.perception.slot_filter import SlotFilter
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.lot_scene import slot_lot
 from sim_sensors.rig import SensorRig
@@ -87,20 +89,20 @@ def perception_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     finally:
         cv2.setNumThreads(threads)
 
-    stack = PerceptionStack(rig)
-    whole = seconds_each(lambda _: stack.look(capture), seconds)
+    pipeline, slots = PerceptionPipeline(rig, lot), SlotFilter(lot)
+    captured = TimedCapture(0.0, capture)
+    whole = seconds_each(lambda _: pipeline.process(captured, slots), seconds)
     rows += rate("perception", "frame to cars in the world, both models", 1.0 / whole, "frames/s")
     _, laser, mount = rig.lasers[0]
-    sweep = laser_sweep(laser, mount, pose, capture.scans["laser"])
-    slots = SlotFilter(lot)
-    beams = seconds_each(lambda _: slots.see_through(sweep), seconds)
+    scan = scan_from_laser(laser, mount, pose, capture.scans["laser"])
+    beams = seconds_each(lambda _: slots.update_from_scan(scan), seconds)
     rows += duration("mapping", f"{laser.n_beams} beams into {lot.n_slots} slots", 1e3 * beams, "ms")
     low_x, low_y, high_x, high_y = lot.bounds()
     grid = OccupancyGrid((low_x, low_y), (high_x, high_y), 0.25)
     cars = np.array([[0.2, 3.0], [-0.3, 5.0]])
     update = seconds_each(lambda _: grid.update((pose[0], pose[1]), pose[2], 0.7, cars), seconds)
     rows += duration("mapping", "grid update, 0.25 m cells, 12 m", 1e3 * update, "ms")
-    survey = Survey(make_scenario("mini"), SurveySettings(weather="sunny"), stack)
+    survey = Survey(make_scenario("mini"), SurveySettings(weather="sunny"))
     session = seconds_each(survey.drive, 0.0, least=1)
     return rows + rate("mapping", "sessions of mini, pictures drawn and seen", 60.0 / session, "sessions/min")
 
@@ -109,7 +111,7 @@ def _detector_rows(grey: NDArray[np.uint8], seconds: float, peers: dict[str, flo
     """One thread, the side model, every size from the window's own on, as OpenCV looks."""
     side = CarModel.load("side")
     plain = CarModel(side.descriptor, side.weights, -1e3, 2.0)
-    detector = Detector((plain,), least_height=64.0, most_height=480.0, scale_step=1.2, margin=0.0)
+    detector = HogDetector((plain,), least_height=64.0, most_height=480.0, scale_step=1.2, margin=0.0)
     scan = seconds_each(lambda _: detector.detect(grey), seconds)
     opencv = {"OpenCV 4 detectMultiScale": 1.0 / peers["opencv"]} if "opencv" in peers else {}
     rows = rate(

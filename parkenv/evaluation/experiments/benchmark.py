@@ -18,6 +18,7 @@ import numpy as np
 
 from parkenv import __version__
 from parkenv.errors import InputError
+from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.compare import Case, at_occupancy, table
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.results import ResultFolder, Row
@@ -113,7 +114,7 @@ class Suite:
             hashlib.sha256(canonical.encode()).hexdigest(),
         )
 
-    def cases(self, agents: Sequence[str]) -> list[tuple[Case, range]]:
+    def cases(self, agents: Sequence[AgentSpec]) -> list[tuple[Case, range]]:
         """Every agent in every task, for `run_cases`.
 
         Raises:
@@ -122,8 +123,12 @@ class Suite:
         worlds = [task.made(self.arrival) for task in self.tasks]
         for world in worlds:
             for agent in agents:
-                make_agent(agent, world)
-        return [(Case(world, agent), self.seeds) for world in worlds for agent in agents]
+                make_agent(agent.name, world, **agent.options)
+        return [
+            (Case(world, agent.name, options=agent.options), self.seeds)
+            for world in worlds
+            for agent in agents
+        ]
 
 
 def result_of(
@@ -133,7 +138,7 @@ def result_of(
     episodes: dict[str, dict[str, dict[str, list[float]]]] = {}
     for case, seeds in cases:
         rows = [folder.episodes[case.key(s)] for s in seeds]
-        episodes.setdefault(case.agent, {})[case.scenario.name] = {
+        episodes.setdefault(case.label, {})[case.scenario.name] = {
             column: [round(row[column], 6) for row in rows] for column in ("total_s", "bound_s")
         }
     rows = [

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from parkenv.errors import InputError
+from parkenv.evaluation.experiments.agent_spec import AgentSpec, label_of
 from parkenv.evaluation.experiments.episodes import EpisodeRunner, SearchTrace
 from parkenv.evaluation.experiments.results import SETTING_COLUMNS, ResultFolder, Row, episode_key
 from parkenv.evaluation.experiments.statistics import mean_interval, summarize
@@ -24,7 +25,7 @@ from parkenv.world.sensor_model import SensorModel
 from planners.agent import make_agent
 
 UNSEEN = "-unseen"
-"""What the names of scenarios end with whose slots are not seen before a try."""
+"""Suffix of the names of scenarios whose slots are not observed before an attempt."""
 BLOCK = 10
 """Episodes a task: few enough to lose little to a crash, enough to make up for starting one."""
 
@@ -38,7 +39,8 @@ class Case:
         agent: the agent's name.
         occupancy_level: the mean occupancy that the world was set to; None where it was left as it is.
         options: of the agent, as `make_agent` takes them.
-        rig: whose sensors the car sees through; None where the scenario's sighting model stands for them.
+        rig: simulated sensors that observe the slots; None: the scenario's sensor model replaces them.
+        detector: of the rig's images, as `make_detector` takes it; None: the packaged one.
     """
 
     scenario: Scenario
@@ -46,14 +48,20 @@ class Case:
     occupancy_level: float | None = None
     rig: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
+    detector: str | None = None
+
+    @property
+    def label(self) -> str:
+        """The agent with its options, as tables name it."""
+        return label_of(self.agent, dict(self.options))
 
     @property
     def columns(self) -> Row:
-        """What names this case in the tables."""
+        """The columns that identify this case in tables."""
         return {
             "scenario": self.scenario.name,
             "occupancy_level": self.occupancy_level,
-            "agent": self.agent,
+            "agent": self.label,
             "failure_cost_s": float(self.scenario.failure_s),
             "v_walk_kmh": round(self.scenario.v_walk / KMH, 6),
             "v_drive_kmh": round(self.scenario.v_drive / KMH, 6),
@@ -64,7 +72,7 @@ class Case:
         return episode_key({**self.columns, "seed": seed})
 
     def run(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row]]:
-        """Search once for each seed: rows of `episodes.csv` and of `timings.csv`."""
+        """Run an episode for each seed: rows of `episodes.csv` and of `timings.csv`."""
         runner = self._runner()
         rows, timings = [], []
         for seed in seeds:
@@ -75,36 +83,41 @@ class Case:
         return rows, timings
 
     def run_reporting(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row], list[str]]:
-        """As `run`, and what it warned of: a worker's own warnings would not reach the user in order."""
+        """Run as `run` does, and also return the warnings: a worker's own would not reach the user in order."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("default")
             rows, timings = self.run(seeds)
-        return rows, timings, [f"{self.agent} in {self.scenario.name}: {w.message}" for w in caught]
+        return rows, timings, [f"{self.label} in {self.scenario.name}: {w.message}" for w in caught]
 
     def trace(self, seed: int) -> SearchTrace:
-        """One search, for a picture."""
+        """Run one episode for a picture."""
         return self._runner().run(seed).trace
 
     def _runner(self) -> EpisodeRunner:
         agent = make_agent(self.agent, self.scenario, **self.options)
-        return EpisodeRunner(self.scenario, self.agent, agent, self.rig)
+        return EpisodeRunner(self.scenario, self.label, agent, self.rig, self.detector)
 
 
 def settings_of(
     scenario: Scenario,
-    failure_s: Sequence[float],
-    v_walk_kmh: Sequence[float],
-    v_drive_kmh: Sequence[float],
+    failure_s: Sequence[float] | None = None,
+    v_walk_kmh: Sequence[float] | None = None,
+    v_drive_kmh: Sequence[float] | None = None,
 ) -> list[Scenario]:
-    """The scenario in every combination of failure cost, s, and speeds, km/h."""
+    """The scenario in every combination of failure cost, s, and speeds, km/h; None keeps the scenario's own."""
+    axes = [
+        [{"failure_s": value} for value in failure_s or ()],
+        [{"v_walk": value * KMH} for value in v_walk_kmh or ()],
+        [{"v_drive": value * KMH} for value in v_drive_kmh or ()],
+    ]
     return [
-        scenario.replace(failure_s=failure, v_walk=walk * KMH, v_drive=drive * KMH)
-        for failure, walk, drive in itertools.product(failure_s, v_walk_kmh, v_drive_kmh)
+        scenario.replace(**failure, **walk, **drive)
+        for failure, walk, drive in itertools.product(*(axis or [{}] for axis in axes))
     ]
 
 
 def unseen(scenario: Scenario) -> Scenario:
-    """The scenario with slots that nobody sees before trying to park there, under a name of its own."""
+    """The scenario without observations of slots before an attempt to park there, under a name of its own."""
     return scenario.replace(name=f"{scenario.name}{UNSEEN}", sensor_model=SensorModel.blind())
 
 
@@ -171,16 +184,18 @@ def run_cases(
                 warnings.warn(message, stacklevel=2)
 
 
-def rows_of(names: Sequence[str], scenario: Scenario, seeds: Sequence[int], workers: Workers) -> list[Row]:
+def rows_of(
+    agents: Sequence[AgentSpec], scenario: Scenario, seeds: Sequence[int], workers: Workers
+) -> list[Row]:
     """A row for each agent, as `table` has them, of searches of which nothing else is kept."""
-    cases = [Case(scenario, name) for name in names]
+    cases = [Case(scenario, agent.name, options=agent.options) for agent in agents]
     blocks = [(case, block) for case in cases for block in _blocks(seeds, 5 * BLOCK)]
-    episodes: dict[str, list[Row]] = {case.agent: [] for case in cases}
+    episodes: dict[str, list[Row]] = {case.label: [] for case in cases}
     for number, (rows, _) in workers.results([partial(case.run, block) for case, block in blocks]):
-        episodes[blocks[number][0].agent] += rows
+        episodes[blocks[number][0].label] += rows
     by_seed = {name: sorted(rows, key=lambda row: row["seed"]) for name, rows in episodes.items()}
-    first = by_seed[names[0]]
-    return [summarize(c.columns, by_seed[c.agent], None if i == 0 else first) for i, c in enumerate(cases)]
+    first = by_seed[cases[0].label]
+    return [summarize(c.columns, by_seed[c.label], None if i == 0 else first) for i, c in enumerate(cases)]
 
 
 def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
@@ -230,7 +245,7 @@ def table(cases: Sequence[tuple[Case, range]], folder: ResultFolder) -> list[Row
     return rows
 
 
-def against_occupancy(rows: Sequence[Row], edges: Sequence[float]) -> list[Row]:
+def against_occupancy(rows: Sequence[Mapping[str, Any]], edges: Sequence[float]) -> list[Row]:
     """Total time against how full the lot was at the arrival, from episodes as they came.
 
     Args:
@@ -240,7 +255,7 @@ def against_occupancy(rows: Sequence[Row], edges: Sequence[float]) -> list[Row]:
     Returns:
         Rows with agent, failure_cost_s, occupancy (the bin's mean), total_s, total_s_ci95, episodes.
     """
-    bins: dict[tuple[Any, ...], list[Row]] = defaultdict(list)
+    bins: dict[tuple[Any, ...], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
         place = int(np.searchsorted(edges, row["occupancy"], side="right")) - 1
         if 0 <= place < len(edges) - 1:

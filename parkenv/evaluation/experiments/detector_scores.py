@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 
 from parkenv.evaluation.figures.picture_files import STYLE, save_picture
 from parkenv.perception.car_datasets import UIUC_SIZE, UIUC_TESTS, LabelledImage, read_uiuc_test
+from parkenv.perception.car_model import CarModel
 from parkenv.perception.detection_scores import RecallPrecision, recall_precision
-from parkenv.perception.detector import CarModel, Detector
+from parkenv.perception.hog_detector import HogDetector
 
 _SMALLEST = {"single": 0.85, "multi": 0.65}
 _LARGEST = {"single": 1.2, "multi": 2.6}
@@ -55,7 +56,7 @@ def score_on(
 ) -> TestSetScore:
     """Recall and precision on labelled images, by UIUC's rule."""
     height = UIUC_SIZE[1]
-    detector = Detector(
+    detector = HogDetector(
         (model,), least_height=_SMALLEST[test_set] * height, most_height=_LARGEST[test_set] * height,
         scale_step=1.08, threshold=0.002, overlap=0.3, margin=0.35,
     )  # fmt: skip

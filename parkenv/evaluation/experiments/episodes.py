@@ -83,17 +83,25 @@ class EpisodeRunner:
         scenario: the scenario, with the costs and speeds of the setting.
         name: the agent's name, for the trace.
         agent: the agent.
-        rig: sensor rig of `parkenv/SearchPerception-v1`; None for `parkenv/Search-v1`.
+        rig: of `parkenv/SearchPerception-v1`, whose sensors observe the slots; None: `parkenv/Search-v1`.
+        detector: of `parkenv/SearchPerception-v1`.
     """
 
-    def __init__(self, scenario: Scenario, name: str, agent: Agent, rig: str | None = None) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        name: str,
+        agent: Agent,
+        rig: str | None = None,
+        detector: str | None = None,
+    ) -> None:
         self.scenario = scenario
         self.name = name
         self.agent = agent
         env = (
             gym.make("parkenv/Search-v1", scenario=scenario)
             if rig is None
-            else gym.make("parkenv/SearchPerception-v1", scenario=scenario, rig=rig)
+            else gym.make("parkenv/SearchPerception-v1", scenario=scenario, rig=rig, detector=detector)
         )
         self.env = adapt_to_agent(env, agent)
         self._routes = DriveRoutes(scenario)

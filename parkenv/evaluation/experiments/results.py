@@ -116,10 +116,19 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) 
 
 
 def _parts(name: str, was: Any, its: Any) -> list[tuple[str, Any, Any]]:
-    """A setting then and now; one that is a mapping by each name that both have."""
-    if isinstance(was, dict) and isinstance(its, dict):
-        return [(f"{name}: {key}", was[key], its[key]) for key in sorted(was.keys() & its.keys())]
-    return [(name, was, its)]
+    """A setting then and now; a mapping by each name that both have, and what stands there by every name."""
+    if not (isinstance(was, dict) and isinstance(its, dict)):
+        return [(name, was, its)]
+    parts: list[tuple[str, Any, Any]] = []
+    for key in sorted(was.keys() & its.keys()):
+        old, new = was[key], its[key]
+        if isinstance(old, dict) and isinstance(new, dict):
+            parts += [
+                (f"{key}.{part}", old.get(part), new.get(part)) for part in sorted(old.keys() | new.keys())
+            ]
+        else:
+            parts.append((f"{name}: {key}", old, new))
+    return parts
 
 
 def make_folder(path: Path) -> None:

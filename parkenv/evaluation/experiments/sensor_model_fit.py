@@ -1,4 +1,4 @@
-"""Fit a surrogate sensor model to the perception stack's errors, counted in searches with simulated sensors."""
+"""Fit a surrogate sensor model to the perception pipeline's errors, counted in searches with simulated sensors."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ _ASSUMED = SensorModel(BAND_ENDS[-1], 0.98, 0.02)
 
 @dataclass(frozen=True, eq=False)
 class ObservationCounts:
-    """Slots in view after a step, and what the perception stack reported of them.
+    """Slots in view after a step, and what the perception pipeline reported of them.
 
     Attributes:
         counts: (bands, 2, 2, 3) int64, by distance, by whether the slot lies beside the car, by whether it is taken,
-            and by what was reported: nothing, free, taken.
+            and by the observed state: none, free, taken.
     """
 
     counts: IntArray
@@ -74,13 +74,13 @@ class ObservationCounts:
 
 
 def _taken_rates(reported: IntArray) -> tuple[float, float]:
-    """Share of the reports that say "taken": of free slots, and of taken ones."""
+    """Return the fraction observed as taken: of free slots, and of taken slots."""
     free, taken = (float((row[1] + 0.5) / (row.sum() + 1.0)) for row in reported)
     return free, taken
 
 
 class _ObservationCounter(Observer):
-    """Counts what the perception stack reports after each step of a search, until the car is parked.
+    """Counts what the perception pipeline reports after each step of a search, until the car is parked.
 
     Args:
         scenario: the world.
@@ -102,11 +102,11 @@ class _ObservationCounter(Observer):
         """Compare the report with the true occupancy."""
         if step.info["parked"]:
             return
-        state, report = self._env.state, self._env.report
+        state, observed = self._env.state, self._env.perception.observation
         rows = slice(self._starts[state.vertex], self._starts[state.vertex + 1])
         near = self._slots[rows]
         reported = np.zeros(len(near), dtype=np.int64)
-        reported[np.searchsorted(near, report.slots)] = 1 + report.looks_taken
+        reported[np.searchsorted(near, observed.slots)] = 1 + observed.taken
         taken = state.world.occupied(near, state.time).astype(np.int64)
         np.add.at(self.counts.counts, (self._band[rows], self._beside[rows], taken, reported), 1)
 
@@ -114,7 +114,7 @@ class _ObservationCounter(Observer):
 def count_observations(
     scenario: Scenario, rig: str, agent: str, seeds: Sequence[int], weather: str | None = None
 ) -> ObservationCounts:
-    """Search with simulated sensors, and compare the perception stack's reports with the true occupancy.
+    """Search with simulated sensors, and compare the perception pipeline's reports with the true occupancy.
 
     Args:
         scenario: the world.

@@ -1,4 +1,4 @@
-"""A picture to check an import by: what became of a file, and what is missing."""
+"""A figure to check a lot import with: what was read from a file, and what is missing."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from parkenv.evaluation.figures.lot_picture import BUILDING, ENTRY, GOAL, GROUND, INK, WALL
+from parkenv.evaluation.figures.lot_picture import ENTRY, GOAL, GROUND, INK, draw_walls
 from parkenv.evaluation.figures.picture_files import save_picture
 from parkenv.lots.importers.lot_draft import LotDraft
 from parkenv.lots.slot_polygons import nearest_on_lanes
@@ -26,14 +26,14 @@ AREA, AREA_EDGE = "#d9d3e3", "#8d7ca8"
 ROAD = "#333a42"
 TIE = "#9aa0a6"
 ARROW_EVERY = 15.0
-"""Metres between two arrows on a one-way lane."""
+"""m, between two arrows on a one-way lane."""
 
 
 def save_import_picture(draft: LotDraft, path: str | Path) -> None:
     """Draw a draft, complete or not, into a PNG.
 
-    Slots are filled by what they were made from, each with a line from its mouth to the lane that
-    serves it; lanes carry arrows where they are one-way; below stands what is missing.
+    Slots are coloured by their source, each with a line from its mouth to the lane that serves it; one-way
+    lanes carry arrows; what is missing is listed below.
 
     Raises:
         InputError: the file cannot be written.
@@ -89,11 +89,7 @@ def _draw(draft: LotDraft, ax: Axes) -> None:
     ax.tick_params(labelsize=7)
     ax.set_xlabel("m", fontsize=7)
     ax.add_collection(PolyCollection(list(draft.outlines), facecolors=AREA, edgecolors=AREA_EDGE, zorder=0.5))
-    for wall in draft.walls:
-        if is_building(wall):
-            ax.fill(*wall.T, facecolor=BUILDING, edgecolor=WALL, linewidth=0.7, zorder=0.6)
-        else:
-            ax.plot(*wall.T, color=WALL, linewidth=1.2, zorder=0.6)
+    draw_walls(ax, *([w for w in draft.walls if is_building(w) == closed] for closed in (True, False)))
     ax.plot(*draft.loose.T, "o", color=SOURCE_COLORS[0], markersize=4, zorder=1.0)
     slots = draft.slots
     sources = _sources(draft)

@@ -1,11 +1,11 @@
-"""Pictures of lots: the ground on which paths, beliefs and policies are drawn."""
+"""Pictures of lots, on which paths, beliefs and policies are drawn."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import shapely
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
@@ -17,12 +17,11 @@ from matplotlib.typing import ColorType
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from parkenv.driving.lot_outline import LotOutline, Rings
 from parkenv.envs.rendering import BELIEF_ANCHORS
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
-from parkenv.lots.generators import ONE_WAY_HALF_WIDTH, TWO_WAY_HALF_WIDTH
-from parkenv.world.drive_graph import linestrings
-from parkenv.world.lot import ParkingLot, is_building, mouth_heading
+from parkenv.world.lot import ParkingLot
 
 FloatArray = NDArray[np.float64]
 
@@ -50,9 +49,9 @@ def draw_lot(
     slot_color: ColorType | FloatArray | None = None,
     show_graph: bool = False,
 ) -> None:
-    """Draw a lot as seen from above, to scale, with a scale bar.
+    """Draw a lot from above, to scale, with a scale bar.
 
-    Everything is drawn with a z-order below 2 but for entries and goals (5), so that what others plot
+    The z-order of all is below 2 except for entries and goals (5), so that what is plotted later
     lies between.
 
     Args:
@@ -68,32 +67,28 @@ def draw_lot(
     ax.set_aspect("equal")
     ax.set_facecolor(GROUND)
     ax.spines[:].set_visible(False)
-    # Paint has a width on the ground, within what the eye can make out.
+    # Paint has a width on the ground, within what is visible.
     scale = points_per_m(ax)
     paint_width = float(np.clip(0.12 * scale, 0.2, 1.2))
 
-    ax.add_patch(_patch(_asphalt(lot), facecolor=ASPHALT, edgecolor="none", zorder=0.5))
-    _draw_lane_marks(lot, ax, paint_width)
-    corners = lot.slot_corners()
+    outline = LotOutline.of(lot)
+    ax.add_patch(_patch(outline.paved(), facecolor=ASPHALT, edgecolor="none", zorder=0.5))
+    _draw_lane_marks(outline, ax, paint_width)
     if slot_color is not None:
-        ax.add_collection(PolyCollection(list(corners), facecolors=slot_color, edgecolors="none", zorder=1.0))
-    # The mouth stays open, as it is painted on the ground.
-    first = np.array([0, 3, 1])[lot.slot_mouth]
-    outline = corners[np.arange(lot.n_slots)[:, None], (first[:, None] + np.arange(4)) % 4]
-    ax.add_collection(LineCollection(list(outline), colors=PAINT, linewidths=paint_width, zorder=1.1))
-    for wall in lot.walls:
-        if is_building(wall):
-            ax.add_patch(Polygon(wall, facecolor=BUILDING, edgecolor=WALL, linewidth=0.8, zorder=0.8))
-        else:
-            ax.plot(*wall.T, color=WALL, linewidth=1.6, solid_capstyle="butt", zorder=0.8)
+        ax.add_collection(
+            PolyCollection(list(outline.slots), facecolors=slot_color, edgecolors="none", zorder=1.0)
+        )
+    lines = LineCollection(list(outline.slot_lines), colors=PAINT, linewidths=paint_width, zorder=1.1)
+    ax.add_collection(lines)
+    draw_walls(ax, outline.buildings, outline.walls)
     if show_graph:
         _draw_graph(lot, ax, scale)
-    _draw_entries_and_goals(lot, ax, scale)
+    _draw_entries_and_goals(outline, ax, scale)
     _draw_scale_bar(ax, x0, y0 - 0.5 * margin - bar_room, x1 - x0)
 
 
 def draw_discs(lot: ParkingLot, ax: Axes, outer: FloatArray, inner: FloatArray) -> None:
-    """Draw two discs at each slot, as T Fig. 4.7: an outer one for a prediction, an inner one for what is there.
+    """Draw two discs at each slot, as T Fig. 4.7: an outer one for a prediction, an inner one for the truth.
 
     Args:
         lot: drawn in `ax` already.
@@ -102,7 +97,7 @@ def draw_discs(lot: ParkingLot, ax: Axes, outer: FloatArray, inner: FloatArray) 
         inner: (n_slots, 3 or 4) RGB(A) in 0..1.
     """
     scale = points_per_m(ax)
-    # As wide as the slot, or larger where that would be too small to see and neighbours leave room.
+    # As wide as the slot, or larger if that is too small to see and neighbours leave room.
     nearest = np.asarray(cKDTree(lot.slot_xy).query(lot.slot_xy, k=2)[0])[:, 1]
     size = np.minimum(lot.slot_width, lot.slot_length)
     size = np.maximum(size, np.minimum(nearest, SMALLEST_DISC / scale))
@@ -123,7 +118,7 @@ def draw_discs(lot: ParkingLot, ax: Axes, outer: FloatArray, inner: FloatArray) 
 
 
 def points_per_m(ax: Axes) -> float:
-    """How large a metre of the lot is in axes with an equal aspect, points."""
+    """Return the size of a metre in axes with an equal aspect, points."""
     box = ax.get_window_extent()
     across, down = np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())
     return float(min(box.width / across, box.height / down)) / ax.figure.dpi * 72
@@ -163,49 +158,35 @@ def save_lot_picture(lot: ParkingLot, path: str | Path, *, show_graph: bool = Fa
         )
 
 
-def _asphalt(lot: ParkingLot) -> shapely.Geometry:
-    """What is paved: lanes, slots, and what lies between the two."""
-    half_width = [ONE_WAY_HALF_WIDTH if lane.oneway else TWO_WAY_HALF_WIDTH for lane in lot.lanes]
-    lanes = shapely.buffer(linestrings([lane.points for lane in lot.lanes]), half_width, quad_segs=16)
-    heading = mouth_heading(lot.slot_yaw, lot.slot_mouth)
-    outward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
-    to_lane = ((lot.vertex_xy[: lot.n_slots] - lot.mouth_xy()) * outward).sum(axis=1)
-    near = lot.slot_corners()
-    far = near + np.maximum(to_lane, 0.0)[:, None, None] * outward[:, None]
-    swept = shapely.convex_hull(shapely.multipoints(np.concatenate([near, far], axis=1)))
-    paved = shapely.union_all(np.concatenate([np.asarray(lanes), np.asarray(swept)]))
-    joint, apron = 0.6, 0.25
-    return shapely.buffer(shapely.buffer(paved, joint, join_style="mitre"), apron - joint, join_style="mitre")
+def draw_walls(ax: Axes, buildings: Sequence[FloatArray], walls: Sequence[FloatArray]) -> None:
+    """Draw buildings and walls, (k, 2) m each."""
+    for building in buildings:
+        ax.add_patch(Polygon(building, facecolor=BUILDING, edgecolor=WALL, linewidth=0.8, zorder=0.8))
+    ax.add_collection(LineCollection(list(walls), colors=WALL, linewidths=1.6, capstyle="butt", zorder=0.8))
 
 
-def _patch(area: shapely.Geometry, **style: object) -> PathPatch:
-    polygons = shapely.get_parts(shapely.normalize(area))
-    rings = [ring for polygon in polygons for ring in (polygon.exterior, *polygon.interiors)]
-    return PathPatch(
-        Outline.make_compound_path(*(Outline(np.asarray(r.coords), closed=True) for r in rings)), **style
-    )
+def _patch(polygons: Sequence[Rings], **style: object) -> PathPatch:
+    rings = [ring for polygon in polygons for ring in polygon]
+    return PathPatch(Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings)), **style)
 
 
-def _draw_lane_marks(lot: ParkingLot, ax: Axes, paint_width: float) -> None:
+def _draw_lane_marks(outline: LotOutline, ax: Axes, paint_width: float) -> None:
     """A dashed line in the middle of two-way lanes, arrows on one-way lanes."""
-    two_way = [lane.points for lane in lot.lanes if not lane.oneway]
     ax.add_collection(
         LineCollection(
-            two_way, colors=PAINT, alpha=0.45, linewidths=paint_width, linestyles=(0, (5, 6)), zorder=0.9
+            list(outline.centre_lines), colors=PAINT, alpha=0.45, linewidths=paint_width, linestyles=(0, (5, 6)),
+            zorder=0.9,
         )
-    )
+    )  # fmt: skip
     arrow = np.array(
         [[1.6, 0.0], [-0.2, 0.75], [-0.2, 0.2], [-1.6, 0.2], [-1.6, -0.2], [-0.2, -0.2], [-0.2, -0.75]]
     )
-    arrows: list[FloatArray] = []
-    for lane in lot.lanes:
-        for start, step in zip(lane.points, np.diff(lane.points, axis=0), strict=False):
-            if lane.oneway:
-                length = float(np.hypot(*step))
-                turn = np.array([step, [-step[1], step[0]]]) / length
-                n = max(1, round(length / 24.0))
-                arrows += [start + (i + 0.5) / n * step + arrow @ turn for i in range(n)]
-    ax.add_collection(PolyCollection(arrows, facecolors=PAINT, edgecolors="none", alpha=0.85, zorder=0.9))
+    cos, sin = np.cos(outline.arrows[:, 2]), np.sin(outline.arrows[:, 2])
+    turn = np.stack([np.stack([cos, sin], axis=1), np.stack([-sin, cos], axis=1)], axis=1)
+    arrows = outline.arrows[:, None, :2] + arrow @ turn
+    ax.add_collection(
+        PolyCollection(list(arrows), facecolors=PAINT, edgecolors="none", alpha=0.85, zorder=0.9)
+    )
 
 
 def _draw_graph(lot: ParkingLot, ax: Axes, points_per_m: float) -> None:
@@ -236,22 +217,14 @@ def _draw_graph(lot: ParkingLot, ax: Axes, points_per_m: float) -> None:
     )
 
 
-def _draw_entries_and_goals(lot: ParkingLot, ax: Axes, points_per_m: float) -> None:
-    """An arrow into the lot along the lane of each entry, a star on each goal."""
-    lines = linestrings([lane.points for lane in lot.lanes])
-    middle = lot.slot_xy.mean(axis=0)
-    for xy in lot.entries:
-        k = int(np.argmin(np.asarray(shapely.distance(lines, shapely.Point(xy)))))
-        at = shapely.line_locate_point(lines[k], shapely.Point(xy))
-        ends = shapely.line_interpolate_point(lines[k], [max(at - 1.0, 0.0), at, at + 1.0])
-        before, here, after = shapely.get_coordinates(ends)
-        # Where cars could go either way, the way toward the slots is the way in.
-        ways = [after - here] if lot.lanes[k].oneway else [after - here, before - here]
-        way = max(ways, key=lambda way: float(way @ (middle - here)))
+def _draw_entries_and_goals(outline: LotOutline, ax: Axes, points_per_m: float) -> None:
+    """Draw an arrow into the lot at each entry, a star on each goal."""
+    for x, y, yaw in outline.entries:
+        reach = 32.0 / points_per_m
         ax.add_patch(
             FancyArrowPatch(
-                tuple(xy),
-                tuple(xy + 32.0 / points_per_m * way),
+                (x, y),
+                (x + reach * np.cos(yaw), y + reach * np.sin(yaw)),
                 arrowstyle="simple,head_length=0.9,head_width=1.1,tail_width=0.45",
                 mutation_scale=14.0,
                 shrinkA=0.0,
@@ -263,8 +236,8 @@ def _draw_entries_and_goals(lot: ParkingLot, ax: Axes, points_per_m: float) -> N
             )
         )
     ax.scatter(
-        lot.goals[:, 0],
-        lot.goals[:, 1],
+        outline.goals[:, 0],
+        outline.goals[:, 1],
         marker="*",
         s=340.0,
         color=GOAL,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import matplotlib as mpl
 import numpy as np
@@ -39,7 +39,7 @@ def time_distributions(results: ComparisonResults) -> Iterator[tuple[str, Figure
             continue
         panels = settings.setdefault((c["failure_cost_s"], c["v_walk_kmh"], c["v_drive_kmh"]), {})
         totals = panels.setdefault(c["scenario"], {})
-        totals[case.agent] = np.array([episode["total_s"] for episode in episodes])
+        totals[case.label] = np.array([episode["total_s"] for episode in episodes])
         totals[BOUND] = np.array([episode["bound_s"] for episode in episodes])
     for setting, panels in settings.items():
         for totals in panels.values():
@@ -79,7 +79,7 @@ def draw_time_distribution(panels: Mapping[str, Totals]) -> Figure:
             if i % columns == 0:
                 ax.set_ylabel("searches done by then, %")
         handles = [
-            Line2D([], [], color=_color(name), linestyle=_dashes(name), linewidth=2.0, label=name)
+            Line2D([], [], color=_color(name), linestyle=_dashes(name) or "-", linewidth=2.0, label=name)
             for name in names
         ]
         handles.append(
@@ -101,12 +101,13 @@ def _draw_panel(ax: Axes, totals: Totals) -> None:
     margin = 0.04 * (end - low) or 1.0
     limit = end + margin
     # The first agent lies on top of the others.
-    for order, name in enumerate(reversed(totals)):
+    for order, name in enumerate(reversed(list(totals))):
         times = np.sort(totals[name])
         share = 100.0 * np.arange(1, len(times) + 1) / len(times)
         x, y = np.r_[times[0], times, max(limit, times[-1])], np.r_[0.0, share, 100.0]
         ax.step(
-            x, y, where="post", color=_color(name), linestyle=_dashes(name), linewidth=1.7, zorder=2 + 0.01 * order
+            x, y, where="post", color=_color(name), linestyle=_dashes(name) or "-", linewidth=1.7,
+            zorder=2 + 0.01 * order,
         )  # fmt: skip
         # A mean beyond the axis is a triangle at its end.
         mean = float(times.mean())
@@ -127,5 +128,5 @@ def _color(name: str) -> str:
     return INK if name in _DASHED else AGENT_COLORS.get(name, OTHER_AGENT)
 
 
-def _dashes(name: str) -> str | tuple[int, tuple[int, ...]]:
-    return (0, (4, 2)) if name in _DASHED else "-"
+def _dashes(name: str) -> tuple[float, Sequence[float]] | None:
+    return (0.0, (4.0, 2.0)) if name in _DASHED else None

@@ -1,4 +1,4 @@
-"""Survey drives driven again and written down, capture by capture, for a page that shows them."""
+"""Record survey drives capture by capture for the replay of a report."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from parkenv.evaluation.report.search_recording import describe_lot
+from parkenv.evaluation.report.lot_data import describe_lot
 from parkenv.mapping.grid import OccupancyGrid
-from parkenv.mapping.survey import Survey, SurveyMoment
-from parkenv.perception.stack import View
+from parkenv.mapping.survey import Survey, SurveyFrame
+from parkenv.perception.pipeline import CameraView, PerceptionResult
 from sim_sensors.rig import poses_along
 
 PICTURE_WIDTH = 480
-"""px, of the camera's frames."""
+"""px, of recorded camera frames."""
 JPEG_QUALITY = 68
 SCAN_REACH = 16.0
-"""m; beams that end farther away are left out."""
+"""m; longer beams are left out."""
 LEVELS = 15
 """Shades of the occupancy grid."""
 
@@ -30,12 +30,12 @@ Recording = dict[str, Any]
 
 
 def record_drive(survey: Survey, number: int, most_frames: int) -> Recording:
-    """Drive a session again.
+    """Drive a session again and record it.
 
     Args:
-        survey: as it was driven.
+        survey: the survey.
         number: of the session.
-        most_frames: captures that are kept, at equal distances; the last one is always among them.
+        most_frames: captures to keep, at equal distances, always with the last one.
     """
     captures = len(poses_along(survey.route.path, survey.settings.every))
     step = max(1, math.ceil(captures / most_frames))
@@ -44,23 +44,23 @@ def record_drive(survey: Survey, number: int, most_frames: int) -> Recording:
     known = np.full(survey.scenario.lot.n_slots, -1)
     taken = np.zeros(survey.scenario.lot.n_slots, dtype=np.bool_)
 
-    def watch(moment: SurveyMoment) -> None:
+    def watch(frame: SurveyFrame) -> None:
         nonlocal count, first_time, known, taken
-        first_time = first_time if count else moment.time
+        first_time = first_time if count else frame.result.captured.time
         if count % step == 0 or count == captures - 1:
-            states = moment.slots.states()
+            states = frame.slots.states()
             now = np.where(states.in_view, np.round(255 * states.p_occupied), -1).astype(np.int64)
             frames.append(
                 {
-                    **_frame(moment, first_time),
+                    **_frame(frame, first_time),
                     "belief": _changes(known, now),
-                    "truth": _changes(taken.astype(np.int64), moment.truth.astype(np.int64)),
+                    "truth": _changes(taken.astype(np.int64), frame.truth.astype(np.int64)),
                 }
             )
-            known, taken = now, moment.truth.copy()
+            known, taken = now, frame.truth.copy()
         count += 1
 
-    result = survey.drive(number, on_moment=watch)
+    result = survey.drive(number, on_frame=watch)
     grid = result.grid
     rows, columns = grid.log_odds.shape
     return {
@@ -87,27 +87,27 @@ def record_drive(survey: Survey, number: int, most_frames: int) -> Recording:
     }
 
 
-def _frame(moment: SurveyMoment, first_time: float) -> Recording:
-    look = moment.look
-    x, y, yaw = (round(float(v), 3) for v in look.vehicle)
-    view = look.views[0]
+def _frame(frame: SurveyFrame, first_time: float) -> Recording:
+    result = frame.result
+    x, y, yaw = (round(float(v), 3) for v in result.vehicle)
+    view = result.views[0]
     return {
-        "t": round(moment.time - first_time, 2),
+        "t": round(result.captured.time - first_time, 2),
         "pose": [x, y, yaw],
         "picture": _jpeg(view.image),
         "boxes": _boxes(view),
         "cars": [
             [round(float(v), 2) for v in (*xy, yaw, *size)]
-            for its in look.views
+            for its in result.views
             for xy, yaw, size in zip(its.cars.xy, its.cars.yaw, its.cars.size, strict=True)
         ],
-        "scan": _scan(moment),
-        "map": _grid_png(moment.grid),
+        "scan": _scan(result),
+        "map": _grid_png(frame.grid),
     }
 
 
-def _boxes(view: View) -> list[list[float]]:
-    """Left, top, right, bottom as shares of the picture; probability; whether it is an end; whether it is placed."""
+def _boxes(view: CameraView) -> list[list[float]]:
+    """List left, top, right, bottom as fractions of the image; probability; is an end; is ranged."""
     height, width = view.image.shape[:2]
     found = view.detections
     made = []
@@ -115,16 +115,16 @@ def _boxes(view: View) -> list[list[float]]:
         left, top, right, bottom = found.boxes[i].tolist()
         box = (left / width, top / height, right / width, bottom / height, float(found.probability[i]))
         placed = int(i in view.cars.detection)
-        made.append([*(round(v, 3) for v in box), int(found.ends[i]), placed])
+        made.append([*(round(v, 3) for v in box), int(found.end_on[i]), placed])
     return made
 
 
-def _scan(moment: SurveyMoment) -> list[int]:
-    """Where beams end, decimetres from the car, x and y in turns."""
-    x, y, _ = moment.look.vehicle
+def _scan(result: PerceptionResult) -> list[int]:
+    """List the ends of beams, decimetres from the car, x and y alternating."""
+    x, y, _ = result.vehicle
     points = [
-        sweep.points(np.flatnonzero(np.nan_to_num(sweep.distance, nan=np.inf) < SCAN_REACH))[::2]
-        for sweep in moment.look.sweeps
+        scan.points(np.flatnonzero(np.nan_to_num(scan.distance, nan=np.inf) < SCAN_REACH))[::2]
+        for scan in result.scans
     ]
     away = np.concatenate(points) - [x, y] if points else np.empty((0, 2))
     whole: list[int] = np.round(10 * away).astype(np.int64).ravel().tolist()
@@ -132,7 +132,7 @@ def _scan(moment: SurveyMoment) -> list[int]:
 
 
 def _changes(before: NDArray[np.int64], now: NDArray[np.int64]) -> list[int]:
-    """Slot and value, in turns, of those that have changed."""
+    """List alternating slot and value of those that have changed."""
     changed = np.flatnonzero(before != now)
     pairs: list[int] = np.stack([changed, now[changed]], axis=1).ravel().tolist()
     return pairs
@@ -147,7 +147,7 @@ def _jpeg(image: NDArray[np.uint8]) -> str:
 
 
 def _grid_png(grid: OccupancyGrid) -> str:
-    """The grid with north up, half as fine as it is kept: 0 where nothing was seen, then from free to taken."""
+    """Encode the grid, north up, at half its resolution: 0 where unobserved, then from free to taken."""
     rows, columns = (2 * (n // 2) for n in grid.log_odds.shape)
     blocks = (rows // 2, 2, columns // 2, 2)
     p = grid.probability[:rows, :columns].reshape(blocks).max(axis=(1, 3))
@@ -161,7 +161,7 @@ def _grid_png(grid: OccupancyGrid) -> str:
 
 
 def _palette() -> list[int]:
-    """Nothing, then from a pale blue to a dark violet."""
+    """Transparent, then from pale blue to dark violet."""
     share = np.linspace(0.0, 1.0, LEVELS)[:, None]
     colors = np.array([[150, 190, 215]]) * (1 - share) + np.array([[112, 48, 170]]) * share
     return [0, 0, 0, *np.round(colors).astype(int).ravel().tolist()]
@@ -169,9 +169,9 @@ def _palette() -> list[int]:
 
 _PALETTE = _palette()
 _OPACITY = bytes([0, *np.round(np.linspace(50, 235, LEVELS)).astype(int).tolist()])
-"""Of each colour: where no car stands, slots are to be seen through it."""
+"""Opacity of each colour: slots are visible through free cells."""
 
 
 def data_uri(kind: str, content: bytes) -> str:
-    """A file's content as an address."""
+    """Encode a file's content as a data URI."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

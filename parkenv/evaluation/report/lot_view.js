@@ -1,10 +1,10 @@
-// A lot from above on a canvas: what stays is drawn once for each size, what moves on top of it.
+// A lot from above on a canvas: the static layer is drawn once for each size, moving things on top of it.
 
-/** The colours of the page's theme, as the style sheet has them. */
+/** The colours of the page's theme, from the style sheet. */
 const palette = {
   read() {
     const style = getComputedStyle(document.documentElement);
-    for (const name of ["ground", "asphalt", "paint", "building", "wall", "parked", "glass", "car", "goal", "halo", "ink", "soft", "view", "card"]) {
+    for (const name of ["ground", "asphalt", "paint", "building", "wall", "parked", "glass", "car", "goal", "halo", "ink", "soft", "view", "card", "entry"]) {
       this[name] = style.getPropertyValue(`--${name}`).trim();
     }
     const anchors = style.getPropertyValue("--belief").split(",").map((hex) => hex.trim()).map((hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16)));
@@ -17,7 +17,7 @@ const palette = {
   },
 };
 
-/** Metres that are shown around a car that is followed. */
+/** Metres shown around the followed car. */
 const AROUND = 44;
 const MARGIN = 2.5;
 
@@ -31,10 +31,15 @@ class LotView {
       x: (ax + cx) / 2, y: (ay + cy) / 2, yaw: Math.atan2(by - ay, bx - ax),
       length: Math.hypot(bx - ax, by - ay), width: Math.hypot(dx - ax, dy - ay),
     }));
+    this.paved = new Path2D();
+    for (const ring of lot.paved.flat()) {
+      for (let i = 0; i < ring.length; i += 2) this.paved[i ? "lineTo" : "moveTo"](ring[i], ring[i + 1]);
+      this.paved.closePath();
+    }
     this.resize();
   }
 
-  /** Take on the canvas's width; the height follows from the lot. */
+  /** Adopt the canvas's width; the height follows from the lot. */
   resize() {
     const [x0, y0, x1, y1] = this.lot.bounds;
     const [across, up] = [x1 - x0 + 2 * MARGIN, y1 - y0 + 2 * MARGIN];
@@ -51,7 +56,7 @@ class LotView {
     this.ground = null;
   }
 
-  /** Begin a picture; around a place where it is followed. */
+  /** Begin a frame; in follow mode, around a place. */
   begin(place) {
     this.at = this.whole;
     if (this.follow && place) {
@@ -78,20 +83,20 @@ class LotView {
     return context;
   }
 
-  /** Coordinates in metres from now on, north up. */
+  /** Use metres as coordinates, north up. */
   toMetres(context) {
     const { scale, x, y } = this.at;
     const k = this.ratio * scale;
     context.setTransform(k, 0, 0, -k, this.ratio * (this.width / 2 - scale * x), this.ratio * (this.height / 2 + scale * y));
   }
 
-  /** So many pixels in metres. */
+  /** Convert pixels to metres. */
   px(pixels) {
     return pixels / this.at.scale;
   }
 
   drawGround(context) {
-    const { lot, slots } = this;
+    const { lot } = this;
     const { x, y, scale } = this.at;
     context.fillStyle = palette.ground;
     context.fillRect(x - this.width / scale, y - this.height / scale, (2 * this.width) / scale, (2 * this.height) / scale);
@@ -99,72 +104,34 @@ class LotView {
       context.beginPath();
       for (let i = 0; i < points.length; i += 2) context.lineTo(points[i], points[i + 1]);
     };
-    for (const wall of lot.walls) {
-      trace(wall.points);
-      if (wall.building) {
-        context.fillStyle = palette.building;
-        context.fill();
-      }
-      context.strokeStyle = palette.wall;
-      context.lineWidth = Math.max(0.25, this.px(1));
-      context.stroke();
-    }
-    context.strokeStyle = palette.asphalt;
-    context.fillStyle = palette.asphalt;
-    context.lineCap = "round";
     context.lineJoin = "round";
-    for (const lane of lot.lanes) {
-      trace(lane.points);
-      context.lineWidth = 2 * lane.half_width;
-      context.stroke();
-    }
-    // From each slot to where a car stops before it.
-    context.lineCap = "butt";
-    slots.forEach((slot, i) => {
-      const [vx, vy] = lot.vertices[i];
-      const along = Math.abs(Math.cos(Math.atan2(vy - slot.y, vx - slot.x) - slot.yaw)) > 0.7;
-      context.lineWidth = (along ? slot.width : slot.length) + 0.5;
-      context.beginPath();
-      context.moveTo(slot.x, slot.y);
-      context.lineTo(vx, vy);
-      context.stroke();
-      context.save();
-      context.translate(slot.x, slot.y);
-      context.rotate(slot.yaw);
-      context.fillRect(-slot.length / 2 - 0.25, -slot.width / 2 - 0.25, slot.length + 0.5, slot.width + 0.5);
-      context.restore();
-    });
-    context.strokeStyle = palette.paint;
-    context.globalAlpha = 0.7;
-    context.lineWidth = Math.max(0.12, this.px(0.6));
-    for (const lane of lot.lanes) {
-      if (lane.oneway) {
-        for (let i = 2; i < lane.points.length; i += 2) this.laneArrows(context, ...lane.points.slice(i - 2, i + 2));
-      } else {
-        context.setLineDash([1.5, 2.5]);
-        trace(lane.points);
-        context.stroke();
-        context.setLineDash([]);
-      }
-    }
-    context.globalAlpha = 1;
-    for (const [ex, ey] of lot.entries) {
-      context.fillStyle = palette.soft;
-      const r = this.px(4);
-      context.beginPath();
-      context.arc(ex, ey, r, 0, 2 * Math.PI);
+    for (const building of lot.buildings) {
+      trace(building);
+      context.fillStyle = palette.building;
       context.fill();
     }
-  }
-
-  laneArrows(context, ax, ay, bx, by) {
-    const length = Math.hypot(bx - ax, by - ay);
-    const n = Math.max(1, Math.round(length / 24));
-    context.fillStyle = palette.paint;
-    for (let i = 0; i < n; i += 1) {
-      const share = (i + 0.5) / n;
-      this.arrowHead(context, ax + share * (bx - ax), ay + share * (by - ay), Math.atan2(by - ay, bx - ax), 1.6);
+    context.fillStyle = palette.asphalt;
+    context.fill(this.paved, "evenodd");
+    context.strokeStyle = palette.wall;
+    context.lineWidth = Math.max(0.25, this.px(1));
+    for (const wall of [...lot.buildings, ...lot.walls]) {
+      trace(wall);
+      context.stroke();
     }
+    context.strokeStyle = palette.paint;
+    context.fillStyle = palette.paint;
+    context.globalAlpha = 0.7;
+    context.lineWidth = Math.max(0.12, this.px(0.6));
+    context.setLineDash([1.5, 2.5]);
+    for (const line of lot.centre_lines) {
+      trace(line);
+      context.stroke();
+    }
+    context.setLineDash([]);
+    for (const arrow of lot.arrows) this.arrowHead(context, ...arrow, 1.6);
+    context.globalAlpha = 1;
+    context.fillStyle = palette.entry;
+    for (const entry of lot.entries) this.arrowHead(context, ...entry, Math.max(2.4, this.px(13)));
   }
 
   arrowHead(context, x, y, yaw, size) {
@@ -182,8 +149,8 @@ class LotView {
   }
 
   /**
-   * All slots: filled with the belief, pale until seen, and a car where one stands.
-   * belief(i) is 0 to 255, or -1 where nothing is known; seen(i), taken(i) are true or false.
+   * Draw all slots: filled by belief, pale until observed, with a car in taken ones.
+   * belief(i) is 0 to 255, or -1 where unknown; seen(i), taken(i) are booleans.
    */
   drawSlots(belief, seen, taken) {
     const context = this.context;
@@ -219,7 +186,7 @@ class LotView {
     context.fillRect(-0.34 * length, -0.32 * width, 0.09 * length, 0.64 * width);
   }
 
-  /** The car that is watched. */
+  /** Draw the searching car. */
   drawCar(x, y, yaw) {
     const context = this.context;
     const length = Math.max(4.4, this.px(15));
@@ -240,7 +207,7 @@ class LotView {
     context.restore();
   }
 
-  /** A line through places, cased so that it is seen on any ground. */
+  /** Draw a line with a halo, visible on any background. */
   drawLine(points, color, pixels, dash = []) {
     if (points.length < 2) return;
     const context = this.context;
@@ -259,7 +226,7 @@ class LotView {
     context.setLineDash([]);
   }
 
-  /** A plan: a line with arrows along it, and a ring where it ends. */
+  /** Draw a plan: a line with arrows along it, and an outline around its last slot. */
   drawPlan(points, endSlot) {
     if (points.length < 2) return;
     this.drawLine(points, palette.ink, 1.6);
@@ -285,7 +252,7 @@ class LotView {
     this.outline(this.slots[endSlot], palette.ink, 2.2);
   }
 
-  /** The outline of a slot or a car. */
+  /** Draw the outline of a slot or a car. */
   outline({ x, y, yaw, length, width }, color, pixels) {
     const context = this.context;
     context.save();
@@ -316,7 +283,7 @@ class LotView {
     context.stroke();
   }
 
-  /** Where people walk to: a mark, or at the edge an arrow toward it. */
+  /** Draw the goal: a mark, or an arrow toward it at the edge. */
   drawGoal(x, y) {
     const context = this.context;
     const [left, right] = [this.at.x - this.width / 2 / this.at.scale, this.at.x + this.width / 2 / this.at.scale];
@@ -332,7 +299,7 @@ class LotView {
     this.drawDot(x, y, 3, palette.halo);
   }
 
-  /** A bar of a round length in the lower left corner. */
+  /** Draw a scale bar in the lower left corner. */
   drawScale() {
     const context = this.context;
     const raw = this.width / 7 / this.at.scale;

@@ -1,4 +1,4 @@
-"""What a command left in its folder: the summary, the figures, and the searches that it counted."""
+"""Read a run folder: summary, figures and episodes."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from typing import Any, Self
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.results import SETTING_COLUMNS, SETTINGS, SUMMARY, SUMMARY_PARTIAL, Row
+from parkenv.evaluation.experiments.spec import SPEC_FILE
+from parkenv.files.spec_file import read_tables
 
 _TEXT = ("scenario", "agent")
 
@@ -24,11 +26,13 @@ class RunFolder:
         path: the folder.
         summary: its `summary.json`.
         figures: the PNG files in it, by name.
+        kind: of run: compare, survey, demo, train, ...; the command's name where it left no specification.
     """
 
     path: Path
     summary: Mapping[str, Any]
     figures: tuple[Path, ...]
+    kind: str
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -64,12 +68,9 @@ class RunFolder:
                 f"{file}: was written by parkenv {summary['version']}, this is {__version__}, whose searches may "
                 "differ; run the command again, or report it with that version"
             )
-        return cls(path, summary, tuple(sorted(path.glob("*.png"))))
-
-    @property
-    def kind(self) -> str:
-        """The command: compare, survey, demo, train, ..."""
-        return str(self.summary["command"][1])
+        spec = path / SPEC_FILE
+        kind = read_tables(spec).get("kind") if spec.exists() else None
+        return cls(path, summary, tuple(sorted(path.glob("*.png"))), str(kind or summary["command"][1]))
 
     @property
     def arguments(self) -> list[str]:

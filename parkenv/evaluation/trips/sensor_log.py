@@ -1,8 +1,8 @@
-"""What sensors measured and the stack made of it, as a recording for the Rerun viewer (https://rerun.io)."""
+"""Record sensor data and perception results for the Rerun viewer (https://rerun.io)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -23,12 +23,11 @@ from parkenv.world.lot import ParkingLot
 if TYPE_CHECKING:
     import rerun as rr
 
-    from parkenv.envs.lookout import Moment
-    from parkenv.envs.perception import SearchPerceptionEnv
+    from parkenv.envs.perception import OnboardPerception, SearchPerceptionEnv
     from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
     from parkenv.mapping.grid import OccupancyGrid
-    from parkenv.mapping.survey import Survey, SurveyMoment
-    from parkenv.perception.stack import Look
+    from parkenv.mapping.survey import Survey, SurveyFrame
+    from parkenv.perception.pipeline import PerceptionResult
     from planners.agent import Agent
     from sim_sensors.rig import SensorRig
 
@@ -39,29 +38,29 @@ TIMELINE = "drive"
 PAUSE_S = 5.0
 """Between two drives."""
 GRID_EVERY = 10
-"""Captures between two pictures of the grid: it is large, and changes little."""
+"""Captures between two images of the grid, which is large and changes little."""
 JPEG_QUALITY = 80
-UNSEEN = 40
-SIDE, END, NOWHERE = (255, 208, 0), (86, 180, 233), (150, 150, 150)
+UNOBSERVED_GREY = 40
+SIDE, END, UNRANGED = (255, 208, 0), (86, 180, 233), (150, 150, 150)
 INK, PATH, SCAN, GOAL = (120, 126, 134), (0, 114, 178), (213, 94, 0), (204, 121, 167)
 
 
 class SensorLog:
-    """A recording on one time line: images, boxes, scans, grid, slots, path.
+    """A recording on one timeline: images, boxes, scans, grid, slots, path.
 
-    Entities are `lot/...` (m, z up: outlines of the slots, coloured by what is believed of each), `car` with its
-    cameras, images and boxes below it, `scan/...`, `grid`, `cars` that were found, and `path`.
+    Entities are `lot/...` (m, z up: outlines of the slots, coloured by belief), `car` with its cameras, images and
+    boxes below it, `scan/...`, `grid`, detected `cars`, and `path`.
 
     Args:
-        recording: where to.
-        lot: which is drawn once.
-        rig: whose sensors measured.
+        recording: the stream to write to.
+        lot: drawn once.
+        rig: the sensors.
     """
 
     def __init__(self, recording: rr.RecordingStream, lot: ParkingLot, rig: SensorRig) -> None:
         self._rec, self._lot, self._rig = recording, lot, rig
         self._path: list[list[float]] = []
-        self._moments = 0
+        self._n_captures = 0
         self._begun = self._time = 0.0
         corners = lot.slot_corners()[:, [0, 1, 2, 3, 0]]
         self._outlines = np.concatenate([corners, np.zeros((*corners.shape[:2], 1))], axis=2)
@@ -69,32 +68,32 @@ class SensorLog:
         self._draw_rig()
 
     def begin(self) -> None:
-        """Another drive begins, behind what was recorded so far."""
-        self._begun = 0.0 if not self._moments else self._time + PAUSE_S
+        """Begin another drive, after the ones recorded so far."""
+        self._begun = 0.0 if not self._n_captures else self._time + PAUSE_S
         self._path = []
 
-    def moment(self, time: float, look: Look) -> None:
-        """Where the car took itself to be, what its sensors measured there, and what was found.
+    def capture(self, time: float, result: PerceptionResult) -> None:
+        """Record the estimated pose of the car, its measurements, and the detected cars.
 
         Args:
             time: s since the drive began.
-            look: what the stack made of it.
+            result: of the perception pipeline.
         """
         import rerun as rr
 
         self._time = self._begun + time
         self._rec.set_time(TIMELINE, duration=self._time)
-        x, y, yaw = (float(v) for v in look.vehicle)
+        x, y, yaw = (float(v) for v in result.vehicle)
         axis = rr.RotationAxisAngle(axis=(0.0, 0.0, 1.0), radians=yaw)
         self._rec.log("car", rr.Transform3D(translation=(x, y, 0.0), rotation=axis))
         self._path.append([x, y, 0.05])
         self._rec.log("path", rr.LineStrips3D([self._path], colors=[PATH], radii=0.08))
-        for view in look.views:
+        for view in result.views:
             at = f"car/{view.name}"
             self._rec.log(at, rr.EncodedImage(contents=_jpeg(view.image), media_type="image/jpeg"))
             found = view.detections
             standing = np.isin(np.arange(len(found)), view.cars.detection)
-            colors = np.where(standing[:, None], np.where(found.ends[:, None], END, SIDE), NOWHERE).astype(
+            colors = np.where(standing[:, None], np.where(found.end_on[:, None], END, SIDE), UNRANGED).astype(
                 np.uint8
             )
             labels = [f"{p:.2f}" for p in found.probability]
@@ -102,11 +101,11 @@ class SensorLog:
                 array=found.boxes, array_format=rr.Box2DFormat.XYXY, colors=colors, labels=labels
             )
             self._rec.log(f"{at}/boxes", boxes)
-        for number, sweep in enumerate(look.sweeps):
-            ended = np.nonzero(np.isfinite(sweep.distance))[0]
-            points = np.column_stack([sweep.points(ended), np.full(len(ended), 0.5)])
+        for number, scan in enumerate(result.scans):
+            ended = np.nonzero(np.isfinite(scan.distance))[0]
+            points = np.column_stack([scan.points(ended), np.full(len(ended), 0.5)])
             self._rec.log(f"scan/{number}", rr.Points3D(points, colors=[SCAN], radii=0.04))
-        cars = [view.cars for view in look.views if len(view.cars)]
+        cars = [view.cars for view in result.views if len(view.cars)]
         self._rec.log(
             "cars",
             rr.Boxes3D(
@@ -120,10 +119,10 @@ class SensorLog:
             if cars
             else rr.Clear(recursive=False),
         )
-        self._moments += 1
+        self._n_captures += 1
 
     def slots(self, p_occupied: FloatArray, known: NDArray[np.bool_] | None = None) -> None:
-        """What is believed of every slot, (n_slots,), now; grey where nothing is `known`."""
+        """Record P(taken) of every slot, (n_slots,); grey where not `known`."""
         import rerun as rr
 
         colors = (255.0 * colormaps["cividis"](p_occupied)).astype(np.uint8)
@@ -137,8 +136,8 @@ class SensorLog:
         )
 
     def grid(self, grid: OccupancyGrid) -> None:
-        """The occupancy grid as it is now, every `GRID_EVERY` moments."""
-        if (self._moments - 1) % GRID_EVERY:
+        """Record the occupancy grid at every `GRID_EVERY`-th capture."""
+        if (self._n_captures - 1) % GRID_EVERY:
             return
         import rerun as rr
 
@@ -147,7 +146,7 @@ class SensorLog:
         side = grid.cell * np.array([columns, rows])
         corners = low + np.array([[0, 0, 0], [side[0], 0, 0], [side[0], side[1], 0], [0, side[1], 0]])
         picture = (255.0 * colormaps["cividis"](grid.probability)[..., :3]).astype(np.uint8)
-        picture[~grid.seen] = UNSEEN
+        picture[~grid.seen] = UNOBSERVED_GREY
         self._rec.log(
             "grid",
             rr.Mesh3D(
@@ -198,10 +197,10 @@ class SensorLog:
 
 
 def require_viewer() -> None:
-    """Say how to install the Rerun SDK where it is missing.
+    """Check that the Rerun SDK is installed.
 
     Raises:
-        InputError: it is.
+        InputError: it is not.
     """
     if find_spec("rerun") is None:
         raise InputError("a recording needs the Rerun SDK; install it with: pip install 'parkenv[viewer]'")
@@ -209,7 +208,7 @@ def require_viewer() -> None:
 
 @contextmanager
 def sensor_log(path: str | Path, lot: ParkingLot, rig: SensorRig) -> Iterator[SensorLog]:
-    """A log that becomes the file `path`, an .rrd, when the block ends.
+    """Open a log that becomes the file `path`, an .rrd, at the end of the block.
 
     Raises:
         InputError: the extra `viewer` is not installed, or the file cannot be written.
@@ -247,24 +246,25 @@ def sensor_log(path: str | Path, lot: ParkingLot, rig: SensorRig) -> Iterator[Se
 
 
 def record_session(survey: Survey, number: int, log: SensorLog) -> None:
-    """Drive a session of a survey, as it is driven for the map, and record it.
+    """Drive a survey session, as for the map, and record it.
 
     Args:
-        survey: of which.
+        survey: the survey.
         number: of the session.
-        log: where to; of the survey's lot and rig.
+        log: of the survey's lot and rig.
     """
     log.begin()
     begun: list[float] = []
 
-    def keep(moment: SurveyMoment) -> None:
-        begun[:] = begun or [moment.time]
-        log.moment(moment.time - begun[0], moment.look)
-        states = moment.slots.states()
+    def keep(frame: SurveyFrame) -> None:
+        time = frame.result.captured.time
+        begun[:] = begun or [time]
+        log.capture(time - begun[0], frame.result)
+        states = frame.slots.states()
         log.slots(states.p_occupied, states.in_view)
-        log.grid(moment.grid)
+        log.grid(frame.grid)
 
-    survey.drive(number, on_moment=keep)
+    survey.drive(number, on_frame=keep)
 
 
 class _SearchLogger(Observer):
@@ -272,11 +272,11 @@ class _SearchLogger(Observer):
 
     Args:
         log: where to.
-        captures: of the last step.
+        perception: of the environment.
     """
 
-    def __init__(self, log: SensorLog, captures: Callable[[], list[tuple[Moment, Look]]]) -> None:
-        self._log, self._captures = log, captures
+    def __init__(self, log: SensorLog, perception: OnboardPerception) -> None:
+        self._log, self._perception = log, perception
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
         """Begin a drive."""
@@ -289,8 +289,8 @@ class _SearchLogger(Observer):
         self._record(step.next_observation)
 
     def _record(self, observation: Any) -> None:
-        for moment, look in self._captures():
-            self._log.moment(moment.time - self._start, look)
+        for result in self._perception.results:
+            self._log.capture(result.captured.time - self._start, result)
         self._log.slots(observation["p_occupied"].astype(np.float64))
 
 
@@ -301,9 +301,9 @@ def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: Sensor
         env: the environment.
         agent: made for its scenario.
         seed: of the world.
-        log: where to; of the environment's lot and rig.
+        log: of the environment's lot and rig.
     """
-    simulate(TimeLimit(env, STEP_LIMIT), agent, seed, (_SearchLogger(log, lambda: env.looks),))
+    simulate(TimeLimit(env, STEP_LIMIT), agent, seed, (_SearchLogger(log, env.perception),))
 
 
 def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
@@ -312,15 +312,15 @@ def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
     Args:
         search: with a rig.
         seed: of the world.
-        log: where to; of the lot and the rig of `search`.
+        log: of the lot and rig of `search`.
 
     Raises:
         InputError: a search without a rig.
     """
-    watcher = search.env.watcher
-    if watcher is None:
+    perception = search.env.perception
+    if perception is None:
         raise InputError("a recorded trip needs sensors: give it a rig")
-    return search.run(seed, (_SearchLogger(log, lambda: watcher.looks),))
+    return search.run(seed, (_SearchLogger(log, perception),))
 
 
 def _jpeg(image: NDArray[np.uint8]) -> bytes:

@@ -1,4 +1,4 @@
-"""`parkenv fit-sensor-model`: how well the stack sees, as a model for the environment without sensors."""
+"""`parkenv fit-sensor-model`: measure the error rates of the perception pipeline."""
 
 from __future__ import annotations
 
@@ -10,58 +10,59 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
-from parkenv.scenarios.build import make_scenario
+from parkenv.scenarios.build import build
 
 
-def fit_sight(
+def fit_sensor_model(
     scenario: Annotated[
-        str, typer.Option("--scenario", metavar="NAME[,NAME...]", help="Where to look.")
+        str,
+        typer.Option("--scenario", metavar="NAME|FILE[,...]", help="Scenarios to search in."),
     ] = "campus,street",
-    rig: Annotated[
-        str, typer.Option("--rig", help="laser: a camera and a 270° laser; stereo: a stereo pair alone.")
-    ] = "laser",
-    searches: Annotated[
-        int, typer.Option("--searches", "-n", min=1, help="Of each of three agents in each scenario.")
+    rig: args.SurveyRigOption = None,
+    episodes: Annotated[
+        int,
+        typer.Option("--episodes", "-n", min=1, help="Searches of each of three agents in each scenario."),
     ] = 20,
     arrival: args.ArrivalOption = None,
     days: args.DaysOption = None,
-    weather: Annotated[
-        str | None,
-        typer.Option("--weather", help="sunny, overcast, low_sun, dusk, rain; drawn where not given."),
-    ] = None,
+    weather: args.WeatherOption = None,
     seed: args.SeedOption = 500_000,
     jobs: args.JobsOption = 0,
     backend: args.BackendOption = "loky",
     address: args.AddressOption = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The JSON file to write.")] = Path("sight.json"),
+    out: Annotated[Path, typer.Option("--out", "-o", help="The JSON file to write.")] = Path(
+        "sensor_model.json"
+    ),
 ) -> None:
-    """Search through the sensors, and count how often the stack is right about slots, by distance and side.
+    """Search with simulated sensors, and count how often slots are observed correctly, by distance and side.
 
-    The rates become a sensor model: `parkenv compare --sensor-model FILE` then sees as the stack does, at a thousandth
-    of the cost.
+    The rates become a sensor model: `parkenv compare --sensor-model FILE` then makes the same errors as the perception
+    pipeline, a thousand times as fast.
 
     Example:
     * `parkenv fit-sensor-model --rig stereo --out stereo.json`
     """
     from parkenv.evaluation.experiments.sensor_model_fit import AGENTS, measure_sensors
-    from parkenv.world.traffic import Traffic
+    from parkenv.evaluation.experiments.spec import BUSY
 
-    scenarios = [
-        make_scenario(spec, traffic=Traffic(cars=3, pedestrians=5))
+    specs = [
+        spec if spec.traffic else spec.changed(traffic=BUSY)
         for spec in args.scenario_specs(scenario, arrival=arrival, days=days)
     ]
+    scenarios = [build(spec) for spec in specs]
+    rig = args.rig_of(rig) or specs[0].rig
     console = make_console()
     with args.workers_of(jobs, backend, address) as workers, Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         console=console, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
         bar = progress.add_task(
-            "Searching through the sensors", total=searches * len(AGENTS) * len(scenarios)
+            "Searching with simulated sensors", total=episodes * len(AGENTS) * len(scenarios)
         )
         counts = measure_sensors(
             scenarios,
             rig,
-            searches,
+            episodes,
             seed=seed,
             weather=weather,
             workers=workers,
@@ -70,14 +71,14 @@ def fit_sight(
     model = counts.fitted()
     model.to_file(out)
     table = make_table(
-        f"What the stack says of slots, rig {rig}",
-        ["slots up to", "side", "looks", "told", "taken, said taken", "free, said taken"],
+        f"Observations of slots, rig {rig}",
+        ["slots up to", "side", "slots in range", "observed", "hit rate", "false-alarm rate"],
     )
-    for band, seen in zip(model.bands, counts.counts.reshape(-1, 2, 3), strict=True):
+    for band, in_band in zip(model.bands, counts.counts.reshape(-1, 2, 3), strict=True):
         table.add_row(
             f"{band.up_to:g} m",
             "right" if band.beside else "elsewhere",
-            str(seen.sum()),
+            str(in_band.sum()),
             f"{band.seen_rate:.0%}",
             f"{band.hit_rate:.3f}",
             f"{band.false_alarm_rate:.3f}",

@@ -1,43 +1,46 @@
-"""Which slots are taken: a static-state binary Bayes filter for each, over one session (T §3.3.2)."""
+"""Slot occupancy from range scans and located cars: one static-state binary Bayes filter per slot (T §3.3.2)."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from parkenv.mapping.grid import P_FREE, P_OCCUPIED
-from parkenv.perception.ranging import CarSightings
-from parkenv.perception.sweeps import Sweep
+from parkenv.perception.range_scan import RangeScan
+from parkenv.perception.ranging import LocatedCars
 from parkenv.world.lot import Mouth, ParkingLot
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
 
+P_FREE, P_OCCUPIED, P_PRIOR = 0.45, 0.95, 0.5
+"""The observation model of eq. 3.9."""
 CORE = (0.8, 0.45)
-"""Half length and half width, m, of the middle of a slot, which every parked car covers."""
+"""Half length and half width, m, of the core of a slot, which every parked car covers."""
 MARGIN = 0.35
-"""m, that a parked car may stick out of its slot towards the lane."""
+"""m; a parked car may extend out of its slot towards the lane by this much."""
 INSET = 0.1
-"""m, that beams must end within the lines to the neighbours: their cars stand up to there."""
-LOOK_LOG_ODDS = 1.2
-"""What one look through the middle of a slot, or at something that fills it, adds or takes away."""
+"""m; beams must end this far inside the lines to the neighbours, whose cars may stand close to them."""
+SCAN_LOG_ODDS = 1.2
+"""Evidence of one scan that crosses the core of a slot (negative) or ends within the slot (positive)."""
 MOST_LOG_ODDS = 4.0
-"""Bound of what is believed of a slot: a car that comes or goes while the drive lasts is to be noticed."""
+"""Bound of the log-odds of a slot, so that the filter notices a car that arrives or leaves during the drive."""
 _LEAST_BEAMS = 4
 _CLEAR = 0.6
 
 
 @dataclass(frozen=True, eq=False)
 class SlotStates:
-    """What a session knows of every slot.
+    """The estimated occupancy of every slot.
 
     Attributes:
-        p_occupied: (n_slots,) float64; 0.5 where nothing was seen.
-        in_view: (n_slots,) bool, whether the slot was ever seen well enough to tell.
+        p_occupied: (n_slots,) float64; 0.5 where nothing was observed.
+        in_view: (n_slots,) bool, whether there was any evidence about the slot.
     """
 
     p_occupied: FloatArray
@@ -49,21 +52,38 @@ class SlotStates:
         return self.p_occupied > 0.5
 
 
-class SlotFilter:
-    """Evidence on each slot in log-odds, from detected cars and from what beams pass through.
-
-    The thesis counts detections alone: a car is put into the nearest slot, and at the end of a session slots without
-    a car are free (`thesis_states`). Here a slot that was never in view stays unknown, a car counts only inside of a
-    slot, so that traffic and people are not taken for parked cars, and beams that end in a slot or cross its middle
-    say taken or free as well.
-
-    Args:
-        lot: whose slots.
+class SlotObservation(NamedTuple):
+    """The slots that were observed, and their observed states.
 
     Attributes:
-        log_odds: (n_slots,) float64, of taken against free.
-        in_view: (n_slots,) bool.
-        told: (n_slots,) bool, slots on which there has been evidence since somebody cleared this.
+        slots: (k,) int64, ascending.
+        taken: (k,) bool.
+    """
+
+    slots: IntArray
+    taken: NDArray[np.bool_]
+
+    @classmethod
+    def none(cls) -> SlotObservation:
+        """Return an observation of no slot."""
+        return cls(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.bool_))
+
+
+class SlotFilter:
+    """Log-odds that each slot is taken, from located cars and from the beams of range scans.
+
+    The thesis uses detections alone: a car is assigned to the nearest slot, and slots without a car at the end of a
+    session are free (`thesis_states`). Here a slot that was never in view stays unknown. A car counts only inside a
+    slot, so that traffic and pedestrians are not taken for parked cars. Beams that end within a slot are evidence that
+    it is taken; beams that cross its core are evidence that it is free.
+
+    Args:
+        lot: the lot with the slots.
+
+    Attributes:
+        log_odds: (n_slots,) float64, taken against free.
+        in_view: (n_slots,) bool, slots with any evidence.
+        updated: (n_slots,) bool, slots with evidence since the caller last cleared this array.
     """
 
     def __init__(self, lot: ParkingLot) -> None:
@@ -74,11 +94,11 @@ class SlotFilter:
         self._inner = self._size + np.where(open_ended, [MARGIN, -INSET], [-INSET, MARGIN])
         self.log_odds = np.zeros(lot.n_slots)
         self.in_view = np.zeros(lot.n_slots, dtype=np.bool_)
-        self.told = np.zeros(lot.n_slots, dtype=np.bool_)
+        self.updated = np.zeros(lot.n_slots, dtype=np.bool_)
         self._visual = np.zeros(lot.n_slots)
 
-    def slots_of(self, cars: CarSightings) -> NDArray[np.int64]:
-        """The slot that each car stands in, (n,) int64; -1 where it stands in none."""
+    def slots_of(self, cars: LocatedCars) -> IntArray:
+        """Return the slot that each car stands in, (n,) int64; -1 for cars outside all slots."""
         if not len(cars):
             return np.empty(0, dtype=np.int64)
         nearest = np.asarray(self._tree.query(cars.xy)[1], dtype=np.int64)
@@ -86,56 +106,61 @@ class SlotFilter:
         inside = (np.abs(local) <= self._size[nearest] + MARGIN).all(axis=1)
         return np.where(inside, nearest, -1).astype(np.int64)
 
-    def see_cars(self, cars: CarSightings) -> NDArray[np.int64]:
-        """Detected cars are in the slots nearest to them; `slots_of` them."""
+    def update_from_cars(self, cars: LocatedCars) -> IntArray:
+        """Update the slots that the cars of one image stand in; return `slots_of(cars)`."""
         slots = self.slots_of(cars)
         if len(cars):
             _, nearest = self._tree.query(cars.xy)
             np.add.at(self._visual, nearest, _logit(P_OCCUPIED))
         there = slots[slots >= 0]
-        # One look says it once, however many boxes a car has.
+        # One image is one observation, even if a car has several boxes.
         self.log_odds[np.unique(there)] += _logit(P_OCCUPIED)
-        self.in_view[there] = self.told[there] = True
+        self.in_view[there] = self.updated[there] = True
         self._clip()
         return slots
 
-    def see_through(self, sweep: Sweep) -> None:
-        """Beams that were aimed at the middle of a slot and ended in the slot, or went on behind it."""
-        near = self._near(sweep)
+    def update_from_scan(self, scan: RangeScan) -> None:
+        """Update the slots whose core is hit by beams: taken if they end within the slot, free if they pass it."""
+        near = self._near(scan)
         if not len(near):
             return
         ended, passed = _beams_on_slots(
-            sweep.x, sweep.y, np.cos(sweep.angle), np.sin(sweep.angle), sweep.distance,
+            scan.x, scan.y, np.cos(scan.angle), np.sin(scan.angle), scan.distance,
             self.lot.slot_xy[near], self.lot.slot_yaw[near], self._inner[near], CORE,
         )  # fmt: skip
-        looks = ended + passed
-        share = ended / np.maximum(looks, 1)
-        change = np.where(share > _CLEAR, LOOK_LOG_ODDS, np.where(share < 1.0 - _CLEAR, -LOOK_LOG_ODDS, 0.0))
-        change[looks < _LEAST_BEAMS] = 0.0
+        beams = ended + passed
+        share = ended / np.maximum(beams, 1)
+        change = np.where(share > _CLEAR, SCAN_LOG_ODDS, np.where(share < 1.0 - _CLEAR, -SCAN_LOG_ODDS, 0.0))
+        change[beams < _LEAST_BEAMS] = 0.0
         self.log_odds[near] += change
         self.in_view[near] |= change != 0.0
-        self.told[near] |= change != 0.0
+        self.updated[near] |= change != 0.0
         self._clip()
 
     def states(self) -> SlotStates:
-        """What is known now."""
+        """Return the current estimate."""
         p = 1.0 / (1.0 + np.exp(-self.log_odds))
         return SlotStates(np.where(self.in_view, p, 0.5), self.in_view.copy())
 
+    def observation(self) -> SlotObservation:
+        """Return the slots whose evidence is for one state, and that state."""
+        slots = np.flatnonzero(self.in_view & (self.log_odds != 0.0))
+        return SlotObservation(slots, self.log_odds[slots] > 0.0)
+
     def thesis_states(self) -> SlotStates:
-        """The thesis's rule: slots to which a detection went are taken, all others free."""
+        """Return the estimate by the thesis's rule: slots with an assigned detection are taken, all others free."""
         evidence = np.where(self._visual > 0.0, self._visual, _logit(P_FREE))
         return SlotStates(1.0 / (1.0 + np.exp(-evidence)), np.ones(self.lot.n_slots, dtype=np.bool_))
 
     def _clip(self) -> None:
         np.clip(self.log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS, out=self.log_odds)
 
-    def _near(self, sweep: Sweep) -> NDArray[np.int64]:
-        found = self._tree.query_ball_point([sweep.x, sweep.y], min(sweep.reach, 15.0))
+    def _near(self, scan: RangeScan) -> IntArray:
+        found = self._tree.query_ball_point([scan.x, scan.y], min(scan.max_range, 15.0))
         return np.array(sorted(found), dtype=np.int64)
 
-    def _in_slot(self, xy: FloatArray, slot: NDArray[np.int64]) -> FloatArray:
-        """Points in the frames of slots, along and across."""
+    def _in_slot(self, xy: FloatArray, slot: IntArray) -> FloatArray:
+        """Transform points into the frames of slots: along and across."""
         yaw = self.lot.slot_yaw[slot]
         away = xy - self.lot.slot_xy[slot]
         along = np.cos(yaw) * away[:, 0] + np.sin(yaw) * away[:, 1]
@@ -157,8 +182,8 @@ def _beams_on_slots(
     slot_yaw: FloatArray,
     half_size: FloatArray,
     core: tuple[float, float],
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Of the beams aimed at each slot's core, how many end within the slot, and how many go on behind the core."""
+) -> tuple[IntArray, IntArray]:
+    """Count, of the beams that hit each slot's core, those that end within the slot and those that pass the core."""
     n = len(slot_xy)
     ended = np.zeros(n, dtype=np.int64)
     passed = np.zeros(n, dtype=np.int64)
@@ -188,7 +213,7 @@ def _beams_on_slots(
 def _crossing(
     ox: float, oy: float, ux: float, uy: float, half_x: float, half_y: float
 ) -> tuple[float, float]:
-    """Where a ray enters and leaves a rectangle about the origin; enter > leave where it misses."""
+    """Return where a ray enters and leaves a rectangle around the origin; enter > leave if it misses."""
     enter, leave = -math.inf, math.inf
     for o, u, half in ((ox, ux, half_x), (oy, uy, half_y)):
         if abs(u) < 1e-12:

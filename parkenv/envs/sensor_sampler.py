@@ -1,4 +1,4 @@
-"""What a searching car's sensors measure on the way from one stop to the next."""
+"""Simulated sensor measurements of a searching car between two decisions."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from parkenv.envs.search_state import SearchState
 from parkenv.errors import InputError
+from parkenv.perception.capture import TimedCapture
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
-from sim_sensors.rig import RIG_NAMES, Capture, SensorRig
+from sim_sensors.rig import RIG_NAMES, SensorRig
 
 if TYPE_CHECKING:
     from sim_sensors.movers import Movers
@@ -24,20 +25,13 @@ FloatArray = NDArray[np.float64]
 _SEEDS = 1 << 31
 
 
-class Moment(NamedTuple):
-    """One capture, and its time in s since Monday 00:00."""
-
-    time: float
-    capture: Capture
-
-
 class Station(NamedTuple):
-    """Where to measure.
+    """A time and a pose at which to measure.
 
     Attributes:
         time: s since Monday 00:00.
         pose: (3,) x, y in m, yaw in rad, of the vehicle.
-        movers: who moves around it; None for the scenario's traffic as it is then where nobody waits for anybody.
+        movers: moving cars and pedestrians around it; None: the scenario's traffic at this time, undisturbed.
     """
 
     time: float
@@ -45,21 +39,21 @@ class Station(NamedTuple):
     movers: Movers | None = None
 
 
-class Lookout:
-    """The sensors of a searching car.
+class SensorSampler:
+    """Samples the simulated sensors of a searching car, along each edge that it drives.
 
-    Where the car stops it stands on its vertex and looks along the lane; between two stops it looks where it drives.
-    Equal worlds, seen from equal places at equal times, give equal measurements, whoever drives.
+    A car at a vertex is headed along the lane; between two vertices it is headed along the edge. Measurements depend on
+    world, pose and time alone, not on the agent or on earlier measurements.
 
     Args:
         scenario: the world, with its traffic.
-        rig: laser, stereo, both_sides, or any rig.
+        rig: laser, stereo, both_sides, or any `SensorRig`.
         weather: one of `sim_sensors.camera.weather.PRESETS`; None draws one for each world.
-        captures: how many there are at most on an edge.
-        every: m; captures on an edge are at least so far apart, but for the one where it ends.
+        captures: largest number of captures on an edge.
+        every: m, least distance between captures on an edge, except for the last one.
 
     Raises:
-        InputError: an unknown rig or weather, a number out of its range.
+        InputError: an unknown rig or weather, a number outside its range.
     """
 
     def __init__(
@@ -84,74 +78,74 @@ class Lookout:
         self._lot, self._scenario = scenario.lot, scenario
         self._weather, self._every = weather, every
         self._slots = slot_lot(scenario.lot)
-        self._seen_world: tuple[np.uint64, LotScenes, Weather] | None = None
+        self._cached_world: tuple[np.uint64, LotScenes, Weather] | None = None
 
-    def look(self, state: SearchState, since: tuple[int, float] | None) -> list[Moment]:
-        """Measure along the edge just driven, or where the car stands if it has not moved.
+    def sample_step(self, state: SearchState, since: tuple[int, float] | None) -> list[TimedCapture]:
+        """Measure along the edge just driven, or at the vertex if the car has not moved.
 
         Args:
-            state: of the search, now.
-            since: vertex and time, s, before the last step; None where the search has just begun.
+            state: the current state of the search.
+            since: vertex and time, s, before the last step; None at the start of the search.
 
         Returns:
-            1 to `captures` moments, the newest last.
+            1 to `captures` captures, the newest last.
         """
-        return self.measure(state, self._stations(state, since))
+        return self.sample(state, self._stations(state, since))
 
-    def measure(self, state: SearchState, stations: Sequence[Station]) -> list[Moment]:
-        """Measure at some places.
+    def sample(self, state: SearchState, stations: Sequence[Station]) -> list[TimedCapture]:
+        """Measure at the given stations.
 
         Args:
-            state: of the search, whose world it is.
-            stations: where, oldest first.
+            state: of the search, for its world.
+            stations: oldest first.
 
         Returns:
-            A moment for each.
+            One capture for each station.
         """
         scenes, weather = self._world(state)
-        moments = []
+        captures = []
         for time, pose, movers in stations:
-            # By the millisecond: the same look has the same noise.
+            # Keyed by the millisecond: the same capture has the same noise.
             noise = np.random.SeedSequence([int(state.key), int(time * 1000.0)]).generate_state(1)
             scene = scenes.at(time, pose)
             if movers is not None:
                 scene = scene.with_movers(movers)
-            moments.append(Moment(time, self.rig.capture(scene, pose, weather, int(noise[0]))))
-        return moments
+            captures.append(TimedCapture(time, self.rig.capture(scene, pose, weather, int(noise[0]))))
+        return captures
 
-    def chosen(self, driven: FloatArray) -> NDArray[np.int64]:
-        """Where on a way to measure: evenly, `every` m apart at least, at most `captures` times, and where it ends.
+    def select_stations(self, driven: FloatArray) -> NDArray[np.int64]:
+        """Select evenly spaced points of a driven path: at least `every` m apart, at most `captures`, and the last one.
 
         Args:
-            driven: (k,) m, how far the car had come at each of the places it could be, ascending; k at least 1.
+            driven: (k,) m, distance driven up to each candidate point, ascending; k at least 1.
 
         Returns:
-            Indices of 1 to `captures` of them, ascending.
+            Indices of 1 to `captures` points, ascending.
         """
-        n = self._n_on(float(driven[-1] - driven[0]))
+        n = self._captures_on(float(driven[-1] - driven[0]))
         wanted = np.linspace(driven[0], driven[-1], n + 1)[1:-1]
         return np.unique(np.r_[np.searchsorted(driven, wanted), len(driven) - 1])
 
-    def _n_on(self, metres: float) -> int:
+    def _captures_on(self, metres: float) -> int:
         return min(max(int(metres / self._every), 1), self.captures)
 
     def _world(self, state: SearchState) -> tuple[LotScenes, Weather]:
-        if self._seen_world is None or self._seen_world[0] != state.key:
+        if self._cached_world is None or self._cached_world[0] != state.key:
             seed = int(state.key) % _SEEDS
             preset = self._weather or str(np.random.default_rng(seed).choice(PRESETS))
             scenes = LotScenes(self._slots, self._scenario, state.key, state.world)
-            self._seen_world = state.key, scenes, Weather.draw(preset, seed)
-        return self._seen_world[1:]
+            self._cached_world = state.key, scenes, Weather.draw(preset, seed)
+        return self._cached_world[1:]
 
     def _stations(self, state: SearchState, since: tuple[int, float] | None) -> list[Station]:
-        """Time and pose of each capture."""
+        """Return time and pose of each capture."""
         here = self._lot.vertex_xy[state.vertex]
         stop = Station(state.time, np.array([*here, self._heading(state)]))
         if since is None or since[0] == state.vertex:
             return [stop]
         start, begun = self._lot.vertex_xy[since[0]], since[1]
         way = here - start
-        n = self._n_on(float(np.hypot(*way)))
+        n = self._captures_on(float(np.hypot(*way)))
         yaw = math.atan2(way[1], way[0])
         shares = [k / n for k in range(1, n)]
         passing = [
@@ -160,7 +154,7 @@ class Lookout:
         return [*passing, stop]
 
     def _heading(self, state: SearchState) -> float:
-        """Where the car looks when it stands: along the lane; at a junction as it came, or on to the first way out."""
+        """Return the heading at a vertex, rad: along the lane; at a junction that of arrival, or to a neighbour."""
         lot, vertex = self._lot, state.vertex
         if vertex < lot.n_slots:
             return float(lot.vertex_yaw[vertex])

@@ -1,0 +1,115 @@
+"""Agents as files and command lines name them: a name, with options where they differ from the agent's own."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BeforeValidator, ConfigDict, model_validator
+
+from parkenv.errors import InputError
+from parkenv.files.spec_file import Spec
+
+OptionValue = bool | int | float | str
+
+
+class AgentSpec(Spec):
+    """An agent and its options, as `planners.make_agent` takes them: `{ name = "mdp", failure_s = 90 }`."""
+
+    model_config = ConfigDict(extra="allow")
+
+    name: str
+
+    @model_validator(mode="after")
+    def _plain_options(self) -> AgentSpec:
+        for option, value in self.options.items():
+            if not isinstance(value, OptionValue) or value != value:
+                raise ValueError(f"{option} to be a number, true, false or text, not {value!r}")
+        return self
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The options by name."""
+        return dict(self.model_extra or {})
+
+    @property
+    def label(self) -> str:
+        """The agent in tables, and on command lines: `mdp(failure_s=90)`."""
+        return label_of(self.name, self.options)
+
+
+def label_of(name: str, options: dict[str, Any]) -> str:
+    """An agent with its options in one word.
+
+    Examples:
+        >>> label_of("belief", {"budget_ms": 2.0})
+        'belief(budget_ms=2)'
+    """
+    if not options:
+        return name
+    return f"{name}({','.join(f'{option}={_text(value)}' for option, value in options.items())})"
+
+
+def _text(value: OptionValue) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def parse_agent(text: str) -> dict[str, Any]:
+    """The table that a word such as `mdp(failure_s=90)` stands for.
+
+    Raises:
+        InputError: brackets that do not match, or an option without a value.
+
+    Examples:
+        >>> parse_agent("mdp(failure_s=90,solver=policy_iteration)")
+        {'name': 'mdp', 'failure_s': 90, 'solver': 'policy_iteration'}
+    """
+    name, bracket, rest = text.strip().partition("(")
+    if not bracket:
+        return {"name": name}
+    if not rest.endswith(")") or "(" in rest or ")" in rest[:-1]:
+        raise InputError(f"agent {text!r}, want NAME or NAME(OPTION=VALUE,...)")
+    table: dict[str, Any] = {"name": name.strip()}
+    for part in rest[:-1].split(","):
+        option, equals, value = (word.strip() for word in part.partition("="))
+        if not (option.isidentifier() and equals and value) or option in table:
+            raise InputError(f"agent {text!r}: option {part.strip()!r}, want OPTION=VALUE, each option once")
+        table[option] = _value(value)
+    return table
+
+
+def _value(text: str) -> OptionValue:
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def split_agents(text: str) -> list[str]:
+    """The agents of a comma-separated list; commas within brackets divide options.
+
+    Examples:
+        >>> split_agents("mdp(failure_s=90,gamma=1),oracle")
+        ['mdp(failure_s=90,gamma=1)', 'oracle']
+    """
+    words, depth = [""], 0
+    for character in text:
+        depth += (character == "(") - (character == ")")
+        if character == "," and depth <= 0:
+            words.append("")
+        else:
+            words[-1] += character
+    return [word.strip() for word in words if word.strip()]
+
+
+def _tables(value: object) -> object:
+    return parse_agent(value) if isinstance(value, str) else value
+
+
+AgentItem = Annotated[AgentSpec, BeforeValidator(_tables, json_schema_input_type=str | AgentSpec)]
+"""An agent in a file: `"mdp"`, `"mdp(failure_s=90)"` or a table."""

@@ -1,0 +1,331 @@
+"""An experiment: from its specification to the cases to run, and from the finished cases to its results."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from parkenv import __version__
+from parkenv.errors import InputError
+from parkenv.evaluation.experiments.agent_spec import AgentSpec
+from parkenv.evaluation.experiments.compare import (
+    UNSEEN,
+    Case,
+    at_occupancy,
+    check_worlds,
+    run_cases,
+    settings_of,
+    table,
+    unseen,
+)
+from parkenv.evaluation.experiments.results import ResultFolder, Row
+from parkenv.evaluation.experiments.spec import SPEC_FILE, ExperimentSpec
+from parkenv.evaluation.experiments.workers import HERE, Workers
+from parkenv.evaluation.figures.registry import ComparisonResults, remove_figures
+from parkenv.evaluation.trips.calibration import Calibration
+from parkenv.files.spec_file import Spec
+from parkenv.scenarios.build import build
+from parkenv.scenarios.spec import ScenarioSpec, SensorModelSpec
+from parkenv.world.flat_map import FlatMap
+from parkenv.world.occupancy import OccupancyProcess
+from parkenv.world.scenario import Scenario
+from planners.agent import agent_file, make_agent
+
+NEEDS_OBSERVATIONS = ("belief", "mdp-tuned", "exact")
+"""Agents that refuse problems in which slots are observed only by attempts."""
+MAP_SAYS = "-map-says-"
+"""Between the name of a scenario and the probability that its map gives for every slot."""
+
+
+@dataclass(frozen=True, eq=False)
+class Experiment:
+    """An experiment with its scenarios made and its agents checked.
+
+    Args:
+        spec: what to run.
+
+    Raises:
+        InputError: a scenario or an agent that cannot be made, or parts that do not fit together.
+    """
+
+    spec: ExperimentSpec
+
+    def __post_init__(self) -> None:
+        for scenario in self._own:
+            for agent in self.spec.agents:
+                make_agent(agent.name, scenario, **agent.options)
+        if self.spec.grid.blind and not any(_works_blind(agent) for agent in self.spec.agents):
+            raise InputError(
+                "blind searches have no observations, and all agents plan on observations: "
+                f"{', '.join(agent.label for agent in self.spec.agents)}; add one that does not, such as mdp"
+            )
+        if (measured := self.calibration) is not None:
+            names = [scenario.name for scenario in self.scenarios]
+            if names != [measured.scenario]:
+                raise InputError(
+                    f"{self.spec.grid.calibrated} was measured on {measured.scenario!r}, here are {', '.join(names)}; "
+                    "compare that scenario alone, neither blind nor with wrong maps"
+                )
+
+    @cached_property
+    def _own(self) -> list[Scenario]:
+        return [build(_seen_through(spec, self.spec.rig)) for spec in self.spec.scenarios]
+
+    @cached_property
+    def maps(self) -> dict[str, tuple[Scenario, float]]:
+        """Scenarios with wrong maps and the probability that these give for every slot, by name."""
+        made = {}
+        for p_occupied in self.spec.grid.map_says:
+            for scenario in self._own:
+                name = f"{scenario.name}{MAP_SAYS}{p_occupied:g}"
+                wrong = FlatMap(p_occupied, scenario.prior or scenario.occupancy)
+                made[name] = (scenario.replace(name=name, prior=wrong), p_occupied)
+        return made
+
+    @cached_property
+    def scenarios(self) -> list[Scenario]:
+        """All scenarios, with their own costs and speeds."""
+        made = self._own + [flat for flat, _ in self.maps.values()]
+        return (
+            [s for scenario in made for s in (scenario, unseen(scenario))] if self.spec.grid.blind else made
+        )
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """The measured costs, if there are any."""
+        path = self.spec.grid.calibrated
+        return None if path is None else Calibration.from_file(path)
+
+    @property
+    def seeds(self) -> range:
+        """One for each episode."""
+        return range(self.spec.seed, self.spec.seed + self.spec.episodes)
+
+    @cached_property
+    def cases(self) -> list[tuple[Case, range]]:
+        """Every agent in every scenario and setting, with the seeds of its episodes."""
+        return [
+            (self._case(setting, agent), self.seeds)
+            for scenario in self.scenarios
+            for setting in self._settings(scenario)
+            for agent in self.spec.agents
+            if not scenario.name.endswith(UNSEEN) or _works_blind(agent)
+        ]
+
+    @cached_property
+    def occupancy_cases(self) -> list[tuple[Case, range]]:
+        """The same at the occupancy levels, with a third of the episodes, at the first speeds of the grid."""
+        return [
+            (self._case(setting, agent, level), self.seeds[: max(1, self.spec.episodes // 3)])
+            for scenario in self.scenarios
+            if isinstance(scenario.occupancy, OccupancyProcess) and scenario.name not in self.maps
+            for level in self.spec.grid.occupancy_levels
+            for setting in self._grid(at_occupancy(scenario, level), first_speeds=True)
+            for agent in self.spec.agents
+            if not scenario.name.endswith(UNSEEN) or _works_blind(agent)
+        ]
+
+    def _case(self, scenario: Scenario, agent: AgentSpec, level: float | None = None) -> Case:
+        return Case(scenario, agent.name, level, self.spec.rig, agent.options)
+
+    def _settings(self, scenario: Scenario) -> list[Scenario]:
+        settings = self._grid(scenario)
+        if (measured := self.calibration) is not None:
+            settings += settings_of(measured.applied(scenario), v_walk_kmh=self.spec.grid.v_walk_kmh)
+        return settings
+
+    def _grid(self, scenario: Scenario, first_speeds: bool = False) -> list[Scenario]:
+        grid = self.spec.grid
+        walk, drive = grid.v_walk_kmh, grid.v_drive_kmh
+        if first_speeds:
+            walk, drive = walk and walk[:1], drive and drive[:1]
+        return settings_of(scenario, grid.failure_s, walk, drive)
+
+    def settings(self) -> Row:
+        """What decides the outcome of an episode: a run that is resumed must agree in it."""
+        return {
+            "version": __version__,
+            "rig": self.spec.rig,
+            "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in self.spec.scenarios},
+            "files": fingerprints(self.spec.files()),
+            "agent files": agent_fingerprints(agent.name for agent in self.spec.agents),
+        }
+
+
+def _works_blind(agent: AgentSpec) -> bool:
+    return agent.name not in NEEDS_OBSERVATIONS
+
+
+def _seen_through(spec: ScenarioSpec, rig: str | None) -> ScenarioSpec:
+    """The scenario with the sensor model that was measured with the rig, unless the scenario names another."""
+    if (
+        rig is None
+        or spec.sensor_model.name not in (None, "perfect")
+        or spec.sensor_model.hit_rate is not None
+    ):
+        return spec
+    if spec.sensor_model.file is not None:
+        return spec
+    measured = SensorModelSpec(
+        name="stereo" if rig == "stereo" else "laser", view_range=spec.sensor_model.view_range
+    )
+    return spec.changed(sensor_model=measured)
+
+
+def flat_tables(tables: Mapping[str, Any], before: str = "") -> Row:
+    """Nested tables as one, with dotted keys.
+
+    Examples:
+        >>> flat_tables({"costs": {"failure_s": 10.0}, "goal": 0})
+        {'costs.failure_s': 10.0, 'goal': 0}
+    """
+    flat: Row = {}
+    for key, value in tables.items():
+        flat |= (
+            flat_tables(value, f"{before}{key}.") if isinstance(value, Mapping) else {f"{before}{key}": value}
+        )
+    return flat
+
+
+def fingerprints(files: Iterable[Path]) -> dict[str, str]:
+    """A short hash of each file's content, by path, so that a resumed run notices a changed file."""
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in files}
+
+
+def agent_fingerprints(names: Iterable[str]) -> dict[str, str]:
+    """Fingerprints, by agent, of those agents that come from files: trained models and agents of your own."""
+    files = {name: agent_file(name) for name in dict.fromkeys(names)}
+    return {name: fingerprints([file])[str(file)] for name, file in files.items() if file is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class ExperimentResult:
+    """What an experiment came to.
+
+    Attributes:
+        experiment: what was run.
+        folder: its folder, with every finished episode.
+        rows: a row for each case with finished episodes, as `summary.json` has them.
+        occupancy_rows: the same at the occupancy levels.
+        complete: whether all episodes are finished.
+    """
+
+    experiment: Experiment
+    folder: ResultFolder
+    rows: list[Row]
+    occupancy_rows: list[Row]
+    complete: bool
+
+    def figure_data(self) -> ComparisonResults:
+        """What the figures of a comparison are drawn from."""
+        flat = {name: (name.partition(MAP_SAYS)[0], p) for name, (_, p) in self.experiment.maps.items()}
+        return ComparisonResults(
+            self.experiment.cases,
+            self.folder.episodes,
+            self.rows,
+            self.occupancy_rows,
+            flat,
+            self.experiment.spec.seed,
+        )
+
+
+def run_experiment(
+    spec: ExperimentSpec,
+    out: Path,
+    *,
+    command: Iterable[str] = (),
+    resume: bool = False,
+    overwrite: bool = False,
+    workers: Workers = HERE,
+    on_start: Callable[[int], None] = lambda _: None,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> ExperimentResult:
+    """Run what the folder does not hold yet, and write its results.
+
+    The folder gets the specification (`experiment.json`), every episode (`episodes.csv`), and the table
+    (`summary.json`). Ctrl-C ends it early; what was finished is in the folder.
+
+    Args:
+        spec: what to run.
+        out: the folder.
+        command: that asked for it, for the summary's readers.
+        resume: go on from the episodes that an earlier run left.
+        overwrite: replace the results of another run.
+        workers: where episodes run; the results do not depend on it.
+        on_start: called with the number of episodes before the first.
+        on_progress: called with the number of episodes just finished.
+
+    Raises:
+        InputError: a scenario or an agent that cannot be made, or a folder that cannot be used.
+
+    Examples:
+        >>> from tempfile import mkdtemp
+        >>> spec = ExperimentSpec.parse(
+        ...     {"scenarios": ["mini"], "agents": ["first-free", "oracle"], "episodes": 3}, "example"
+        ... )
+        >>> result = run_experiment(spec, Path(mkdtemp()))
+        >>> [row["agent"] for row in result.rows], result.rows[0]["episodes"]
+        (['first-free', 'oracle'], 3)
+    """
+    experiment = Experiment(spec)
+    for scenario in experiment.scenarios:
+        check_worlds(scenario, experiment.seeds)
+    cases = experiment.cases + experiment.occupancy_cases
+    with workers:
+        folder = ResultFolder(out, experiment.settings(), resume=resume, overwrite=overwrite)
+        remove_figures(out)
+        spec.write(out / SPEC_FILE)
+        on_start(sum(len(seeds) for _, seeds in cases))
+        try:
+            run_cases(cases, folder, workers=workers, on_progress=on_progress)
+            complete = True
+        except KeyboardInterrupt:
+            complete = False
+    measured = experiment.calibration
+    result = ExperimentResult(
+        experiment,
+        folder,
+        table(experiment.cases, folder),
+        table(experiment.occupancy_cases, folder),
+        complete,
+    )
+    summary = {
+        "command": list(command),
+        "version": __version__,
+        "seed": spec.seed,
+        "complete": complete,
+        "rows": result.rows,
+        "occupancy_rows": result.occupancy_rows,
+        "calibrated": None if measured is None else dataclasses.asdict(measured),
+    }
+    folder.finish([case.key(s) for case, seeds in cases for s in seeds], summary, complete=complete)
+    return result
+
+
+def saved_spec(folder: Path) -> dict[str, Any] | None:
+    """The tables of the specification in a run folder; None where there is none.
+
+    Raises:
+        InputError: the file is torn.
+    """
+    from parkenv.files.spec_file import read_tables
+
+    file = folder / SPEC_FILE
+    return read_tables(file) if file.exists() else None
+
+
+def require_unchanged(spec: Spec, settings: Mapping[str, Any]) -> None:
+    """Refuse files that are no longer those that a run read.
+
+    Raises:
+        InputError: a file that has changed.
+    """
+    before = settings.get("files", {})
+    for path, now in fingerprints(spec.files()).items():
+        if before.get(path) not in (None, now):
+            raise InputError(f"{path} has changed since the run")

@@ -1,0 +1,235 @@
+"""What an experiment file may say: agents, scenarios, a grid of settings, episodes, seed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Self, TypeVar
+
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
+from pydantic_core import PydanticCustomError
+
+from parkenv.evaluation.experiments.agent_spec import AgentItem, AgentSpec
+from parkenv.files.spec_file import Axis, FilePath, Several, Spec
+from parkenv.scenarios.spec import (
+    SCENARIO_NAMES,
+    Cost,
+    Hours,
+    Probability,
+    RigName,
+    ScenarioSpec,
+    Speed,
+    TrafficSpec,
+    scenario_spec,
+)
+
+MAX_EPISODES = 10_000_000
+"""Most episodes of an experiment, all agents, scenarios and settings together."""
+SPEC_FILE = "experiment.json"
+"""What a run folder holds of the experiment that made it."""
+DEFAULT_AGENTS = (
+    "mdp", "mdp-static", "mdp-tuned", "belief", "greedy-goal", "greedy-drive", "first-free", "random", "oracle",
+)  # fmt: skip
+FAILURE_COST_SWEEP = (0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0)
+"""s, the failure costs that `--failure-cost sweep` stands for."""
+
+T = TypeVar("T")
+
+
+def _scenario_tables(value: object, info: ValidationInfo) -> object:
+    """A packaged scenario's name, or a file relative to the one that names it."""
+    if not isinstance(value, str | Path):
+        return value
+    folder = (info.context or {}).get("folder", Path())
+    return scenario_spec(value if str(value) in SCENARIO_NAMES else Path(folder) / value)
+
+
+ScenarioItem = Annotated[
+    ScenarioSpec, BeforeValidator(_scenario_tables, json_schema_input_type=str | ScenarioSpec)
+]
+"""A scenario in a file: a name, a file, or an inline table."""
+
+
+def _listed(value: object) -> object:
+    return value if isinstance(value, list | tuple) else [value]
+
+
+Level = Annotated[float, Field(gt=0.0, lt=1.0)]
+Values = Annotated[Axis[T], BeforeValidator(_listed)]
+"""An axis of the grid; a single value may stand alone."""
+
+
+class Grid(Spec):
+    """Settings that are varied; every combination is run. An axis that is absent keeps each scenario's own value."""
+
+    failure_s: Values[Cost] | None = Field(
+        None,
+        description="Cost of a failed attempt, s: what the world charges, and what planners assume of it.",
+    )
+    v_walk_kmh: Values[Speed] | None = None
+    v_drive_kmh: Values[Speed] | None = None
+    occupancy_levels: Annotated[tuple[Level, ...], AfterValidator(lambda v: tuple(sorted(set(v))))] = Field(
+        (),
+        strict=False,
+        max_length=100,
+        description="Also set the mean occupancy to these, a third as many episodes.",
+    )
+    map_says: Annotated[tuple[Probability, ...], AfterValidator(lambda v: tuple(sorted(set(v))))] = Field(
+        (), strict=False, max_length=100, description="Also with wrong maps: this probability for every slot."
+    )
+    blind: bool = Field(
+        False,
+        description="Also without observations of slots before an attempt, for agents that can do without.",
+    )
+    calibrated: FilePath | None = Field(
+        None, description="Also at the failure cost and speed in a calibrated.json of `parkenv calibrate`."
+    )
+
+
+class Workplace(Spec):
+    """Where tasks run; the results do not depend on it."""
+
+    jobs: int = Field(0, ge=0, le=10_000, description="Worker processes; 0 for all cores.")
+    backend: Literal["loky", "ray", "dask"] = "loky"
+    address: str | None = Field(None, description="Of a Ray or Dask cluster.")
+
+
+class ExperimentSpec(Workplace):
+    """An experiment file: agents meet the same worlds in every scenario and setting."""
+
+    kind: Literal["compare"] = "compare"
+    agents: Several[AgentItem] = Field(
+        tuple(AgentSpec(name=name) for name in DEFAULT_AGENTS), min_length=1, max_length=1_000,
+        description="Differences are to the first.",
+    )  # fmt: skip
+    scenarios: Several[ScenarioItem] = Field((scenario_spec("campus"),), min_length=1, max_length=1_000)
+    grid: Grid = Grid()
+    episodes: int = Field(200, ge=1, le=MAX_EPISODES, description="Searches of each agent in each setting.")
+    seed: int = Field(0, ge=0, lt=2**31, description="Episode i has the seed `seed` + i.")
+    rig: RigName | None = Field(None, description="Observe slots through this rig's simulated sensors.")
+    figures: bool = True
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        for what, names in (
+            ("agents", [agent.label for agent in self.agents]),
+            ("scenarios", [scenario.title for scenario in self.scenarios]),
+        ):
+            repeated = [name for i, name in enumerate(names) if name in names[:i]]
+            if repeated:
+                raise PydanticCustomError("whole", f"{what} has {{name}} twice", {"name": repr(repeated[0])})
+        if (count := self.episode_count) > MAX_EPISODES:
+            raise PydanticCustomError(
+                "whole",
+                "agents x scenarios x grid x episodes is {count} searches, want at most {most}",
+                {"count": count, "most": MAX_EPISODES},
+            )
+        return self
+
+    @property
+    def episode_count(self) -> int:
+        """Upper bound on the episodes of all agents, scenarios and settings."""
+        grid = self.grid
+        failure, walk, drive = (
+            len(axis) if axis is not None else 1
+            for axis in (grid.failure_s, grid.v_walk_kmh, grid.v_drive_kmh)
+        )
+        worlds = len(self.scenarios) * (1 + len(grid.map_says)) * (1 + grid.blind)
+        settings = (
+            failure * walk * drive + (walk if grid.calibrated else 0) + failure * len(grid.occupancy_levels)
+        )
+        return len(self.agents) * worlds * settings * self.episodes
+
+
+class BenchmarkSpec(Workplace):
+    """A run of a benchmark suite: scenarios, costs, speeds and seeds are the suite's."""
+
+    kind: Literal["benchmark"] = "benchmark"
+    suite: str = "v1"
+    agents: Several[AgentItem] = Field(
+        tuple(
+            AgentSpec(name=name)
+            for name in ("belief", "mdp-tuned", "mdp", "first-free", "greedy-drive", "greedy-goal")
+        ),
+        min_length=1,
+        max_length=1_000,
+    )
+
+
+BUSY = TrafficSpec(cars=3, pedestrians=5)
+"""Traffic where sensors are simulated and the scenario names none."""
+Weather = Literal["sunny", "overcast", "low_sun", "dusk", "rain"]
+CaptureDistance = Annotated[float, Field(ge=0.1, le=1_000.0)]
+"""m between captures."""
+
+
+class SurveySpec(Workplace):
+    """Drives past every slot with simulated sensors, into a map file."""
+
+    kind: Literal["survey"] = "survey"
+    scenario: ScenarioItem = scenario_spec("campus")
+    sessions: int = Field(6, ge=1, le=100_000)
+    rig: RigName | None = Field(None, description="The scenario's if absent.")
+    detector: str = Field("hog", description="hog, side, front, a model file (.npz) or MODULE:CLASS.")
+    hours: Several[Hours] = Field(
+        ("08:00-10:00", "11:00-14:00", "16:00-18:00"), min_length=1, max_length=1_000,
+        description="When drives begin, one window after the other, on the scenario's days.",
+    )  # fmt: skip
+    weather: Weather | None = Field(None, description="Drawn for each session if absent.")
+    every: CaptureDistance = 1.25
+    pose_noise: float = Field(0.0, ge=0.0, le=100.0, description="Localisation error of the car, m.")
+    seed: int = Field(0, ge=0, lt=2**31)
+
+
+class DemoSpec(Workplace):
+    """A survey, the map that it gives, and searches on other days with this map."""
+
+    kind: Literal["demo"] = "demo"
+    scenario: ScenarioItem = scenario_spec("campus")
+    sessions: int = Field(4, ge=1, le=100_000)
+    episodes: int = Field(6, ge=2, le=MAX_EPISODES, description="Searches of each agent.")
+    every: CaptureDistance = 2.5
+    detector: str = "hog"
+    seed: int = Field(0, ge=0, lt=2**31)
+
+
+class TrainingSpec(Workplace):
+    """Training by reinforcement learning, one model for each seed; values that are absent are the environment's."""
+
+    kind: Literal["train"] = "train"
+    env: Literal["search", "drive"] = Field("search", description="Search for a slot, or drive into one.")
+    algorithm: str | None = Field(None, description="maskable-ppo for search, ppo for drive if absent.")
+    scenarios: Several[ScenarioItem] | None = Field(
+        None, min_length=1, max_length=1_000, description="Trained on in turns; evaluations use the first."
+    )
+    test_on: Several[ScenarioItem] | None = Field(
+        None, min_length=1, max_length=1_000, description="Tested on in the end; the same if absent."
+    )
+    steps: int | None = Field(None, ge=1, le=10**12, description="Decisions of a training.")
+    seeds: int = Field(5, ge=1, le=10_000, description="How many trainings.")
+    seed: int = Field(0, ge=0, lt=2**31, description="Of the first.")
+    clone: str | None = Field(
+        None, description="Behaviour cloning of this planner first (search; ppo, maskable-ppo)."
+    )
+    demonstrations: int | None = Field(
+        None, ge=1, le=MAX_EPISODES, description="Searches of the planner to clone."
+    )
+    k: int | None = Field(None, ge=1, le=1_000, description="Slots in an observation (search).")
+    evaluate_every: int | None = Field(None, ge=1, le=10**12, description="Decisions between evaluations.")
+    evaluation_episodes: int | None = Field(
+        None,
+        ge=2,
+        le=1_000_000,
+        description="Episodes of an evaluation; the test in the end has twice as many.",
+    )
+    planners: Several[AgentItem] | None = Field(None, max_length=1_000, description="Drawn for comparison.")
+    tensorboard: bool = False
+
+    @model_validator(mode="after")
+    def _of_env(self) -> Self:
+        if self.env == "drive":
+            for name in ("clone", "demonstrations", "k"):
+                if getattr(self, name) is not None:
+                    raise PydanticCustomError("whole", "{name} goes with env search", {"name": name})
+        if self.demonstrations is not None and self.clone is None:
+            raise PydanticCustomError("whole", "demonstrations goes with clone")
+        return self

@@ -1,0 +1,19 @@
+"""A capture of a sensor rig and its time."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from sim_sensors.rig import Capture
+
+
+class TimedCapture(NamedTuple):
+    """What a rig measured at one moment.
+
+    Attributes:
+        time: s since Monday 00:00.
+        capture: images, stereo pairs and laser scans, with the true pose of the vehicle.
+    """
+
+    time: float
+    capture: Capture

@@ -1,0 +1,147 @@
+"""A linear classifier of image windows, and its file."""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import zipfile
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
+from parkenv.perception.hog import Descriptor
+
+Float32Array = NDArray[np.float32]
+
+PACKAGED_MODELS = ("side", "front")
+"""Models that come with the package; trained on simulated images alone."""
+_FORMAT = "parkenv-car-model"
+_VERSION = 2  # 1 took no square root of the grey values
+_EPOCH = (1980, 1, 1, 0, 0, 0)  # equal models are equal files
+
+
+@dataclass(frozen=True, eq=False)
+class CarModel:
+    """A linear classifier (support vector machine) of image windows on HOG features (T §3.2.1).
+
+    Args:
+        descriptor: the features of a window.
+        weights: `descriptor.shape` float32.
+        bias: added to the weighted sum; a score above 0 means car.
+        region_aspect: width over height of the image region that is resized to the window.
+        car: left, top, right, bottom of the car within the window, as fractions of its width and height.
+        calibration: slope and offset: the probability of a score s is 1/(1 + exp(-(slope·s + offset))).
+        end_on: whether it was trained on fronts and rears rather than on sides.
+        trained_on: one line that describes the training data.
+
+    Raises:
+        InputError: weights of another shape, or a number outside its range.
+    """
+
+    descriptor: Descriptor
+    weights: Float32Array
+    bias: float
+    region_aspect: float
+    car: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    calibration: tuple[float, float] = (1.0, 0.0)
+    end_on: bool = False
+    trained_on: str = ""
+
+    def __post_init__(self) -> None:
+        weights = np.ascontiguousarray(self.weights, dtype=np.float32)
+        if weights.shape != self.descriptor.shape or not np.isfinite(weights).all():
+            raise InputError(f"weights are {weights.shape}, want finite {self.descriptor.shape}")
+        object.__setattr__(self, "weights", weights)
+        left, top, right, bottom = self.car
+        if not (0.0 <= left < right <= 1.0 and 0.0 <= top < bottom <= 1.0):
+            raise InputError(f"car is {self.car}, want fractions left < right, top < bottom of the window")
+        if not (self.region_aspect > 0.0 and math.isfinite(self.region_aspect)):
+            raise InputError(f"region_aspect is {self.region_aspect}, want a finite number above 0")
+
+    def probability(self, score: Float32Array) -> Float32Array:
+        """Return P(car) of each score."""
+        slope, offset = self.calibration
+        return np.asarray(1.0 / (1.0 + np.exp(-(slope * score + offset))), dtype=np.float32)
+
+    def scores(self, crops: NDArray[np.uint8]) -> Float32Array:
+        """Return the score of each of (n, height, width) uint8 grey windows."""
+        flat = self.weights.reshape(-1)
+        return np.array([self.descriptor.describe(c) @ flat + self.bias for c in crops], dtype=np.float32)
+
+    def save(self, path: Path) -> None:
+        """Write the model to an `.npz` file of some 10 kB; equal models give equal bytes."""
+        settings = {
+            "format": _FORMAT,
+            "version": _VERSION,
+            "window": [self.descriptor.width, self.descriptor.height],
+            "normalization": self.descriptor.normalization,
+            "bias": self.bias,
+            "region_aspect": self.region_aspect,
+            "car": list(self.car),
+            "calibration": list(self.calibration),
+            "ends": self.end_on,
+            "trained_on": self.trained_on,
+        }
+        parts: dict[str, NDArray[Any]] = {
+            "settings": np.frombuffer(json.dumps(settings, sort_keys=True).encode(), dtype=np.uint8),
+            "weights": self.weights,
+        }
+        with (
+            atomic_write(path) as unfinished,
+            zipfile.ZipFile(unfinished, "w", zipfile.ZIP_DEFLATED) as archive,
+        ):
+            for name, array in parts.items():
+                data = io.BytesIO()
+                np.save(data, array, allow_pickle=False)
+                archive.writestr(
+                    zipfile.ZipInfo(f"{name}.npy", _EPOCH), data.getvalue(), zipfile.ZIP_DEFLATED
+                )
+
+    @classmethod
+    def load(cls, name: str | Path) -> CarModel:
+        """Load a packaged model by name, or a model from a file.
+
+        Raises:
+            InputError: no such model or file, or a file of another kind or version.
+        """
+        if str(name) in PACKAGED_MODELS:
+            source = resources.files("parkenv.perception") / "models" / f"{name}.npz"
+            data = source.read_bytes()
+        elif Path(name).is_file():
+            data = Path(name).read_bytes()
+        else:
+            raise InputError(f"{name}: no such model; want {', '.join(PACKAGED_MODELS)}, or an .npz file")
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as parts:
+                settings = json.loads(bytes(parts["settings"]).decode())
+                weights = parts["weights"]
+            if settings["format"] != _FORMAT:
+                raise KeyError("format")
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise InputError(
+                f"{name}: not a car model; want an .npz file that parkenv train-detector wrote"
+            ) from error
+        if settings["version"] != _VERSION:
+            raise InputError(
+                f"{name}: format version {settings['version']}, want {_VERSION}: written by another version of parkenv"
+            )
+        try:
+            return cls(
+                Descriptor(settings["window"][0], settings["window"][1], settings["normalization"]),
+                weights,
+                float(settings["bias"]),
+                float(settings["region_aspect"]),
+                tuple(settings["car"]),
+                tuple(settings["calibration"]),
+                bool(settings["ends"]),
+                str(settings["trained_on"]),
+            )
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{name}: the model's settings are incomplete: {error}") from error

@@ -1,0 +1,59 @@
+"""Detectors by name."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from parkenv.errors import InputError
+from parkenv.files.user_class import file_of_class, load_class
+from parkenv.perception.car_model import PACKAGED_MODELS
+from parkenv.perception.detector import LEAST_PROBABILITY, Detector
+from parkenv.perception.hog_detector import HogDetector
+
+DEFAULT_DETECTOR = "hog"
+"""Both packaged models, `side` and `front`."""
+
+
+def make_detector(name: str | Detector | None = None) -> Detector:
+    """Make a detector.
+
+    Args:
+        name: `hog` (the packaged HOG models, of sides and of fronts and rears), `side` or `front` (one of them), the
+            path of a model file that `parkenv train-detector` wrote, or `MODULE:CLASS` for a detector of your own
+            (see `Detector`; the module may be in the working directory). A detector is returned as it is; None is
+            `hog`.
+
+    Raises:
+        InputError: an unknown name, a file that holds no model, or a class that is no detector.
+
+    Examples:
+        >>> len(make_detector("hog").models)
+        2
+    """
+    if name is not None and not isinstance(name, str):
+        if not callable(getattr(name, "detect", None)):
+            raise InputError(f"detector is a {type(name).__name__} without a method detect(image)")
+        return name
+    name = name or DEFAULT_DETECTOR
+    if name == DEFAULT_DETECTOR:
+        return HogDetector.load(threshold=LEAST_PROBABILITY)
+    if name in PACKAGED_MODELS or Path(name).is_file():
+        return HogDetector.load(name, threshold=LEAST_PROBABILITY)
+    if ":" in name:
+        made: Detector = load_class(name, "detector", "detect(image)")()
+        return made
+    raise InputError(
+        f"unknown detector {name!r}; want {DEFAULT_DETECTOR}, {', '.join(PACKAGED_MODELS)}, a model file (.npz) or "
+        "MODULE:CLASS"
+    )
+
+
+def detector_version(name: str) -> str:
+    """Return the name with a hash of the file behind it, which changes if the model or module does.
+
+    Args:
+        name: as `make_detector` takes it, which has made a detector of it before.
+    """
+    file = Path(name) if Path(name).is_file() else file_of_class(name) if ":" in name else None
+    return name if file is None else f"{name}@{hashlib.sha256(file.read_bytes()).hexdigest()[:8]}"

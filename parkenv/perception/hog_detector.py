@@ -1,0 +1,192 @@
+"""The HOG detector of the thesis: a window slides over an image pyramid, a linear classifier scores each place.
+
+T §3.2.1 and §3.2.2.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.perception.car_model import PACKAGED_MODELS, CarModel
+from parkenv.perception.detector import Detections
+from parkenv.perception.hog import CELL, correlate
+
+Image = NDArray[np.uint8]
+Float32Array = NDArray[np.float32]
+
+_ZOOM = 1.6
+_MOST_WINDOWS = 2000  # the best of them; beyond that a model separates nothing
+
+
+@dataclass(frozen=True, eq=False)
+class HogDetector:
+    """A `Detector` that slides the windows of one or more models over an image pyramid.
+
+    Args:
+        models: the packaged side and front models, or others.
+        least_height: px, height of the smallest regions that are searched; None: five eighths of each model's window,
+            because smaller cars show little detail when enlarged, and cost the most time.
+        most_height: px, height of the largest regions; None: as large as the image and its margin allow.
+        scale_step: ratio of one region size to the next smaller one.
+        threshold: probability from which a window is reported as a car.
+        overlap: intersection over union from which only the better of two boxes is kept.
+        margin: cars may reach beyond the image by this fraction of their region; the border pixels are replicated.
+
+    Raises:
+        InputError: no model, or a number outside its range.
+    """
+
+    models: tuple[CarModel, ...]
+    least_height: float | None = None
+    most_height: float | None = None
+    scale_step: float = 1.2
+    threshold: float = 0.5
+    overlap: float = 0.4
+    margin: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not self.models:
+            raise InputError("models is empty, want at least one")
+        if self.least_height is not None and not self.least_height >= 8.0:
+            raise InputError(f"least_height is {self.least_height} px, want at least 8")
+        if self.most_height is not None and not self.most_height >= (self.least_height or 8.0):
+            raise InputError(
+                f"most_height is {self.most_height} px, want at least {self.least_height or 8.0}"
+            )
+        if not self.scale_step > 1.0:
+            raise InputError(f"scale_step is {self.scale_step}, want above 1")
+        for name in ("threshold", "overlap"):
+            if not 0.0 < getattr(self, name) < 1.0:
+                raise InputError(f"{name} is {getattr(self, name)}, want between 0 and 1")
+        if not 0.0 <= self.margin <= 1.0:
+            raise InputError(f"margin is {self.margin}, want 0 to 1")
+
+    @classmethod
+    def load(
+        cls, *names: str | Path, threshold: float = 0.5, least_height: float | None = None
+    ) -> HogDetector:
+        """Load packaged models or model files; both packaged models if none is named."""
+        models = tuple(CarModel.load(name) for name in names or PACKAGED_MODELS)
+        return cls(models, least_height=least_height, threshold=threshold)
+
+    def detect(self, image: Image) -> Detections:
+        """Find the cars in an image, best first.
+
+        Args:
+            image: (h, w) grey or (h, w, 3) RGB, uint8.
+
+        Raises:
+            InputError: an image of another shape or dtype.
+        """
+        grey = as_grey(image)
+        found = [self.scan(model, grey) for model in self.models]
+        all_models = Detections(
+            *(
+                np.concatenate([getattr(f, name) for f in found])
+                for name in ("boxes", "probability", "end_on", "score", "regions")
+            )
+        )
+        return all_models.select(best_boxes(all_models.boxes, all_models.probability, self.overlap))
+
+    def scan(self, model: CarModel, grey: Image) -> Detections:
+        """Return all windows above the threshold, before non-maximum suppression; `grey` is (h, w) uint8."""
+        height, width = grey.shape
+        most = self.most_height or max(height, width / model.region_aspect) * (1.0 + 2.0 * self.margin)
+        window = model.descriptor
+        regions, scores = [np.empty((0, 4), np.float32)], [np.empty(0, np.float32)]
+        # The score at the threshold; lower ones need not be kept.
+        slope, offset = model.calibration
+        enough = (math.log(self.threshold / (1.0 - self.threshold)) - offset) / slope
+        least = self.least_height or window.height / _ZOOM
+        n_sizes = 1 + int(math.log(max(most / least, 1.0)) / math.log(self.scale_step) + 1e-9)
+        smaller: Image | None = None
+        for size in range(n_sizes):
+            region_height = least * self.scale_step**size
+            region_width = region_height * model.region_aspect
+            edge_x, edge_y = (math.ceil(self.margin * r) for r in (region_width, region_height))
+            if region_width > width + 2 * edge_x or region_height > height + 2 * edge_y:
+                break
+            scale_x, scale_y = window.width / region_width, window.height / region_height
+            scaled = _scaled(grey if smaller is None else smaller, (width * scale_x, height * scale_y))
+            if scale_x <= 1.0 and scale_y <= 1.0:
+                smaller = scaled
+            score = correlate(
+                window.features(_bordered(scaled, edge_x * scale_x, edge_y * scale_y)), model.weights
+            )
+            row, column = np.nonzero(score > enough - model.bias)
+            scores.append(score[row, column] + np.float32(model.bias))
+            left, top = column * CELL / scale_x - edge_x, row * CELL / scale_y - edge_y
+            regions.append(
+                np.stack([left, top, left + region_width, top + region_height], axis=1).astype(np.float32)
+            )
+        region, value = np.concatenate(regions), np.concatenate(scores)
+        size_xy = region[:, 2:] - region[:, :2]
+        left_top, right_bottom = np.array(model.car[:2]), np.array(model.car[2:])
+        boxes = np.concatenate(
+            [region[:, :2] + left_top * size_xy, region[:, :2] + right_bottom * size_xy], axis=1
+        )
+        end_on = np.full(len(value), model.end_on)
+        return Detections(boxes, model.probability(value), end_on, value, region)
+
+
+def as_grey(image: Image) -> Image:
+    """Return the image as (h, w) uint8.
+
+    Raises:
+        InputError: an image that is neither (h, w) nor (h, w, 3), not uint8, or empty.
+    """
+    if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
+        raise InputError(f"image is {image.shape} of {image.dtype}, want (h, w) or (h, w, 3) uint8")
+    if image.size == 0:
+        raise InputError(f"image is {image.shape}, want at least one pixel")
+    return (
+        np.ascontiguousarray(image)
+        if image.ndim == 2
+        else np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+    )
+
+
+def best_boxes(boxes: Float32Array, value: Float32Array, overlap: float) -> NDArray[np.int64]:
+    """Suppress non-maxima: return the rows of boxes that overlap no better box by more than `overlap`, best first.
+
+    Args:
+        boxes: (n, 4) left, top, right, bottom.
+        value: (n,) score of each.
+        overlap: intersection over union.
+    """
+    order = np.argsort(-value, kind="stable")[:_MOST_WINDOWS]
+    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    kept = []
+    while len(order):
+        best, rest = order[0], order[1:]
+        kept.append(best)
+        inner = np.minimum(boxes[best, 2:], boxes[rest, 2:]) - np.maximum(boxes[best, :2], boxes[rest, :2])
+        common = np.clip(inner, 0.0, None).prod(axis=1)
+        order = rest[common <= overlap * (area[best] + area[rest] - common)]
+    return np.array(kept, dtype=np.int64)
+
+
+def _scaled(image: Image, size: tuple[float, float]) -> Image:
+    """Resize an image to (width, height) px.
+
+    Each level of a pyramid is made from the level before: one step is small enough for linear interpolation, which is
+    many times as fast as area averaging of the whole image.
+    """
+    width, height = (max(1, round(s)) for s in size)
+    far = image.shape[1] > 1.6 * width or image.shape[0] > 1.6 * height
+    return np.asarray(
+        cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if far else cv2.INTER_LINEAR)
+    )
+
+
+def _bordered(level: Image, x: float, y: float) -> Image:
+    """Replicate the border of a pyramid level by x and y px; the same before scaling costs more."""
+    left, top = round(x), round(y)
+    return np.asarray(cv2.copyMakeBorder(level, top, top, left, left, cv2.BORDER_REPLICATE))

@@ -1,0 +1,196 @@
+"""The perception pipeline: from what a sensor rig measured to which slots are taken (T §3.2, §3.3.2)."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.perception.capture import TimedCapture
+from parkenv.perception.detector import Detections, Detector
+from parkenv.perception.detector_registry import make_detector
+from parkenv.perception.range_scan import RangeScan, disparity, scan_from_laser, scan_from_stereo
+from parkenv.perception.ranging import LocatedCars, localize_cars, localize_disparity, localize_median
+from parkenv.perception.slot_filter import SlotFilter, SlotObservation
+from parkenv.world.lot import ParkingLot
+from sim_sensors.camera.models import PinholeCamera, StereoCamera
+from sim_sensors.rig import Capture, Mount, SensorRig
+
+FloatArray = NDArray[np.float64]
+
+PROBABILITY = 0.25
+"""A detection counts from this probability on; from `LEAST_PROBABILITY` on if it could be located as well."""
+
+
+@dataclass(frozen=True, eq=False)
+class CameraView:
+    """One camera's image and what was made of it.
+
+    Attributes:
+        name: of the camera in the rig.
+        camera, mount: its model, and its pose on the vehicle.
+        image: (h, w, 3) uint8, RGB.
+        detections: the cars in the image.
+        scan: the ranges with which they were located.
+        stereo: the stereo camera, and its disparity, (h, w) float32 px, where there is no laser; else None.
+        cars: the detections that could be located.
+        slots: (n,) int64, the slot that each of `cars` stands in; -1 for none.
+    """
+
+    name: str
+    camera: PinholeCamera
+    mount: Mount
+    image: NDArray[np.uint8]
+    detections: Detections
+    scan: RangeScan
+    stereo: tuple[StereoCamera, NDArray[np.float32]] | None
+    cars: LocatedCars
+    slots: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class PerceptionResult:
+    """What the pipeline made of one capture.
+
+    Attributes:
+        captured: the capture and its time.
+        vehicle: (3,) estimated x, y in m and yaw in rad of the vehicle, world frame.
+        views: one for each camera and stereo camera of the rig.
+        scans: one for each laser and stereo camera of the rig.
+    """
+
+    captured: TimedCapture
+    vehicle: FloatArray
+    views: tuple[CameraView, ...]
+    scans: tuple[RangeScan, ...]
+
+    @property
+    def n_cars(self) -> int:
+        """Number of located cars."""
+        return sum(len(view.cars) for view in self.views)
+
+
+class PerceptionPipeline:
+    """Detects cars, measures their distance, and estimates which slots are taken, with the sensors of one rig.
+
+    A laser measures the distances for all cameras; in a rig without a laser each stereo camera measures its own.
+
+    Args:
+        rig: with at least one camera or stereo camera, and a laser or stereo camera.
+        lot: the lot with the slots.
+        detector: a detector, or its name (see `make_detector`); None: the packaged HOG detector.
+
+    Raises:
+        InputError: a rig without a camera or without a ranging sensor, or an unknown detector.
+    """
+
+    def __init__(self, rig: SensorRig, lot: ParkingLot, detector: str | Detector | None = None) -> None:
+        if not (rig.lasers or rig.stereo_cameras) or not (rig.cameras or rig.stereo_cameras):
+            raise InputError(
+                "the rig has no camera, or no ranging sensor; want a camera and a laser, or stereo"
+            )
+        self.rig = rig
+        self.lot = lot
+        self.detector = make_detector(detector)
+
+    def process(
+        self, captured: TimedCapture, slots: SlotFilter, vehicle: FloatArray | None = None
+    ) -> PerceptionResult:
+        """Process one capture, and update the slots with what was observed.
+
+        Args:
+            captured: measured with the pipeline's rig.
+            slots: the filter to update.
+            vehicle: (3,) estimated x, y, yaw of the vehicle; None: the true pose.
+        """
+        vehicle = captured.capture.pose if vehicle is None else vehicle
+        views = []
+        disparities = self._disparities(captured.capture)  # eq. 3.1
+        scans = self._range_scans(captured.capture, disparities, vehicle)  # T §3.2.3
+        for scan in scans.values():
+            slots.update_from_scan(scan)  # T §3.3.2, from beams
+        for name, camera, mount, image in self._images(captured.capture):
+            scan = scans[self._ranging_sensor(name)]
+            found = self.detector.detect(image)  # T §3.2.1, §3.2.2
+            cars = localize_cars(found, scan, camera, mount, vehicle)  # eq. 3.2
+            found, cars = _confirmed(found, cars)
+            placed = slots.update_from_cars(cars)  # T §3.3.2, from detections
+            stereo = None if self.rig.lasers else disparities.get(name)
+            views.append(CameraView(name, camera, mount, image, found, scan, stereo, cars, placed))
+        return PerceptionResult(captured, vehicle, tuple(views), tuple(scans.values()))
+
+    def observe(
+        self, captures: Sequence[TimedCapture]
+    ) -> tuple[tuple[PerceptionResult, ...], SlotObservation]:
+        """Process the captures of one step together, without evidence from earlier ones.
+
+        Returns:
+            The result of each capture, and the states of the slots that were observed.
+        """
+        slots = SlotFilter(self.lot)
+        results = tuple(self.process(captured, slots) for captured in captures)
+        return results, slots.observation()
+
+    def _ranging_sensor(self, camera: str) -> str:
+        """Name of the sensor whose ranges locate the detections of a camera."""
+        if self.rig.lasers:
+            return self.rig.lasers[0][0]
+        stereo_cameras = [name for name, _, _ in self.rig.stereo_cameras]
+        return camera if camera in stereo_cameras else stereo_cameras[0]
+
+    def _disparities(self, capture: Capture) -> dict[str, tuple[StereoCamera, NDArray[np.float32]]]:
+        return {
+            name: (stereo, disparity(capture.pairs[name], stereo))
+            for name, stereo, _ in self.rig.stereo_cameras
+        }
+
+    def _range_scans(
+        self,
+        capture: Capture,
+        disparities: dict[str, tuple[StereoCamera, NDArray[np.float32]]],
+        vehicle: FloatArray,
+    ) -> dict[str, RangeScan]:
+        """Range scans by the sensor's name, those of lasers first."""
+        lasers = {
+            name: scan_from_laser(laser, mount, vehicle, capture.scans[name])
+            for name, laser, mount in self.rig.lasers
+        }
+        stereo = {
+            name: scan_from_stereo(camera, mount, vehicle, disparities[name][1])
+            for name, camera, mount in self.rig.stereo_cameras
+        }
+        return lasers | stereo
+
+    def _images(self, capture: Capture) -> list[tuple[str, PinholeCamera, Mount, NDArray[np.uint8]]]:
+        """Name, camera, mount and image of every camera; of stereo cameras the left one."""
+        return [
+            *((name, camera, mount, capture.images[name].image) for name, camera, mount in self.rig.cameras),
+            *(
+                (name, stereo.camera, mount, capture.pairs[name].left.image)
+                for name, stereo, mount in self.rig.stereo_cameras
+            ),
+        ]
+
+
+def localize_as_thesis(view: CameraView, vehicle: FloatArray) -> LocatedCars:
+    """Locate the detections of a view as the thesis does, for comparison: by the median range in each box (T §3.2.3).
+
+    Args:
+        view: of a `PerceptionResult`.
+        vehicle: (3,) estimated x, y, yaw of the vehicle, world frame.
+    """
+    if view.stereo is not None:
+        stereo, disparity_px = view.stereo
+        return localize_disparity(view.detections, disparity_px, stereo, view.mount, vehicle)
+    return localize_median(view.detections, view.scan, view.camera, view.mount, vehicle)
+
+
+def _confirmed(found: Detections, cars: LocatedCars) -> tuple[Detections, LocatedCars]:
+    """Drop detections of low probability that could not be located."""
+    kept = found.probability >= PROBABILITY
+    kept[cars.detection] = True
+    return found.select(kept), dataclasses.replace(cars, detection=np.cumsum(kept)[cars.detection] - 1)

@@ -1,0 +1,169 @@
+"""Ranges around the car at bumper height: from a laser scanner, or from the disparities of a stereo pair."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from sim_sensors.camera.models import StereoCamera, StereoFrame
+from sim_sensors.compilation import compiled
+from sim_sensors.laser.scanner import LaserScanner
+from sim_sensors.rig import Mount
+
+FloatArray = NDArray[np.float64]
+Float32Array = NDArray[np.float32]
+
+STEREO_RANGE = 12.0
+"""m; beyond it, half a pixel of disparity is a metre."""
+_NEAREST = 1.0  # m, the shortest depth that the matcher searches
+_BAND = (0.35, 1.1)  # m above ground: bumpers and doors, below the windows
+_LEAST_PIXELS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class RangeScan:
+    """Ranges in many directions from one point.
+
+    Args:
+        x, y: m, position of the sensor, world frame.
+        angle: (k,) float64, rad, world frame, ascending (counter-clockwise).
+        distance: (k,) float64, m; inf if the beam meets nothing within `max_range`, NaN if the range is unknown.
+        max_range: m.
+    """
+
+    x: float
+    y: float
+    angle: FloatArray
+    distance: FloatArray
+    max_range: float
+
+    def points(self, beams: NDArray[np.int64]) -> FloatArray:
+        """Return the end points of beams with a finite range, (k, 2) float64, m, world frame."""
+        angle, distance = self.angle[beams], self.distance[beams]
+        return np.stack([self.x + distance * np.cos(angle), self.y + distance * np.sin(angle)], axis=1)
+
+
+def scan_from_laser(
+    laser: LaserScanner, mount: Mount, vehicle: FloatArray, ranges: Float32Array
+) -> RangeScan:
+    """Place the ranges of a laser scanner in the world.
+
+    Args:
+        laser: the scanner.
+        mount: its pose on the vehicle.
+        vehicle: (3,) estimated x, y in m and yaw in rad of the vehicle, world frame.
+        ranges: (n_beams,) float32, m; inf for beams without a return.
+
+    Raises:
+        InputError: a wrong number of beams, NaN, or a range below 0.
+    """
+    if ranges.shape != (laser.n_beams,):
+        raise InputError(f"scan has shape {ranges.shape}, want ({laser.n_beams},)")
+    if np.isnan(ranges).any() or (ranges < 0.0).any():
+        bad = int(np.flatnonzero(np.isnan(ranges) | (ranges < 0.0))[0])
+        raise InputError(f"scan[{bad}] is {ranges[bad]} m, want at least 0, or inf for no return")
+    x, y, yaw = mount.in_world(vehicle)
+    return RangeScan(x, y, yaw + laser.angles.astype(np.float64), ranges.astype(np.float64), laser.max_range)
+
+
+def scan_from_stereo(
+    stereo: StereoCamera, mount: Mount, vehicle: FloatArray, disparity_px: Float32Array, columns: int = 2
+) -> RangeScan:
+    """Find the nearest obstacle at bumper height in every few columns of a disparity image.
+
+    A direction in which only ground is seen is free; a direction without matches is unknown.
+
+    Args:
+        stereo: the camera.
+        mount: pose of its left camera on the vehicle; without pitch.
+        vehicle: (3,) x, y in m and yaw in rad of the vehicle, world frame.
+        disparity_px: (h, w) float32, px, NaN where nothing matches; see `disparity`.
+        columns: number of image columns that share a direction.
+    """
+    camera = stereo.camera
+    x, y, yaw = mount.in_world(vehicle)
+    depth = _column_depths(
+        disparity_px,
+        columns,
+        camera.fx * stereo.baseline,
+        camera.fy,
+        camera.cy,
+        mount.z,
+        *_BAND,
+        STEREO_RANGE,
+    )
+    middle = columns * (np.arange(len(depth)) + 0.5) - camera.cx
+    aside = np.arctan2(middle, camera.fx)
+    distance = depth / np.cos(aside)
+    return RangeScan(x, y, (yaw - aside)[::-1], distance[::-1], STEREO_RANGE)
+
+
+def disparity(pair: StereoFrame, stereo: StereoCamera, nearest: float = _NEAREST) -> Float32Array:
+    """Compute the disparity, (h, w) float32 px, by OpenCV's semi-global matching; NaN where it finds no match.
+
+    Args:
+        pair: rectified images.
+        stereo: the camera.
+        nearest: m, the shortest depth that is searched.
+    """
+    most = 16 * math.ceil(stereo.camera.fx * stereo.baseline / nearest / 16)
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=most,
+        blockSize=5,
+        P1=8 * 25,
+        P2=32 * 25,
+        disp12MaxDiff=1,
+        uniquenessRatio=5,
+        speckleWindowSize=80,
+        speckleRange=2,
+    )
+    left, right = (cv2.cvtColor(f.image, cv2.COLOR_RGB2GRAY) for f in (pair.left, pair.right))
+    # The matcher skips `most` px at the left border: pad the images there, and cut the padding off again.
+    left, right = (cv2.copyMakeBorder(i, 0, 0, most, 0, cv2.BORDER_REPLICATE) for i in (left, right))
+    found = matcher.compute(left, right)[:, most:].astype(np.float32) / 16.0
+    return np.where(found > 0.0, found, np.nan).astype(np.float32)
+
+
+@compiled
+def _column_depths(
+    disparity_px: Float32Array,
+    columns: int,
+    focal_baseline: float,
+    fy: float,
+    cy: float,
+    height: float,
+    low: float,
+    high: float,
+    max_range: float,
+) -> FloatArray:
+    rows, width = disparity_px.shape
+    out = np.full(width // columns, np.nan)
+    found = np.empty(rows * columns)
+    for c in range(len(out)):
+        obstacle = 0
+        ground = 0.0
+        for v in range(rows):
+            down = (v + 0.5 - cy) / fy
+            for u in range(c * columns, (c + 1) * columns):
+                d = disparity_px[v, u]
+                if not d > 0.0:
+                    continue
+                z = focal_baseline / d
+                level = height - down * z
+                if low <= level <= high and z <= max_range:
+                    found[obstacle] = z
+                    obstacle += 1
+                elif abs(level) < 0.15 and z <= max_range:
+                    ground = max(ground, z)
+        if obstacle >= _LEAST_PIXELS:
+            out[c] = np.sort(found[:obstacle])[obstacle // 4]
+        elif ground > 0.0:
+            # Free if the ground is seen nearly to the maximum range; else it is not known what stands beyond.
+            out[c] = np.inf if ground > 0.8 * max_range else np.nan
+    return out

@@ -1,0 +1,168 @@
+"""Experiment files: what they run, how a run folder is gone on with, and how bad files are refused."""
+
+import json
+
+import pytest
+
+from parkenv import InputError
+from parkenv.evaluation.experiments.agent_spec import AgentSpec, parse_agent, split_agents
+from parkenv.evaluation.experiments.experiment import Experiment, run_experiment
+from parkenv.evaluation.experiments.spec import SPEC_FILE, ExperimentSpec
+from parkenv.world.scenario import KMH
+from tests.command_line import parkenv
+
+SWEEP = """
+agents = ["first-free", { name = "mdp", failure_s = 90 }, "mdp"]
+scenarios = ["mini", "own.toml", { name = "inline", lot = { grid = { rows = 2, columns = 6 } } }]
+episodes = 4
+seed = 7
+jobs = 1
+figures = false
+
+[grid]
+failure_s = [5, 60]
+v_walk_kmh = 4
+v_drive_kmh = [10, 15]
+"""
+
+
+@pytest.fixture
+def sweep(tmp_path):
+    (tmp_path / "own.toml").write_text(
+        'lot = "mini"\ncosts = { give_up_s = 60 }\nspeeds = { v_walk_kmh = 3 }\n'
+    )
+    file = tmp_path / "sweep.toml"
+    file.write_text(SWEEP)
+    return file
+
+
+def refusal(folder, text):
+    file = folder / "bad.toml"
+    file.write_text(text)
+    done = parkenv("run", file, "--out", folder / "out")
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert not (folder / "out").exists()
+    return done.stderr
+
+
+def summary_of(out):
+    return json.loads((out / "summary.json").read_text())
+
+
+def test_a_file_is_run_and_its_folder_says_what_was_run(tmp_path, sweep):
+    out = tmp_path / "out"
+    done = parkenv("run", sweep, "--out", out)
+    assert done.returncode == 0, done.stderr
+    rows = summary_of(out)["rows"]
+    assert len(rows) == 3 * 3 * 2 * 2
+    assert {row["agent"] for row in rows} == {"first-free", "mdp(failure_s=90)", "mdp"}
+    assert {row["scenario"] for row in rows} == {"mini", "own", "inline"}
+    assert {row["v_walk_kmh"] for row in rows} == {4.0}, "the grid goes before the scenario's own speed"
+    assert {row["seed"] for row in Experiment(ExperimentSpec.read(sweep)).cases and [{"seed": 7}]} == {7}
+    kept = ExperimentSpec.read(out / SPEC_FILE)
+    assert kept == ExperimentSpec.read(sweep)
+
+    # The folder alone is enough to go on, and to add to it.
+    (out / "summary.json").unlink()
+    episodes = (out / "episodes.csv").read_text()
+    (out / "episodes.csv").write_text("\n".join(episodes.splitlines()[:20]) + "\n")
+    assert parkenv("run", out, "--resume").returncode == 0
+    assert (out / "episodes.csv").read_text() == episodes
+    assert parkenv("compare", "--resume", "-n", 5, "--out", out).returncode == 0
+    assert {row["episodes"] for row in summary_of(out)["rows"]} == {5}
+    assert ExperimentSpec.read(out / SPEC_FILE) == kept.changed(episodes=5, jobs=0)
+
+    # A file of the experiment that has changed is noticed.
+    (tmp_path / "own.toml").write_text('lot = "mini"\ncosts = { give_up_s = 70 }\n')
+    again = parkenv("run", sweep, "--out", out, "--resume")
+    assert again.returncode == 2
+    assert "own.costs.give_up_s was 60.0" in again.stderr
+
+
+def test_what_the_world_charges_and_what_a_planner_assumes_are_two_things(sweep):
+    cases = [case for case, _ in Experiment(ExperimentSpec.read(sweep)).cases if case.agent == "mdp"]
+    assert {case.scenario.failure_s for case in cases} == {5.0, 60.0}
+    assert {case.label: case.options for case in cases} == {"mdp(failure_s=90)": {"failure_s": 90}, "mdp": {}}
+
+
+def test_options_build_the_same_specification_as_a_file(tmp_path, sweep):
+    out = tmp_path / "out"
+    done = parkenv(
+        "compare", "--scenario", f"mini,{tmp_path / 'own.toml'}", "--agents", "first-free,mdp(failure_s=90)", "-n", 2,
+        "--failure-cost", "5,60", "--v-walk-kmh", "4", "--occupancy-levels", "none", "--jobs", 1, "--no-figures",
+        "--out", out,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    text = SWEEP.replace(', { name = "inline", lot = { grid = { rows = 2, columns = 6 } } }', "")
+    text = text.replace(', "mdp"]', "]").replace("v_drive_kmh = [10, 15]", "").replace("seed = 7", "")
+    sweep.write_text(text.replace("episodes = 4", "episodes = 2"))
+    assert ExperimentSpec.read(out / SPEC_FILE) == ExperimentSpec.read(sweep)
+
+
+def test_python_runs_the_same_object(tmp_path):
+    spec = ExperimentSpec.parse(
+        {
+            "agents": ["greedy-goal", "oracle"],
+            "scenarios": ["mini"],
+            "episodes": 3,
+            "grid": {"v_drive_kmh": [5, 20]},
+        },
+        "test",
+    )
+    seen = []
+    result = run_experiment(spec, tmp_path, on_progress=seen.append)
+    assert sum(seen) == 12
+    assert [case.scenario.v_drive for case, _ in result.experiment.cases] == [5 * KMH] * 2 + [20 * KMH] * 2
+    slow, _, fast, _ = result.rows
+    assert slow["drive_s"] > fast["drive_s"]
+
+
+def test_agents_with_options_are_read_from_words_and_tables():
+    assert split_agents("mdp(failure_s=90,gamma=0.9), ppo:a/b.zip,oracle") == [
+        "mdp(failure_s=90,gamma=0.9)",
+        "ppo:a/b.zip",
+        "oracle",
+    ]
+    table = parse_agent("x:Y(a=1, b=2.5,c=true,d=word)")
+    assert table == {"name": "x:Y", "a": 1, "b": 2.5, "c": True, "d": "word"}
+    spec = AgentSpec.parse(table, "test")
+    assert spec.label == "x:Y(a=1,b=2.5,c=true,d=word)"
+    assert parse_agent(spec.label) == table
+    for text in ("mdp(", "mdp(a)", "mdp(a=1,a=2)", "mdp(a=(1))", "mdp(=1)", "mdp(a=)"):
+        with pytest.raises(InputError, match="agent 'mdp"):
+            parse_agent(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("episods = 3", "bad.toml: unknown key 'episods'; did you mean 'episodes'? known: "),
+        ("[grid]\nfailure = 3", "unknown key 'failure' in [grid]; did you mean 'failure_s'?"),
+        ('scenarios = [{ lot = "mini", cost = {} }]', "unknown key 'cost' in [scenarios.0]; did you mean 'costs'?"),
+        ('scenarios = ["campsu"]', "scenarios.0: unknown scenario "),
+        ('scenarios = [{ lot = "none.geojson" }]', "scenarios.0.lot.file is 'none.geojson', want a file"),
+        ('scenarios = ["mini", "mini"]', "scenarios has 'mini' twice"),
+        ('agents = "mdp"', "agents is 'mdp', want a list"),
+        ("agents = [{ nam = 'mdp' }]", "agents.0.name is missing"),
+        ("agents = ['mdp(failre_s=9)']", "agent 'mdp' has no option 'failre_s'"),
+        ("agents = ['belief']\ngrid = { blind = true }", "all agents plan on observations: belief"),
+        ("episodes = 'many'", "episodes is 'many', want a whole number"),
+        ("grid = { v_walk_kmh = [4, -4] }", "grid.v_walk_kmh.1 is -4, want a number of at least 0.1"),
+        ("grid = { failure_s = [nan] }", "grid.failure_s.0 is nan, want a finite number"),
+        ("grid = { failure_s = [1, 1] }", "grid.failure_s is [1, 1], want different values; 1.0 is repeated"),
+        ("seed = -1", "seed is -1, want a number of at least 0"),
+        ("kind = 'comparison'", "kind is 'comparison'; did you mean 'compare'?"),
+        ("backend = 'spark'", "backend is 'spark', want 'loky', 'ray' or 'dask'"),
+    ],
+)  # fmt: skip
+def test_bad_files_are_refused_in_one_line(tmp_path, text, message):
+    assert message in refusal(tmp_path, text)
+
+
+def test_a_grid_without_bounds_is_refused_before_any_work(tmp_path):
+    axis = list(range(1, 1001))
+    speeds = f"v_walk_kmh = {[v / 10 for v in axis]}\nv_drive_kmh = {[v / 5 for v in axis]}"
+    text = f"episodes = 1\n[grid]\nfailure_s = {axis}\n{speeds}"
+    assert "is 9000000000 searches, want at most 10000000" in refusal(tmp_path, text)
+    assert "bad.toml: No such file" in parkenv("run", tmp_path / "none" / "bad.toml").stderr
