@@ -73,16 +73,6 @@ class SearchProblem:
         """Walk from each slot to the goal, (n_slots,) s (eq. 3.25)."""
         return _read_only(self.lot.walk_m(self.goal) / self.v_walk)
 
-    @property
-    def parking_cost_s(self) -> FloatArray:
-        """Cost of parking in each slot, (n_slots,) s: a price over the value of time."""
-        return self.lot.slot_parking_cost_s
-
-    @cached_property
-    def arrival_cost_s(self) -> FloatArray:
-        """What it costs to be parked in each slot, walk and parking cost, (n_slots,) s."""
-        return _read_only(self.walk_s + self.parking_cost_s)
-
     @cached_property
     def arrival_cost_s(self) -> FloatArray:
         """What parking in each slot costs on arrival, (n_slots,) s: the walk and the price."""
