@@ -188,7 +188,7 @@ def test_the_planner_parks(lot):
         assert row["time_s"] < 45.0
 
 
-def park_thousand():
+def park_hundreds():
     lots = [packaged_lot(name) for name in LOTS]
     cases = [
         ParkingCase(lots[0], ("perpendicular",)),
@@ -197,7 +197,7 @@ def park_thousand():
     ]
     if DRAGON_LAKE.exists():
         cases.append(ParkingCase(read_lot(DRAGON_LAKE)))
-    per_case = -(-1000 // len(cases))
+    per_case = -(-400 // len(cases))
     with Workers(1) as workers:
         return [p.row for some in park_all(cases, range(1000, 1000 + per_case), workers) for p in some]
 
@@ -227,10 +227,10 @@ def test_the_planner_parks_on_an_imported_lot(tmp_path):
 
 
 @pytest.mark.slow
-def test_of_a_thousand_random_parkings_ninety_nine_in_a_hundred_succeed():
-    rows = park_thousand()
+def test_of_a_hundred_random_parkings_ninety_nine_succeed():
+    rows = park_hundreds()
     (overall,) = [row for row in parking_table(rows) if row["kind"] == "all"]
-    assert overall["episodes"] >= 1000
+    assert overall["episodes"] >= 400
     assert overall["success"] >= 0.99
     assert overall["contacts"] <= 0.01 * overall["episodes"]
     assert {row["kind"] for row in rows} == {"perpendicular", "oblique", "parallel"}

@@ -176,13 +176,12 @@ def test_bad_settings_are_named(wrong, message):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "rig"), [("campus", "laser"), ("street", "laser"), ("campus", "stereo")])
-def test_held_out_sessions_are_as_right_as_promised(name, rig):
-    scenario = make_scenario(name, traffic=BUSY)
+@pytest.mark.parametrize(("name", "rig", "accuracy"), [("campus", "laser", 0.97), ("street", "stereo", 0.94)])
+def test_held_out_sessions_are_as_right_as_promised(name, rig, accuracy):
+    """With a fifth of the captures that a survey makes unless it is asked for others."""
     window = ArrivalWindow((1,), 36_000.0, 43_200.0)
-    survey = Survey(scenario, SurveySettings(rig=rig, windows=(window,), seed=777))
-    results = [survey.drive(0)]
-    assert np.mean([r.slot_accuracy for r in results]) >= (0.97 if rig == "laser" else 0.94)
+    settings = SurveySettings(rig=rig, windows=(window,), seed=777, every=6.0)
+    assert Survey(make_scenario(name, traffic=BUSY), settings).drive(0).slot_accuracy >= accuracy
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """Learning agents: the batch for stable-baselines3, trainings that can be stopped, models that say what they are."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -303,8 +304,22 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
     assert (tmp_path / "curve.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("algorithm", sorted(SEARCH_CONFIGS))
+def test_every_algorithm_trains_a_model_that_searches(algorithm, tmp_path, monkeypatch):
+    config = SEARCH_CONFIGS[algorithm]
+    sizes = {"batch_size": 256, **({"learning_starts": 200} if algorithm == "dqn" else {})}
+    small = dataclasses.replace(config, n_envs=16, settings={**config.settings, **sizes})
+    monkeypatch.setitem(SEARCH_CONFIGS, algorithm, small)
+    train_one(SearchTraining(algorithm, 1_000, 1_000, (SCENARIO,), EXAMINED[:4]), 0, tmp_path)
+    curve = read_curve(tmp_path / "curve.csv")
+    assert curve[-1]["steps"] >= 1_000
+    row = search_times(LearnedAgent(SCENARIO, algorithm, tmp_path / "model.zip"), SCENARIO, EXAMINED[:4])
+    assert row["episodes"] == 4
+
+
+# One that learns from its last decisions, and one that keeps what it did for long.
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["maskable-ppo", "dqn"])
 def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp_path, algorithm):
     out = tmp_path / "out"
     command = [
@@ -338,7 +353,7 @@ def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp
     assert [row["steps"] for row in means] == [row["steps"] for row in curve]
     compared = parkenv(
         "compare", "--scenario", "mini", "--agents", f"mdp,{algorithm}:{out / 'seed_1' / 'model.zip'}", "-n", 10,
-        "--occupancy-levels", "none", "--out", tmp_path / "compared",
+        "--occupancy-levels", "none", "--jobs", 1, "--out", tmp_path / "compared",
     )  # fmt: skip
     assert compared.returncode == 0, compared.stderr
 
