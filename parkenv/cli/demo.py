@@ -1,4 +1,4 @@
-"""`parkenv demo`: the whole story, from the first survey drive to the comparison."""
+"""`parkenv demo`: from the first survey session to the comparison of agents."""
 
 from __future__ import annotations
 
@@ -44,13 +44,14 @@ def demo(
         bool, typer.Option("--report", help="Also write report.html, as `parkenv report` does.")
     ] = False,
 ) -> None:
-    """Survey a lot with simulated sensors, learn from it how often each slot is taken, and search there on other days.
+    """Survey a lot with simulated sensors, estimate how often each slot is taken, and search there on other days.
 
-    1. Survey drives: a side camera and a laser pass every slot; cars are detected, ranged and put into slots.
+    1. Survey: a car with a side camera and a laser passes every slot; parked cars are detected, located and assigned to
+    slots.
 
-    2. The map: how likely each slot is taken at the hour of the search, from these drives alone.
+    2. Map: the probability that each slot is taken at the hour of the search, from these sessions alone.
 
-    3. Searches on new days, each seen through camera, laser and detector: the thesis's planner and what people do, all
+    3. Searches on other days, with camera, laser and detector: the thesis's planner and three heuristic baselines, all
     with the same map, in the same worlds.
 
     Example:
@@ -59,6 +60,7 @@ def demo(
     from parkenv.evaluation.experiments.compare import run_cases, table
     from parkenv.evaluation.experiments.results import ResultFolder, make_folder
     from parkenv.evaluation.experiments.surveys import run_survey, summarize
+    from parkenv.evaluation.experiments.warm_up import warm_up_tasks
     from parkenv.evaluation.figures.registry import ComparisonResults, draw_figures
     from parkenv.evaluation.figures.survey_pictures import save_detections, save_map, save_session
     from parkenv.evaluation.trips.sensor_log import require_viewer
@@ -77,7 +79,11 @@ def demo(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         console=console, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
-        bar = progress.add_task("1/3 surveying (compiles first after an installation)", total=sessions)
+        tasks = warm_up_tasks(settings, AGENTS)
+        bar = progress.add_task("compiling, once after an installation", total=len(tasks))
+        for _ in workers.results(tasks):
+            progress.advance(bar)
+        bar = progress.add_task("1/3 surveying", total=sessions)
         run = run_survey(
             its, settings, sessions, map_file, workers=workers, on_session=lambda _: progress.advance(bar)
         )
@@ -96,7 +102,7 @@ def demo(
         progress.advance(bar)
 
         cases = search_spec(its, log, searches, seed, detector)
-        bar = progress.add_task("3/3 searching through the sensors", total=len(AGENTS) * searches)
+        bar = progress.add_task("3/3 searching with simulated sensors", total=len(AGENTS) * searches)
         run_cases(
             cases, folder, workers=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n)
         )
@@ -108,16 +114,15 @@ def demo(
     folder.finish([case.key(s) for case, its_seeds in cases for s in its_seeds], summary)
     draw_figures(ComparisonResults(cases, folder.episodes, rows), out, FIGURES)
     console.print(
-        f"{sessions} drives past {its.lot.n_slots} slots: {surveyed['car_detection_rate']:.1%} of the parked cars were "
-        f"found, {surveyed['slot_accuracy']:.1%} of the slots judged right. The map is off by "
-        f"{surveyed['occupancy_mae']:.2f} in the mean; counting as many drives at that hour alone would be by "
-        f"{surveyed['occupancy_mae_expected']:.2f}."
+        f"{sessions} survey sessions, {its.lot.n_slots} slots: {surveyed['car_detection_rate']:.1%} of the parked cars "
+        f"detected, {surveyed['slot_accuracy']:.1%} of the slots right. Mean absolute error of the map: "
+        f"{surveyed['occupancy_mae']:.2f} (raw counts for that hour: {surveyed['occupancy_mae_expected']:.2f})."
     )
     for printed in result_tables(rows, console.width):
         console.print(printed)
     console.print(f"Pictures, the map, episodes.csv and summary.json are in {out}")
     if rerun is not None:
-        with console.status(f"Driving the first survey and the first search once more for {rerun}"):
+        with console.status(f"Running the first session and the first search again for {rerun}"):
             case, seeds = cases[0]
             _record(case.scenario, settings, seeds[0], rerun)
         console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
@@ -128,7 +133,7 @@ def demo(
 
 
 def survey_spec(scenario: str, every: float, seed: int, detector: str) -> tuple[Scenario, SurveySettings]:
-    """The world of the demo, and how it is surveyed."""
+    """Return the world of the demo, and how it is surveyed."""
     from parkenv.mapping.survey import SurveySettings
     from parkenv.world.occupancy import ArrivalWindow
     from parkenv.world.traffic import Traffic
@@ -142,19 +147,19 @@ def survey_spec(scenario: str, every: float, seed: int, detector: str) -> tuple[
 def search_spec(
     its: Scenario, log: SessionLog, searches: int, seed: int, detector: str
 ) -> list[tuple[Case, range]]:
-    """Who searches in it, knowing what the survey tells, with the seeds of the searches."""
+    """Return the searches: all agents with the map of the survey, and the seeds."""
     from parkenv.evaluation.experiments.compare import Case
     from parkenv.mapping.inference import MapPrior
     from parkenv.world.sensor_model import SensorModel
 
     known = its.replace(prior=MapPrior(log), sensor_model=SensorModel.named("laser"))
-    # Worlds of the searches are others than those of the survey: their seeds lie far from its own.
+    # The worlds of the searches are not those of the survey: their seeds are far from its seeds.
     seeds = range(seed + 1_000_000, seed + 1_000_000 + searches)
     return [(Case(known, name, rig="laser", detector=detector), seeds) for name in AGENTS]
 
 
 def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:
-    """The first survey drive and the first search, on one time line."""
+    """Record the first session and the first search, on one time line."""
     from parkenv.envs.perception import SearchPerceptionEnv
     from parkenv.evaluation.trips.sensor_log import record_search, record_session, sensor_log
     from parkenv.mapping.survey import Survey
@@ -167,7 +172,7 @@ def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) ->
 
 
 def _settings(its: Scenario, settings: SurveySettings, sessions: int, seed: int) -> dict[str, Any]:
-    """What decides the outcome of the searches."""
+    """Return what determines the outcome of the searches."""
     from parkenv.perception.detector_registry import detector_version
 
     return {
@@ -181,7 +186,7 @@ def _settings(its: Scenario, settings: SurveySettings, sessions: int, seed: int)
 
 
 def _goes_on(out: Path) -> bool:
-    """Whether an unfinished demo is in the folder."""
+    """Return whether the folder holds an unfinished demo."""
     from parkenv.evaluation.experiments.results import SETTINGS, SUMMARY
 
     return (out / SETTINGS).exists() and not (out / SUMMARY).exists()
