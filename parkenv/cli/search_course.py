@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from parkenv.cli import arguments as args
 from parkenv.cli.training_course import (
     EXAMINED_FROM,
     FIGURE,
@@ -20,8 +19,11 @@ from parkenv.cli.training_course import (
     name_of,
     print_tests,
     row_of,
+    scenario_settings,
 )
-from parkenv.scenarios.build import make_scenario
+from parkenv.evaluation.experiments.agent_spec import AgentSpec
+from parkenv.scenarios.build import build
+from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.workers import Workers
@@ -29,66 +31,71 @@ if TYPE_CHECKING:
     from parkenv.world.scenario import Scenario
 
 SHOWN_FROM = 5_000_000
-"""First seed of the worlds in which a planner shows what to imitate."""
+"""First seed of the worlds in which demonstrations are recorded."""
+PLANNERS = tuple(
+    AgentSpec(name=name)
+    for name in ("belief", "mdp-tuned", "mdp", "first-free", "greedy-drive", "greedy-goal")
+)
 
 
 @dataclass(eq=False)
 class SearchCourse(Course):
-    """Searches in some scenarios.
-
-    Args:
-        algorithm: by name.
-        scenario, test_on: names of scenarios, divided by commas, to train and to test in; None to test in the same.
-        steps: decisions of a training.
-        imitate: name of a planner to begin by imitating, or None.
-        shown: searches of it.
-        k: slots that an observation tells of.
-        examine_every: decisions between examinations.
-        examined_on: searches an examination; the test has twice as many.
-        planners: names, divided by commas, or none.
-    """
-
-    algorithm: str
-    scenario: str
-    test_on: str | None
-    steps: int
-    imitate: str | None
-    shown: int
-    k: int
-    examine_every: int
-    examined_on: int
-    planners: str
+    """Searches in some scenarios."""
 
     @property
     def folder(self) -> str:
         """See `Course`."""
         return self.algorithm
 
-    def recipe(self) -> Any:
+    def config(self) -> Any:
         """See `Course`."""
-        from parkenv.evaluation.training.configs import RECIPES, recipe_of
+        from parkenv.evaluation.training.configs import SEARCH_CONFIGS, config_of
 
-        return recipe_of(self.algorithm, RECIPES, "search")
+        return config_of(self.algorithm, SEARCH_CONFIGS, "search")
+
+    @property
+    def algorithm(self) -> str:
+        """See `Course`."""
+        return self.spec.algorithm or "maskable-ppo"
+
+    @property
+    def _scenarios(self) -> Sequence[ScenarioSpec]:
+        return self.spec.scenarios or (scenario_spec("campus"),)
 
     @cached_property
     def worlds(self) -> list[Scenario]:
-        """Where it is trained."""
-        return [make_scenario(name) for name in args.words("--scenario", self.scenario)]
+        """Scenarios to train in."""
+        return [build(scenario) for scenario in self._scenarios]
 
     @cached_property
     def tested(self) -> list[Scenario]:
-        """Where it is tested."""
-        return [make_scenario(name) for name in args.words("--test-on", self.test_on or self.scenario)]
+        """Scenarios to test in."""
+        return [build(scenario) for scenario in self.spec.test_on or self._scenarios]
+
+    @property
+    def k(self) -> int:
+        """Slots in an observation."""
+        return self.spec.k or 5
+
+    @property
+    def demonstrations(self) -> int:
+        """Searches of the planner to clone."""
+        return self.spec.demonstrations or 2000
+
+    @property
+    def evaluation_episodes(self) -> int:
+        """Searches of an evaluation."""
+        return self.spec.evaluation_episodes or 256
 
     @property
     def examined(self) -> range:
-        """Seeds of the worlds of the examinations."""
-        return range(EXAMINED_FROM, EXAMINED_FROM + self.examined_on)
+        """Seeds of the worlds of the evaluations."""
+        return range(EXAMINED_FROM, EXAMINED_FROM + self.evaluation_episodes)
 
     @property
-    def compared(self) -> list[str]:
+    def compared(self) -> Sequence[AgentSpec]:
         """Planners that are drawn for comparison."""
-        return [] if self.planners == "none" else args.words("--planners", self.planners)
+        return PLANNERS if self.spec.planners is None else self.spec.planners
 
     def check(self) -> None:
         """See `Course`."""
@@ -96,24 +103,35 @@ class SearchCourse(Course):
         from planners.agent import make_agent
 
         super().check()
-        if self.imitate is not None:
-            require_imitable(self.algorithm, self.imitate, self.worlds[0])
+        if self.spec.clone is not None:
+            require_imitable(self.algorithm, self.spec.clone, self.worlds[0])
         for world in (self.worlds[0], *self.tested):
-            for name in self.compared:
-                make_agent(name, world)
+            for agent in self.compared:
+                make_agent(agent.name, world, **agent.options)
+
+    @property
+    def steps(self) -> int:
+        """Decisions of a training."""
+        return self.spec.steps or 2_000_000
+
+    @property
+    def evaluate_every(self) -> int:
+        """Decisions between evaluations."""
+        return self.spec.evaluate_every or 100_000
 
     def settings(self) -> Row:
         """See `Course`."""
         return {
             "algorithm": self.algorithm, "scenario": [w.name for w in self.worlds], "steps": self.steps,
-            "imitate": self.imitate, "shown": self.shown if self.imitate else None, "k": self.k,
-            "examine_every": self.examine_every, "examined_on": self.examined_on,
+            "clone": self.spec.clone, "demonstrations": self.demonstrations if self.spec.clone else None, "k": self.k,
+            "evaluate_every": self.evaluate_every, "evaluation_episodes": self.evaluation_episodes,
+            **scenario_settings(self._scenarios),
         }  # fmt: skip
 
-    def examination(self, settings: Row) -> Row:
+    def evaluation_settings(self, settings: Row) -> Row:
         """See `Course`."""
         first, *_ = settings.get("scenario") or [None]
-        return {"scenario": first, "examined_on": settings.get("examined_on")}
+        return {"scenario": first, "evaluation_episodes": settings.get("evaluation_episodes")}
 
     @property
     def measures(self) -> tuple[str, ...]:
@@ -125,18 +143,21 @@ class SearchCourse(Course):
         from parkenv.evaluation.training.search_training import SearchTraining
 
         demonstrations = None
-        if self.imitate is not None:
+        if self.spec.clone is not None:
             from parkenv.evaluation.training.cloning import Demonstrations
 
-            with console.status(f"Watching {self.imitate} search {self.shown} times"):
+            with console.status(f"Recording {self.demonstrations} searches of {self.spec.clone}"):
                 demonstrations = Demonstrations.collect(
-                    self.imitate, self.worlds[0], range(SHOWN_FROM, SHOWN_FROM + self.shown), self.k
+                    self.spec.clone,
+                    self.worlds[0],
+                    range(SHOWN_FROM, SHOWN_FROM + self.demonstrations),
+                    self.k,
                 )
         return SearchTraining(
-            self.algorithm, self.steps, self.examine_every, tuple(self.worlds), self.examined, self.k, demonstrations
+            self.algorithm, self.steps, self.evaluate_every, tuple(self.worlds), self.examined, self.k, demonstrations
         )  # fmt: skip
 
-    def told(self, row: Row) -> str:
+    def score_text(self, row: Row) -> str:
         """See `Course`."""
         return f"{row['total_s']:.1f} s"
 
@@ -154,7 +175,7 @@ class SearchCourse(Course):
         from parkenv.evaluation.training.search_training import search_times
         from planners.learned import LearnedAgent
 
-        at_test = range(TESTED_FROM, TESTED_FROM + 2 * self.examined_on)
+        at_test = range(TESTED_FROM, TESTED_FROM + 2 * self.evaluation_episodes)
         lines, tables = _planner_times(
             console, workers, self.compared, self.worlds[0], self.tested, self.examined, at_test
         )
@@ -169,11 +190,11 @@ class SearchCourse(Course):
                 tested = transfer[-len(self.tested)]
                 own = {c: tested[c] for c in ("total_s", "total_s_ci95")}
                 rows.append(row_of(self.algorithm, tested["test_scenario"], number, curve, own, model))
-        title = f"{self.worlds[0].name}: {self.examined_on} searches in worlds that were not trained on"
+        title = f"{self.worlds[0].name}: {self.evaluation_episodes} searches in held-out worlds"
         save_learning_curves({name_of(self.settings()): curves, **beside}, lines, title, out / FIGURE)
         print_tests(
             console,
-            "Mean total time, s, in worlds of no examination",
+            "Mean total time, s, in held-out worlds",
             self.algorithm,
             transfer,
             tables,
@@ -188,20 +209,20 @@ class SearchCourse(Course):
 def _planner_times(
     console: Console,
     workers: Workers,
-    names: Sequence[str],
+    agents: Sequence[AgentSpec],
     first: Any,
     tested: Sequence[Any],
     examined: range,
     at_test: range,
 ) -> tuple[dict[str, float], list[Row]]:
-    """Mean times of planners in the worlds of the examinations, and rows of those of the test."""
+    """Mean times of planners in the worlds of the evaluations, and rows of those of the test."""
     from parkenv.evaluation.experiments.compare import rows_of
 
-    if not names:
+    if not agents:
         return {}, []
     with console.status("Planners search in the same worlds"):
-        rows = rows_of(names, first, examined, workers)
-        tables = [row for world in tested for row in rows_of(names, world, at_test, workers)]
+        rows = rows_of(agents, first, examined, workers)
+        tables = [row for world in tested for row in rows_of(agents, world, at_test, workers)]
     lines = {row["agent"]: row["total_s"] for row in rows}
     return {**lines, "clairvoyant bound": rows[0]["bound_s"]}, tables
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,21 +14,33 @@ from parkenv.cli.tables import make_table
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
+    from parkenv.evaluation.experiments.spec import TrainingSpec
     from parkenv.evaluation.experiments.workers import Workers
     from parkenv.evaluation.training.rl_training import Training
+    from parkenv.scenarios.spec import ScenarioSpec
 
 EXAMINED_FROM, TESTED_FROM = 2_000_000, 3_000_000
-"""First seeds of the worlds in which models are examined, and tested at the end."""
+"""First seeds of the worlds of evaluations, and of the test at the end."""
 
 FIGURE = "learning_curve.png"
 
 Row = dict[str, Any]
 
 
+@dataclass(eq=False)
 class Course(ABC):
-    """What is trained, and what the command tells of it."""
+    """What is trained, and what the command prints and draws.
 
-    algorithm: str
+    Args:
+        spec: what was asked for; what it leaves open is decided here.
+    """
+
+    spec: TrainingSpec
+
+    @property
+    @abstractmethod
+    def algorithm(self) -> str:
+        """By name."""
 
     @property
     @abstractmethod
@@ -35,7 +48,7 @@ class Course(ABC):
         """Where results go by default."""
 
     @abstractmethod
-    def recipe(self) -> Any:
+    def config(self) -> Any:
         """The algorithm's, or an `InputError`."""
 
     def check(self) -> None:
@@ -46,7 +59,7 @@ class Course(ABC):
         """
         from planners.learned import algorithm_class
 
-        self.recipe()
+        self.config()
         algorithm_class(self.algorithm)
 
     @abstractmethod
@@ -54,8 +67,8 @@ class Course(ABC):
         """What a training that is gone on with must have in common with this one."""
 
     @abstractmethod
-    def examination(self, settings: Row) -> Row:
-        """What examinations are of, by the settings of a training: equal where curves can be set side by side."""
+    def evaluation_settings(self, settings: Row) -> Row:
+        """What the evaluations of a training depend on: curves can be compared where it is equal."""
 
     @property
     @abstractmethod
@@ -67,8 +80,8 @@ class Course(ABC):
         """Made when it is sure that there will be one."""
 
     @abstractmethod
-    def told(self, row: Row) -> str:
-        """An examination in a word."""
+    def score_text(self, row: Row) -> str:
+        """An evaluation in a few words."""
 
     @abstractmethod
     def report(
@@ -83,16 +96,26 @@ class Course(ABC):
         """Test the models, draw the figure, print the table; what goes into the summary."""
 
 
+def scenario_settings(scenarios: Sequence[ScenarioSpec]) -> Row:
+    """What training depends on of its scenarios, as settings hold it."""
+    from parkenv.evaluation.experiments.experiment import fingerprints, flat_tables
+
+    return {
+        "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in scenarios},
+        "files": fingerprints([file for s in scenarios for file in s.files()]),
+    }
+
+
 def name_of(settings: Row) -> str:
     """What a training is called beside others."""
     name, imitated, scenarios = (
         str(settings["algorithm"]),
-        settings.get("imitate"),
+        settings.get("clone"),
         settings.get("scenario", ()),
     )
     if len(scenarios) > 1:
         name += f" on {', '.join(scenarios)}"
-    return f"{name} after imitating {imitated}" if imitated else name
+    return f"{name} after cloning {imitated}" if imitated else name
 
 
 def curves_beside(folders: Sequence[str], out: Path, course: Course) -> dict[str, list[list[Row]]]:
@@ -104,7 +127,7 @@ def curves_beside(folders: Sequence[str], out: Path, course: Course) -> dict[str
         course: of that training.
 
     Raises:
-        InputError: a folder without a training, or with one that was examined otherwise; the same one twice; or too
+        InputError: a folder without a training, or one with other evaluations; the same one twice; or too
             many to tell apart.
     """
     from parkenv.evaluation.experiments.results import read_settings
@@ -124,11 +147,11 @@ def curves_beside(folders: Sequence[str], out: Path, course: Course) -> dict[str
         curves = [curve for curve in curves if curve]
         if settings is None or not curves:
             raise InputError(f"--beside: {folder} holds no training")
-        theirs = course.examination(settings)
-        for name, value in course.examination(own).items():
+        theirs = course.evaluation_settings(settings)
+        for name, value in course.evaluation_settings(own).items():
             if theirs[name] != value:
                 raise InputError(
-                    f"--beside: {name} is {theirs[name]!r} in {folder} and {value!r} here; their examinations cannot "
+                    f"--beside: {name} is {theirs[name]!r} in {folder} and {value!r} here; their evaluations cannot "
                     "be compared"
                 )
         if not {"steps", *course.measures} <= {*curves[0][0]} or "algorithm" not in settings:

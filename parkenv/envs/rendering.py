@@ -247,7 +247,7 @@ class SearchRenderer:
             ground.cover,
             ground.car,
             ground.car_cover,
-            belief_colors(state.belief.p_occupied[slots], state.belief.seen[slots]),
+            belief_colors(state.belief.p_occupied[slots], state.belief.observed[slots]),
             occupied[slots],
         )
         self._draw_trail(image, ground.view, state)
@@ -268,7 +268,7 @@ class SearchRenderer:
         lines = [
             f"{lot.name}: {self._place(state)}",
             f"{clock(state.time)}  elapsed {state.time - state.arrival.time:.1f} s  "
-            f"failed attempts {state.failed_parks}  observed {int(belief.seen.sum())}/{lot.n_slots}",
+            f"failed attempts {state.failed_parks}  observed {int(belief.observed.sum())}/{lot.n_slots}",
             f"in view: {around}",
             *self._text_map(state),
             "observed: o free  # taken   not: . likely free  : undecided  % likely taken",
@@ -328,7 +328,7 @@ class SearchRenderer:
         # Where slots share a cell, the one most likely free is written last.
         order = np.argsort(-belief.p_occupied, kind="stable")
         likely = np.searchsorted([1 / 3, 2 / 3], belief.p_occupied)
-        glyphs = np.where(belief.seen, np.array(list("oo#"))[likely], np.array(list(".:%"))[likely])
+        glyphs = np.where(belief.observed, np.array(list("oo#"))[likely], np.array(list(".:%"))[likely])
         put(lot.vertex_xy[state.path], np.full(len(state.path), "+"))
         put(lot.slot_xy[order], glyphs[order])
         put(lot.entries, np.full(len(lot.entries), "E"))

@@ -13,17 +13,19 @@ from parkenv.envs.search_step import (
     FLAGS,
     GAVE_UP_S,
     KEY,
-    N_KNOWN_TAKEN,
+    LOOKED,
     N_TOUCHED,
     OVER,
     PARKED,
     PARKED_WALK_S,
+    SAID,
     SEEN,
     TIME,
     VERTEX,
     WHO,
     Search,
     belief_now,
+    spot,
 )
 from parkenv.world.occupancy import Arrival, World
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -73,11 +75,13 @@ class SearchState:
 
     @property
     def belief(self) -> SlotBelief:
-        """What the car believes now, a copy."""
+        """The belief about the slots now, a copy, in float64."""
         forecast = self._scenario.forecast(self.arrival)
-        p, seen = forecast.p_occupied.copy(), np.zeros(len(forecast.p_occupied), dtype=np.bool_)
-        _read_belief(self._search, p, seen)
-        return SlotBelief(forecast.p_occupied, forecast.decay_rate, p, seen, self._count(N_KNOWN_TAKEN))
+        belief = SlotBelief.of_forecast(forecast.p_occupied, forecast.decay_rate)
+        belief.p_occupied, belief.p_observed = belief.forecast.copy(), belief.forecast.copy()
+        _read_belief(self._search, belief.p_occupied, belief.p_observed, belief.observed_at)
+        belief.time = self.time - self.arrival.time
+        return belief
 
     @property
     def vertex(self) -> int:
@@ -116,11 +120,19 @@ class SearchState:
 
 
 @compiled
-def _read_belief(search: Search, p: NDArray[np.float64], seen: NDArray[np.bool_]) -> None:
+def _read_belief(
+    search: Search,
+    p_occupied: NDArray[np.float64],
+    p_observed: NDArray[np.float64],
+    observed_at: NDArray[np.float64],
+) -> None:
     for column in range(1, search.counts[0, N_TOUCHED] + 1):
         slot = search.marks[0, column, WHO]
-        p[slot] = belief_now(search, 0, column)
-        seen[slot] = search.marks[0, column, FLAGS] & SEEN != 0
+        p_occupied[slot] = belief_now(search, 0, column)
+        if search.marks[0, column, FLAGS] & SEEN != 0:
+            at = spot(column)
+            p_observed[slot] = search.memory[0, at + SAID]
+            observed_at[slot] = search.memory[0, at + LOOKED] - search.numbers[0, ARRIVAL]
 
 
 def arrival_of(scenario: Scenario, search: Search, e: int) -> Arrival:

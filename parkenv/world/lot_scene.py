@@ -1,4 +1,4 @@
-"""A parking lot as the sensors see it."""
+"""Scenes of a parking lot for the simulated sensors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sim_sensors.slot_scenes import SlotLot, slot_surroundings
 FloatArray = NDArray[np.float64]
 
 WALL_HEIGHT = 1.8
-"""Height, m, of walls that a lot's file gives as open lines; closed ones are buildings."""
+"""Height, m, of walls given as open lines; closed lines are buildings."""
 
 _CARS_APART = 1 << 31
 _KEPT_LOTS = 4
@@ -28,14 +28,13 @@ _SLOT_LOTS: OrderedDict[bytes, SlotLot] = OrderedDict()
 
 
 def slot_lot(lot: ParkingLot, seed: int = 0) -> SlotLot:
-    """The lot's slots for `sim_sensors`: `slot_lot(lot).scene(occupied)` is what stands there.
+    """Convert a lot for `sim_sensors`: `slot_lot(lot).scene(occupied)` is its scene.
 
-    Closed walls become buildings, open ones free-standing walls. Place i of the scene is slot i, in the lot's
-    own frame.
+    Closed walls become buildings, open ones free-standing walls. Place i of the scene is slot i, in the lot's frame.
 
     Args:
         lot: the lot.
-        seed: of the cars' models and of everything's texture.
+        seed: of vehicle models and textures.
 
     Equal lots share one object in a process, and with it the ground's texture and the vehicles' meshes, which take
     seconds to make: every task of a worker process brings a new copy of its lot.
@@ -82,16 +81,15 @@ def _make_slot_lot(lot: ParkingLot, seed: int) -> SlotLot:
 
 
 class LotScenes:
-    """A world as the sensors see it, moment after moment.
+    """Scenes of one world over time.
 
-    Which car stands in a slot depends on the world alone, as do the other cars that drive and the people who walk.
-    From one moment to the next only what has changed is changed.
+    Parked cars and traffic depend on the world alone. Consecutive scenes are updated incrementally.
 
     Args:
-        slots: of the scenario's lot, as `slot_lot` makes it.
-        scenario: whose lot and traffic it is.
+        slots: of the scenario's lot, from `slot_lot`.
+        scenario: defines lot and traffic.
         key: of the world.
-        world: which slots are taken when.
+        world: occupancy of the slots over time.
     """
 
     def __init__(self, slots: SlotLot, scenario: Scenario, key: np.uint64, world: World) -> None:
@@ -103,11 +101,11 @@ class LotScenes:
         self._scene: Scene | None = None
 
     def at(self, time: float, ego: FloatArray | None = None) -> Scene:
-        """The scene at `time`, s; slot i is its place i.
+        """The scene at a time; slot i is its place i.
 
         Args:
-            time: at or after the world's arrival.
-            ego: (3,) x, y, yaw of the car that carries the sensors, which is not part of the scene.
+            time: s, at or after the world's arrival.
+            ego: (3,) x, y in m and yaw in rad of the car with the sensors, which is not part of the scene.
         """
         taken = self._world.occupied(self._everything, time)
         stretch = self._world.stretch(self._everything, time)

@@ -1,8 +1,8 @@
-"""Drive a car along a path: where to steer, and how fast, forward and backward.
+"""Path tracking: steering and speed along a path, forward and backward.
 
 The steering is feedback about the rear axle (Samson 1992; Paden et al., "A survey of motion planning and control
-techniques for self-driving urban vehicles", 2016, §V): like Stanley's rule it steers off the heading error and the
-offset from the path, and unlike it in reverse too, where the front axle would lead it astray.
+techniques for self-driving urban vehicles", 2016, §V): like Stanley's rule it corrects the heading error and the
+offset from the path; unlike it, it is stable in reverse, where feedback about the front axle diverges.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import VehicleParameters, move_along
 from parkenv.errors import InputError
-from planners.driving.hybrid_astar import CarPath
+from planners.driving.car_path import CarPath
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
 SAMPLE_M = 0.05
-"""m between the samples of a path."""
+"""Distance between samples of a path, m."""
 
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """How fast, and how firmly, a car follows a path.
+    """Speeds and gains of path tracking.
 
     Args:
-        speed, reverse_speed: m/s, at most.
-        acceleration: m/s², of getting faster and slower.
-        firmness: 1/m; an offset from the path dies out over some 2/firmness metres.
-        blend_m: m, over which the steering goes from one arc's to the next one's while the car moves.
-        control_s: s, from one command to the next.
+        speed, reverse_speed: greatest speeds, m/s.
+        acceleration: acceleration and deceleration, m/s².
+        firmness: gain, 1/m; an offset from the path decays over about 2/firmness metres.
+        blend_m: distance over which the steering changes from one arc's to the next one's, m.
+        control_s: control period, s.
 
     Raises:
         InputError: a value that is not a finite number above 0.
@@ -65,7 +65,7 @@ _REACTION_S = 0.2
 
 
 class PathTracker:
-    """Follows one path; remembers how far it has come.
+    """Track one path, with the progress made so far.
 
     Args:
         vehicle: the car.
@@ -73,9 +73,9 @@ class PathTracker:
         settings: of the tracking.
 
     Attributes:
-        done: whether the car has come to the path's end.
-        offset: m, how far from the path the car last was, left above 0.
-        askew: rad, how far its heading last was from the path's.
+        done: whether the car has reached the end of the path.
+        offset: last lateral offset from the path, m, positive to the left.
+        askew: last heading error, rad.
     """
 
     def __init__(

@@ -17,8 +17,7 @@ from parkenv.errors import InputError
 from parkenv.evaluation.simulate import EpisodeResult, Observer, Step, simulate
 from parkenv.evaluation.training.configs import MAX_STEPS, REWARD_SCALE
 from parkenv.world.scenario import Scenario
-from planners.agent import make_agent
-from planners.bounds.oracle import OracleAgent
+from planners.agent import ClairvoyantAgent, make_agent
 
 UPDATES = 3000
 """Steps of the optimizer, enough for a policy that seldom deviates from the demonstrations."""
@@ -36,7 +35,7 @@ def require_imitable(algorithm: str, agent: str, scenario: Scenario) -> None:
     """
     if algorithm not in IMITATORS:
         raise InputError(f"{algorithm} has no behaviour cloning; take {' or '.join(IMITATORS)}")
-    if isinstance(make_agent(agent, scenario), OracleAgent):
+    if isinstance(make_agent(agent, scenario), ClairvoyantAgent):
         raise InputError(
             f"{agent} cannot be imitated: it decides on the hidden occupancy, which no policy observes"
         )

@@ -21,8 +21,8 @@ from parkenv.evaluation.simulate import Observer, Step, simulate
 from parkenv.files.atomic_write import atomic_write
 from parkenv.world.lot import ParkingLot
 from planners.agent import Agent
-from planners.driving.drivers import PLANNER, make_driver
 from planners.driving.parking import ParkingMemory
+from planners.driving.parking_agents import PLANNER, make_parking_agent
 
 CHUNK = 25
 """Parkings that one worker drives at a time."""
@@ -168,14 +168,14 @@ def park_all(
         cases: where is parked.
         seeds: of the tasks.
         workers: who runs it.
-        driver: a name for `planners.driving.drivers.make_driver`.
+        driver: a name for `planners.driving.parking_agents.make_parking_agent`.
     """
     parts = [seeds[i : i + CHUNK] for i in range(0, len(seeds), CHUNK)]
     yield from workers.in_order([partial(_park_some, case, part, driver) for case in cases for part in parts])
 
 
 def _park_some(case: ParkingCase, seeds: Sequence[int], driver: str) -> list[Parking]:
-    env, agent = case.environment(), make_driver(driver)
+    env, agent = case.environment(), make_parking_agent(driver)
     return [park_once(env, agent, seed) for seed in seeds]
 
 
