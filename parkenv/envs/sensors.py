@@ -71,7 +71,7 @@ class SearchSensorsEnv(SearchEnv):
     ## Arguments
     | Name | Default | Meaning |
     |------|---------|---------|
-    | `scenario`, `render_mode`, changes | | as in `parkenv/Search-v1`; `traffic=Traffic(4, 6)` adds moving cars and pedestrians |
+    | `scenario`, `render_mode`, changes | | as in `parkenv/Search-v1`; `traffic=Traffic(4, 6)` adds road users |
     | `rig` | `"laser"` | `laser` (the thesis's camera and 270° laser), `stereo`, `both_sides`, or a `SensorRig` |
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 4 | largest number of captures on an edge |
