@@ -50,9 +50,9 @@ def test_two_drives_follow_each_other_on_one_time_line(mini: Scenario, tmp_path:
     survey = Survey(mini, SurveySettings(every=8.0, weather="overcast"))
     moments: list[SurveyFrame] = []
     survey.drive(0, on_frame=moments.append)
-    with sensor_log(tmp_path / "one.rrd", mini.lot, survey.stack.rig) as log:
+    with sensor_log(tmp_path / "one.rrd", mini.lot, survey.pipeline.rig) as log:
         record_session(survey, 0, log)
-    with sensor_log(tmp_path / "two.rrd", mini.lot, survey.stack.rig) as log:
+    with sensor_log(tmp_path / "two.rrd", mini.lot, survey.pipeline.rig) as log:
         record_session(survey, 0, log)
         record_session(survey, 0, log)
     one, two = rows_of(tmp_path / "one.rrd"), rows_of(tmp_path / "two.rrd")
@@ -67,7 +67,7 @@ def test_who_watches_a_session_changes_nothing_and_sees_the_truth(mini: Scenario
     watched, alone = survey.drive(0, on_frame=moments.append), survey.drive(0)
     assert np.array_equal(watched.states.p_occupied, alone.states.p_occupied)
     assert np.array_equal(watched.truth, alone.truth)
-    assert [m.time for m in moments] == sorted(m.time for m in moments)
+    assert [m.result.captured.time for m in moments] == sorted(m.result.captured.time for m in moments)
     assert moments[0].truth.shape == (mini.lot.n_slots,)
 
 

@@ -20,6 +20,7 @@ from parkenv.driving.road_users import CLEAR_RADIUS_M, RoadUsers
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
 from parkenv.evaluation.experiments.compare import unseen
+from parkenv.evaluation.simulate import Observer
 from parkenv.evaluation.trips.calibration import (
     OBSERVED,
     UNOBSERVED,
@@ -30,7 +31,7 @@ from parkenv.evaluation.trips.calibration import (
     drive_trips,
 )
 from parkenv.evaluation.trips.driven_search import DrivenSearch, DrivenSearchEnv
-from parkenv.evaluation.trips.driver import ACROSS, ALONG, NO_ROOM, TAKEN, TURN, GraphDriver
+from parkenv.evaluation.trips.executor import ACROSS, ALONG, NO_ROOM, TAKEN, TURN, ParkingAttempt
 from parkenv.evaluation.trips.lot_driver import DrivingStyle, LotDriver
 from parkenv.evaluation.trips.sensor_log import record_trip
 from parkenv.lots import packaged_lot
@@ -59,6 +60,43 @@ def lines_of(name):
 def searched(name, blind=False, notice_m=2.0):
     scenario = make_scenario(name)
     return DrivenSearch(unseen(scenario) if blind else scenario, style=DrivingStyle(notice_m=notice_m))
+
+
+class Calling(Observer):
+    """Calls a function with every observation."""
+
+    def __init__(self, function):
+        self.function = function
+
+    def on_reset(self, env, observation):
+        self.function(observation)
+
+    def on_step(self, step):
+        self.function(step.next_observation)
+
+
+class GraphExecutor:
+    """Drives as the graph has it: every edge at the speed limit, parking at once."""
+
+    def __init__(self, scenario):
+        self.scenario = scenario
+        self.track = []
+
+    def begin(self, key, world, vertex, time):
+        pass
+
+    def drive(self, source, column):
+        return float(self.scenario.move_s[source, column])
+
+    def park(self, slot, taken):
+        name = self.scenario.lot.slot_ids[slot]
+        return ParkingAttempt(name, "", "", self.scenario.failure_s if taken else 0.0, TAKEN if taken else "")
+
+    def wait(self, seconds):
+        return seconds
+
+    def movers_at(self, point):
+        return None
 
 
 def started(name, seed=0, **kinds):
@@ -163,7 +201,7 @@ def test_with_the_graphs_times_a_trip_is_the_search_itself(name):
     """Replace what was driven by what the graph says, and every decision and second is that of Search-v1."""
     scenario = unseen(make_scenario(name))
     agent = make_agent("mdp", scenario)
-    plain, driven = SearchEnv(scenario), DrivenSearchEnv(scenario, GraphDriver(scenario))
+    plain, driven = SearchEnv(scenario), DrivenSearchEnv(scenario, GraphExecutor(scenario))
     failed = 0
     for seed in range(6):
         ones, twos = plain.reset(seed=seed)[0], driven.reset(seed=seed)[0]
@@ -199,8 +237,8 @@ def test_a_trip_is_the_sum_of_its_parts_and_parks_without_a_contact(name, seed, 
     )
     assert trip.lanes_s == pytest.approx(sum(leg.seconds for leg in trip.legs))
     assert trip.graph_m == pytest.approx(sum(leg.graph_m for leg in trip.legs))
-    assert trip.failed_s == pytest.approx(sum(t.seconds for t in trip.failed))
-    assert trip.manoeuvre_s == trip.tries[-1].seconds
+    assert trip.failed_s == pytest.approx(sum(t.seconds for t in trip.failed_attempts))
+    assert trip.manoeuvre_s == trip.attempts[-1].seconds
     # The car's clock, the search's clock, and the parts agree.
     began = search.env.state.arrival.time
     assert driver.time - began == pytest.approx(trip.total_s - trip.walk_s)
@@ -211,7 +249,7 @@ def test_a_trip_is_the_sum_of_its_parts_and_parks_without_a_contact(name, seed, 
     assert np.hypot(*(middle[:2] - scenario.lot.slot_xy[slot])) < 0.25
     assert driver.state[SPEED] == pytest.approx(0.0, abs=0.01)
     assert not search.env.state.world.occupied([slot], driver.time - trip.manoeuvre_s)[0]
-    assert bool(trip.failed) == blind
+    assert bool(trip.failed_attempts) == blind
 
 
 def test_equal_seeds_give_equal_trips_whatever_was_driven_before():
@@ -234,18 +272,18 @@ def test_with_sensors_equal_seeds_give_equal_trips_and_captures_are_where_the_ca
 
     def keep(observation):
         track = {spot.time: spot for spot in driver.track}
-        looks = env.watcher.looks
+        results = env.perception.results
         # (ends of edges are no captures of their own where nothing was driven)
-        assert len(looks) <= 2
-        assert bool(looks) == bool(track) or env.state.parked
-        for moment, look in looks:
-            np.testing.assert_array_equal(look.vehicle, track[moment.time].pose)
-            poses.append((moment.time, *look.vehicle))
-        driven = [track[moment.time].driven_m for moment, _ in looks]
+        assert len(results) <= 2
+        assert bool(results) == bool(track) or env.state.parked
+        for result in results:
+            np.testing.assert_array_equal(result.vehicle, track[result.captured.time].pose)
+            poses.append((result.captured.time, *result.vehicle))
+        driven = [track[result.captured.time].driven_m for result in results]
         assert len(driven) < 2 or np.diff(driven).min() > 1.25 - 0.3
         told.append(observation["p_occupied"].copy())
 
-    first = search.run(2, on_step=keep)
+    first = search.run(2, [Calling(keep)])
     assert first.parked
     assert first.contacts == 0
     times = np.array([pose[0] for pose in poses])
@@ -256,7 +294,7 @@ def test_with_sensors_equal_seeds_give_equal_trips_and_captures_are_where_the_ca
     assert offset.max() < 1.5, "on the lane, right of its middle, and not on the graph's vertices"
     before, poses[:], told[:] = list(poses), [], []
     search.run(3)
-    assert search.run(2, on_step=keep) == first
+    assert search.run(2, [Calling(keep)]) == first
     assert poses == before
 
 
@@ -420,7 +458,7 @@ def test_others_are_in_the_pictures_where_the_car_meets_them(monkeypatch):
             np.testing.assert_allclose(poses, now)
             checked += len(now)
 
-    search.run(1, on_step=keep)
+    search.run(1, [Calling(keep)])
     assert checked > 0
 
 
@@ -514,12 +552,12 @@ def test_a_slot_too_narrow_for_the_car_is_left_and_not_sought_again():
     refused = 0
     for seed in range(8):
         trip = search.run(seed)
-        names = [t.slot for t in trip.failed if t.reason == NO_ROOM]
+        names = [t.slot for t in trip.failed_attempts if t.reason == NO_ROOM]
         refused += len(names)
         assert len(set(names)) == len(names), "the same slot is not tried twice"
         assert set(names) <= {lot.slot_ids[i] for i in narrow}
         assert trip.slot not in {lot.slot_ids[i] for i in narrow}
-        assert trip.failed_s == pytest.approx(sum(t.seconds for t in trip.failed))
+        assert trip.failed_s == pytest.approx(sum(t.seconds for t in trip.failed_attempts))
     assert refused > 0
 
 
@@ -544,7 +582,7 @@ def test_bad_input_is_one_clear_error():
         DrivenSearch(MINI, "nobody")
     with pytest.raises(InputError, match="rig is 'sonar', want a SensorRig or one of laser"):
         DrivenSearch(MINI, rig="sonar")
-    with pytest.raises(InputError, match="this one has none: give it a rig"):
+    with pytest.raises(InputError, match="a recorded trip needs sensors"):
         record_trip(searched("mini"), 0, None)
     for words, message in (
         (["--rerun", "trip.rrd"], "add --rig laser"),
@@ -565,7 +603,7 @@ def row(slots, seed, graph_m, lanes_s, tries):
     failed = sum(t[3] for t in tries if t[4])
     return {
         "slots": slots, "seed": seed, "graph_m": graph_m, "lanes_s": lanes_s, "failed_s": failed,
-        "legs": [["along", graph_m, lanes_s]], "tries": tries,
+        "legs": [["along", graph_m, lanes_s]], "attempts": tries,
     }  # fmt: skip
 
 

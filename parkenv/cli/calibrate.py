@@ -143,9 +143,9 @@ def calibrate(
         )
     console.print(printed)
     console.print(
-        f"Calibrated: driving at {made.v_drive / KMH:.2f} km/h, a failed try costs {made.failure_s:.1f} s, and parking "
-        f"takes {made.manoeuvre_s:.1f} s that the drive graph leaves out. In {len(rows)} trips: {touched} contacts, "
-        f"{stuck} times stuck."
+        f"Calibrated: driving at {made.v_drive / KMH:.2f} km/h, a failed attempt costs {made.failure_s:.1f} s, and "
+        f"parking takes {made.manoeuvre_s:.1f} s that the drive graph leaves out. In {len(rows)} trips: "
+        f"{touched} contacts, {stuck} times stuck."
     )
     console.print(f"Calibration, trips, summary and figure are in {out}")
 
@@ -216,11 +216,11 @@ def _show(console: Any, driven: Any) -> None:
     end = f"parked in {driven.slot}" if driven.parked else "not parked"
     console.print(
         f"{end}: {driven.total_s:.1f} s = {driven.lanes_s:.1f} s on the lanes + {driven.manoeuvre_s:.1f} s manoeuvre + "
-        f"{driven.failed_s:.1f} s failed tries + {driven.walk_s:.1f} s walk + {driven.gave_up_s:.1f} s elsewhere"
+        f"{driven.failed_s:.1f} s failed + {driven.walk_s:.1f} s walk + {driven.gave_up_s:.1f} s give-up penalty"
     )
     if driven.waited_s or driven.contacts:
         console.print(f"  {driven.waited_s:.1f} s of it behind and before others; {driven.contacts} contacts")
-    for t in driven.tries:
+    for t in driven.attempts:
         console.print(
             f"  {t.slot} ({t.kind}{', ' + t.way if t.way else ''}): {t.seconds:.1f} s, {t.reason or 'parked'}"
         )

@@ -120,7 +120,7 @@ class TripRenderer(SearchRenderer):
         ):
             write_text(image, part, (x, baseline), WHITE, 15, 500)
             x += 124 if ":" in part else 76
-        text = f"parked in {driver.log.tries[-1].slot}" if state.parked else driver.doing
+        text = f"parked in {driver.log.attempts[-1].slot}" if state.parked else driver.doing
         failed = ":" in text
         write_text(image, text, (x, baseline), GAVE_UP if failed else CAR, 15, 600)
 

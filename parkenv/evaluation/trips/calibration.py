@@ -29,7 +29,7 @@ from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.evaluation.figures.picture_files import INK, STYLE, save_picture
 from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
-from parkenv.evaluation.trips.driver import EDGE_KINDS, Leg, Try
+from parkenv.evaluation.trips.executor import EDGE_KINDS, Leg, ParkingAttempt
 from parkenv.evaluation.trips.lot_driver import DrivingStyle
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.versioned_json import JsonFormat
@@ -129,7 +129,7 @@ def trip_row(trip: Trip, slots: str) -> Row:
         "slots": slots,
         **row,
         "legs": [list(leg) for leg in trip.legs],
-        "tries": [list(t) for t in trip.tries],
+        "attempts": [list(t) for t in trip.attempts],
     }
 
 
@@ -187,7 +187,7 @@ def drive_trips(
 ) -> list[Row]:
     """Drive the missing trips, each seed with and without observations of slots; returns all rows in order.
 
-    An agent that observes slots hardly ever tries a taken one; trips without observations provide failed attempts.
+    An agent that observes slots hardly ever attempts a taken one; trips without observations provide failed attempts.
     """
     tasks = [
         partial(plan.run, slots, block)
@@ -221,9 +221,9 @@ def samples(rows: Sequence[Row], speed: float) -> dict[str, FloatArray]:
         same, less the onward way; `s_per_m` by kind of edge.
     """
     observed = [row for row in rows if row["slots"] == OBSERVED]
-    tries = [Try(*t) for row in rows for t in row["tries"]]
-    failed = [t for t in tries if t.reason]
-    done = [Try(*t) for row in observed for t in row["tries"] if not t[4]]
+    attempts = [ParkingAttempt(*t) for row in rows for t in row["attempts"]]
+    failed = [t for t in attempts if t.reason]
+    done = [ParkingAttempt(*t) for row in observed for t in row["attempts"] if not t[4]]
     legs = [Leg(*leg) for row in observed for leg in row["legs"]]
     lists: dict[str, list[float]] = {
         "speed_kmh": [

@@ -1,4 +1,4 @@
-"""A car that is driven through a lot: along the lanes, into slots, and out of those that turn out taken."""
+"""Drive a car through a lot: along the lanes, into slots, and back out of those that turn out taken."""
 
 from __future__ import annotations
 
@@ -22,7 +22,18 @@ from parkenv.driving.yielding_traffic import YieldingTraffic
 from parkenv.envs.drive import CONTROL_S, SUBSTEPS
 from parkenv.envs.drive_goals import ANGLE_TOLERANCE, POSITION_TOLERANCE
 from parkenv.errors import InputError
-from parkenv.evaluation.trips.driver import ACROSS, ALONG, NO_ROOM, NO_WAY, ROUND, TAKEN, TURN, Leg, Spot, Try
+from parkenv.evaluation.trips.executor import (
+    ACROSS,
+    ALONG,
+    NO_ROOM,
+    NO_WAY,
+    ROUND,
+    TAKEN,
+    TURN,
+    Leg,
+    ParkingAttempt,
+    TrackPoint,
+)
 from parkenv.world.occupancy import World
 from parkenv.world.scenario import Scenario
 from planners.driving.car_path import CarPath
@@ -37,15 +48,15 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 RESCUE_S = 60.0
-"""s that pass until a car that is stuck is back on the lane."""
+"""s until a stuck car is back on the lane."""
 PATIENCE_S = 3.0
-"""s for which the car stands before somebody who waits, too, until those give way."""
+"""s for which the car and another waiting road user stand until the other gives way."""
 TURN_IN_M = 9.0
-"""m, from the rear axle to the middle of a junction where the driver decides where to go on."""
+"""m, from the rear axle to the middle of a junction at which the turn begins."""
 
 _LEAD_M = 1.5
 _LANE = SearchSettings(change_m=8.0, attempts=((0.25, 0.5), (0.15, 0.5), (0.08, 0.5), (0.03, 0.25)))
-_WIDE = (0.6, 0.3, 0.06)  # by how much wider than need be turns are driven, where there is room
+_WIDE = (0.6, 0.3, 0.06)  # margins, by which turns are wider than necessary where there is room
 _ONTO = (4.0, 6.5, 9.0, 12.0)  # m after a junction, where a turn into the lane may end
 _BACK = (0.0, 3.0, 6.0, 9.0)  # m after a slot, or after where the car turns round
 _CHANGE_S = 3.0  # s, about what a change of direction takes
@@ -59,22 +70,22 @@ _LEAST_NOTICE = 0.8
 _WAITS_M = 7.0
 _BEND_M = 8.0
 _LONGEST_S = 240.0
-_SOON_S = 0.8  # brake hard for who is in the way by then
+_SOON_S = 0.8  # brake hard for encounters within this time
 _NOBODY: NDArray[np.float64] = np.empty(0)
 
 
 @dataclass(frozen=True)
 class DrivingStyle:
-    """How the car is driven.
+    """Parameters of driving.
 
     Args:
-        speed: m/s, on the lanes at most; None for the scenario's `v_drive`.
-        acceleration: m/s², of getting faster, and of getting slower before turns.
-        braking: m/s², of stopping to park.
-        notice_m: m on along its path, where the car notices at the latest that a slot is taken which it drives into.
+        speed: m/s, highest on the lanes; None for the scenario's `v_drive`.
+        acceleration: m/s², and deceleration before turns.
+        braking: m/s², before parking.
+        notice_m: m along its path, the distance at which the car notices at the latest that a slot is taken.
 
     Raises:
-        InputError: a value that is not a finite number above 0, or a car that would notice too late to stop.
+        InputError: a value that is not a finite number above 0, or a notice distance too short to stop.
 
     Example:
         >>> DrivingStyle(notice_m=0.1)
@@ -104,20 +115,20 @@ class DrivingStyle:
 
 @dataclass
 class DriveLog:
-    """What was driven.
+    """Record of a drive.
 
     Attributes:
-        legs: the edges.
-        tries: the tries to park.
-        driven_m: m, in either direction.
-        contacts: what was touched, by name, once each time.
-        strays: how often the car was off its way and sought another.
-        rescues: how often there was none, and it was put back on the lane.
-        waited_s: s of braking and standing for others who were in the way.
+        legs: driven edges.
+        attempts: parking attempts.
+        driven_m: m, forward and backward.
+        contacts: kinds of obstacles touched, one per collision.
+        strays: how often the car left its path and planned another.
+        rescues: how often there was none, and the car was put back on the lane.
+        waited_s: s, braking and standing for other road users.
     """
 
     legs: list[Leg] = field(default_factory=list)
-    tries: list[Try] = field(default_factory=list)
+    attempts: list[ParkingAttempt] = field(default_factory=list)
     driven_m: float = 0.0
     contacts: list[str] = field(default_factory=list)
     strays: int = 0
@@ -126,29 +137,28 @@ class DriveLog:
 
 
 class LotDriver:
-    """Drives a car for real: a kinematic bicycle among bodies of pymunk, by lane keeping and planned manoeuvres.
+    """Drives a kinematic bicycle among pymunk bodies, by lane keeping and planned manoeuvres.
 
-    Ways along lanes are straights and arcs; where a lane is left for another the way between is planned among kerbs,
-    walls and slots as if all were filled, so it can be driven at any time. Parking, turning round and leaving a slot
-    are planned among the cars that really stand there. Who comes during a manoeuvre waits until the car is
-    out of the way.
+    Paths along lanes are straights and arcs; paths between lanes are planned among kerbs, walls and slots as if all
+    slots were filled, so they can be driven at any time. Parking, turning round and leaving a slot are planned among
+    the cars that are parked there. Cars that arrive during a manoeuvre wait until it is over.
 
-    The scenario's traffic moves about meanwhile. The car brakes for who is, or will be, in its way; they wait for it
-    likewise; and where both have stood for `PATIENCE_S`, the others give way, see `RoadUsers`.
+    The scenario's traffic moves meanwhile. The car brakes for road users in its way now or soon, and they for it; where
+    both have stood for `PATIENCE_S`, the others give way, see `RoadUsers`.
 
     Args:
-        scenario: whose lot, cars and traffic they are.
+        scenario: with lot, parked cars and traffic.
         vehicle: the car.
-        style: how it is driven.
+        style: of driving.
 
     Attributes:
-        log: what was driven since `begin`.
+        log: of the drive since `begin`.
         state: (6,) of the vehicle, see `parkenv.driving.vehicle`.
         time: now, s.
-        doing: what the car is about, in a word or two.
-        track: where it has been since the last decision, every 0.1 s.
-        others: everybody else who moves; None where nobody does.
-        watch: called after every step of the control, 0.1 s, for pictures.
+        doing: current activity, for displays.
+        track: the car's places since the last decision, every 0.1 s.
+        others: moving road users; None without traffic.
+        on_control: called after every control step, 0.1 s.
     """
 
     def __init__(
@@ -170,16 +180,16 @@ class LotDriver:
             speed=speed, acceleration=self.style.acceleration, blend_m=2.0, firmness=0.5
         )
         self._turns: dict[tuple[int, int, int, int], CarPath | None] = {}
-        self.watch: Callable[[], None] = lambda: None
+        self.on_control: Callable[[], None] = lambda: None
         self.log = DriveLog()
-        self.track: list[Spot] = []
+        self.track: list[TrackPoint] = []
         self.others: RoadUsers | None = None
         self.doing = ""
         self.state = np.zeros(STATE_SIZE)
         self.time = 0.0
 
     def begin(self, key: np.uint64, world: World, vertex: int, time: float) -> None:
-        """Start at a vertex at a time, s, in the world of a key; at full speed, as who comes from a street."""
+        """Start at a vertex at a time, s, in the world of a key; at full speed."""
         self._around.begin(key, world)
         self.log = DriveLog()
         self.track = []
@@ -199,7 +209,7 @@ class LotDriver:
         self._enter(self._standing(self.scenario.lot.vertex_xy[vertex]))
 
     def drive(self, source: int, column: int) -> float:
-        """Drive along an edge of the graph until the car has come to its end; s."""
+        """Drive along an edge of the graph to its end; returns s."""
         lot = self.scenario.lot
         target, length = int(lot.neighbors[source, column]), float(lot.edge_length[source, column])
         edge = self._lines.edge(source, target, length)
@@ -218,12 +228,12 @@ class LotDriver:
         self.log.legs.append(leg)
         return leg.seconds
 
-    def park(self, slot: int, taken: bool) -> Try:
-        """Stop, plan a manoeuvre into a slot and drive it; where it is taken or too narrow, drive back on the lane.
+    def park(self, slot: int, taken: bool) -> ParkingAttempt:
+        """Stop, plan a manoeuvre into a slot and drive it; if it is taken or too narrow, drive back onto the lane.
 
         Args:
             slot: its index.
-            taken: whether a car stands in it. The car finds out when it is about to drive into it.
+            taken: whether a car is parked in it, which this car notices when it is about to drive in.
         """
         lot, vehicle, began = self.scenario.lot, self.vehicle, self.time
         self.track = []
@@ -244,26 +254,26 @@ class LotDriver:
         if reason:
             self.doing = f"{lot.slot_ids[slot]}: {reason}"
             onward = self._back(slot)
-        result = Try(lot.slot_ids[slot], kind, way, self.time - began, reason, onward)
-        self.log.tries.append(result)
+        result = ParkingAttempt(lot.slot_ids[slot], kind, way, self.time - began, reason, onward)
+        self.log.attempts.append(result)
         return result
 
     def wait(self, seconds: float) -> float:
-        """Brake, and stay for some time; s."""
+        """Brake, and stand for some time; returns s."""
         until, self.track = self.time + seconds, []
         self._refresh()
         while self.time < until - 1e-9:
             self._brake(self.style.braking)
         return seconds
 
-    def movers_at(self, spot: Spot) -> Movers | None:
-        """Who else was where when the car was at a spot of its `track`."""
-        return None if self.others is None else self.others.movers(spot.clocks)
+    def movers_at(self, point: TrackPoint) -> Movers | None:
+        """Return the road users at the time of a point of `track`."""
+        return None if self.others is None else self.others.movers(point.clocks)
 
     # --- Lanes
 
     def _place(self, edge: DrivenEdge) -> None:
-        """Put the car where the first edge begins."""
+        """Place the car at the start of the first edge."""
         line = self._lines.lines[edge.line]
         self.state[:3] = line.pose(edge.start - self.vehicle.middle)
         self.state[SPEED] = self._on_lane.speed
@@ -271,7 +281,7 @@ class LotDriver:
         self._clear_area()
 
     def _take(self, edge: DrivenEdge) -> str:
-        """Lay the way along an edge from where the car is; the edge's kind."""
+        """Plan the path along an edge from the car's place; returns the edge's kind."""
         if self._line == edge.line and self._keeper is not None and not self._keeper.done:
             return ALONG
         line = self._lines.lines[edge.line]
@@ -572,8 +582,10 @@ class LotDriver:
             self._touches = bool(touched)
             self.time += PHYSICS_S
         clocks = _NOBODY if others is None else others.clocks
-        self.track.append(Spot(self.time, self.log.driven_m, self.vehicle.at_middle(self.state[:3]), clocks))
-        self.watch()
+        self.track.append(
+            TrackPoint(self.time, self.log.driven_m, self.vehicle.at_middle(self.state[:3]), clocks)
+        )
+        self.on_control()
         if np.abs(self.state[:2] - self._space_at).max() > REACH_M - 10.0:
             self._refresh()
 
