@@ -1,4 +1,4 @@
-"""Drive parking episodes, and summarise them in a table."""
+"""Run parking episodes and summarise them in a table."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ from planners.driving.parking import ParkingMemory
 from planners.driving.parking_agents import PLANNER, make_parking_agent
 
 CHUNK = 25
-"""Parkings per task of a worker."""
+"""Episodes per task of a worker."""
 
 
 @dataclass(frozen=True)
 class ParkingCase:
-    """Kinds of parking tasks on a lot.
+    """A parking task distribution on one lot.
 
     Args:
         lot: the lot.
-        kinds: of slots; all that the lot has where None.
-        ways: of parking in perpendicular and oblique slots.
-        occupancy: fraction of the other slots that are taken.
-        slack: m, clearance around the slot.
+        kinds: kinds of slots; None for all that the lot has.
+        ways: orientations in perpendicular and oblique slots.
+        occupancy: fraction of the other slots that are occupied.
+        slack: distance around the slot kept clear of parked cars, m.
     """
 
     lot: ParkingLot
@@ -63,12 +63,12 @@ class ParkingCase:
 
 @dataclass
 class Parking:
-    """One parking.
+    """Result of one parking episode.
 
     Attributes:
-        row: its results.
-        state: at the end of the episode, with the driven path as its trail.
-        frames: one every `every` steps, if requested.
+        row: its metrics.
+        state: final state of the episode, with the driven trail.
+        frames: rendered frames, if requested.
     """
 
     row: dict[str, Any]
@@ -77,7 +77,7 @@ class Parking:
 
 
 class _ParkingRecorder(Observer):
-    """Keeps steering angle and heading after every step, and frames.
+    """Record steering angle and heading after every step, and frames.
 
     Args:
         every: steps between frames; 0 for none.
@@ -90,13 +90,13 @@ class _ParkingRecorder(Observer):
         self.frames: list[Any] = []
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Keep the start."""
+        """Record the start."""
         del observation
         self._env, self.drive = env, cast(DriveEnv, env.unwrapped)
         self._record(frame=True)
 
     def on_step(self, step: Step) -> None:
-        """Keep the step; the last one always has a frame."""
+        """Record the step; the last one always has a frame."""
         over = step.terminated or step.truncated
         self._record(frame=over or (self._every > 0 and len(self.yaws) % self._every == 0))
 
@@ -109,11 +109,11 @@ class _ParkingRecorder(Observer):
 
 
 def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0) -> Parking:
-    """Drive one parking episode.
+    """Run one parking episode.
 
     Args:
         env: `parkenv/Drive-v1`; with `render_mode="rgb_array"` for pictures.
-        agent: drives.
+        agent: the parking agent.
         seed: of the task.
         every: steps between frames; 0 for none.
 
