@@ -1,4 +1,4 @@
-"""`parkenv/SearchPerception-v1`: the search with the real detection and mapping stack in the loop."""
+"""`parkenv/SearchPerception-v1`: the search with the real perception pipeline in the loop."""
 
 from __future__ import annotations
 
@@ -86,39 +86,58 @@ class OnboardPerception:
 
 
 class SearchPerceptionEnv(SearchEnv):
-    """`parkenv/Search-v1` whose belief is what the detection and mapping stack makes of simulated sensors.
+    """`parkenv/Search-v1` with the real perception pipeline in the loop: the belief comes from simulated sensors.
 
     ## Description
-    World, decisions, rewards and observations are those of `parkenv/Search-v1`; equal seeds give equal worlds. But
-    nobody tells the car which slots are taken: on the way of every step its camera and laser take pictures and scans
-    (as in `parkenv/SearchSensors-v1`), cars are detected and ranged, beams are followed into the slots, and what that
-    says of each slot goes into the belief. So the car errs where its eyes do, and sees slots that no circle holds.
+    World, decisions and rewards are those of `parkenv/Search-v1`, and equal seeds give equal worlds. But slots are not
+    observed by a sensor model. During every step the car's camera and laser measure (as in
+    `parkenv/SearchSensors-v1`), cars are detected and located, beams are traced into the slots, and the observed states
+    of the slots update the belief. So the belief has the errors of a real detector, and the observed slots depend on
+    occlusion, not on distance alone.
 
     ## Action space
-    `Discrete(5)`: up, down, left, right, park, as in `parkenv/Search-v1`.
+    `Discrete(5)`, as in `parkenv/Search-v1`:
+
+    | Num | Action | Effect |
+    |-----|--------|--------|
+    | 0-3 | up, down, left, right | drive along that edge of the graph; wait `wait_s` if there is none |
+    | 4 | park | park and walk to the goal if the slot here is free; lose `failure_s` if it is taken |
 
     ## Observation space
-    As in `parkenv/Search-v1`.
+    The `Dict` of `parkenv/Search-v1`:
+
+    | Key | Space | Meaning |
+    |-----|-------|---------|
+    | `vertex` | `Discrete(n_vertices)` | position of the car; vertex i < n_slots is in front of slot i |
+    | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
+    | `p_occupied` | `Box(0, 1, (n_slots,), float32)` | current belief that each slot is taken |
+    | `belief` | `Box((4 * n_slots,), float32)` | forecast, decay rate, p at the last observation, time of it |
+    | `action_mask` | `Box(0, 1, (5,), int8)` | the actions that the graph has here |
 
     ## Rewards
-    As in `parkenv/Search-v1`.
+    Minus the seconds of the step, as in `parkenv/Search-v1`.
 
     ## Starting state
-    As in `parkenv/Search-v1`. The weather is drawn for each search unless it is given.
+    As in `parkenv/Search-v1`. The weather is drawn for each episode unless it is given.
 
     ## Episode end
-    As in `parkenv/Search-v1`; *proven full* is what the stack takes for full.
+    As in `parkenv/Search-v1`. The lot counts as full when the *observed* states of all slots are taken.
 
     ## Arguments
-    - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v1`. Its `sighting` is what the
-      car takes its eyes to be worth, and how far away slots may be of which it takes note; where that is perfect,
-      what was measured of the rig (`SensorModel.named`).
-    - `rig`: laser (the thesis's: a camera and a 270° laser), stereo, both_sides, or a `sim_sensors.rig.SensorRig`
-      that can see and range.
-    - `weather`: sunny, overcast, low_sun, dusk or rain; None draws one.
-    - `captures`: how many there are at most on an edge.
-    - `every`: m; on short edges captures are at least so far apart.
-    - `detector`: a `parkenv.perception.detector.Detector`; the shipped models where None.
+    | Name | Default | Meaning |
+    |------|---------|---------|
+    | `scenario`, `render_mode`, changes | | as in `parkenv/Search-v1` |
+    | `rig` | `"laser"` | `laser` (the thesis's camera and 270° laser), `stereo`, `both_sides`, or a `SensorRig` |
+    | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
+    | `captures` | 2 | largest number of captures on an edge |
+    | `every` | 1.25 | m, least distance between captures on an edge |
+    | `detector` | `None` | a `Detector`, or its name: `hog`, `side`, `front`, a model file, `MODULE:CLASS` |
+
+    The scenario's `sensor_model` gives the error rates that the belief update assumes, and its range: farther slots
+    are not updated. If it is perfect, the fitted model of the rig replaces it (`SensorModel.named`).
+
+    `info` is that of `parkenv/Search-v1`. `env.unwrapped.perception` has the results of the last step: `results`
+    (captures, detections, located cars, range scans) and `observation` (the observed slots and their states).
 
     ```python
     >>> import gymnasium as gym
