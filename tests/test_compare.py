@@ -253,7 +253,9 @@ def test_degenerate_samples_have_sane_intervals():
 
 def test_differences_are_paired_by_seed():
     def episode(seed, total):
-        zero = dict.fromkeys(("drive_s", "failed_s", "walk_s", "gave_up_s", "failed_parks", "replans"), 0.0)
+        zero = dict.fromkeys(
+            ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s", "failed_parks", "replans"), 0.0
+        )
         more = dict.fromkeys(("driven_m", "walked_m", "slots_passed", "occupancy", "bound_s"), 0.0)
         return {"seed": seed, "total_s": total, "parked": True, **zero, **more}
 

@@ -175,7 +175,10 @@ class SearchRecorder(Observer):
             "parked": parked,
             "slot": self.state.vertex if parked else None,
             "truncated": result.truncated,
-            **{name: info[name] for name in ("drive_s", "failed_s", "walk_s", "gave_up_s", "total_s")},
+            **{
+                name: info[name]
+                for name in ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s", "total_s")
+            },
             "failed_parks": int(info["failed_parks"]),
             "replans": int(getattr(result.memory, "replans", 0)),
         }
