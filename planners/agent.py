@@ -112,8 +112,9 @@ class SearchAgent(ABC, Generic[Memory]):
         """
         del deterministic
         if np.ndim(observation["vertex"]) == 0:
-            starts = state is None or (episode_start is not None and bool(np.any(episode_start)))
-            return self._predict_one(observation, None if starts else state)  # type: ignore[arg-type]
+            if episode_start is not None and np.any(episode_start):
+                state = None
+            return self._predict_one(observation, state)  # type: ignore[arg-type]
         n = len(observation["vertex"])
         memories: list[Any] = [None] * n if state is None else list(state)  # type: ignore[arg-type]
         actions = np.empty(n, dtype=np.int64)

@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.slot_belief import SlotBelief
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, SlotBelief
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
@@ -47,12 +47,12 @@ class TargetAgent(SearchAgent[GreedyState]):
     def decide(self, observation: Observation, belief: SlotBelief, memory: GreedyState) -> int:
         """Keep the target while it is a candidate, else choose another; park on arrival."""
         vertex = int(observation["vertex"])
-        # An observation that has decayed to the forecast says nothing any more: the slot is a candidate again.
-        decayed = (belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast)
-        taken, free = belief.observed_taken & ~decayed, belief.observed_free
         previous = memory.target
-        if previous < 0 or taken[previous] or self.drops_target(free, previous):
-            memory.target = self.choose(~taken, free, vertex, previous)
+        if previous < 0 or belief.state[previous] == OBSERVED_TAKEN or self.drops_target(belief, previous):
+            # An observation that has decayed to the forecast says nothing any more: the slot is a candidate again.
+            decayed = (belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast)
+            candidates = ~belief.observed_taken | decayed
+            memory.target = self.choose(candidates, belief.observed_free, vertex, previous)
             if memory.target < 0:
                 # Every slot was observed taken: the one observed longest ago is likeliest to be free by now.
                 p_occupied = np.where(self.reachable(vertex), belief.p_occupied, np.inf)
@@ -96,9 +96,9 @@ class TargetAgent(SearchAgent[GreedyState]):
             best = np.asarray(np.isfinite(cost_s) & (cost_s == cost_s.min()))
         return best
 
-    def drops_target(self, observed_free: NDArray[np.bool_], target: int) -> bool:
+    def drops_target(self, belief: SlotBelief, target: int) -> bool:
         """Return whether to choose another target although this one was not observed taken."""
-        del observed_free, target
+        del belief, target
         return False
 
 
@@ -182,9 +182,9 @@ class FirstFreeAgent(TargetAgent):
         slots, _ = self.routes.nearest(vertex, candidates)
         return int(slots[0]) if len(slots) else -1
 
-    def drops_target(self, observed_free: NDArray[np.bool_], target: int) -> bool:
+    def drops_target(self, belief: SlotBelief, target: int) -> bool:
         """Return whether a slot that is near enough was observed free while driving to another one."""
-        return bool((observed_free & self._near).any()) and not observed_free[target]
+        return belief.state[target] != OBSERVED_FREE and bool((belief.observed_free & self._near).any())
 
 
 class RandomAgent(SearchAgent[np.random.Generator]):

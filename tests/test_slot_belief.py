@@ -78,5 +78,5 @@ def test_parts_and_observations_keep_the_belief():
 
 
 def test_observations_of_other_environments_are_refused():
-    with pytest.raises(InputError, match="has no 'belief'; want one of parkenv/Search-v1, got vertex"):
+    with pytest.raises(InputError, match="has no 'p_occupied'; want one of parkenv/Search-v1, got vertex"):
         SlotBelief.of_observation({"vertex": 0})

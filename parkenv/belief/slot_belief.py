@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -19,6 +18,10 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
+UNOBSERVED, OBSERVED_FREE, OBSERVED_TAKEN = 0, 1, 2
+"""What a slot's last observation showed."""
+
+
 @dataclass(eq=False)
 class SlotBelief:
     """Probability that each slot is taken, at one moment of a search, and what it rests on.
@@ -27,16 +30,16 @@ class SlotBelief:
     from then on the probability decays to the forecast as that of a two-state Markov chain:
     p(t) = p∞ + (p_observed - p∞)·exp(-(λ+μ)t), p∞ being the forecast, λ and μ the rates of arrival and departure.
 
-    Instances are not changed once made: `update` and `decay` return new ones. (The class is not frozen because agents
-    make one for each decision, and a frozen one takes three times as long to make.)
+    Instances are not changed once made: `update` and `decay` return new ones. (The class is not frozen, and keeps its
+    parts as the observation has them, because agents make one for each decision, of which some take microseconds.)
 
     Args:
-        forecast: (n_slots,) float, P(taken) before anything was observed.
-        decay_rate: (n_slots,) float, 1/s, λ+μ: how fast an observation loses its value.
         p_occupied: (n_slots,) float, P(taken) now.
-        p_observed: (n_slots,) float, P(taken) right after the slot's last observation; the forecast where there
-            was none.
-        observed_at: (n_slots,) float, s since the search began, when that was; -1 where there was none.
+        parts: (4 * n_slots,) float, one after the other:
+            `forecast`, P(taken) before anything was observed;
+            `decay_rate`, 1/s, λ+μ: how fast an observation loses its value;
+            `p_observed`, P(taken) right after the slot's last observation, the forecast where there was none;
+            `observed_at`, s since the search began, when that was, -1 where there was none.
         time: s since the search began, now.
 
     Examples:
@@ -48,11 +51,8 @@ class SlotBelief:
         ([False, True], [0.8, 0.076])
     """
 
-    forecast: NDArray[np.floating]
-    decay_rate: NDArray[np.floating]
     p_occupied: NDArray[np.floating]
-    p_observed: NDArray[np.floating]
-    observed_at: NDArray[np.floating]
+    parts: NDArray[np.floating]
     time: float
 
     @classmethod
@@ -63,21 +63,15 @@ class SlotBelief:
             InputError: the observation is of another environment.
         """
         try:
-            forecast, decay_rate, p_observed, observed_at = observation["belief"].reshape(4, -1)
-            p_occupied, time = observation["p_occupied"], float(observation["time"][1])
+            return cls(observation["p_occupied"], observation["belief"], float(observation["time"][1]))
         except KeyError as error:
             raise InputError(
                 f"observation has no {error.args[0]!r}; want one of parkenv/Search-v1, got {', '.join(observation)}"
             ) from None
-        return cls(forecast, decay_rate, p_occupied, p_observed, observed_at, time)
 
     def to_observation(self) -> dict[str, NDArray[np.float32]]:
         """Return the entries of an observation that state this belief: `p_occupied` and `belief`, float32."""
-        parts = (self.forecast, self.decay_rate, self.p_observed, self.observed_at)
-        return {
-            "p_occupied": self.p_occupied.astype(np.float32),
-            "belief": np.concatenate(parts).astype(np.float32),
-        }
+        return {"p_occupied": self.p_occupied.astype(np.float32), "belief": self.parts.astype(np.float32)}
 
     @classmethod
     def of_forecast(cls, p_occupied: ArrayLike, decay_rate: ArrayLike) -> Self:
@@ -87,9 +81,37 @@ class SlotBelief:
             p_occupied: (n_slots,) the forecast.
             decay_rate: (n_slots,) 1/s.
         """
-        forecast = np.asarray(p_occupied, dtype=np.float64)
-        rate = np.asarray(decay_rate, dtype=np.float64)
-        return cls(forecast, rate, forecast, forecast, np.full(len(forecast), -1.0), 0.0)
+        forecast = np.array(p_occupied, dtype=np.float64)
+        parts = np.concatenate([forecast, decay_rate, forecast, np.full(len(forecast), -1.0)])
+        return cls(forecast, parts, 0.0)
+
+    @cached_property
+    def _rows(self) -> NDArray[np.floating]:
+        return self.parts.reshape(4, -1)
+
+    @property
+    def forecast(self) -> NDArray[np.floating]:
+        """(n_slots,) float, P(taken) before anything was observed."""
+        row: NDArray[np.floating] = self._rows[0]
+        return row
+
+    @property
+    def decay_rate(self) -> NDArray[np.floating]:
+        """(n_slots,) float, 1/s, how fast an observation loses its value."""
+        row: NDArray[np.floating] = self._rows[1]
+        return row
+
+    @property
+    def p_observed(self) -> NDArray[np.floating]:
+        """(n_slots,) float, P(taken) right after the slot's last observation; the forecast where there was none."""
+        row: NDArray[np.floating] = self._rows[2]
+        return row
+
+    @property
+    def observed_at(self) -> NDArray[np.floating]:
+        """(n_slots,) float, s since the search began, when the slot was last observed; -1 where it never was."""
+        row: NDArray[np.floating] = self._rows[3]
+        return row
 
     @cached_property
     def observed(self) -> BoolArray:
@@ -97,20 +119,24 @@ class SlotBelief:
         return self.observed_at >= 0.0
 
     @cached_property
+    def state(self) -> NDArray[np.int8]:
+        """(n_slots,) int8, `UNOBSERVED`, `OBSERVED_FREE` or `OBSERVED_TAKEN`, by each slot's last observation.
+
+        A slot is observed free if the observation left it less likely to be taken than forecast, observed taken if more
+        likely; where the forecast is certain, an observation that confirms it counts, too.
+        """
+        states: NDArray[np.int8] = _states(self.parts)
+        return states
+
+    @property
     def observed_free(self) -> BoolArray:
-        """(n_slots,) bool, slots whose last observation left them less likely to be taken than forecast.
+        """(n_slots,) bool, see `state`."""
+        return np.asarray(self.state == OBSERVED_FREE)
 
-        Where the forecast is certain, an observation that confirms it counts.
-        """
-        return np.asarray(self.observed & ((self.p_observed < self.forecast) | (self.p_observed == 0.0)))
-
-    @cached_property
+    @property
     def observed_taken(self) -> BoolArray:
-        """(n_slots,) bool, slots whose last observation left them more likely to be taken than forecast.
-
-        Where the forecast is certain, an observation that confirms it counts.
-        """
-        return np.asarray(self.observed & ((self.p_observed > self.forecast) | (self.p_observed == 1.0)))
+        """(n_slots,) bool, see `state`."""
+        return np.asarray(self.state == OBSERVED_TAKEN)
 
     @cached_property
     def age(self) -> FloatArray:
@@ -119,14 +145,8 @@ class SlotBelief:
 
     def take(self, slots: NDArray[np.integer]) -> Self:
         """Return the belief of some of the slots, (k,), in float64."""
-        return type(self)(
-            self.forecast[slots].astype(np.float64),
-            self.decay_rate[slots].astype(np.float64),
-            self.p_occupied[slots].astype(np.float64),
-            self.p_observed[slots].astype(np.float64),
-            self.observed_at[slots].astype(np.float64),
-            self.time,
-        )
+        parts = self._rows[:, slots].astype(np.float64)
+        return type(self)(self.p_occupied[slots].astype(np.float64), parts.ravel(), self.time)
 
     def update(
         self,
@@ -152,23 +172,15 @@ class SlotBelief:
                 (false_alarm_rate, np.float64),
             )
         )
-        p_occupied, p_observed, observed_at = (
-            np.array(array, dtype=np.float64)
-            for array in (self.p_occupied, self.p_observed, self.observed_at)
-        )
-        _update_slots(p_occupied, observed, reports, hits, false_alarms)
-        p_observed[observed], observed_at[observed] = p_occupied[observed], self.time
-        return dataclasses.replace(
-            self, p_occupied=p_occupied, p_observed=p_observed, observed_at=observed_at
-        )
+        later = type(self)(self.p_occupied.astype(np.float64), self.parts.astype(np.float64), self.time)
+        _update_slots(later.p_occupied, observed, reports, hits, false_alarms)
+        later.p_observed[observed], later.observed_at[observed] = later.p_occupied[observed], self.time
+        return later
 
     def decay(self, seconds: float) -> Self:
         """Return the belief some time later, nothing having been observed in between."""
-        later = dataclasses.replace(self, time=self.time + seconds)
-        later.p_occupied = _decay_slots(
-            *(np.asarray(a, dtype=np.float64) for a in (self.forecast, self.decay_rate, self.p_observed)),
-            later.age,
-        )
+        later = type(self)(self.p_occupied, self.parts.astype(np.float64), self.time + seconds)
+        later.p_occupied = _decay_slots(later.forecast, later.decay_rate, later.p_observed, later.age)
         return later
 
 
@@ -195,6 +207,20 @@ def bayes_update(p: float, looks_taken: bool, hit_rate: float, false_alarm_rate:
     if evidence <= 0.0:
         return 1.0 if looks_taken else 0.0
     return if_taken * p / evidence
+
+
+@compiled
+def _states(parts: NDArray[np.floating]) -> NDArray[np.int8]:
+    n = len(parts) // 4
+    states = np.empty(n, np.int8)
+    for s in range(n):
+        forecast, p_observed, observed_at = parts[s], parts[2 * n + s], parts[3 * n + s]
+        states[s] = UNOBSERVED
+        if observed_at >= 0.0 and (p_observed < forecast or p_observed == 0.0):
+            states[s] = OBSERVED_FREE
+        elif observed_at >= 0.0 and (p_observed > forecast or p_observed == 1.0):
+            states[s] = OBSERVED_TAKEN
+    return states
 
 
 @compiled

@@ -282,16 +282,18 @@ class SearchRenderer:
             if self._still is None:
                 self._still = draw_still_layer(self.scenario.lot, self.outline, self._whole)
             return self._still
-        # The window depends on the car's place alone: equal states, equal frames.
-        scale = WINDOW_SLOT / self._slot_width
-        stride = np.array(self._size) / scale / 2
-        column, row = np.round(self.scenario.lot.vertex_xy[state.vertex] / stride).astype(int)
+        return self._window(self.scenario.lot.vertex_xy[state.vertex], WINDOW_SLOT, 2)
+
+    def _window(self, place: FloatArray, slot_px: float, parts: int) -> StillLayer:
+        """Return the layer around a place, (2,) m, with slots of `slot_px` width; it moves by 1/`parts` of its size."""
+        # The window depends on the place alone: equal states, equal frames.
+        scale = slot_px / self._slot_width
+        stride = np.array(self._size) / scale / parts
+        column, row = np.round(place / stride).astype(int)
         if self._still is None or self._window_at != (column, row):
             self._window_at = column, row
-            center = np.array([column, row]) * stride
-            self._still = draw_still_layer(
-                self.scenario.lot, self.outline, MapView.around(center, self._size, scale)
-            )
+            view = MapView.around(np.array([column, row]) * stride, self._size, scale)
+            self._still = draw_still_layer(self.scenario.lot, self.outline, view)
         return self._still
 
     def _pose(self, state: SearchState) -> tuple[FloatArray, float]:

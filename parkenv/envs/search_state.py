@@ -78,9 +78,8 @@ class SearchState:
         """The belief about the slots now, a copy, in float64."""
         forecast = self._scenario.forecast(self.arrival)
         belief = SlotBelief.of_forecast(forecast.p_occupied, forecast.decay_rate)
-        belief.p_occupied, belief.p_observed = belief.forecast.copy(), belief.forecast.copy()
-        _read_belief(self._search, belief.p_occupied, belief.p_observed, belief.observed_at)
         belief.time = self.time - self.arrival.time
+        _read_belief(self._search, belief.p_occupied, belief.p_observed, belief.observed_at)
         return belief
 
     @property

@@ -11,17 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.forecast_error import DayBelief, ForecastErrorModel
-from parkenv.belief.slot_belief import SlotBelief
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED, SlotBelief
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
 from planners.belief.best_path import ATTEMPT, NOWHERE, Budget, best_path
 from planners.belief.planning_graph import (
-    OBSERVED_FREE,
-    OBSERVED_TAKEN,
     SLOT,
-    UNOBSERVED,
     BeliefSnapshot,
     IntArray,
     PathBuffer,
@@ -58,7 +55,7 @@ class BeliefSearch:
         near: the part of the lot that is planned for. The arrays below are of its slots, by its numbers.
         n_unobserved: slots of it that were unobserved when it was chosen.
         day: belief about how far the day differs from the forecast.
-        state: (n_slots,) int64, `UNOBSERVED`, `OBSERVED_FREE` or `OBSERVED_TAKEN` at the last decision.
+        state: (n_slots,) int8, `SlotBelief.state` at the last decision.
         missed_rate: (n_slots,) float64, the greatest detection rate of a view from which a slot was not detected.
         time: s since the search began, of the last decision.
         news_at: s, when a slot of the part was last observed for the first time, or the part was chosen.
@@ -75,7 +72,7 @@ class BeliefSearch:
     near: Neighborhood
     n_unobserved: int
     day: DayBelief
-    state: IntArray
+    state: NDArray[np.int8]
     missed_rate: FloatArray
     time: float
     news_at: float
@@ -170,7 +167,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             near=near,
             n_unobserved=n,
             day=self._forecast_error.prior(belief.forecast[near.slots], walk_s),
-            state=np.full(n, UNOBSERVED),
+            state=np.full(n, UNOBSERVED, dtype=np.int8),
             missed_rate=np.zeros(n),
             time=belief.time,
             news_at=belief.time,
@@ -202,9 +199,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         """Update the memory by what was observed; return the belief about the slots of its part."""
         near = memory.near
         known = belief.take(near.slots)
-        state = np.where(
-            known.observed_free, OBSERVED_FREE, np.where(known.observed_taken, OBSERVED_TAKEN, UNOBSERVED)
-        )
+        state = known.state
         first = np.flatnonzero((state != UNOBSERVED) & (memory.state == UNOBSERVED))
         if len(first):
             memory.news_at = belief.time
@@ -317,5 +312,5 @@ def _snapshot(here: int, known: SlotBelief, memory: BeliefSearch) -> BeliefSnaps
     return BeliefSnapshot(slots, weights, np.ascontiguousarray(p_free_if.T))
 
 
-def _n_unobserved(state: IntArray) -> int:
+def _n_unobserved(state: NDArray[np.int8]) -> int:
     return int((state == UNOBSERVED).sum())

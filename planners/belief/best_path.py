@@ -7,12 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from planners.belief.path_evaluation import evaluate_path, expected_cost_to_slot
 from planners.belief.path_rollout import is_worth_an_attempt, rollout_path
 from planners.belief.planning_graph import (
-    OBSERVED_FREE,
-    OBSERVED_TAKEN,
-    UNOBSERVED,
     BeliefSnapshot,
     FloatArray,
     IntArray,

@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from planners.belief.planning_graph import (
-    OBSERVED_FREE,
-    OBSERVED_TAKEN,
-    UNOBSERVED,
     BeliefSnapshot,
     FloatArray,
     IntArray,

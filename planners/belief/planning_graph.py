@@ -13,15 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.belief.slot_belief import OBSERVED_FREE, UNOBSERVED
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Records = NDArray[Any]
 """A structured array. One array of records compiles several times as fast as an array for each of their fields."""
-
-UNOBSERVED, OBSERVED_FREE, OBSERVED_TAKEN = 0, 1, 2
-"""States of a slot's last observation."""
 
 MOST_HYPOTHESES = 64
 """Hypotheses of the forecast error model that there is room for."""
@@ -39,7 +37,7 @@ SLOT = np.dtype(
         ("odds", np.float64),  # P(taken)/P(free) about when the car could be there; inf where hopeless
         ("least_odds", np.float64),  # the value to which those decay
         ("missed_rate", np.float64),  # greatest detection rate of a view from which it was not detected
-        ("state", np.int64),  # of its last observation
+        ("state", np.int64),  # `SlotBelief.state`
     ]
 )
 """What is believed of a slot at a decision."""

@@ -160,6 +160,7 @@ def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_
     return {
         "scenario": scenario.name,
         "rig": settings.rig,
+        "detector": settings.detector,
         "weather": settings.weather or "any",
         "sessions": len(run.rows),
         "slots": scenario.lot.n_slots,

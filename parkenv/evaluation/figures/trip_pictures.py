@@ -23,7 +23,6 @@ from parkenv.envs.rendering import (
     SearchRenderer,
     StillLayer,
     clock,
-    draw_still_layer,
 )
 from parkenv.envs.search_state import SearchState
 from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
@@ -76,16 +75,7 @@ class TripRenderer(SearchRenderer):
         """Return the layer of the lot's part near the car, or of the whole lot."""
         if not self._near:
             return super().still_layer(state)
-        scale = _SLOT_PX / self._slot_width
-        stride = np.array(self._size) / scale / 3
-        column, row = np.round(self._middle()[:2] / stride).astype(int)
-        if self._still is None or self._window_at != (column, row):
-            self._window_at = column, row
-            center = np.array([column, row]) * stride
-            self._still = draw_still_layer(
-                self.scenario.lot, self.outline, MapView.around(center, self._size, scale)
-            )
-        return self._still
+        return self._window(self._middle()[:2], _SLOT_PX, 3)
 
     def _draw_trail(self, image: Image, view: MapView, state: SearchState) -> None:
         del state  # the driven path is not part of it

@@ -152,7 +152,6 @@ class DriveTrainingEnv(SharedVecEnv):
         super().__init__(num_envs, spaces.Dict(shown), spaces.Box(-1.0, 1.0, (2,), np.float32))
         self._rng = np.random.default_rng(0)
         self._at = [("", 0)] * num_envs
-        self._returns, self._lengths = np.zeros(num_envs), np.zeros(num_envs, dtype=np.int64)
         self._stood = np.zeros(num_envs, dtype=np.int64)
 
     def seed(self, seed: int | None = None) -> list[int | None]:
@@ -164,7 +163,7 @@ class DriveTrainingEnv(SharedVecEnv):
         """Start a new episode in every drive; levels are kept."""
         for i in range(self.num_envs):
             self._start_episode(i)
-        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        self._start_all()
         return self.batch.observation()
 
     def step_wait(
@@ -179,22 +178,19 @@ class DriveTrainingEnv(SharedVecEnv):
             rewards = self._sparse(batch.status == PARKED, failed)
         else:
             rewards = self._scaled(batch.took + batch.approach, failed)
-        self._returns += rewards
-        self._lengths += 1
+        self._count(rewards)
         self._stood = np.where(np.abs(batch.state[:, SPEED]) <= STANDING, self._stood + 1, 0)
         over = batch.status != RUNNING
         done = over | (self._lengths >= MOST_DECISIONS) | (self._stood >= STOOD)
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        parked = batch.status == PARKED
+
+        def final(i: int) -> tuple[dict[str, Any], dict[str, Any]]:
+            last = {name: values[i].copy() for name, values in observations.items()}
+            return last, {"is_success": bool(parked[i]), "contact": bool(failed[i])}
+
+        infos = self._end_episodes(done, ~over, final)
         for i in np.flatnonzero(done).tolist():
-            parked = bool(batch.status[i] == PARKED)
-            infos[i] = {
-                "terminal_observation": {name: values[i].copy() for name, values in observations.items()},
-                "TimeLimit.truncated": not over[i],
-                "episode": {"r": float(self._returns[i]), "l": int(self._lengths[i])},
-                "is_success": parked,
-                "contact": bool(failed[i]),
-            }
-            self._record_outcome(*self._at[i], parked)
+            self._record_outcome(*self._at[i], bool(parked[i]))
             self._start_episode(i)
         for name, values in batch.observation(np.flatnonzero(done)).items():
             observations[name][done] = values
@@ -247,7 +243,7 @@ class DriveTrainingEnv(SharedVecEnv):
             pose = path[min(round(left / _STEP_M), len(path) - 1)]
         self.batch.start(i, task, pose)
         self._at[i] = kind, level
-        self._returns[i], self._lengths[i], self._stood[i] = 0.0, 0, 0
+        self._stood[i] = 0
 
     def _draw_task(self, group: SlotGroup, level: int) -> CurriculumTask:
         key, rng = (group, level), self._rng

@@ -177,11 +177,6 @@ class Trip:
     legs: tuple[Leg, ...]
     attempts: tuple[ParkingAttempt, ...]
 
-    @property
-    def failed_attempts(self) -> list[ParkingAttempt]:
-        """The failed attempts."""
-        return [t for t in self.attempts if t.reason]
-
 
 class DrivenSearch:
     """Drives trips in one scenario.
