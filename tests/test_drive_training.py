@@ -580,7 +580,7 @@ def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algo
     summary = json.loads((out / "summary.json").read_text())
     assert [row["seed"] for row in summary["rows"]] == [0, 1]
     assert all(row["steps"] >= steps for row in summary["rows"])
-    assert summary["examined"] == {"perpendicular": 1.0, "all": 1.0}
+    assert summary["evaluated"] == {"perpendicular": 1.0, "all": 1.0}
     assert (out / "learning_curve.png").stat().st_size > 10_000
     model = f"{algorithm}:{out / 'seed_1' / 'model.zip'}"
     parked = parkenv(

@@ -228,7 +228,7 @@ def test_learning_curves_are_those_of_the_training(tmp_path, drives):
         tmp_path,
         command=["parkenv", "train"],
         rows=[{"agent": "ppo", "scenario": "campus,street", "seed": 3, "success": 0.5}],
-        examined=dict.fromkeys(kinds, 1.0) if drives else {"mdp": 80.0, "clairvoyant bound": 60.0},
+        evaluated=dict.fromkeys(kinds, 1.0) if drives else {"mdp": 80.0, "clairvoyant bound": 60.0},
         curve=dict(zip(kinds, curves, strict=True)) if drives else curves[0],
         beside={"dqn": dict(zip(kinds, curves, strict=True)) if drives else curves[0]},
     )

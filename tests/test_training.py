@@ -19,8 +19,8 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from parkenv import make_scenario
-from parkenv.cli.search_course import SearchCourse
-from parkenv.cli.training_course import curves_beside
+from parkenv.cli.search_task import SearchTask
+from parkenv.cli.training_task import curves_beside
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
@@ -184,7 +184,7 @@ class Waits:
 
 def test_a_planner_that_finishes_nothing_cannot_be_imitated(monkeypatch):
     monkeypatch.setattr("parkenv.evaluation.training.cloning.make_agent", lambda *_: Waits())
-    with pytest.raises(InputError, match="finished none of 1 searches on mini: nothing to imitate"):
+    with pytest.raises(InputError, match="finished none of 1 searches on mini: nothing to clone"):
         Demonstrations.collect("waits", SCENARIO, [5_000_000])
 
 
@@ -367,7 +367,7 @@ def training_in(folder, **changed):
 
 
 def course_of(algorithm="ppo"):
-    return SearchCourse(
+    return SearchTask(
         TrainingSpec(
             algorithm=algorithm, scenarios=(scenario_spec("mini"),), steps=10, evaluate_every=10,
             evaluation_episodes=16, planners=(),
@@ -426,7 +426,7 @@ def test_trainings_that_cannot_be_compared_are_refused(tmp_path, changed, spoil,
 def test_a_training_is_drawn_once(tmp_path):
     folder = training_in(tmp_path / "other")
     for folders, own in (([folder, f"{folder}/../other"], "own"), ([folder], "other")):
-        with pytest.raises(InputError, match="is drawn already"):
+        with pytest.raises(InputError, match="is already drawn"):
             curves_beside(folders, tmp_path / own, course_of())
 
 
@@ -470,7 +470,7 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
         (["ppo", "--resume"], "holds no training to go on with"),
         (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
         (["ppo", "--planners", "mdp,belif"], "unknown agent 'belif'"),
-        (["ppo", "--clone", "oracle"], "oracle cannot be imitated"),
+        (["ppo", "--clone", "oracle"], "oracle cannot be cloned"),
         (["ppo", "--demonstrations", "5"], "demonstrations goes with clone"),
         (["ppo", "--env", "drive", "--demonstrations", "5"], "demonstrations goes with env search"),
     ],

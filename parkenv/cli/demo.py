@@ -1,4 +1,4 @@
-"""`parkenv demo`: the whole story, from the first survey drive to the comparison."""
+"""`parkenv demo`: from the first survey session to the comparison of agents."""
 
 from __future__ import annotations
 
@@ -37,13 +37,14 @@ def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for everything.")] = Path("results/demo"),
     report: args.ReportOption = False,
 ) -> None:
-    """Survey a lot with simulated sensors, learn from it how often each slot is taken, and search there on other days.
+    """Survey a lot with simulated sensors, estimate how often each slot is taken, and search there on other days.
 
-    1. Survey drives: a side camera and a laser pass every slot; cars are detected, ranged and put into slots.
+    1. Survey: a car with a side camera and a laser passes every slot; parked cars are detected, located and assigned to
+    slots.
 
-    2. The map: how likely each slot is taken at the hour of the search, from these drives alone.
+    2. Map: the probability that each slot is taken at the hour of the search, from these sessions alone.
 
-    3. Searches on new days, each seen through camera, laser and detector: the thesis's planner and what people do, all
+    3. Searches on other days, with camera, laser and detector: the thesis's planner and three heuristic baselines, all
     with the same map, in the same worlds.
 
     Example:
@@ -74,10 +75,11 @@ def run_demo(
     """
     del overwrite
     from parkenv.evaluation.experiments.compare import run_cases, table
-    from parkenv.evaluation.experiments.demo import demo_cases, demo_survey
+    from parkenv.evaluation.experiments.demo import AGENTS, demo_cases, demo_survey
     from parkenv.evaluation.experiments.results import ResultFolder, make_folder
     from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.experiments.surveys import run_survey, summarize
+    from parkenv.evaluation.experiments.warm_up import warm_up_tasks
     from parkenv.evaluation.figures.registry import ComparisonResults, draw_figures
     from parkenv.evaluation.figures.survey_pictures import save_detections, save_map, save_session
     from parkenv.evaluation.trips.sensor_log import require_viewer
@@ -97,7 +99,11 @@ def run_demo(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         console=console, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
-        bar = progress.add_task("1/3 surveying (compiles first after an installation)", total=spec.sessions)
+        tasks = warm_up_tasks(settings, AGENTS)
+        bar = progress.add_task("compiling, once after an installation", total=len(tasks))
+        for _ in workers.results(tasks):
+            progress.advance(bar)
+        bar = progress.add_task("1/3 surveying", total=spec.sessions)
         run = run_survey(
             its,
             settings,
@@ -121,7 +127,7 @@ def run_demo(
         progress.advance(bar)
 
         cases = demo_cases(spec, its, log)
-        bar = progress.add_task("3/3 searching through the sensors", total=len(cases) * spec.episodes)
+        bar = progress.add_task("3/3 searching with simulated sensors", total=len(cases) * spec.episodes)
         run_cases(
             cases, folder, workers=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n)
         )
@@ -142,7 +148,7 @@ def run_demo(
         console.print(printed)
     console.print(f"Pictures, the map, episodes.csv and summary.json are in {out}")
     if rerun is not None:
-        with console.status(f"Driving the first survey and the first search once more for {rerun}"):
+        with console.status(f"Running the first session and the first search again for {rerun}"):
             case, seeds = cases[0]
             _record(case.scenario, settings, seeds[0], rerun)
         console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
@@ -153,7 +159,7 @@ def run_demo(
 
 
 def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:
-    """The first survey drive and the first search, on one time line."""
+    """Record the first session and the first search, on one time line."""
     from parkenv.envs.perception import SearchPerceptionEnv
     from parkenv.evaluation.trips.sensor_log import record_search, record_session, sensor_log
     from parkenv.mapping.survey import Survey
@@ -166,7 +172,7 @@ def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) ->
 
 
 def _settings(spec: DemoSpec) -> dict[str, Any]:
-    """What decides the outcome of the searches."""
+    """Return what determines the outcome of the searches."""
     from parkenv.evaluation.experiments.experiment import fingerprints, flat_tables
     from parkenv.perception.detector_registry import detector_version
 
@@ -179,7 +185,7 @@ def _settings(spec: DemoSpec) -> dict[str, Any]:
 
 
 def _goes_on(out: Path) -> bool:
-    """Whether an unfinished demo is in the folder."""
+    """Return whether the folder holds an unfinished demo."""
     from parkenv.evaluation.experiments.results import SETTINGS, SUMMARY
 
     return (out / SETTINGS).exists() and not (out / SUMMARY).exists()

@@ -193,16 +193,16 @@ def _trained(run: RunFolder) -> Cases:
     spec = TrainingSpec.read(run.path / SPEC_FILE)
     if spec.env != "search" or not run.summary.get("transfer"):
         return []
-    from parkenv.cli.search_course import SearchCourse
-    from parkenv.cli.training_course import TESTED_FROM
+    from parkenv.cli.search_task import SearchTask
+    from parkenv.cli.training_task import TEST_SEED
 
     best = min(run.summary["rows"], key=lambda row: float(row["total_s"]))
     model = run.path / f"seed_{best['seed']}" / "model.zip"
-    course = SearchCourse(spec)
-    agents = {agent.label: agent for agent in course.compared}
-    seeds = range(TESTED_FROM, TESTED_FROM + int(run.summary["transfer"][0]["episodes"]))
+    task = SearchTask(spec)
+    agents = {agent.label: agent for agent in task.compared}
+    seeds = range(TEST_SEED, TEST_SEED + int(run.summary["transfer"][0]["episodes"]))
     cases: Cases = []
-    for scenario in course.tested:
+    for scenario in task.tested:
         planners = [row for row in run.summary.get("planners", []) if row["scenario"] == scenario.name]
         beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
         cases.append((Case(scenario, f"{best['agent']}:{model}"), seeds))

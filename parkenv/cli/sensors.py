@@ -80,7 +80,7 @@ def preview(
     scenes = LotScenes(slot_lot(its.lot), its, key, its.occupancy.world(key, arrival))
 
     entry, target = int(its.lot.entry_vertices[0]), int(its.lot.walk_m().argmin())
-    path = [entry, *(vertex for _, vertex in DriveRoutes(its).way(entry, target))]
+    path = [entry, *DriveRoutes(its).path(entry, target)]
     poses = poses_along(its.lot.vertex_xy[path], every)
     parked = scenes.at(arrival.time)
     beside = poses[:, :2] + 4.0 * np.column_stack([np.sin(poses[:, 2]), -np.cos(poses[:, 2])])

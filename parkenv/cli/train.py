@@ -1,4 +1,4 @@
-"""`parkenv train`: agents that learn, evaluated beside the planners."""
+"""`parkenv train`: reinforcement learning agents, evaluated beside the planners."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
-from parkenv.cli.drive_course import DriveCourse
+from parkenv.cli.drive_task import DriveTask
 from parkenv.cli.report import PAGE
-from parkenv.cli.search_course import SearchCourse
+from parkenv.cli.search_task import SearchTask
 from parkenv.cli.tables import make_console
-from parkenv.cli.training_course import FIGURE, Course, Row, curves_beside
+from parkenv.cli.training_task import FIGURE, Row, TrainingTask, curves_beside
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from parkenv.evaluation.experiments.workers import Workers
     from parkenv.evaluation.training.rl_training import Training
 
-COURSES: Mapping[str, type[Course]] = {"search": SearchCourse, "drive": DriveCourse}
+TASKS: Mapping[str, type[TrainingTask]] = {"search": SearchTask, "drive": DriveTask}
 
 
 def train(
@@ -132,7 +132,7 @@ def train(
             help="Folders of other trainings with the same evaluations, to draw in the same figure.",
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoints in --out.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoints in --out.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the training in --out.")] = False,
     report: args.ReportOption = False,
 ) -> None:
@@ -191,22 +191,22 @@ def run_training(
     from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.training.rl_training import MODEL
 
-    course = COURSES[spec.env](spec)
-    course.check()
-    settings = {"version": __version__, **course.settings()}
-    out = out or Path("results") / course.folder
-    others = curves_beside(beside, out, course)
+    task = TASKS[spec.env](spec)
+    task.check()
+    settings = {"version": __version__, **task.settings()}
+    out = out or Path("results") / task.folder
+    others = curves_beside(beside, out, task)
     make_folder(out)
     _require_free(out, settings, resume, overwrite)
     console = make_console()
     with args.workers_of(spec.jobs, spec.backend, spec.address) as workers:
-        training = course.training(console)
+        training = task.training(console)
         _claim(out, settings, overwrite)
         spec.write(out / SPEC_FILE)
         numbers = range(spec.seed, spec.seed + spec.seeds)
-        curves = _train_all(console, course, training, numbers, out, workers, spec.tensorboard)
+        curves = _train_all(console, task, training, numbers, out, workers, spec.tensorboard)
         models = {n: out / f"seed_{n}" / MODEL for n in numbers}
-        outcome = course.report(console, workers, curves, models, out, others)
+        outcome = task.report(console, workers, curves, models, out, others)
     command = ["parkenv", *sys.argv[1:]]
     write_summary(
         out, {"command": command, "version": __version__, "seed": spec.seed, "settings": settings, **outcome}
@@ -219,7 +219,7 @@ def run_training(
 
 
 def _require_free(out: Path, settings: Row, resume: bool, overwrite: bool) -> None:
-    """Make sure that what is in the folder may be used, or replaced."""
+    """Check that the folder is free, resumable or to be replaced."""
     from parkenv.evaluation.experiments.results import read_settings, require_same_settings
 
     if resume and overwrite:
@@ -234,12 +234,12 @@ def _require_free(out: Path, settings: Row, resume: bool, overwrite: bool) -> No
 
 
 def _claim(out: Path, settings: Row, overwrite: bool) -> None:
-    """Write down what is trained in the folder from now on, in place of what was."""
+    """Write the settings of the training that starts, and remove what the previous one left."""
     import shutil
 
     from parkenv.evaluation.experiments.results import SUMMARY, write_settings
 
-    # Whoever finds no summary knows that the training is not finished.
+    # A folder without a summary holds an unfinished training.
     for outcome in (SUMMARY, PAGE, FIGURE):
         (out / outcome).unlink(missing_ok=True)
     if overwrite:
@@ -250,7 +250,7 @@ def _claim(out: Path, settings: Row, overwrite: bool) -> None:
 
 def _train_all(
     console: Console,
-    course: Course,
+    task: TrainingTask,
     training: Training,
     seeds: range,
     out: Path,
@@ -263,21 +263,21 @@ def _train_all(
     from parkenv.evaluation.training.rl_training import CURVE, read_curve, train_one
 
     progress = Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[told]}"), TimeElapsedColumn(),
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[score]}"), TimeElapsedColumn(),
         TimeRemainingColumn(), console=console, disable=not console.is_terminal,
     )  # fmt: skip
-    bars = {k: progress.add_task(f"seed {k}", total=training.steps, told="") for k in seeds}
+    bars = {k: progress.add_task(f"seed {k}", total=training.steps, score="") for k in seeds}
     over = threading.Event()
 
-    def look() -> None:
+    def update_bars() -> None:
         while not over.is_set():
             for k, bar in bars.items():
                 if curve := read_curve(out / f"seed_{k}" / CURVE):
                     last = curve[-1]
-                    progress.update(bar, completed=last["steps"], told=course.score_text(last))
+                    progress.update(bar, completed=last["steps"], score=task.score_text(last))
             over.wait(2.0)
 
-    watcher = threading.Thread(target=look, daemon=True)
+    watcher = threading.Thread(target=update_bars, daemon=True)
     with progress:
         watcher.start()
         try:

@@ -36,13 +36,13 @@ class LaneKeeper(PathTracker):
         super().__init__(vehicle, path, settings)
         self._set_off = True
         most = 1.5 * self._settings.acceleration
-        for stretch in self._stretches:
-            bend = np.maximum(np.abs(stretch.curvature), 1e-6)
-            pace = np.minimum(stretch.pace, np.sqrt(aside / bend))
-            step = np.diff(stretch.station)
+        for segment in self._segments:
+            bend = np.maximum(np.abs(segment.curvature), 1e-6)
+            pace = np.minimum(segment.pace, np.sqrt(aside / bend))
+            step = np.diff(segment.station)
             for i in range(len(pace) - 2, -1, -1):
                 pace[i] = min(pace[i], math.sqrt(pace[i + 1] ** 2 + 2.0 * most * step[i]))
-            stretch.pace[:] = pace
+            segment.pace[:] = pace
 
 
 def rounded(points: FloatArray, radius: float) -> CarPath:

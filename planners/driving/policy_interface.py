@@ -115,9 +115,9 @@ def pedal_command(action: Float32Array, speed: float, pedals: FloatArray) -> flo
         speed: the car's, m/s.
         pedals: of a `PolicyInterface`.
     """
-    asked = min(max(float(action[0]), -1.0), 1.0)
-    size = (abs(asked) - STAND) / (1.0 - STAND)
-    wanted = 0.0 if size <= 0.0 else size * pedals[2] if asked > 0.0 else -size * pedals[3]
+    target = min(max(float(action[0]), -1.0), 1.0)
+    size = (abs(target) - STAND) / (1.0 - STAND)
+    wanted = 0.0 if size <= 0.0 else size * pedals[2] if target > 0.0 else -size * pedals[3]
     needed = (wanted - speed) / _CONTROL_S
     return float(min(max(needed / (pedals[0] if needed * speed < 0.0 else pedals[1]), -1.0), 1.0))
 

@@ -25,8 +25,9 @@ from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
 from parkenv.mapping.survey_score import DISTANCE_ENDS, METHODS
 from parkenv.scenarios.build import build
-from parkenv.world.occupancy import DAY_S, Arrival, ArrivalWindow
+from parkenv.world.occupancy import Arrival, ArrivalWindow
 from parkenv.world.scenario import Scenario
+from parkenv.world.week import DAY_S
 
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
@@ -158,6 +159,7 @@ def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_
     return {
         "scenario": scenario.name,
         "rig": settings.rig,
+        "detector": settings.detector,
         "weather": settings.weather or "any",
         "sessions": len(run.rows),
         "slots": scenario.lot.n_slots,

@@ -16,7 +16,7 @@ def learning_of(run: RunFolder) -> list[dict[str, Any]]:
     Args:
         run: any run; only trainings have curves.
     """
-    curve, lines = run.summary.get("curve"), run.summary.get("examined")
+    curve, lines = run.summary.get("curve"), run.summary.get("evaluated")
     if run.kind != "train" or not curve or not isinstance(lines, Mapping):
         return []
     seeds = [run.table(f"seed_{row['seed']}/curve.csv") for row in run.summary["rows"]]

@@ -16,7 +16,7 @@ from parkenv.envs.search_sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.simulate import charge_truncation
-from parkenv.evaluation.training.cloning import Demonstrations, clone, require_imitable
+from parkenv.evaluation.training.cloning import Demonstrations, clone, require_cloneable
 from parkenv.evaluation.training.configs import (
     MAX_STEPS,
     REWARD_SCALE,
@@ -54,7 +54,7 @@ class SearchTraining(Training):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.demonstrations is not None:
-            require_imitable(self.algorithm, self.demonstrations.agent, self.scenarios[0])
+            require_cloneable(self.algorithm, self.demonstrations.agent, self.scenarios[0])
 
     @property
     def config(self) -> TrainingConfig:

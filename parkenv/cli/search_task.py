@@ -1,4 +1,4 @@
-"""The course in which `parkenv train` teaches to search."""
+"""Training of search agents by `parkenv train`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from parkenv.cli.training_course import (
-    EXAMINED_FROM,
+from parkenv.cli.training_task import (
+    EVALUATION_SEED,
     FIGURE,
-    TESTED_FROM,
-    Course,
+    TEST_SEED,
     Row,
+    TrainingTask,
     name_of,
     print_tests,
     row_of,
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from parkenv.evaluation.training.search_training import SearchTraining
     from parkenv.world.scenario import Scenario
 
-SHOWN_FROM = 5_000_000
-"""First seed of the worlds in which demonstrations are recorded."""
+DEMONSTRATION_SEED = 5_000_000
+"""First world seed of the demonstrations."""
 PLANNERS = tuple(
     AgentSpec(name=name)
     for name in ("belief", "mdp-tuned", "mdp", "first-free", "greedy-drive", "greedy-goal")
@@ -39,23 +39,23 @@ PLANNERS = tuple(
 
 
 @dataclass(eq=False)
-class SearchCourse(Course):
-    """Searches in some scenarios."""
+class SearchTask(TrainingTask):
+    """Train to search in some scenarios."""
 
     @property
     def folder(self) -> str:
-        """See `Course`."""
+        """See `TrainingTask`."""
         return self.algorithm
 
     def config(self) -> Any:
-        """See `Course`."""
+        """See `TrainingTask`."""
         from parkenv.evaluation.training.configs import SEARCH_CONFIGS, config_of
 
         return config_of(self.algorithm, SEARCH_CONFIGS, "search")
 
     @property
     def algorithm(self) -> str:
-        """See `Course`."""
+        """See `TrainingTask`."""
         return self.spec.algorithm or "maskable-ppo"
 
     @property
@@ -74,37 +74,37 @@ class SearchCourse(Course):
 
     @property
     def k(self) -> int:
-        """Slots in an observation."""
+        """Number of slots in an observation."""
         return self.spec.k or 5
 
     @property
     def demonstrations(self) -> int:
-        """Searches of the planner to clone."""
+        """Number of demonstrations to clone."""
         return self.spec.demonstrations or 2000
 
     @property
     def evaluation_episodes(self) -> int:
-        """Searches of an evaluation."""
+        """Episodes per evaluation."""
         return self.spec.evaluation_episodes or 256
 
     @property
-    def examined(self) -> range:
+    def evaluation_seeds(self) -> range:
         """Seeds of the worlds of the evaluations."""
-        return range(EXAMINED_FROM, EXAMINED_FROM + self.evaluation_episodes)
+        return range(EVALUATION_SEED, EVALUATION_SEED + self.evaluation_episodes)
 
     @property
     def compared(self) -> Sequence[AgentSpec]:
-        """Planners that are drawn for comparison."""
+        """Planners to draw for comparison."""
         return PLANNERS if self.spec.planners is None else self.spec.planners
 
     def check(self) -> None:
-        """See `Course`."""
-        from parkenv.evaluation.training.cloning import require_imitable
+        """See `TrainingTask`."""
+        from parkenv.evaluation.training.cloning import require_cloneable
         from planners.agent import make_agent
 
         super().check()
         if self.spec.clone is not None:
-            require_imitable(self.algorithm, self.spec.clone, self.worlds[0])
+            require_cloneable(self.algorithm, self.spec.clone, self.worlds[0])
         for world in (self.worlds[0], *self.tested):
             for agent in self.compared:
                 make_agent(agent.name, world, **agent.options)
@@ -120,7 +120,7 @@ class SearchCourse(Course):
         return self.spec.evaluate_every or 100_000
 
     def settings(self) -> Row:
-        """See `Course`."""
+        """See `TrainingTask`."""
         return {
             "algorithm": self.algorithm, "scenario": [w.name for w in self.worlds], "steps": self.steps,
             "clone": self.spec.clone, "demonstrations": self.demonstrations if self.spec.clone else None, "k": self.k,
@@ -129,17 +129,17 @@ class SearchCourse(Course):
         }  # fmt: skip
 
     def evaluation_settings(self, settings: Row) -> Row:
-        """See `Course`."""
+        """See `TrainingTask`."""
         first, *_ = settings.get("scenario") or [None]
         return {"scenario": first, "evaluation_episodes": settings.get("evaluation_episodes")}
 
     @property
     def measures(self) -> tuple[str, ...]:
-        """See `Course`."""
+        """See `TrainingTask`."""
         return ("total_s",)
 
     def training(self, console: Console) -> SearchTraining:
-        """See `Course`."""
+        """See `TrainingTask`."""
         from parkenv.evaluation.training.search_training import SearchTraining
 
         demonstrations = None
@@ -150,15 +150,21 @@ class SearchCourse(Course):
                 demonstrations = Demonstrations.collect(
                     self.spec.clone,
                     self.worlds[0],
-                    range(SHOWN_FROM, SHOWN_FROM + self.demonstrations),
+                    range(DEMONSTRATION_SEED, DEMONSTRATION_SEED + self.demonstrations),
                     self.k,
                 )
         return SearchTraining(
-            self.algorithm, self.steps, self.evaluate_every, tuple(self.worlds), self.examined, self.k, demonstrations
-        )  # fmt: skip
+            self.algorithm,
+            self.steps,
+            self.evaluate_every,
+            tuple(self.worlds),
+            self.evaluation_seeds,
+            self.k,
+            demonstrations,
+        )
 
     def score_text(self, row: Row) -> str:
-        """See `Course`."""
+        """See `TrainingTask`."""
         return f"{row['total_s']:.1f} s"
 
     def report(
@@ -170,14 +176,14 @@ class SearchCourse(Course):
         out: Path,
         beside: dict[str, list[list[Row]]],
     ) -> Row:
-        """See `Course`."""
+        """See `TrainingTask`."""
         from parkenv.evaluation.figures.learning_curves import across_seeds, save_learning_curves
         from parkenv.evaluation.training.search_training import search_times
         from planners.learned import LearnedAgent
 
-        at_test = range(TESTED_FROM, TESTED_FROM + 2 * self.evaluation_episodes)
+        at_test = range(TEST_SEED, TEST_SEED + 2 * self.evaluation_episodes)
         lines, tables = _planner_times(
-            console, workers, self.compared, self.worlds[0], self.tested, self.examined, at_test
+            console, workers, self.compared, self.worlds[0], self.tested, self.evaluation_seeds, at_test
         )
         rows, transfer = [], []
         with console.status("Testing"):
@@ -201,7 +207,7 @@ class SearchCourse(Course):
             _interval,
         )
         return {
-            "rows": rows, "transfer": transfer, "planners": tables, "examined": lines, "curve": across_seeds(curves),
+            "rows": rows, "transfer": transfer, "planners": tables, "evaluated": lines, "curve": across_seeds(curves),
             "beside": {name: across_seeds(its) for name, its in beside.items()},
         }  # fmt: skip
 
@@ -212,16 +218,16 @@ def _planner_times(
     agents: Sequence[AgentSpec],
     first: Any,
     tested: Sequence[Any],
-    examined: range,
+    evaluation_seeds: range,
     at_test: range,
 ) -> tuple[dict[str, float], list[Row]]:
-    """Mean times of planners in the worlds of the evaluations, and rows of those of the test."""
+    """Mean times of planners in the evaluation worlds, and their rows in the test worlds."""
     from parkenv.evaluation.experiments.compare import rows_of
 
     if not agents:
         return {}, []
     with console.status("Planners search in the same worlds"):
-        rows = rows_of(agents, first, examined, workers)
+        rows = rows_of(agents, first, evaluation_seeds, workers)
         tables = [row for world in tested for row in rows_of(agents, world, at_test, workers)]
     lines = {row["agent"]: row["total_s"] for row in rows}
     return {**lines, "clairvoyant bound": rows[0]["bound_s"]}, tables

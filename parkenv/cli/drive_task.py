@@ -1,4 +1,4 @@
-"""The course in which `parkenv train` teaches to drive into slots."""
+"""Training of parking agents by `parkenv train --env drive`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from parkenv.cli.training_course import (
-    EXAMINED_FROM,
+from parkenv.cli.training_task import (
+    EVALUATION_SEED,
     FIGURE,
-    TESTED_FROM,
-    Course,
+    TEST_SEED,
     Row,
+    TrainingTask,
     print_tests,
     row_of,
     scenario_settings,
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 
 @dataclass(eq=False)
-class DriveCourse(Course):
-    """Drives into the slots of some scenarios' lots."""
+class DriveTask(TrainingTask):
+    """Train to park on the lots of some scenarios."""
 
     @property
     def algorithm(self) -> str:
-        """See `Course`."""
+        """See `TrainingTask`."""
         return self.spec.algorithm or "ppo"
 
     @property
@@ -45,16 +45,16 @@ class DriveCourse(Course):
 
     @property
     def evaluation_episodes(self) -> int:
-        """Drives into each lot's slots of each kind in an evaluation."""
+        """Episodes per evaluation, lot and kind of slot."""
         return self.spec.evaluation_episodes or 64
 
     @property
     def folder(self) -> str:
-        """See `Course`."""
+        """See `TrainingTask`."""
         return f"drive-{self.algorithm}"
 
     def config(self) -> Any:
-        """See `Course`."""
+        """See `TrainingTask`."""
         from parkenv.evaluation.training.configs import DRIVE_CONFIGS, config_of
 
         return config_of(self.algorithm, DRIVE_CONFIGS, "drive")
@@ -80,7 +80,7 @@ class DriveCourse(Course):
         return [build(scenario).lot for scenario in self.spec.test_on or self._scenarios]
 
     def check(self) -> None:
-        """See `Course`."""
+        """See `TrainingTask`."""
         from parkenv.evaluation.training.drive_training_env import slot_groups
         from planners.driving.parking_agents import PLANNER
 
@@ -93,7 +93,7 @@ class DriveCourse(Course):
             )
 
     def settings(self) -> Row:
-        """See `Course`."""
+        """See `TrainingTask`."""
         return {
             "algorithm": self.algorithm, "env": "drive", "lot": [lot.name for lot in self.lots], "steps": self.steps,
             "evaluate_every": self.evaluate_every, "evaluation_episodes": self.evaluation_episodes,
@@ -101,26 +101,28 @@ class DriveCourse(Course):
         }  # fmt: skip
 
     def evaluation_settings(self, settings: Row) -> Row:
-        """See `Course`."""
+        """See `TrainingTask`."""
         return {name: settings.get(name) for name in ("env", "lot", "evaluation_episodes")}
 
     @property
     def measures(self) -> tuple[str, ...]:
-        """See `Course`."""
+        """See `TrainingTask`."""
         from parkenv.evaluation.training.drive_training_env import slot_groups
 
         return tuple(f"{group.kind}_success" for group in slot_groups(self.lots))
 
     def training(self, console: Console) -> DriveTraining:
-        """See `Course`."""
+        """See `TrainingTask`."""
         del console
         from parkenv.evaluation.training.drive_training import DriveTraining
 
-        examined = range(EXAMINED_FROM, EXAMINED_FROM + self.evaluation_episodes)
-        return DriveTraining(self.algorithm, self.steps, self.evaluate_every, tuple(self.lots), examined)
+        evaluation_seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.evaluation_episodes)
+        return DriveTraining(
+            self.algorithm, self.steps, self.evaluate_every, tuple(self.lots), evaluation_seeds
+        )
 
     def score_text(self, row: Row) -> str:
-        """See `Course`."""
+        """See `TrainingTask`."""
         return f"{row['success']:.0%} parked"
 
     def report(
@@ -132,20 +134,20 @@ class DriveCourse(Course):
         out: Path,
         beside: dict[str, list[list[Row]]],
     ) -> Row:
-        """See `Course`."""
+        """See `TrainingTask`."""
         from parkenv.evaluation.figures.learning_curves import across_seeds, save_success_curves
         from parkenv.evaluation.training.drive_training import parked_on
         from parkenv.evaluation.trips.parking_runs import parking_table
         from planners.driving.parking_agents import PLANNER
 
-        examined = range(EXAMINED_FROM, EXAMINED_FROM + self.evaluation_episodes)
-        at_test = range(TESTED_FROM, TESTED_FROM + 2 * self.evaluation_episodes)
+        evaluation_seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.evaluation_episodes)
+        at_test = range(TEST_SEED, TEST_SEED + 2 * self.evaluation_episodes)
         names = " and ".join(lot.name for lot in self.lots)
         lines: dict[str, float] = {}
         tables: list[Row] = []
         if self.spec.planners is None or self.spec.planners:
             with console.status("The planner parks in the same tasks"):
-                parkings = parked_on(self.lots, examined, workers, PLANNER)
+                parkings = parked_on(self.lots, evaluation_seeds, workers, PLANNER)
                 lines = {row["kind"]: row["success"] for row in parking_table(parkings)}
                 for lot in self.tested:
                     table = parking_table(parked_on([lot], at_test, workers, PLANNER))
@@ -174,7 +176,7 @@ class DriveCourse(Course):
         heading = "Parkings that succeed, contacts, median s of those, in held-out tasks"
         print_tests(console, heading, self.algorithm, transfer, tables, _parkings, "kind")
         return {
-            "rows": rows, "transfer": transfer, "planners": tables, "examined": lines,
+            "rows": rows, "transfer": transfer, "planners": tables, "evaluated": lines,
             "curve": {kind: across_seeds(curves, f"{kind}_success") for kind in kinds},
             "beside": {
                 name: {kind: across_seeds(its, f"{kind}_success") for kind in kinds} for name, its in beside.items()
