@@ -363,8 +363,8 @@ def busy(name, cars, pedestrians):
     ("name", "cars", "pedestrians", "seeds"),
     [
         ("mini", 2, 2, range(2)),
-        pytest.param("mini", 2, 3, range(20), marks=pytest.mark.slow),
-        pytest.param("campus", 8, 10, range(30), marks=pytest.mark.slow),
+        pytest.param("mini", 2, 3, range(10), marks=pytest.mark.slow),
+        pytest.param("campus", 8, 10, range(8), marks=pytest.mark.slow),
     ],
 )
 def test_among_others_trips_take_longer_and_end_parked_without_a_contact(name, cars, pedestrians, seeds):
@@ -437,7 +437,6 @@ def test_who_gives_way_is_out_of_sight_until_the_car_has_gone():
     assert {there for there, _ in seen} == {True, False}
 
 
-@pytest.mark.slow
 def test_others_are_in_the_pictures_where_the_car_meets_them(monkeypatch):
     search = DrivenSearch(busy("mini", 1, 1), rig="laser", weather="sunny", captures=1)
     driver, met = search.driver, []
@@ -483,7 +482,6 @@ def test_straight_on_the_car_drives_at_the_limit_and_slower_where_that_is_lower(
     assert not fast.log.contacts
 
 
-@pytest.mark.slow
 def test_crossing_a_lane_costs_nothing_before_one_drives_on_from_there():
     driver, _, _ = started("mini")
     lot = driver.scenario.lot

@@ -234,7 +234,8 @@ def show_map(
     from parkenv.files.atomic_write import atomic_write
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
-    from parkenv.world.occupancy import DAY_NAMES, DAY_S, HOUR_S
+    from parkenv.world.occupancy import DAY_NAMES
+    from parkenv.world.week import DAY_S, HOUR_S
 
     its = build(args.one_scenario(args.scenario_specs(scenario, lot=lot)))
     if weekday is not None and weekday not in DAY_NAMES:

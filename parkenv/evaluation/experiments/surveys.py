@@ -25,10 +25,11 @@ from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
 from parkenv.mapping.survey_score import DISTANCE_ENDS, METHODS
 from parkenv.scenarios.build import build
-from parkenv.world.occupancy import DAY_S, Arrival, ArrivalWindow, OccupancyModel
+from parkenv.world.occupancy import Arrival, ArrivalWindow, OccupancyModel
 from parkenv.world.occupancy_log import weekday_of
 from parkenv.world.recorded_occupancy import RecordedOccupancy
 from parkenv.world.scenario import Scenario
+from parkenv.world.week import DAY_S
 
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]

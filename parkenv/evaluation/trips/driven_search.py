@@ -12,21 +12,6 @@ from gymnasium.wrappers import TimeLimit
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.envs.perception import OnboardPerception
 from parkenv.envs.search import SearchEnv
-from parkenv.envs.search_step import (
-    DRIVEN_M,
-    FAILED_PARKS,
-    STEP_DRIVE,
-    STEP_FAILED,
-    STEP_WALK,
-    STEPS,
-    TIME,
-    drive_or_park,
-    learn,
-    look,
-    renew,
-    settle,
-    touched,
-)
 from parkenv.envs.sensor_sampler import Station
 from parkenv.errors import InputError
 from parkenv.evaluation.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
@@ -73,35 +58,32 @@ class DrivenSearchEnv(SearchEnv):
         self.executor.begin(state.key, state.world, state.vertex, state.time)
         return result
 
-    def _advance(self, action: int) -> None:
+    def _advance(self, action: int) -> tuple[Any, ...]:
         """Drive the action, and advance the world by the time that it took."""
-        state, search = self._state, self.search
-        numbers = search.numbers[0]
-        vertex, before = state.vertex, state.time
+        state, control = self._state, self._control
+        vertex, begin = state.vertex, state.time
         possible = self.scenario.action_masks[vertex, action] == 1
         if possible and action == PARK:
-            self._park(vertex, before)
+            self._park(vertex, begin)
         elif possible:
             seconds = self.executor.drive(vertex, action)
-            drive_or_park(search, 0, action)
-            numbers[STEP_DRIVE], numbers[TIME] = seconds, before + seconds
+            control.drive_or_park(action)
+            control.set_step_time(begin, drive_s=seconds)
         else:
             self.executor.wait(self.scenario.wait_s)
-            drive_or_park(search, 0, action)
+            control.drive_or_park(action)
         if not state.parked:
             self._observe(moved=possible and action != PARK)
             for slot in self._refused:
                 # It looks free, but this car does not fit into it.
-                learn(search, 0, touched(search, 0, slot), True, 1.0)
-        settle(search, 0)
-        renew(search, 0)
-        self._clock[:] = state.time, state.time - state.arrival.time
+                control.set_taken(slot)
+        return control.finish_step()
 
     def _observe(self, *, moved: bool) -> None:
         """Update the belief from the observations at the car's place and on its way there."""
         perception = self.perception
         if perception is None:
-            look(self.search, 0)
+            self._control.observe()
             return
         # After an attempt or a wait, the car observes once; captures within a manoeuvre are useless.
         track = self.executor.track if moved else self.executor.track[-1:]
@@ -110,25 +92,21 @@ class DrivenSearchEnv(SearchEnv):
             chosen = perception.sampler.select_stations(np.array([point.driven_m for point in track]))
             points = [track[i] for i in chosen.tolist()]
             stations = [Station(s.time, s.pose, self.executor.movers_at(s)) for s in points]
-        perception.update_belief(self.search, perception.sampler.sample(self._state, stations))
+        captures = perception.sampler.sample(self._state, stations)
+        perception.update_belief(self._control, self._state.vertex, captures)
 
-    def _park(self, slot: int, before: float) -> None:
-        search, state = self.search, self._state
-        numbers, counts = search.numbers[0], search.counts[0]
-        taken = bool(state.world.occupied(np.array([slot]), before)[0])
+    def _park(self, slot: int, begin: float) -> None:
+        taken = bool(self._state.world.occupied(np.array([slot]), begin)[0])
         outcome = self.executor.park(slot, taken)
         if taken or not outcome.reason:
-            drive_or_park(search, 0, PARK)
+            self._control.drive_or_park(PARK)
         else:
             self._refused.add(slot)
-            counts[FAILED_PARKS] += 1
-            counts[STEPS] += 1
-            numbers[STEP_WALK] = 0.0
+            self._control.fail_attempt()
         if not outcome.reason:
             self.manoeuvre = outcome
         lost = outcome.seconds if outcome.reason else 0.0
-        numbers[STEP_DRIVE], numbers[STEP_FAILED] = outcome.seconds - lost, lost
-        numbers[TIME] = before + outcome.seconds
+        self._control.set_step_time(begin, drive_s=outcome.seconds - lost, failed_s=lost)
 
 
 @dataclass(frozen=True)
@@ -256,7 +234,7 @@ class DrivenSearch:
             parked=bool(info["parked"]),
             slot=parked.slot if parked else "",
             slot_kind=parked.kind if parked else "",
-            graph_m=float(env.search.numbers[0, DRIVEN_M]),
+            graph_m=env.state.driven_m,
             driven_m=log.driven_m,
             contacts=len(log.contacts),
             strays=log.strays,
