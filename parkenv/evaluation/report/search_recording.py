@@ -30,6 +30,10 @@ Recording = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
+
+_TIMES = ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s", "total_s")
+
+
 class Encounter:
     """Agents in the same world.
 
