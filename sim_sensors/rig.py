@@ -135,7 +135,7 @@ class SensorRig:
 
     @classmethod
     def thesis(cls) -> SensorRig:
-        """Return the thesis's rig (T §4.1, Fig. 4.3): a camera to the right above a 270° laser, on one vertical axis."""
+        """Return the thesis's rig (T §4.1, Fig. 4.3): a camera to the right above a 270° laser, on one axis."""
         return cls(
             cameras=(("right", WIDE, Mount(z=EYE_M, yaw=RIGHT)),),
             lasers=(("laser", LaserScanner(), Mount(z=0.5)),),

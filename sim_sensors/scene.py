@@ -293,7 +293,7 @@ class Scene:
         return Instances(coarse[self.instances.mesh], self.instances.pose, self.instances.ids)
 
     def footprints(self) -> Footprints:
-        """Return the obstacles 0.5 m above the ground: a convex polygon for each vehicle and post, and wall segments."""
+        """Return the obstacles 0.5 m above the ground: convex polygons of vehicles and posts, and wall segments."""
         outline, count = self.fleet.outlines
         posts, post_count = self.fleet.posts
         corners = np.zeros((self.n_vehicles + len(posts), FOOTPRINT_CORNERS, 2))

@@ -211,7 +211,7 @@ class SlotLot:
 
 
 def slot_surroundings(lot: SlotLot, lanes: Sequence[ArrayLike] = (), **more: object) -> Surroundings:
-    """Return asphalt under slots and lanes, and the painted lines of the slots: both sides, and the ends of kerbside slots.
+    """Return asphalt under slots and lanes, and painted lines: both sides of slots, and the ends of kerbside ones.
 
     Args:
         lot: the slots.

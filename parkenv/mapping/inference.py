@@ -76,7 +76,7 @@ class Prediction:
 
 
 def counted(log: SessionLog) -> FloatArray:
-    """Return the thesis's prediction, (n_slots,): N_occupied / (N_occupied + N_free), 0.5 if never seen (eq. 3.10-3.12)."""
+    """Return the thesis's prediction, (n_slots,): N_occupied / (N_occupied + N_free); 0.5 if unseen (eq. 3.10-3.12)."""
     seen = log.known.sum(axis=0)
     taken = (log.occupied & log.known).sum(axis=0)
     return np.where(seen > 0, taken / np.maximum(seen, 1), 0.5)

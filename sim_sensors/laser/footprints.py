@@ -215,7 +215,7 @@ class ScanPlane:
 
     @property
     def footprints(self) -> tuple[Float64Array, IntArray]:
-        """Corners, (n, k_max, 2) float64, m, world frame, counter-clockwise, zero-padded; and their (n,) int64 counts."""
+        """Corners, (n, k_max, 2) float64, m, world frame, counter-clockwise, zero-padded; (n,) int64 counts."""
         return self._corners.copy(), self._n_corners.copy()
 
     @property

@@ -125,7 +125,7 @@ class LaserScanner:
         *,
         exclude: int | None = None,
     ) -> tuple[Float32Array, Int32Array]:
-        """Simulate one scan as `scan` does; also return (n_beams,) int32: the id hit, `WALL` (-2), or `NO_RETURN` (-1)."""
+        """Simulate one scan; also return (n_beams,) int32: the id hit, `WALL` (-2), or `NO_RETURN` (-1)."""
         ranges, ids = self._measure(plane, _poses(pose, "pose", 1), rng, exclude, True)
         return ranges[0], ids[0]
 
