@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,12 +42,8 @@ TIME_COLORS = {
     "gave_up_s": ("give-up penalty", "#8c8c8c"),
 }
 """Names and colours of the parts of the total time."""
-
-
-def time_parts(rows: Iterable[Mapping[str, Any]]) -> dict[str, tuple[str, str]]:
-    """Return the entries of `TIME_COLORS` to show for some rows: without the parking cost if slots cost nothing."""
-    costs = any(row.get("parking_cost_s") for row in rows)
-    return {key: value for key, value in TIME_COLORS.items() if costs or key != "parking_cost_s"}
+OPTIONAL_TIMES = ("parking_cost_s", "gave_up_s")
+"""Parts that are mentioned only where they are not 0."""
 
 
 def save_picture(figure: Figure, path: str | Path) -> None:

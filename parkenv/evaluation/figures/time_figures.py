@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import UNSEEN, against_occupancy
-from parkenv.evaluation.figures.picture_files import INK, STYLE, time_parts
+from parkenv.evaluation.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
 from parkenv.evaluation.figures.registry import ComparisonResults
 
 FloatArray = NDArray[np.float64]
@@ -125,7 +125,11 @@ def draw_time_split(rows: Sequence[Row]) -> Figure:
             lowest = (len(panels) - 1 - column) // columns
             axes[lowest, column].tick_params(labelbottom=True)
             axes[lowest, column].set_xlabel("mean total time, s; 95 % interval", color="#444444")
-        handles: list[Any] = [Patch(color=color, label=name) for name, color in time_parts(rows).values()]
+        handles: list[Any] = [
+            Patch(color=color, label=name)
+            for key, (name, color) in TIME_COLORS.items()
+            if key not in OPTIONAL_TIMES or any(row[key] for row in rows)
+        ]
         handles.append(
             Line2D([], [], color=INK, linestyle=(0, (3, 2)), linewidth=1.2, label="clairvoyant lower bound")
         )
@@ -138,7 +142,7 @@ def _draw_split(ax: Axes, rows: Sequence[Row], limit: float) -> None:
     y = np.arange(len(rows))
     total = np.array([row["total_s"] for row in rows])
     left = np.zeros(len(rows))
-    for key, (_, color) in time_parts(rows).items():
+    for key, (_, color) in TIME_COLORS.items():
         part = np.array([row[key] for row in rows])
         ax.barh(
             y,
