@@ -86,7 +86,8 @@ def run_demo(
     from parkenv.evaluation.trips.sensor_log import require_viewer
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
-    from parkenv.world.week import DAY_NAMES, DAY_S
+    from parkenv.world.occupancy import DAY_NAMES
+    from parkenv.world.week import DAY_S
 
     if rerun is not None:
         require_viewer()
