@@ -1,19 +1,22 @@
-"""What an agent is, and how to make one by name."""
+"""The agents' interface, and agents by name."""
 
 from __future__ import annotations
 
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
 from parkenv.files.user_class import file_of_class, load_class
+from parkenv.world.occupancy import World
 from parkenv.world.scenario import Scenario, SearchProblem
 from planners.learned import ALGORITHMS
 
@@ -22,7 +25,7 @@ Memory = TypeVar("Memory")
 
 
 class Agent(Protocol):
-    """Whatever decides: planners, strategies and stable-baselines3's models alike."""
+    """Interface of everything that decides: planners, heuristic baselines and stable-baselines3's models alike."""
 
     def predict(
         self,
@@ -31,30 +34,62 @@ class Agent(Protocol):
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, Any]:
-        """Choose an action for an observation; hand the returned state back at the next call."""
+        """Choose an action for an observation; pass the returned state to the next call."""
         ...
 
 
-class SearchAgent(ABC, Generic[Memory]):
-    """Base of the agents for `parkenv/Search-v1`: one decision at a time, batches handled here.
+@runtime_checkable
+class ClairvoyantAgent(Protocol):
+    """An agent that is shown the hidden occupancy of each episode; of those in this package the oracle alone."""
 
-    An agent object holds what it knows of the problem and never changes; what it remembers of an episode
-    travels in `state`, so one object may serve many episodes at once.
+    def prepare(self, world: World, time: float) -> None:
+        """Receive the world of the episode about to begin, and its starting time, s since Monday 00:00."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class PlanPreview:
+    """Where an agent intends to drive, for replays and pictures.
+
+    Attributes:
+        path: vertices ahead, in order, without the present one; empty where the agent has no plan to show.
+    """
+
+    path: tuple[int, ...] = ()
+
+
+class SearchAgent(ABC, Generic[Memory]):
+    """Base class of the agents for `parkenv/Search-v1`.
+
+    A subclass decides on one observation at a time, by the belief about the slots that the observation states; this
+    class handles batches. An agent object holds what it knows of the problem and does not change; what it remembers of
+    an episode is in `state`, so one object may serve many episodes at once.
     """
 
     name: ClassVar[str]
 
     def __init__(self, problem: SearchProblem) -> None:
-        # Handed a whole scenario, an agent keeps the part that it may know.
+        # An agent that is given a whole scenario keeps the public part only.
         self.problem = problem.public() if isinstance(problem, Scenario) else problem
 
     @abstractmethod
-    def begin(self, observation: Observation) -> Memory:
-        """What to remember when an episode starts with this observation."""
+    def begin(self, observation: Observation, belief: SlotBelief) -> Memory:
+        """Return the memory for an episode that starts with this observation.
+
+        Args:
+            observation: from `parkenv/Search-v1`.
+            belief: what it says about the slots.
+        """
 
     @abstractmethod
-    def decide(self, observation: Observation, memory: Memory) -> int:
-        """The action for this observation; `memory` may be written to."""
+    def decide(self, observation: Observation, belief: SlotBelief, memory: Memory) -> int:
+        """Choose the action.
+
+        Args:
+            observation: from `parkenv/Search-v1`.
+            belief: what it says about the slots.
+            memory: of this episode; may be changed in place.
+        """
 
     def predict(
         self,
@@ -63,7 +98,7 @@ class SearchAgent(ABC, Generic[Memory]):
         episode_start: NDArray[np.bool_] | Sequence[bool] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.int64], Sequence[Memory] | Memory]:
-        """stable-baselines3's interface: single observations, or batches of them with a leading axis.
+        """Choose actions by stable-baselines3's interface, for one observation or a batch with a leading axis.
 
         Args:
             observation: from `parkenv/Search-v1` or a vector of them.
@@ -73,25 +108,43 @@ class SearchAgent(ABC, Generic[Memory]):
             deterministic: accepted for the interface; these agents make no distinction.
 
         Returns:
-            The action, () or (n_envs,) int64, and the state to hand back.
+            The action, () or (n_envs,) int64, and the state to pass to the next call.
         """
         del deterministic
         if np.ndim(observation["vertex"]) == 0:
-            starts = state is None or (episode_start is not None and bool(np.any(episode_start)))
-            memory: Memory = self.begin(observation) if starts else state  # type: ignore[assignment]
-            return np.asarray(self.decide(observation, memory), dtype=np.int64), memory
+            if episode_start is not None and np.any(episode_start):
+                state = None
+            return self._predict_one(observation, state)  # type: ignore[arg-type]
         n = len(observation["vertex"])
         memories: list[Any] = [None] * n if state is None else list(state)  # type: ignore[arg-type]
         actions = np.empty(n, dtype=np.int64)
         for i in range(n):
             single = {key: values[i] for key, values in observation.items()}
-            if memories[i] is None or (episode_start is not None and episode_start[i]):
-                memories[i] = self.begin(single)
-            actions[i] = self.decide(single, memories[i])
+            starts = episode_start is not None and bool(episode_start[i])
+            actions[i], memories[i] = self._predict_one(single, None if starts else memories[i])
         return actions, memories
 
+    def _predict_one(
+        self, observation: Observation, memory: Memory | None
+    ) -> tuple[NDArray[np.int64], Memory]:
+        belief = SlotBelief.of_observation(observation)
+        if memory is None:
+            memory = self.begin(observation, belief)
+        return np.asarray(self.decide(observation, belief, memory), dtype=np.int64), memory
 
-# Modules are named, not imported: a strategy needs no sparse solver, and nobody pays for torch unasked.
+    def plan_preview(self, observation: Observation, action: int, memory: Memory) -> PlanPreview:
+        """Return where the agent intends to drive, right after `predict` chose `action`; changes nothing.
+
+        Args:
+            observation: that it decided on.
+            action: what it chose.
+            memory: the state that `predict` returned.
+        """
+        del observation, action, memory
+        return PlanPreview()
+
+
+# Modules are imported when an agent is made: heuristics need no sparse solver, and only models need torch.
 _AGENTS: dict[str, tuple[str, str]] = {
     "mdp": ("planners.thesis.replanning", "ReplanningAgent"),
     "mdp-static": ("planners.thesis.replanning", "StaticAgent"),
@@ -106,24 +159,24 @@ _AGENTS: dict[str, tuple[str, str]] = {
 }
 
 SMALL_LOTS_ONLY = ("exact",)
-"""Agents that refuse lots over a certain size and looks that may err."""
+"""Agents that refuse lots over a certain size and sensors that err."""
 AGENT_NAMES = tuple(name for name in _AGENTS if name not in SMALL_LOTS_ONLY)
 """Agents for lots of any kind and size."""
 
 
-def require_sight(name: str, problem: SearchProblem) -> None:
-    """Refuse problems in which no slot is made out before somebody tries to park there.
+def require_observations(name: str, problem: SearchProblem) -> None:
+    """Refuse problems in which slots are never observed from the lane.
 
     Args:
-        name: of the agent that refuses.
-        problem: how slots are seen.
+        name: of the agent.
+        problem: with its sensor model.
 
     Raises:
-        InputError: nothing is seen.
+        InputError: no slot is ever observed.
     """
     if not problem.sensor_rates.seen.any():
         raise InputError(
-            f"{name} plans on what it sees from the lane, and here slots are seen only by trying; take mdp"
+            f"{name} plans on observations from the lane, and this sensor model has none; take mdp"
         )
 
 
@@ -133,9 +186,9 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
     Args:
         name: one of `AGENT_NAMES` or `SMALL_LOTS_ONLY`; `ALGORITHM:FILE` for a model of `parkenv train`, such as
             `ppo:models/ppo.zip`; or `MODULE:CLASS` for an agent of your own, such as `my_agents:Patient`: a class whose
-            first argument is the problem. The module is looked for in the working directory, too.
-        scenario: the scenario; what stands in its slots is kept from the agent.
-        options: the agent's own, such as `failure_s=5.0` of "mdp".
+            first argument is the problem. The module may be in the working directory.
+        scenario: the scenario; its hidden occupancy is not passed to the agent.
+        options: of the agent, such as `failure_s=5.0` of "mdp".
 
     Raises:
         InputError: an unknown name or option; the message lists the known ones.
@@ -169,10 +222,10 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
 
 
 def agent_file(name: str) -> Path | None:
-    """The file that an agent comes from: a trained model, or the module of an agent of your own.
+    """Return the file that an agent comes from: a trained model, or the module of an agent of the user's.
 
     Args:
-        name: as `make_agent` takes it, which has made an agent of it before.
+        name: as `make_agent` takes it; `make_agent` was called with it before.
 
     Returns:
         None for the agents that come with the package.

@@ -1,7 +1,7 @@
-"""The strategies that people use: no map of how often slots are taken, just eyes and habits.
+"""Heuristic baselines: how people search. They use what they observe, and no forecast.
 
-They tell from the belief what they have seen: a slot below its forecast was seen free, above it taken,
-at its forecast not at all. "Free-looking" means not seen taken.
+A slot is a candidate unless it was observed taken not long ago. Heuristics that look at the goal rank slots by what
+parking costs there on arrival (`SearchProblem.arrival_cost_s`): the walk, and the price where slots have one.
 """
 
 from __future__ import annotations
@@ -13,168 +13,178 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, SlotBelief
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
-from planners.agent import Observation, SearchAgent
+from planners.agent import Observation, PlanPreview, SearchAgent
 from planners.routes import DriveRoutes
 
 
 @dataclass
-class Eyes:
-    """What a strategy remembers.
+class GreedyState:
+    """Memory of a heuristic.
 
     Attributes:
-        forecast: (n_slots,) float32, the belief before anything was seen.
-        target: the slot that it is driving to, or -1.
+        target: the slot that it drives to, or -1.
     """
 
-    forecast: NDArray[np.float32]
     target: int = -1
 
 
-class TargetAgent(SearchAgent[Eyes]):
-    """Drives to one slot after the other, parks where its target is free, and drops it once seen taken."""
+class TargetAgent(SearchAgent[GreedyState]):
+    """Drives to one slot after the other, parks where its target is free, and drops it once it is observed taken."""
 
     def __init__(self, problem: SearchProblem) -> None:
         super().__init__(problem)
-        self.routes = DriveRoutes(problem)
+        self.routes = DriveRoutes(self.problem)
 
-    def begin(self, observation: Observation) -> Eyes:
-        """Remember the first observation, which is the forecast, so that later sightings stand out."""
-        return Eyes(forecast=np.array(observation["p_occupied"]))
+    def begin(self, observation: Observation, belief: SlotBelief) -> GreedyState:
+        """Start without a target."""
+        del observation, belief
+        return GreedyState()
 
-    def decide(self, observation: Observation, memory: Eyes) -> int:
-        """Keep to the target while it is free-looking, else choose another; park on arrival."""
+    def decide(self, observation: Observation, belief: SlotBelief, memory: GreedyState) -> int:
+        """Keep the target while it is a candidate, else choose another; park on arrival."""
         vertex = int(observation["vertex"])
-        p = observation["p_occupied"]
-        candidates = p <= memory.forecast
-        seen_free = p < memory.forecast
         previous = memory.target
-        if previous < 0 or not candidates[previous] or self.changes_mind(seen_free, previous):
-            memory.target = self.choose(candidates, seen_free, vertex, previous)
+        if previous < 0 or belief.state[previous] == OBSERVED_TAKEN or self.drops_target(belief, previous):
+            # An observation that has decayed to the forecast says nothing any more: the slot is a candidate again.
+            decayed = (belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast)
+            candidates = ~belief.observed_taken | decayed
+            memory.target = self.choose(candidates, belief.observed_free, vertex, previous)
             if memory.target < 0:
-                # Everything has been seen taken: what was seen longest ago may be free by now.
-                memory.target = int(np.where(self.within_reach(vertex), p, np.inf).argmin())
+                # Every slot was observed taken: the one observed longest ago is likeliest to be free by now.
+                p_occupied = np.where(self.reachable(vertex), belief.p_occupied, np.inf)
+                memory.target = int(p_occupied.argmin())
         if memory.target == vertex:
             return PARK
         return self.routes.move_toward(vertex, memory.target)
+
+    def plan_preview(self, observation: Observation, action: int, memory: GreedyState) -> PlanPreview:
+        """Return the shortest route to the target."""
+        del action
+        return PlanPreview(self.routes.path(int(observation["vertex"]), memory.target))
 
     @abstractmethod
     def choose(
         self,
         candidates: NDArray[np.bool_],
-        seen_free: NDArray[np.bool_],
+        observed_free: NDArray[np.bool_],
         vertex: int,
         previous: int,
     ) -> int:
-        """The slot to drive to, or -1 where no candidate is within reach.
+        """Return the slot to drive to, or -1 where no candidate is reachable.
 
         Args:
-            candidates: (n_slots,) free-looking.
-            seen_free: (n_slots,) seen free.
+            candidates: (n_slots,) bool, not observed taken.
+            observed_free: (n_slots,) bool.
             vertex: where the car is.
             previous: the slot that it was driving to, or -1 at the start.
         """
 
-    def within_reach(self, vertex: int) -> NDArray[np.bool_]:
-        """Which slots, (n_slots,), a way leads to."""
+    def reachable(self, vertex: int) -> NDArray[np.bool_]:
+        """Return which slots, (n_slots,), a route leads to."""
         return np.asarray(np.isfinite(self.routes.seconds_from(vertex)[: self.problem.lot.n_slots]))
 
-    def shortest_walks(self, candidates: NDArray[np.bool_], vertex: int) -> NDArray[np.bool_]:
-        """The candidates within reach, (n_slots,), that have the shortest walk; none where none is within reach."""
-        walk_s = np.where(candidates, self.problem.walk_s, np.inf)
-        best = np.asarray(candidates & (walk_s == walk_s.min()))
+    def cheapest(self, candidates: NDArray[np.bool_], vertex: int) -> NDArray[np.bool_]:
+        """Return the reachable candidates, (n_slots,) bool, with the least arrival cost; none if none is reachable."""
+        cost_s = np.where(candidates, self.problem.arrival_cost_s, np.inf)
+        best = np.asarray(candidates & (cost_s == cost_s.min()))
         if not len(self.routes.nearest(vertex, best)[0]):
-            walk_s[~self.within_reach(vertex)] = np.inf
-            best = np.asarray(np.isfinite(walk_s) & (walk_s == walk_s.min()))
+            cost_s[~self.reachable(vertex)] = np.inf
+            best = np.asarray(np.isfinite(cost_s) & (cost_s == cost_s.min()))
         return best
 
-    def changes_mind(self, seen_free: NDArray[np.bool_], target: int) -> bool:
-        """Whether what is seen makes the agent leave a target that still looks free."""
-        del seen_free, target
+    def drops_target(self, belief: SlotBelief, target: int) -> bool:
+        """Return whether to choose another target although this one was not observed taken."""
+        del belief, target
         return False
 
 
 class GreedyGoalAgent(TargetAgent):
-    """`greedy-goal`: heads for the free-looking slot nearest to the goal, then for the next one."""
+    """`greedy-goal`: drives to the candidate nearest to the goal, then to the next one.
+
+    Nearest means the least arrival cost: where slots have a price, a cheaper one may come before a nearer one.
+    """
 
     name: ClassVar[str] = "greedy-goal"
 
     def choose(
         self,
         candidates: NDArray[np.bool_],
-        seen_free: NDArray[np.bool_],
+        observed_free: NDArray[np.bool_],
         vertex: int,
         previous: int,
     ) -> int:
-        """The shortest walk; among equals the shortest drive."""
-        del seen_free, previous
-        slots, _ = self.routes.nearest(vertex, self.shortest_walks(candidates, vertex))
+        """Return the least arrival cost; among equals the shortest drive."""
+        del observed_free, previous
+        slots, _ = self.routes.nearest(vertex, self.cheapest(candidates, vertex))
         return int(slots[0]) if len(slots) else -1
 
 
 class GreedyDriveAgent(TargetAgent):
-    """`greedy-drive`: heads for the nearest free-looking slot, however far it is from the goal."""
+    """`greedy-drive`: drives to the nearest candidate, however far it is from the goal."""
 
     name: ClassVar[str] = "greedy-drive"
 
     def choose(
         self,
         candidates: NDArray[np.bool_],
-        seen_free: NDArray[np.bool_],
+        observed_free: NDArray[np.bool_],
         vertex: int,
         previous: int,
     ) -> int:
-        """The shortest drive; among equals the shortest walk."""
-        del seen_free, previous
+        """Return the shortest drive; among equals the least arrival cost."""
+        del observed_free, previous
         slots, _ = self.routes.nearest(vertex, candidates)
-        return int(slots[self.problem.walk_s[slots].argmin()]) if len(slots) else -1
+        return int(slots[self.problem.arrival_cost_s[slots].argmin()]) if len(slots) else -1
 
 
 class FirstFreeAgent(TargetAgent):
-    """`first-free`: drives toward the goal and takes the first free slot once it is near enough.
+    """`first-free`: drives toward the goal and takes the first free slot that is near enough.
 
-    If it gets to where the slot nearest to the goal is and has found nothing, it looks on from there:
-    always at the nearest slot not yet seen, and takes whatever is free.
+    Where it has found nothing by the time it reaches the slot nearest to the goal, it goes on to the nearest slot not
+    observed yet, and so on, and takes whatever is free.
 
     Args:
         problem: lot, goal, speeds and costs.
-        within_m: walk from which on a free slot is good enough, m; the lot's median walk where None.
+        within_m: greatest distance from the goal, m, at which a free slot is good enough; the lot's median where
+            None. A slot's price counts as the metres that one walks in as many seconds.
     """
 
     name: ClassVar[str] = "first-free"
 
     def __init__(self, problem: SearchProblem, within_m: float | None = None) -> None:
         super().__init__(problem)
-        walk_m = problem.walk_s * problem.v_walk
-        if within_m is not None and not within_m >= walk_m.min():
+        arrival_m = self.problem.arrival_cost_s * self.problem.v_walk
+        if within_m is not None and not within_m >= arrival_m.min():
             raise InputError(
-                f"within_m is {within_m}, want at least {walk_m.min():.1f}, the shortest walk of the lot"
+                f"within_m is {within_m}, want at least {arrival_m.min():.1f}, the shortest walk of the lot"
             )
-        self._near = walk_m <= (np.median(walk_m) if within_m is None else within_m)
+        self._near = arrival_m <= (np.median(arrival_m) if within_m is None else within_m)
 
     def choose(
         self,
         candidates: NDArray[np.bool_],
-        seen_free: NDArray[np.bool_],
+        observed_free: NDArray[np.bool_],
         vertex: int,
         previous: int,
     ) -> int:
-        """A free slot in sight that is near enough; at first the one at the goal; then the next ones."""
-        good = candidates & seen_free & self._near
+        """Return a slot observed free that is near enough; at first the one at the goal; then the nearest candidate."""
+        good = candidates & observed_free & self._near
         if good.any():
             slots, _ = self.routes.nearest(vertex, good)
             if len(slots):
                 return int(slots[0])
         if previous < 0:
-            candidates = self.shortest_walks(candidates, vertex)
+            candidates = self.cheapest(candidates, vertex)
         slots, _ = self.routes.nearest(vertex, candidates)
         return int(slots[0]) if len(slots) else -1
 
-    def changes_mind(self, seen_free: NDArray[np.bool_], target: int) -> bool:
-        """At the first near slot seen free it stops driving on."""
-        return bool((seen_free & self._near).any()) and not seen_free[target]
+    def drops_target(self, belief: SlotBelief, target: int) -> bool:
+        """Return whether a slot that is near enough was observed free while driving to another one."""
+        return belief.state[target] != OBSERVED_FREE and bool((belief.observed_free & self._near).any())
 
 
 class RandomAgent(SearchAgent[np.random.Generator]):
@@ -182,7 +192,7 @@ class RandomAgent(SearchAgent[np.random.Generator]):
 
     Args:
         problem: lot, goal, speeds and costs.
-        seed: together with the moment of arrival it fixes the whole episode.
+        seed: fixes the episode together with the moment of arrival.
     """
 
     name: ClassVar[str] = "random"
@@ -191,11 +201,13 @@ class RandomAgent(SearchAgent[np.random.Generator]):
         super().__init__(problem)
         self.seed = seed
 
-    def begin(self, observation: Observation) -> np.random.Generator:
-        """A generator that depends on the seed and the moment of arrival alone."""
+    def begin(self, observation: Observation, belief: SlotBelief) -> np.random.Generator:
+        """Return a generator that depends on the seed and the moment of arrival alone."""
+        del belief
         moment = int(np.float32(observation["time"][0]).view(np.uint32))
         return np.random.default_rng([self.seed, moment, int(observation["vertex"])])
 
-    def decide(self, observation: Observation, memory: np.random.Generator) -> int:
-        """One of the actions that the mask allows."""
+    def decide(self, observation: Observation, belief: SlotBelief, memory: np.random.Generator) -> int:
+        """Choose one of the actions that the mask allows."""
+        del belief
         return int(memory.choice(np.flatnonzero(observation["action_mask"])))

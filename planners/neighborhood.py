@@ -1,17 +1,18 @@
-"""The part of a lot that a search can be about, with every drive in it."""
+"""Subgraphs of large lots: the part of the drive graph that a search can be about, with all drives in it."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
-from planners.belief.planning_graph import Ground
-from planners.driving.road_table import RoadTable
+from planners.belief.planning_graph import VIEW, PlanningGraph
+from planners.road_table import RoadTable
 from planners.thesis.heap import pop, push
 from planners.thesis.label_setting import StoppingGraph, settle
 from planners.thesis.mdp import ParkingMDP
@@ -21,79 +22,87 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MOST_VERTICES = 2000
-"""A part's table of drives grows with the square: this many vertices take 40 MB."""
+"""The table of drives of a subgraph grows with the square: this many vertices take 40 MB."""
 _LEAST_VERTICES = 16
 _KEPT = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Neighborhood:
-    """Some vertices of a lot, with numbers of their own, and all drives that stay among them.
+    """A subgraph of a lot, with vertex numbers of its own, and all drives within it.
 
     Attributes:
-        vertices: (k,) int64, their numbers in the lot, ascending, so that slots come first here, too.
-        n_slots: how many of them lie before slots.
+        vertices: (k,) int64, the vertices' numbers in the lot, ascending, so that slots come first here, too.
+        n_slots: how many of them are slots.
         whole: whether it is the whole lot.
-        gate: the vertex in the lot that it spreads from.
+        entry: the vertex of the lot from which it was expanded, and through which the car enters it.
         table: the drives.
-        view_starts: (k + 1,) int64, rows of `view_slots`.
-        view_slots: int64, slots of the neighbourhood in view of each vertex.
-        view_rates: float64, P(each of them is made out).
-        own_rates: (n_slots,) float64, the same of each slot from its own vertex.
-        walk_s: (n_slots,) float64, s.
+        view_starts: (k + 1,) int64, rows of `views`.
+        views: `VIEW` records, slots of the subgraph in view of each vertex.
+        own_rate: (n_slots,) float64, P(each slot is detected from its own vertex).
+        cost_s: (n_slots,) float64, s, what parking costs on arrival.
     """
 
     vertices: IntArray
     n_slots: int
     whole: bool
-    gate: int
+    entry: int
     table: RoadTable
     view_starts: IntArray
-    view_slots: IntArray
-    view_rates: FloatArray
-    own_rates: FloatArray
-    walk_s: FloatArray
+    views: NDArray[Any]
+    own_rate: FloatArray
+    cost_s: FloatArray
 
     @classmethod
-    def of(cls, problem: SearchProblem, vertices: IntArray, gate: int) -> Neighborhood:
-        """That of some vertices, (k,) ascending."""
+    def of(cls, problem: SearchProblem, vertices: IntArray, entry: int) -> Neighborhood:
+        """Make the subgraph of some vertices, (k,) ascending."""
         lot = problem.lot
         whole, n_slots = len(vertices) == lot.n_vertices, int(np.searchsorted(vertices, lot.n_slots))
         neighbors, (starts, slots), rates = lot.neighbors, problem.slots_in_view, problem.sensor_rates.seen
         if not whole:
-            neighbors = _numbered(vertices, lot.neighbors[vertices]).astype(np.int32)
+            neighbors = _renumber(vertices, lot.neighbors[vertices]).astype(np.int32)
             first, last = starts[vertices], starts[vertices + 1]
             viewer = np.repeat(np.arange(len(vertices)), last - first)
             row = np.arange(len(viewer)) - np.repeat(np.cumsum(last - first) - last, last - first)
-            seen = _numbered(vertices, slots[row])
+            seen = _renumber(vertices, slots[row])
             starts = np.searchsorted(viewer[seen >= 0], np.arange(len(vertices) + 1)).astype(np.int64)
             slots, rates = seen[seen >= 0], rates[row][seen >= 0]
-        table, own_rates = RoadTable.over(neighbors, problem.move_s[vertices]), np.zeros(n_slots)
+        views = np.empty(len(slots), VIEW)
+        views["slot"], views["rate"] = slots, rates
+        table, own_rate = RoadTable.over(neighbors, problem.move_s[vertices]), np.zeros(n_slots)
         own = slots == np.repeat(np.arange(len(vertices)), np.diff(starts))
-        own_rates[slots[own]] = rates[own]
-        walk_s = problem.walk_s[vertices[:n_slots]]
-        return cls(vertices, n_slots, whole, gate, table, starts, slots, rates, own_rates, walk_s)
+        own_rate[slots[own]] = rates[own]
+        cost_s = problem.arrival_cost_s[vertices[:n_slots]]
+        return cls(vertices, n_slots, whole, entry, table, starts, views, own_rate, cost_s)
 
     @property
     def slots(self) -> IntArray:
         """The slots' numbers in the lot, (n_slots,)."""
         return self.vertices[: self.n_slots]
 
-    def place(self, vertex: int) -> int:
-        """The number here of one of the lot's vertices, or -1."""
+    def index(self, vertex: int) -> int:
+        """Return the number here of a vertex of the lot, or -1."""
         i = int(np.searchsorted(self.vertices, vertex))
         return i if i < len(self.vertices) and self.vertices[i] == vertex else -1
 
-    def ground(self, problem: SearchProblem, failure_s: float) -> Ground:
-        """What a path search wants to know of it."""
-        return Ground(
+    def in_view(self, vertex: int) -> NDArray[Any]:
+        """Return the `VIEW` records of a vertex, numbered as here."""
+        return self.views[self.view_starts[vertex] : self.view_starts[vertex + 1]]
+
+    def planning_graph(self, problem: SearchProblem, failure_s: float) -> PlanningGraph:
+        """Return the data of a path search.
+
+        Args:
+            problem: that this is a part of.
+            failure_s: s, cost of finding a slot taken on arrival.
+        """
+        return PlanningGraph(
             self.table.seconds,
             self.table.following,
             self.view_starts,
-            self.view_slots,
-            self.view_rates,
-            self.own_rates,
-            self.walk_s,
+            self.views,
+            self.own_rate,
+            self.cost_s,
             problem.wait_s,
             problem.give_up_s,
             failure_s,
@@ -102,17 +111,18 @@ class Neighborhood:
 
 
 class Neighborhoods:
-    """Finds the part of a lot that matters to a search.
+    """Finds the subgraph of a lot that matters to a search.
 
-    A vertex cannot do better than g = drive to it + h, where h is the least drive and walk from there if every slot
-    were free. Taken in the order of g, vertices can be left out from any on: no plan that is expected to take less
-    than the next one's g goes there first. The shortest ways from the start to those taken lie among them. Near the
-    goal that is so from where the car is; while it is farther from the goal than a quarter of what there is room for,
-    it is from where a quickest way comes as near as that, the gate.
+    A vertex cannot do better than g = drive to it + h, where h is the least drive and arrival cost from there if every
+    slot were free. Vertices are added in the order of g; from any of them on the rest can be left out: no plan that is
+    expected to take less than the next one's g goes there first. The shortest routes from the start to the vertices
+    added are among them. Near the goal the expansion starts where the car is. While the car is farther from the goal
+    than a quarter of the vertices that there is room for, it starts where a shortest route first comes that near: the
+    subgraph's entry.
 
     Args:
         problem: the lot, goal and speeds.
-        most_vertices: lots of up to so many are one neighbourhood.
+        most_vertices: lots of up to so many vertices are one neighbourhood.
 
     Raises:
         InputError: too few vertices, or too many for a table.
@@ -136,11 +146,11 @@ class Neighborhoods:
         self._far_s = float(np.partition(self._least_s, most_vertices // 4)[most_vertices // 4])
 
     def toward(self, vertex: int) -> Neighborhood:
-        """Where a search that begins at a vertex will take place. The last few are kept."""
+        """Return where a search that begins at a vertex will take place. The last few are kept."""
         if self._whole is not None:
             return self._whole
         if vertex not in self._kept:
-            self._kept[vertex] = self._spread(
+            self._kept[vertex] = self._expand(
                 self._descend(vertex, self._least_s, self._far_s), self._least_s
             )
             if len(self._kept) > _KEPT:
@@ -148,20 +158,20 @@ class Neighborhoods:
         return self._kept[vertex]
 
     def around(self, vertex: int, taken: IntArray) -> Neighborhood:
-        """Where a search goes on from a vertex when some slots, (k,), were found taken.
+        """Return where a search goes on from a vertex when some slots, (k,), were observed taken.
 
-        It spreads from there; where that reaches no other slot, from the best of them.
+        It is expanded from there; where that reaches no other slot, from the best of them.
         """
         if self._whole is not None:
             return self._whole
         least_s = self._least(taken)
-        near = self._spread(vertex, least_s)
+        near = self._expand(vertex, least_s)
         if np.isin(near.slots, taken).all():
-            near = self._spread(self._descend(vertex, least_s, -np.inf), least_s)
+            near = self._expand(self._descend(vertex, least_s, -np.inf), least_s)
         return near
 
     def _descend(self, vertex: int, least_s: FloatArray, enough_s: float) -> int:
-        """Where a quickest way to the best slot is first within some time, or its end."""
+        """Return where a shortest route to the best slot is first within some time of it, or its end."""
         while enough_s < least_s[vertex] < np.inf:
             onward = self._problem.lot.neighbors[vertex]
             through = np.where(onward >= 0, self._problem.move_s[vertex] + least_s[onward], np.inf)
@@ -171,28 +181,28 @@ class Neighborhoods:
         return vertex
 
     def _least(self, taken: IntArray) -> FloatArray:
-        """The h of every vertex, (n_vertices,) s up to a constant, where all slots but some are free."""
+        """Return h of every vertex, (n_vertices,) s up to a constant, where all slots but some are free."""
         p_free = self._free.copy()
         p_free[taken] = 0.0
         return settle(self._graph, p_free).cost
 
-    def _spread(self, gate: int, least_s: FloatArray) -> Neighborhood:
+    def _expand(self, entry: int, least_s: FloatArray) -> Neighborhood:
         lot = self._problem.lot
-        found = _in_order(gate, least_s, lot.neighbors, self._problem.move_s, self._most)
-        return Neighborhood.of(self._problem, np.sort(found).astype(np.int64), gate)
+        found = _first_by_bound(entry, least_s, lot.neighbors, self._problem.move_s, self._most)
+        return Neighborhood.of(self._problem, np.sort(found).astype(np.int64), entry)
 
 
-def _numbered(vertices: IntArray, numbers: NDArray[np.integer]) -> IntArray:
-    """The places of the lot's numbers among `vertices`; -1 where one is not there."""
+def _renumber(vertices: IntArray, numbers: NDArray[np.integer]) -> IntArray:
+    """Return the positions of vertices of the lot among `vertices`; -1 where one is not there."""
     place = np.minimum(np.searchsorted(vertices, numbers), len(vertices) - 1)
     return np.where(vertices[place] == numbers, place, -1).astype(np.int64)
 
 
 @compiled
-def _in_order(
+def _first_by_bound(
     start: int, least_s: FloatArray, neighbors: NDArray[np.int32], move_s: FloatArray, most: int
 ) -> NDArray[np.int32]:
-    """Up to `most` vertices, by the drive to them and `least_s` from there on: A*'s order, whose bounds those are."""
+    """Return up to `most` vertices in the order of the drive to them plus `least_s`, their bound: A* search."""
     seconds = np.full(len(neighbors), np.inf)
     settled = np.zeros(len(neighbors), np.bool_)
     room = neighbors.shape[1] * most + 1

@@ -1,4 +1,4 @@
-"""Shortest drives over the lot's graph, searched no farther than is asked for."""
+"""Shortest drives over the drive graph, searched only as far as needed."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 
 _KEPT_TARGETS = 64
-_NOBODY = -1
+_NONE = -1
 
 
 class DriveRoutes:
-    """Distances from a vertex, and the way to one.
+    """Drive times from a vertex, and shortest routes.
 
     Args:
-        problem: whose lot is driven, and how fast.
+        problem: the lot and the driving speed.
     """
 
     def __init__(self, problem: SearchProblem) -> None:
@@ -37,26 +37,31 @@ class DriveRoutes:
         self._moves: OrderedDict[int, dict[int, int]] = OrderedDict()
 
     def seconds_from(self, vertex: int) -> FloatArray:
-        """Drive time, (n_vertices,) s, from a vertex to every other; inf where no way leads."""
+        """Return the drive time, (n_vertices,) s, from a vertex to every other; inf where no route leads."""
         nowhere = np.zeros(0, dtype=np.bool_)
         return self._outward(vertex, nowhere)[0]
 
     def nearest(self, vertex: int, slots: NDArray[np.bool_]) -> tuple[NDArray[np.int64], float]:
-        """Those of some slots, (n_slots,) bool, that are the shortest drive away, ascending, and that drive, s.
+        """Return those of some slots that are nearest by drive.
 
-        None, and inf, where no way leads to any.
+        Args:
+            vertex: where the car is.
+            slots: (n_slots,) bool, to choose from.
+
+        Returns:
+            (k,) int64, ascending, the nearest slots, and their drive time, s; none and inf where no route leads to any.
         """
         seconds, reached = self._outward(vertex, slots)
-        if reached == _NOBODY:
+        if reached == _NONE:
             return np.empty(0, dtype=np.int64), np.inf
         least = float(seconds[reached])
         return np.flatnonzero(slots & (seconds[: len(slots)] == least)), least
 
     def move_toward(self, vertex: int, target: int) -> int:
-        """The first move of a shortest way.
+        """Return the first move of a shortest route.
 
         Raises:
-            InputError: no way leads to the target, or the car is there already.
+            InputError: no route leads to the target, or the car is there already.
         """
         moves = self._moves.setdefault(target, {})
         self._moves.move_to_end(target)
@@ -65,14 +70,20 @@ class DriveRoutes:
         if vertex not in moves:
             moves |= self._moves_along(vertex, target)
         if vertex not in moves:
-            raise InputError(f"no way leads on from vertex {vertex} to vertex {target}")
+            raise InputError(f"no route leads from vertex {vertex} to vertex {target}")
         return moves[vertex]
 
-    def way(self, vertex: int, target: int) -> Iterator[tuple[int, int]]:
-        """A shortest way, hop by hop: the move and the vertex that it leads to; nothing where the car is there.
+    def path(self, vertex: int, target: int) -> tuple[int, ...]:
+        """Return the vertices of a shortest route without the first; none where there is no target (-1) or no route."""
+        if target < 0 or not np.isfinite(self.seconds_from(vertex)[target]):
+            return ()
+        return tuple(v for _, v in self.hops(vertex, target))
+
+    def hops(self, vertex: int, target: int) -> Iterator[tuple[int, int]]:
+        """Yield the moves of a shortest route and the vertices that they lead to; nothing where the car is there.
 
         Raises:
-            InputError: no way leads to the target.
+            InputError: no route leads to the target.
         """
         while vertex != target:
             move = self.move_toward(vertex, target)
@@ -80,18 +91,18 @@ class DriveRoutes:
             yield move, vertex
 
     def _outward(self, vertex: int, ends: NDArray[np.bool_]) -> tuple[FloatArray, int]:
-        """Drive times up to the nearest of `ends` and the place of one, or `_NOBODY`; later ones are upper bounds."""
+        """Return drive times, exact up to the nearest of `ends` and upper bounds beyond, and that one's vertex."""
         seconds = np.full(len(self._neighbors), np.inf)
         reached = _search(self._out_start, self._out_target, self._out_s, vertex, ends, seconds)
         return seconds, int(reached)
 
     def _moves_along(self, vertex: int, target: int) -> dict[int, int]:
-        """The moves of a shortest way, by the vertices that they are made at; none where no way leads on."""
+        """Return the moves of a shortest route by the vertex that each is made at; none where there is no route."""
         seconds = np.full(len(self._neighbors), np.inf)
         end = np.zeros(vertex + 1, dtype=np.bool_)
         end[vertex] = True
         moves: dict[int, int] = {}
-        if _search(self._in_start, self._in_source, self._in_s, target, end, seconds) == _NOBODY:
+        if _search(self._in_start, self._in_source, self._in_s, target, end, seconds) == _NONE:
             return moves
         while vertex != target:
             following = self._neighbors[vertex]
@@ -113,12 +124,12 @@ def _search(
     """Dijkstra's algorithm until the first of `ends`, (k,) bool of the first k vertices, is settled.
 
     Args:
-        start: (n + 1,) the edges of v are rows `start[v]` to `start[v + 1]` of the next two.
-        leads_to: (m,) the vertex at an edge's other end; -1 is no edge.
+        start: (n + 1,) int32, the edges of v are rows `start[v]` to `start[v + 1]` of the next two.
+        leads_to: (m,) int32, the vertex at an edge's other end; -1 is no edge.
         edge_s: (m,) s.
-        origin: where it starts.
-        ends: where it may stop.
-        seconds: (n,) inf, filled: exact up to where it stopped, since every edge takes time; upper bounds beyond.
+        origin: the first vertex.
+        ends: vertices at which the search may stop.
+        seconds: (n,) s, all inf; filled with drive times, exact up to where it stopped and upper bounds beyond.
 
     Returns:
         One of the nearest of `ends`, or -1.
@@ -138,4 +149,4 @@ def _search(
             if u >= 0 and far + edge_s[e] < seconds[u]:
                 seconds[u] = far + edge_s[e]
                 size = push(keys, vertices, size, seconds[u], u)
-    return _NOBODY
+    return _NONE

@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, overload
 
 import numba
-from numba.core import event
+from numba.core import event, types
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache, _CacheLocator
 from numba.core.serialize import dumps
 from platformdirs import user_cache_path
@@ -68,11 +68,27 @@ def _compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     dispatcher = numba.njit(**options)(function)
     if numba.config.DISABLE_JIT:
         return dispatcher
+    _ignore_literals(dispatcher)
     try:
         dispatcher._cache = _SourceKeyedCache(function, options)
     except (OSError, RuntimeError):
         dispatcher._cache = NullCache()  # the function stands in no file that can be read
     return dispatcher
+
+
+def _ignore_literals(dispatcher: Any) -> None:
+    """Let compiled callers share one version of a function for `f(0)` and `f(n)`.
+
+    Numba types a constant, and a variable whose first value is one, as a type of its own, and would compile the
+    function, and all that it calls, once more for it.
+    """
+    template_of = dispatcher.get_call_template
+
+    def get_call_template(args: Any, kws: Any) -> Any:
+        values = {name: types.unliteral(kind) for name, kind in dict(kws).items()}
+        return template_of(tuple(types.unliteral(kind) for kind in args), values)
+
+    dispatcher.get_call_template = get_call_template
 
 
 class _Clock:

@@ -23,14 +23,17 @@ def features(lot):
 def small_lot(seed: int, shapes=SHAPES):
     """Problem, forecast and entry: rows and aisles, any goal, any speeds; 324 seeds are three full rounds.
 
-    The slots' chances rise with the walk, are all the same, or follow a beta distribution.
+    The slots' chances rise with the walk, are all the same, or follow a beta distribution. Odd seeds have slots with a
+    price.
     """
     rng = np.random.default_rng([7, seed])
     plain = grid_lot(*shapes[seed % len(shapes)], pitch=PITCHES[seed // 6 % 3])
     west, south, east, north = plain.bounds()
     goal = [[rng.uniform(west - 10.0, east + 10.0), rng.uniform(south - 10.0, north + 10.0)]]
     problem = SearchProblem(
-        lot=ParkingLot(**{**features(plain), "goals": np.array(goal)}),
+        lot=ParkingLot(
+            **{**features(plain), "goals": np.array(goal), "slot_parking_cost_s": prices(plain, seed)}
+        ),
         v_drive=rng.uniform(1.5, 4.0),
         v_walk=rng.uniform(0.8, 1.6),
         give_up_s=300.0,
@@ -45,6 +48,11 @@ def small_lot(seed: int, shapes=SHAPES):
     else:
         free = rng.beta(4.0 * mean, 4.0 * (1.0 - mean), n)
     return problem, 1.0 - np.clip(free, 0.01, 0.99), int(problem.lot.entry_vertices[0])
+
+
+def prices(lot, seed):
+    """What parking costs in each slot, s."""
+    return np.random.default_rng([8, seed]).choice([0.0, 5.0, 40.0], lot.n_slots) * (seed % 2)
 
 
 def cut_in_two():

@@ -54,9 +54,9 @@ def test_an_agent_of_your_own_is_named_by_module_and_class(tmp_path, monkeypatch
         "    def __init__(self, problem, action=4):\n"
         "        super().__init__(problem)\n"
         "        self.action, self.given = action, problem\n"
-        "    def begin(self, observation):\n"
+        "    def begin(self, observation, belief):\n"
         "        return None\n"
-        "    def decide(self, observation, memory):\n"
+        "    def decide(self, observation, belief, memory):\n"
         "        return self.action\n"
         "nothing = 3\n"
     )
@@ -258,7 +258,7 @@ def test_the_oracle_waits_for_a_slot_that_is_about_to_come_free():
 def test_the_oracle_must_be_shown_the_future():
     scenario = make_scenario("mini")
     env = gym.make("parkenv/Search-v1", scenario=scenario)
-    with pytest.raises(RuntimeError, match="reveal"):
+    with pytest.raises(RuntimeError, match="prepare"):
         make_agent("oracle", scenario).predict(env.reset(seed=0)[0])
 
 

@@ -1,16 +1,19 @@
-"""The rules of the house: who may import whom, and what importing costs."""
+"""The architecture: which module may import which, and what importing costs."""
 
 import ast
+import importlib
 import subprocess
 import sys
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
 
+PACKAGES = ("sim_sensors", "parkenv", "planners")
 MAY_SEE_PLANNERS = ("parkenv/evaluation/", "parkenv/cli/")
-# In this order, a package imports those before it only.
+# A package imports the packages before it only.
 LAYERS = (
     "errors",
     "files",
@@ -28,14 +31,38 @@ LAYERS = (
 PLANNERS_MAY_SEE = ("parkenv.world", "parkenv.belief", "parkenv.driving", "parkenv.errors", "parkenv.files")
 
 
-def imports(path):
-    """Every module that a file imports, at any depth of its code."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+def import_statements(path):
+    """Every import of a file, at any depth of its code, but those for type checking alone."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in ast.walk(tree):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            node.body = []
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            yield from ((alias.name, None) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            yield node.module
+            yield from ((node.module, alias.name) for alias in node.names)
+
+
+def imports(path):
+    """Every module that a file imports from."""
+    return {module for module, _ in import_statements(path)}
+
+
+def import_graph(root):
+    """The modules below a folder, and which of them each imports."""
+    modules = {
+        ".".join(path.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): path
+        for package in PACKAGES
+        for path in (root / package).rglob("*.py")
+    }
+    graph = {}
+    for module, path in modules.items():
+        # `from package import module` imports the module.
+        named = {(f"{m}.{n}" if f"{m}.{n}" in modules else m) for m, n in import_statements(path)}
+        graph[module] = (named & modules.keys()) - {module}
+    return graph
 
 
 def sources(package):
@@ -59,6 +86,37 @@ def test_the_world_never_imports_a_planner(path):
         assert not [m for m in imports(path) if m.split(".")[0] == "planners"]
 
 
+@pytest.mark.parametrize("path", sources("parkenv"), ids=lambda p: str(p.relative_to(ROOT)))
+def test_packages_import_those_below_them_only(path):
+    here = path.relative_to(ROOT / "parkenv").with_suffix("").parts[0]
+    if here == "__init__":
+        return
+    above = LAYERS[LAYERS.index(here) + 1 :]
+    assert not [m for m in imports(path) if m.startswith("parkenv.") and m.split(".")[1] in above]
+
+
+def test_parkenv_holds_nothing_but_its_layers():
+    entries = {path.name for path in (ROOT / "parkenv").iterdir() if path.name != "__pycache__"}
+    packages = {layer for layer in LAYERS if layer != "errors"}
+    assert entries == packages | {"__init__.py", "errors.py", "py.typed"}
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    TopologicalSorter(import_graph(ROOT)).prepare()  # raises CycleError, which names the modules
+
+
+def test_a_circle_is_found_within_functions_and_not_for_type_checking(tmp_path):
+    for package in PACKAGES:
+        (tmp_path / package).mkdir()
+    one, two = tmp_path / "parkenv" / "one.py", tmp_path / "parkenv" / "two.py"
+    one.write_text("from parkenv import two\n")
+    two.write_text("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from parkenv.one import f\n")
+    TopologicalSorter(import_graph(tmp_path)).prepare()
+    two.write_text("def g():\n    from parkenv.one import f\n    return f\n")
+    with pytest.raises(CycleError):
+        TopologicalSorter(import_graph(tmp_path)).prepare()
+
+
 def test_importing_parkenv_is_light():
     program = (
         "import sys, parkenv;"
@@ -76,3 +134,23 @@ def test_the_command_line_answers_without_loading_the_world():
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout
     assert loaded.strip() == "[]"
+
+
+def test_a_laser_alone_loads_no_camera():
+    program = (
+        "import sys; from sim_sensors.laser import LaserScanner;"
+        "print([m for m in sys.modules if m.startswith('sim_sensors.camera') or m == 'cv2'])"
+    )
+    loaded = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout
+    assert loaded.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    "package", ["sim_sensors", "sim_sensors.camera", "sim_sensors.laser", "sim_sensors.vehicles"]
+)
+def test_every_name_that_a_package_lists_can_be_imported(package):
+    module = importlib.import_module(package)
+    for name in module.__all__:
+        assert getattr(module, name).__name__ == name

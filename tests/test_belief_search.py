@@ -6,6 +6,7 @@ import pytest
 from small_lots import cut_in_two, features, small_lot
 
 from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorModel, make_scenario
+from parkenv.belief.forecast_error import ForecastErrorModel
 from parkenv.evaluation.experiments.compare import Case, at_occupancy
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.statistics import mean_interval
@@ -14,10 +15,9 @@ from parkenv.world.sensor_model import SensorBand
 from planners import make_agent
 from planners.belief.agent import WORK_PER_MS
 from planners.belief.best_path import best_path
-from planners.belief.forecast_error import MapDoubt
-from planners.belief.planning_graph import MOST_STEPS, shows
+from planners.belief.planning_graph import MOST_STOPS, detects_missed
 from planners.bounds.exact import ExactSolution
-from planners.thesis.expected_time import expected_time
+from planners.bounds.expected_time import expected_time
 
 
 def gap(seed, **options):
@@ -38,7 +38,7 @@ def has_large_trees(seed):
 
 
 def test_it_stays_near_the_optimum_on_small_lots():
-    gaps = np.array([gap(seed, trusting=True) for seed in LOTS if not has_large_trees(seed)])
+    gaps = np.array([gap(seed, trust_forecast=True) for seed in LOTS if not has_large_trees(seed)])
     assert len(gaps) > 25
     assert gaps.min() > -1e-3
     assert gaps.mean() < 0.02
@@ -47,7 +47,7 @@ def test_it_stays_near_the_optimum_on_small_lots():
 
 @pytest.mark.slow
 def test_it_stays_near_the_optimum_where_there_is_much_to_choose_and_doubting_a_right_map_costs_little():
-    gaps = np.array([gap(seed, trusting=True) for seed in LOTS if has_large_trees(seed)])
+    gaps = np.array([gap(seed, trust_forecast=True) for seed in LOTS if has_large_trees(seed)])
     assert len(gaps) > 10
     assert gaps.min() > -1e-3
     assert gaps.mean() < 0.5
@@ -92,7 +92,7 @@ def choices(scenario, monkeypatch, seed=1, **options):
 def test_decisions_keep_to_their_budget(monkeypatch):
     scenario = at_occupancy(make_scenario("campus"), 0.95)
     n = scenario.lot.n_slots
-    one_candidate = 30 * (MOST_STEPS + n + MOST_STEPS) + n
+    one_candidate = 30 * (MOST_STOPS + n + MOST_STOPS) + n
     quick, usual, slow = (
         np.array([choice.work for _, choice in choices(scenario, monkeypatch, budget_ms=ms)])
         for ms in (0.2, 5.0, 50.0)
@@ -128,57 +128,59 @@ def test_doubt_costs_nothing_where_cars_drive_past_what_is_free(level):
     observation, _ = gym.make("parkenv/Search-v1", scenario=scenario).reset(seed=5)
     expected = []
     for trusting in (True, False):
-        _, memory = make_agent("belief", scenario, trusting=trusting).predict(observation)
+        _, memory = make_agent("belief", scenario, trust_forecast=trusting).predict(observation)
         expected.append(memory.expected_s)
     assert expected[1] == pytest.approx(expected[0], rel=0.02)
 
 
-def test_what_it_saw_tells_how_long_cars_stay():
-    """The rate is not observed; the way in which a sighting fades is."""
-    scenario = make_scenario("street")
-    agent = make_agent("belief", scenario)
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
-    observation, _ = env.reset(seed=2)
-    memory = None
-    for _ in range(12):
-        action, memory = agent.predict(observation, memory)
-        observation, _, over, _, _ = env.step(action)
-        if over:
-            break
-    told = memory.leaving[np.isfinite(memory.leaving)]
-    assert len(told) > 0
-    # Cars stay half an hour on average.
-    np.testing.assert_allclose(told, 1.0 / 1800.0, rtol=0.02)
+# --- forecast errors ---------------------------------------------------------------------------------
 
 
-# --- doubt -------------------------------------------------------------------------------------------
-
-
-def test_doubt_moves_with_what_is_seen_and_not_without():
+def test_the_day_is_believed_to_differ_as_far_as_observations_say():
     rng = np.random.default_rng(0)
     forecast, walk = rng.uniform(0.2, 0.9, 60), rng.uniform(10.0, 90.0, 60)
-    doubt = MapDoubt(forecast, walk)
-    np.testing.assert_allclose(doubt.p_occupied(), forecast, atol=1e-6)
-    np.testing.assert_allclose(MapDoubt(forecast, walk, trusting=True).p_occupied(), forecast)
+    day = ForecastErrorModel().prior(forecast, walk)
+    np.testing.assert_allclose(day.p_occupied(), forecast, atol=1e-6)
     near = np.argsort(walk)[:15]
-    doubt.look(near, np.ones(15, dtype=bool))
-    fuller = doubt.p_occupied()
+    day.update(near, np.ones(15, dtype=bool))
+    fuller = day.p_occupied()
     assert (fuller > forecast).all()
-    # It learns more of slots as near as those that it saw.
+    # It learns more about slots as near as those that it observed.
     moved = np.log(fuller / (1 - fuller)) - np.log(forecast / (1 - forecast))
     assert moved[near].mean() > 1.5 * moved[np.argsort(walk)[-15:]].mean()
 
 
-def test_doubt_stays_small_where_the_map_is_right():
+def test_a_forecast_without_errors_is_believed_whatever_is_observed():
+    forecast, walk = np.linspace(0.2, 0.9, 60), np.arange(60.0)
+    day = ForecastErrorModel.none().prior(forecast, walk)
+    day.update(np.arange(15), np.ones(15, dtype=bool))
+    np.testing.assert_allclose(day.p_occupied(), forecast)
+
+
+def test_the_belief_stays_near_a_forecast_that_is_right():
     rng = np.random.default_rng(1)
     forecast, walk = rng.uniform(0.1, 0.9, 200), rng.uniform(10.0, 90.0, 200)
     off = []
     for _ in range(20):
-        doubt = MapDoubt(forecast, walk)
-        seen = rng.permutation(200)[:60]
-        doubt.look(seen, rng.random(60) < forecast[seen])
-        off.append(np.abs(doubt.p_occupied() - forecast).mean())
+        day = ForecastErrorModel().prior(forecast, walk)
+        observed = rng.permutation(200)[:60]
+        day.update(observed, rng.random(60) < forecast[observed])
+        off.append(np.abs(day.p_occupied() - forecast).mean())
     assert np.mean(off) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"events": {1.0: 0.6}, "shifts": {(1.0, 1.0): 0.5}}, "below 1 in sum"),
+        ({"shifts": {(1.0, 1.0): -0.1}}, "at least 0"),
+        ({"p_occupied_at_event": 1.0}, "p_occupied_at_event is 1.0"),
+        ({"half_events_at": -1.0}, "half_events_at is -1.0"),
+    ],
+)
+def test_a_bad_forecast_error_model_is_refused(changes, told):
+    with pytest.raises(InputError, match=told):
+        ForecastErrorModel(**changes)
 
 
 # --- where things go wrong ---------------------------------------------------------------------------
@@ -259,7 +261,7 @@ def test_it_expects_slots_that_it_saw_taken_to_come_free():
         memory, over = None, False
         while not over:
             action, memory = agent.predict(observation, memory)
-            if not (memory.kind[: lot.n_slots // 2] == 0).any():
+            if not (memory.state[: lot.n_slots // 2] == 0).any():
                 expected.append(memory.expected_s)
             observation, _, terminated, truncated, info = env.step(action)
             over = terminated or truncated
@@ -319,8 +321,8 @@ def test_a_path_is_kept_to_until_something_is_seen_unless_another_is_better_than
 
 def test_views_show_what_worse_ones_missed():
     """A view makes out all that one with a lower rate does; of what a better one missed it shows nothing."""
-    assert shows(1.0, 0.0)
-    assert shows(1.0, 0.9)
-    assert not shows(0.9, 0.9)
-    assert not shows(1.0, 1.0)
-    assert not shows(0.3, 0.0), "likelier not to"
+    assert detects_missed(1.0, 0.0)
+    assert detects_missed(1.0, 0.9)
+    assert not detects_missed(0.9, 0.9)
+    assert not detects_missed(1.0, 1.0)
+    assert not detects_missed(0.3, 0.0), "likelier not to"

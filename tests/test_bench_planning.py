@@ -12,7 +12,7 @@ def test_rows_have_the_keys_of_every_bench_and_stand_beside_the_thesis():
     rows = planning_rows(seconds=0.01, largest=2_000)
     keys = {"part", "case", "value", "unit", "peer", "peer_value", "ratio"}
     assert all(set(row) == keys and row["value"] > 0 for row in rows)
-    assert {row["part"] for row in rows} == {"plan", "plan again", "search"}
+    assert {row["part"] for row in rows} == {"plan", "replan", "search"}
     by_thesis = [row for row in rows if row["peer"] == "policy iteration, sparse LU"]
     assert len(by_thesis) == 2
     assert all(row["ratio"] > 0 for row in by_thesis)

@@ -14,11 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from parkenv import InputError, Traffic
+from parkenv.driving.collision_world import CollisionWorld, ObstacleKind
 from parkenv.driving.drivable_area import DrivableArea
-from parkenv.driving.lot_space import LotSpace, Thing
 from parkenv.driving.parking_task import AREA, ParkingTasks
 from parkenv.driving.vehicle import VehicleParameters
-from parkenv.envs.drive import CONTROL_S, DriveEnv, goal_errors
+from parkenv.envs.drive import CONTROL_S, DriveEnv
+from parkenv.envs.drive_goals import goal_errors
 from parkenv.lots import packaged_lot, write_lot
 from parkenv.world.lot import corner_points
 from sim_sensors.laser.scanner import LaserScanner
@@ -260,9 +261,9 @@ def test_tasks_are_what_they_say(seed, lot):
     """Nothing is touched at the start nor at the target, and the slot is as large as the room says."""
     tasks = tasks_on(lot)
     task = tasks.draw(seed)
-    space = LotSpace(task.vehicle, task.obstacles)
-    assert space.touched(*task.start[:3]) == Thing.NOTHING
-    assert space.touched(*task.vehicle.at_rear_axle(task.target)) == Thing.NOTHING
+    space = CollisionWorld(task.vehicle, task.obstacles)
+    assert space.touched(*task.start[:3]) == ObstacleKind.NOTHING
+    assert space.touched(*task.vehicle.at_rear_axle(task.target)) == ObstacleKind.NOTHING
     i = tasks.lot.slot_ids.index(task.slot_id)
     assert task.size == (tasks.lot.slot_length[i], tasks.lot.slot_width[i])
     assert (task.room > 0.0).all()
@@ -289,7 +290,7 @@ def test_slack_clears_the_slots_beside_and_distance_moves_the_start(campus):
         rooms = []
         tasks = ParkingTasks(campus, kinds=("perpendicular",), occupancy=1.0, slack=slack)
         for task in map(tasks.draw, range(20)):
-            cars = task.in_slot_frame(task.obstacles.only(Thing.PARKED_CAR).corners)
+            cars = task.in_slot_frame(task.obstacles.only(ObstacleKind.PARKED_CAR).corners)
             rooms.append((np.abs(cars[..., 1]) - 1.25)[np.abs(cars[..., 0]) < 2.5].min())
         return min(rooms)
 
@@ -337,12 +338,12 @@ def test_the_obstacle_map_holds_everything_near_in_the_frame_of_the_slot():
     observation, _ = env.reset(seed=3)
     task = env.unwrapped.task
     cars = observation["cars"][observation["cars"][:, 0, 0] < 999.0]
-    assert len(cars) == (task.obstacles.thing == Thing.PARKED_CAR).sum()
+    assert len(cars) == (task.obstacles.kind == ObstacleKind.PARKED_CAR).sum()
     lines = observation["lines"][observation["lines"][:, 0, 0] < 999.0]
-    assert len(lines) == (task.obstacles.thing != Thing.PARKED_CAR).sum()
+    assert len(lines) == (task.obstacles.kind != ObstacleKind.PARKED_CAR).sum()
     c, s = math.cos(task.slot[2]), math.sin(task.slot[2])
     back = cars @ np.array([[c, s], [-s, c]]) + task.slot[:2]
-    np.testing.assert_allclose(back, task.obstacles.only(Thing.PARKED_CAR).corners, atol=1e-4)
+    np.testing.assert_allclose(back, task.obstacles.only(ObstacleKind.PARKED_CAR).corners, atol=1e-4)
 
 
 CROWD = Traffic(cars=6, pedestrians=8)
@@ -383,7 +384,7 @@ def test_a_state_with_others_goes_on_the_same():
     two.set_state(kept)
     for a in rest:
         np.testing.assert_equal(two.step([0.2, 0.3]), a)
-    with pytest.raises(InputError, match="state has 14 who move, this environment 0"):
+    with pytest.raises(InputError, match="state has 14 road users, this environment 0"):
         make("street").unwrapped.set_state(kept)
 
 
@@ -471,7 +472,7 @@ def test_a_start_in_collision_is_refused_and_a_free_one_is_taken():
     lot = env.tasks.lot
     other = next(i for i in range(lot.n_slots) if lot.slot_ids[i] != env.task.slot_id)
     taken = CAR.at_rear_axle(np.array([*lot.slot_xy[other], lot.slot_yaw[other]]))
-    with pytest.raises(InputError, match="the car touches a parked car there, want a free place"):
+    with pytest.raises(InputError, match="the car touches a parked car there, want a free pose"):
         env.reset(seed=0, options={"start": taken})
     with pytest.raises(InputError, match="reset has no option begin"):
         env.reset(options={"begin": free})

@@ -19,28 +19,43 @@ from typer.testing import CliRunner
 
 from parkenv import make_scenario
 from parkenv.cli import app
-from parkenv.driving.lot_space import LotSpace
+from parkenv.driving.collision_world import CollisionWorld
 from parkenv.driving.vehicle import SPEED, STATE_SIZE, YAW, VehicleParameters
 from parkenv.envs.drive import DriveEnv
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.workers import HERE
 from parkenv.evaluation.figures.learning_curves import across_seeds, save_success_curves
-from parkenv.evaluation.training.configs import DRIVE_RECIPES, WAY_IN
-from parkenv.evaluation.training.drive_batch import CONTACT, LEFT, PARKED, UNDER_WAY, DriveBatch, PreparedTask
-from parkenv.evaluation.training.drive_hindsight import EndingGoals
-from parkenv.evaluation.training.drive_practice import (
+from parkenv.evaluation.training.configs import DRIVE_CONFIGS, WAY_IN
+from parkenv.evaluation.training.drive_batch import (
+    CONTACT,
+    LEFT_AREA,
+    PARKED,
+    RUNNING,
+    DriveBatch,
+    PreparedTask,
+)
+from parkenv.evaluation.training.drive_replay_buffer import TerminalGoalReplayBuffer
+from parkenv.evaluation.training.drive_training import DriveTraining, evaluate_parking, parked_on
+from parkenv.evaluation.training.drive_training_env import (
     MASTERED,
     STOOD,
     TRIED,
-    DrivePractice,
-    places_of,
-    way_in,
+    DriveTrainingEnv,
+    planned_path,
+    slot_groups,
 )
-from parkenv.evaluation.training.drive_training import DriveTraining, parked_by, parked_on
 from parkenv.evaluation.training.rl_training import read_curve, train_one
 from parkenv.lots import packaged_lot
-from planners.driving.driver_view import BEAMS, FARTHEST_M, HOLD, DriverView, Outlines, command, see
-from planners.driving.drivers import make_driver
+from planners.driving.parking_agents import make_parking_agent
+from planners.driving.policy_interface import (
+    ACTION_REPEAT,
+    BEAMS,
+    FARTHEST_M,
+    Outlines,
+    PolicyInterface,
+    encode_observation,
+    pedal_command,
+)
 from planners.learned import ModelCard
 
 MINI, STREET = packaged_lot("mini"), packaged_lot("street")
@@ -62,7 +77,7 @@ def training_of(algorithm, steps, every=None, lots=(MINI,)):
     return DriveTraining(algorithm, steps, every or steps // 2, lots, EXAMINED)
 
 
-FULL_SIZE = dict(DRIVE_RECIPES)
+FULL_SIZE = dict(DRIVE_CONFIGS)
 SMALL = {
     "ppo": {"n_steps": 32, "batch_size": 256, "n_epochs": 2},
     "sac": {"learning_starts": 800, "batch_size": 32, "gradient_steps": 1},
@@ -74,9 +89,9 @@ SMALL = {
 def small():
     """The recipes, with networks and batches that are fast to train."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, recipe in DRIVE_RECIPES.items():
+        for name, recipe in DRIVE_CONFIGS.items():
             changed = {**recipe.settings, **SMALL[name], "policy_kwargs": {"net_arch": [16]}}
-            patch.setitem(DRIVE_RECIPES, name, dataclasses.replace(recipe, n_envs=16, settings=changed))
+            patch.setitem(DRIVE_CONFIGS, name, dataclasses.replace(recipe, n_envs=16, settings=changed))
         yield
 
 
@@ -95,7 +110,7 @@ def trained(request, tmp_path_factory):
 def test_the_batch_drives_as_the_environment_does(lot):
     n, rng = 8, np.random.default_rng(0)
     envs = [DriveEnv(lot=lot, obstacle_map=True, reward="dense") for _ in range(n)]
-    batch, pedals = DriveBatch(n), DriverView(VehicleParameters()).pedals
+    batch, pedals = DriveBatch(n), PolicyInterface(VehicleParameters()).pedals
     for i, env in enumerate(envs):
         env.tasks = envs[0].tasks
         env.reset(seed=i)
@@ -107,16 +122,16 @@ def test_the_batch_drives_as_the_environment_does(lot):
         before = batch.status.copy()
         batch.drive(actions)
         seen = batch.observation()
-        for i in np.flatnonzero(before == UNDER_WAY):
+        for i in np.flatnonzero(before == RUNNING):
             env, reward = envs[i], 0.0
-            for _ in range(HOLD):
-                pedal = command(actions[i], env.state.vehicle[SPEED], pedals)
+            for _ in range(ACTION_REPEAT):
+                pedal = pedal_command(actions[i], env.state.vehicle[SPEED], pedals)
                 observation, seconds, over, _, info = env.step([pedal, actions[i, 1]])
                 reward += seconds
                 if over:
                     break
-            failed = LEFT if info["contact"] == "left the area" else CONTACT
-            wanted = PARKED if info["is_success"] else failed if info["contact"] else UNDER_WAY
+            failed = LEFT_AREA if info["contact"] == "left the area" else CONTACT
+            wanted = PARKED if info["is_success"] else failed if info["contact"] else RUNNING
             assert batch.status[i] == wanted
             assert batch.time[i] == pytest.approx(info["time_s"])
             np.testing.assert_allclose(seen["achieved_goal"][i], observation["achieved_goal"], atol=1e-4)
@@ -150,7 +165,7 @@ def test_a_drive_that_stands_in_its_slot_has_parked():
 @settings(max_examples=60)
 def test_room_is_measured_from_the_cars_outline_wherever_it_stands(x, y, yaw, gap, turned):
     """A long wall across the way, `gap` before the car's front; the car and the wall are moved and turned together."""
-    view = DriverView(VehicleParameters())
+    view = PolicyInterface(VehicleParameters())
     front = view.half[0] + gap
     wall = np.array([[front, -50.0, front, 50.0]])
     c, s = math.cos(yaw), math.sin(yaw)
@@ -160,7 +175,9 @@ def test_room_is_measured_from_the_cars_outline_wherever_it_stands(x, y, yaw, ga
     state = np.zeros(STATE_SIZE)
     state[YAW] = yaw
     seen = np.empty(8 + BEAMS, np.float32)
-    see(np.array([x, y]), state, (edges, np.array([0, 1]), circle), view.body, np.zeros(5), seen)
+    encode_observation(
+        np.array([x, y]), state, (edges, np.array([0, 1]), circle), view.body, np.zeros(5), seen
+    )
     room = 1.0 / seen[8:] - 1.0
     angle = 2.0 * math.pi / BEAMS * np.arange(BEAMS)
     with np.errstate(divide="ignore"):
@@ -187,7 +204,7 @@ def test_a_decision_asks_for_a_speed_and_gets_it(asked, reached):
     task = DriveEnv(lot=MINI).tasks.draw(0)
     batch = DriveBatch(1)
     batch.start(0, PreparedTask(task))
-    batch._things[0] = 0  # nothing in the way
+    batch._obstacles[0] = 0  # nothing in the way
     batch.state[0, SPEED] = 0.7
     for _ in range(6):
         batch.drive(np.array([[asked, 0.0]], np.float32))
@@ -198,12 +215,12 @@ def test_a_decision_asks_for_a_speed_and_gets_it(asked, reached):
 
 
 def practice_of(algorithm, n=4, lots=(MINI, STREET), levels=None):
-    return DrivePractice(n, places_of(lots), DRIVE_RECIPES[algorithm], levels)
+    return DriveTrainingEnv(n, slot_groups(lots), DRIVE_CONFIGS[algorithm], levels)
 
 
 def test_places_are_the_kinds_of_slots_that_there_are():
     lots = (STREET, packaged_lot("campus"), MINI)
-    assert [(p.lot.name, p.kind) for p in places_of(lots)] == [
+    assert [(p.lot.name, p.kind) for p in slot_groups(lots)] == [
         ("campus", "perpendicular"), ("mini", "perpendicular"), ("campus", "oblique"), ("street", "parallel"),
     ]  # fmt: skip
 
@@ -232,21 +249,21 @@ def test_equal_seeds_give_equal_practice_and_ends_are_told():
 def test_a_level_is_mastered_by_parking_and_by_nothing_else():
     env = practice_of("ppo")
     for _ in range(TRIED):
-        env._note("parallel", 0, True)
-        env._note("perpendicular", 5, True)  # of another level
+        env._record_outcome("parallel", 0, True)
+        env._record_outcome("perpendicular", 5, True)  # of another level
     assert env.levels == {"perpendicular": 0, "parallel": 1}
     for k in range(3 * TRIED):
-        env._note("parallel", 1, k % 100 < 100 * MASTERED - 1)
+        env._record_outcome("parallel", 1, k % 100 < 100 * MASTERED - 1)
     assert env.levels["parallel"] == 1
     for _ in range(TRIED * 20):
-        env._note("parallel", env.levels["parallel"], True)
-    assert env.levels["parallel"] == len(DRIVE_RECIPES["ppo"].curriculum) - 1
+        env._record_outcome("parallel", env.levels["parallel"], True)
+    assert env.levels["parallel"] == len(DRIVE_CONFIGS["ppo"].curriculum) - 1
 
 
 def test_levels_make_tasks_harder():
     """At the first level the car is in its slot or just before it; at the last one it is on the lane."""
     away = []
-    for level in (0, len(DRIVE_RECIPES["ppo"].curriculum) - 1):
+    for level in (0, len(DRIVE_CONFIGS["ppo"].curriculum) - 1):
         env = practice_of("ppo", 64, levels=dict.fromkeys(("perpendicular", "parallel"), level))
         env.seed(0)
         seen = env.reset()
@@ -254,11 +271,11 @@ def test_levels_make_tasks_harder():
     assert away[0] < 2.0 < 5.0 < away[1]
 
 
-@pytest.mark.parametrize("place", places_of((MINI, STREET)), ids=lambda place: place.kind)
+@pytest.mark.parametrize("place", slot_groups((MINI, STREET)), ids=lambda place: place.kind)
 def test_the_way_in_leads_from_the_slot_back_to_the_start_and_touches_nothing(place):
     for key in range(4):
         task = place.tasks().draw(key)
-        way, space = way_in(task), LotSpace(task.vehicle, task.obstacles)
+        way, space = planned_path(task), CollisionWorld(task.vehicle, task.obstacles)
         desired = PreparedTask(task).desired
         middle = task.vehicle.at_middle(way[0])
         assert np.hypot(*(middle[:2] - desired[:2])) < 0.05
@@ -272,12 +289,12 @@ def test_the_way_in_leads_from_the_slot_back_to_the_start_and_touches_nothing(pl
 
 
 def test_drives_on_the_way_in_begin_as_far_from_its_end_as_the_level_says():
-    curriculum = DRIVE_RECIPES["ppo"].curriculum
+    curriculum = DRIVE_CONFIGS["ppo"].curriculum
     level = next(i for i, stage in enumerate(curriculum) if stage.starts == WAY_IN)
     env = practice_of("ppo", 64, lots=(STREET,), levels={"parallel": level})
     env.seed(1)
     env.reset()
-    ways = [exercise.way for exercise in env._at_hand[env._places["parallel"][0], level]]
+    ways = [task.path for task in env._cached[env._groups["parallel"][0], level]]
     low, high = curriculum[level].distance
     checked = 0
     for i in np.flatnonzero([at == ("parallel", level) for at in env._at]):
@@ -308,7 +325,7 @@ def test_who_stands_for_too_long_is_cut_off():
 
 
 def test_the_kind_that_lags_is_practised_most():
-    last = len(DRIVE_RECIPES["ppo"].curriculum) - 1
+    last = len(DRIVE_CONFIGS["ppo"].curriculum) - 1
     env = practice_of("ppo", 400, levels={"perpendicular": last, "parallel": last - 3})
     env.seed(0)
     env.reset()
@@ -321,7 +338,7 @@ def test_the_kind_that_lags_is_practised_most():
     [
         (lambda: practice_of("ppo", 0), "num_envs is 0"),
         (lambda: practice_of("ppo", levels={"parallel": 10}), "level of parallel slots is 10, want 0 to 9"),
-        (lambda: DrivePractice(2, (), DRIVE_RECIPES["sac"]), "at least one kind of slots"),
+        (lambda: DriveTrainingEnv(2, (), DRIVE_CONFIGS["sac"]), "at least one kind of slots"),
         (
             lambda: DriveTraining("dqn", 10, 10, (MINI,), EXAMINED),
             "'dqn', want one of ppo, sac, tqc for drive",
@@ -356,7 +373,7 @@ def test_rewards_of_hindsight_are_those_of_the_drive():
         before = after
     assert parked > 5
     assert contacts > 5
-    recipe = DRIVE_RECIPES["sac"]
+    recipe = DRIVE_CONFIGS["sac"]
     wanted = [recipe.reward_scale * seconds for seconds in (-0.4 - recipe.contact_cost, -0.4, 0.0)]
     assert np.unique(np.concatenate(given)) == pytest.approx(wanted)
 
@@ -364,7 +381,7 @@ def test_rewards_of_hindsight_are_those_of_the_drive():
 def test_a_goal_of_hindsight_ends_the_drive_unless_something_was_touched():
     env = practice_of("sac", 2, lots=(MINI,))
     env.seed(0)
-    buffer = EndingGoals(
+    buffer = TerminalGoalReplayBuffer(
         2_000, env.observation_space, env.action_space, env, n_envs=2, device="cpu", copy_info_dict=True
     )
     rng, seen = np.random.default_rng(0), env.reset()
@@ -384,7 +401,7 @@ def test_a_goal_of_hindsight_ends_the_drive_unless_something_was_touched():
         batch.next_observations[f"{which}_goal"].numpy() for which in ("achieved", "desired")
     )
     reached = (achieved == desired).all(axis=1)
-    recipe = DRIVE_RECIPES["sac"]
+    recipe = DRIVE_CONFIGS["sac"]
     contact = np.float32(-recipe.reward_scale * (0.4 + recipe.contact_cost))
     assert (rewards == 0.0).sum() > 100
     assert done[rewards == 0.0].all()
@@ -406,7 +423,7 @@ def test_a_model_is_trained_examined_and_driven(trained):
     assert {path.name for path in folder.iterdir()} == {"curve.csv", "model.zip", "checkpoint.zip"}
     card = ModelCard.of_file(folder / "checkpoint.zip")
     assert (card.task, card.algorithm, card.scenarios) == ("drive", algorithm, ("mini",))
-    assert card.settings["contact_cost"] == DRIVE_RECIPES[algorithm].contact_cost
+    assert card.settings["contact_cost"] == DRIVE_CONFIGS[algorithm].contact_cost
     rows = parked_on([MINI], EXAMINED, HERE, f"{algorithm}:{folder / 'checkpoint.zip'}")
     assert len(rows) == len(EXAMINED)
     assert np.mean([row["parked"] for row in rows]) == curve[-1]["success"]
@@ -426,7 +443,7 @@ def test_equal_seeds_give_equal_trainings_and_another_seed_another(trained, tmp_
 def weights_of(path):
     """All weights of a model in a file, as bytes."""
     algorithm = ModelCard.of_file(path).algorithm
-    parameters = make_driver(f"{algorithm}:{path}").model.policy.state_dict()
+    parameters = make_parking_agent(f"{algorithm}:{path}").model.policy.state_dict()
     return b"".join(values.numpy().tobytes() for values in parameters.values())
 
 
@@ -445,27 +462,27 @@ def test_a_training_goes_on_from_its_checkpoint(trained, tmp_path):
 def test_levels_and_memory_outlive_an_interruption(tmp_path, monkeypatch):
     """Stopped after its third examination, a training goes on with the drives that it remembers."""
     training = training_of("sac", STEPS["sac"], 300)
-    examine, examinations = DriveTraining.examine, []
+    examine, examinations = DriveTraining.evaluate, []
 
-    def stopping(self, model, practice):
+    def stopping(self, model, env):
         if len(examinations) == 3:
             raise KeyboardInterrupt
         examinations.append(model.num_timesteps)
-        practice.levels["perpendicular"] = 2
-        return examine(self, model, practice)
+        env.levels["perpendicular"] = 2
+        return examine(self, model, env)
 
-    monkeypatch.setattr(DriveTraining, "examine", stopping)
+    monkeypatch.setattr(DriveTraining, "evaluate", stopping)
     with pytest.raises(KeyboardInterrupt):
         training.train(0, tmp_path)
     assert (tmp_path / "replay.pkl").exists()
     sizes, levels = [], []
 
-    def looking(self, model, practice):
+    def looking(self, model, env):
         sizes.append(model.replay_buffer.size() * model.n_envs)
-        levels.append(practice.levels["perpendicular"])
-        return examine(self, model, practice)
+        levels.append(env.levels["perpendicular"])
+        return examine(self, model, env)
 
-    monkeypatch.setattr(DriveTraining, "examine", looking)
+    monkeypatch.setattr(DriveTraining, "evaluate", looking)
     training.train(0, tmp_path)
     assert sizes[-1] >= STEPS["sac"]
     assert levels[0] >= 2
@@ -481,14 +498,14 @@ def test_models_of_another_task_are_refused(trained, name):
         make_agent(f"{algorithm}:{folder / name}", make_scenario("mini"))
     other = "ppo" if algorithm != "ppo" else "sac"
     with pytest.raises(InputError, match=f"is a model of {algorithm}, not of {other}"):
-        make_driver(f"{other}:{folder / name}")
-    with pytest.raises(InputError, match="unknown driver 'mdp'; known: planner"):
-        make_driver("mdp")
+        make_parking_agent(f"{other}:{folder / name}")
+    with pytest.raises(InputError, match="unknown agent 'mdp'; known: planner"):
+        make_parking_agent("mdp")
 
 
 def test_a_driver_wants_the_obstacle_map_and_serves_many_episodes(trained):
     algorithm, folder = trained
-    driver = make_driver(f"{algorithm}:{folder / 'model.zip'}")
+    driver = make_parking_agent(f"{algorithm}:{folder / 'model.zip'}")
     blind = DriveEnv(lot=MINI)
     with pytest.raises(InputError, match="obstacle_map=True"):
         driver.predict(blind.reset(seed=0)[0])
@@ -509,14 +526,14 @@ def test_a_driver_wants_the_obstacle_map_and_serves_many_episodes(trained):
 def test_the_examination_is_the_environments_own_tasks():
     """Who drives blindly ahead ends in the batch as in the environment."""
     training = training_of("ppo", 10, lots=(STREET,))
-    status, times = parked_by(Always(0.5, 0.1), training._tasks["parallel"])
-    view = DriverView(VehicleParameters())
+    status, times = evaluate_parking(Always(0.5, 0.1), training._tasks["parallel"])
+    view = PolicyInterface(VehicleParameters())
     env = DriveEnv(lot=STREET, kinds=("parallel",))
     for k, seed in enumerate(EXAMINED):
         env.reset(seed=seed)
         over = False
         while not over:
-            pedal = command(np.float32([0.5, 0.1]), env.state.vehicle[SPEED], view.pedals)
+            pedal = pedal_command(np.float32([0.5, 0.1]), env.state.vehicle[SPEED], view.pedals)
             *_, over, _, info = env.step([pedal, np.float32(0.1)])
         assert status[k] >= CONTACT
         assert times[k] == pytest.approx(info["time_s"])
@@ -536,15 +553,16 @@ def test_success_is_drawn_by_kind(tmp_path):
     assert (tmp_path / "curve.png").stat().st_size > 10_000
 
 
+# One that learns from its last decisions, and one that keeps what it did for long.
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", sorted(DRIVE_RECIPES))
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
 def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algorithm):
     out = tmp_path / "out"
     steps = 40_000 if algorithm == "ppo" else 4_000
     every = steps // 4
     command = [
         "train", algorithm, "--env", "drive", "--lot", "mini", "--steps", str(steps),
-        "--seeds", "2", "--examine-every", str(every), "--examined-on", "4", "--jobs", "2", "--out", str(out),
+        "--seeds", "2", "--evaluate-every", str(every), "--evaluation-episodes", "4", "--jobs", "2", "--out", str(out),
     ]  # fmt: skip
     process = subprocess.Popen(
         [*PARKENV, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
@@ -562,7 +580,7 @@ def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algo
     summary = json.loads((out / "summary.json").read_text())
     assert [row["seed"] for row in summary["rows"]] == [0, 1]
     assert all(row["steps"] >= steps for row in summary["rows"])
-    assert summary["examined"] == {"perpendicular": 1.0, "all": 1.0}
+    assert summary["evaluated"] == {"perpendicular": 1.0, "all": 1.0}
     assert (out / "learning_curve.png").stat().st_size > 10_000
     model = f"{algorithm}:{out / 'seed_1' / 'model.zip'}"
     parked = parkenv(
@@ -577,21 +595,21 @@ def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algo
 @pytest.mark.slow
 def test_a_short_training_learns_to_park_from_nearby(tmp_path, monkeypatch):
     """In a minute of training it masters two levels: it parks in 60 of the last 100 drives of each."""
-    monkeypatch.setitem(DRIVE_RECIPES, "ppo", FULL_SIZE["ppo"])
+    monkeypatch.setitem(DRIVE_CONFIGS, "ppo", FULL_SIZE["ppo"])
     curve = train_one(training_of("ppo", 800_000, 400_000), 0, tmp_path).curve
     assert curve[-1]["perpendicular_level"] >= 2.0
-    near = places_of((MINI,))[0].tasks(slack=1.0, distance=(1.0, 6.0), starts="way-out")
+    near = slot_groups((MINI,))[0].tasks(slack=1.0, distance=(1.0, 6.0), starts="way-out")
     tasks = [PreparedTask(near.draw(7_000 + k)) for k in range(60)]
     standing, trained = (
-        (parked_by(driver, tasks)[0] == PARKED).mean()
-        for driver in (Always(0.0, 0.0), make_driver(f"ppo:{tmp_path / 'checkpoint.zip'}").model)
+        (evaluate_parking(driver, tasks)[0] == PARKED).mean()
+        for driver in (Always(0.0, 0.0), make_parking_agent(f"ppo:{tmp_path / 'checkpoint.zip'}").model)
     )
     assert trained > standing
 
 
 @pytest.mark.parametrize(
     ("agents", "wanted"),
-    [("robot", "unknown driver 'robot'; known: planner"), ("sac:nowhere.zip", "nowhere.zip: no model file")],
+    [("robot", "unknown agent 'robot'; known: planner"), ("sac:nowhere.zip", "nowhere.zip: no model file")],
 )
 def test_park_refuses_who_cannot_drive(tmp_path, agents, wanted):
     result = CliRunner().invoke(app, ["park", "--agents", agents, "--out", str(tmp_path / "p")])

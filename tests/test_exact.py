@@ -23,7 +23,7 @@ from parkenv.lots import packaged_lot
 from parkenv.world.scenario import SearchProblem
 from planners import make_agent
 from planners.bounds.exact import ExactSolution
-from planners.thesis.expected_time import expected_time
+from planners.bounds.expected_time import expected_time
 
 BLIND = SensorModel(view_range=0.0)
 
@@ -99,7 +99,7 @@ def brute_force(problem, p, entry):
         if len(seen) == n and not free:
             return problem.give_up_s
         seconds = reach(vertex, seen)
-        best = min((seconds[s] + problem.walk_s[s] for s in free if s in seconds), default=np.inf)
+        best = min((seconds[s] + problem.arrival_cost_s[s] for s in free if s in seconds), default=np.inf)
         for v, drive in seconds.items():
             new = sorted(view[v] - seen)
             if not new:
@@ -170,14 +170,14 @@ def test_a_certain_lot_is_a_shortest_way():
 def test_what_is_too_large_or_uncertain_is_refused_with_the_limit():
     with pytest.raises(InputError, match="at most 25 slots"):
         make_agent("exact", make_scenario("campus"))
-    with pytest.raises(InputError, match="seen without error"):
+    with pytest.raises(InputError, match="never errs"):
         make_agent("exact", make_scenario("mini", sensor_model=SensorModel(hit_rate=0.9)))
     problem, p, entry = small_lot(2)
     with pytest.raises(InputError, match="over 500 belief states, the limit"):
         ExactSolution(problem, p, entry, most_states=500)
     with pytest.raises(InputError, match="want 12 probabilities"):
         ExactSolution(problem, p[:3], entry)
-    with pytest.raises(InputError, match="seen without error"):
+    with pytest.raises(InputError, match="never errs"):
         expected_time(
             make_agent("belief", problem), problem.replace(sensor_model=SensorModel(hit_rate=0.9)), p, entry
         )

@@ -63,7 +63,7 @@ def test_without_discount_what_can_reach_no_slot_costs_infinity_and_waits():
         [[-1, 1, -1, -1], [-1] * 4, [0, -1, -1, -1]],
         np.ones((3, 4)),
         p_free=[0.5, 0.0, 0.0],
-        walk_s=[5.0, 5.0, 5.0],
+        arrival_cost_s=[5.0, 5.0, 5.0],
         failure_s=10.0,
         gamma=1.0,
     )
@@ -135,7 +135,7 @@ def test_edges_of_no_length_or_hardly_any_are_no_obstacle(seed, gamma, shortest)
     mdp = random_process(seed, gamma, 5.0)
     rng = np.random.default_rng(seed)
     move_s = np.where(rng.random(mdp.move_s.shape) < 0.2, shortest, mdp.move_s)
-    mdp = ParkingMDP(mdp.neighbors, move_s, mdp.p_free, mdp.walk_s, 5.0, 1.0, gamma)
+    mdp = ParkingMDP(mdp.neighbors, move_s, mdp.p_free, mdp.arrival_cost_s, 5.0, 1.0, gamma)
     ours = label_setting(mdp)
     if gamma < 1.0:
         expect_same_values(ours.values, policy_iteration(mdp).values)

@@ -62,12 +62,12 @@ def test_every_number_is_what_the_table_says(name):
             here = v < n
             expected = [here, free[v] if here else 0.0, squashed(scenario.walk_s[v]) if here else 1.0]
             expected.append(squashed(state.time - state.arrival.time))
-            for s in np.flatnonzero(belief.seen):
-                first_looks.setdefault(int(s), float(free[s] > 1.0 - belief.prior[s]))
+            for s in np.flatnonzero(belief.observed):
+                first_looks.setdefault(int(s), float(free[s] > 1.0 - belief.forecast[s]))
             m = len(first_looks)
             expected.append(m / (m + 20))
             expected.append(np.mean(list(first_looks.values())) if m else 0.0)
-            expected.append(np.mean(1.0 - belief.prior[list(first_looks)]) if m else 0.0)
+            expected.append(np.mean(1.0 - belief.forecast[list(first_looks)]) if m else 0.0)
             np.testing.assert_allclose(local[:7], expected, atol=1e-6)
 
             reach = np.array([drive[v].get(s, np.inf) for s in range(n)])
@@ -77,7 +77,7 @@ def test_every_number_is_what_the_table_says(name):
             for row, seconds in zip(near, nearest, strict=True):
                 # Ties may come in any order, and by either way.
                 tied = np.flatnonzero(np.isclose(reach, seconds))
-                told = [[free[s], belief.seen[s], squashed(scenario.walk_s[s])] for s in tied]
+                told = [[free[s], belief.observed[s], squashed(scenario.walk_s[s])] for s in tied]
                 assert np.isclose(told, row[[0, 1, 3]], atol=1e-6).all(axis=1).any()
                 assert row[4:].sum() == (seconds > 0.0)
             for move in range(len(MOVES)):
@@ -141,7 +141,7 @@ def test_the_best_free_slot_is_remembered_until_it_is_seen_taken():
         for _ in range(40):
             observation, _, over, *_ = env.step(rng.choice(np.flatnonzero(observation["action_mask"][:PARK])))
             belief = env.unwrapped.state.belief
-            free = belief.seen & (belief.p_occupied < belief.prior)
+            free = belief.observed & (belief.p_occupied < belief.forecast)
             chance, walk, _ = observation["local"][11:14]
             if chance > 0.0:
                 remembered += 1

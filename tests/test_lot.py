@@ -47,7 +47,7 @@ def test_a_slot_knows_its_corners_and_its_mouth():
     ("change", "message"),
     [
         ({"slot_ids": ()}, "has no slot"),
-        ({"slot_ids": ("a", "a")}, "slot id 'a' stands twice"),
+        ({"slot_ids": ("a", "a")}, "slot id 'a' appears twice"),
         ({"slot_xy": [[1.0, 2.0, 3.0]]}, r"slot_xy has shape \(1, 3\), want \(1, 2\)"),
         ({"slot_xy": [["east", 0.0]]}, "slot_xy: want numbers"),
         ({"slot_yaw": [np.nan]}, r"slot_yaw\[0\] is nan, want a finite number"),
@@ -76,7 +76,7 @@ def test_a_lot_that_cannot_be_is_refused(change, message):
     ("points", "message"),
     [
         ([[0.0, 0.0]], "want"),
-        ([[0.0, 0.0], [0.0, 0.0]], "are the same place"),
+        ([[0.0, 0.0], [0.0, 0.0]], "are equal, want different points"),
         ([[0.0, 0.0], [np.nan, 0.0]], "finite"),
     ],
 )

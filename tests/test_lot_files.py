@@ -439,7 +439,7 @@ FAULTS = [
     (set_feature(4, "goal", "Point", [10**400, 0]), 4, "want two finite numbers"),
     (set_feature(4, "goal", "Point", 7), 4, "goal: position 7, want two finite numbers"),
     (set_feature(2, "lane", "LineString", [[0, 0]]), 2, "want at least 2 positions"),
-    (set_feature(2, "lane", "LineString", [[0, 0], [0, 0]]), 2, "are the same place"),
+    (set_feature(2, "lane", "LineString", [[0, 0], [0, 0]]), 2, "are equal, want different points"),
     (
         set_feature(2, "lane", "LineString", [[0, 0], [40, 0]], oneway="no"),
         2,

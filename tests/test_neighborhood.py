@@ -25,7 +25,7 @@ def test_a_small_lot_is_one_neighbourhood():
     near = Neighborhoods(problem).toward(0)
     assert near.whole
     np.testing.assert_array_equal(near.slots, np.arange(problem.lot.n_slots))
-    np.testing.assert_array_equal(near.walk_s, problem.walk_s)
+    np.testing.assert_array_equal(near.cost_s, problem.walk_s)
     assert Neighborhoods(problem).around(3, np.arange(5)).whole
 
 
@@ -40,16 +40,16 @@ def test_a_part_holds_the_vertices_that_may_do_best_and_the_ways_to_them(name):
     assert not near.whole
     inside = np.isin(np.arange(lot.n_vertices), near.vertices)
     assert g[inside].max() <= g[~inside].min() + 1e-9
-    np.testing.assert_allclose(near.table.seconds[near.place(start)], seconds[start, near.vertices])
+    np.testing.assert_allclose(near.table.seconds[near.index(start)], seconds[start, near.vertices])
     # Ways among the others may leave the part; what is there is true.
     assert (near.table.seconds >= seconds[np.ix_(near.vertices, near.vertices)] - 1e-9).all()
     for v, vertex in enumerate(near.vertices):
         starts, slots = problem.slots_in_view
-        here = near.slots[near.view_slots[near.view_starts[v] : near.view_starts[v + 1]]]
+        here = near.slots[near.in_view(v)["slot"]]
         seen = slots[starts[vertex] : starts[vertex + 1]]
         np.testing.assert_array_equal(here, seen[inside[seen]])
-        assert near.place(int(vertex)) == v
-    assert near.place(int(np.flatnonzero(~inside)[0])) == -1
+        assert near.index(int(vertex)) == v
+    assert near.index(int(np.flatnonzero(~inside)[0])) == -1
 
 
 def test_slots_known_to_be_taken_draw_nobody():
@@ -57,21 +57,21 @@ def test_slots_known_to_be_taken_draw_nobody():
     start = int(problem.walk_s.argmin())
     parts = Neighborhoods(problem, 80)
     before = parts.around(start, np.empty(0, dtype=np.int64))
-    taken = before.slots[np.argsort(before.walk_s)[:60]]
+    taken = before.slots[np.argsort(before.cost_s)[:60]]
     after = parts.around(start, taken)
     assert not np.isin(after.slots, before.slots).all()
 
 
-def test_far_from_the_goal_the_part_begins_at_a_gate_on_a_quickest_way():
+def test_far_from_the_goal_the_part_is_entered_on_a_shortest_route():
     problem = make_scenario(city_lot(3000)).public()
     entry = int(problem.lot.entry_vertices[0])
     parts = Neighborhoods(problem, 500)
     near = parts.toward(entry)
     assert near is parts.toward(entry)
-    assert near.place(entry) == -1
+    assert near.index(entry) == -1
     _, g = everything_at_best(problem, entry)
-    assert g[near.gate] == pytest.approx(g[entry])
-    assert near.place(int(problem.walk_s.argmin())) >= 0
+    assert g[near.entry] == pytest.approx(g[entry])
+    assert near.index(int(problem.walk_s.argmin())) >= 0
 
 
 @pytest.mark.parametrize(("level", "seeds"), [(0.6, 4), (0.9, 4)])
@@ -80,7 +80,9 @@ def test_leaving_out_what_cannot_matter_changes_nothing(level, seeds):
     scenario = at_occupancy(make_scenario(grid_lot(8, 40)), level)
     most = scenario.lot.n_vertices * 9 // 10
     whole, part = (
-        EpisodeRunner(scenario, "belief", make_agent("belief", scenario, trusting=True, most_vertices=m))
+        EpisodeRunner(
+            scenario, "belief", make_agent("belief", scenario, trust_forecast=True, most_vertices=m)
+        )
         for m in (scenario.lot.n_vertices, most)
     )
     for seed in range(seeds):

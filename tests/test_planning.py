@@ -152,7 +152,7 @@ def test_a_failure_cost_at_which_trying_in_vain_looks_best_is_warned_of():
         ({"failure_s": -1.0}, "failure_s"),
         ({"failure_s": np.inf}, "failure_s"),
         ({"neighbors": [[-1, -1, -1, 7], [-1] * 4]}, "neighbors"),
-        ({"walk_s": [np.nan, 1.0]}, "walk_s"),
+        ({"arrival_cost_s": [np.nan, 1.0]}, "arrival_cost_s"),
     ],
 )
 def test_a_wrong_process_is_refused(changes, message):
@@ -160,7 +160,7 @@ def test_a_wrong_process_is_refused(changes, message):
         "neighbors": [[-1, -1, -1, 1], [-1, -1, 0, -1]],
         "move_s": np.ones((2, 4)),
         "p_free": [0.5, 0.5],
-        "walk_s": [1.0, 2.0],
+        "arrival_cost_s": [1.0, 2.0],
         "failure_s": 1.0,
     }
     with pytest.raises(InputError, match=message):

@@ -52,14 +52,14 @@ def middle_of_slot(renderer, state, slot, along=0.0):
     return row, column
 
 
-def stand_in(env, p_occupied=None, seen=None, **changes):
+def stand_in(env, p_occupied=None, observed=None, **changes):
     """The state of an environment, but for some of it."""
     state = env.unwrapped.state
     belief = state.belief
     if p_occupied is not None:
         belief = dataclasses.replace(belief, p_occupied=p_occupied)
-    if seen is not None:
-        belief = dataclasses.replace(belief, seen=seen)
+    if observed is not None:
+        belief.observed_at[:] = np.where(observed, 0.0, -1.0)
     names = ("arrival", "time", "vertex", "path", "parked", "over", "failed_parks", "walk_s", "gave_up_s")
     return SimpleNamespace(**{n: getattr(state, n) for n in names} | {"belief": belief} | changes)
 
@@ -83,10 +83,10 @@ def test_frames_are_what_gymnasium_asks_for_and_do_not_depend_on_history():
 def test_slots_have_the_colour_of_the_belief_and_cars_stand_where_the_truth_is_taken():
     env = start(row_lot())
     renderer = SearchRenderer(env.unwrapped.scenario)
-    state = stand_in(env, p_occupied=np.linspace(0, 1, 10), seen=np.arange(10) >= 5)
+    state = stand_in(env, p_occupied=np.linspace(0, 1, 10), observed=np.arange(10) >= 5)
     occupied = np.arange(10) % 2 == 1
     frame = renderer.frame(state, occupied)
-    colors = belief_colors(state.belief.p_occupied, state.belief.seen)
+    colors = belief_colors(state.belief.p_occupied, state.belief.observed)
     for slot in range(10):
         edge = frame[middle_of_slot(renderer, state, slot, along=2.3)]
         assert np.abs(edge.astype(int) - colors[slot]).max() <= 2

@@ -11,11 +11,11 @@ import pytest
 from command_line import parkenv
 
 from parkenv import InputError, make_scenario
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.cli.report import make_report
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.results import episode_key
 from parkenv.evaluation.report.page import SCHEMA, page_data
-from parkenv.evaluation.report.plan_preview import PlanPreview
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.report.search_recording import Encounter, choose, record
 from parkenv.evaluation.report.tables import table_of
@@ -228,7 +228,7 @@ def test_learning_curves_are_those_of_the_training(tmp_path, drives):
         tmp_path,
         command=["parkenv", "train"],
         rows=[{"agent": "ppo", "scenario": "campus,street", "seed": 3, "success": 0.5}],
-        examined=dict.fromkeys(kinds, 1.0) if drives else {"mdp": 80.0, "clairvoyant bound": 60.0},
+        evaluated=dict.fromkeys(kinds, 1.0) if drives else {"mdp": 80.0, "clairvoyant bound": 60.0},
         curve=dict(zip(kinds, curves, strict=True)) if drives else curves[0],
         beside={"dqn": dict(zip(kinds, curves, strict=True)) if drives else curves[0]},
     )
@@ -295,14 +295,18 @@ def test_asking_belief_for_its_plan_changes_nothing():
 
     agent = make_agent("belief", scenario)
     observation = {
-        "vertex": np.int64(scenario.lot.entry_vertices[0]), "time": np.array([3e4, 0.0], dtype=np.float32),
-        "p_occupied": np.full(10, 0.5, dtype=np.float32),
-    }  # fmt: skip
+        "vertex": np.int64(scenario.lot.entry_vertices[0]),
+        "time": np.array([3e4, 0.0], dtype=np.float32),
+        **SlotBelief.of_forecast(np.full(10, 0.5), np.full(10, 1e-4)).to_observation(),
+    }
     action, memory = agent.predict(observation)
-    before = [np.array(v) for v in (memory.kind, memory.p_occupied, memory.targets)]
-    ahead = PlanPreview(scenario.public(), agent).ahead(observation, int(action), memory)
-    assert ahead
-    for old, new in zip(before, (memory.kind, memory.p_occupied, memory.targets), strict=True):
+    before = (
+        memory.day.p_occupied(),
+        [np.array(v) for v in (memory.state, memory.missed_rate, memory.targets)],
+    )
+    assert agent.plan_preview(observation, int(action), memory).path
+    np.testing.assert_array_equal(before[0], memory.day.p_occupied())
+    for old, new in zip(before[1], (memory.state, memory.missed_rate, memory.targets), strict=True):
         np.testing.assert_array_equal(old, new)
 
 
@@ -318,7 +322,7 @@ def test_intervals_and_nested_figures_become_cells():
 def test_a_survey_is_driven_again(tmp_path):
     out = tmp_path / "survey"
     done = parkenv(
-        "survey", "--scenario", "mini", "-n", 2, "--every", 4, "--weather", "sunny", "--jobs", 1, "--out", out,
+        "survey", "--scenario", "mini", "--sessions", 2, "--every", 4, "--weather", "sunny", "--jobs", 1, "--out", out,
         "--report",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

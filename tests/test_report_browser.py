@@ -225,7 +225,7 @@ def test_a_survey_drive_is_shown_in_step(browser, tmp_path):
         "survey",
         "--scenario",
         "mini",
-        "-n",
+        "--sessions",
         "1",
         "--every",
         "4",

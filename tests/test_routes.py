@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv import InputError, Lane, ParkingLot, make_scenario
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.lots import city_lot, grid_lot, packaged_lot
 from planners import make_agent
 from planners.routes import DriveRoutes
@@ -37,7 +38,7 @@ def test_ways_are_as_long_as_they_should_be(drives):
     for _ in range(100):
         vertex, target = rng.integers(scenario.lot.n_vertices, size=2)
         here, took = int(vertex), 0.0
-        for move, following in routes.way(int(vertex), int(target)):
+        for move, following in routes.hops(int(vertex), int(target)):
             assert scenario.lot.neighbors[here, move] == following
             took += scenario.move_s[here, move]
             here = following
@@ -80,11 +81,11 @@ def test_what_no_way_leads_to_is_left_out():
     routes, entry = DriveRoutes(scenario), int(lot.entry_vertices[0])
     assert routes.nearest(entry, np.array([True, False]))[1] == np.inf
     assert list(routes.nearest(entry, np.array([True, True]))[0]) == [1]
-    with pytest.raises(InputError, match="no way leads on"):
+    with pytest.raises(InputError, match="no route leads from"):
         routes.move_toward(entry, 0)
-    with pytest.raises(InputError, match="no way leads on"):
+    with pytest.raises(InputError, match="no route leads from"):
         routes.move_toward(1, 1)
-    assert list(routes.way(1, 1)) == []
+    assert list(routes.hops(1, 1)) == []
 
 
 @pytest.mark.parametrize("name", ["greedy-goal", "greedy-drive", "first-free"])
@@ -92,6 +93,7 @@ def test_agents_head_for_what_they_can_reach(name):
     """The slot with the shorter walk lies behind the entry, on a one-way lane."""
     lot = one_way_past_two_slots()
     agent, vertex = make_agent(name, make_scenario(lot)), int(lot.entry_vertices[0])
-    observation = {"vertex": vertex, "p_occupied": np.full(2, 0.5, dtype=np.float32)}
+    belief = SlotBelief.of_forecast(np.full(2, 0.5), np.zeros(2))
+    observation = {"vertex": vertex, "time": np.zeros(2), **belief.to_observation()}
     move, _ = agent.predict(observation)
     assert lot.neighbors[vertex, int(move)] == 1

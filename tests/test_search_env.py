@@ -13,12 +13,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba.core.errors import TypingError
 
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
-from parkenv.envs.search_alone import held
 from parkenv.envs.wrappers import ThesisReward
 from parkenv.lots import grid_lot
 from parkenv.scenarios.spec import SCENARIO_NAMES
@@ -229,13 +227,6 @@ def test_the_mask_tells_what_the_graph_has():
         observation, *_ = env.step(int(np.flatnonzero(observation["action_mask"][:PARK])[-1]))
 
 
-def test_arrays_of_other_types_are_not_held():
-    search = gym.make("parkenv/Search-v1", scenario="mini").unwrapped.search
-    other = search._replace(place=search.place.astype(np.int64))
-    with pytest.raises(TypingError):
-        held(other, np.zeros(2, dtype=np.float32))
-
-
 def test_state_deepcopy_and_pickle_bring_an_episode_back():
     env = gym.make("parkenv/Search-v1", scenario="campus").unwrapped
     env.reset(seed=3)
@@ -289,7 +280,7 @@ def test_the_observed_belief_explains_p_occupied(noisy):
         changed = (observation["belief"].reshape(4, -1)[2:] != before).any(axis=0)
         assert (observed_at[changed] == observation["time"][1]).all()
         observed |= changed
-        np.testing.assert_array_equal(observed_at >= 0.0, env.state.belief.seen)
+        np.testing.assert_array_equal(observed_at >= 0.0, env.state.belief.observed)
         before = observation["belief"].reshape(4, -1)[2:]
         moves = np.flatnonzero(observation["action_mask"][:PARK])
         observation, *_ = env.step(rng.choice(moves))
@@ -310,7 +301,7 @@ def test_only_slots_in_view_are_learnt_of():
     scenario = make_scenario("campus", sensor_model=SensorModel(view_range=6.0))
     env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
     observation, _ = env.reset(seed=0)
-    lot, forecast = scenario.lot, env.state.belief.prior
+    lot, forecast = scenario.lot, env.state.belief.forecast
     np.testing.assert_array_equal(observation["p_occupied"], forecast.astype(np.float32))
     in_view = np.zeros(lot.n_slots, dtype=bool)
     for _ in range(40):
@@ -354,10 +345,10 @@ def test_the_belief_in_a_slot_left_behind_grows_old():
             last[slot] = now, float(env.state.world.occupied([slot], now)[0])
         belief = env.state.belief
         for s, (then, taken) in last.items():
-            expected = belief.prior[s] + (taken - belief.prior[s]) * np.exp((then - now) * 2 / 600)
+            expected = belief.forecast[s] + (taken - belief.forecast[s]) * np.exp((then - now) * 2 / 600)
             assert belief.p_occupied[s] == pytest.approx(expected)
         np.testing.assert_array_equal(observation["p_occupied"], belief.p_occupied.astype(np.float32))
-        assert set(np.flatnonzero(belief.seen)) == set(last)
+        assert set(np.flatnonzero(belief.observed)) == set(last)
     assert len(last) > 5
 
 
@@ -385,7 +376,7 @@ def test_noisy_sight_errs_as_often_as_stated():
     for seed in range(seeds):
         env.reset(seed=seed)
         env.step(0)
-        looks_taken += env.state.belief.p_occupied > env.state.belief.prior
+        looks_taken += env.state.belief.p_occupied > env.state.belief.forecast
     per_seed = looks_taken / seeds
     assert per_seed[taken].mean() == pytest.approx(0.8, abs=0.02)
     assert per_seed[~taken].mean() == pytest.approx(0.3, abs=0.02)
@@ -417,8 +408,8 @@ def test_sight_differs_by_distance_and_side():
     for seed in range(seeds):
         env.reset(seed=seed)
         env.step(way_to_0)
-        seen += env.state.belief.seen
-        looked_taken += env.state.belief.p_occupied > env.state.belief.prior
+        seen += env.state.belief.observed
+        looked_taken += env.state.belief.p_occupied > env.state.belief.forecast
     rows = slice(*starts[env.state.vertex : env.state.vertex + 2])
     view, rates = slots[rows], scenario.sensor_rates.of(rows)
     np.testing.assert_allclose(seen[view] / seeds, rates.seen, atol=0.08)

@@ -50,9 +50,9 @@ def test_two_drives_follow_each_other_on_one_time_line(mini: Scenario, tmp_path:
     survey = Survey(mini, SurveySettings(every=8.0, weather="overcast"))
     moments: list[SurveyFrame] = []
     survey.drive(0, on_frame=moments.append)
-    with sensor_log(tmp_path / "one.rrd", mini.lot, survey.stack.rig) as log:
+    with sensor_log(tmp_path / "one.rrd", mini.lot, survey.pipeline.rig) as log:
         record_session(survey, 0, log)
-    with sensor_log(tmp_path / "two.rrd", mini.lot, survey.stack.rig) as log:
+    with sensor_log(tmp_path / "two.rrd", mini.lot, survey.pipeline.rig) as log:
         record_session(survey, 0, log)
         record_session(survey, 0, log)
     one, two = rows_of(tmp_path / "one.rrd"), rows_of(tmp_path / "two.rrd")
@@ -67,7 +67,7 @@ def test_who_watches_a_session_changes_nothing_and_sees_the_truth(mini: Scenario
     watched, alone = survey.drive(0, on_frame=moments.append), survey.drive(0)
     assert np.array_equal(watched.states.p_occupied, alone.states.p_occupied)
     assert np.array_equal(watched.truth, alone.truth)
-    assert [m.time for m in moments] == sorted(m.time for m in moments)
+    assert [m.result.captured.time for m in moments] == sorted(m.result.captured.time for m in moments)
     assert moments[0].truth.shape == (mini.lot.n_slots,)
 
 
@@ -99,7 +99,7 @@ def test_compare_records_its_first_search_where_it_looks_through_sensors(tmp_pat
     ]
     refused = parkenv(*command)
     assert refused.returncode == 2
-    assert "add --sensors laser" in refused.stderr
-    done = parkenv(*command, "--sensors", "laser", "--jobs", 1)
+    assert "add --rig laser" in refused.stderr
+    done = parkenv(*command, "--rig", "laser", "--jobs", 1)
     assert done.returncode == 0, done.stderr
     assert rows_of(tmp_path / "s.rrd")["/car/right/boxes"] > 1

@@ -80,7 +80,19 @@ def test_the_maps_error_is_zero_where_it_is_right():
 def test_survey_and_map_on_the_command_line(tmp_path):
     out = tmp_path / "s"
     done = parkenv(
-        "survey", "--scenario", "mini", "-n", 1, "--weather", "sunny", "--every", 3, "--jobs", 1, "--out", out
+        "survey",
+        "--scenario",
+        "mini",
+        "--sessions",
+        1,
+        "--weather",
+        "sunny",
+        "--every",
+        3,
+        "--jobs",
+        1,
+        "--out",
+        out,
     )
     assert done.returncode == 0, done.stderr
     (row,) = json.loads((out / "summary.json").read_text())["rows"]
@@ -105,7 +117,7 @@ def test_survey_and_map_on_the_command_line(tmp_path):
         (["map", tmp_path / "none", "--scenario", "mini"], "no such map file"),
         (
             ["survey", "--rig", "sonar", "--out", tmp_path / "x"],
-            "rig is 'sonar', want one of laser, stereo, both_sides",
+            "rig is 'sonar', want 'laser', 'stereo' or 'both_sides'",
         ),
         (["survey", "--weather", "snow", "--out", tmp_path / "x"], "weather is 'snow'"),
     ):
@@ -123,7 +135,7 @@ def test_the_search_sees_what_is_there_and_nothing_else():
     for _ in range(6):
         action = int(np.flatnonzero(lot.neighbors[env.state.vertex] >= 0)[-1])
         observation, *_ = env.step(action)
-    seen = env.state.belief.seen
+    seen = env.state.belief.observed
     assert seen.sum() >= 4
     believed = observation["p_occupied"] > 0.5
     assert (believed == taken)[seen].mean() >= 0.9
@@ -164,13 +176,12 @@ def test_bad_settings_are_named(wrong, message):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "rig"), [("campus", "laser"), ("street", "laser"), ("campus", "stereo")])
-def test_held_out_sessions_are_as_right_as_promised(name, rig):
-    scenario = make_scenario(name, traffic=BUSY)
+@pytest.mark.parametrize(("name", "rig", "accuracy"), [("campus", "laser", 0.97), ("street", "stereo", 0.94)])
+def test_held_out_sessions_are_as_right_as_promised(name, rig, accuracy):
+    """With a fifth of the captures that a survey makes unless it is asked for others."""
     window = ArrivalWindow((1,), 36_000.0, 43_200.0)
-    survey = Survey(scenario, SurveySettings(rig=rig, windows=(window,), seed=777))
-    results = [survey.drive(0)]
-    assert np.mean([r.slot_accuracy for r in results]) >= (0.97 if rig == "laser" else 0.94)
+    settings = SurveySettings(rig=rig, windows=(window,), seed=777, every=6.0)
+    assert Survey(make_scenario(name, traffic=BUSY), settings).drive(0).slot_accuracy >= accuracy
 
 
 @pytest.mark.slow
@@ -178,7 +189,9 @@ def test_a_killed_survey_loses_only_the_drive_under_way(tmp_path):
     """SIGKILL in the middle: what the map file holds is whole, and the same command goes on from there."""
     scenario, out = make_scenario("mini"), tmp_path / "s"
     command = [*PARKENV, "survey", "--scenario", "mini", "--every", "4", "--jobs", "1", "--out", str(out)]
-    drive = subprocess.Popen([*command, "-n", "500"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    drive = subprocess.Popen(
+        [*command, "--sessions", "500"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
     try:
         table = out / "sessions.csv"
         while not (table.exists() and len(table.read_text().splitlines()) > 2):
@@ -190,7 +203,7 @@ def test_a_killed_survey_loses_only_the_drive_under_way(tmp_path):
     with MapStore(out / "map.sqlite", scenario.lot, create=False) as store:
         before = store.sessions()
     assert 1 <= len(before) < 500
-    done = parkenv(*command[len(PARKENV) :], "-n", len(before) + 1)
+    done = parkenv(*command[len(PARKENV) :], "--sessions", len(before) + 1)
     assert done.returncode == 0, done.stderr
     with MapStore(out / "map.sqlite", scenario.lot, create=False) as store:
         after = {s.key: s for s in store.sessions()}

@@ -1,5 +1,6 @@
 """Learning agents: the batch for stable-baselines3, trainings that can be stopped, models that say what they are."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -18,18 +19,20 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from parkenv import make_scenario
-from parkenv.cli.search_course import SearchCourse
-from parkenv.cli.training_course import curves_beside
+from parkenv.cli.search_task import SearchTask
+from parkenv.cli.training_task import curves_beside
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case
+from parkenv.evaluation.experiments.spec import TrainingSpec
 from parkenv.evaluation.figures.learning_curves import across_seeds, save_learning_curves
 from parkenv.evaluation.training.cloning import Demonstrations, clone
-from parkenv.evaluation.training.configs import DRIVE_RECIPES, MAX_STEPS, RECIPES
+from parkenv.evaluation.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
 from parkenv.evaluation.training.rl_training import read_curve, train_one, write_curve
-from parkenv.evaluation.training.search_training import SearchTraining, examined, search_times
+from parkenv.evaluation.training.search_training import SearchTraining, episode_times, search_times
+from parkenv.scenarios.spec import scenario_spec
 from planners.agent import make_agent
 from planners.learned import ALGORITHMS, LearnedAgent, ModelCard
 
@@ -115,7 +118,7 @@ def test_a_model_learns_to_park_and_evaluate_policy_agrees_with_compare(trained)
     assert best < 60.0 < curve[0]["total_s"], "it parks now, and did not when it began"
     name = f"maskable-ppo:{trained / 'model.zip'}"
     agent = make_agent(name, SCENARIO)
-    times, _ = examined(agent.model, SCENARIO, EXAMINED, 5)
+    times, _ = episode_times(agent.model, SCENARIO, EXAMINED, 5)
     assert times.mean() == pytest.approx(best)
     rows, _ = Case(SCENARIO, name).run(EXAMINED)
     assert [row["total_s"] for row in rows] == pytest.approx(times)
@@ -181,7 +184,7 @@ class Waits:
 
 def test_a_planner_that_finishes_nothing_cannot_be_imitated(monkeypatch):
     monkeypatch.setattr("parkenv.evaluation.training.cloning.make_agent", lambda *_: Waits())
-    with pytest.raises(InputError, match="finished none of 1 searches on mini: nothing to imitate"):
+    with pytest.raises(InputError, match="finished none of 1 searches on mini: nothing to clone"):
         Demonstrations.collect("waits", SCENARIO, [5_000_000])
 
 
@@ -194,9 +197,9 @@ def test_imitation_begins_near_the_planner():
     assert (shown.times > 0.0).all()
     venv = SearchVecEnv(4, campus, reward_scale=0.01, max_episode_steps=MAX_STEPS)
     model = MaskablePPO("MultiInputPolicy", venv, seed=0, policy_kwargs={"net_arch": [64, 64]})
-    fresh, _ = examined(model, campus, EXAMINED, 5)
+    fresh, _ = episode_times(model, campus, EXAMINED, 5)
     clone(model, shown, 0, updates=2000)
-    cloned, _ = examined(model, campus, EXAMINED, 5)
+    cloned, _ = episode_times(model, campus, EXAMINED, 5)
     planner = np.mean([row["total_s"] for row in Case(campus, "first-free").run(EXAMINED)[0]])
     # The mean would be of those few searches in which a clone drives in circles.
     assert np.median(cloned) < 1.2 * planner < np.median(fresh)
@@ -282,7 +285,7 @@ def test_a_mask_that_allows_nothing_is_refused(trained):
 
 
 def test_every_algorithm_has_a_recipe():
-    assert RECIPES.keys() | DRIVE_RECIPES.keys() == ALGORITHMS.keys()
+    assert SEARCH_CONFIGS.keys() | DRIVE_CONFIGS.keys() == ALGORITHMS.keys()
 
 
 def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
@@ -301,13 +304,27 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
     assert (tmp_path / "curve.png").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("algorithm", sorted(SEARCH_CONFIGS))
+def test_every_algorithm_trains_a_model_that_searches(algorithm, tmp_path, monkeypatch):
+    config = SEARCH_CONFIGS[algorithm]
+    sizes = {"batch_size": 256, **({"learning_starts": 200} if algorithm == "dqn" else {})}
+    small = dataclasses.replace(config, n_envs=16, settings={**config.settings, **sizes})
+    monkeypatch.setitem(SEARCH_CONFIGS, algorithm, small)
+    train_one(SearchTraining(algorithm, 1_000, 1_000, (SCENARIO,), EXAMINED[:4]), 0, tmp_path)
+    curve = read_curve(tmp_path / "curve.csv")
+    assert curve[-1]["steps"] >= 1_000
+    row = search_times(LearnedAgent(SCENARIO, algorithm, tmp_path / "model.zip"), SCENARIO, EXAMINED[:4])
+    assert row["episodes"] == 4
+
+
+# One that learns from its last decisions, and one that keeps what it did for long.
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", sorted(RECIPES))
+@pytest.mark.parametrize("algorithm", ["maskable-ppo", "dqn"])
 def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp_path, algorithm):
     out = tmp_path / "out"
     command = [
-        "train", algorithm, "--scenario", "mini", "--steps", "40000", "--seeds", "2", "--examine-every",
-        "8000", "--examined-on", "16", "--planners", "mdp", "--jobs", "2", "--out", str(out),
+        "train", algorithm, "--scenario", "mini", "--steps", "40000", "--seeds", "2", "--evaluate-every",
+        "8000", "--evaluation-episodes", "16", "--planners", "mdp", "--jobs", "2", "--out", str(out),
     ]  # fmt: skip
     process = subprocess.Popen(
         [*PARKENV, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
@@ -336,32 +353,37 @@ def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp
     assert [row["steps"] for row in means] == [row["steps"] for row in curve]
     compared = parkenv(
         "compare", "--scenario", "mini", "--agents", f"mdp,{algorithm}:{out / 'seed_1' / 'model.zip'}", "-n", 10,
-        "--occupancy-levels", "none", "--out", tmp_path / "compared",
+        "--occupancy-levels", "none", "--jobs", 1, "--out", tmp_path / "compared",
     )  # fmt: skip
     assert compared.returncode == 0, compared.stderr
 
 
 def training_in(folder, **changed):
-    settings = {"algorithm": "dqn", "scenario": ["mini"], "examined_on": 16, "imitate": None, **changed}
+    settings = {"algorithm": "dqn", "scenario": ["mini"], "evaluation_episodes": 16, "clone": None, **changed}
     (folder / "seed_0").mkdir(parents=True)
     (folder / "seed_0" / "curve.csv").write_text("steps,total_s\n0,300.0\n10,90.0\n")
     (folder / "settings.json").write_text(json.dumps(settings))
     return str(folder)
 
 
-def course_of(algorithm="ppo", imitate=None):
-    return SearchCourse(algorithm, "mini", None, 10, imitate, 2, 5, 10, 16, "none")
+def course_of(algorithm="ppo"):
+    return SearchTask(
+        TrainingSpec(
+            algorithm=algorithm, scenarios=(scenario_spec("mini"),), steps=10, evaluate_every=10,
+            evaluation_episodes=16, planners=(),
+        )
+    )  # fmt: skip
 
 
 def test_trainings_are_set_beside_each_other_by_what_tells_them_apart(tmp_path):
     folders = [
         training_in(tmp_path / "dqn"),
         training_in(tmp_path / "again", algorithm="ppo"),
-        training_in(tmp_path / "cloned", algorithm="ppo", imitate="mdp"),
+        training_in(tmp_path / "cloned", algorithm="ppo", clone="mdp"),
         training_in(tmp_path / "two", algorithm="ppo", scenario=["mini", "street"]),
     ]
     beside = curves_beside(folders, tmp_path / "own", course_of())
-    assert list(beside) == ["dqn", f"ppo ({folders[1]})", "ppo after imitating mdp", "ppo on mini, street"]
+    assert list(beside) == ["dqn", f"ppo ({folders[1]})", "ppo after cloning mdp", "ppo on mini, street"]
     assert beside["dqn"] == [[{"steps": 0, "total_s": 300.0}, {"steps": 10, "total_s": 90.0}]]
 
 
@@ -384,8 +406,8 @@ def curve_of_another_kind(folder):
 @pytest.mark.parametrize(
     ("changed", "spoil", "wanted"),
     [
-        ({"scenario": ["jam", "mini"]}, None, "scenario is 'jam' in .* and 'mini' here; their examinations"),
-        ({"examined_on": 8}, None, "examined_on is 8 in .* and 16 here"),
+        ({"scenario": ["jam", "mini"]}, None, "scenario is 'jam' in .* and 'mini' here; their evaluations"),
+        ({"evaluation_episodes": 8}, None, "evaluation_episodes is 8 in .* and 16 here"),
         ({}, lambda folder: shutil.rmtree(folder / "seed_0"), "holds no training"),
         ({}, torn_settings, "settings.json: is torn"),
         ({}, settings_of_another_kind, "want the settings of a command"),
@@ -404,7 +426,7 @@ def test_trainings_that_cannot_be_compared_are_refused(tmp_path, changed, spoil,
 def test_a_training_is_drawn_once(tmp_path):
     folder = training_in(tmp_path / "other")
     for folders, own in (([folder, f"{folder}/../other"], "own"), ([folder], "other")):
-        with pytest.raises(InputError, match="is drawn already"):
+        with pytest.raises(InputError, match="is already drawn"):
             curves_beside(folders, tmp_path / own, course_of())
 
 
@@ -413,8 +435,8 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
     training_in(out)
     before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     wrong = (
-        ["dqn", "--imitate", "mdp", "--overwrite"],
-        ["ppo", "--imitate", "nobody", "--overwrite"],
+        ["dqn", "--clone", "mdp", "--overwrite"],
+        ["ppo", "--clone", "nobody", "--overwrite"],
         ["ppo", "--planners", "belif", "--overwrite"],
         ["ppo", "--resume", "--overwrite"],
         ["ppo"],
@@ -423,7 +445,7 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
         done = parkenv("train", *arguments, "--scenario", "mini", "--out", out)
         assert done.returncode == 2
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
-    done = parkenv("train", "dqn", "--imitate", "mdp", "--out", tmp_path / "new")
+    done = parkenv("train", "dqn", "--clone", "mdp", "--out", tmp_path / "new")
     assert done.returncode == 2
     assert not (tmp_path / "new").exists()
 
@@ -434,18 +456,23 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
         (["sarsa"], "ALGORITHM is 'sarsa', want one of"),
         (["sac"], "ALGORITHM is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn for search"),
         (["dqn", "--env", "drive"], "ALGORITHM is 'dqn', want one of ppo, sac, tqc for drive"),
-        (["ppo", "--env", "fly"], "--env is 'fly', want one of search, drive"),
-        (["ppo", "--env", "drive", "--imitate", "mdp"], "--imitate goes with --env search"),
-        (["ppo", "--env", "drive", "--scenario", "campus"], "--scenario goes with --env search"),
-        (["ppo", "--lot", "campus"], "--lot goes with --env drive"),
-        (["sac", "--env", "drive", "--lot", "nowhere"], "nowhere: no such file, nor a packaged lot"),
-        (["sac", "--env", "drive", "--planners", "mdp"], "--planners is 'mdp', want planner or none"),
+        (["ppo", "--env", "fly"], "env is 'fly', want 'search' or 'drive'"),
+        (["ppo", "--env", "drive", "--clone", "mdp"], "clone goes with env search"),
+        (
+            ["sac", "--env", "drive", "--lot", "nowhere"],
+            "--lot is 'nowhere', want a packaged lot (campus, jam",
+        ),
+        (
+            ["sac", "--env", "drive", "--lot", "nowhere.geojson"],
+            "--lot is 'nowhere.geojson', want a file; there is",
+        ),
+        (["sac", "--env", "drive", "--planners", "mdp"], "--planners names other agents than planner"),
         (["ppo", "--resume"], "holds no training to go on with"),
         (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
         (["ppo", "--planners", "mdp,belif"], "unknown agent 'belif'"),
-        (["ppo", "--imitate", "oracle"], "oracle cannot be imitated"),
-        (["ppo", "--shown", "5"], "--shown goes with --imitate"),
-        (["ppo", "--env", "drive", "--shown", "5"], "--shown goes with --env search"),
+        (["ppo", "--clone", "oracle"], "oracle cannot be cloned"),
+        (["ppo", "--demonstrations", "5"], "demonstrations goes with clone"),
+        (["ppo", "--env", "drive", "--demonstrations", "5"], "demonstrations goes with env search"),
     ],
 )
 def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):

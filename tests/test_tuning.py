@@ -6,9 +6,10 @@ import pytest
 from small_lots import small_lot
 
 from parkenv import InputError, OccupancyProcess, make_scenario
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from planners import make_agent
-from planners.thesis.expected_time import expected_time
+from planners.bounds.expected_time import expected_time
 from planners.thesis.tuning import tune_failure_cost
 
 COSTS = (1.0, 4.0, 16.0, 64.0)
@@ -39,7 +40,7 @@ def test_it_sees_the_forecast_and_not_the_world():
     for s in (scenario, scenario.replace(occupancy=full, prior=scenario.prior)):
         observation, _ = gym.make("parkenv/Search-v1", scenario=s).reset(seed=4)
         agent = make_agent("mdp-tuned", s)
-        chosen.append(agent.begin(observation).failure_s)
+        chosen.append(agent.begin(observation, SlotBelief.of_observation(observation)).failure_s)
     assert chosen[0] == chosen[1]
 
 
@@ -49,7 +50,7 @@ def test_it_is_the_planner_of_the_thesis_at_the_chosen_cost():
     for seed in range(3):
         row = tuned.run(seed).row
         observation, _ = tuned.env.reset(seed=seed)
-        cost = tuned.agent.begin(observation).failure_s
+        cost = tuned.agent.begin(observation, SlotBelief.of_observation(observation)).failure_s
         plain = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario, failure_s=cost)).run(seed).row
         assert row == plain
 

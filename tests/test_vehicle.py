@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from parkenv import InputError
-from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
+from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
 from parkenv.driving.vehicle import (
     ACCELERATION,
     PHYSICS_S,
@@ -140,7 +140,7 @@ def test_nothing_is_passed_through_at_any_allowed_speed(speed, offset, phase, an
     along = np.array([math.sin(angle), math.cos(angle)])
     at = np.array([12.0 + phase, offset])
     wall = np.stack([at - 0.05 * along, at + 0.05 * along])
-    space = LotSpace(CAR, Obstacles.of([(Thing.WALL, wall)]))
+    space = CollisionWorld(CAR, Obstacles.of([(ObstacleKind.WALL, wall)]))
     state = np.array([0.0, 0.0, 0.0, speed, 0.0, 0.0])
     while state[X] < 20.0:
         advance(state, 0.0, 0.0, CAR.limits)
@@ -150,28 +150,30 @@ def test_nothing_is_passed_through_at_any_allowed_speed(speed, offset, phase, an
     assert state[X] < 12.5
 
 
-@pytest.mark.parametrize("thing", [t for t in Thing if t is not Thing.NOTHING])
+@pytest.mark.parametrize("thing", [t for t in ObstacleKind if t is not ObstacleKind.NOTHING])
 def test_what_is_touched_is_named(thing):
     outline = np.array([[6.0, -1.0], [7.0, -1.0], [7.0, 1.0], [6.0, 1.0]])
-    if thing in (Thing.MOVING_CAR, Thing.PEDESTRIAN):
-        space = LotSpace(CAR, Obstacles.of([]), [(thing, outline - [6.5, 0.0])])
+    if thing in (ObstacleKind.MOVING_CAR, ObstacleKind.PEDESTRIAN):
+        space = CollisionWorld(CAR, Obstacles.of([]), [(thing, outline - [6.5, 0.0])])
         space.move([[30.0, 0.0, 0.0]])
-        assert space.touched(0.0, 0.0, 0.0) == Thing.NOTHING
+        assert space.touched(0.0, 0.0, 0.0) == ObstacleKind.NOTHING
         space.move([[4.0, 0.0, 0.3]])
         assert space.touched(0.0, 0.0, 0.0) == thing
     else:
-        line = outline[:2] + np.array([0.0, 0.9]) if thing in (Thing.KERB, Thing.WALL) else outline
-        space = LotSpace(CAR, Obstacles.of([(thing, line)]))
-        assert space.touched(0.0, 1.5, 0.0) == Thing.NOTHING
+        line = (
+            outline[:2] + np.array([0.0, 0.9]) if thing in (ObstacleKind.KERB, ObstacleKind.WALL) else outline
+        )
+        space = CollisionWorld(CAR, Obstacles.of([(thing, line)]))
+        assert space.touched(0.0, 1.5, 0.0) == ObstacleKind.NOTHING
         assert space.touched(3.0, 0.0, 0.0) == thing
-        assert space.touched(0.0, 1.5, 0.0) == Thing.NOTHING
+        assert space.touched(0.0, 1.5, 0.0) == ObstacleKind.NOTHING
 
 
 def test_of_several_things_the_same_one_is_named_in_any_order():
-    car = (Thing.PARKED_CAR, np.array([[3.0, -1.0], [4.0, -1.0], [4.0, 1.0], [3.0, 1.0]]))
-    kerb = (Thing.KERB, np.array([[3.0, -1.0], [3.0, 1.0]]))
+    car = (ObstacleKind.PARKED_CAR, np.array([[3.0, -1.0], [4.0, -1.0], [4.0, 1.0], [3.0, 1.0]]))
+    kerb = (ObstacleKind.KERB, np.array([[3.0, -1.0], [3.0, 1.0]]))
     for things in ([car, kerb], [kerb, car]):
-        assert LotSpace(CAR, Obstacles.of(things)).touched(0.0, 0.0, 0.0) == Thing.PARKED_CAR
+        assert CollisionWorld(CAR, Obstacles.of(things)).touched(0.0, 0.0, 0.0) == ObstacleKind.PARKED_CAR
 
 
 def test_obstacles_that_do_not_fit_together_are_refused():

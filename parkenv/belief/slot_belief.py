@@ -1,66 +1,247 @@
-"""What the car holds to be true of each slot: a forecast, and what it saw, growing old."""
+"""The belief state of the slots: what is known of each from the forecast and from the search's own observations."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from parkenv.errors import InputError
 from parkenv.world.decay import decay_factor
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
+UNOBSERVED, OBSERVED_FREE, OBSERVED_TAKEN = 0, 1, 2
+"""What a slot's last observation showed."""
+
+
+@dataclass(eq=False)
 class SlotBelief:
-    """Probability that each slot is taken, from a forecast and the sightings of one search, at one moment.
+    """Probability that each slot is taken, at one moment of a search, and what it rests on.
 
-    A slot that was never seen keeps its forecast. After a sighting the probability is Bayes's, and from
-    then on it relaxes to the forecast as a two-state chain does: p(t) = p∞ + (p_seen - p∞)·exp(-(λ+μ)t).
-    So one reads off it what is known: a slot below its forecast was last seen free, above it taken.
+    A slot that was never observed keeps its forecast. An observation updates its probability by Bayes' rule;
+    from then on the probability decays to the forecast as that of a two-state Markov chain:
+    p(t) = p∞ + (p_observed - p∞)·exp(-(λ+μ)t), p∞ being the forecast, λ and μ the rates of arrival and departure.
+
+    Instances are not changed once made: `update` and `decay` return new ones. (The class is not frozen, and keeps its
+    parts as the observation has them, because agents make one for each decision, of which some take microseconds.)
 
     Args:
-        prior: (n_slots,) float64, the forecast.
-        rate: (n_slots,) float64, 1/s, at which sightings fade.
-        p_occupied: (n_slots,) float64, now.
-        seen: (n_slots,) bool, seen in this search.
-        n_known_taken: how many slots were seen and looked taken at the last look.
+        p_occupied: (n_slots,) float, P(taken) now.
+        parts: (4 * n_slots,) float, one after the other:
+            `forecast`, P(taken) before anything was observed;
+            `decay_rate`, 1/s, λ+μ: how fast an observation loses its value;
+            `p_observed`, P(taken) right after the slot's last observation, the forecast where there was none;
+            `observed_at`, s since the search began, when that was, -1 where there was none.
+        time: s since the search began, now.
+
+    Examples:
+        Slot 1 is seen free and stays likely to be free for a while.
+
+        >>> belief = SlotBelief.of_forecast(np.array([0.8, 0.8]), np.array([1e-3, 1e-3]))
+        >>> later = belief.update([1], [False]).decay(100.0)
+        >>> later.observed_free.tolist(), later.p_occupied.round(3).tolist()
+        ([False, True], [0.8, 0.076])
     """
 
-    prior: FloatArray
-    rate: FloatArray
-    p_occupied: FloatArray
-    seen: NDArray[np.bool_]
-    n_known_taken: int
+    p_occupied: NDArray[np.floating]
+    parts: NDArray[np.floating]
+    time: float
+
+    @classmethod
+    def of_observation(cls, observation: Mapping[str, Any]) -> Self:
+        """Return the belief that an observation of `parkenv/Search-v1` states. Its arrays are shared, not copied.
+
+        Raises:
+            InputError: the observation is of another environment.
+        """
+        try:
+            return cls(observation["p_occupied"], observation["belief"], float(observation["time"][1]))
+        except KeyError as error:
+            raise InputError(
+                f"observation has no {error.args[0]!r}; want one of parkenv/Search-v1, got {', '.join(observation)}"
+            ) from None
+
+    def to_observation(self) -> dict[str, NDArray[np.float32]]:
+        """Return the entries of an observation that state this belief: `p_occupied` and `belief`, float32."""
+        return {"p_occupied": self.p_occupied.astype(np.float32), "belief": self.parts.astype(np.float32)}
+
+    @classmethod
+    def of_forecast(cls, p_occupied: ArrayLike, decay_rate: ArrayLike) -> Self:
+        """Return the belief before anything was observed.
+
+        Args:
+            p_occupied: (n_slots,) the forecast.
+            decay_rate: (n_slots,) 1/s.
+        """
+        forecast = np.array(p_occupied, dtype=np.float64)
+        parts = np.concatenate([forecast, decay_rate, forecast, np.full(len(forecast), -1.0)])
+        return cls(forecast, parts, 0.0)
+
+    @cached_property
+    def _rows(self) -> NDArray[np.floating]:
+        return self.parts.reshape(4, -1)
 
     @property
-    def proven_full(self) -> bool:
-        """Whether every slot has been seen in this search and looked taken at its last look."""
-        return self.n_known_taken == len(self.prior)
+    def forecast(self) -> NDArray[np.floating]:
+        """(n_slots,) float, P(taken) before anything was observed."""
+        row: NDArray[np.floating] = self._rows[0]
+        return row
+
+    @property
+    def decay_rate(self) -> NDArray[np.floating]:
+        """(n_slots,) float, 1/s, how fast an observation loses its value."""
+        row: NDArray[np.floating] = self._rows[1]
+        return row
+
+    @property
+    def p_observed(self) -> NDArray[np.floating]:
+        """(n_slots,) float, P(taken) right after the slot's last observation; the forecast where there was none."""
+        row: NDArray[np.floating] = self._rows[2]
+        return row
+
+    @property
+    def observed_at(self) -> NDArray[np.floating]:
+        """(n_slots,) float, s since the search began, when the slot was last observed; -1 where it never was."""
+        row: NDArray[np.floating] = self._rows[3]
+        return row
+
+    @cached_property
+    def observed(self) -> BoolArray:
+        """(n_slots,) bool, slots that were observed in this search."""
+        return self.observed_at >= 0.0
+
+    @cached_property
+    def state(self) -> NDArray[np.int8]:
+        """(n_slots,) int8, `UNOBSERVED`, `OBSERVED_FREE` or `OBSERVED_TAKEN`, by each slot's last observation.
+
+        A slot is observed free if the observation left it less likely to be taken than forecast, observed taken if more
+        likely; where the forecast is certain, an observation that confirms it counts, too.
+        """
+        states: NDArray[np.int8] = _states(self.parts)
+        return states
+
+    @property
+    def observed_free(self) -> BoolArray:
+        """(n_slots,) bool, see `state`."""
+        return np.asarray(self.state == OBSERVED_FREE)
+
+    @property
+    def observed_taken(self) -> BoolArray:
+        """(n_slots,) bool, see `state`."""
+        return np.asarray(self.state == OBSERVED_TAKEN)
+
+    @cached_property
+    def age(self) -> FloatArray:
+        """(n_slots,) float64, s since each slot's last observation; inf where there was none."""
+        return np.where(self.observed, self.time - self.observed_at.astype(np.float64), np.inf)
+
+    def take(self, slots: NDArray[np.integer]) -> Self:
+        """Return the belief of some of the slots, (k,), in float64."""
+        parts = self._rows[:, slots].astype(np.float64)
+        return type(self)(self.p_occupied[slots].astype(np.float64), parts.ravel(), self.time)
+
+    def update(
+        self,
+        slots: ArrayLike,
+        looks_taken: ArrayLike,
+        hit_rate: ArrayLike = 1.0,
+        false_alarm_rate: ArrayLike = 0.0,
+    ) -> Self:
+        """Return the belief after observations of some slots (Bayes' rule).
+
+        Args:
+            slots: (k,) int, each at most once.
+            looks_taken: (k,) bool, what the sensor reported.
+            hit_rate: (k,) or one for all, P(looks taken | taken).
+            false_alarm_rate: (k,) or one for all, P(looks taken | free).
+        """
+        observed = np.asarray(slots, dtype=np.int64)
+        reports, hits, false_alarms = (
+            np.broadcast_to(np.asarray(values, dtype=kind), observed.shape)
+            for values, kind in (
+                (looks_taken, np.bool_),
+                (hit_rate, np.float64),
+                (false_alarm_rate, np.float64),
+            )
+        )
+        later = type(self)(self.p_occupied.astype(np.float64), self.parts.astype(np.float64), self.time)
+        _update_slots(later.p_occupied, observed, reports, hits, false_alarms)
+        later.p_observed[observed], later.observed_at[observed] = later.p_occupied[observed], self.time
+        return later
+
+    def decay(self, seconds: float) -> Self:
+        """Return the belief some time later, nothing having been observed in between."""
+        later = type(self)(self.p_occupied, self.parts.astype(np.float64), self.time + seconds)
+        later.p_occupied = _decay_slots(later.forecast, later.decay_rate, later.p_observed, later.age)
+        return later
 
 
 @compiled(inline="always")
-def decay_to_prior(prior: float, rate: float, said: float, elapsed: float) -> float:
-    """The belief in a slot, `elapsed` s after a look that left it at `said`."""
-    return float(prior + (said - prior) * decay_factor(rate * elapsed))
+def decay_to_prior(prior: float, rate: float, p_observed: float, elapsed: float) -> float:
+    """P(taken) of a slot `elapsed` s after an observation that left it at `p_observed`."""
+    return float(prior + (p_observed - prior) * decay_factor(rate * elapsed))
 
 
-@compiled(inline="always")
+@compiled(error_model="numpy", forceinline=True)
 def bayes_update(p: float, looks_taken: bool, hit_rate: float, false_alarm_rate: float) -> float:
-    """The belief `p` in a slot after one look at it; Bayes's rule.
+    """P(taken) of a slot after one observation (Bayes' rule).
 
     Args:
-        p: before the look.
-        looks_taken: what it showed.
+        p: P(taken) before it.
+        looks_taken: what the sensor reported.
         hit_rate: P(looks taken | taken).
         false_alarm_rate: P(looks taken | free).
     """
     if_taken = hit_rate if looks_taken else 1.0 - hit_rate
     if_free = false_alarm_rate if looks_taken else 1.0 - false_alarm_rate
     evidence = if_taken * p + if_free * (1.0 - p)
-    # A look that the belief held to be impossible: believe the look, as a perfect sensor's.
+    # The belief ruled this observation out: trust the sensor, as if it never erred.
     if evidence <= 0.0:
         return 1.0 if looks_taken else 0.0
     return if_taken * p / evidence
+
+
+@compiled
+def _states(parts: NDArray[np.floating]) -> NDArray[np.int8]:
+    n = len(parts) // 4
+    states = np.empty(n, np.int8)
+    for s in range(n):
+        forecast, p_observed, observed_at = parts[s], parts[2 * n + s], parts[3 * n + s]
+        states[s] = UNOBSERVED
+        if observed_at >= 0.0 and (p_observed < forecast or p_observed == 0.0):
+            states[s] = OBSERVED_FREE
+        elif observed_at >= 0.0 and (p_observed > forecast or p_observed == 1.0):
+            states[s] = OBSERVED_TAKEN
+    return states
+
+
+@compiled
+def _update_slots(
+    p_occupied: FloatArray,
+    slots: NDArray[np.int64],
+    looks_taken: BoolArray,
+    hit_rate: FloatArray,
+    false_alarm_rate: FloatArray,
+) -> None:
+    for i in range(len(slots)):
+        s = slots[i]
+        p_occupied[s] = bayes_update(p_occupied[s], looks_taken[i], hit_rate[i], false_alarm_rate[i])
+
+
+@compiled
+def _decay_slots(
+    forecast: FloatArray, decay_rate: FloatArray, p_observed: FloatArray, age: FloatArray
+) -> FloatArray:
+    p_occupied = forecast.copy()
+    for s in range(len(forecast)):
+        if age[s] < np.inf:
+            p_occupied[s] = decay_to_prior(forecast[s], decay_rate[s], p_observed[s], age[s])
+    return p_occupied

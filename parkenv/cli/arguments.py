@@ -10,7 +10,7 @@ import typer
 
 from parkenv.errors import InputError
 from parkenv.files.spec_file import Spec
-from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
+from parkenv.scenarios.spec import ScenarioSpec, TrafficSpec, scenario_spec
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import Grid
@@ -111,9 +111,28 @@ SensorModelOption = Annotated[
         rich_help_panel=WORLD,
     ),
 ]
-CarsOption = Annotated[int, typer.Option("--cars", metavar="N", min=0, help="Other cars that drive about.")]
+CarsOption = Annotated[
+    int | None,
+    typer.Option(
+        "--cars", metavar="N", min=0, help="Other cars that drive about.  [default: the scenario's]"
+    ),
+]
 PedestriansOption = Annotated[
-    int, typer.Option("--pedestrians", metavar="M", min=0, help="People who walk about.")
+    int | None,
+    typer.Option("--pedestrians", metavar="N", min=0, help="Pedestrians.  [default: the scenario's]"),
+]
+WeatherOption = Annotated[
+    str | None,
+    typer.Option("--weather", help="sunny, overcast, low_sun, dusk or rain.  [default: drawn each time]"),
+]
+SurveyRigOption = Annotated[
+    str | None,
+    typer.Option(
+        "--rig",
+        metavar="laser|stereo|both_sides",
+        help="Simulated sensors: laser, a camera and a 270° laser; stereo, a stereo camera alone; both_sides, a laser "
+        "and a camera to each side.  [default: the scenario's, laser]",
+    ),
 ]
 RigOption = Annotated[
     str | None,
@@ -265,6 +284,9 @@ def scenario_specs(
     days: str | None = None,
     sensor_model: str | None = None,
     view_range: float | None = None,
+    cars: int | None = None,
+    pedestrians: int | None = None,
+    traffic: TrafficSpec | None = None,
     base: Sequence[ScenarioSpec] | None = None,
     default: str = "campus",
 ) -> list[ScenarioSpec]:
@@ -280,6 +302,9 @@ def scenario_specs(
         days: such as weekdays.
         sensor_model: by name, or a file.
         view_range: m.
+        cars: that drive about.
+        pedestrians: that walk about.
+        traffic: where the scenario names none.
         base: the scenarios to change where neither `scenario` nor `lot` is given.
         default: names, where there is no base either.
 
@@ -300,8 +325,29 @@ def scenario_specs(
     else:
         specs = [scenario_spec(word) for word in words("--scenario", scenario or default)]
     return [
-        _changed(spec, occupancy, mapping, goal, arrival, days, sensor_model, view_range) for spec in specs
+        _with_traffic(
+            _changed(spec, occupancy, mapping, goal, arrival, days, sensor_model, view_range),
+            cars,
+            pedestrians,
+            traffic or TrafficSpec(),
+        )
+        for spec in specs
     ]
+
+
+def _with_traffic(
+    spec: ScenarioSpec, cars: int | None, pedestrians: int | None, default: TrafficSpec
+) -> ScenarioSpec:
+    if cars is None and pedestrians is None:
+        return spec
+    usual = spec.traffic or default
+    return spec.changed(
+        "--cars, --pedestrians",
+        traffic={
+            "cars": usual.cars if cars is None else cars,
+            "pedestrians": usual.pedestrians if pedestrians is None else pedestrians,
+        },
+    )
 
 
 def _changed(

@@ -14,11 +14,8 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
-from parkenv.scenarios.build import make_scenario
+from parkenv.scenarios.build import build
 
-ScenarioOption = Annotated[
-    str, typer.Option("--scenario", metavar="NAME", help="A packaged scenario: campus, jam, street, mini.")
-]
 AgentOption = Annotated[
     str, typer.Option("--agent", metavar="NAME", help="Who decides where to drive and park.")
 ]
@@ -38,18 +35,19 @@ SpeedOption = Annotated[
 
 
 def calibrate(
-    scenario: ScenarioOption = "campus",
-    trips: Annotated[
-        int, typer.Option("--trips", min=1, help="Trips with, and as many without, sight.")
+    scenario: args.ScenarioOption = None,
+    episodes: Annotated[
+        int,
+        typer.Option("--episodes", "-n", min=1, help="Trips with observations, and as many without."),
     ] = 100,
     agent: AgentOption = "mdp",
     notice_m: NoticeOption = 2.0,
     v_drive_kmh: SpeedOption = None,
     rig: args.RigOption = None,
-    cars: args.CarsOption = 0,
-    pedestrians: args.PedestriansOption = 0,
+    cars: args.CarsOption = None,
+    pedestrians: args.PedestriansOption = None,
     seed: args.SeedOption = 0,
-    jobs: args.JobsOption = 1,
+    jobs: args.JobsOption = 0,
     backend: args.BackendOption = "loky",
     address: args.AddressOption = None,
     out: Annotated[
@@ -67,11 +65,11 @@ def calibrate(
     fail. `parkenv compare --calibrated OUT/calibrated.json` then sets agents side by side under both costs.
 
     Examples:
-    * `parkenv calibrate --scenario campus --trips 200 --jobs 2 --out results/calibrate`
+    * `parkenv calibrate --scenario campus --episodes 200 --jobs 2 --out results/calibrate`
 
     * `parkenv compare --calibrated results/calibrate/calibrated.json`
     """
-    from parkenv.evaluation.experiments.experiment import agent_fingerprints
+    from parkenv.evaluation.experiments.experiment import agent_fingerprints, fingerprints, flat_tables
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.trips.calibration import (
         TripFolder,
@@ -83,16 +81,18 @@ def calibrate(
     from parkenv.evaluation.trips.driven_search import DrivenSearch
     from parkenv.evaluation.trips.lot_driver import DrivingStyle
     from parkenv.world.scenario import KMH
-    from parkenv.world.traffic import Traffic
 
-    its = make_scenario(scenario, traffic=Traffic(cars, pedestrians))
+    spec = args.one_scenario(args.scenario_specs(scenario, cars=cars, pedestrians=pedestrians))
+    its = build(spec)
     speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
     style = DrivingStyle(speed=speed, notice_m=notice_m)
     rig = args.rig_of(rig)
     DrivenSearch(its, agent, style=style, rig=rig)  # complains before anything is driven
     make_folder(out)
     settings = {
-        "version": __version__, "scenario": scenario, "agent": agent, "style": dataclasses.asdict(style),
+        "version": __version__, "scenario": its.name,
+        "scenarios": {its.name: flat_tables(spec.model_dump(mode="json"))},
+        "files": fingerprints(spec.files()), "agent": agent, "style": dataclasses.asdict(style),
         "rig": rig,
         "traffic": dataclasses.asdict(its.traffic), "agent files": agent_fingerprints([agent]),
     }  # fmt: skip
@@ -106,9 +106,9 @@ def calibrate(
         TimeRemainingColumn(),
         console=console,
     )
-    seeds = range(seed, seed + trips)
+    seeds = range(seed, seed + episodes)
     with progress, args.workers_of(jobs, backend, address) as workers:
-        bar = progress.add_task("Driving", total=2 * trips)
+        bar = progress.add_task("Driving", total=2 * episodes)
         rows = drive_trips(
             TripPlan(its, agent, style, rig), seeds, folder, workers, lambda n: progress.advance(bar, n)
         )
@@ -129,8 +129,8 @@ def calibrate(
             "rows": table,
         },
     )
-    title = f"{scenario}: {trips} trips with and {trips} without sight of the slots, by {agent}"
-    save_distributions(rows, speed, title, out / f"calibration_{scenario}.png")
+    title = f"{its.name}: {episodes} trips with and {episodes} without observations of slots, by {agent}"
+    save_distributions(rows, speed, title, out / f"calibration_{its.name}.png")
     printed = make_table(title, ("what", "n", "mean [95 %]", "median", "p95"))
     for row in table:
         low, high = row["mean_ci95"]
@@ -143,23 +143,23 @@ def calibrate(
         )
     console.print(printed)
     console.print(
-        f"Calibrated: driving at {made.v_drive / KMH:.2f} km/h, a failed try costs {made.failure_s:.1f} s, and parking "
-        f"takes {made.manoeuvre_s:.1f} s that the drive graph leaves out. In {len(rows)} trips: {touched} contacts, "
-        f"{stuck} times stuck."
+        f"Calibrated: driving at {made.v_drive / KMH:.2f} km/h, a failed attempt costs {made.failure_s:.1f} s, and "
+        f"parking takes {made.manoeuvre_s:.1f} s that the drive graph leaves out. In {len(rows)} trips: "
+        f"{touched} contacts, {stuck} times stuck."
     )
     console.print(f"Calibration, trips, summary and figure are in {out}")
 
 
 def trip(
-    scenario: ScenarioOption = "campus",
+    scenario: args.ScenarioOption = None,
     agent: AgentOption = "mdp",
     blind: Annotated[
         bool, typer.Option("--unseen", help="Let no slot be seen before a try, so that tries fail.")
     ] = False,
     notice_m: NoticeOption = 2.0,
     rig: args.RigOption = None,
-    cars: args.CarsOption = 0,
-    pedestrians: args.PedestriansOption = 0,
+    cars: args.CarsOption = None,
+    pedestrians: args.PedestriansOption = None,
     seed: args.SeedOption = 0,
     out: Annotated[Path, typer.Option("--out", "-o", help="The film, a GIF.")] = Path("results/trip.gif"),
     rerun: args.RerunOption = None,
@@ -180,7 +180,6 @@ def trip(
     from parkenv.evaluation.trips.driven_search import DrivenSearch
     from parkenv.evaluation.trips.lot_driver import DrivingStyle
     from parkenv.evaluation.trips.sensor_log import record_trip, require_viewer, sensor_log
-    from parkenv.world.traffic import Traffic
 
     if out.suffix.lower() != ".gif":
         raise InputError(f"--out is {out}, want a file that ends in .gif")
@@ -192,7 +191,8 @@ def trip(
         if rig is None:
             raise InputError("--rerun records what sensors measure: add --rig laser")
         require_viewer()
-    its = make_scenario(scenario, traffic=Traffic(cars, pedestrians))
+    spec = args.one_scenario(args.scenario_specs(scenario, cars=cars, pedestrians=pedestrians))
+    its = build(spec)
     style = DrivingStyle(notice_m=notice_m)
     search = DrivenSearch(unseen(its) if blind else its, agent, style=style, rig=args.rig_of(rig))
     make_folder(out.parent)
@@ -216,11 +216,11 @@ def _show(console: Any, driven: Any) -> None:
     end = f"parked in {driven.slot}" if driven.parked else "not parked"
     console.print(
         f"{end}: {driven.total_s:.1f} s = {driven.lanes_s:.1f} s on the lanes + {driven.manoeuvre_s:.1f} s manoeuvre + "
-        f"{driven.failed_s:.1f} s failed tries + {driven.walk_s:.1f} s walk + {driven.gave_up_s:.1f} s elsewhere"
+        f"{driven.failed_s:.1f} s failed + {driven.walk_s:.1f} s walk + {driven.gave_up_s:.1f} s give-up penalty"
     )
     if driven.waited_s or driven.contacts:
         console.print(f"  {driven.waited_s:.1f} s of it behind and before others; {driven.contacts} contacts")
-    for t in driven.tries:
+    for t in driven.attempts:
         console.print(
             f"  {t.slot} ({t.kind}{', ' + t.way if t.way else ''}): {t.seconds:.1f} s, {t.reason or 'parked'}"
         )

@@ -1,4 +1,4 @@
-"""`parkenv demo`: the whole story, from the first survey drive to the comparison."""
+"""`parkenv demo`: from the first survey session to the comparison of agents."""
 
 from __future__ import annotations
 
@@ -13,25 +13,20 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.compare import result_tables
 from parkenv.cli.tables import make_console
-from parkenv.scenarios.build import make_scenario
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.experiments.compare import Case
-    from parkenv.mapping.inference import SessionLog
+    from parkenv.evaluation.experiments.spec import DemoSpec
     from parkenv.mapping.survey import SurveySettings
     from parkenv.world.scenario import Scenario
 
-AGENTS = ("mdp", "greedy-goal", "greedy-drive", "first-free")
 FIGURES = ("time_split", "time_distribution")
 """Of `parkenv.evaluation.figures.registry`."""
 
 
 def demo(
-    scenario: Annotated[
-        str, typer.Option("--scenario", help="A packaged scenario: campus, jam, street, mini.")
-    ] = "campus",
+    scenario: args.ScenarioOption = None,
     sessions: Annotated[int, typer.Option("--sessions", min=1, help="Survey drives.")] = 4,
-    searches: Annotated[int, typer.Option("--searches", "-n", min=2, help="Searches of each agent.")] = 6,
+    episodes: Annotated[int, typer.Option("--episodes", "-n", min=2, help="Searches of each agent.")] = 6,
     every: Annotated[
         float, typer.Option("--every", min=0.1, help="Metres between captures of the survey.")
     ] = 2.5,
@@ -40,25 +35,51 @@ def demo(
     jobs: args.JobsOption = 0,
     rerun: args.RerunOption = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for everything.")] = Path("results/demo"),
-    report: Annotated[
-        bool, typer.Option("--report", help="Also write report.html, as `parkenv report` does.")
-    ] = False,
+    report: args.ReportOption = False,
 ) -> None:
-    """Survey a lot with simulated sensors, learn from it how often each slot is taken, and search there on other days.
+    """Survey a lot with simulated sensors, estimate how often each slot is taken, and search there on other days.
 
-    1. Survey drives: a side camera and a laser pass every slot; cars are detected, ranged and put into slots.
+    1. Survey: a car with a side camera and a laser passes every slot; parked cars are detected, located and assigned to
+    slots.
 
-    2. The map: how likely each slot is taken at the hour of the search, from these drives alone.
+    2. Map: the probability that each slot is taken at the hour of the search, from these sessions alone.
 
-    3. Searches on new days, each seen through camera, laser and detector: the thesis's planner and what people do, all
+    3. Searches on other days, with camera, laser and detector: the thesis's planner and three heuristic baselines, all
     with the same map, in the same worlds.
 
     Example:
     * `parkenv demo`
     """
+    from parkenv.evaluation.experiments.spec import DemoSpec
+
+    spec = DemoSpec().changed(
+        scenario=args.one_scenario(args.scenario_specs(scenario)),
+        sessions=sessions, episodes=episodes, every=every, detector=detector, seed=seed, jobs=jobs,
+    )  # fmt: skip
+    run_demo(spec, out, rerun=rerun, report=report)
+
+
+def run_demo(
+    spec: DemoSpec,
+    out: Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    rerun: Path | None = None,
+    report: bool = False,
+) -> None:
+    """Run the demo; an unfinished one in the folder goes on, a finished one is replaced.
+
+    Raises:
+        InputError: a scenario that cannot be made, or a folder that cannot be used.
+    """
+    del overwrite
     from parkenv.evaluation.experiments.compare import run_cases, table
+    from parkenv.evaluation.experiments.demo import AGENTS, demo_cases, demo_survey
     from parkenv.evaluation.experiments.results import ResultFolder, make_folder
+    from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.experiments.surveys import run_survey, summarize
+    from parkenv.evaluation.experiments.warm_up import warm_up_tasks
     from parkenv.evaluation.figures.registry import ComparisonResults, draw_figures
     from parkenv.evaluation.figures.survey_pictures import save_detections, save_map, save_session
     from parkenv.evaluation.trips.sensor_log import require_viewer
@@ -68,93 +89,77 @@ def demo(
 
     if rerun is not None:
         require_viewer()
-    its, settings = survey_spec(scenario, every, seed, detector)
+    its, settings = demo_survey(spec)
     make_folder(out)
     console = make_console()
     map_file = out / "map.sqlite"
-    folder = ResultFolder(out, _settings(its, settings, sessions, seed), resume=_goes_on(out), overwrite=True)
-    with args.workers_of(jobs, "loky", None) as workers, Progress(
+    folder = ResultFolder(out, _settings(spec), resume=resume or _goes_on(out), overwrite=True)
+    spec.write(out / SPEC_FILE)
+    with args.workers_of(spec.jobs, spec.backend, spec.address) as workers, Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         console=console, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
-        bar = progress.add_task("1/3 surveying (compiles first after an installation)", total=sessions)
+        tasks = warm_up_tasks(settings, AGENTS)
+        bar = progress.add_task("compiling, once after an installation", total=len(tasks))
+        for _ in workers.results(tasks):
+            progress.advance(bar)
+        bar = progress.add_task("1/3 surveying", total=spec.sessions)
         run = run_survey(
-            its, settings, sessions, map_file, workers=workers, on_session=lambda _: progress.advance(bar)
+            its,
+            settings,
+            spec.sessions,
+            map_file,
+            workers=workers,
+            on_session=lambda _: progress.advance(bar),
         )
-        progress.update(bar, completed=sessions)
+        progress.update(bar, completed=spec.sessions)
 
         bar = progress.add_task("2/3 drawing the map", total=1)
         with MapStore(map_file, its.lot, create=False) as store:
             log = store.log()
         noon = 86_400.0 + 0.5 * (its.arrival.start_s + its.arrival.end_s)
         true = its.occupancy.forecast(Arrival(noon)).p_occupied
-        title = f"{its.name}, Tuesday {int(noon % 86_400 // 3600):02d}:30, {sessions} sessions"
+        title = f"{its.name}, Tuesday {int(noon % 86_400 // 3600):02d}:30, {spec.sessions} sessions"
         save_map(its.lot, predict(log, noon), true, title, out / "map.png")
         if run.shown is not None:
             save_detections(run.shown, out / "detections.png")
             save_session(its.lot, run.shown, out / "session.png")
         progress.advance(bar)
 
-        cases = search_spec(its, log, searches, seed, detector)
-        bar = progress.add_task("3/3 searching through the sensors", total=len(AGENTS) * searches)
+        cases = demo_cases(spec, its, log)
+        bar = progress.add_task("3/3 searching with simulated sensors", total=len(cases) * spec.episodes)
         run_cases(
             cases, folder, workers=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n)
         )
     rows = table(cases, folder)
     surveyed = summarize(its, settings, run, map_file)
     summary = {
-        "command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "rows": rows, "survey": surveyed,
+        "command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": spec.seed, "rows": rows,
+        "survey": surveyed,
     }  # fmt: skip
     folder.finish([case.key(s) for case, its_seeds in cases for s in its_seeds], summary)
     draw_figures(ComparisonResults(cases, folder.episodes, rows), out, FIGURES)
     console.print(
-        f"{sessions} drives past {its.lot.n_slots} slots: {surveyed['car_detection_rate']:.1%} of the parked cars were "
-        f"found, {surveyed['slot_accuracy']:.1%} of the slots judged right. The map is off by "
-        f"{surveyed['occupancy_mae']:.2f} in the mean; counting as many drives at that hour alone would be by "
-        f"{surveyed['occupancy_mae_expected']:.2f}."
+        f"{spec.sessions} drives past {its.lot.n_slots} slots: {surveyed['car_detection_rate']:.1%} of the parked cars "
+        f"were found, {surveyed['slot_accuracy']:.1%} of the slots classified correctly. Mean absolute error of the "
+        f"map: {surveyed['occupancy_mae']:.2f} (raw counts for that hour: {surveyed['occupancy_mae_expected']:.2f})."
     )
     for printed in result_tables(rows, console.width):
         console.print(printed)
     console.print(f"Pictures, the map, episodes.csv and summary.json are in {out}")
     if rerun is not None:
-        with console.status(f"Driving the first survey and the first search once more for {rerun}"):
+        with console.status(f"Running the first session and the first search again for {rerun}"):
             case, seeds = cases[0]
             _record(case.scenario, settings, seeds[0], rerun)
         console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
     if report:
         from parkenv.cli.report import make_report
 
-        make_report(out, jobs=jobs)
-
-
-def survey_spec(scenario: str, every: float, seed: int, detector: str) -> tuple[Scenario, SurveySettings]:
-    """The world of the demo, and how it is surveyed."""
-    from parkenv.mapping.survey import SurveySettings
-    from parkenv.world.occupancy import ArrivalWindow
-    from parkenv.world.traffic import Traffic
-
-    hours = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
-    windows = tuple(ArrivalWindow.parse(h) for h in hours)
-    its = make_scenario(scenario, traffic=Traffic(cars=3, pedestrians=5))
-    return its, SurveySettings(every=every, windows=windows, seed=seed, detector=detector)
-
-
-def search_spec(
-    its: Scenario, log: SessionLog, searches: int, seed: int, detector: str
-) -> list[tuple[Case, range]]:
-    """Who searches in it, knowing what the survey tells, with the seeds of the searches."""
-    from parkenv.evaluation.experiments.compare import Case
-    from parkenv.mapping.inference import MapPrior
-    from parkenv.world.sensor_model import SensorModel
-
-    known = its.replace(prior=MapPrior(log), sensor_model=SensorModel.named("laser"))
-    # Worlds of the searches are others than those of the survey: their seeds lie far from its own.
-    seeds = range(seed + 1_000_000, seed + 1_000_000 + searches)
-    return [(Case(known, name, rig="laser", detector=detector), seeds) for name in AGENTS]
+        make_report(out, jobs=spec.jobs)
 
 
 def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:
-    """The first survey drive and the first search, on one time line."""
+    """Record the first session and the first search, on one time line."""
     from parkenv.envs.perception import SearchPerceptionEnv
     from parkenv.evaluation.trips.sensor_log import record_search, record_session, sensor_log
     from parkenv.mapping.survey import Survey
@@ -163,25 +168,24 @@ def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) ->
     env = SearchPerceptionEnv(known, rig="laser", detector=settings.detector)
     with sensor_log(path, known.lot, env.rig) as log:
         record_session(Survey(known, settings), 0, log)
-        record_search(env, make_agent(AGENTS[0], env.scenario), seed, log)
+        record_search(env, make_agent("mdp", env.scenario), seed, log)
 
 
-def _settings(its: Scenario, settings: SurveySettings, sessions: int, seed: int) -> dict[str, Any]:
-    """What decides the outcome of the searches."""
+def _settings(spec: DemoSpec) -> dict[str, Any]:
+    """Return what determines the outcome of the searches."""
+    from parkenv.evaluation.experiments.experiment import fingerprints, flat_tables
     from parkenv.perception.detector_registry import detector_version
 
     return {
         "version": __version__,
-        "demo": its.name,
-        "every": settings.every,
-        "sessions": sessions,
-        "seed": seed,
-        "detector": detector_version(settings.detector),
+        **flat_tables(spec.model_dump(mode="json", exclude={"jobs", "backend", "address", "episodes"})),
+        "files": fingerprints(spec.files()),
+        "detector": detector_version(spec.detector),
     }
 
 
 def _goes_on(out: Path) -> bool:
-    """Whether an unfinished demo is in the folder."""
+    """Return whether the folder holds an unfinished demo."""
     from parkenv.evaluation.experiments.results import SETTINGS, SUMMARY
 
     return (out / SETTINGS).exists() and not (out / SUMMARY).exists()

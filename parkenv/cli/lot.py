@@ -1,4 +1,4 @@
-"""`parkenv lot`: look at lots and check lot files."""
+"""`parkenv lot`: show, check, import and convert lots."""
 
 from __future__ import annotations
 
@@ -16,23 +16,35 @@ from parkenv.errors import InputError
 if TYPE_CHECKING:
     from parkenv.world.lot import ParkingLot
 
-app = typer.Typer(help="Show, check, import and convert lots.", no_args_is_help=True)
+app = typer.Typer(
+    help="Show, check, import and convert lots (lot files, OpenStreetMap, lists of slots).",
+    no_args_is_help=True,
+)
 
 
 @app.command()
 def show(
     lot: Annotated[str, typer.Argument(help="A lot file, or a packaged lot: campus, jam, street, mini.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="The picture.  [default: NAME.png]")] = None,
-    graph: Annotated[bool, typer.Option("--graph", help="Draw the drive graph, too.")] = False,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Picture file: .png, .pdf or .svg.  [default: NAME.png]"),
+    ] = None,
+    graph: Annotated[bool, typer.Option("--graph", help="Also draw the drive graph.")] = False,
 ) -> None:
-    """Draw a lot, and say what is in it."""
+    """Draw a lot and summarise it; slots with a parking cost are coloured by it.
+
+    Examples:
+    * `parkenv lot show campus --graph --out campus.png`
+
+    * `parkenv lot show mine.geojson`
+    """
     from parkenv.evaluation.figures.lot_picture import save_lot_picture
     from parkenv.lots import load_lot
 
     its_lot = load_lot(lot)
     picture = out or Path(f"{its_lot.name}.png")
     save_lot_picture(its_lot, picture, show_graph=graph)
-    make_console().print(f"{_summary(its_lot)}. Drawn in {picture}")
+    make_console().print(f"{_summary(its_lot)}. Picture: {picture}")
 
 
 def _summary(lot: ParkingLot) -> str:
@@ -56,11 +68,16 @@ def _summary(lot: ParkingLot) -> str:
 
 @app.command()
 def check(
-    file: Annotated[Path, typer.Argument(help="A lot file.")],
+    file: Annotated[Path, typer.Argument(help="A lot file, or a file to import.")],
 ) -> None:
-    """List all that is wrong with a lot file, with feature numbers counted from 0.
+    """List all errors and warnings of a lot file, by feature number (from 0), and summarise a valid lot.
 
-    Exit code 2 where there are errors; warnings alone leave it at 0.
+    The exit code is 2 if there are errors, else 0.
+
+    Examples:
+    * `parkenv lot check mine.geojson`
+
+    * `parkenv lot check map.osm` (what an import would lack)
     """
     from parkenv.lots import check_lot, read_lot
     from parkenv.lots.file_formats import lot_format
@@ -76,7 +93,7 @@ def check(
         )
     errors = sum(p.severity == "error" for p in problems)
     if not problems:
-        console.print(f"{file}: nothing wrong", markup=False)
+        console.print(f"{file}: no errors, no warnings", markup=False)
     else:
         console.print(f"{file}: {errors} errors, {len(problems) - errors} warnings", markup=False)
     if errors:
@@ -95,36 +112,37 @@ def import_place(
             "a Dragon Lake map (.yml) or a lot."
         ),
     ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The lot, native GeoJSON.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Lot file to write (.geojson).")],
     goal: Annotated[
         list[str] | None,
         typer.Option(
-            help="Where people walk to: LAT,LON, or X,Y in metres. Repeatable.  [default: building entrances, "
-            "the nearest building]"
+            help="Place that people walk to: LAT,LON, or X,Y in metres. Repeatable.  [default: building entrances, "
+            "else the nearest building]"
         ),
     ] = None,
     entry: Annotated[
         list[str] | None,
         typer.Option(
-            help="Where cars come in, likewise.  [default: where service roads meet a public street, or streets "
-            "leave the map]"
+            help="Place where cars enter: LAT,LON, or X,Y in metres. Repeatable.  [default: where service roads meet "
+            "a public street, or where streets leave the map]"
         ),
     ] = None,
     bounds: Annotated[
         str | None,
-        typer.Option(help="Read only what lies within SOUTH,WEST,NORTH,EAST, or X0,Y0,X1,Y1 in metres."),
+        typer.Option(help="Import only what is within SOUTH,WEST,NORTH,EAST, or X0,Y0,X1,Y1 in metres."),
     ] = None,
     disabled: Annotated[
-        bool, typer.Option("--disabled", help="Spaces for disabled drivers are slots, too.")
+        bool, typer.Option("--disabled", help="Also import spaces for disabled drivers.")
     ] = False,
-    picture: Annotated[Path | None, typer.Option(help="A PNG to check the import by.")] = None,
+    picture: Annotated[Path | None, typer.Option(help="PNG to check the import by.")] = None,
 ) -> None:
-    """Make a lot of a real place, say what was found and what was left out.
+    """Import a lot of a real place; report what was found, left out and is missing.
 
-    The picture is drawn, and the findings are told, also where something is missing; no lot is written then, and
-    the exit code is 2.
+    If something is missing, the picture is still drawn, but no lot is written and the exit code is 2.
 
+    Examples:
     * `parkenv lot import map.osm --out lot.geojson --picture lot.png`
+
     * `parkenv lot import slots.csv --out lot.geojson --entry 0,0 --goal 40,25`
     """
     from parkenv.lots import import_lot, write_lot
@@ -147,7 +165,7 @@ def import_place(
         from parkenv.evaluation.figures.import_picture import save_import_picture
 
         save_import_picture(draft, picture)
-        console.print(f"Drawn in {picture}", markup=False)
+        console.print(f"Picture: {picture}", markup=False)
     try:
         lot = draft.lot()
     except InputError as error:
@@ -162,16 +180,20 @@ def _numbers(option: str, text: str, count: int) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count or not all(map(math.isfinite, values)):
-        raise InputError(f"{option} is {text!r}, want {count} numbers with commas between")
+        raise InputError(f"{option} is {text!r}, want {count} numbers separated by commas")
     return values
 
 
 @app.command()
 def convert(
     lot: Annotated[str, typer.Argument(help="A lot file, or a packaged lot.")],
-    out: Annotated[Path, typer.Argument(help="The GeoJSON file to write.")],
+    out: Annotated[Path, typer.Argument(help="GeoJSON file to write.")],
 ) -> None:
-    """Write a lot as native GeoJSON, e.g. to edit it."""
+    """Write a lot as native GeoJSON, e.g. to edit it in a GIS.
+
+    Example:
+    * `parkenv lot convert campus mine.geojson`
+    """
     from parkenv.lots import load_lot, write_lot
 
     write_lot(load_lot(lot), out)

@@ -1,4 +1,4 @@
-"""`parkenv park`: the planner parks, and who has learned to, again and again."""
+"""`parkenv park`: success rates and times of parking agents."""
 
 from __future__ import annotations
 
@@ -28,35 +28,44 @@ def park(
         typer.Option(
             "--agents",
             metavar="NAME[,NAME...]",
-            help="Who parks, in the same tasks: planner, or ALGORITHM:FILE for a model of `parkenv train --env drive`.",
+            help="Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of "
+            "`parkenv train --env drive`.",
         ),
     ] = "planner",
     lot: Annotated[
         str,
-        typer.Option("--lot", help="Packaged lots (campus, jam, street, mini) or lot files, with commas."),
+        typer.Option(
+            "--lot", help="Packaged lots (campus, jam, street, mini) or lot files, separated by commas."
+        ),
     ] = "campus,street",
     kind: Annotated[
-        str, typer.Option("--kind", help="perpendicular, oblique, parallel; or all that each lot has.")
+        str,
+        typer.Option(
+            "--kind", help="Kinds of slots, separated by commas: perpendicular, oblique, parallel; or all."
+        ),
     ] = "all",
-    way: Annotated[str, typer.Option("--way", help="nose-in, back-in; or both.")] = "both",
-    episodes: Annotated[int, typer.Option("--episodes", min=1, help="Parkings on each lot.")] = 100,
+    way: Annotated[
+        str, typer.Option("--way", help="Orientation in the slot: nose-in, back-in; or both.")
+    ] = "both",
+    episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Episodes per lot.")] = 100,
     occupancy: Annotated[
-        float, typer.Option("--occupancy", min=0.0, max=1.0, help="Share of the other slots that are taken.")
+        float,
+        typer.Option("--occupancy", min=0.0, max=1.0, help="Fraction of the other slots that are occupied."),
     ] = 0.85,
     slack: Annotated[
         float,
-        typer.Option("--slack", min=0.0, help="Metres around the slot that are kept clear of parked cars."),
+        typer.Option("--slack", min=0.0, help="Distance around the slot kept clear of parked cars, m."),
     ] = 0.0,
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 1,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for pictures, episodes.csv and summary.json.")
+        Path, typer.Option("--out", "-o", help="Output folder for pictures, episodes.csv and summary.json.")
     ] = Path("results/park"),
 ) -> None:
-    """Let drivers park in `parkenv/Drive-v1`: how often they do, how long they plan and drive.
+    """Evaluate parking agents in `parkenv/Drive-v1`: success rate, planning time, driving time, manoeuvres.
 
-    Writes a picture of one parking for each kind of slot and way of standing in it, an animation of one, and
-    pictures of failures where there are any; of several agents, into a folder for each.
+    Writes pictures of one successful episode per kind of slot and orientation, an animation of one, and pictures of
+    failures, if any; with several agents, into one folder per agent.
 
     Examples:
     * `parkenv park --episodes 250 --lot campus,street,jam --jobs 2`
@@ -69,17 +78,17 @@ def park(
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, parking_table, write_parkings
     from parkenv.lots import load_lot
-    from planners.driving.drivers import make_driver
+    from planners.driving.parking_agents import make_parking_agent
 
     kinds = None if kind == "all" else _chosen("--kind", kind, KINDS)
     ways = WAYS if way == "both" else _chosen("--way", way, WAYS)
     cases = []
     for name in args.words("--lot", lot):
         case = ParkingCase(load_lot(name), kinds, ways, occupancy, slack)
-        case.environment().close()  # complains before anything is driven
+        case.environment().close()  # validates the options before the first episode
         cases.append(case)
     labels = _labels(args.words("--agents", agents))
-    drivers = {label: make_driver(name) for label, name in labels.items()}
+    drivers = {label: make_parking_agent(name) for label, name in labels.items()}
     make_folder(out)
     console = make_console()
     progress = Progress(
@@ -93,7 +102,7 @@ def park(
     parkings: dict[str, list[Parking]] = {label: [] for label in labels}
     with progress, args.workers_of(jobs, "loky", None) as workers:
         for label, name in labels.items():
-            what = "Parking" if len(labels) == 1 else f"{label} parks"
+            what = "Parking" if len(labels) == 1 else label
             bar = progress.add_task(what, total=len(cases) * episodes)
             for some in park_all(cases, seeds, workers, name):
                 parkings[label] += some
@@ -114,7 +123,7 @@ def park(
         folder = out if len(labels) == 1 else out / label
         make_folder(folder)
         _picture(its, cases, drivers[label], film, folder)
-    _show(console, f"{', '.join(names)}: {episodes} parkings on each", table)
+    _show(console, f"{', '.join(names)}: {episodes} episodes per lot", table)
     for row in [row for row in rows if not row["parked"]][:SHOWN_ROWS]:
         who = f"{row['agent']}, " if len(labels) > 1 else ""
         console.print(
@@ -124,7 +133,7 @@ def park(
 
 
 def _labels(names: list[str]) -> dict[str, str]:
-    """A word for each agent that can name a folder, and its name."""
+    """A short label per agent, usable as a folder name, and the agent's full name."""
     labels: dict[str, str] = {}
     for name in names:
         word = name.partition(":")[0]
@@ -134,13 +143,13 @@ def _labels(names: list[str]) -> dict[str, str]:
 
 
 def _to_film(parkings: list[Parking]) -> dict[str, Any] | None:
-    """The row of the parking that is the most of a manoeuvre; None where nothing is parked."""
+    """The row of the successful episode with the most direction changes; None without success."""
     parked = [p.row for p in _one_of_each(parkings)]
     return max(parked, key=lambda row: row["direction_changes"], default=None)
 
 
 def _one_of_each(parkings: list[Parking]) -> list[Parking]:
-    """The first that succeeded, of each kind of slot and way of standing in it."""
+    """The first success per kind of slot and orientation."""
     kept = {(p.row["kind"], p.row["way"]): p for p in reversed(parkings) if p.row["parked"]}
     return [kept[key] for key in sorted(kept)]
 
@@ -152,7 +161,7 @@ def _picture(
     film: dict[str, Any] | None,
     folder: Path,
 ) -> None:
-    """Pictures of parkings and failures, and an animation of the task to film."""
+    """Write pictures of successes and failures, and an animation of the episode `film`."""
     from parkenv.evaluation.figures.parking_pictures import save_parkings
     from parkenv.evaluation.figures.picture_files import save_film
     from parkenv.evaluation.trips.parking_runs import park_once
@@ -200,7 +209,7 @@ def _show(console: Any, title: str, table: list[dict[str, Any]]) -> None:
 
 
 def _pair(row: dict[str, Any], name: str, digits: int) -> str:
-    """A median and its 95th percentile; nothing for who has none, as who does not plan."""
+    """A median with its 95th percentile; empty for agents without the quantity, e.g. planning time."""
     median, p95 = (_known(row[key], digits) for key in (name, f"{name}_p95"))
     return median and f"{median} ({p95})"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -14,7 +13,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
-from parkenv.scenarios.build import make_scenario
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.compare import Case
@@ -22,6 +20,7 @@ if TYPE_CHECKING:
     from parkenv.mapping.survey import Survey
 
 PAGE = "report.html"
+MAP_FILE = "map.sqlite"
 EPISODES, SENSED = 20, 4
 """Searches that are replayed by default, and where every step goes through rendered sensors."""
 BESIDE_MODELS = 3
@@ -149,91 +148,66 @@ def make_report(
 
 
 def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
-    """What the command did: its survey, with the number of drives, and its searches.
+    """What the run did, from its specification: its survey, with the number of drives, and its searches.
 
     Raises:
         InputError, OSError: it cannot be done again.
     """
-    if run.kind == "compare":
-        from parkenv.evaluation.experiments.experiment import Experiment, require_unchanged
-        from parkenv.evaluation.experiments.results import read_settings
-        from parkenv.evaluation.experiments.spec import SPEC_FILE, ExperimentSpec
+    from parkenv.evaluation.experiments import spec as specs
+    from parkenv.evaluation.experiments.experiment import Experiment, require_unchanged
+    from parkenv.evaluation.experiments.results import read_settings
 
-        spec = ExperimentSpec.read(run.path / SPEC_FILE)
+    file = run.path / specs.SPEC_FILE
+    if run.kind == "compare":
+        spec = specs.ExperimentSpec.read(file)
         require_unchanged(spec, read_settings(run.path) or {})
         return None, [*Experiment(spec).cases]
     if run.kind == "benchmark":
         from parkenv.evaluation.experiments.benchmark import Suite
-        from parkenv.evaluation.experiments.spec import SPEC_FILE, BenchmarkSpec
 
-        suite = BenchmarkSpec.read(run.path / SPEC_FILE)
-        return None, [*Suite.named(suite.suite).cases(suite.agents)]
+        benchmark = specs.BenchmarkSpec.read(file)
+        return None, [*Suite.named(benchmark.suite).cases(benchmark.agents)]
     if run.kind == "survey":
-        from parkenv.cli.survey import survey_of_options
+        from parkenv.evaluation.experiments.surveys import survey_of
 
-        return (
-            partial(_survey, *survey_of_options(**_options(run, survey_of_options))),
-            len(run.table("sessions.csv")),
-        ), []
+        return (partial(_survey, *survey_of(specs.SurveySpec.read(file))), len(run.table("sessions.csv"))), []
     if run.kind == "demo":
-        from parkenv.cli.demo import search_spec, survey_spec
-        from parkenv.cli.survey import MAP_FILE
+        from parkenv.evaluation.experiments.demo import demo_cases, demo_survey
         from parkenv.mapping.store import MapStore
 
-        its, settings = survey_spec(**_options(run, survey_spec))
+        demo = specs.DemoSpec.read(file)
+        its, settings = demo_survey(demo)
         with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:
             log = store.log()
-        numbers = {k: v for k, v in _parsed(run).items() if k in ("searches", "seed", "detector")}
-        return (partial(_survey, its, settings), len(log.time)), [*search_spec(its, log, **numbers)]
+        return (partial(_survey, its, settings), len(log.time)), [*demo_cases(demo, its, log)]
     if run.kind == "train":
         return None, _trained(run)
     return None, []
 
 
-def _options(run: RunFolder, function: Callable[..., Any]) -> dict[str, Any]:
-    """Those of the command's options that a function takes."""
-    names = inspect.signature(function).parameters
-    return {k: v for k, v in _parsed(run).items() if k in names}
-
-
-def _parsed(run: RunFolder) -> dict[str, Any]:
-    """The options that the command was called with, defaults included.
-
-    Raises:
-        InputError: they are no longer those of the command.
-    """
-    from parkenv.cli import app
-
-    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
-    try:
-        with commands[run.kind].make_context(run.kind, run.arguments) as context:
-            return dict(context.params)
-    except typer.TyperException as error:
-        raise InputError(f"{run.path}: its command cannot be read: {error.format_message()}") from error
-
-
 def _trained(run: RunFolder) -> Cases:
     """The best model and the best planners, where the models were tested; none where that was no search."""
     from parkenv.evaluation.experiments.compare import Case
-    from parkenv.scenarios.spec import SCENARIO_NAMES
+    from parkenv.evaluation.experiments.spec import SPEC_FILE, TrainingSpec
 
-    rows = [
-        r for r in run.summary["rows"] if r.get("scenario") in SCENARIO_NAMES and r.get("total_s") is not None
-    ]
-    if not rows or not run.summary.get("transfer"):
+    spec = TrainingSpec.read(run.path / SPEC_FILE)
+    if spec.env != "search" or not run.summary.get("transfer"):
         return []
-    from parkenv.cli.training_course import TESTED_FROM
+    from parkenv.cli.search_task import SearchTask
+    from parkenv.cli.training_task import TEST_SEED
 
-    best = min(rows, key=lambda row: float(row["total_s"]))
+    best = min(run.summary["rows"], key=lambda row: float(row["total_s"]))
     model = run.path / f"seed_{best['seed']}" / "model.zip"
+    task = SearchTask(spec)
+    agents = {agent.label: agent for agent in task.compared}
+    seeds = range(TEST_SEED, TEST_SEED + int(run.summary["transfer"][0]["episodes"]))
     cases: Cases = []
-    for name in dict.fromkeys(row["test_scenario"] for row in run.summary["transfer"]):
-        scenario = make_scenario(name)
-        planners = [row for row in run.summary.get("planners", []) if row["scenario"] == name]
+    for scenario in task.tested:
+        planners = [row for row in run.summary.get("planners", []) if row["scenario"] == scenario.name]
         beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
-        seeds = range(TESTED_FROM, TESTED_FROM + int(run.summary["transfer"][0]["episodes"]))
-        names = [f"{best['agent']}:{model}", *(row["agent"] for row in beside)]
-        cases += [(Case(scenario, agent), seeds) for agent in names]
+        cases.append((Case(scenario, f"{best['agent']}:{model}"), seeds))
+        shown = [agents[row["agent"]] for row in beside if row["agent"] in agents]
+        cases += [(Case(scenario, agent.name, options=agent.options), seeds) for agent in shown]
     return cases
 
 

@@ -11,7 +11,10 @@ import typer
 from parkenv.cli import arguments as args
 from parkenv.cli.benchmark import run_suite
 from parkenv.cli.compare import run_comparison
+from parkenv.cli.demo import run_demo
 from parkenv.cli.report import make_report
+from parkenv.cli.survey import run_survey_of
+from parkenv.cli.train import run_training
 from parkenv.errors import InputError
 from parkenv.files.spec_file import nearest, read_tables
 
@@ -31,6 +34,9 @@ class Kind(NamedTuple):
 KINDS: Mapping[str, Kind] = {
     "compare": Kind("ExperimentSpec", run_comparison),
     "benchmark": Kind("BenchmarkSpec", run_suite),
+    "survey": Kind("SurveySpec", run_survey_of),
+    "demo": Kind("DemoSpec", run_demo),
+    "train": Kind("TrainingSpec", run_training),
 }
 
 

@@ -10,28 +10,22 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
-from parkenv.scenarios.build import make_scenario
+from parkenv.scenarios.build import build
 
 
 def fit_sensor_model(
     scenario: Annotated[
-        str, typer.Option("--scenario", metavar="NAME[,NAME...]", help="Scenarios to search in.")
+        str,
+        typer.Option("--scenario", metavar="NAME|FILE[,...]", help="Scenarios to search in."),
     ] = "campus,street",
-    rig: Annotated[
-        str, typer.Option("--rig", help="laser: a camera and a 270° laser; stereo: a stereo camera alone.")
-    ] = "laser",
-    searches: Annotated[
+    rig: args.SurveyRigOption = None,
+    episodes: Annotated[
         int,
-        typer.Option("--searches", "-n", min=1, help="Searches of each of three agents in each scenario."),
+        typer.Option("--episodes", "-n", min=1, help="Searches of each of three agents in each scenario."),
     ] = 20,
     arrival: args.ArrivalOption = None,
     days: args.DaysOption = None,
-    weather: Annotated[
-        str | None,
-        typer.Option(
-            "--weather", help="sunny, overcast, low_sun, dusk, rain; default: drawn for each search."
-        ),
-    ] = None,
+    weather: args.WeatherOption = None,
     seed: args.SeedOption = 500_000,
     jobs: args.JobsOption = 0,
     backend: args.BackendOption = "loky",
@@ -49,24 +43,26 @@ def fit_sensor_model(
     * `parkenv fit-sensor-model --rig stereo --out stereo.json`
     """
     from parkenv.evaluation.experiments.sensor_model_fit import AGENTS, measure_sensors
-    from parkenv.world.traffic import Traffic
+    from parkenv.evaluation.experiments.spec import BUSY
 
-    scenarios = [
-        make_scenario(spec, traffic=Traffic(cars=3, pedestrians=5))
+    specs = [
+        spec if spec.traffic else spec.changed(traffic=BUSY)
         for spec in args.scenario_specs(scenario, arrival=arrival, days=days)
     ]
+    scenarios = [build(spec) for spec in specs]
+    rig = args.rig_of(rig) or specs[0].rig
     console = make_console()
     with args.workers_of(jobs, backend, address) as workers, Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         console=console, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
         bar = progress.add_task(
-            "Searching with simulated sensors", total=searches * len(AGENTS) * len(scenarios)
+            "Searching with simulated sensors", total=episodes * len(AGENTS) * len(scenarios)
         )
         counts = measure_sensors(
             scenarios,
             rig,
-            searches,
+            episodes,
             seed=seed,
             weather=weather,
             workers=workers,

@@ -12,7 +12,7 @@ from rich.progress import track
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
-from parkenv.scenarios.build import make_scenario
+from parkenv.scenarios.build import build
 
 app = typer.Typer(help="Look through the simulated sensors.", no_args_is_help=True)
 
@@ -24,9 +24,7 @@ def _sensors() -> None:
 
 @app.command()
 def preview(
-    scenario: Annotated[
-        str, typer.Option("--scenario", help="A packaged scenario: campus, jam, street, mini.")
-    ] = "campus",
+    scenario: args.ScenarioOption = None,
     weather: Annotated[
         str,
         typer.Option(
@@ -36,8 +34,8 @@ def preview(
     seed: args.SeedOption = 0,
     drive: Annotated[float, typer.Option("--drive", min=0.0, help="Metres of the video; 0 for none.")] = 20.0,
     every: Annotated[float, typer.Option("--every", min=0.05, help="Metres between its frames.")] = 0.5,
-    cars: args.CarsOption = 3,
-    pedestrians: args.PedestriansOption = 5,
+    cars: args.CarsOption = None,
+    pedestrians: args.PedestriansOption = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures and drive.gif.")] = Path(
         "results/sensors"
     ),
@@ -57,11 +55,11 @@ def preview(
     from scipy.spatial import cKDTree
 
     from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.evaluation.experiments.spec import BUSY
     from parkenv.evaluation.figures.picture_files import save_film
     from parkenv.evaluation.figures.sensor_pictures import save_sensor_preview, with_boxes
     from parkenv.world.keyed_random import world_key
     from parkenv.world.lot_scene import LotScenes, slot_lot
-    from parkenv.world.traffic import Traffic
     from planners.routes import DriveRoutes
     from sim_sensors.camera.weather import PRESETS, Weather
     from sim_sensors.ground_truth import vehicle_boxes
@@ -71,7 +69,9 @@ def preview(
     for name in names:
         if name not in PRESETS:
             raise InputError(f"--weather has {name!r}, want all or some of {', '.join(PRESETS)}")
-    its = make_scenario(scenario, traffic=Traffic(cars, pedestrians))
+    specs = args.scenario_specs(scenario, cars=cars, pedestrians=pedestrians, traffic=BUSY)
+    spec = args.one_scenario(specs)
+    its = build(spec if spec.traffic else spec.changed(traffic=BUSY))
     make_folder(out)
     console = make_console()
 
@@ -80,7 +80,7 @@ def preview(
     scenes = LotScenes(slot_lot(its.lot), its, key, its.occupancy.world(key, arrival))
 
     entry, target = int(its.lot.entry_vertices[0]), int(its.lot.walk_m().argmin())
-    path = [entry, *(vertex for _, vertex in DriveRoutes(its).way(entry, target))]
+    path = [entry, *DriveRoutes(its).path(entry, target)]
     poses = poses_along(its.lot.vertex_xy[path], every)
     parked = scenes.at(arrival.time)
     beside = poses[:, :2] + 4.0 * np.column_stack([np.sin(poses[:, 2]), -np.cos(poses[:, 2])])

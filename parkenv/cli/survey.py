@@ -16,42 +16,36 @@ from parkenv.errors import InputError
 from parkenv.scenarios.build import build
 
 if TYPE_CHECKING:
-    from parkenv.mapping.survey import SurveySettings
-    from parkenv.world.scenario import Scenario
+    from parkenv.evaluation.experiments.spec import SurveySpec
 
 MAP_FILE = "map.sqlite"
 
 
 def survey(
-    scenario: Annotated[
-        str | None, typer.Option("--scenario", help="A packaged scenario: campus, jam, street, mini.")
-    ] = None,
+    scenario: args.ScenarioOption = None,
     lot: args.LotOption = None,
     occupancy: args.OccupancyOption = None,
     sessions: Annotated[
-        int, typer.Option("--sessions", "-n", min=1, help="How many drives; the thesis made 21.")
+        int, typer.Option("--sessions", min=1, help="How many drives; the thesis made 21.")
     ] = 6,
-    rig: Annotated[
-        str, typer.Option("--rig", help="laser: a camera and a 270° laser; stereo: a stereo pair alone.")
-    ] = "laser",
+    rig: args.SurveyRigOption = None,
     detector: args.DetectorOption = "hog",
     hours: Annotated[
-        str,
-        typer.Option(
-            "--hours", metavar="HH:MM-HH:MM[,...]", help="When drives begin; one window after the other."
-        ),
-    ] = "08:00-10:00,11:00-14:00,16:00-18:00",
-    days: args.DaysOption = None,
-    weather: Annotated[
         str | None,
-        typer.Option("--weather", help="sunny, overcast, low_sun, dusk, rain; drawn where not given."),
+        typer.Option(
+            "--hours",
+            metavar="HH:MM-HH:MM[,...]",
+            help="When drives begin; one window after the other.  [default: 08:00-10:00,11:00-14:00,16:00-18:00]",
+        ),
     ] = None,
+    days: args.DaysOption = None,
+    weather: args.WeatherOption = None,
     every: Annotated[float, typer.Option("--every", min=0.1, help="Metres between captures.")] = 1.25,
     pose_noise: Annotated[
-        float, typer.Option("--pose-noise", min=0.0, help="How wrong the car is about where it is, m.")
+        float, typer.Option("--pose-noise", min=0.0, help="Localisation error of the car, m.")
     ] = 0.0,
-    cars: args.CarsOption = 3,
-    pedestrians: args.PedestriansOption = 5,
+    cars: args.CarsOption = None,
+    pedestrians: args.PedestriansOption = None,
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 0,
     backend: args.BackendOption = "loky",
@@ -60,9 +54,7 @@ def survey(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder for map.sqlite, pictures, summary.json.")
     ] = Path("results/survey"),
-    report: Annotated[
-        bool, typer.Option("--report", help="Also write report.html, as `parkenv report` does.")
-    ] = False,
+    report: args.ReportOption = False,
 ) -> None:
     """Drive past every slot with simulated sensors, find the parked cars, and keep what was seen in a map file.
 
@@ -76,8 +68,41 @@ def survey(
 
     * `parkenv survey --scenario mini --sessions 1 --rerun drive.rrd`
     """
+    from parkenv.evaluation.experiments.spec import BUSY, SurveySpec
+
+    given = {} if hours is None else {"hours": [window.strip() for window in hours.split(",")]}
+    spec = SurveySpec().changed(
+        scenario=args.one_scenario(
+            args.scenario_specs(
+                scenario, lot=lot, occupancy=occupancy, days=days, cars=cars, pedestrians=pedestrians, traffic=BUSY
+            )
+        ),
+        sessions=sessions, rig=rig, detector=detector, weather=weather, every=every, pose_noise=pose_noise, seed=seed,
+        jobs=jobs, backend=backend, address=address, **given,
+    )  # fmt: skip
+    run_survey_of(spec, out, rerun=rerun, report=report)
+
+
+def run_survey_of(
+    spec: SurveySpec,
+    out: Path,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    rerun: Path | None = None,
+    report: bool = False,
+) -> None:
+    """Drive the sessions that the map in the folder does not hold yet, print the errors and draw the figures.
+
+    Raises:
+        InputError: a scenario that cannot be made, or a folder that cannot be used.
+    """
+    del resume
+    if overwrite:
+        raise InputError("--overwrite: a survey adds sessions to its map; name another folder for a new one")
     from parkenv.evaluation.experiments.results import make_folder, write_summary
-    from parkenv.evaluation.experiments.surveys import run_survey, slots_found, summarize
+    from parkenv.evaluation.experiments.spec import SPEC_FILE
+    from parkenv.evaluation.experiments.surveys import run_survey, slots_found, summarize, survey_of
     from parkenv.evaluation.figures.survey_pictures import (
         save_detection_reach,
         save_detections,
@@ -95,28 +120,24 @@ def survey(
 
     if rerun is not None:
         require_viewer()
-    its, settings = survey_of_options(
-        scenario=scenario, lot=lot, occupancy=occupancy, rig=rig, detector=detector,
-        hours=hours, days=days, weather=weather, every=every,
-        pose_noise=pose_noise,
-        cars=cars, pedestrians=pedestrians, seed=seed,
-    )  # fmt: skip
+    its, settings = survey_of(spec)
     make_folder(out)
+    spec.write(out / SPEC_FILE)
     console = make_console()
     with (
-        args.workers_of(jobs, backend, address) as workers,
+        args.workers_of(spec.jobs, spec.backend, spec.address) as workers,
         Progress(console=console, disable=not console.is_terminal) as progress,
     ):
-        task = progress.add_task("Driving (compiles first after an installation)", total=sessions)
+        task = progress.add_task("Driving (compiles first after an installation)", total=spec.sessions)
         run = run_survey(
             its,
             settings,
-            sessions,
+            spec.sessions,
             out / MAP_FILE,
             workers=workers,
             on_session=lambda _: progress.advance(task),
         )
-        progress.update(task, completed=sessions)
+        progress.update(task, completed=spec.sessions)
     row = summarize(its, settings, run, out / MAP_FILE)
     with MapStore(out / MAP_FILE, its.lot, create=False) as store:
         log = store.log()
@@ -128,7 +149,7 @@ def survey(
         its.lot, predicted, its.occupancy.forecast(Arrival(time)).p_occupied,
         f"{its.name} after {row['sessions']} sessions", out / f"map_{its.name}.png",
     )  # fmt: skip
-    title = f"{its.name}, rig {rig}, {row['sessions']} sessions"
+    title = f"{its.name}, rig {settings.rig}, {row['sessions']} sessions"
     if row["detection_by_distance"]:
         save_detection_reach(row["detection_by_distance"], title, out / f"reach_{its.name}.png")
     if run.shown is not None:
@@ -157,13 +178,18 @@ def survey(
         rates = (f"{its_row[c]:.1%}" for c in ("car_detection_rate", "slot_accuracy"))
         table.add_row(name, str(its_row["sessions"]), *rates)
     console.print(table)
-    summary = {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "rows": [row]}
+    summary = {
+        "command": ["parkenv", *sys.argv[1:]],
+        "version": __version__,
+        "seed": spec.seed,
+        "rows": [row],
+    }
     write_summary(out, summary)
     console.print(f"Written: {out / MAP_FILE}, summary.json, sessions.csv and pictures")
     if report:
         from parkenv.cli.report import make_report
 
-        make_report(out, jobs=jobs)
+        make_report(out, jobs=spec.jobs)
     if rerun is not None:
         with console.status(f"Driving the first session once more for {rerun}"):
             first = Survey(its, settings)
@@ -172,50 +198,9 @@ def survey(
         console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
 
 
-def survey_of_options(
-    *,
-    scenario: str | None,
-    lot: str | None,
-    occupancy: Path | None,
-    rig: str,
-    detector: str,
-    hours: str,
-    days: str | None,
-    weather: str | None,
-    every: float,
-    pose_noise: float,
-    cars: int,
-    pedestrians: int,
-    seed: int,
-) -> tuple[Scenario, SurveySettings]:
-    """The world and the way of driving that the options of `parkenv survey` ask for.
-
-    Raises:
-        InputError: options that cannot be used, by name.
-    """
-    from parkenv.mapping.odometry import PoseNoise
-    from parkenv.mapping.survey import SurveySettings
-    from parkenv.world.occupancy import ArrivalWindow
-    from parkenv.world.traffic import Traffic
-
-    its = build(args.one_scenario(args.scenario_specs(scenario, lot=lot, occupancy=occupancy, days=days)))
-    settings = SurveySettings(
-        rig=rig,
-        every=every,
-        weather=weather,
-        windows=tuple(ArrivalWindow.parse(h, days or "weekdays") for h in hours.split(",")),
-        pose_noise=PoseNoise(pose_noise, 0.02 * pose_noise),
-        seed=seed,
-        detector=detector,
-    )
-    return its.replace(traffic=Traffic(cars, pedestrians)), settings
-
-
 def show_map(
     file: Annotated[Path, typer.Argument(help="A map file that parkenv survey wrote.")],
-    scenario: Annotated[
-        str | None, typer.Option("--scenario", help="The packaged scenario that was surveyed.")
-    ] = None,
+    scenario: args.ScenarioOption = None,
     lot: args.LotOption = None,
     weekday: Annotated[
         str | None, typer.Option("--weekday", help="mon to sun; over all sessions where not given.")
@@ -244,7 +229,8 @@ def show_map(
     from parkenv.files.atomic_write import atomic_write
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
-    from parkenv.world.occupancy import DAY_NAMES, DAY_S, HOUR_S
+    from parkenv.world.occupancy import DAY_NAMES
+    from parkenv.world.week import DAY_S, HOUR_S
 
     its = build(args.one_scenario(args.scenario_specs(scenario, lot=lot)))
     if weekday is not None and weekday not in DAY_NAMES:

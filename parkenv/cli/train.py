@@ -1,9 +1,10 @@
-"""`parkenv train`: agents that learn, examined beside the planners."""
+"""`parkenv train`: reinforcement learning agents, evaluated beside the planners."""
 
 from __future__ import annotations
 
 import sys
 import threading
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,19 +14,19 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
-from parkenv.cli.drive_course import DriveCourse
+from parkenv.cli.drive_task import DriveTask
 from parkenv.cli.report import PAGE
-from parkenv.cli.search_course import SearchCourse
+from parkenv.cli.search_task import SearchTask
 from parkenv.cli.tables import make_console
-from parkenv.cli.training_course import FIGURE, Course, Row, curves_beside
+from parkenv.cli.training_task import FIGURE, Row, TrainingTask, curves_beside
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
+    from parkenv.evaluation.experiments.spec import TrainingSpec
     from parkenv.evaluation.experiments.workers import Workers
     from parkenv.evaluation.training.rl_training import Training
 
-PLANNERS = "belief,mdp-tuned,mdp,first-free,greedy-drive,greedy-goal"
-ENVS = ("search", "drive")
+TASKS: Mapping[str, type[TrainingTask]] = {"search": SearchTask, "drive": DriveTask}
 
 
 def train(
@@ -45,30 +46,14 @@ def train(
             rich_help_panel=args.WORLD,
         ),
     ] = "search",
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            "--scenario",
-            metavar="NAME[,NAME...]",
-            help="Where to learn to search; several take turns, and examinations are on the first.  [default: campus]",
-            rich_help_panel=args.WORLD,
-        ),
-    ] = None,
-    lot: Annotated[
-        str | None,
-        typer.Option(
-            "--lot",
-            metavar="NAME|FILE[,...]",
-            help="Where to learn to drive into slots.  [default: campus,street, which have all kinds of slots]",
-            rich_help_panel=args.WORLD,
-        ),
-    ] = None,
+    scenario: args.ScenariosOption = None,
+    lot: args.LotOption = None,
     test_on: Annotated[
         str | None,
         typer.Option(
             "--test-on",
-            metavar="NAME[,NAME...]",
-            help="Where to test in the end.  [default: where they learn]",
+            metavar="NAME|FILE[,...]",
+            help="Scenarios to test in at the end.  [default: those of the training]",
             rich_help_panel=args.WORLD,
         ),
     ] = None,
@@ -77,42 +62,41 @@ def train(
         typer.Option(
             "--steps",
             min=1,
-            help="Decisions to make in training.  [default: 2000000 to search; to drive, what the recipe says]",
+            help="Decisions of a training.  [default: 2000000 to search; to drive, the training config's]",
         ),
     ] = None,
     seeds: Annotated[
         int, typer.Option("--seeds", min=1, help="Trainings, one for each seed from --seed on.")
     ] = 5,
-    imitate: Annotated[
+    clone: Annotated[
         str | None,
         typer.Option(
-            "--imitate",
+            "--clone",
             metavar="PLANNER",
-            help="Begin by imitating this planner (search; ppo, maskable-ppo).",
+            help="Start with behaviour cloning of this planner (search; ppo, maskable-ppo).",
         ),
     ] = None,
-    shown: Annotated[
+    demonstrations: Annotated[
         int | None,
-        typer.Option("--shown", min=1, help="Searches of the planner to imitate.  [default: 2000]"),
+        typer.Option("--demonstrations", min=1, help="Searches of the planner to clone.  [default: 2000]"),
     ] = None,
     k: Annotated[
-        int | None,
-        typer.Option("--k", min=1, help="Slots that an observation tells of (search).  [default: 5]"),
+        int | None, typer.Option("--k", min=1, help="Slots in an observation (search).  [default: 5]")
     ] = None,
-    examine_every: Annotated[
+    evaluate_every: Annotated[
         int | None,
         typer.Option(
-            "--examine-every",
+            "--evaluate-every",
             min=1,
-            help="Decisions between examinations.  [default: 100000 to search; to drive, a twentieth of --steps]",
+            help="Decisions between evaluations.  [default: 100000 to search; to drive, a twentieth of --steps]",
         ),
     ] = None,
-    examined_on: Annotated[
+    evaluation_episodes: Annotated[
         int | None,
         typer.Option(
-            "--examined-on",
+            "--evaluation-episodes",
             min=2,
-            help="Searches an examination, or drives into each lot's slots of each kind, none of them trained on.  "
+            help="Episodes of an evaluation, in held-out worlds; to drive, on each lot for each kind of slot.  "
             "[default: 256; 64]",
         ),
     ] = None,
@@ -121,7 +105,8 @@ def train(
         typer.Option(
             "--planners",
             metavar="NAME[,NAME...]|none",
-            help=f"Who is drawn for comparison.  [default: {PLANNERS}; planner]",
+            help="Agents that are drawn for comparison.  [default: belief, mdp-tuned, mdp, first-free, greedy-drive, "
+            "greedy-goal; to drive, planner]",
         ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="First seed of the trainings.")] = 0,
@@ -144,87 +129,97 @@ def train(
         typer.Option(
             "--beside",
             metavar="DIR[,DIR...]",
-            help="Folders of other trainings with the same examinations, to draw in the same figure.",
+            help="Folders of other trainings with the same evaluations, to draw in the same figure.",
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoints in --out.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoints in --out.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the training in --out.")] = False,
-    report: Annotated[
-        bool, typer.Option("--report", help="Also write report.html, as `parkenv report` does.")
-    ] = False,
+    report: args.ReportOption = False,
 ) -> None:
     """Train agents by reinforcement learning, several seeds, and draw their learning curves beside the planners.
 
-    They learn to search, with minus the seconds as rewards, and observe what is near the car, so that they run on any
-    lot. Or they learn to drive into slots, from goals of hindsight (sac, tqc) or the dense reward (ppo), beginning a
-    step before the slot. They are examined as they learn, in worlds that are not trained on; each seed's best model is
-    kept, and tested in the end in worlds of no examination. Settings are in parkenv/evaluation/training/configs.py.
+    Search agents are rewarded with minus the seconds and observe the surroundings of the car, so that they run on any
+    lot. Driving agents park the car in a slot, with hindsight experience replay (sac, tqc) or the dense reward (ppo),
+    starting one step before the slot. Both are evaluated in held-out worlds; each seed's best model is kept, and
+    tested in the end. Hyperparameters are in parkenv/evaluation/training/configs.py.
 
     Examples:
     * `parkenv train maskable-ppo --scenario campus`
 
-    * `parkenv train ppo --imitate mdp-tuned --test-on campus,street,jam --out results/cloned`
+    * `parkenv train maskable-ppo --scenario my_lot.toml --steps 200000 --seeds 1`
+
+    * `parkenv train ppo --clone mdp-tuned --test-on campus,street,jam --out results/cloned`
 
     * `parkenv train ppo --beside results/maskable-ppo,results/dqn`
 
-    * `parkenv train sac --env drive --lot campus,street --seeds 3`
+    * `parkenv train sac --env drive --scenario campus,street --seeds 3`
 
     * `parkenv compare --agents mdp,maskable-ppo:results/maskable-ppo/seed_0/model.zip`
-    """  # fmt: skip
-    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    """
+    from parkenv.evaluation.experiments.agent_spec import split_agents
+    from parkenv.evaluation.experiments.spec import TrainingSpec
 
-    if env not in ENVS:
-        raise InputError(f"--env is {env!r}, want one of {', '.join(ENVS)}")
-    course: Course
-    if env == "search":
-        _refuse("drive", {"--lot": lot})
-        if shown is not None and imitate is None:
-            raise InputError("--shown goes with --imitate")
-        course = SearchCourse(
-            algorithm or "maskable-ppo", scenario or "campus", test_on, steps or 2_000_000, imitate, shown or 2000,
-            k or 5, examine_every or 100_000, examined_on or 256, planners or PLANNERS,
-        )  # fmt: skip
-    else:
-        _refuse("search", {"--scenario": scenario, "--imitate": imitate, "--shown": shown, "--k": k})
-        course = DriveCourse(
-            algorithm or "ppo", lot or "campus,street", test_on, steps, examine_every, examined_on or 64,
-            planners or "planner",
-        )  # fmt: skip
-    course.check()
+    given = {
+        "scenarios": tuple(args.scenario_specs(scenario, lot=lot)) if scenario or lot else None,
+        "test_on": tuple(args.scenario_specs(test_on)) if test_on else None,
+        "planners": None if planners is None else [] if planners == "none" else split_agents(planners),
+    }
+    spec = TrainingSpec().changed(
+        env=env, algorithm=algorithm, steps=steps, seeds=seeds, seed=seed, clone=clone, demonstrations=demonstrations,
+        k=k, evaluate_every=evaluate_every, evaluation_episodes=evaluation_episodes, tensorboard=tensorboard,
+        jobs=jobs, backend=backend, address=address, **given,
+    )  # fmt: skip
+    others = args.words("--beside", beside) if beside else ()
+    run_training(spec, out, resume=resume, overwrite=overwrite, beside=others, report=report)
+
+
+def run_training(
+    spec: TrainingSpec,
+    out: Path | None = None,
+    *,
+    resume: bool = False,
+    overwrite: bool = False,
+    beside: Sequence[str] = (),
+    report: bool = False,
+) -> None:
+    """Train, test and draw; see `train`.
+
+    Raises:
+        InputError: what cannot be trained, or a folder that cannot be used.
+    """
+    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.training.rl_training import MODEL
 
-    settings = {"version": __version__, **course.settings()}
-    out = out or Path("results") / course.folder
-    others = curves_beside(args.words("--beside", beside) if beside else (), out, course)
+    task = TASKS[spec.env](spec)
+    task.check()
+    settings = {"version": __version__, **task.settings()}
+    out = out or Path("results") / task.folder
+    others = curves_beside(beside, out, task)
     make_folder(out)
     _require_free(out, settings, resume, overwrite)
     console = make_console()
-    with args.workers_of(jobs, backend, address) as workers:
-        training = course.training(console)
+    with args.workers_of(spec.jobs, spec.backend, spec.address) as workers:
+        training = task.training(console)
         _claim(out, settings, overwrite)
-        numbers = range(seed, seed + seeds)
-        curves = _train_all(console, course, training, numbers, out, workers, tensorboard)
+        spec.write(out / SPEC_FILE)
+        numbers = range(spec.seed, spec.seed + spec.seeds)
+        curves = _train_all(console, task, training, numbers, out, workers, spec.tensorboard)
         models = {n: out / f"seed_{n}" / MODEL for n in numbers}
-        outcome = course.report(console, workers, curves, models, out, others)
+        outcome = task.report(console, workers, curves, models, out, others)
     command = ["parkenv", *sys.argv[1:]]
     write_summary(
-        out, {"command": command, "version": __version__, "seed": seed, "settings": settings, **outcome}
+        out, {"command": command, "version": __version__, "seed": spec.seed, "settings": settings, **outcome}
     )
     console.print(f"Models, curves, summary and figure are in {out}")
     if report:
         from parkenv.cli.report import make_report
 
-        make_report(out, jobs=jobs)
-
-
-def _refuse(env: str, options: Row) -> None:
-    for name, value in options.items():
-        if value is not None:
-            raise InputError(f"{name} goes with --env {env}")
+        make_report(out, jobs=spec.jobs)
 
 
 def _require_free(out: Path, settings: Row, resume: bool, overwrite: bool) -> None:
-    """Make sure that what is in the folder may be used, or replaced."""
+    """Check that the folder is free, resumable or to be replaced."""
     from parkenv.evaluation.experiments.results import read_settings, require_same_settings
 
     if resume and overwrite:
@@ -239,12 +234,12 @@ def _require_free(out: Path, settings: Row, resume: bool, overwrite: bool) -> No
 
 
 def _claim(out: Path, settings: Row, overwrite: bool) -> None:
-    """Write down what is trained in the folder from now on, in place of what was."""
+    """Write the settings of the training that starts, and remove what the previous one left."""
     import shutil
 
     from parkenv.evaluation.experiments.results import SUMMARY, write_settings
 
-    # Whoever finds no summary knows that the training is not finished.
+    # A folder without a summary holds an unfinished training.
     for outcome in (SUMMARY, PAGE, FIGURE):
         (out / outcome).unlink(missing_ok=True)
     if overwrite:
@@ -255,7 +250,7 @@ def _claim(out: Path, settings: Row, overwrite: bool) -> None:
 
 def _train_all(
     console: Console,
-    course: Course,
+    task: TrainingTask,
     training: Training,
     seeds: range,
     out: Path,
@@ -268,28 +263,28 @@ def _train_all(
     from parkenv.evaluation.training.rl_training import CURVE, read_curve, train_one
 
     progress = Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[told]}"), TimeElapsedColumn(),
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[score]}"), TimeElapsedColumn(),
         TimeRemainingColumn(), console=console, disable=not console.is_terminal,
     )  # fmt: skip
-    bars = {k: progress.add_task(f"seed {k}", total=training.steps, told="") for k in seeds}
+    bars = {k: progress.add_task(f"seed {k}", total=training.steps, score="") for k in seeds}
     over = threading.Event()
 
-    def look() -> None:
+    def update_bars() -> None:
         while not over.is_set():
             for k, bar in bars.items():
                 if curve := read_curve(out / f"seed_{k}" / CURVE):
                     last = curve[-1]
-                    progress.update(bar, completed=last["steps"], told=course.told(last))
+                    progress.update(bar, completed=last["steps"], score=task.score_text(last))
             over.wait(2.0)
 
-    watcher = threading.Thread(target=look, daemon=True)
+    watcher = threading.Thread(target=update_bars, daemon=True)
     with progress:
         watcher.start()
         try:
             tasks = [partial(train_one, training, k, out / f"seed_{k}", tensorboard) for k in seeds]
             curves: dict[int, list[Row]] = {}
             for i, trained in workers.results(tasks):
-                trained.keep_in(out / f"seed_{seeds[i]}")
+                trained.save(out / f"seed_{seeds[i]}")
                 curves[i] = trained.curve
         except KeyboardInterrupt:
             console.print(f"Interrupted. Checkpoints are in {out}; the same command with --resume goes on.")

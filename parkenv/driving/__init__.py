@@ -1,1 +1,1 @@
-"""Driving for real: the car, what it may run into, and the tasks of getting it into a slot."""
+"""Vehicle dynamics: the car, the obstacles around it, other road users, and tasks of parking in a slot."""

@@ -1,4 +1,4 @@
-"""Where the asphalt of a lot ends: its kerbs."""
+"""The paved area of a lot and its kerbs."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from parkenv.world.lot import ParkingLot, mouth_heading
 FloatArray = NDArray[np.float64]
 
 ROAD_HALF_WIDTH = 3.0
-"""m, from the centre line of a lane without slots to its kerbs."""
+"""From the centre line of a lane without slots to its kerbs, m."""
 HALF_WIDTHS = (2.0, 4.0)
-"""m, between which half the width of a lane lies that has slots along it: they begin where it ends."""
+"""Limits, m, of half the width of a lane with slots, which extends to the slots' mouths."""
 JOINT = 0.6
-"""m; gaps up to twice as wide between slots are asphalt."""
+"""Gaps between slots of up to twice this width, m, are paved."""
 STRAIGHTENED = 0.03
-"""m, by which kerbs may be off to have fewer corners."""
+"""Tolerance, m, for simplifying kerbs."""
 
 
-_JOINED_WHOLE = 2000  # slots, up to which a lot's asphalt is made once and for all
+_JOINED_WHOLE = 2000  # slots up to which the whole paved area is computed once
 
 
 class DrivableArea:
-    """The asphalt of a lot: its lanes as wide as the slots along them leave them, its slots, and the ways in.
+    """The paved area of a lot: lanes up to the mouths of their slots, slots, and the approaches to them.
 
     Args:
         lot: the lot.
@@ -42,7 +42,7 @@ class DrivableArea:
         np.minimum.at(reach, served_by, shapely.distance(lanes[served_by], mouth[slot]))
         self._lanes = lanes
         self._half_width = np.where(np.isinf(reach), ROAD_HALF_WIDTH, np.clip(reach, *HALF_WIDTHS))
-        # A bay goes on, as wide as its mouth, to its lane; of an oblique one both sides do so along the slot.
+        # A bay continues, as wide as its mouth, to its lane; that of an oblique slot in the slot's direction.
         heading = mouth_heading(lot.slot_yaw, lot.slot_mouth)
         outward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
         away = ((lot.vertex_xy[: lot.n_slots] - lot.mouth_xy()) * outward).sum(axis=1)
@@ -54,7 +54,7 @@ class DrivableArea:
         self._whole: shapely.Geometry | None = None
 
     def around(self, center: FloatArray, reach: float) -> shapely.Geometry:
-        """The asphalt near a point, (2,) m; exact within `reach` m of it along both axes, and anything beyond."""
+        """The paved area near a point, (2,) m; exact within `reach` m along both axes only."""
         if self._lot.n_slots > _JOINED_WHOLE:
             return self._joined(shapely.box(*(center - reach - 10.0), *(center + reach + 10.0)))
         if self._whole is None:
@@ -68,11 +68,11 @@ class DrivableArea:
         near = np.sort(self._tree.query(window))
         area = shapely.union_all(np.concatenate([roads, self._bays[near]]))
         joined = shapely.buffer(shapely.buffer(area, JOINT, join_style="mitre"), -JOINT, join_style="mitre")
-        # Shrinking with sharp corners takes too much away where the outline turns inward.
+        # Shrinking with mitred corners removes too much at reflex corners.
         return shapely.union(joined, area).simplify(STRAIGHTENED)
 
     def kerbs(self, center: FloatArray, reach: float) -> FloatArray:
-        """Ends, (m, 2, 2) m, of the straight pieces of kerb within `reach` m of a point, (2,) m, along both axes."""
+        """Straight kerb segments, end points (m, 2, 2) m, within `reach` m of a point, (2,) m, along both axes."""
         edge = shapely.boundary(self.around(center, reach))
         window = shapely.box(*(center - reach), *(center + reach))
         lines = shapely.get_parts(shapely.intersection(edge, window))

@@ -1,4 +1,4 @@
-"""The lines along which cars drive on the lanes of a lot, and where the drive graph's vertices lie on them."""
+"""The lines that cars follow on the lanes of a lot, and the positions of the drive graph's vertices on them."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from parkenv.world.lot import ParkingLot
 FloatArray = NDArray[np.float64]
 
 KEPT_RIGHT_M = 1.0
-"""m, of a car's middle from that of a two-way lane: nearer than the graph's vertices, so that right turns succeed."""
+"""From the centre of a two-way lane to that of a car, m: less than to the graph's vertices, for right turns."""
 
 _ON_LINE = 0.05  # m
-_DIFFERS = 1.0  # m, by which a way along a line around bends may differ from the edge's length
+_LENGTH_TOLERANCE = 1.0  # m, between the length along a line with bends and that of the edge
 
 
 @dataclass(frozen=True, eq=False)
 class DrivenLine:
-    """One direction of a lane: the line that cars keep to, right of the middle where the lane is two-way.
+    """One direction of a lane: the line that cars follow, right of the middle on a two-way lane.
 
     Args:
-        points: (k, 2) m, in the order driven.
+        points: (k, 2) m, in driving order.
     """
 
     points: FloatArray
@@ -40,7 +40,7 @@ class DrivenLine:
 
     @property
     def length(self) -> float:
-        """Its length, m."""
+        """Length, m."""
         return float(self.station[-1])
 
     @cached_property
@@ -48,7 +48,7 @@ class DrivenLine:
         return shapely.LineString(self.points)
 
     def pose(self, station: float) -> FloatArray:
-        """(3,) x, y in m and yaw in rad at a station, m; straight on before its start and beyond its end."""
+        """Pose, (3,) x, y in m and yaw in rad, at a station, m; extrapolated straight beyond both ends."""
         k = int(np.clip(np.searchsorted(self.station, station, side="right") - 1, 0, len(self.points) - 2))
         step = self.points[k + 1] - self.points[k]
         along = step / np.hypot(*step)
@@ -56,7 +56,7 @@ class DrivenLine:
         return np.array([*xy, math.atan2(along[1], along[0])])
 
     def station_of(self, xy: FloatArray) -> float:
-        """The station, m, of the point of the line, straight on at both ends, that is nearest to a point, (2,) m."""
+        """Station, m, of the point nearest to `xy`, (2,) m, on the line extended straight at both ends."""
         station = float(self._shape.line_locate_point(shapely.Point(xy)))
         if 0.0 < station < self.length:
             return station
@@ -65,20 +65,20 @@ class DrivenLine:
         return station + float(min(beyond, 0.0) if station <= 0.0 else max(beyond, 0.0))
 
     def between(self, start: float, end: float) -> FloatArray:
-        """The part from one station to a later one, (k, 2) m."""
+        """The part between two stations, start < end, (k, 2) m."""
         inner = self.points[(self.station > start + 1e-6) & (self.station < end - 1e-6)]
         return np.concatenate([self.pose(start)[None, :2], inner, self.pose(end)[None, :2]])
 
 
 @dataclass(frozen=True, eq=False)
 class DrivenEdge:
-    """An edge of the drive graph on the ground.
+    """An edge of the drive graph as part of a driven line.
 
     Args:
-        line: which of `DrivenLines.lines` it leads along, or onto.
-        start: station on it where the edge begins, m; that of `end` where the edge leads across the lane.
-        end: station on it where the edge ends, m.
-        across: whether it leads across a two-way lane, to who drives the other way.
+        line: index in `DrivenLines.lines` of the line that it follows, or leads to.
+        start: station of its start, m; equal to `end` where the edge crosses the lane.
+        end: station of its end, m.
+        across: whether it crosses a two-way lane to the opposite direction.
     """
 
     line: int
@@ -88,13 +88,13 @@ class DrivenEdge:
 
 
 class DrivenLines:
-    """All lines of a lot.
+    """All driven lines of a lot.
 
     Args:
         lot: the lot.
 
     Attributes:
-        lines: of each lane the way along its points, and of two-way ones the way back.
+        lines: one per direction: each lane in the order of its points, two-way lanes also in reverse order.
     """
 
     def __init__(self, lot: ParkingLot) -> None:
@@ -104,7 +104,7 @@ class DrivenLines:
         for lane in lot.lanes:
             for points in (lane.points,) if lane.oneway else (lane.points, lane.points[::-1]):
                 self._centers.append(points)
-                self.lines.append(DrivenLine(_beside(points, 0.0 if lane.oneway else KEPT_RIGHT_M)))
+                self.lines.append(DrivenLine(_offset_line(points, 0.0 if lane.oneway else KEPT_RIGHT_M)))
         self._aside = np.array([abs(LANE_OFFSET - KEPT_RIGHT_M) * (not lane.oneway) for lane in lot.lanes])
         self._aside = np.repeat(self._aside, [1 if lane.oneway else 2 for lane in lot.lanes])
         self._middles = np.array([shapely.LineString(points) for points in self._centers])
@@ -112,12 +112,12 @@ class DrivenLines:
         self._stations: dict[int, list[tuple[int, float]]] = {}
 
     def edge(self, source: int, target: int, length: float) -> DrivenEdge:
-        """The edge between two vertices.
+        """Find the edge between two vertices.
 
         Args:
-            source: vertex where it begins.
+            source: vertex where it starts.
             target: vertex where it ends.
-            length: m, that the graph gives it.
+            length: its length in the graph, m.
 
         Raises:
             InputError: no line leads to the target.
@@ -131,7 +131,7 @@ class DrivenLines:
         ]
         if along:
             differs, line, start, end = min(along)
-            if differs <= _DIFFERS:
+            if differs <= _LENGTH_TOLERANCE:
                 return DrivenEdge(line, start, end, across=False)
         if not ends:
             raise InputError(f"lot {self._lot.name!r}: vertex {target} lies on no lane")
@@ -139,14 +139,14 @@ class DrivenLines:
         return DrivenEdge(line, end, end, across=True)
 
     def at(self, vertex: int) -> tuple[int, float]:
-        """The line on which a slot's vertex lies, and the station there, m."""
+        """Index of the line of a slot's vertex, and its station there, m."""
         heading = self._lot.vertex_yaw[vertex]
         return max(
             self._on_lines(vertex), key=lambda at: math.cos(self.lines[at[0]].pose(at[1])[2] - heading)
         )
 
     def _on_lines(self, vertex: int) -> list[tuple[int, float]]:
-        """Where a vertex lies: lines, and stations on them."""
+        """The lines that pass a vertex, and its station on each, m."""
         if vertex not in self._stations:
             lot = self._lot
             xy = lot.vertex_xy[vertex]
@@ -161,12 +161,12 @@ class DrivenLines:
             else:
                 found = []
                 for k in np.flatnonzero(shapely.distance(self._middles, point) < 2 * NODE_TOLERANCE).tolist():
-                    found += [(k, station) for station in self._abeam(k, xy)]
+                    found += [(k, station) for station in self._stations_near(k, xy)]
             self._stations[vertex] = found
         return self._stations[vertex]
 
-    def _abeam(self, k: int, xy: FloatArray) -> list[float]:
-        """Stations of line k abeam of a point of its lane's middle; two where the lane comes back to its start."""
+    def _stations_near(self, k: int, xy: FloatArray) -> list[float]:
+        """Stations on line k of a point on its lane's centre line; two where the lane is closed."""
         line, center = self.lines[k], self._centers[k]
         ends = [
             station
@@ -176,13 +176,13 @@ class DrivenLines:
         return ends or [line.station_of(xy)]
 
 
-def _beside(points: FloatArray, offset: float) -> FloatArray:
-    """A polyline, (k, 2) m, `offset` m to the right of another."""
+def _offset_line(points: FloatArray, offset: float) -> FloatArray:
+    """Offset a polyline, (k, 2) m, by `offset` m to the right."""
     step = np.diff(points, axis=0)
     along = step / np.hypot(step[:, 0], step[:, 1])[:, None]
     right = np.stack([along[:, 1], -along[:, 0]], axis=1)
     normal = np.concatenate([right[:1], right[:-1] + right[1:], right[-1:]])
-    # The bisector of a corner is stretched so that both sides keep their distance.
+    # The bisector of a corner is lengthened so that both sides keep their distance.
     scale = np.r_[1.0, 2.0 / np.maximum((normal[1:-1] ** 2).sum(axis=1), 0.5), 1.0]
     beside: FloatArray = points + offset * scale[:, None] * normal
     return beside

@@ -1,4 +1,4 @@
-"""Who will be in a car's way: what its driver foresees of those who move."""
+"""Predict which moving road users will be in the way of a car, at constant velocity."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ from parkenv.driving.vehicle import VehicleParameters
 
 FloatArray = NDArray[np.float64]
 
-WATCHED_S = np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0])
-"""How far ahead, s, the driver looks for others on its way."""
-KEPT_M, KEPT_STANDING_M = 0.5, 0.05
-"""m that the driver keeps from others who move, and from those who have stopped to wait for it."""
+PREDICTION_TIMES_S = np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0])
+"""Times, s from now, at which positions are predicted."""
+MOVING_CLEARANCE_M, STANDING_CLEARANCE_M = 0.5, 0.05
+"""Clearance, m, to road users that move, and to those that stand and wait."""
 MOVES = 0.1
-"""m/s above which somebody moves."""
-SLOWEST = 0.7
-"""m/s at which a car that stands is taken to set off."""
+"""Speed, m/s, above which a road user counts as moving."""
+START_SPEED = 0.7
+"""Speed, m/s, at which a standing car is assumed to start."""
 
 _NEAR_M = 20.0
 
 
-def in_frame(poses: FloatArray, points: FloatArray) -> FloatArray:
-    """Points, (..., k, 2) m, as they lie before a car at poses, (..., 3) m and rad: forward and left of it."""
+def to_car_frame(poses: FloatArray, points: FloatArray) -> FloatArray:
+    """Transform points, (..., k, 2) m, into the frame of a car at poses, (..., 3) m and rad: forward and left."""
     c, s = np.cos(poses[..., 2, None]), np.sin(poses[..., 2, None])
     offset = points - poses[..., None, :2]
     return np.stack([c * offset[..., 0] + s * offset[..., 1], c * offset[..., 1] - s * offset[..., 0]], -1)
 
 
-def encounters(
+def encounter_times(
     vehicle: VehicleParameters, own: FloatArray, outlines: Sequence[FloatArray], velocity: FloatArray
 ) -> FloatArray:
-    """When each of those about comes too near to the car, if all go on as now.
+    """Time until each road user comes too close to the car, at constant velocity.
 
     Args:
         vehicle: the car.
-        own: (6, 3) x, y in m and yaw in rad, where its middle will be after `WATCHED_S`.
-        outlines: of each of the others, (k, 2) m, now.
-        velocity: (n, 2) m/s, of each.
+        own: (6, 3) x, y in m and yaw in rad of its middle after `PREDICTION_TIMES_S`.
+        outlines: current outline of each road user, (k, 2) m.
+        velocity: (n, 2) m/s of each.
 
     Returns:
-        (n,) s, of `WATCHED_S`; infinity where it is not soon.
+        (n,) s, one of `PREDICTION_TIMES_S`; infinity where none is too close within them.
     """
     when = np.full(len(outlines), np.inf)
     half = 0.5 * np.array([vehicle.length, vehicle.width])
     for i, outline in enumerate(outlines):
         if np.hypot(*(outline.mean(axis=0) - own[0, :2])) >= _NEAR_M:
             continue
-        # Whoever overlaps the car's box, grown by what is to be kept.
-        local = in_frame(own, outline + WATCHED_S[:, None, None] * velocity[i])
-        margin = half + (KEPT_M if np.hypot(*velocity[i]) > MOVES else KEPT_STANDING_M)
+        # Overlap with the car's box, enlarged by the clearance.
+        local = to_car_frame(own, outline + PREDICTION_TIMES_S[:, None, None] * velocity[i])
+        margin = half + (MOVING_CLEARANCE_M if np.hypot(*velocity[i]) > MOVES else STANDING_CLEARANCE_M)
         meets = ((local.min(axis=1) < margin) & (local.max(axis=1) > -margin)).all(axis=1)
         if meets.any():
-            when[i] = WATCHED_S[meets.argmax()]
+            when[i] = PREDICTION_TIMES_S[meets.argmax()]
     return when

@@ -1,4 +1,4 @@
-"""Tasks of getting a car into a slot: which one, from where, and what stands around."""
+"""Parking tasks: the slot, the start of the car, and the obstacles around."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
 from parkenv.driving.drivable_area import DrivableArea
-from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
 from parkenv.driving.vehicle import STATE_SIZE, VehicleParameters, move_along, placed
 from parkenv.errors import InputError
 from parkenv.world.drive_graph import LANE_OFFSET, linestrings
@@ -23,29 +23,29 @@ from sim_sensors.surroundings import Surroundings
 FloatArray = NDArray[np.float64]
 
 KINDS = ("perpendicular", "oblique", "parallel")
-"""How slots lie to their lane."""
+"""Orientation of a slot to its lane."""
 WAYS = ("nose-in", "back-in")
-"""How a car stands in a perpendicular or oblique slot; in a parallel one it stands as traffic runs."""
+"""Orientation of a car in a perpendicular or oblique slot; in a parallel slot it faces the direction of traffic."""
 STARTS = ("lane", "way-out")
 REACH = 30.0
-"""m, from the slot's middle along both axes: what lies farther away is not part of a task."""
+"""Distance, m along both axes, from the slot's middle beyond which obstacles are not part of a task."""
 AREA = REACH - 3.0
-"""m, likewise: a car whose middle is farther away has left the area of its task."""
+"""Distance, m, likewise, beyond which the car has left the area of its task."""
 FARTHEST = AREA - 7.0
-"""m, the greatest `distance` of a start."""
+"""Greatest `distance` of a start, m."""
 UPRIGHT = math.radians(75.0)
-"""Angle between a slot and its lane from which the slot is perpendicular."""
+"""Least angle between a perpendicular slot and its lane, rad."""
 
 _ASIDE, _ASKEW = 0.2, math.radians(4.0)  # greatest offsets of a start on the lane
 _TRIES = 64
 _STEP = 0.1
 _MOST_KNOWN = 1 << 15
-_ARRIVALS = 16  # different cars, each standing in its own way, that a slot may hold
+_ARRIVALS = 16  # number of different cars and poses per slot
 
 
 @dataclass(frozen=True, eq=False)
 class ParkingTask:
-    """A slot to park in, all that stands around it, and where the car starts; what everybody may know.
+    """A slot to park in, the obstacles around it, and the start of the car; public to agents.
 
     Args:
         vehicle: the car.
@@ -55,8 +55,8 @@ class ParkingTask:
         way: one of `WAYS`.
         slot: (3,) float64, x, y in m and yaw in rad of the slot, world frame.
         size: length and width of the slot, m.
-        target: (3,) where the middle of the parked car is to be, and its yaw.
-        start: (6,) the vehicle's state at the start.
+        target: (3,) wanted position of the car's middle, m, and its yaw, rad.
+        start: (6,) state of the vehicle at the start.
         obstacles: parked cars, walls and kerbs within `REACH`.
 
     Raises:
@@ -85,11 +85,11 @@ class ParkingTask:
 
     @cached_property
     def room(self) -> FloatArray:
-        """(2,) m: how far the car's ends and sides are from the slot's when it stands in its middle."""
+        """Free space, (2,) m, in front and at the side of a car in the middle of the slot."""
         return 0.5 * np.array([self.size[0] - self.vehicle.length, self.size[1] - self.vehicle.width])
 
     def in_slot_frame(self, points: FloatArray) -> FloatArray:
-        """Points, (..., 2) m, in the frame of the slot: origin in its middle, x along its yaw."""
+        """Transform points, (..., 2) m, into the slot's frame: origin in its middle, x along its yaw."""
         x, y, yaw = self.slot.tolist()
         turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
         local: FloatArray = (points - np.array([x, y])) @ turn
@@ -98,24 +98,24 @@ class ParkingTask:
 
 @dataclass(frozen=True, eq=False)
 class ParkingTasks:
-    """Draws tasks on one lot; a task is a pure function of a key.
+    """Draw parking tasks on one lot; a task is a pure function of a key.
 
     Args:
         lot: the lot.
         vehicle: the car.
-        kinds: from which kinds of slots to draw, each as often as the others; None: those that the lot has.
-        ways: of standing in perpendicular and oblique slots, each as often as the other.
-        slot: the name of the only slot to park in; None draws one.
-        occupancy: share, 0 to 1, of the other slots that are taken.
-        slack: m around the slot that are kept clear of parked cars. 0 leaves whoever parked beside it, however
-            crookedly, within the limits of `manners`; 3 clears the slots beside it.
-        distance: m, least and greatest: how far before the slot the car starts.
-        starts: `lane`: on the lane, `distance` before the slot, in either direction of a two-way one; `way-out`:
-            where a random drive of `distance` out of the slot ends, so that a short one is an easy task.
-        manners: how the other cars stand in their slots.
+        kinds: kinds of slots to draw from, equally often; None for all that the lot has.
+        ways: orientations in perpendicular and oblique slots to draw from, equally often.
+        slot: id of the only slot to park in; None draws one.
+        occupancy: fraction of the other slots that are occupied, 0 to 1.
+        slack: distance around the slot kept clear of parked cars, m. 0 keeps all neighbours, as crooked as `manners`
+            allows; 3 clears the adjacent slots.
+        distance: least and greatest distance of the start before the slot, m.
+        starts: `lane`: on the lane, `distance` before the slot, in either direction of a two-way lane; `way-out`: the
+            end of a random drive of `distance` out of the slot, so that a short one is an easy task.
+        manners: distribution of the poses of parked cars in their slots.
 
     Raises:
-        InputError: a value out of its range; a slot that is not there, or that the car does not fit into; no slot of
+        InputError: a value out of its range; an unknown slot, or one that the car does not fit into; no slot of
             these kinds that it fits into.
 
     Examples:
@@ -158,7 +158,7 @@ class ParkingTasks:
             raise InputError(f"distance is {self.distance!r}, want least and greatest, 0 to {FARTHEST:g} m")
         if self.slot is not None and self.slot not in self.lot.slot_ids:
             raise InputError(f"lot {self.lot.name!r} has no slot {self.slot!r}")
-        if not any(map(len, self._choice.values())):
+        if not any(map(len, self._slots_by_kind.values())):
             raise InputError(
                 f"lot {self.lot.name!r} has no slot of the kinds {', '.join(self.kinds or KINDS)} that is at least "
                 f"{self.vehicle.length:g} m × {self.vehicle.width:g} m, the size of the car"
@@ -173,8 +173,8 @@ class ParkingTasks:
         return [str(kind) for kind in np.where(lot.slot_mouth == Mouth.REAR, upright, KINDS[2])]
 
     @cached_property
-    def _choice(self) -> dict[str, list[int]]:
-        """The slots to draw from, by kind."""
+    def _slots_by_kind(self) -> dict[str, list[int]]:
+        """Indices of the slots to draw from, by kind."""
         lot, vehicle = self.lot, self.vehicle
         if self.slot is not None:
             i = lot.slot_ids.index(self.slot)
@@ -197,7 +197,7 @@ class ParkingTasks:
 
     @cached_property
     def slot_cars(self) -> SlotLot:
-        """The cars that may stand in the slots."""
+        """The cars that may park in the slots."""
         lot = self.lot
         return SlotLot(
             lot.slot_xy,
@@ -215,19 +215,19 @@ class ParkingTasks:
         return shapely.STRtree(np.asarray(shapely.linestrings(legs))), legs
 
     def draw(self, key: int, start: ArrayLike | None = None) -> ParkingTask:
-        """The task of a key.
+        """Draw the task of a key.
 
         Args:
-            key: 0 or more.
+            key: at least 0.
             start: (3,) x, y in m and yaw in rad of the rear axle; None draws one.
 
         Raises:
-            InputError: a start that is not three finite numbers, touches something, or lies outside the
-                `AREA`; or no start without a contact could be drawn.
+            InputError: a start that is not three finite numbers, touches an obstacle, or lies outside the
+                `AREA`; or no start without a contact was found.
         """
         rng = np.random.default_rng([int(key), 0])
-        kinds = sorted(self._choice)
-        of_kind = self._choice[kinds[rng.integers(len(kinds))]]
+        kinds = sorted(self._slots_by_kind)
+        of_kind = self._slots_by_kind[kinds[rng.integers(len(kinds))]]
         i = of_kind[rng.integers(len(of_kind))]
         way = self.ways[rng.integers(len(self.ways))]
         kind, lot = self.slot_kinds[i], self.lot
@@ -235,8 +235,8 @@ class ParkingTasks:
             way = WAYS[0]
         slot = np.array([*lot.slot_xy[i], lot.slot_yaw[i]])
         target = slot + np.array([0.0, 0.0, math.pi if way == WAYS[1] else 0.0])
-        obstacles = self._around(i, rng)
-        space = LotSpace(self.vehicle, obstacles)
+        obstacles = self._obstacles_around(i, rng)
+        space = CollisionWorld(self.vehicle, obstacles)
         if start is None:
             drawn = (
                 self._way_out(target, space, rng)
@@ -249,7 +249,7 @@ class ParkingTasks:
                     "want more room there"
                 )
         else:
-            drawn = self._given(start, slot, space)
+            drawn = self._checked_start(start, slot, space)
         return ParkingTask(
             vehicle=self.vehicle,
             lot=lot.name,
@@ -277,8 +277,8 @@ class ParkingTasks:
             known[slot, arrival] = placed(self.slot_cars.fleet.models[model].footprint(), pose)
         return known[slot, arrival]
 
-    def _around(self, i: int, rng: np.random.Generator) -> Obstacles:
-        """What stands around slot i, the nearest first of each kind."""
+    def _obstacles_around(self, i: int, rng: np.random.Generator) -> Obstacles:
+        """The obstacles around slot i, nearest first within each kind."""
         lot = self.lot
         center = lot.slot_xy[i]
         offset = np.abs(lot.slot_xy - center).max(axis=1)
@@ -286,24 +286,27 @@ class ParkingTasks:
         near = near[rng.random(len(near)) < self.occupancy]
         near = near[np.argsort(offset[near], kind="stable")]
         box = shapely.Polygon(lot.slot_corners()[i])
-        outlines: list[tuple[Thing, FloatArray]] = []
+        outlines: list[tuple[ObstacleKind, FloatArray]] = []
         arrivals = rng.integers(_ARRIVALS, size=len(near))
         for j, arrival in zip(near.tolist(), arrivals.tolist(), strict=True):
             outline = self._outline(j, arrival)
             close = self.slack > 0.0 and offset[j] < self.slack + 12.0
             if not (close and shapely.distance(box, shapely.Polygon(outline)) < self.slack):
-                outlines.append((Thing.PARKED_CAR, outline))
+                outlines.append((ObstacleKind.PARKED_CAR, outline))
         tree, legs = self._walls
         walls = legs[np.sort(tree.query(shapely.box(*(center - REACH), *(center + REACH))))]
-        for thing, lines in ((Thing.KERB, self._area.kerbs(center, REACH)), (Thing.WALL, walls)):
+        for thing, lines in (
+            (ObstacleKind.KERB, self._area.kerbs(center, REACH)),
+            (ObstacleKind.WALL, walls),
+        ):
             order = np.argsort(
                 shapely.distance(shapely.Point(center), shapely.linestrings(lines)), kind="stable"
             )
             outlines += [(thing, line) for line in lines[order]]
         return Obstacles.of(outlines)
 
-    def _on_lane(self, i: int, space: LotSpace, rng: np.random.Generator) -> FloatArray | None:
-        """A rear-axle pose on the lane before slot i."""
+    def _on_lane(self, i: int, space: CollisionWorld, rng: np.random.Generator) -> FloatArray | None:
+        """Draw a rear-axle pose on the lane before slot i; None without a free one."""
         lot = self.lot
         lanes = linestrings([lane.points for lane in lot.lanes])
         mouth = shapely.Point(lot.mouth_xy()[i])
@@ -327,8 +330,10 @@ class ParkingTasks:
                 return pose
         return None
 
-    def _way_out(self, target: FloatArray, space: LotSpace, rng: np.random.Generator) -> FloatArray | None:
-        """Where a random drive out of the slot ends: a rear-axle pose."""
+    def _way_out(
+        self, target: FloatArray, space: CollisionWorld, rng: np.random.Generator
+    ) -> FloatArray | None:
+        """Draw the rear-axle pose at the end of a random drive out of the slot; None for a blocked slot."""
         x, y, yaw = self.vehicle.at_rear_axle(target).tolist()
         if space.touched(x, y, yaw):
             return None
@@ -343,7 +348,7 @@ class ParkingTasks:
                 (x, y, yaw), left = ahead, left - _STEP
         return np.array([x, y, yaw])
 
-    def _given(self, start: ArrayLike, slot: FloatArray, space: LotSpace) -> FloatArray:
+    def _checked_start(self, start: ArrayLike, slot: FloatArray, space: CollisionWorld) -> FloatArray:
         try:
             pose = np.array(start, dtype=np.float64)
         except (TypeError, ValueError) as error:
@@ -352,27 +357,27 @@ class ParkingTasks:
             raise InputError(f"start is {pose.tolist()}, want three finite numbers: x, y in m and yaw in rad")
         if np.abs(self.vehicle.at_middle(pose)[:2] - slot[:2]).max() > AREA:
             raise InputError(f"start {pose.tolist()} is more than {AREA:g} m away from the slot")
-        touched = Thing(space.touched(*pose.tolist()))
+        touched = ObstacleKind(space.touched(*pose.tolist()))
         if touched:
             raise InputError(
-                f"start {pose.tolist()}: the car touches a {touched.words} there, want a free place"
+                f"start {pose.tolist()}: the car touches a {touched.label} there, want a free pose"
             )
         return pose
 
 
 def require_room(vehicle: VehicleParameters, size: tuple[float, float], what: str) -> None:
-    """Refuse slots that a car does not fit into.
+    """Refuse a slot that a car does not fit into.
 
     Raises:
-        InputError: a length or width that is no number, or less than the car's.
+        InputError: a length or width that is not finite, or less than the car's.
     """
     for name, own, needed in (("long", size[0], vehicle.length), ("wide", size[1], vehicle.width)):
         if not (math.isfinite(own) and own >= needed):
-            raise InputError(f"{what} is {own:g} m {name}, want at least {needed:g} m, as the car is")
+            raise InputError(f"{what} is {own:g} m {name}, want at least {needed:g} m, the size of the car")
 
 
 def _tangent(line: shapely.LineString, station: float) -> FloatArray:
-    """Unit vector, (2,), along a line at a station, m."""
+    """Unit tangent, (2,), of a line at a station, m."""
     step = 0.05
     low = min(max(station - step, 0.0), line.length - 2 * step)
     ends = [shapely.get_coordinates(line.interpolate(s))[0] for s in (low, low + 2 * step)]

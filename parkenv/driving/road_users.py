@@ -1,4 +1,4 @@
-"""Everybody else who moves while a car drives through a lot, and who lets whom go first."""
+"""Road users around a car that drives through a lot, and the rules of yielding."""
 
 from __future__ import annotations
 
@@ -7,103 +7,103 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.driving.encounters import MOVES, encounters, in_frame
-from parkenv.driving.polite_traffic import PoliteTraffic
+from parkenv.driving.encounters import MOVES, encounter_times, to_car_frame
 from parkenv.driving.vehicle import VehicleParameters, placed
+from parkenv.driving.yielding_traffic import YieldingTraffic
 
 if TYPE_CHECKING:
     from sim_sensors.movers import Movers
 
 FloatArray = NDArray[np.float64]
 
-ROOM_M = 12.0
-"""m, from the car's middle, within which nobody comes back who gave way."""
+CLEAR_RADIUS_M = 12.0
+"""Radius, m, around the car's middle within which hidden road users do not return."""
 
-_OUT_OF_SIGHT = np.array([1e6, 1e6, 0.0])
+_FAR_AWAY = np.array([1e6, 1e6, 0.0])
 
 
 class RoadUsers:
-    """Cars and people on their rounds around a car.
+    """Cars and pedestrians on their routes around a driving car.
 
-    They wait for the car, and it for them. Where both wait, somebody has to give way, and `give_way` has them out of
-    sight until the car is `ROOM_M` away; then they go on from where they stood. Where they turn aside to is left out,
-    so a stand-off costs the time that it lasts, and always ends. Among each other they do not meet.
+    They wait for the car, and it waits for them. `hide_standing` resolves a deadlock: it removes standing road users
+    until the car is `CLEAR_RADIUS_M` away; then they continue from where they stood. Their evasive manoeuvres are not
+    simulated, so a deadlock costs the time that it lasts, and always ends. Road users do not interact.
 
     Args:
         traffic: of the world.
-        vehicle: the car that they wait for.
+        vehicle: the driving car.
 
     Attributes:
-        outlines: as of `PoliteTraffic`.
-        clocks: (n,) s, of each; not a number of those who are out of sight.
-        poses: (n, 3) x, y in m and yaw in rad, now; far away of those who are out of sight.
+        outlines: as of `YieldingTraffic`.
+        clocks: (n,) s; NaN for hidden road users.
+        poses: (n, 3) x, y in m and yaw in rad, now; far away for hidden road users.
     """
 
-    def __init__(self, traffic: PoliteTraffic, vehicle: VehicleParameters) -> None:
+    def __init__(self, traffic: YieldingTraffic, vehicle: VehicleParameters) -> None:
         self.outlines, self._traffic, self._vehicle = traffic.outlines, traffic, vehicle
         n = len(traffic.outlines)
-        self._clocks, self._away = np.zeros(n), np.zeros(n, dtype=bool)
+        self._clocks, self._hidden = np.zeros(n), np.zeros(n, dtype=bool)
         self._before, self._velocity = self._clocks, np.zeros((n, 2))
         self.poses = self._placed(self._clocks)
 
     @property
     def clocks(self) -> FloatArray:
         """See the class."""
-        return np.where(self._away, np.nan, self._clocks)
+        return np.where(self._hidden, np.nan, self._clocks)
 
     def movers(self, clocks: FloatArray) -> Movers | None:
-        """Who was where at clocks that were those of a moment; see `PoliteTraffic.movers`."""
+        """Road users at recorded clocks; see `YieldingTraffic.movers`."""
         return self._traffic.movers(clocks)
 
-    def make_room(self, car: FloatArray) -> None:
-        """Have nobody near a car that appears with these corners, (4, 2) m."""
-        self._leave(self._near(car))
+    def clear_area(self, car: FloatArray) -> None:
+        """Hide the road users near a car that appears with these corners, (4, 2) m."""
+        self._hide(self._near(car))
 
-    def give_way(self, who: NDArray[np.bool_]) -> None:
-        """Have those, (n,) bool, out of sight who stand."""
-        self._leave(who & (np.hypot(*self._velocity.T) <= MOVES))
+    def hide_standing(self, mask: NDArray[np.bool_]) -> None:
+        """Hide the road users selected by `mask`, (n,) bool, while they stand still."""
+        self._hide(mask & (np.hypot(*self._velocity.T) <= MOVES))
 
-    def onward(self, seconds: float, car: FloatArray) -> None:
-        """Let some time pass, with the car's corners, (4, 2) m, where they are."""
-        came = self._away & ~self._near(car)
-        self._away &= ~came
+    def advance(self, seconds: float, car: FloatArray) -> None:
+        """Advance by `seconds`, with the car's corners at `car`, (4, 2) m."""
+        returned = self._hidden & ~self._near(car)
+        self._hidden &= ~returned
         self._before = self._clocks
-        onward = self._traffic.onward(self._clocks, seconds, car)
-        self._clocks = np.where(self._away, self._clocks, onward)
+        onward = self._traffic.advance_clocks(self._clocks, seconds, car)
+        self._clocks = np.where(self._hidden, self._clocks, onward)
         was, self.poses = self.poses, self._placed(self._clocks)
         self._velocity = (self.poses - was)[:, :2] / seconds
-        self._velocity[came] = 0.0
+        self._velocity[returned] = 0.0
 
-    def between(self, share: float) -> FloatArray:
-        """Poses, (n, 3), a share of the way from before the last step to now."""
+    def interpolate(self, share: float) -> FloatArray:
+        """Poses, (n, 3), interpolated over the last step: `share` 0 before it, 1 after."""
         return self._placed(self._before + share * (self._clocks - self._before))
 
-    def in_way(self, own: FloatArray) -> FloatArray:
-        """When, (n,) s, each will be in the way of the car, going on as now; infinity where that is not soon.
+    def encounter_times(self, own: FloatArray) -> FloatArray:
+        """Time, (n,) s, until each road user is in the car's way at constant velocity; infinity beyond the horizon.
 
         Args:
-            own: (6, 3) m and rad, where the car's middle will be after `WATCHED_S`.
+            own: (6, 3) m and rad, poses of the car's middle after `PREDICTION_TIMES_S`.
         """
         outlines = [
             placed(corners, pose) for (_, corners), pose in zip(self.outlines, self.poses, strict=True)
         ]
-        when = encounters(self._vehicle, own, outlines, self._velocity)
-        ahead = float(in_frame(own[0], own[-1:, :2])[0, 0])
+        when = encounter_times(self._vehicle, own, outlines, self._velocity)
+        ahead = float(to_car_frame(own[0], own[-1:, :2])[0, 0])
         for i in np.flatnonzero(np.isfinite(when)).tolist():
-            forward = in_frame(own[0], outlines[i])[:, 0]
+            forward = to_car_frame(own[0], outlines[i])[:, 0]
             if (ahead * forward < -abs(ahead) * 0.5 * self._vehicle.length).all():
-                when[i] = np.inf  # whoever comes from behind looks out alone
+                when[i] = np.inf  # road users behind the car yield themselves
         return when
 
     def _near(self, car: FloatArray) -> NDArray[np.bool_]:
         away = self._traffic.poses(self._clocks)[:, :2] - car.mean(axis=0)
-        return np.asarray(np.hypot(*away.T) < ROOM_M)
+        return np.asarray(np.hypot(*away.T) < CLEAR_RADIUS_M)
 
-    def _leave(self, who: NDArray[np.bool_]) -> None:
-        self._away |= who
+    def _hide(self, mask: NDArray[np.bool_]) -> None:
+        self._hidden |= mask
         self._before = self._clocks
-        self._velocity[who] = 0.0
+        self._velocity[mask] = 0.0
         self.poses = self._placed(self._clocks)
 
     def _placed(self, clocks: FloatArray) -> FloatArray:
-        return np.where(self._away[:, None], _OUT_OF_SIGHT, self._traffic.poses(clocks))
+        return np.where(self._hidden[:, None], _FAR_AWAY, self._traffic.poses(clocks))

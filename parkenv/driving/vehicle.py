@@ -1,4 +1,4 @@
-"""The car that drives: its size, its limits, and how it moves in a step of time."""
+"""The car: dimensions, limits, and the kinematic bicycle model."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 
 PHYSICS_S = 0.05
-"""s, one step of the physics."""
+"""Physics time step, s."""
 X, Y, YAW, SPEED, STEERING, ACCELERATION = range(6)
 """Columns of a vehicle's state: m, m, rad, m/s, rad, m/s²; x and y are the middle of the rear axle."""
 STATE_SIZE = 6
 STRAIGHT = 1e-6
-"""rad turned in a step, below which an arc is its chord."""
+"""Turn per step, rad, below which an arc is approximated by its chord."""
 
 
 @dataclass(frozen=True)
@@ -29,19 +29,19 @@ class VehicleParameters:
     """A car: by default a Volkswagen Golf of 2012, whose turning circle is 10.9 m from kerb to kerb.
 
     Args:
-        length, width: m, of the footprint, a rectangle without mirrors.
-        wheelbase: m, from axle to axle.
-        rear_overhang: m, from the rear axle to the rear end.
-        max_steering: rad, of the wheel in the middle of the front axle, to either side.
+        length, width: of the footprint, a rectangle without mirrors, m.
+        wheelbase: between the axles, m.
+        rear_overhang: from the rear axle to the rear end, m.
+        max_steering: of a wheel in the middle of the front axle, to either side, rad.
         steering_rate: rad/s.
         max_speed, max_reverse_speed: m/s, both above 0.
-        max_acceleration: m/s², of getting faster in either direction.
-        max_braking: m/s², of getting slower.
-        acceleration_rate: m/s³, how fast the acceleration changes.
+        max_acceleration: in either direction, m/s².
+        max_braking: deceleration, m/s².
+        acceleration_rate: greatest rate of change of the acceleration, m/s³.
 
     Raises:
         InputError: a value that is not a finite number above 0, axles outside the car, steering of a right angle
-            or more, or a speed that carries the car over more than half its length in a step of the physics.
+            or more, or a speed above half a length of the car per physics step.
 
     Examples:
         >>> round(VehicleParameters().turning_radius, 2)
@@ -83,17 +83,17 @@ class VehicleParameters:
 
     @cached_property
     def turning_radius(self) -> float:
-        """m, of the smallest circle of the rear axle's middle: wheelbase / tan(steering)."""
+        """Least turning radius of the middle of the rear axle, m: wheelbase / tan(steering)."""
         return self.wheelbase / math.tan(self.max_steering)
 
     @cached_property
     def middle(self) -> float:
-        """m, from the rear axle forward to the middle of the footprint."""
+        """From the rear axle forward to the middle of the footprint, m."""
         return 0.5 * self.length - self.rear_overhang
 
     @cached_property
     def limits(self) -> FloatArray:
-        """(8,) float64: what `advance` takes."""
+        """The limits as `advance` takes them, (8,) float64."""
         limits = np.array(
             [
                 self.wheelbase,
@@ -116,16 +116,16 @@ class VehicleParameters:
         return placed(own, pose)
 
     def at_middle(self, pose: FloatArray) -> FloatArray:
-        """Poses, (..., 3), of the footprint's middle, of a car whose rear axle is at `pose`, (..., 3)."""
+        """Convert poses of the rear axle, (..., 3), to poses of the footprint's middle."""
         return _shifted(pose, self.middle)
 
     def at_rear_axle(self, pose: FloatArray) -> FloatArray:
-        """Poses, (..., 3), of the rear axle, of a car whose footprint has its middle at `pose`, (..., 3)."""
+        """Convert poses of the footprint's middle, (..., 3), to poses of the rear axle."""
         return _shifted(pose, -self.middle)
 
 
 def placed(points: FloatArray, pose: FloatArray) -> FloatArray:
-    """Points, (k, 2) m, of a body at poses, (..., 3): (..., k, 2) m."""
+    """Transform points of a body, (k, 2) m, to poses, (..., 3): (..., k, 2) m."""
     pose = np.asarray(pose, dtype=np.float64)
     cosine, sine = np.cos(pose[..., 2, None]), np.sin(pose[..., 2, None])
     x = pose[..., 0, None] + cosine * points[:, 0] - sine * points[:, 1]
@@ -142,7 +142,7 @@ def _shifted(pose: FloatArray, ahead: float) -> FloatArray:
 
 @compiled(error_model="numpy")
 def move_along(x: float, y: float, yaw: float, curvature: float, way: float) -> tuple[float, float, float]:
-    """The pose at the end of an arc: `way` m forward, or backward where it is negative; exact."""
+    """The exact pose at the end of an arc of `way` m, backward where negative."""
     turned = curvature * way
     half = 0.5 * turned
     chord = way if abs(turned) < STRAIGHT else way * math.sin(half) / half
@@ -153,19 +153,18 @@ def move_along(x: float, y: float, yaw: float, curvature: float, way: float) -> 
 def advance(state: FloatArray, acceleration: float, steering: float, limits: FloatArray) -> float:
     """Move a car by one step of the physics, `PHYSICS_S`.
 
-    The kinematic bicycle: no wheel slips, and the rear axle's middle runs on a circle of wheelbase / tan(steering).
-    Steering angle and acceleration go toward what is asked for as fast as their rates let them, and are then held
-    for the step, so that the motion is an arc and exact. A car that brakes comes to rest and stays so for the rest
-    of the step.
+    Kinematic bicycle model: no wheel slips, and the rear axle's middle moves on a circle of wheelbase / tan(steering).
+    Steering angle and acceleration approach the command as fast as their rates allow, and are then constant for the
+    step, so that the motion is an exact arc. A braking car comes to rest and stays at rest for the rest of the step.
 
     Args:
-        state: (6,) float64, changed in place; see `X`.
-        acceleration: -1 to 1, of the limit: the one for braking where it is against the motion.
-        steering: -1 to 1, of the greatest angle, left above 0.
+        state: (6,) float64, changed in place; columns: see `X`.
+        acceleration: fraction of the limit, -1 to 1; against the motion, of the braking limit.
+        steering: fraction of the greatest angle, -1 to 1, positive to the left.
         limits: `VehicleParameters.limits`.
 
     Returns:
-        The way driven, m, below 0 backward.
+        The distance driven, m, negative backward.
     """
     wheelbase, max_steering, steering_rate, max_speed, max_reverse, max_faster, max_slower, rate = limits
     dt = PHYSICS_S
@@ -196,14 +195,14 @@ def advance(state: FloatArray, acceleration: float, steering: float, limits: Flo
 def drive(
     vehicle: VehicleParameters, state: FloatArray, acceleration: float, steering: float, steps: int = 1
 ) -> FloatArray:
-    """The states, (steps + 1, 6) float64, that a car goes through under one command; see `advance`.
+    """Simulate a car under a constant command; return the states, (steps + 1, 6) float64.
 
     Args:
         vehicle: the car.
-        state: (6,) float64, where it starts; stays as it is.
-        acceleration: -1 to 1, of the limit.
-        steering: -1 to 1, of the greatest angle.
-        steps: of the physics.
+        state: (6,) float64, the start; not changed.
+        acceleration: fraction of the limit, -1 to 1.
+        steering: fraction of the greatest angle, -1 to 1.
+        steps: number of physics steps.
 
     Examples:
         >>> path = drive(VehicleParameters(), np.zeros(6), 1.0, 0.0, steps=40)

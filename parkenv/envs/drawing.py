@@ -1,4 +1,4 @@
-"""Strokes on an image: smooth shapes and text in pixels with fractions, by OpenCV."""
+"""Draw anti-aliased shapes and text on images with subpixel precision (OpenCV)."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ FONT = cv2.FontFace("sans")
 
 
 def rotation(yaw: float) -> FloatArray:
-    """Matrix that turns row vectors by `yaw` in the picture's axes."""
+    """Return the matrix that rotates row vectors by `yaw` in image axes."""
     return np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
 
 
 def fixed_point(pixels: FloatArray) -> NDArray[np.int32]:
-    """Pixels as OpenCV's fixed-point numbers; its pixel centres are whole numbers."""
+    """Convert pixels to OpenCV's fixed-point numbers, whose pixel centres are integers."""
     fixed: NDArray[np.int32] = np.round((pixels - 0.5) * 2**SUBPIXEL_BITS).astype(np.int32)
     return fixed
 
 
 def mixed_color(start: Color, end: Color, share: float) -> Color:
-    """The colour a share of the way from one to another."""
+    """Interpolate between two colours."""
     red, green, blue = (round(a + share * (b - a)) for a, b in zip(start, end, strict=True))
     return red, green, blue
 
 
 def fill_polygon(image: Image, pixels: FloatArray, color: Color) -> None:
-    """Fill a polygon, (k, 2) px, with smooth edges."""
+    """Fill a polygon, (k, 2) px, anti-aliased."""
     cv2.fillPoly(image, [fixed_point(pixels)], color, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def fill_disc(image: Image, at: FloatArray, radius: float, color: Color) -> None:
-    """Fill a disc with a smooth edge."""
+    """Fill a disc, anti-aliased."""
     x, y = fixed_point(at).tolist()
     cv2.circle(image, (x, y), round(radius * 2**SUBPIXEL_BITS), color, -1, cv2.LINE_AA, SUBPIXEL_BITS)
 
@@ -51,13 +51,13 @@ def draw_dashes(image: Image, start: FloatArray, end: FloatArray, color: Color) 
 
 
 def write_text(image: Image, text: str, at: tuple[int, int], color: Color, size: int, weight: int) -> int:
-    """Write from a point of the baseline on; where the text ends, px."""
+    """Write text from a point of the baseline; returns its right end, px."""
     (right, _), _ = cv2.putText(image, text, at, color, FONT, size, weight)
     return int(right)
 
 
 def text_width(text: str, size: int, weight: int) -> int:
-    """How wide a text comes out, px."""
+    """Return the width of a text, px."""
     _, _, width, _ = cv2.getTextSize((1 << 14, 1 << 14), text, (0, 0), FONT, size, weight)
     return int(width)
 
@@ -65,7 +65,7 @@ def text_width(text: str, size: int, weight: int) -> int:
 def write_label(
     image: Image, text: str, at: FloatArray, color: Color, size: int, weight: int, *, halo: bool = False
 ) -> None:
-    """Write a text with its middle at a point, kept inside the picture."""
+    """Write text centred at a point, kept inside the image."""
     width = text_width(text, size, weight)
     left = int(np.clip(round(at[0] - width / 2), 2, image.shape[1] - width - 2))
     base = round(at[1] + 0.36 * size)

@@ -1,4 +1,4 @@
-"""`parkenv/Drive-v1`: drive the car into the slot."""
+"""`parkenv/Drive-v1`: drive a car into a parking slot."""
 
 from __future__ import annotations
 
@@ -13,18 +13,25 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from parkenv.driving.lot_space import LotSpace, Thing
-from parkenv.driving.parking_task import AREA, KINDS, REACH, ParkingTask, ParkingTasks
-from parkenv.driving.polite_traffic import PoliteTraffic
+from parkenv.driving.collision_world import CollisionWorld, ObstacleKind
+from parkenv.driving.parking_task import AREA, KINDS, ParkingTask, ParkingTasks
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters, advance, placed
+from parkenv.driving.yielding_traffic import YieldingTraffic
+from parkenv.envs.drive_goals import goal_error, goal_errors
+from parkenv.envs.drive_observation import (
+    CORNERS,
+    FAR,
+    drive_observation_space,
+    fill_observation,
+    obstacle_map,
+    scan_plane,
+)
 from parkenv.envs.drive_state import DriveState
 from parkenv.errors import InputError
 from parkenv.lots import load_lot
 from parkenv.world.keyed_random import world_key
 from parkenv.world.lot import ParkingLot
 from parkenv.world.traffic import Traffic
-from sim_sensors.compilation import compiled
-from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
 
 if TYPE_CHECKING:
@@ -33,96 +40,100 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 SUBSTEPS = 2
-"""Steps of the physics in one of the control."""
+"""Physics steps per action."""
 CONTROL_S = SUBSTEPS * PHYSICS_S
-"""s, from one action to the next."""
-POSITION_TOLERANCE = 0.25
-"""m."""
-ANGLE_TOLERANCE = math.radians(5.0)
-STANDING = 0.05
-"""m/s, the speed below which a car stands."""
+"""Control period, s."""
 CONTACT_COST = 200.0
-"""s, what a contact costs by default: more than any drive that ends in time."""
-FAR = 1000.0
-"""m, slot frame: where the unused rows of the obstacle map lie."""
-MOST_CARS, MOST_LINES = 160, 320
-"""Rows of the obstacle map."""
+"""Default cost of a contact, s: more than any drive within the step limit."""
 REWARD_TERMS = ("time", "approach", "contact")
-
-_CORNERS = 24
-_BOUND = 2.0 * REACH
-_GOAL = 7
 
 
 class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
-    """Drive a car into a slot and stand there, without touching anything.
+    """Drive a car into a parking slot and stop there without a collision.
 
     ## Description
-    A car stands on the lane before a slot that is free. Beside the slot others have parked, not quite straight.
-    The car is a kinematic bicycle with limits and rates (`parkenv.driving.vehicle`), moved in steps of 0.05 s; a
-    pymunk space says what it touches. An action holds for 0.1 s.
+    A car stands on the lane before a free slot, between parked cars that stand not quite straight. The car is a
+    kinematic bicycle with limited speeds and rates (`parkenv.driving.vehicle`), integrated in steps of 0.05 s; pymunk
+    detects collisions. An action is applied for 0.1 s.
 
-    ## Action space
-    `Box(-1, 1, (2,), float32)`; values beyond are cut.
+    ## Action Space
+    `Box(-1, 1, (2,), float32)`; values outside are clipped.
 
-    | Num | Action | -1 | 1 |
-    |-----|--------|----|---|
-    | 0 | acceleration, as a share of the limit | backward | forward |
-    | 1 | steering angle that the wheels turn to, as a share of the greatest | right | left |
+    | Num | Action | Min (-1) | Max (1) |
+    |-----|--------|----------|---------|
+    | 0 | acceleration, fraction of the limit | backward | forward |
+    | 1 | steering angle of the wheels, fraction of the limit | right | left |
 
-    Against the motion, the limit is that of the brakes. They bring the car to rest, not beyond, within a step.
+    Acceleration against the motion brakes: the limit is that of the brakes, and within a step the car comes to rest at
+    most.
 
-    ## Observation space
-    A `Dict` in the form of goals. The frame is the slot's: origin in its middle, x along its yaw, so that a
-    car that stands nose-in has yaw 0.
+    ## Observation Space
+    A `Dict` with the keys of Gymnasium-Robotics' goal environments. Positions are in the slot's frame: origin in its
+    middle, x along its yaw, so that a car parked nose-in has yaw 0.
 
-    | Key | Space | Meaning |
+    | Key | Space | Content |
     |-----|-------|---------|
-    | `observation` | `Box((12,), float32)` | the car and the slot, see below |
-    | `achieved_goal` | `Box((7,), float32)` | x, y, cos, sin, speed, half of what the slot is longer and wider |
-    | `desired_goal` | `Box((7,), float32)` | the same of the car as it is to stand |
-    | `scan` | `Box(0, max_range, (n_beams,), float32)` | m, with `laser` |
-    | `cars` | `Box(-1000, 1000, (160, 24, 2), float32)` | m, with `obstacle_map`: outlines of parked cars |
-    | `lines` | `Box(-1000, 1000, (320, 2, 2), float32)` | m, with `obstacle_map`: kerbs and walls |
-    | `movers` | `Box(-1000, 1000, (n, 24, 2), float32)` | m, with `obstacle_map` and `traffic`: who moves |
+    | `observation` | `Box((12,), float32)` | state of the car and dimensions of the slot, see below |
+    | `achieved_goal` | `Box((7,), float32)` | x, y, cos(yaw), sin(yaw), speed, and half the excess of the slot's \
+length and width over the car's |
+    | `desired_goal` | `Box((7,), float32)` | the same for the parked car |
+    | `scan` | `Box(0, max_range, (n_beams,), float32)` | laser ranges, m; with `laser` |
+    | `cars` | `Box(-1000, 1000, (160, 24, 2), float32)` | outlines of parked cars, m; with `obstacle_map` |
+    | `lines` | `Box(-1000, 1000, (320, 2, 2), float32)` | kerbs and walls, m; with `obstacle_map` |
+    | `movers` | `Box(-1000, 1000, (n, 24, 2), float32)` | outlines of moving road users, m; with `obstacle_map` and \
+`traffic` |
 
-    `observation` holds x, y of the footprint's middle (m), cos and sin of the yaw, speed (m/s), steering angle (rad),
-    acceleration (m/s²), half of what the slot is longer and wider than the car (m), and a 1 for its kind:
-    perpendicular, oblique, parallel. The laser sits in the footprint's middle and low enough to see kerbs, too. In the
-    obstacle map the nearest come first, an outline of fewer corners repeats its last, and unused rows lie at 1000 m.
+    `observation`:
+
+    | Num | Content | Unit | Bounds |
+    |-----|---------|------|--------|
+    | 0, 1 | x, y of the footprint's middle | m | ±60 |
+    | 2, 3 | cosine and sine of the yaw | | ±1 |
+    | 4 | speed, negative backward | m/s | ± the car's limit |
+    | 5 | steering angle, positive to the left | rad | ± the car's limit |
+    | 6 | acceleration | m/s² | ± the car's limit |
+    | 7, 8 | half the excess of the slot's length and width over the car's | m | ±60 |
+    | 9-11 | kind of the slot, one-hot: perpendicular, oblique, parallel | | ±1 |
+
+    The laser is in the middle of the footprint, low enough to detect kerbs. Rows of the obstacle map are sorted by
+    distance; outlines of fewer corners are padded with their last corner, unused rows with 1000 m.
 
     ## Rewards
-    `sparse`: minus the seconds of a step, 0 for the step that parks. `dense`: besides, minus 0.1 s × (distance to the
-    goal / 10 m + angle to it / π). A contact costs `contact_cost`. `info["reward_terms"]` holds the terms `time`,
-    `approach`, `contact`; they add up to the reward. `compute_reward` gives the same from batches of goals; the
-    contact comes from `info["contact"]`.
+    - `sparse`: -0.1 per step, its duration in seconds; 0 for the step that parks.
+    - `dense`: in addition -0.1 s × (distance to the goal / 10 m + angle to it / π).
 
-    ## Starting state
-    Standing on the lane, `distance` before the slot, a little aside and askew. `reset(seed=s)` fixes all of it, and
-    later `reset()` calls go through further tasks of the same seed.
-    `options` of reset: `start`, x, y (m) and yaw (rad) of the rear axle in the lot's frame.
+    A contact costs `contact_cost`, s. `info["reward_terms"]` holds the terms `time`, `approach` and `contact`, which
+    add up to the reward. `compute_reward(achieved_goal, desired_goal, info)` returns the same for batches of goals,
+    with the contact from `info["contact"]`.
 
-    ## Episode end
-    - Terminated: parked (`info["is_success"]`): the footprint lies inside the slot, its middle at most 0.25 m from the
-      slot's, the yaw within 5°, and the car stands (0.05 m/s at most); a contact, of which `info["contact"]` names
-      the thing; or the car left the area, 27 m around the slot along the lot's axes (`contact` is "left the area").
-    - Truncated: after the step limit of the spec, 600, a minute.
+    ## Starting State
+    The car stands on the lane, `distance` before the slot, up to 0.2 m beside the driving line and up to 4° askew, with
+    straight wheels. `reset(seed=s)` determines all of it; later `reset()` calls draw further tasks of the seed.
+    Option of `reset`: `start`, x, y (m) and yaw (rad) of the rear axle in the lot's frame.
 
-    `info` holds time_s, driven_m, direction_changes, position_error_m, angle_error_rad, contact, is_success and parked.
+    ## Episode End
+    Terminated:
 
-    ## Keys
-    For `gymnasium.utils.play.play(env, noop=np.zeros(2, dtype=np.float32))` (needs the extra `human`): w and s
-    accelerate forward and backward, a and d steer left and right, two at once do both.
+    1. parked (`info["is_success"]`): the footprint is inside the slot, its middle at most 0.25 m from the slot's, the
+       yaw within 5°, and the speed at most 0.05 m/s;
+    2. a contact, of which `info["contact"]` names the obstacle;
+    3. the car left the area of 27 m around the slot along the lot's axes (`contact` is "left the area").
+
+    Truncated after 600 steps, one minute.
+
+    ## Info
+    `time_s`, `driven_m`, `direction_changes`, `position_error_m`, `angle_error_rad`, `contact` (empty without one),
+    `is_success` and `parked`; after a step also `reward_terms`.
 
     ## Arguments
-    - `lot`: a `ParkingLot`, the name of a packaged one (campus, jam, street, mini), or a lot file.
-    - `kinds`, `ways`, `slot`, `occupancy`, `slack`, `distance`, `starts`, `vehicle`: as in `ParkingTasks`. For a
-      curriculum, begin with `starts="way-out"`, a small `distance` and a large `slack`.
-    - `reward`: sparse or dense. `contact_cost`: s.
-    - `laser`: True for the scanner of the thesis (1081 beams over 270°), or a `LaserScanner`.
-    - `obstacle_map`: whether the observation holds `cars` and `lines`.
-    - `traffic`: `Traffic(cars=4, pedestrians=6)` lets others drive and walk in the lot. They wait for the car, but not
-      for one that runs into them.
+    - `lot`: a `ParkingLot`, the name of a packaged lot (campus, jam, street, mini), or a lot file.
+    - `kinds`, `ways`, `slot`, `occupancy`, `slack`, `distance`, `starts`, `vehicle`: see `ParkingTasks`. A curriculum
+      starts with `starts="way-out"`, a small `distance` and a large `slack`.
+    - `reward`: `sparse` or `dense`. `contact_cost`: s.
+    - `laser`: True for the thesis's scanner (1081 beams over 270°), or a `LaserScanner`.
+    - `obstacle_map`: whether the observation has `cars` and `lines`.
+    - `traffic`: e.g. `Traffic(cars=4, pedestrians=6)` adds moving cars and pedestrians. They wait for the car, but do
+      not evade a car that drives into them.
     - `render_mode`: `rgb_array` (480, 640, 3), or `human` (needs the extra `human`).
 
     ```python
@@ -138,7 +149,11 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     ```
 
-    ## Version history
+    ## Keys
+    For `gymnasium.utils.play.play(env, noop=np.zeros(2, dtype=np.float32))` (needs the extra `human`): w and s
+    accelerate forward and backward, a and d steer left and right; combinations are possible.
+
+    ## Version History
     - v1: the id rises with the other environments'.
     - v0: first version.
     """
@@ -198,24 +213,9 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         self._traffic = traffic or Traffic()
         self._n_movers = self._traffic.cars + self._traffic.pedestrians
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        fastest = max(self.vehicle.max_speed, self.vehicle.max_reverse_speed)
-        goal = np.array([_BOUND, _BOUND, 1.0, 1.0, fastest, _BOUND, _BOUND], dtype=np.float32)
-        strongest = max(self.vehicle.max_braking, self.vehicle.max_acceleration)
-        own = np.r_[goal[:5], self.vehicle.max_steering, strongest, _BOUND, _BOUND, 1.0, 1.0, 1.0]
-        own = (own * (1.0 + 1e-6)).astype(np.float32)
-        shown: dict[str, spaces.Space[Any]] = {
-            "observation": spaces.Box(-own, own, dtype=np.float32),
-            "achieved_goal": spaces.Box(-goal, goal, dtype=np.float32),
-            "desired_goal": spaces.Box(-goal, goal, dtype=np.float32),
-        }
-        if self.laser is not None:
-            shown["scan"] = spaces.Box(0.0, self.laser.max_range, (self.laser.n_beams,), np.float32)
-        if obstacle_map:
-            shown["cars"] = spaces.Box(-FAR, FAR, (MOST_CARS, _CORNERS, 2), np.float32)
-            shown["lines"] = spaces.Box(-FAR, FAR, (MOST_LINES, 2, 2), np.float32)
-            if self._n_movers:
-                shown["movers"] = spaces.Box(-FAR, FAR, (self._n_movers, _CORNERS, 2), np.float32)
-        self.observation_space = spaces.Dict(shown)
+        self.observation_space = drive_observation_space(
+            self.vehicle, self.laser, n_movers=self._n_movers, obstacle_map=obstacle_map
+        )
         self._half = np.array([0.5 * self.vehicle.length, 0.5 * self.vehicle.width])
         self._state: DriveState | None = None
         self._episode = 0
@@ -223,7 +223,7 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     @property
     def state(self) -> DriveState:
-        """The episode under way.
+        """State of the current episode.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
@@ -234,21 +234,21 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     @property
     def task(self) -> ParkingTask:
-        """What is to be done; everybody may know it."""
+        """The current task, public to agents."""
         return self.state.task
 
     def get_state(self) -> tuple[int, DriveState]:
-        """A copy of the episode, which `set_state` brings back."""
+        """A copy of the episode's state, for `set_state`."""
         return self._episode, copy.deepcopy(self.state)
 
     def set_state(self, state: tuple[int, DriveState]) -> None:
-        """Go on from a state that `get_state` of an environment with the same car returned."""
+        """Continue from a state returned by `get_state` of an environment with the same car."""
         episode, episode_state = state
         if episode_state.task.vehicle != self.vehicle:
             raise InputError("state is of another vehicle than this environment's")
         if len(episode_state.clocks) != self._n_movers:
             raise InputError(
-                f"state has {len(episode_state.clocks)} who move, this environment {self._n_movers}"
+                f"state has {len(episode_state.clocks)} road users, this environment {self._n_movers}"
             )
         self._episode, self._state = episode, copy.deepcopy(episode_state)
         self._enter(self._state)
@@ -256,39 +256,41 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start anew; see the class for what a seed fixes and for the option."""
+        """Start a new episode; see the class for seeds and options."""
         super().reset(seed=seed)
         unknown = set(options or ()) - {"start"}
         if unknown:
             raise InputError(f"reset has no option {', '.join(sorted(unknown))}, want start or none")
         self._episode = 0 if seed is not None else self._episode + 1
-        _ = self.np_random  # draws a seed where none was ever given
+        _ = self.np_random  # draws a seed if none was given
         key = world_key(self.np_random_seed, self._episode)
         task = self.tasks.draw(int(key), (options or {}).get("start"))
         self._state = DriveState(key, task, task.start.copy(), np.random.default_rng([int(key), 1]))
         self._state.trail.append(tuple(task.start[:3].tolist()))
         self._enter(self._state)
         if self._n_movers:
-            self._state.clocks = self._others.started(self.vehicle.corners(task.start[:3]))
+            self._state.clocks = self._others.initial_clocks(self.vehicle.corners(task.start[:3]))
             self._state.movers = self._others.poses(self._state.clocks)
             self._space.move(self._state.movers)
         if self.render_mode == "human":
             self.render()
         observation = self._observation()
-        self._judge(observation)
+        self._update_errors(observation)
         return observation, self._info(self._state)
 
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drive for 0.1 s; see the class."""
+        """Apply an action for 0.1 s; see the class."""
         state = self.state
         if state.over:
-            raise gym.error.ResetNeeded("the drive is over: call reset()")
+            raise gym.error.ResetNeeded("the episode has ended: call reset()")
         acceleration, steering = _command(action)
         vehicle, limits, space = state.vehicle, self.vehicle.limits, self._space
         touched = 0
         if self._n_movers:
             before = state.movers
-            state.clocks = self._others.onward(state.clocks, CONTROL_S, self.vehicle.corners(vehicle[:3]))
+            state.clocks = self._others.advance_clocks(
+                state.clocks, CONTROL_S, self.vehicle.corners(vehicle[:3])
+            )
             state.movers = self._others.poses(state.clocks)
         for k in range(SUBSTEPS):
             if self._n_movers:
@@ -302,11 +304,11 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
                 state.direction = direction
             state.time += PHYSICS_S
             if touched:
-                state.contact = Thing(touched).words
+                state.contact = ObstacleKind(touched).label
                 break
         state.trail.append(tuple(vehicle[:3].tolist()))
         observation = self._observation()
-        success = self._judge(observation)
+        success = self._update_errors(observation)
         if not touched and self._away > AREA:
             state.contact = "left the area"
         state.parked = success and not state.contact
@@ -319,12 +321,12 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return observation, sum(terms), state.over, False, info
 
     def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any) -> Any:
-        """The rewards of goals; see the class.
+        """Rewards of achieved goals; see the class.
 
         Args:
             achieved_goal: (7,) or (n, 7).
             desired_goal: likewise.
-            info: of the step, or n of them; one without `contact` counts as without a contact.
+            info: of the step, or a sequence of n; a missing `contact` means none.
 
         Returns:
             A float, or (n,) float32.
@@ -343,7 +345,7 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return float(rewards[0]) if np.ndim(achieved_goal) == 1 else rewards.astype(np.float32)
 
     def render(self) -> Any:
-        """A frame, or the window brought up to date, as `render_mode` says."""
+        """Return a frame, or update the window, depending on `render_mode`."""
         if self.render_mode is None:
             gym.logger.warn(
                 'render() does nothing without a render_mode, e.g. gym.make(..., render_mode="rgb_array")'
@@ -360,7 +362,7 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         return frame
 
     def get_keys_to_action(self) -> dict[tuple[int, ...], NDArray[np.float32]]:
-        """Keys of `gymnasium.utils.play`: w and s accelerate forward and backward, a and d steer left and right."""
+        """Keys for `gymnasium.utils.play`: w and s accelerate forward and backward, a and d steer left and right."""
         along, aside = {"": 0.0, "w": 1.0, "s": -1.0}, {"": 0.0, "a": 1.0, "d": -1.0}
         return {
             tuple(sorted(map(ord, go + turn))): np.array([force, angle], dtype=np.float32)
@@ -370,19 +372,19 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         }
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window, if open."""
         if self._renderer is not None:
             self._renderer.window.close()
             self._renderer = None
 
     def _enter(self, state: DriveState) -> None:
-        """Put the world of an episode in place."""
+        """Set up the collision world and the constant parts of the observation of an episode."""
         task = state.task
-        movers: list[tuple[Thing, FloatArray]] = []
+        movers: list[tuple[ObstacleKind, FloatArray]] = []
         if self._n_movers:
-            self._others = PoliteTraffic(self.tasks.lot, self._traffic, state.key, self.tasks.slot_cars)
+            self._others = YieldingTraffic(self.tasks.lot, self._traffic, state.key, self.tasks.slot_cars)
             movers = self._others.outlines
-        self._space = LotSpace(self.vehicle, task.obstacles, movers)
+        self._space = CollisionWorld(self.vehicle, task.obstacles, movers)
         if len(state.movers):
             self._space.move(state.movers)
         self._slot = np.array([*task.slot.tolist(), *task.room.tolist()])
@@ -397,8 +399,10 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
 
     def _observation(self) -> dict[str, Any]:
         state = self.state
-        own, achieved = np.empty(12, np.float32), np.empty(_GOAL, np.float32)
-        self._away = _observe(state.vehicle, self._slot, self._kind, self.vehicle.middle, own, achieved)
+        own, achieved = np.empty(12, np.float32), np.empty(7, np.float32)
+        self._away = fill_observation(
+            state.vehicle, self._slot, self._kind, self.vehicle.middle, own, achieved
+        )
         observation = {"observation": own, "achieved_goal": achieved, "desired_goal": self._desired.copy()}
         outlines = [placed(own, at) for (_, own), at in zip(self._moving(), state.movers, strict=True)]
         if self.laser is not None:
@@ -410,15 +414,15 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         if self._maps:
             observation["cars"], observation["lines"] = self._map[0].copy(), self._map[1].copy()
             if self._n_movers:
-                seen = np.array([np.r_[o, np.repeat(o[-1:], _CORNERS - len(o), axis=0)] for o in outlines])
+                seen = np.array([np.r_[o, np.repeat(o[-1:], CORNERS - len(o), axis=0)] for o in outlines])
                 seen = np.clip(state.task.in_slot_frame(seen), -FAR, FAR)
                 observation["movers"] = seen.astype(np.float32)
         return observation
 
-    def _moving(self) -> list[tuple[Thing, FloatArray]]:
+    def _moving(self) -> list[tuple[ObstacleKind, FloatArray]]:
         return self._others.outlines if self._n_movers else []
 
-    def _judge(self, observation: dict[str, Any]) -> bool:
+    def _update_errors(self, observation: dict[str, Any]) -> bool:
         achieved, desired = observation["achieved_goal"], observation["desired_goal"]
         distance, angle, success = goal_error(achieved, desired, self._half)
         self._errors = distance, angle
@@ -445,99 +449,12 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
         }
 
 
-def goal_errors(
-    achieved: NDArray[np.float32], desired: NDArray[np.float32], half: FloatArray
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """How far goals are from being reached.
-
-    Args:
-        achieved: (n, 7) float32; see `DriveEnv`.
-        desired: (n, 7) float32.
-        half: (2,) half the car's length and width, m.
-
-    Returns:
-        (n,) distance, m; (n,) angle, rad; (n,) whether it counts as parked.
-    """
-    errors = np.array([goal_error(a, d, half) for a, d in zip(achieved, desired, strict=True)]).reshape(-1, 3)
-    return errors[:, 0], errors[:, 1], errors[:, 2] > 0.5
-
-
-@compiled(error_model="numpy")
-def goal_error(
-    achieved: NDArray[np.float32], desired: NDArray[np.float32], half: FloatArray
-) -> tuple[float, float, float]:
-    """Distance, m, angle, rad, and 1 or 0 for whether the car is parked, of one pair of goals."""
-    dx, dy = float(achieved[0]) - float(desired[0]), float(achieved[1]) - float(desired[1])
-    c, s = float(desired[2]), float(desired[3])
-    cosine = float(achieved[2]) * c + float(achieved[3]) * s
-    sine = float(achieved[3]) * c - float(achieved[2]) * s
-    ahead, aside = abs(c * dx + s * dy), abs(c * dy - s * dx)
-    distance, angle = math.hypot(dx, dy), abs(math.atan2(sine, cosine))
-    long = half[0] * math.cos(angle) + half[1] * math.sin(angle)
-    wide = half[0] * math.sin(angle) + half[1] * math.cos(angle)
-    inside = ahead + long <= half[0] + float(desired[5]) and aside + wide <= half[1] + float(desired[6])
-    near = distance <= POSITION_TOLERANCE and angle <= ANGLE_TOLERANCE
-    stands = abs(float(achieved[4]) - float(desired[4])) <= STANDING
-    return distance, angle, 1.0 if (near and inside and stands) else 0.0
-
-
-@compiled(error_model="numpy")
-def _observe(
-    vehicle: FloatArray,
-    slot: FloatArray,
-    kind: NDArray[np.float32],
-    middle: float,
-    own: NDArray[np.float32],
-    achieved: NDArray[np.float32],
-) -> float:
-    """Fill `own`, (12,), and `achieved`, (7,); how far the car is from the slot along either axis of the world, m."""
-    yaw = vehicle[2]
-    dx, dy = vehicle[0] + middle * math.cos(yaw) - slot[0], vehicle[1] + middle * math.sin(yaw) - slot[1]
-    c, s = math.cos(slot[2]), math.sin(slot[2])
-    own[0], own[1] = c * dx + s * dy, c * dy - s * dx
-    own[2], own[3] = math.cos(yaw - slot[2]), math.sin(yaw - slot[2])
-    own[4], own[5], own[6] = vehicle[3], vehicle[4], vehicle[5]
-    own[7], own[8] = slot[3], slot[4]
-    own[9:12] = kind
-    achieved[:5] = own[:5]
-    achieved[5:] = own[7:9]
-    return float(max(abs(dx), abs(dy)))
-
-
-def scan_plane(task: ParkingTask, movers: int = 0) -> ScanPlane:
-    """What a laser low on the car meets: parked cars as footprints; kerbs and walls as walls.
-
-    Args:
-        task: what stands there.
-        movers: places kept after the cars for outlines that move.
-    """
-    cars = task.obstacles.only(Thing.PARKED_CAR)
-    lines = task.obstacles.only(Thing.KERB, Thing.WALL)
-    corners = np.zeros((len(cars) + movers, _CORNERS, 2))
-    corners[: len(cars), : cars.corners.shape[1]] = cars.corners
-    n_corners = np.r_[cars.n_corners, np.zeros(movers, dtype=np.int64)]
-    return ScanPlane(corners, n_corners, np.array(lines.corners[:, :2]))
-
-
 def _between(before: FloatArray, after: FloatArray, share: float) -> FloatArray:
-    """Poses, (n, 3), a share of the way from some to others."""
+    """Interpolate poses, (n, 3): `share` 0 gives `before`, 1 gives `after`."""
     poses = before + share * (after - before)
     turn = after[:, 2] - before[:, 2]
     poses[:, 2] = before[:, 2] + share * (turn - 2.0 * np.pi * np.round(turn / (2.0 * np.pi)))
     return poses
-
-
-def obstacle_map(task: ParkingTask) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """`cars` and `lines` of the observation; see `DriveEnv`. What does not fit is the farthest, and left out."""
-    cars = np.full((MOST_CARS, _CORNERS, 2), FAR, dtype=np.float32)
-    lines = np.full((MOST_LINES, 2, 2), FAR, dtype=np.float32)
-    parked = task.in_slot_frame(task.obstacles.only(Thing.PARKED_CAR).corners[:MOST_CARS])
-    cars[: len(parked), : parked.shape[1]] = parked
-    cars[: len(parked), parked.shape[1] :] = parked[:, -1:]
-    drawn = task.in_slot_frame(task.obstacles.only(Thing.KERB, Thing.WALL).corners[:, :2])
-    drawn = drawn[np.argsort(np.hypot(*drawn.mean(axis=1).T), kind="stable")][:MOST_LINES]
-    lines[: len(drawn)] = drawn
-    return cars, lines
 
 
 def _command(action: ArrayLike) -> tuple[float, float]:

@@ -10,8 +10,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.driving.collision_world import ObstacleKind
 from parkenv.driving.lot_outline import LotOutline
-from parkenv.driving.lot_space import Thing
 from parkenv.driving.parking_task import REACH, ParkingTask
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, placed
 from parkenv.envs.drawing import (
@@ -68,7 +68,7 @@ _BODY = 0.5 * np.stack([np.sign(f) * np.abs(f) ** 0.3 for f in (np.cos(_ANGLE), 
 
 
 class DriveRenderer:
-    """Draws the manoeuvres on one lot, true to scale.
+    """Renderer of the manoeuvres on one lot, to scale.
 
     Args:
         lot: the lot.
@@ -196,10 +196,10 @@ def _ground(lot: ParkingLot, outline: LotOutline, task: ParkingTask, view: MapVi
     stroke(_box(task.slot, *task.size), WHITE, _LINE, closed=True)
     nose = np.array([[0.5, 0.0], [-0.3, 0.55], [-0.1, 0.0], [-0.3, -0.55]])
     cv2.fillPoly(image, [fixed_point(fine(placed(nose, task.target)))], WHITE, cv2.LINE_8, SUBPIXEL_BITS)
-    for thing, points in zip(task.obstacles.thing.tolist(), task.obstacles.outlines(), strict=True):
-        if thing == Thing.PARKED_CAR:
+    for kind, points in zip(task.obstacles.kind.tolist(), task.obstacles.outlines(), strict=True):
+        if kind == ObstacleKind.PARKED_CAR:
             _draw_parked(image, fine, points)
-        elif thing == Thing.KERB:
+        elif kind == ObstacleKind.KERB:
             stroke(points, KERB, 0.2)
         else:
             stroke(points, WALL, 0.3)

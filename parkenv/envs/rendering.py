@@ -29,8 +29,9 @@ from parkenv.envs.drawing import (
 from parkenv.envs.search_state import SearchState
 from parkenv.envs.window import Window
 from parkenv.world.lot import ParkingLot
-from parkenv.world.occupancy import DAY_NAMES, DAY_S
+from parkenv.world.occupancy import DAY_NAMES
 from parkenv.world.scenario import Scenario
+from parkenv.world.week import DAY_S
 from sim_sensors.compilation import compiled
 
 WIDTH, HEIGHT = 640, 480
@@ -247,7 +248,7 @@ class SearchRenderer:
             ground.cover,
             ground.car,
             ground.car_cover,
-            belief_colors(state.belief.p_occupied[slots], state.belief.seen[slots]),
+            belief_colors(state.belief.p_occupied[slots], state.belief.observed[slots]),
             occupied[slots],
         )
         self._draw_trail(image, ground.view, state)
@@ -268,7 +269,7 @@ class SearchRenderer:
         lines = [
             f"{lot.name}: {self._place(state)}",
             f"{clock(state.time)}  elapsed {state.time - state.arrival.time:.1f} s  "
-            f"failed attempts {state.failed_parks}  observed {int(belief.seen.sum())}/{lot.n_slots}",
+            f"failed attempts {state.failed_parks}  observed {int(belief.observed.sum())}/{lot.n_slots}",
             f"in view: {around}",
             *self._text_map(state),
             "observed: o free  # taken   not: . likely free  : undecided  % likely taken",
@@ -282,16 +283,18 @@ class SearchRenderer:
             if self._still is None:
                 self._still = draw_still_layer(self.scenario.lot, self.outline, self._whole)
             return self._still
-        # The window depends on the car's place alone: equal states, equal frames.
-        scale = WINDOW_SLOT / self._slot_width
-        stride = np.array(self._size) / scale / 2
-        column, row = np.round(self.scenario.lot.vertex_xy[state.vertex] / stride).astype(int)
+        return self._window(self.scenario.lot.vertex_xy[state.vertex], WINDOW_SLOT, 2)
+
+    def _window(self, place: FloatArray, slot_px: float, parts: int) -> StillLayer:
+        """Return the layer around a place, (2,) m, with slots of `slot_px` width; it moves by 1/`parts` of its size."""
+        # The window depends on the place alone: equal states, equal frames.
+        scale = slot_px / self._slot_width
+        stride = np.array(self._size) / scale / parts
+        column, row = np.round(place / stride).astype(int)
         if self._still is None or self._window_at != (column, row):
             self._window_at = column, row
-            center = np.array([column, row]) * stride
-            self._still = draw_still_layer(
-                self.scenario.lot, self.outline, MapView.around(center, self._size, scale)
-            )
+            view = MapView.around(np.array([column, row]) * stride, self._size, scale)
+            self._still = draw_still_layer(self.scenario.lot, self.outline, view)
         return self._still
 
     def _pose(self, state: SearchState) -> tuple[FloatArray, float]:
@@ -328,7 +331,7 @@ class SearchRenderer:
         # Where slots share a cell, the one most likely free is written last.
         order = np.argsort(-belief.p_occupied, kind="stable")
         likely = np.searchsorted([1 / 3, 2 / 3], belief.p_occupied)
-        glyphs = np.where(belief.seen, np.array(list("oo#"))[likely], np.array(list(".:%"))[likely])
+        glyphs = np.where(belief.observed, np.array(list("oo#"))[likely], np.array(list(".:%"))[likely])
         put(lot.vertex_xy[state.path], np.full(len(state.path), "+"))
         put(lot.slot_xy[order], glyphs[order])
         put(lot.entries, np.full(len(lot.entries), "E"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import index
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
@@ -9,18 +10,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.envs.search_alone import begin_alone, held, step_alone
+from parkenv.envs.search_control import SearchControl
+from parkenv.envs.search_kernel import begin_search, init_external_prior, step_search
+from parkenv.envs.search_records import NEVER_OBSERVED, ScenarioRecords, Searches
 from parkenv.envs.search_state import SearchState
-from parkenv.envs.search_step import (
-    EPISODE,
-    NEVER_OBSERVED,
-    SEED_STATE,
-    STEP_GAVE_UP,
-    VERTEX,
-    Search,
-    foresee,
-)
-from parkenv.envs.search_tables import SearchTables
 from parkenv.errors import InputError
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.keyed_random import seed_state
@@ -35,25 +28,22 @@ LATEST = 1e8
 MAX_DECAY_RATE = 1e6
 """Bound, 1/s, of `decay_rate`."""
 _REBUILT = (
-    "search",
+    "searches",
     "_state",
-    "_numbers",
-    "_counts",
-    "_p_occupied",
-    "_belief",
-    "_clock",
-    "_held",
+    "_control",
+    "_address",
+    "_copy_time",
+    "_copy_p_occupied",
+    "_copy_belief",
     "_seeded_with",
     "_begun",
     "_over",
 )
-_USUAL = (np.int64, int)
-"""Types that actions mostly have."""
-REWARD_TERMS = ("drive", "failed", "walk", "gave_up")
+REWARD_TERMS = ("drive", "failed", "walk", "parking", "gave_up")
 
 
 class SavedSearch(NamedTuple):
-    """What `SearchEnv.get_state` hands out: copies of all that changes, and the stops so far."""
+    """What `SearchEnv.get_state` returns: copies of all that changes, and the vertices passed so far."""
 
     arrays: tuple[NDArray[Any], ...]
     path: list[int]
@@ -170,16 +160,16 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self._make_search()
 
     def _make_search(self) -> None:
-        tables = SearchTables.of([self.scenario])
-        self.search = Search.on(tables, np.zeros(1, dtype=np.int64), full_belief=True)
-        self._state = SearchState(self.scenario, self.search)
-        # The rows of this one search, as far as a step reads them.
-        self._numbers = self.search.numbers[0, : STEP_GAVE_UP + 1]
-        self._counts = self.search.counts[0, : VERTEX + 1]
-        self._p_occupied = self.search.p_occupied[0]
-        self._belief = self.search.belief[0].reshape(-1)
-        self._clock = np.zeros(2, dtype=np.float32)
-        self._held = held(self.search, self._clock)
+        self.searches = Searches(
+            ScenarioRecords([self.scenario]), np.zeros(1, dtype=np.int64), full_belief=True
+        )
+        self._address = self.searches.address
+        self._state = SearchState(self.scenario, self.searches)
+        self._control = SearchControl(self.searches)
+        # Methods that copy what is observed: looking them up takes as long as copying a little.
+        self._copy_time = self.searches.records["clock"][0].copy
+        self._copy_p_occupied = self.searches.p_occupied[0].copy
+        self._copy_belief = self.searches.belief[0].reshape(-1).copy
         self._seeded_with: int | None = None
         self._begun, self._over = False, True
 
@@ -196,15 +186,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     def get_state(self) -> SavedSearch:
         """A copy of the episode, which `set_state` brings back."""
-        return SavedSearch(tuple(a.copy() for a in self.search.changing()), list(self.state.path))
+        return SavedSearch(self.searches.save(), list(self.state.path))
 
     def set_state(self, state: SavedSearch) -> None:
-        """Go on from a state that `get_state` of an environment with the same scenario returned."""
-        slots, n_slots = state.arrays[-1].shape[-1], self.scenario.lot.n_slots
-        if slots != n_slots:
-            raise InputError(f"state is of a lot with {slots} slots, this one has {n_slots}")
-        for mine, saved in zip(self.search.changing(), state.arrays, strict=True):
-            mine[...] = saved
+        """Continue from a state that `get_state` of an environment with the same scenario returned."""
+        self.searches.restore(state.arrays)
         self._state.path = list(state.path)
         self._begun, self._over = True, self._state.over
 
@@ -227,18 +213,18 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if options:
             raise InputError(f"reset takes no options, got {', '.join(options)}")
         if self.np_random_seed < 0:
-            # Whoever set `np_random` by hand: its seed is not known.
+            # `np_random` was set by hand: its seed is not known.
             super().reset(seed=int(self.np_random.integers(1 << 62)))
-        counts = self.search.counts
-        counts[0, EPISODE] = 0 if seed is not None else counts[0, EPISODE] + 1
+        record = self.searches.records[0]
+        record["episode"] = 0 if seed is not None else record["episode"] + 1
         if seed is not None or self._seeded_with != self.np_random_seed:
             self._seeded_with = self.np_random_seed
-            counts.view(np.uint64)[0, SEED_STATE] = seed_state(self.np_random_seed)
-        begin_alone(self._held)
-        if len(self.search.asked):
+            record["seed_state"] = seed_state(self.np_random_seed)
+        begin_search(self._address)
+        if len(self.searches.external_prior):
             forecast = self.scenario.forecast(self._state.arrival)
-            self.search.asked[0] = forecast.p_occupied, forecast.decay_rate
-            foresee(self.search, 0)
+            self.searches.external_prior[0] = forecast.p_occupied, forecast.decay_rate
+            init_external_prior(self._address)
         self._begun, self._over = True, False
         self._state.path = [self._state.vertex]
         if self.render_mode == "human":
@@ -249,38 +235,50 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         """Drive along an edge, or try to park; see the class."""
         if self._over:
             raise gym.error.ResetNeeded("the search has not begun, or is over: call reset()")
-        self._advance(_action_number(action))
-        # Taken as Python's numbers all at once: one by one, numpy's take most of a step's time.
+        try:
+            number = index(action)
+        except TypeError:
+            number = _action_number(action)
+        if not 0 <= number <= PARK:
+            raise _wrong_action(action)
         (
-            drive_s, failed_s, walk_s, gave_up_s, driven_m, walked_m,
-            drive, failed, walk, gave_up,
-        ) = self._numbers.tolist()  # fmt: skip
-        failed_parks, slots_passed, parked, over, vertex = self._counts.tolist()
+            reward, drive, failed, walk, parking, gave_up,
+            drive_s, failed_s, walk_s, parking_cost_s, gave_up_s, total_s, driven_m, walked_m,
+            failed_parks, slots_passed, parked, over, vertex,
+        ) = self._advance(number)  # fmt: skip
         state = self._state
         if vertex != state.path[-1]:
             state.path.append(vertex)
+        self._over = over
         # A time limit ends the episode from outside, so the metrics are there at every step.
         info = {
-            "reward_terms": {"drive": -drive, "failed": -failed, "walk": -walk, "gave_up": -gave_up},
+            "reward_terms": {
+                "drive": drive,
+                "failed": failed,
+                "walk": walk,
+                "parking": parking,
+                "gave_up": gave_up,
+            },
             "drive_s": drive_s,
             "failed_s": failed_s,
             "walk_s": walk_s,
+            "parking_cost_s": parking_cost_s,
             "gave_up_s": gave_up_s,
-            "total_s": drive_s + failed_s + walk_s + gave_up_s,
+            "total_s": total_s,
             "driven_m": driven_m,
             "walked_m": walked_m,
             "failed_parks": failed_parks,
             "slots_passed": slots_passed,
-            "parked": parked == 1,
+            "parked": parked,
         }
         if self.render_mode == "human":
             self.render()
-        self._over = over == 1
-        return self._observation(state), -(drive + failed + walk + gave_up), self._over, False, info
+        return self._observation(state), reward, over, False, info
 
-    def _advance(self, action: int) -> None:
-        """Act, and look around."""
-        step_alone(self._held, action)
+    def _advance(self, action: int) -> tuple[Any, ...]:
+        """Act, observe, and return what `parkenv.envs.search_kernel.step_result` does."""
+        result: tuple[Any, ...] = step_search(self._address, action)
+        return result
 
     def action_masks(self) -> NDArray[np.bool_]:
         """(5,) bool, which actions the graph has here; the name that sb3-contrib looks for."""
@@ -327,9 +325,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         vertex = state.path[-1]
         return {
             "vertex": self._vertices[vertex],
-            "time": self._clock.copy(),
-            "p_occupied": self._p_occupied.copy(),
-            "belief": self._belief.copy(),
+            "time": self._copy_time(),
+            "p_occupied": self._copy_p_occupied(),
+            "belief": self._copy_belief(),
             "action_mask": self._masks[vertex].copy(),
         }
 
@@ -351,11 +349,12 @@ def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
 
 
 def _action_number(action: Any) -> int:
-    """The action as an int; arrays of one element will do, as models return them."""
-    # Compared as Python's: numpy's take longer.
-    if type(action) in _USUAL and 0 <= (usual := int(action)) <= PARK:
-        return usual
+    """The element of an array of one, as models return it."""
     number = np.asarray(action)
-    if number.size != 1 or not np.issubdtype(number.dtype, np.integer) or not 0 <= number.item() <= PARK:
-        raise InputError(f"action is {action!r}, want a whole number from 0 to {PARK} ({', '.join(ACTIONS)})")
+    if number.size != 1 or not np.issubdtype(number.dtype, np.integer):
+        raise _wrong_action(action)
     return int(number.item())
+
+
+def _wrong_action(action: Any) -> InputError:
+    return InputError(f"action is {action!r}, want a whole number from 0 to {PARK} ({', '.join(ACTIONS)})")

@@ -1,4 +1,4 @@
-"""The compiled batch as stable-baselines3 wants its environments."""
+"""The compiled batch of searches as stable-baselines3's `VecEnv`."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class SearchVecEnv(SharedVecEnv):
     length, as `Monitor` has them) and the metrics of `parkenv/Search-v1`. sb3-contrib finds `action_masks`.
 
     Args:
-        num_envs: how many searches at once.
-        scenario: one, by name or itself; or several, which take turns.
-        reward_scale: rewards are seconds times this. Learning is easiest with returns of about one.
-        k: how many slots the `local` observation tells of.
-        observation: local, or full where all lots are one.
-        max_episode_steps: after which a search is truncated.
+        num_envs: number of searches.
+        scenario: one, by name or as object, or several, which take turns.
+        reward_scale: factor of the rewards in seconds; returns of about one are easiest to learn.
+        k: number of slots in the `local` observation.
+        observation: local; or full, for a single lot.
+        max_episode_steps: steps after which a search is truncated.
 
     Raises:
         InputError: an argument out of its range, by name.
@@ -68,48 +68,39 @@ class SearchVecEnv(SharedVecEnv):
         super().__init__(num_envs, self.batch.single_observation_space, self.batch.single_action_space)
         self.reward_scale = reward_scale
         self._masks: NDArray[np.int8] = np.zeros((num_envs, 0), dtype=np.int8)
-        self._returns = np.zeros(num_envs)
-        self._lengths = np.zeros(num_envs, dtype=np.int64)
 
     def reset(self) -> dict[str, NDArray[Any]]:
-        """Start a search everywhere: in the worlds of `seed`, or in the next ones."""
+        """Start all searches, in the worlds of `seed` or in the next ones."""
         seeds = None if all(seed is None for seed in self._seeds) else self._seeds
         observations, _ = self.batch.reset(seed=seeds)
         self._reset_seeds()
         self._reset_options()
-        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        self._returns[:] = 0.0
-        self._lengths[:] = 0
+        self._start_all()
         self._masks = observations["action_mask"]
         return observations
 
     def step_wait(
         self,
     ) -> tuple[dict[str, NDArray[Any]], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Do it; see the class for what `info` holds."""
-        observations, rewards, terminated, truncated, told = self.batch.step(self.actions)
+        """Step all searches; see the class for `info`."""
+        observations, rewards, terminated, truncated, info = self.batch.step(self.actions)
         self._masks = observations["action_mask"]
-        self._returns += rewards
-        self._lengths += 1
+        self._count(rewards)
         done = terminated | truncated
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        for i in np.flatnonzero(done):
-            final = told["final_info"]
-            infos[i] = {name: final[name][i].item() for name in METRICS} | {
-                "terminal_observation": told["final_obs"][i],
-                "TimeLimit.truncated": bool(truncated[i] and not terminated[i]),
-                "episode": {"r": float(self._returns[i]), "l": int(self._lengths[i])},
-            }
-        self._returns[done] = 0.0
-        self._lengths[done] = 0
+
+        def final(i: int) -> tuple[dict[str, Any], dict[str, Any]]:
+            metrics = info["final_info"]
+            return info["final_obs"][i], {name: metrics[name][i].item() for name in METRICS}
+
+        infos = self._end_episodes(done, truncated & ~terminated, final)
         return observations, (rewards * self.reward_scale).astype(np.float32), done, infos
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """(n_envs, 5) bool, what can be done now."""
+        """Return the action masks, (n_envs, 5) bool."""
         return self._masks.astype(np.bool_)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of the adapter, or else of the batch."""
+        """Return an attribute of the adapter, else of the batch, for each environment."""
         if attr_name == "render_mode" or hasattr(self, attr_name):
             return super().get_attr(attr_name, indices)
         value = getattr(self.batch, attr_name)
@@ -118,7 +109,7 @@ class SearchVecEnv(SharedVecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """`action_masks`, a row for each search: what sb3-contrib asks for.
+        """Return a row of `action_masks` per search, which sb3-contrib calls.
 
         Raises:
             NotImplementedError: another method.

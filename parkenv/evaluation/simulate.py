@@ -11,8 +11,7 @@ import gymnasium as gym
 
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.world.scenario import Scenario
-from planners.agent import Agent
-from planners.bounds.oracle import OracleAgent
+from planners.agent import Agent, ClairvoyantAgent
 from sim_sensors.compilation import seconds_spent
 
 STEP_LIMIT = 2000
@@ -143,6 +142,6 @@ def adapt_to_agent(env: gym.Env[Any, Any], agent: Agent) -> gym.Env[Any, Any]:
 
 def _prepare(agent: Agent, env: gym.Env[Any, Any]) -> None:
     """Show the hidden occupancy to agents that are defined by knowing it."""
-    if isinstance(agent, OracleAgent):
+    if isinstance(agent, ClairvoyantAgent):
         state = env.unwrapped.state  # type: ignore[attr-defined]
-        agent.reveal(state.world, state.time)
+        agent.prepare(state.world, state.time)

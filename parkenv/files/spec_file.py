@@ -111,7 +111,7 @@ class Spec(BaseModel):
         except ValidationError as error:
             raise InputError(_message(cls, error, source)) from error
 
-    def changed(self, source: str = "", **changes: Any) -> Self:
+    def changed(self, source: str = "", /, **changes: Any) -> Self:
         """A copy with some fields changed, validated again.
 
         Args:

@@ -10,7 +10,7 @@ from parkenv.lots.importers.osm_elements import holds_osm
 
 
 class LotFormat(Enum):
-    """What a file describes a lot in."""
+    """Format of a file that a lot is read or imported from."""
 
     GEOJSON = "native GeoJSON"
     DRAGON_LAKE = "Dragon Lake map"
@@ -26,7 +26,7 @@ class LotFormat(Enum):
 def lot_format(path: Path) -> LotFormat | None:
     """The format of a file by its suffix and, for JSON, its content; None for an unknown suffix. Does not raise.
 
-    A JSON file that cannot be read counts as native: the reader of lots then says what is wrong with it.
+    A JSON file that cannot be read counts as native: its reader then reports the error.
     """
     suffix = path.suffix.lower()
     if suffix in (".json", ".geojson"):

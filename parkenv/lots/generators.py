@@ -36,7 +36,7 @@ BUILDING_SETBACK = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 2.9
 class Slots:
     """The columns of n slots: each field `name` is the column `slot_name` of `ParkingLot`.
 
-    An empty `parking_cost_s` stands for zeros.
+    An empty `parking_cost_s` means zeros.
     """
 
     xy: FloatArray

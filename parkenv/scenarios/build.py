@@ -50,11 +50,9 @@ def make_scenario(source: ScenarioSource, **changes: Any) -> Scenario:
         return source.replace(**changes)
     if isinstance(source, ParkingLot):
         goal = changes.get("goal", 0)
-        fields = {
-            "name": source.name,
-            "occupancy": changes.get("occupancy") or typical_occupancy(source, goal=goal),
-        }
-        return Scenario(lot=source, **(fields | changes | {"occupancy": fields["occupancy"]}))
+        occupancy = changes.get("occupancy") or typical_occupancy(source, goal=goal)
+        made = Scenario(name=source.name, lot=source, goal=goal, occupancy=occupancy)
+        return made.replace(**changes | {"occupancy": occupancy})
     if isinstance(source, ScenarioSpec):
         return build(source).replace(**changes)
     if not isinstance(source, str | Path):

@@ -186,6 +186,10 @@ def _hours(value: str) -> str:
     return value
 
 
+Hours = Annotated[str, AfterValidator(_hours)]
+"""HH:MM-HH:MM."""
+
+
 def _days(value: object) -> object:
     text = ",".join(value) if isinstance(value, list) and all(isinstance(v, str) for v in value) else value
     try:
@@ -199,7 +203,7 @@ class Arrivals(Spec):
     """When searches begin."""
 
     days: Annotated[str, BeforeValidator(_days, json_schema_input_type=str | list[str])] = "weekdays"
-    hours: Annotated[str, AfterValidator(_hours)] = "08:00-13:00"
+    hours: Hours = "08:00-13:00"
 
     def window(self) -> ArrivalWindow:
         """The arrival window."""

@@ -1,10 +1,10 @@
-"""The drive graph of a lot: where a car can stop, and which stop leads to which.
+"""Build the drive graph of a lot: stop positions and the moves between them.
 
-Every slot has one vertex, the point on the lane before its mouth; lane ends and crossings are the
-further vertices. A two-way lane carries one directed chain of slot vertices a side, kept to the right
-of the centre line, so a car passes the slots on its right in order, turns round at the lane's ends,
-and may swing across to the slots opposite. A one-way lane carries a single chain that serves both of
-its sides. Everything is array work, so that a million slots take seconds.
+Every slot has one vertex, the point on the lane before its mouth; lane ends and junctions are further vertices.
+A two-way lane carries one directed chain of slot vertices per side, to the right of the centre line: a car passes
+the slots on its right in order, turns round at the ends of the lane, and may cross to the opposite slots. A one-way
+lane carries a single chain that serves both of its sides. All computations are vectorised: a million slots take
+seconds.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from parkenv.errors import InputError
 LANE_OFFSET = 1.5
 """Distance, m, of a slot's vertex from the centre line of a two-way lane, to the right of travel."""
 SLOT_REACH = 8.0
-"""Farthest, m, that a slot's mouth may lie from the centre line of the lane that serves it."""
+"""Greatest distance, m, of a slot's mouth from the centre line of its lane."""
 ENTRY_REACH = 15.0
-"""Farthest, m, that an entry may lie from a lane."""
+"""Greatest distance, m, of an entry from a lane."""
 VERTEX_SPACING = 1.0
-"""Least distance, m, between two slot vertices on one chain, so that every move takes time."""
-SWING_REACH = 3.0
-"""Farthest, m along the lane, that a car swings across to a slot on the other side."""
+"""Least distance, m, between two slot vertices of one chain, so that every move takes time."""
+CROSSING_REACH = 3.0
+"""Greatest distance, m along the lane, of a move across to a slot on the other side."""
 NODE_TOLERANCE = 1e-3
-"""Lane points closer than this, m, are one junction."""
+"""Lane points closer than this, m, are one node."""
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -41,7 +41,7 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class GraphProblem:
-    """Why a drive graph cannot be made: kind of feature, its index among its kind, the reason, and where."""
+    """Why a drive graph cannot be built: kind of feature, its index within its kind, the reason, and the position."""
 
     kind: str
     index: int
@@ -50,7 +50,7 @@ class GraphProblem:
 
 
 class GraphError(InputError):
-    """A lot whose lanes, slots and entries do not fit together; `problems` lists all of them."""
+    """Lanes, slots and entries that form no drive graph; `problems` lists all reasons."""
 
     def __init__(self, problems: Sequence[GraphProblem]) -> None:
         self.problems = tuple(problems)
@@ -61,14 +61,14 @@ class GraphError(InputError):
 
 @dataclass(frozen=True, eq=False)
 class DriveGraph:
-    """Vertices 0..n_slots-1 belong to the slots in order; the rest are junctions and lane ends.
+    """A drive graph; vertices 0..n_slots-1 belong to the slots in order, the others are junctions and lane ends.
 
     Attributes:
         vertex_xy: (n_vertices, 2) float64, m, lot frame.
-        vertex_yaw: (n_vertices,) float64, rad: the direction of travel at a slot's vertex, 0 elsewhere.
+        vertex_yaw: (n_vertices,) float64, rad, direction of travel at a slot's vertex; 0 elsewhere.
         neighbors: (n_vertices, 4) int32, columns up, down, left, right; -1 where there is no edge.
         edge_length: (n_vertices, 4) float64, m; 0 where there is no edge.
-        entry_vertices: (n_entries,) int64.
+        entry_vertices: (n_entries,) int64, the vertex of each entry.
     """
 
     vertex_xy: FloatArray
@@ -80,9 +80,9 @@ class DriveGraph:
 
 @dataclass(frozen=True, eq=False)
 class _Centrelines:
-    """All lanes in one row of points; `station` is a running length that never decreases along it.
+    """All lanes in one array of points; `station` is the cumulative length along it.
 
-    A segment is the stretch of one lane between two neighbouring nodes, a leg a straight piece.
+    A segment is the part of a lane between two consecutive nodes, a leg is a straight piece between two points.
     """
 
     xy: FloatArray  # (n_points, 2)
@@ -96,7 +96,7 @@ class _Centrelines:
     node_xy: FloatArray  # (n_nodes, 2)
 
     def legs_at(self, station: FloatArray) -> IntArray:
-        """The leg on which each station lies."""
+        """The leg of each station."""
         leg = np.searchsorted(self.station[self.leg_start], station, side="right") - 1
         return np.clip(leg, 0, len(self.leg_start) - 1)
 
@@ -110,16 +110,16 @@ def build_drive_graph(
     mouth_xy: FloatArray,
     entry_xy: FloatArray,
 ) -> DriveGraph:
-    """Tie slots and entries to lanes, and link what can be driven.
+    """Build the drive graph: assign slots and entries to lanes, and connect vertices by moves.
 
     Args:
-        lanes: pairs of a centre line, (k, 2) m, and whether it is one-way in the order of its points.
-            Lanes meet where they share a point.
-        mouth_xy: (n_slots, 2) m, the middle of the side by which each slot is entered.
+        lanes: pairs of a centre line, (k, 2) m, and whether it is one-way in the order of its points. Lanes are
+            connected where they share a point.
+        mouth_xy: (n_slots, 2) m, middle of the side by which each slot is entered.
         entry_xy: (n_entries, 2) m.
 
     Raises:
-        GraphError: a slot or an entry that no lane serves, or a junction of more than four lanes.
+        GraphError: a slot or an entry out of reach of all lanes, or a junction with more than four lanes out.
     """
     lanes, entry_point = _with_entry_points(lanes, entry_xy)
     lines = _centrelines(lanes)
@@ -141,7 +141,7 @@ def build_drive_graph(
     slot_vertex_xy = lines.points_at(station, leg) + offset[:, None] * right
 
     edges = _chain_edges(lines, station, tangent, chain, order, n_slots)
-    edges += _swing_edges(lines, station, tangent, segment, against)
+    edges += _crossing_edges(lines, station, tangent, segment, against)
     source, target, length, bearing = (np.concatenate(part) for part in zip(*edges, strict=True))
     neighbors, edge_length = _four_columns(
         n_slots + len(lines.node_xy), n_slots, lines.node_xy, source, target, length, bearing
@@ -160,21 +160,21 @@ def build_drive_graph(
 def _with_entry_points(
     lanes: Sequence[tuple[FloatArray, bool]], entry_xy: FloatArray
 ) -> tuple[list[tuple[FloatArray, bool]], FloatArray]:
-    """Give the lane nearest to each entry a point there (twice, so that it becomes a node)."""
+    """Insert a node into the lane nearest to each entry; return the lanes and the nodes, (n_entries, 2) m."""
     lanes = list(lanes)
     points = np.empty((len(entry_xy), 2))
     problems = []
     for i, xy in enumerate(entry_xy):
         lines = linestrings([centre for centre, _ in lanes])
-        spot = shapely.Point(xy)
-        distance = np.asarray(shapely.distance(lines, spot))
+        point = shapely.Point(xy)
+        distance = np.asarray(shapely.distance(lines, point))
         k = int(np.argmin(distance))
         if distance[k] > ENTRY_REACH:
             reason = f"is {distance[k]:.1f} m from the nearest lane, want at most {ENTRY_REACH:g} m"
             problems.append(GraphProblem("entry", i, reason, (float(xy[0]), float(xy[1]))))
             continue
         centre, oneway = lanes[k]
-        along = shapely.line_locate_point(lines[k], spot)
+        along = shapely.line_locate_point(lines[k], point)
         station = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(centre, axis=0).T))])
         nearest = int(np.argmin(np.abs(station - along)))
         if abs(station[nearest] - along) > NODE_TOLERANCE:
@@ -183,7 +183,7 @@ def _with_entry_points(
             centre = np.insert(centre, nearest, on_lane, axis=0)
         points[i] = centre[nearest]
         if 0 < nearest < len(centre) - 1:
-            # Two lanes that meet at the entry make it a node.
+            # Splitting the lane at the entry makes it a node.
             lanes[k : k + 1] = [(centre[: nearest + 1], oneway), (centre[nearest:], oneway)]
     if problems:
         raise GraphError(problems)
@@ -218,7 +218,7 @@ def _centrelines(lanes: Sequence[tuple[FloatArray, bool]]) -> _Centrelines:
     is_node = is_end | (np.bincount(label)[label] > 1)
     cut = np.flatnonzero(is_node)
     loops = (lane[cut[:-1]] == lane[cut[1:]]) & (label[cut[:-1]] == label[cut[1:]]) & (np.diff(cut) > 1)
-    # A lane that comes back to where it left would be an edge to itself: stop once on the way round.
+    # A closed lane would be an edge from a vertex to itself: add a node halfway.
     is_node[(cut[:-1][loops] + cut[1:][loops]) // 2] = True
     cut = np.flatnonzero(is_node)
 
@@ -236,7 +236,7 @@ def _centrelines(lanes: Sequence[tuple[FloatArray, bool]]) -> _Centrelines:
     node_of_point = np.full(len(xy), -1)
     node_of_point[cut] = node
     node_xy = np.empty((node.max() + 1, 2))
-    node_xy[node[::-1]] = xy[cut[::-1]]  # where points differ by less than the tolerance the first one counts
+    node_xy[node[::-1]] = xy[cut[::-1]]  # of points within the tolerance the first one counts
     return _Centrelines(
         xy=xy,
         station=station,
@@ -253,7 +253,7 @@ def _centrelines(lanes: Sequence[tuple[FloatArray, bool]]) -> _Centrelines:
 def _attach_slots(
     lines: _Centrelines, mouth_xy: FloatArray
 ) -> tuple[FloatArray, IntArray, NDArray[np.bool_]]:
-    """Station, leg and side (True: left of the lane's direction) of the lane point nearest each mouth."""
+    """Station, leg and side (True: left of the lane's direction) of the lane point nearest to each mouth."""
     start = lines.leg_start
     ends = np.stack([lines.xy[start], lines.xy[start + 1]], axis=1)
     tree = shapely.STRtree(np.asarray(shapely.linestrings(ends)))
@@ -284,7 +284,7 @@ def _attach_slots(
 def _spread(
     lines: _Centrelines, station: FloatArray, segment: IntArray, chain: IntArray, order: IntArray
 ) -> FloatArray:
-    """Move vertices along their lane as little as keeps them apart from each other and from its nodes."""
+    """Move vertices along their lane, as little as possible, until they keep a distance from each other and nodes."""
     if not len(order):
         return station
     sign = np.where(chain % 2 == 1, -1.0, 1.0)
@@ -296,7 +296,7 @@ def _spread(
     size = np.repeat(size, size)
     low, high, wanted = low[order], high[order], (station * sign)[order]
     gap = np.minimum(VERTEX_SPACING, (high - low) / (size + 1))
-    # With k gaps taken off, "each at least a gap after the one before" is a running maximum per chain.
+    # After subtracting k gaps, "each at least a gap after its predecessor" is a running maximum per chain.
     shift = np.cumsum(np.r_[0.0, np.where(sorted_chain[1:] != sorted_chain[:-1], 1.0, 0.0)])
     stride = float(np.max(high - low)) + 1.0
     free = np.clip(wanted - low, gap, high - low - gap)
@@ -318,7 +318,7 @@ def _chain_edges(
     order: IntArray,
     n_slots: int,
 ) -> list[Edges]:
-    """From node to slot to slot to node along every chain: sources, targets, lengths and bearings."""
+    """Edges along every chain, from node to slots to node: sources, targets, lengths, m, and bearings, rad."""
     n_segments = len(lines.segment_oneway)
     drivable = np.ones(2 * n_segments, dtype=bool)
     drivable[1::2] = ~lines.segment_oneway
@@ -328,13 +328,13 @@ def _chain_edges(
     last_node = np.where(against, lines.segment_nodes[segment, 0], lines.segment_nodes[segment, 1])
     first_at = np.where(against, lines.segment_stations[segment, 1], lines.segment_stations[segment, 0])
     last_at = np.where(against, lines.segment_stations[segment, 0], lines.segment_stations[segment, 1])
-    # The first leg of a segment starts where the segment does, its last leg ends there.
+    # The first leg of a segment starts at its start, the last leg ends at its end.
     first_leg = np.searchsorted(lines.leg_segment, segment, side="left")
     last_leg = np.searchsorted(lines.leg_segment, segment, side="right") - 1
     leaving = lines.leg_tangent[np.where(against, last_leg, first_leg)]
     leaving = leaving * np.where(against, -1.0, 1.0)[:, None]
 
-    # One row of stops: each chain's first node, its slots in order, its last node.
+    # The stops of all chains: first node, slots in order, last node.
     stop_chain = np.concatenate([chains, chain[order], chains])
     stop_rank = np.concatenate([np.zeros(len(chains)), np.ones(len(order)), np.full(len(chains), 2.0)])
     stop_vertex = np.concatenate([n_slots + first_node, order, n_slots + last_node])
@@ -354,14 +354,14 @@ def _chain_edges(
     ]
 
 
-def _swing_edges(
+def _crossing_edges(
     lines: _Centrelines,
     station: FloatArray,
     tangent: FloatArray,
     segment: IntArray,
     against: NDArray[np.bool_],
 ) -> list[Edges]:
-    """From a slot's vertex across a two-way lane to the nearest one of the other side."""
+    """Edges from a slot's vertex across a two-way lane to the nearest vertex of the other side."""
     edges = []
     two_way = ~lines.segment_oneway[segment]
     for side in (False, True):
@@ -376,7 +376,7 @@ def _swing_edges(
         ahead, behind = (np.abs(station[there[i]] - station[here]) for i in (after, before))
         mate = np.where(ahead < behind, there[after], there[before])
         along = np.abs(station[mate] - station[here])
-        linked = (along <= SWING_REACH) & (segment[mate] == segment[here])
+        linked = (along <= CROSSING_REACH) & (segment[mate] == segment[here])
         here, mate, along = here[linked], mate[linked], along[linked]
         # Across means to the left of the direction of travel.
         bearing = np.arctan2(tangent[here, 0], -tangent[here, 1])
@@ -397,16 +397,16 @@ def _four_columns(
     length: FloatArray,
     bearing: FloatArray,
 ) -> tuple[NDArray[np.int32], FloatArray]:
-    """Assign every vertex's edges to up, down, left, right so that the bearings fit best in sum.
+    """Assign the edges of every vertex to the columns up, down, left, right with the least total bearing error.
 
-    The assignment problem has at most 4! solutions, so all of them are tried, for many vertices at once.
+    The assignment problem has at most 4! solutions, so all are tried, for many vertices at once.
     """
     order = np.argsort(source, kind="stable")
     source, target, length, bearing = source[order], target[order], length[order], bearing[order]
     degree = np.bincount(source, minlength=n_vertices)
     crowded = np.flatnonzero(degree > 4)
     if len(crowded):
-        spots = node_xy[crowded - n_slots].tolist()
+        crowded_xy = node_xy[crowded - n_slots].tolist()
         raise GraphError(
             [
                 GraphProblem(
@@ -416,11 +416,11 @@ def _four_columns(
                     "up, down, left and right leave room for 4",
                     (x, y),
                 )
-                for v, (x, y) in zip(crowded, spots, strict=True)
+                for v, (x, y) in zip(crowded, crowded_xy, strict=True)
             ]
         )
     rank = np.arange(len(source)) - np.repeat(np.cumsum(degree) - degree, degree)
-    misfit = np.zeros((n_vertices, 4, 4))  # vertex, edge, column; an edge that is not there fits everywhere
+    misfit = np.zeros((n_vertices, 4, 4))  # vertex, edge, column; absent edges fit everywhere
     misfit[source, rank] = 1.0 - np.cos(bearing[:, None] - _COLUMN_BEARINGS)
     choices = np.array(list(permutations(range(4))))
     column = np.empty((n_vertices, 4), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""A map that is wrong on purpose: it says the same of every slot."""
+"""A forecast that is wrong on purpose: the same probability for every slot."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from parkenv.errors import InputError
-from parkenv.world.occupancy import MAX_PROBABILITY, MIN_PROBABILITY, Arrival, Forecast, PriorModel
+from parkenv.world.occupancy import Arrival, Forecast, PriorModel
+from parkenv.world.occupancy_kernel import MAX_PROBABILITY, MIN_PROBABILITY
 
 
 @dataclass(frozen=True, eq=False)
 class FlatMap:
-    """Stands where a `Scenario` wants a `prior`: every slot is as likely to be taken as any other.
+    """A `prior` of a `Scenario` with the same occupancy probability for every slot.
 
     Args:
-        p_occupied: what it says, from 0 to 1; forecasts stay within what is allowed of them.
-        true: whose rates are kept: how fast sightings grow old is known.
+        p_occupied: the probability, 0 to 1; clipped to the range of forecasts.
+        true: provides the decay rates, which remain correct.
 
     Raises:
-        InputError: no probability.
+        InputError: `p_occupied` is not a probability.
 
     Examples:
         >>> from parkenv import Scenario
@@ -41,6 +42,6 @@ class FlatMap:
         return self.true.n_slots
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """The same of every slot."""
-        said = min(max(self.p_occupied, MIN_PROBABILITY), MAX_PROBABILITY)
-        return Forecast(np.full(self.n_slots, said), self.true.forecast(arrival).decay_rate)
+        """Forecast the same probability for every slot."""
+        p = min(max(self.p_occupied, MIN_PROBABILITY), MAX_PROBABILITY)
+        return Forecast(np.full(self.n_slots, p), self.true.forecast(arrival).decay_rate)

@@ -39,16 +39,23 @@ def _mix64(word: np.uint64) -> np.uint64:
     return z ^ (z >> _SHIFT_31)
 
 
-@compiled
+@compiled(inline="always")
 def keyed_uniform(key: np.uint64, stream: int, slot: int, index: int) -> float:
     """Uniform float64 in the open interval (0, 1), callable from Python and from compiled code.
 
     `key` comes from `world_key`; `stream`, `slot` and `index` are non-negative integers below 2**63.
     """
-    # Every operand is cast by hand: uint64 with int64 would be promoted to float64.
-    h = _mix64(np.uint64(key) + _GOLDEN * np.uint64(stream))
-    h = _mix64(h + _GOLDEN * np.uint64(slot))
-    h = _mix64(h + _GOLDEN * np.uint64(index))
+    # Cast here, so that the function below is compiled once and not for each constant that is passed; and all to
+    # uint64, since uint64 with int64 would be promoted to float64.
+    u: float = _uniform(np.uint64(key), np.uint64(stream), np.uint64(slot), np.uint64(index))
+    return u
+
+
+@compiled
+def _uniform(key: np.uint64, stream: np.uint64, slot: np.uint64, index: np.uint64) -> float:
+    h = _mix64(key + _GOLDEN * stream)
+    h = _mix64(h + _GOLDEN * slot)
+    h = _mix64(h + _GOLDEN * index)
     # 52 bits and a half: neither 0 nor 1 can come out.
     return (float(h >> _SHIFT_12) + 0.5) * 2.0**-52
 

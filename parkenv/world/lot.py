@@ -1,4 +1,4 @@
-"""The lot: its slots, lanes, entries, goals and walls, and the drive graph that follows from them."""
+"""The parking lot: slots, lanes, entries, goals and walls, and the drive graph derived from them."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ FloatArray = NDArray[np.float64]
 MOVES = ("up", "down", "left", "right")
 """The names of the four columns of `ParkingLot.neighbors`, in order (eq. 3.13)."""
 PARK = len(MOVES)
-"""The action "park" (eq. 3.14); actions below it are the moves."""
+"""The action "park" (eq. 3.14); lower actions are the moves."""
 ACTIONS = (*MOVES, "park")
 SLOT_SIDE = 0.1
-"""Least length and width, m, of a slot."""
+"""Least length and width of a slot, m."""
 
 
 class Mouth(IntEnum):
-    """The side of a parked car, standing nose-in along the slot's yaw, by which the slot is entered."""
+    """The side by which a slot is entered, relative to a car parked nose-in along the slot's yaw."""
 
     REAR = 0  # perpendicular and angled slots
     LEFT = 1  # kerbside slots to the right of their lane
@@ -39,8 +39,11 @@ class Lane:
     """A drivable centre line.
 
     Args:
-        points: (k, 2) m, lot frame. Lanes are joined where they share a point.
-        oneway: whether cars may drive in the order of the points only. Cars keep to the right otherwise.
+        points: (k, 2) float64, m, lot frame, k ≥ 2. Lanes are connected where they share a point.
+        oneway: whether cars may drive in the order of the points only; else they keep to the right.
+
+    Raises:
+        InputError: a wrong shape, a value that is not finite, or two equal consecutive points.
     """
 
     points: FloatArray
@@ -54,9 +57,7 @@ class Lane:
         step = np.diff(points, axis=0)
         short = np.flatnonzero(np.hypot(step[:, 0], step[:, 1]) <= NODE_TOLERANCE)
         if len(short):
-            raise InputError(
-                f"lane points[{short[0]}] and [{short[0] + 1}] are the same place, want a step between"
-            )
+            raise InputError(f"lane points[{short[0]}] and [{short[0] + 1}] are equal, want different points")
         object.__setattr__(self, "points", points)
 
     def __eq__(self, other: object) -> bool:
@@ -69,23 +70,24 @@ class Lane:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ParkingLot:
-    """A parking lot: what is painted on the ground, and how a car gets from one slot to the next.
+    """A parking lot: slots, lanes, entries, goals and walls, and the drive graph between slots.
 
-    Units are metres in a local frame, x east and y north; yaw is counter-clockwise from x. The drive
-    graph is derived from slots, lanes and entries when the lot is made, so two lots with equal features
-    have equal graphs. Vertex `i < n_slots` is the place on the lane before slot `i`, the state that the
-    thesis plans on (T §3.4.1, Fig. 3.6 right); the vertices after them are junctions and lane ends.
+    Units are metres in a local frame, x east and y north; yaw is counter-clockwise from x, in radians. The drive
+    graph is derived from slots, lanes and entries on construction, so two lots with equal features have equal
+    graphs. Vertex `i < n_slots` is the stop position on the lane before slot `i`, the planning state of the thesis
+    (T §3.4.1, Fig. 3.6 right); further vertices are junctions and lane ends. `parkenv.lots` reads, writes and
+    generates lots.
 
     Args:
-        name: a word for tables and pictures.
-        slot_ids: n_slots unique names.
+        name: for tables and pictures.
+        slot_ids: n_slots unique ids.
         slot_xy: (n_slots, 2) float64, m, centres.
-        slot_yaw: (n_slots,) float64, rad, heading of a car that stands nose-in.
+        slot_yaw: (n_slots,) float64, rad, heading of a car parked nose-in.
         slot_length: (n_slots,) float64, m, along the yaw.
         slot_width: (n_slots,) float64, m.
         slot_mouth: (n_slots,) int8, a `Mouth` each: the side towards the lane.
-        lanes: the centre lines that cars drive along.
-        entries: (n_entries, 2) float64, m, where cars come in; each must lie near a lane.
+        lanes: centre lines.
+        entries: (n_entries, 2) float64, m, where cars enter; each must be within 15 m of a lane.
         goals: (n_goals, 2) float64, m, where people walk to; anywhere.
         walls: polylines, (k, 2) m each; they block the view, not the walker.
         slot_parking_cost_s: (n_slots,) float64, s, at least 0: what parking in each slot costs, as time. A price
@@ -94,13 +96,13 @@ class ParkingLot:
     Attributes:
         vertex_xy: (n_vertices, 2) float64, m.
         vertex_yaw: (n_vertices,) float64, rad, the direction of travel at a slot's vertex.
-        neighbors: (n_vertices, 4) int32, the vertex that up, down, left, right lead to, or -1.
-        edge_length: (n_vertices, 4) float64, m.
-        entry_vertices: (n_entries,) int64.
+        neighbors: (n_vertices, 4) int32, the vertex reached by up, down, left, right; -1 where there is none.
+        edge_length: (n_vertices, 4) float64, m; 0 where there is no edge.
+        entry_vertices: (n_entries,) int64, the vertex of each entry.
 
     Raises:
         InputError: a wrong shape, a value that is not finite, a repeated id, no slot, entry or goal.
-        GraphError: slots or entries that no lane serves, or more than four lanes out of one junction.
+        GraphError: slots or entries out of reach of all lanes, or more than four lanes out of one junction.
 
     Examples:
         >>> from parkenv.lots import packaged_lot
@@ -140,7 +142,7 @@ class ParkingLot:
         if len(set(self.slot_ids)) < n:
             seen: set[str] = set()
             twice = next(i for i in self.slot_ids if i in seen or seen.add(i))  # type: ignore[func-returns-value]
-            raise InputError(f"lot {self.name!r}: slot id {twice!r} stands twice")
+            raise InputError(f"lot {self.name!r}: slot id {twice!r} appears twice")
         set_field("slot_ids", tuple(self.slot_ids))
         set_field("lanes", tuple(self.lanes))
         if np.size(self.slot_parking_cost_s) == 0:
@@ -201,29 +203,29 @@ class ParkingLot:
 
     @property
     def n_slots(self) -> int:
-        """How many slots there are."""
+        """Number of slots."""
         return len(self.slot_ids)
 
     @property
     def n_vertices(self) -> int:
-        """How many places to stop there are: one a slot, then junctions and lane ends."""
+        """Number of vertices of the drive graph: one per slot, then junctions and lane ends."""
         return len(self.vertex_xy)
 
     def walk_m(self, goal: int = 0) -> FloatArray:
-        """Straight distance, (n_slots,) m, from each slot to a goal (eq. 3.25)."""
+        """Straight-line distance from each slot to a goal, (n_slots,) float64, m (eq. 3.25)."""
         away = self.slot_xy - self.goals[goal]
         return np.asarray(np.hypot(away[:, 0], away[:, 1]))
 
     def mouth_xy(self) -> FloatArray:
-        """Middle, (n_slots, 2) m, of the side by which each slot is entered."""
+        """Middle of the side by which each slot is entered, (n_slots, 2) float64, m."""
         return mouth_points(self.slot_xy, self.slot_yaw, self.slot_length, self.slot_width, self.slot_mouth)
 
     def slot_corners(self) -> FloatArray:
-        """Corners, (n_slots, 4, 2) m, counter-clockwise from the rear right one."""
+        """Corners of the slots, (n_slots, 4, 2) float64, m, counter-clockwise from the rear right one."""
         return corner_points(self.slot_xy, self.slot_yaw, self.slot_length, self.slot_width)
 
     def bounds(self) -> tuple[float, float, float, float]:
-        """Least x and y, greatest x and y, m, of all features."""
+        """Bounding box of all features: least x and y, greatest x and y, m."""
         points = np.concatenate(
             [
                 self.slot_corners().reshape(-1, 2),
@@ -237,13 +239,13 @@ class ParkingLot:
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
     def drive_matrix(self) -> csr_array[np.float64]:
-        """The drive graph as a sparse matrix, (n_vertices, n_vertices), m, for scipy's graph routines."""
+        """The drive graph as a sparse matrix of edge lengths, (n_vertices, n_vertices) float64, m, for scipy."""
         from scipy.sparse import csr_array
 
         source, column = np.nonzero(self.neighbors >= 0)
         target = self.neighbors[source, column]
         shape = (self.n_vertices, self.n_vertices)
-        # Parallel edges would be added up by the matrix: keep the shortest.
+        # The matrix would sum parallel edges: keep the shortest.
         length = self.edge_length[source, column]
         order = np.lexsort((length, target, source))
         source, target, length = source[order], target[order], length[order]
@@ -252,7 +254,7 @@ class ParkingLot:
 
 
 def mouth_heading(yaw: FloatArray, mouth: NDArray[np.int8]) -> FloatArray:
-    """Direction, (n,) rad, that each slot's mouth faces."""
+    """Direction that the mouth of each slot faces, (n,) float64, rad."""
     heading: FloatArray = yaw + np.array([np.pi, np.pi / 2, -np.pi / 2])[mouth]
     return heading
 
@@ -260,7 +262,7 @@ def mouth_heading(yaw: FloatArray, mouth: NDArray[np.int8]) -> FloatArray:
 def mouth_points(
     xy: FloatArray, yaw: FloatArray, length: FloatArray, width: FloatArray, mouth: NDArray[np.int8]
 ) -> FloatArray:
-    """Middle, (n, 2) m, of the side by which each slot is entered."""
+    """Middle of the side by which each slot is entered, (n, 2) float64, m."""
     half = np.where(mouth == Mouth.REAR, length, width) / 2
     heading = mouth_heading(yaw, mouth)
     middle: FloatArray = xy + half[:, None] * np.stack([np.cos(heading), np.sin(heading)], axis=1)
@@ -268,7 +270,7 @@ def mouth_points(
 
 
 def corner_points(xy: FloatArray, yaw: FloatArray, length: FloatArray, width: FloatArray) -> FloatArray:
-    """Corners, (n, 4, 2) m, counter-clockwise from the rear right one."""
+    """Corners of rectangles, (n, 4, 2) float64, m, counter-clockwise from the rear right one."""
     along = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) * length[:, None] / 2
     left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1) * width[:, None] / 2
     signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
@@ -276,7 +278,7 @@ def corner_points(xy: FloatArray, yaw: FloatArray, length: FloatArray, width: Fl
 
 
 def is_building(wall: FloatArray) -> bool:
-    """Whether a wall, (k, 2), ends where it starts and so is a building's outline."""
+    """Whether a wall, (k, 2) m, is closed, and so the outline of a building."""
     return len(wall) >= 4 and np.array_equal(wall[0], wall[-1])
 
 

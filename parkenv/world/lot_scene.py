@@ -1,7 +1,9 @@
-"""A parking lot as the sensors see it."""
+"""Scenes of a parking lot for the simulated sensors."""
 
 from __future__ import annotations
 
+import hashlib
+from collections import OrderedDict
 from dataclasses import replace
 from itertools import pairwise
 
@@ -18,21 +20,46 @@ from sim_sensors.slot_scenes import SlotLot, slot_surroundings
 FloatArray = NDArray[np.float64]
 
 WALL_HEIGHT = 1.8
-"""Height, m, of walls that a lot's file gives as open lines; closed ones are buildings."""
+"""Height, m, of walls given as open lines; closed lines are buildings."""
 
 _CARS_APART = 1 << 31
+_KEPT_LOTS = 4
+_SLOT_LOTS: OrderedDict[bytes, SlotLot] = OrderedDict()
 
 
 def slot_lot(lot: ParkingLot, seed: int = 0) -> SlotLot:
-    """The lot's slots for `sim_sensors`: `slot_lot(lot).scene(occupied)` is what stands there.
+    """Convert a lot for `sim_sensors`: `slot_lot(lot).scene(occupied)` is its scene.
 
-    Closed walls become buildings, open ones free-standing walls. Place i of the scene is slot i, in the lot's
-    own frame.
+    Closed walls become buildings, open ones free-standing walls. Place i of the scene is slot i, in the lot's frame.
 
     Args:
         lot: the lot.
-        seed: of the cars' models and of everything's texture.
+        seed: of vehicle models and textures.
+
+    Equal lots share one object in a process, and with it the ground's texture and the vehicles' meshes, which take
+    seconds to make: every task of a worker process brings a new copy of its lot.
     """
+    key = _content(lot, seed)
+    if key not in _SLOT_LOTS:
+        _SLOT_LOTS[key] = _make_slot_lot(lot, seed)
+        if len(_SLOT_LOTS) > _KEPT_LOTS:
+            _SLOT_LOTS.popitem(last=False)
+    _SLOT_LOTS.move_to_end(key)
+    return _SLOT_LOTS[key]
+
+
+def _content(lot: ParkingLot, seed: int) -> bytes:
+    """Hash everything of the lot that its scene depends on."""
+    digest = hashlib.sha256(str(seed).encode())
+    columns = (lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width, lot.slot_mouth)
+    for array in (*columns, *lot.walls, *(lane.points for lane in lot.lanes)):
+        values = np.ascontiguousarray(array)
+        digest.update(f"{values.shape}{values.dtype}".encode())
+        digest.update(values.tobytes())
+    return digest.digest()
+
+
+def _make_slot_lot(lot: ParkingLot, seed: int) -> SlotLot:
     buildings = [wall[:-1] for wall in lot.walls if is_building(wall)]
     legs = [
         [*start, *end, WALL_HEIGHT]
@@ -54,16 +81,15 @@ def slot_lot(lot: ParkingLot, seed: int = 0) -> SlotLot:
 
 
 class LotScenes:
-    """A world as the sensors see it, moment after moment.
+    """Scenes of one world over time.
 
-    Which car stands in a slot depends on the world alone, as do the other cars that drive and the people who walk.
-    From one moment to the next only what has changed is changed.
+    Parked cars and traffic depend on the world alone. Consecutive scenes are updated incrementally.
 
     Args:
-        slots: of the scenario's lot, as `slot_lot` makes it.
-        scenario: whose lot and traffic it is.
+        slots: of the scenario's lot, from `slot_lot`.
+        scenario: defines lot and traffic.
         key: of the world.
-        world: which slots are taken when.
+        world: occupancy of the slots over time.
     """
 
     def __init__(self, slots: SlotLot, scenario: Scenario, key: np.uint64, world: World) -> None:
@@ -75,22 +101,22 @@ class LotScenes:
         self._scene: Scene | None = None
 
     def at(self, time: float, ego: FloatArray | None = None) -> Scene:
-        """The scene at `time`, s; slot i is its place i.
+        """The scene at a time; slot i is its place i.
 
         Args:
-            time: at or after the world's arrival.
-            ego: (3,) x, y, yaw of the car that carries the sensors, which is not part of the scene.
+            time: s, at or after the world's arrival.
+            ego: (3,) x, y in m and yaw in rad of the car with the sensors, which is not part of the scene.
         """
         taken = self._world.occupied(self._everything, time)
-        stretch = self._world.stretch(self._everything, time)
+        sojourn = self._world.sojourn(self._everything, time)
         if self._scene is None:
-            self._scene = self._slots.scene(taken, self._first_car + stretch)
+            self._scene = self._slots.scene(taken, self._first_car + sojourn)
         else:
-            for slot in np.flatnonzero(stretch != self._stretch).tolist():
+            for slot in np.flatnonzero(sojourn != self._stretch).tolist():
                 if taken[slot]:
-                    car = self._first_car + int(stretch[slot])
+                    car = self._first_car + int(sojourn[slot])
                     self._scene = self._slots.filled(self._scene, slot, car)
                 else:
                     self._scene = self._scene.without_vehicle(slot)
-        self._stretch = stretch
+        self._stretch = sojourn
         return self._scene.with_movers(self._traffic.at(time, ego))

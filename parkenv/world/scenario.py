@@ -74,6 +74,16 @@ class SearchProblem:
         return _read_only(self.lot.walk_m(self.goal) / self.v_walk)
 
     @cached_property
+    def arrival_cost_s(self) -> FloatArray:
+        """What parking in each slot costs on arrival, (n_slots,) s: the walk and the price."""
+        return _read_only(self.walk_s + self.parking_cost_s)
+
+    @property
+    def parking_cost_s(self) -> FloatArray:
+        """Price of each slot times the inverse value of time, (n_slots,) s."""
+        return self.lot.slot_parking_cost_s
+
+    @cached_property
     def move_s(self) -> FloatArray:
         """Drive time of each edge, (n_vertices, 4) s; 0 where there is none (eq. 3.22)."""
         return _read_only(self.lot.edge_length / self.v_drive)

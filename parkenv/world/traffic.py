@@ -1,4 +1,4 @@
-"""Other cars that drive about in the lot and people who walk there: where each of them is at a moment."""
+"""Traffic in a lot: moving cars and pedestrians, and their poses at any time."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 CAR_SPEEDS = (2.0, 4.0)
-"""m/s between which cars drive in a lot."""
+"""Range of car speeds, m/s."""
 WALK_SPEEDS = (0.9, 1.5)
-"""m/s between which people walk."""
+"""Range of walking speeds, m/s."""
 STRIDE_M = 1.4
-"""Two steps."""
+"""Length of a stride (two steps), m."""
 
 _CARS, _PEOPLE = 0, 1
 _STOPS = 3
-_AXLE_M = 1.3  # a car's axles are this far before and behind its middle, and run on its path
+_AXLE_M = 1.3  # from a car's middle to its axles, which follow its path
 _STEP_M = 0.3
 _EGO = np.array([2.4, 0.95])
 _GAP = np.array([1.2, 0.4])
@@ -36,14 +36,14 @@ _HALF_PERSON = np.array([0.35, 0.3])
 
 @dataclass(frozen=True)
 class Traffic:
-    """How much moves in a lot besides the car that searches.
+    """Numbers of road users in a lot besides the searching car.
 
-    It takes no slot. On the slot graph it blocks no way, and is there to be seen. Where the car really drives, on whole
-    trips and in `parkenv/Drive-v1`, each waits for the other.
+    Traffic occupies no slots. In the search environments it blocks nothing and is only visible to the sensors. Where
+    the car is driven, on whole trips and in `parkenv/Drive-v1`, it and the road users yield to each other.
 
     Args:
-        cars: how many drive about, along the lanes in rounds.
-        pedestrians: how many walk between a slot and the goal and back.
+        cars: number of cars that drive in loops along the lanes.
+        pedestrians: number of pedestrians that walk between a slot and the goal and back.
 
     Raises:
         InputError: a number below 0.
@@ -63,11 +63,11 @@ class LotTraffic:
     """The traffic of one world: a pure function of (lot, key, time).
 
     Args:
-        lot: whose lanes are driven and walked.
-        goal: index of the goal that people walk to.
-        traffic: how much there is.
+        lot: with the lanes to drive and walk on.
+        goal: index of the goal that pedestrians walk to.
+        traffic: numbers of cars and pedestrians.
         key: of the world.
-        slots: whose vehicle models are driven.
+        slots: provide the vehicle models.
     """
 
     def __init__(self, lot: ParkingLot, goal: int, traffic: Traffic, key: np.uint64, slots: SlotLot) -> None:
@@ -80,15 +80,15 @@ class LotTraffic:
         ]
 
     def at(self, time: float, ego: FloatArray | None = None) -> Movers | None:
-        """Who is where.
+        """Road users at a time.
 
         Args:
             time: s.
-            ego: (3,) x, y, yaw of the searching car. Who would be in its way waits out of sight: everybody else
-                drives as if it were not there, or the world would depend on the agent.
+            ego: (3,) x, y in m and yaw in rad of the searching car. Road users in its way are hidden; all others
+                ignore it, so that the world does not depend on the agent.
 
         Returns:
-            None where nobody is about.
+            The road users; None without traffic.
         """
         from sim_sensors.movers import LOOKS, Movers
 
@@ -111,10 +111,10 @@ class LotTraffic:
         return Movers(cars, model, people, stride, look)
 
     def poses_at(self, times: FloatArray) -> FloatArray:
-        """Where everybody is, each at a time of their own, as those need it who wait for somebody on their way.
+        """Poses of all road users, each at its own time, for traffic that waits.
 
         Args:
-            times: (cars + pedestrians,) s, the cars first.
+            times: (cars + pedestrians,) s, cars first.
 
         Returns:
             (cars + pedestrians, 3) x, y in m and yaw in rad.
@@ -138,14 +138,14 @@ class LotTraffic:
 
 
 class _Loop:
-    """A closed way, gone round for ever.
+    """Motion along a closed path at constant speed.
 
     Args:
-        path: (k, 2) m, its corners; the last one leads back to the first.
-        reach: m; the heading is that of a chord from so far behind to so far ahead.
+        path: (k, 2) m, corners; the last one connects to the first.
+        reach: the heading is that of the chord from this far behind to this far ahead, m.
         speed: m/s.
-        aside: m, to the right of the way.
-        start: where on it, as a share, at time 0.
+        aside: lateral offset to the right of the path, m.
+        start: position on the path at time 0, as a fraction of its length.
     """
 
     def __init__(self, path: FloatArray, reach: float, speed: float, aside: float, start: float) -> None:
@@ -158,15 +158,15 @@ class _Loop:
         self._start = start * self._station[-1]
 
     def station(self, time: float) -> float:
-        """M gone since the start of the round."""
+        """Station on the path, m."""
         return float((self._start + self._speed * time) % self._station[-1])
 
     def pose(self, time: float) -> FloatArray:
-        """(3,) x, y in m, yaw in rad."""
+        """Pose, (3,) x, y in m and yaw in rad."""
         s = self.station(time)
         behind, ahead = self._point(s - self._reach), self._point(s + self._reach)
         chord = ahead - behind
-        if np.hypot(*chord) < _STEP_M:  # it turns on the spot
+        if np.hypot(*chord) < _STEP_M:  # it turns in place
             chord = self._point(s + 0.01) - self._point(s)
         yaw = np.arctan2(chord[1], chord[0])
         right = np.array([np.sin(yaw), -np.cos(yaw)])
@@ -178,7 +178,7 @@ class _Loop:
 
 
 class _Routes:
-    """Shortest ways over a lot's drive graph."""
+    """Random routes over the drive graph of a lot."""
 
     def __init__(self, lot: ParkingLot, goal: int) -> None:
         self._lot = lot
@@ -188,21 +188,21 @@ class _Routes:
         self._drive = lot.drive_matrix()
 
     def round_trip(self, rng: np.random.Generator) -> FloatArray:
-        """Corners, (k, 2) m, of a drive past some slots and back to the first."""
+        """Draw a drive past some slots and back to the first: corners, (k, 2) m."""
         stops = rng.choice(self._lot.n_slots, size=min(_STOPS, self._lot.n_slots), replace=False).tolist()
-        legs = [self._way(a, b) for a, b in zip(stops, [*stops[1:], stops[0]], strict=True)]
+        legs = [self._shortest_path(a, b) for a, b in zip(stops, [*stops[1:], stops[0]], strict=True)]
         return np.concatenate(legs)
 
     def walk(self, rng: np.random.Generator) -> FloatArray:
-        """Corners, (k, 2) m, of a walk from a slot to the goal and back."""
+        """Draw a walk from a slot to the goal and back: corners, (k, 2) m."""
         slot = int(rng.integers(self._lot.n_slots))
         there = np.concatenate(
-            [self._lot.mouth_xy()[[slot]], self._way(slot, self._goal_vertex), [self._goal]]
+            [self._lot.mouth_xy()[[slot]], self._shortest_path(slot, self._goal_vertex), [self._goal]]
         )
         return np.concatenate([there, there[-2:0:-1]])
 
-    def _way(self, start: int, end: int) -> FloatArray:
-        """(k, 2) m, vertices from one to the other, the last left out; nothing where no way leads there."""
+    def _shortest_path(self, start: int, end: int) -> FloatArray:
+        """Vertices on the shortest path, (k, 2) m, without the last; empty where there is no path."""
         from scipy.sparse.csgraph import dijkstra
 
         _, before = dijkstra(self._drive, indices=[start], return_predecessors=True)
@@ -215,7 +215,7 @@ class _Routes:
 
 
 def _clear_of(ego: FloatArray, pose: FloatArray, half: FloatArray) -> NDArray[np.bool_]:
-    """(n,) bool: which rectangles keep `_GAP` from the searching car."""
+    """Mask, (n,), of the rectangles that keep a distance of `_GAP` from the searching car."""
     offset = pose[:, :2] - ego[:2]
     c, s = np.cos(ego[2]), np.sin(ego[2])
     local = np.stack([c * offset[:, 0] + s * offset[:, 1], c * offset[:, 1] - s * offset[:, 0]], axis=1)

@@ -1,7 +1,8 @@
-"""`belief`: a planner for the search as it is, not as the thesis models it."""
+"""`belief`: a planner in belief space, for a search in which slots are revealed on the way and change."""
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import ClassVar
@@ -9,122 +10,122 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.belief.forecast_error import DayBelief, ForecastErrorModel
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED, SlotBelief
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
-from planners.agent import Observation, SearchAgent, require_sight
-from planners.belief.best_path import NOWHERE, TRY, Budget, best_path
-from planners.belief.forecast_error import MapDoubt
-from planners.belief.planning_graph import LOOKS_FREE, LOOKS_TAKEN, UNSEEN, Outlook, Path, new_path
+from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
+from planners.belief.best_path import ATTEMPT, NOWHERE, Budget, best_path
+from planners.belief.planning_graph import (
+    SLOT,
+    BeliefSnapshot,
+    IntArray,
+    PathBuffer,
+    path_buffer,
+)
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.routes import DriveRoutes
 
 FloatArray = NDArray[np.float64]
 
-COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-"""Failure costs, s, with which the thesis's planner lays the paths that the search starts from."""
+FAILURE_COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
+"""s, failure costs with which the thesis's planner rolls out the paths that the search starts from."""
 DEPTH = 3
-"""Targets that a path may have before the thesis's planner goes on."""
+"""Targets of a path at most before the thesis's planner takes over."""
 WORK_PER_MS = 50_000
 """Steps of the path search that take about a millisecond."""
-USUAL_STAY = 7200.0
-"""How long a car is thought to stay, s, until ageing sightings tell."""
 WORTH_PASSING_S = 1.0
-"""s that driving on must promise over a free slot at hand, unless the map is taken at its word.
+"""s that driving on must promise over a free slot at hand, unless the forecast is trusted.
 
-Where the map is right, next to nothing is lost by not driving on for less than that; where it is wrong, the slot passed
-may have been the last one for long.
+Where the forecast is right, next to nothing is lost by not driving on for less than that; where it is wrong, the slot
+passed may have been the last one for long.
 """
 STALE_S = 60.0
-"""s without a slot that was not seen before, after which it is time to look beyond the part of the lot."""
+"""s without a newly observed slot after which the search moves on to another part of the lot."""
+PREVIEW_S = 60.0
+"""s ahead that a plan is previewed."""
 
 
 @dataclass
-class Search:
-    """What the agent remembers of an episode.
+class BeliefSearch:
+    """Memory of an episode.
 
     Attributes:
-        forecast: (n_slots,) float32, the belief in all slots of the lot before anything was seen.
-        near: the part of the lot that is planned for. The next six are of its slots, with its numbers.
-        n_unseen: how many of its slots had not been seen when it was chosen.
-        doubt: how far the forecast is thought to be off.
-        kind: (n_slots,) int8, UNSEEN, LOOKS_FREE or LOOKS_TAKEN at the last look.
-        looked_at: (n_slots,) float64, s, when each slot was last in view.
-        missed: (n_slots,) float64, the greatest rate of a view from which each slot was not made out.
-        p_occupied: (n_slots,) float32, the last observation's.
-        time: s since the search began, of the last observation.
-        news: s, when a slot of that part was last seen for the first time, or the part was chosen.
-        leaving: (n_slots,) float64, 1/s, the rate at which a parked car leaves; NaN where nothing has told yet.
-        targets: (DEPTH,) int64, what the path of the last decision goes past first, as the part numbers it.
+        near: the part of the lot that is planned for. The arrays below are of its slots, by its numbers.
+        n_unobserved: slots of it that were unobserved when it was chosen.
+        day: belief about how far the day differs from the forecast.
+        state: (n_slots,) int8, `SlotBelief.state` at the last decision.
+        missed_rate: (n_slots,) float64, the greatest detection rate of a view from which a slot was not detected.
+        time: s since the search began, of the last decision.
+        news_at: s, when a slot of the part was last observed for the first time, or the part was chosen.
+        targets: (DEPTH,) int64, what the path of the last decision goes past first.
         path: room for one.
-        gate: the vertex that the car drives to before it plans, or -1.
+        entry: the vertex that the car drives to before it plans, or -1.
         n_targets: how many targets there are.
-        cost: s, the failure cost with which that path goes on.
-        promise_s: s, what that path was expected to leave by now, unless something has been seen since; else inf.
+        failure_s: s, the failure cost of the thesis's planner on that path.
+        promise_s: s, what that path was expected to leave by now, unless something was observed since; else inf.
         replans: how often the path ahead has changed.
-        expected_s: s, what the search is expected to take from here.
+        expected_s: s, expected time of the search from here.
     """
 
-    forecast: NDArray[np.float32]
     near: Neighborhood
-    n_unseen: int
-    doubt: MapDoubt
-    kind: NDArray[np.int8]
-    looked_at: FloatArray
-    missed: FloatArray
-    p_occupied: NDArray[np.float32]
+    n_unobserved: int
+    day: DayBelief
+    state: NDArray[np.int8]
+    missed_rate: FloatArray
     time: float
-    news: float
-    leaving: FloatArray
-    targets: NDArray[np.int64]
-    path: Path
-    gate: int = -1
+    news_at: float
+    targets: IntArray
+    path: PathBuffer
+    entry: int = -1
     n_targets: int = 0
-    cost: float = COSTS[1]
+    failure_s: float = FAILURE_COSTS[1]
     promise_s: float = math.inf
     replans: int = 0
     expected_s: float = math.nan
 
 
-class BeliefAgent(SearchAgent[Search]):
-    """`belief`: drives the path on which stopping at the best moment is expected to take the least time.
+class BeliefAgent(SearchAgent[BeliefSearch]):
+    """`belief`: follows the path with the least expected time under optimal stopping.
 
-    Model: a slot is free with the probability that the map gives, unless the map is off in one of several ways, of
-    which the slots seen so far tell (`MapDoubt`); it is revealed when it comes in view; once seen, its state lasts and
-    decays as a two-state chain, so a free slot may be gone on arrival and a taken one may come free. At each
-    decision candidate paths are laid: as the thesis's planner would go on if all that it sees were taken, at several
-    failure costs, and past up to three vertices put in before. Each is valued by optimal stopping with recall
-    (`path_worth`), so whatever lies on the way counts, and so does that taken slots make the map more doubtful; the
-    best one's first step is taken, and its targets are where the next decision starts from. Where a path ends, a part
-    of it is driven again and again, or what it found so far is extrapolated where enough slots are left to see; and
-    where one more look may prove the lot full, the look may be left out.
+    **Model.** A slot is free with the forecast probability, unless the day differs from its forecast in one of several
+    ways, about which the slots observed so far are evidence (`ForecastErrorModel`). A slot is revealed when it comes in
+    view; then its state decays as a two-state Markov chain, so a free slot may be gone on arrival and a taken one may
+    come free.
 
-    Why it wins over the thesis's planner: that one values the one slot it drives to and needs a failure cost to stand
-    for all else, which goes wrong by a factor where the map is wrong; and it makes the look that proves a lot full
-    where it had better wait for a car to leave. This one has no cost to tune; on small lots it stays within a
-    thousandth of the exact optimum on average where slots last, and within 2 % where they change (tests). Where it
-    does not win: where the map is right, the thesis's planner with its failure cost tuned to the forecast is as good,
-    for then it is as near to the best path as this one is. Doubting the map costs a little on such days; where an
-    event has filled a lot against the map, those who take the first free slot that they see still do better. What is
-    valued is one path at a time, so it is not foreseen that the car leaves the path for another one after a sighting.
-    Estimates differ by where the car is, so that it could turn round between two paths for ever: until it sees
-    something, it keeps to its path unless another is better than what that one had promised.
+    **Search.** At each decision candidate paths are rolled out (`rollout_path`): as the thesis's planner would drive if
+    everything that it observes were taken, at several failure costs, and past up to three vertices inserted before.
+    Each is evaluated by optimal stopping with recall (`evaluate_path`), so everything on the way counts, and so does
+    that taken slots are evidence for a full day. The best path's first step is taken, and its targets are where the
+    next decision starts. At its end, a part of a path is driven again and again, or what it found so far is
+    extrapolated where enough slots are unobserved; and where one more observation may prove the lot full, it may be
+    better not to make it.
 
-    What it may know: rates are not observed, so the rate at which cars leave is read off the way in which a slot's
-    belief decays once it is out of view; until then stays of two hours are assumed, and no look
-    is left out in the hope that a car leaves. Where sight is imperfect, a slot that was in view and not made out is
-    looked for only from where it is likelier than not to be seen then; one that does not show from its own vertex
-    either is tried.
+    **Why it beats the thesis's planner.** That one values the one slot it drives to and needs a failure cost to stand
+    for all else, which is off by a factor where the forecast is wrong; and it makes the observation that proves a lot
+    full where it had better wait for a car to leave. This one has no cost to tune; on small lots it stays within a
+    thousandth of the exact optimum on average where slots last, and within 2 % where they change (tests).
+
+    **Where it does not.** Where the forecast is right, the thesis's planner with its failure cost tuned to the forecast
+    is as near to the best path as this one. Allowing for forecast errors costs a little on such days; where an event
+    has filled a lot against the forecast, drivers who take the first free slot still do better. One path at a time is
+    evaluated, so it is not foreseen that the car leaves the path for another one after an observation. Estimates differ
+    by where the car is, so that it could turn round between two paths for ever: until it observes something, it keeps
+    to its path unless another is better than what that one had promised. Where a sensor misses slots, a slot that was
+    in view and not detected is looked for only from where it is likelier than not to be detected; one that is not
+    detected from its own vertex either is attempted.
 
     Args:
         problem: lot, goal, speeds and costs.
-        budget_ms: about how long a decision may take, ms. It is counted in work, not on the clock, so
+        budget_ms: about how long a decision may take, ms. It is counted in work, not by the clock, so
             that the same observations give the same actions on every machine.
-        trusting: whether the map is taken at its word, without `MapDoubt`.
+        trust_forecast: whether to assume that the forecast is right on every day.
         most_vertices: a lot with more is planned for in part (`Neighborhoods`).
+        forecast_error: how a day may differ from its forecast, where that is not trusted.
 
     Raises:
-        InputError: a budget that is not positive, a bad `most_vertices`, or a problem in which nothing is seen.
+        InputError: a budget that is not positive, a bad `most_vertices`, or a problem in which nothing is observed.
     """
 
     name: ClassVar[str] = "belief"
@@ -133,189 +134,183 @@ class BeliefAgent(SearchAgent[Search]):
         self,
         problem: SearchProblem,
         budget_ms: float = 5.0,
-        trusting: bool = False,
+        trust_forecast: bool = False,
         most_vertices: int = MOST_VERTICES,
+        forecast_error: ForecastErrorModel | None = None,
     ) -> None:
         super().__init__(problem)
-        require_sight(self.name, problem)
+        require_observations(self.name, problem)
         if not (budget_ms > 0.0 and math.isfinite(budget_ms)):
             raise InputError(f"budget_ms is {budget_ms}, want a finite number above 0")
-        self.trusting = trusting
-        self._budget = Budget(np.array(COSTS), int(budget_ms * WORK_PER_MS), DEPTH)
-        # Where a slot is seen for what it is, nobody tries a taken one.
+        self._forecast_error = (
+            ForecastErrorModel.none() if trust_forecast else forecast_error or ForecastErrorModel()
+        )
+        self._worth_passing_s = 0.0 if trust_forecast else WORTH_PASSING_S
+        self._budget = Budget(np.array(FAILURE_COSTS), int(budget_ms * WORK_PER_MS), DEPTH)
+        # With a sensor that never errs nobody attempts a taken slot.
         self._failure_s = 0.0 if self.problem.sensor_model.perfect else self.problem.failure_s
         self._neighborhoods = Neighborhoods(self.problem, most_vertices)
         self._routes = DriveRoutes(self.problem)
 
-    def begin(self, observation: Observation) -> Search:
-        """Nothing seen yet."""
-        forecast = np.array(observation["p_occupied"])
+    def begin(self, observation: Observation, belief: SlotBelief) -> BeliefSearch:
+        """Choose the part of the lot to search."""
         vertex = int(observation["vertex"])
-        memory = self._search(self._neighborhoods.toward(vertex), forecast, float(observation["time"][1]))
-        if memory.near.place(vertex) < 0:
-            memory.gate = memory.near.gate
+        memory = self._search_of(self._neighborhoods.toward(vertex), belief)
+        if memory.near.index(vertex) < 0:
+            memory.entry = memory.near.entry
         return memory
 
-    def _search(self, near: Neighborhood, forecast: NDArray[np.float32], time: float) -> Search:
-        n, p = near.n_slots, forecast[near.slots]
-        return Search(
-            forecast=forecast,
+    def _search_of(self, near: Neighborhood, belief: SlotBelief) -> BeliefSearch:
+        n = near.n_slots
+        walk_s = self.problem.walk_s[near.slots]
+        return BeliefSearch(
             near=near,
-            n_unseen=n,
-            doubt=MapDoubt(p.astype(np.float64), near.walk_s, self.trusting),
-            kind=np.full(n, UNSEEN, dtype=np.int8),
-            looked_at=np.zeros(n),
-            missed=np.zeros(n),
-            p_occupied=p,
-            time=time,
-            news=time,
-            leaving=np.full(n, np.nan),
+            n_unobserved=n,
+            day=self._forecast_error.prior(belief.forecast[near.slots], walk_s),
+            state=np.full(n, UNOBSERVED, dtype=np.int8),
+            missed_rate=np.zeros(n),
+            time=belief.time,
+            news_at=belief.time,
             targets=np.zeros(DEPTH, dtype=np.int64),
-            path=new_path(n, len(near.vertices)),
+            path=path_buffer(n, len(near.vertices)),
         )
 
-    def decide(self, observation: Observation, memory: Search) -> int:
-        """Take in what was seen, search for the best path, and go its first step or to the slot to settle for."""
+    def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
+        """Update on the observation, search for the best path, and take its first step or park."""
         vertex = int(observation["vertex"])
-        self._take_in(observation, vertex, memory)
-        if memory.gate not in (-1, vertex):
-            return self._routes.move_toward(vertex, memory.gate)
-        if memory.gate == vertex:
-            memory.gate, memory.news = -1, memory.time
-        here = memory.near.place(vertex)
-        # Half of what there was to see has been seen, or nothing new for long: time to look farther.
-        half = 2 * _n_unseen(memory.kind) < memory.n_unseen
-        spent = not memory.near.whole and (half or memory.time - memory.news > STALE_S)
-        action = None if here < 0 or spent else self._act(vertex, here, memory)
+        known = self._update(belief, vertex, memory)
+        if memory.entry not in (-1, vertex):
+            return self._routes.move_toward(vertex, memory.entry)
+        if memory.entry == vertex:
+            memory.entry, memory.news_at = -1, memory.time
+        here = memory.near.index(vertex)
+        # Half of the slots that were unobserved have been observed, or none for long: search another part.
+        half = 2 * _n_unobserved(memory.state) < memory.n_unobserved
+        spent = not memory.near.whole and (half or memory.time - memory.news_at > STALE_S)
+        action = None if here < 0 or spent else self._follow_best_path(vertex, here, known, memory)
         if action is None and not memory.near.whole:
-            self._move_on(observation, vertex, memory)
-            if memory.gate >= 0:
-                return self._routes.move_toward(vertex, memory.gate)
-            action = self._act(vertex, memory.near.place(vertex), memory)
+            known = self._change_part(belief, vertex, memory)
+            if memory.entry >= 0:
+                return self._routes.move_toward(vertex, memory.entry)
+            action = self._follow_best_path(vertex, memory.near.index(vertex), known, memory)
         return self._wait(vertex) if action is None else action
 
-    def _act(self, vertex: int, here: int, memory: Search) -> int | None:
-        """What the best path begins with, or None where there is none."""
+    def _update(self, belief: SlotBelief, vertex: int, memory: BeliefSearch) -> SlotBelief:
+        """Update the memory by what was observed; return the belief about the slots of its part."""
         near = memory.near
-        before = memory.targets[: memory.n_targets].tolist(), memory.cost
+        known = belief.take(near.slots)
+        state = known.state
+        first = np.flatnonzero((state != UNOBSERVED) & (memory.state == UNOBSERVED))
+        if len(first):
+            memory.news_at = belief.time
+            memory.day.update(first, state[first] == OBSERVED_TAKEN)
+        if (state != memory.state).any():
+            memory.promise_s = math.inf
+        memory.state = state
+        here = near.index(vertex)
+        # There are no observations at the moment of arrival.
+        if here >= 0 and belief.time > memory.time:
+            views = near.in_view(here)
+            missed = np.where(state[views["slot"]] == UNOBSERVED, views["rate"], 0.0)
+            np.maximum.at(memory.missed_rate, views["slot"], missed)
+        memory.time = belief.time
+        return known
+
+    def _follow_best_path(
+        self, vertex: int, here: int, known: SlotBelief, memory: BeliefSearch
+    ) -> int | None:
+        """Return the first action of the best path, or None where there is no path."""
+        near = memory.near
+        before = memory.targets[: memory.n_targets].tolist(), memory.failure_s
         choice = best_path(
             here,
             memory.targets,
             memory.n_targets,
-            memory.cost,
+            memory.failure_s,
             memory.promise_s,
             self._budget,
-            near.ground(self.problem, self._failure_s),
-            self._outlook(here, memory),
+            near.planning_graph(self.problem, self._failure_s),
+            _snapshot(here, known, memory),
             memory.path,
         )
-        memory.n_targets, memory.cost = choice.n_targets, choice.cost
+        memory.n_targets, memory.failure_s = choice.n_targets, choice.failure_s
         memory.promise_s = choice.then_s
         memory.expected_s = min(choice.onward_s, choice.at_hand_s)
-        memory.replans += before != (memory.targets[: memory.n_targets].tolist(), memory.cost)
-        worth_passing_s = 0.0 if self.trusting else WORTH_PASSING_S
-        if choice.slot >= 0 and choice.at_hand_s <= choice.onward_s + worth_passing_s:
+        memory.replans += before != (memory.targets[: memory.n_targets].tolist(), memory.failure_s)
+        if choice.slot >= 0 and choice.at_hand_s <= choice.onward_s + self._worth_passing_s:
             memory.promise_s = math.inf
             return PARK if choice.slot == here else near.table.move(here, choice.slot)
-        if choice.following == TRY:
+        if choice.next_vertex == ATTEMPT:
             return PARK
-        if choice.following == NOWHERE:
+        if choice.next_vertex == NOWHERE:
             return None
-        return self._wait(vertex) if choice.following == here else near.table.move_to(here, choice.following)
+        if choice.next_vertex == here:
+            return self._wait(vertex)
+        return near.table.move_to(here, choice.next_vertex)
 
-    def _move_on(self, observation: Observation, vertex: int, memory: Search) -> None:
-        """Plan for the part of the lot around the car from now on, and take along what is known of it."""
+    def _change_part(self, belief: SlotBelief, vertex: int, memory: BeliefSearch) -> SlotBelief:
+        """Plan for the part of the lot around the car from now on, and keep what is known about it."""
         old = memory.near
-        taken = np.flatnonzero(np.asarray(observation["p_occupied"]) > memory.forecast)
-        near = self._neighborhoods.around(vertex, taken)
-        new = self._search(near, memory.forecast, memory.time)
+        near = self._neighborhoods.around(vertex, np.flatnonzero(belief.observed_taken))
+        new = self._search_of(near, belief)
         _, ours, theirs = np.intersect1d(old.slots, near.slots, assume_unique=True, return_indices=True)
-        for known in ("looked_at", "missed", "leaving"):
-            getattr(new, known)[theirs] = getattr(memory, known)[ours]
-        new.cost, new.replans = memory.cost, memory.replans
-        # The caller holds on to `memory`.
+        new.missed_rate[theirs] = memory.missed_rate[ours]
+        new.failure_s, new.replans = memory.failure_s, memory.replans
+        # The caller keeps `memory`: it becomes the new one in place.
         vars(memory).update(vars(new))
-        memory.gate = -1 if near.gate == vertex else near.gate
-        self._take_in(observation, vertex, memory)
-        memory.n_unseen = _n_unseen(memory.kind)
+        memory.entry = -1 if near.entry == vertex else near.entry
+        known = self._update(belief, vertex, memory)
+        memory.n_unobserved = _n_unobserved(memory.state)
+        return known
 
-    def _take_in(self, observation: Observation, vertex: int, memory: Search) -> None:
-        p, time = np.asarray(observation["p_occupied"])[memory.near.slots], float(observation["time"][1])
-        forecast = memory.forecast[memory.near.slots]
-        near, in_view, here = memory.near, np.zeros(len(p), dtype=np.bool_), memory.near.place(vertex)
-        view = slice(0, 0) if here < 0 else slice(*near.view_starts[here : here + 2])
-        in_view[near.view_slots[view]] = True
-        self._watch_ageing(p, forecast, time, in_view, memory)
-        kind = np.where(p < forecast, LOOKS_FREE, np.where(p > forecast, LOOKS_TAKEN, UNSEEN))
-        first = np.flatnonzero((kind != UNSEEN) & (memory.kind == UNSEEN))
-        memory.news = time if len(first) else memory.news
-        memory.doubt.look(first, kind[first] == LOOKS_TAKEN)
-        # A sighting that has quite faded leaves the slot as good as unseen, but it was a first look once.
-        kind = np.where(kind == UNSEEN, memory.kind, kind).astype(np.int8)
-        if (kind != memory.kind).any():
-            memory.promise_s = math.inf
-        memory.kind = kind
-        memory.looked_at[in_view] = time
-        if time > memory.time:
-            # Who has just arrived has not looked yet.
-            hidden = np.where(memory.kind[near.view_slots[view]] == UNSEEN, near.view_rates[view], 0.0)
-            np.maximum.at(memory.missed, near.view_slots[view], hidden)
-        memory.p_occupied, memory.time = p, time
-
-    def _watch_ageing(
-        self,
-        p: NDArray[np.float32],
-        forecast: NDArray[np.float32],
-        time: float,
-        in_view: NDArray[np.bool_],
-        memory: Search,
-    ) -> None:
-        """Read the rate at which cars leave off the beliefs that have grown older."""
-        elapsed = time - memory.time
-        if not elapsed > 0.0:
-            return
-        forecast = forecast.astype(np.float64)
-        was, now = memory.p_occupied - forecast, p - forecast
-        ageing = np.flatnonzero(
-            ~in_view & (np.abs(was) > 0.05) & (now * was > 0.0) & (np.abs(now) <= np.abs(was))
-        )
-        rate = np.log(was[ageing] / now[ageing]) / elapsed
-        memory.leaving[ageing] = rate * (1.0 - forecast[ageing])
-
-    def _outlook(self, here: int, memory: Search) -> Outlook:
-        told = memory.leaving[np.isfinite(memory.leaving)]
-        typical = float(np.median(told)) if len(told) else 1.0 / USUAL_STAY
-        leaving = np.where(np.isfinite(memory.leaving), memory.leaving, typical)
-        weights, free_if = memory.doubt.mixture()
-        usual = np.maximum(weights @ free_if, 1e-6)
-        rate = leaving / usual
-        seen_free = memory.kind == LOOKS_FREE
-        free = np.where(memory.kind == UNSEEN, usual, 1.0 - memory.p_occupied.astype(np.float64))
-        # The observation ages by the map; a lot that is fuller than the map takes free slots faster.
-        kept = usual + (1.0 - usual) * np.exp(-rate * (memory.time - memory.looked_at))
-        free = np.where(seen_free, np.minimum(free, kept), free)
-        drive = memory.near.table.seconds[here, : len(free)]
-        there = usual + (free - usual) * np.exp(-rate * np.where(np.isfinite(drive), drive, 0.0))
-        odds = np.divide(1.0 - there, there, out=np.full(len(free), np.inf), where=there > 0.0)
-        of_slots = np.ascontiguousarray(free_if.T)
-        return Outlook(
-            memory.kind,
-            free,
-            weights,
-            of_slots,
-            usual,
-            rate,
-            odds,
-            1.0 / usual - 1.0,
-            memory.missed,
-            len(told) > 0,
-        )
+    def plan_preview(self, observation: Observation, action: int, memory: BeliefSearch) -> PlanPreview:
+        """Return the path that the agent would drive if everything that it comes to observe were taken."""
+        belief = SlotBelief.of_observation(observation)
+        # The lot does not change; what is remembered does.
+        imagined = copy.deepcopy(memory, {id(memory.near): memory.near})
+        problem, vertex, path = self.problem, int(observation["vertex"]), list[int]()
+        starts, slots = problem.slots_in_view
+        end = belief.time + PREVIEW_S
+        while action != PARK:
+            following = int(problem.lot.neighbors[vertex, action])
+            if following < 0 or following in path or following == observation["vertex"] or belief.time > end:
+                break
+            belief = belief.decay(float(problem.move_s[vertex, action]))
+            vertex = following
+            path.append(vertex)
+            shown = slots[starts[vertex] : starts[vertex + 1]]
+            shown = shown[~belief.observed_free[shown]]
+            belief = belief.update(shown, np.full(len(shown), True))
+            action = self.decide({"vertex": vertex}, belief, imagined)
+        return PlanPreview(tuple(path))
 
     def _wait(self, vertex: int) -> int:
-        """A move that the graph does not have; where it has all four, the shortest."""
+        """Return a move that the graph does not have; where it has all four, the shortest."""
         missing = np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)
         return int(missing[0]) if len(missing) else int(self.problem.move_s[vertex].argmin())
 
 
-def _n_unseen(kind: NDArray[np.int8]) -> int:
-    return int((kind == UNSEEN).sum())
+def _snapshot(here: int, known: SlotBelief, memory: BeliefSearch) -> BeliefSnapshot:
+    """Return the belief about the slots of a part as the path search uses it."""
+    weights, p_free_if = memory.day.mixture()
+    n, state = len(memory.state), memory.state
+    # Cars leave as often as on the forecast day; a fuller day takes free slots faster.
+    usual = np.maximum(weights @ p_free_if, 1e-6)
+    rate = known.decay_rate * (1.0 - known.forecast) / usual
+    p_free = np.where(state == UNOBSERVED, usual, 1.0 - known.p_occupied)
+    # An observation decays to the forecast; on a fuller day a free slot has a lower chance to have lasted.
+    age = np.where(known.observed, known.age, 0.0)
+    lasted = usual + (1.0 - usual) * np.exp(-rate * age)
+    p_free = np.where(state == OBSERVED_FREE, np.minimum(p_free, lasted), p_free)
+    drive_s = memory.near.table.seconds[here, :n]
+    on_arrival = usual + (p_free - usual) * np.exp(-rate * np.where(np.isfinite(drive_s), drive_s, 0.0))
+    slots = np.empty(n, SLOT)
+    slots["p_free"], slots["p_free_usual"], slots["decay_rate"] = p_free, usual, rate
+    slots["odds"] = np.divide(1.0 - on_arrival, on_arrival, out=np.full(n, np.inf), where=on_arrival > 0.0)
+    slots["least_odds"] = 1.0 / usual - 1.0
+    slots["missed_rate"], slots["state"] = memory.missed_rate, state
+    return BeliefSnapshot(slots, weights, np.ascontiguousarray(p_free_if.T))
+
+
+def _n_unobserved(state: NDArray[np.int8]) -> int:
+    return int((state == UNOBSERVED).sum())

@@ -7,49 +7,47 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planners.belief.path_evaluation import offer, worth
-from planners.belief.path_rollout import lay, worth_a_try
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
+from planners.belief.path_evaluation import evaluate_path, expected_cost_to_slot
+from planners.belief.path_rollout import is_worth_an_attempt, rollout_path
 from planners.belief.planning_graph import (
-    LOOKS_FREE,
-    LOOKS_TAKEN,
-    UNSEEN,
+    BeliefSnapshot,
     FloatArray,
-    Ground,
     IntArray,
-    Outlook,
-    Path,
-    hidden,
+    PathBuffer,
+    PlanningGraph,
+    is_hidden,
 )
 from sim_sensors.compilation import compiled
 
 MOST_OPTIONS = 12
-"""Slots known to be free that are kept in mind, best first."""
-NOWHERE, TRY = -1, -2
-"""What comes next on a path that goes nowhere, or begins with a try to park where the car is."""
+"""Slots known to be free that are considered, best first."""
+NOWHERE, ATTEMPT = -1, -2
+"""What comes next where there is no path, or on one that begins with a parking attempt where the car is."""
 
 
-class Choice(NamedTuple):
-    """What a search for a path has come to.
+class PathChoice(NamedTuple):
+    """Result of a search for a path.
 
     Attributes:
-        onward_s: expected s of the path.
-        then_s: expected s that are left after its first step for who goes on, if that step is a drive to where nothing
-            is looked at; or inf.
-        at_hand_s: expected s of going to the best slot known now.
+        onward_s: s, expected time of the path.
+        then_s: s, expected time left after its first step of a car that goes on, if that step is a drive to where
+            nothing is observed; else inf.
+        at_hand_s: s, expected time of driving to the best slot known now.
         slot: that slot, or -1.
-        following: the vertex that comes next on the path, `TRY` or `NOWHERE`.
-        n_targets: how many targets the path has before the thesis's planner goes on.
-        cost: s, failure cost with which that one does.
-        work: steps of the way back that were made to put targets in, at most one candidate's more than the budget.
+        next_vertex: the vertex that comes next on the path, `ATTEMPT` or `NOWHERE`.
+        n_targets: targets of the path before the thesis's planner takes over.
+        failure_s: s, failure cost of that planner on it.
+        work: steps of the evaluation made to insert targets, at most one candidate's more than the budget.
     """
 
     onward_s: float
     then_s: float
     at_hand_s: float
     slot: int
-    following: int
+    next_vertex: int
     n_targets: int
-    cost: float
+    failure_s: float
     work: int
 
 
@@ -57,117 +55,79 @@ class Budget(NamedTuple):
     """How far to search.
 
     Attributes:
-        costs: (k,) float64, s, failure costs with which the thesis's planner lays paths.
-        work: how many steps of the way back may be made; it bounds the time of a decision.
-        depth: how many targets a path may have before the thesis's planner goes on.
+        failure_costs: (k,) float64, s, failure costs with which the thesis's planner rolls out paths.
+        work: steps of the evaluation at most; it bounds the time of a decision.
+        depth: targets of a path at most.
     """
 
-    costs: FloatArray
+    failure_costs: FloatArray
     work: int
     depth: int
 
 
-@compiled
+@compiled(error_model="numpy")
 def best_path(
     vertex: int,
     targets: IntArray,
     n_targets: int,
-    cost: float,
+    failure_s: float,
     promise_s: float,
     budget: Budget,
-    ground: Ground,
-    outlook: Outlook,
-    path: Path,
-) -> Choice:
-    """Search for the path of the least expected time, from the last decision's on.
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    path: PathBuffer,
+) -> PathChoice:
+    """Search for the path of the least expected time, starting from that of the last decision.
 
-    Candidates are the paths of the thesis's planner at several failure costs, then those past one target
-    more, which may be any vertex, put in at any place. Ties go to what was found first.
+    Candidates are the paths of the thesis's planner at several failure costs, then those past one more target, which
+    may be any vertex, inserted at any place. Ties go to what was found first.
 
     Args:
         vertex: where the car is.
-        targets: (depth,) int64, of the last decision's path; those of the chosen one when this returns.
+        targets: (depth,) int64, of the last decision's path; those of the chosen one on return.
         n_targets: how many.
-        cost: s, failure cost of the last decision's path.
-        promise_s: expected s that are left on that path, where nothing was looked at since, to keep to it unless
-            another is better: estimates differ by where the car is, and it could turn round for ever. Or inf.
+        failure_s: s, failure cost of the last decision's path.
+        promise_s: expected s left on that path, where nothing was observed since, to keep to it unless another is
+            better: estimates differ by where the car is, and it could turn round for ever. Else inf.
         budget: how far to search.
-        ground: the lot.
-        outlook: the belief.
-        path: room for one.
+        graph: the lot.
+        belief: the belief.
+        path: room for one path.
     """
-    n = len(outlook.kind)
-    options, n_options = np.empty(MOST_OPTIONS, np.int64), 0
-    depth, work = budget.depth, 0
-    trial, kept = np.empty(depth, np.int64), np.empty(depth, np.int64)
-
-    # What a failure on arrival costs: the search as it would be if nothing were known to be free.
-    late_s, base = np.inf, cost
-    late = np.zeros(n)
-    for i in range(len(budget.costs)):
-        n_path, left = lay(vertex, trial, 0, budget.costs[i], ground, outlook, path)
-        value, _ = worth(n_path, left, options, 0, late, ground, outlook, path)
-        if value < late_s:
-            late_s, base = value, budget.costs[i]
-    late_s = min(late_s, ground.give_up_s)
-    at_hand, slot = np.inf, -1
-    offers = np.full(MOST_OPTIONS, np.inf)
-    for s in range(n):
-        if outlook.kind[s] != LOOKS_FREE:
-            continue
-        value = offer(vertex, s, outlook.free[s], 0.0, late_s, ground, outlook)
-        if value < at_hand:
-            at_hand, slot = value, s
-        if n_options < MOST_OPTIONS:
-            place = n_options
-            n_options += 1
-        elif value < offers[MOST_OPTIONS - 1]:
-            place = MOST_OPTIONS - 1
-        else:
-            continue
-        while place > 0 and offers[place - 1] > value:
-            offers[place], options[place] = offers[place - 1], options[place - 1]
-            place -= 1
-        offers[place], options[place] = value, s
-    # Whoever finds a slot gone may have another one to fall back on.
-    for s in range(n):
-        late[s] = late_s
-        for i in range(n_options):
-            o = options[i]
-            if o != s:
-                fall_back = offer(s, o, outlook.free[o], ground.seconds[vertex, s], late_s, ground, outlook)
-                late[s] = min(late[s], fall_back)
-    at_hand, slot = np.inf, -1
+    options, n_options, fallback_s = _options_at_hand(vertex, budget, graph, belief, path)
+    at_hand_s, slot = np.inf, -1
     for i in range(n_options):
         s = options[i]
-        value = offer(vertex, s, outlook.free[s], 0.0, late[s], ground, outlook)
-        if value < at_hand:
-            at_hand, slot = value, s
+        value = expected_cost_to_slot(vertex, s, belief.slots[s].p_free, 0.0, fallback_s[s], graph, belief)
+        if value < at_hand_s:
+            at_hand_s, slot = value, s
 
-    best, then_s, following, n_kept = np.inf, np.inf, NOWHERE, 0
-    if n_targets > 0 and targets[0] == vertex and not worth_a_try(vertex, 0.0, -1.0, ground, outlook):
+    depth, work = budget.depth, 0
+    trial, kept = np.empty(depth, np.int64), np.empty(depth, np.int64)
+    best, then_s, next_vertex, n_kept, base = np.inf, np.inf, NOWHERE, 0, failure_s
+    if n_targets > 0 and targets[0] == vertex and not is_worth_an_attempt(vertex, 0.0, -1.0, graph, belief):
         for i in range(1, n_targets):
             targets[i - 1] = targets[i]
         n_targets -= 1
-    for i in range(-1, len(budget.costs)):
-        tried = n_targets if i < 0 else 0
-        if i >= 0:
-            cost = budget.costs[i]
-        n_path, left = lay(vertex, targets, tried, cost, ground, outlook, path)
-        value, onward_s = worth(n_path, left, options, n_options, late, ground, outlook, path)
+    # The last decision's path, then the thesis's planner's at each failure cost.
+    for i in range(-1, len(budget.failure_costs)):
+        n_tried = n_targets if i < 0 else 0
+        cost = failure_s if i < 0 else budget.failure_costs[i]
+        n_stops, left_s = rollout_path(vertex, targets, n_tried, cost, graph, belief, path)
+        value, onward_s = evaluate_path(n_stops, left_s, options, n_options, fallback_s, graph, belief, path)
         if i < 0 and promise_s < value:
-            value, onward_s = promise_s, promise_s - path.times[1]
+            value, onward_s = promise_s, promise_s - path.stops[1].time
         if value < best - 1e-9:
-            best, base, n_kept = value, cost, tried
-            following, then_s = _first_step(onward_s, path)
-            for j in range(tried):
+            best, base, n_kept = value, cost, n_tried
+            next_vertex, then_s = _first_step(onward_s, path)
+            for j in range(n_tried):
                 kept[j] = targets[j]
     if best == np.inf:
-        return Choice(best, best, at_hand, slot, NOWHERE, 0, base, 0)
+        return PathChoice(best, best, at_hand_s, slot, NOWHERE, 0, base, 0)
 
-    # The near ones matter for the step to be taken now, and come first where the budget is small.
-    nearest_first = np.argsort(ground.seconds[vertex])
-    on_way = np.empty((depth, len(ground.seconds)), np.bool_)
+    # Vertices nearby matter for the step to be taken now, and come first where the budget is small.
+    nearest_first = np.argsort(graph.drive_s[vertex])
+    on_route = np.empty((depth, len(graph.drive_s)), np.bool_)
     for _ in range(depth):
         improved = False
         n_before = n_kept
@@ -175,15 +135,15 @@ def best_path(
             targets[j] = kept[j]
         if n_before == depth:
             break
-        n_path, left = lay(vertex, targets, n_before, base, ground, outlook, path)
-        _mark(on_way, vertex, targets, n_before, n_path, ground, path)
+        n_stops, left_s = rollout_path(vertex, targets, n_before, base, graph, belief, path)
+        _mark_route(on_route, vertex, targets, n_before, n_stops, graph, path)
         for place in range(n_before + 1):
             before = vertex if place == 0 else targets[place - 1]
             for u in nearest_first:
-                if work > budget.work or not ground.seconds[vertex, u] < min(best, at_hand):
+                if work > budget.work or not graph.drive_s[vertex, u] < min(best, at_hand_s):
                     break
-                if not worth_a_try(u, ground.seconds[vertex, u], -1.0, ground, outlook) and (
-                    u == before or on_way[place, u] or not _shows_news(u, ground, outlook)
+                if not is_worth_an_attempt(u, graph.drive_s[vertex, u], -1.0, graph, belief) and (
+                    u == before or on_route[place, u] or not _shows_news(u, graph, belief)
                 ):
                     continue
                 for j in range(place):
@@ -191,62 +151,114 @@ def best_path(
                 trial[place] = u
                 for j in range(place, n_before):
                     trial[j + 1] = targets[j]
-                n_path, left = lay(vertex, trial, n_before + 1, base, ground, outlook, path)
-                value, onward_s = worth(n_path, left, options, n_options, late, ground, outlook, path)
-                looks = path.starts[n_path]
-                work += 30 * (n_path + looks) + n
+                n_stops, left_s = rollout_path(vertex, trial, n_before + 1, base, graph, belief, path)
+                value, onward_s = evaluate_path(
+                    n_stops, left_s, options, n_options, fallback_s, graph, belief, path
+                )
+                work += 30 * (n_stops + path.stops[n_stops].first) + len(belief.slots)
                 if value < best - 1e-6:
                     best, n_kept, improved = value, n_before + 1, True
-                    following, then_s = _first_step(onward_s, path)
+                    next_vertex, then_s = _first_step(onward_s, path)
                     for j in range(n_kept):
                         kept[j] = trial[j]
         if not improved:
             break
     for j in range(n_kept):
         targets[j] = kept[j]
-    return Choice(best, then_s, at_hand, slot, following, n_kept, base, work)
+    return PathChoice(best, then_s, at_hand_s, slot, next_vertex, n_kept, base, work)
 
 
-@compiled
-def _first_step(onward_s: float, path: Path) -> tuple[int, float]:
-    """`following` and `then_s` of a laid path; `onward_s` as it would be if nothing were looked at."""
-    if path.times[1] == 0.0 and path.starts[2] > 0:
-        return TRY, np.inf  # nothing but a try takes no time
-    following = int(path.vertices[1])
-    if path.starts[2] > 0 or following == path.vertices[0]:
+@compiled(error_model="numpy")
+def _options_at_hand(
+    vertex: int,
+    budget: Budget,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    path: PathBuffer,
+) -> tuple[IntArray, int, FloatArray]:
+    """Return the best slots known to be free, how many, and what the search takes on where each slot is gone, s.
+
+    Where a slot is gone on arrival, the search goes on as if no slot were known to be free, or to another of the slots.
+    """
+    n = len(belief.slots)
+    options, n_options = np.empty(MOST_OPTIONS, np.int64), 0
+    fallback_s = np.zeros(n)
+    search_s = np.inf
+    for i in range(len(budget.failure_costs)):
+        cost = budget.failure_costs[i]
+        n_stops, left_s = rollout_path(vertex, options, n_options, cost, graph, belief, path)
+        value, _ = evaluate_path(n_stops, left_s, options, n_options, fallback_s, graph, belief, path)
+        search_s = min(search_s, value)
+    search_s = min(search_s, graph.give_up_s)
+    expected_s = np.full(MOST_OPTIONS, np.inf)
+    for s in range(n):
+        if belief.slots[s].state != OBSERVED_FREE:
+            continue
+        value = expected_cost_to_slot(vertex, s, belief.slots[s].p_free, 0.0, search_s, graph, belief)
+        if n_options < MOST_OPTIONS:
+            place = n_options
+            n_options += 1
+        elif value < expected_s[MOST_OPTIONS - 1]:
+            place = MOST_OPTIONS - 1
+        else:
+            continue
+        while place > 0 and expected_s[place - 1] > value:
+            expected_s[place], options[place] = expected_s[place - 1], options[place - 1]
+            place -= 1
+        expected_s[place], options[place] = value, s
+    for s in range(n):
+        fallback_s[s] = search_s
+        for i in range(n_options):
+            o = options[i]
+            if o != s:
+                p_free, age = belief.slots[o].p_free, graph.drive_s[vertex, s]
+                other_s = expected_cost_to_slot(s, o, p_free, age, search_s, graph, belief)
+                fallback_s[s] = min(fallback_s[s], other_s)
+    return options, n_options, fallback_s
+
+
+@compiled(error_model="numpy")
+def _first_step(onward_s: float, path: PathBuffer) -> tuple[int, float]:
+    """Return `next_vertex` and `then_s` of a path; `onward_s` as it would be if nothing were observed."""
+    stops = path.stops
+    if stops[1].time == 0.0 and stops[2].first > 0:
+        return ATTEMPT, np.inf  # only an attempt takes no time
+    following = stops[1].vertex
+    if stops[2].first > 0 or following == stops[0].vertex:
         return following, np.inf
     return following, onward_s
 
 
-@compiled
-def _shows_news(vertex: int, ground: Ground, outlook: Outlook) -> bool:
-    """Whether a slot is in view of a vertex that has not been seen yet, or may have come free."""
-    for i in range(ground.view_starts[vertex], ground.view_starts[vertex + 1]):
-        s = ground.view_slots[i]
-        if hidden(s, ground.view_rates[i], outlook):
+@compiled(error_model="numpy")
+def _shows_news(vertex: int, graph: PlanningGraph, belief: BeliefSnapshot) -> bool:
+    """Return whether a slot in view of a vertex was not observed yet, or may have come free."""
+    for i in range(graph.view_starts[vertex], graph.view_starts[vertex + 1]):
+        view = graph.views[i]
+        if is_hidden(view.slot, view.rate, belief):
             continue
-        if outlook.kind[s] == UNSEEN or (outlook.kind[s] == LOOKS_TAKEN and outlook.rate[s] > 0.0):
+        at = belief.slots[view.slot]
+        if at.state == UNOBSERVED or (at.state == OBSERVED_TAKEN and at.decay_rate > 0.0):
             return True
     return False
 
 
-@compiled
-def _mark(
-    on_way: NDArray[np.bool_],
+@compiled(error_model="numpy")
+def _mark_route(
+    on_route: NDArray[np.bool_],
     vertex: int,
     targets: IntArray,
     n_targets: int,
-    n_path: int,
-    ground: Ground,
-    path: Path,
+    n_stops: int,
+    graph: PlanningGraph,
+    path: PathBuffer,
 ) -> None:
-    """Find the vertices that a path reaches by a shortest way from its start or last target: no use to put them in."""
-    on_way[:] = False
+    """Mark vertices that a path reaches by a shortest route from its start or last target: no use to insert them."""
+    on_route[:] = False
     passed, since, origin = 0, 0.0, vertex
-    for k in range(n_path):
-        v = path.vertices[k]
+    for k in range(n_stops):
+        v, time = path.stops[k].vertex, path.stops[k].time
         while passed < n_targets and targets[passed] == v:
             passed += 1
-            since, origin = path.times[k], v
-        if path.times[k] - since <= ground.seconds[origin, v] + 1e-9:
-            on_way[passed, v] = True
+            since, origin = time, v
+        if time - since <= graph.drive_s[origin, v] + 1e-9:
+            on_route[passed, v] = True

@@ -1,183 +1,204 @@
-"""What a path through a lot is worth to a car that may stop at any free slot it has seen, compiled.
+"""Evaluation of a path for a car that may stop at any free slot it has observed: optimal stopping with recall.
 
-A path says where to look next as long as all that was seen is taken. At every vertex of it the car knows what it
-has passed, and either settles for the best free slot so far, which may mean to drive back, or goes on. That is
-optimal stopping with recall, and its value follows exactly by going through the path backwards: the state is
-which slot is the best so far, or none.
+A path says where to observe next while everything observed is taken. At every stop of it the car knows what it has
+passed, and either settles for the best free slot so far, which may mean driving back, or goes on. The value follows
+exactly by going through the path backwards; the state is which slot is the best so far, or none.
 
-Whoever comes too late to a slot goes on searching, for a time that is estimated once a decision, or tries the next of
-those that it knows to be free.
+A car that comes too late to a slot goes on searching, for a time that is estimated once a decision, or tries the next
+of the slots that it knows to be free.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from planners.belief.path_rollout import foreseen
-from planners.belief.planning_graph import FloatArray, Ground, IntArray, Outlook, Path, decayed
+from planners.belief.path_rollout import p_free_at_first_look
+from planners.belief.planning_graph import (
+    BeliefSnapshot,
+    FloatArray,
+    IntArray,
+    PathBuffer,
+    PlanningGraph,
+    copy_weights,
+    decayed_part,
+)
 from sim_sensors.compilation import compiled
 
 KEPT_IN_MIND = 32
-"""Vertices along which a free slot that was passed is kept in mind."""
+"""Stops along which a free slot that was passed is kept in mind."""
 
 
-@compiled
-def offer(
+@compiled(error_model="numpy")
+def expected_cost_to_slot(
     vertex: int,
     slot: int,
-    free: float,
+    p_free: float,
     age: float,
-    late_s: float,
-    ground: Ground,
-    outlook: Outlook,
+    fallback_s: float,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
 ) -> float:
-    """Expected time, s, of driving to a slot that was free with some probability a while ago.
+    """Return the expected time, s, of driving to a slot that was observed some time ago.
 
     Args:
         vertex: where from.
         slot: where to.
-        free: P(free) when last seen.
+        p_free: P(free) when it was observed.
         age: s since then.
-        late_s: s that the search takes on if it is taken.
-        ground: the lot.
-        outlook: the belief.
+        fallback_s: s that the search takes on if it is taken.
+        graph: the lot.
+        belief: the belief.
     """
-    drive = ground.seconds[vertex, slot]
+    drive = graph.drive_s[vertex, slot]
     if drive == np.inf:
         return np.inf
-    p = free + (outlook.usual[slot] - free) * decayed(outlook.rate[slot], age + drive)
-    expected: float = drive + p * ground.walk_s[slot] + (1.0 - p) * (late_s + ground.failure_s)
+    at = belief.slots[slot]
+    p = p_free + (at.p_free_usual - p_free) * decayed_part(at.decay_rate, age + drive)
+    expected: float = drive + p * graph.cost_s[slot] + (1.0 - p) * (fallback_s + graph.failure_s)
     return expected
 
 
-@compiled
-def worth(
-    n_path: int,
+@compiled(error_model="numpy")
+def evaluate_path(
+    n_stops: int,
     left_s: float,
     options: IntArray,
     n_options: int,
-    late_s: FloatArray,
-    ground: Ground,
-    outlook: Outlook,
-    path: Path,
+    fallback_s: FloatArray,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    path: PathBuffer,
 ) -> tuple[float, float]:
-    """Least expected time, s, of going on along a laid path and stopping at will.
+    """Return the least expected time, s, of following a path and stopping at will.
 
-    What a look tells of the map depends on what it leads to. Where the car would park in a slot if it is free, going
-    on means that it was taken; where it drives past in any case, the look may show either, and tells nothing on
-    average. So the path is valued twice: as if no look told anything, which shows where the car would park, and with
-    what the looks there tell.
+    What an observation says about the day depends on what it leads to. Where the car would park if the slot were free,
+    going on means that it was taken; where the car drives past in any case, the observation may have been either, and
+    on average says nothing. So the path is evaluated twice: without any such evidence, which shows where the car would
+    park, and with the evidence of the observations there.
 
     Args:
-        n_path: its vertices.
-        left_s: s, left at its end if nothing was found.
+        n_stops: of the path.
+        left_s: s, expected at its end if nothing was found.
         options: slots that are known to be free now.
         n_options: how many.
-        late_s: (n_slots,) float64, s that the search takes on where each slot is gone on arrival.
-        ground: the lot.
-        outlook: the belief.
+        fallback_s: (n_slots,) float64, s that the search takes on where each slot is gone on arrival.
+        graph: the lot.
+        belief: the belief.
         path: the path.
 
     Returns:
-        The value of driving on to its second vertex, and that of not stopping there either, counted from there; inf
+        The value of driving on to its second stop, and that of not stopping there either, counted from there; inf
         where it has none.
     """
-    if n_path < 2:
+    if n_stops < 2:
         return np.inf, np.inf
-    path.taken_up[: path.starts[n_path]] = False
-    _foresee(n_path, outlook, path)
-    value, then_s = _stop_at_best(n_path, left_s, options, n_options, late_s, ground, outlook, path)
-    if len(outlook.weights) > 1:
-        _foresee(n_path, outlook, path)
-        value, then_s = _stop_at_best(n_path, left_s, options, n_options, late_s, ground, outlook, path)
+    for j in range(path.stops[n_stops].first):
+        path.looks[j].parks = False
+    value, then_s = np.inf, np.inf
+    for _ in range(2 if len(belief.weights) > 1 else 1):
+        _set_first_looks(n_stops, belief, path)
+        value, then_s = _stop_optimally(n_stops, left_s, options, n_options, fallback_s, graph, belief, path)
     return value, then_s
 
 
-@compiled
-def _foresee(n_path: int, outlook: Outlook, path: Path) -> None:
-    """Write down P(free) of the first looks along a path, each given that those before led to no parking."""
-    weights = path.weights[: len(outlook.weights)]
-    weights[:] = outlook.weights
-    for j in range(path.starts[n_path]):
-        if path.first_look[j]:
-            path.chances[j] = foreseen(weights, outlook.free_if[path.slots[j]], path.taken_up[j])
+@compiled(error_model="numpy")
+def _set_first_looks(n_stops: int, belief: BeliefSnapshot, path: PathBuffer) -> None:
+    """Set P(free) of the first observations along a path, each given that the car did not park before."""
+    weights = copy_weights(belief, path)
+    for j in range(path.stops[n_stops].first):
+        look = path.looks[j]
+        if look.is_first:
+            look.p_free = p_free_at_first_look(weights, belief.p_free_if[look.slot], look.parks)
 
 
-@compiled
-def _stop_at_best(
-    n_path: int,
+@compiled(error_model="numpy")
+def _stop_optimally(
+    n_stops: int,
     left_s: float,
     options: IntArray,
     n_options: int,
-    late_s: FloatArray,
-    ground: Ground,
-    outlook: Outlook,
-    path: Path,
+    fallback_s: FloatArray,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    path: PathBuffer,
 ) -> tuple[float, float]:
-    """`worth` of a path on which the chances of all looks are known."""
-    values, offers, slots, times, until = path.values, path.offers, path.slots, path.times, path.until
-    # What any look still to come can offer, at each vertex, is bounded from below. A slot that is better than that
-    # is taken at once; others are kept in mind for a while, in which they grow no better.
+    """Evaluate a path on which P(free) of all observations is known."""
+    stops, looks = path.stops, path.looks
+    # A bound on what any later observation can bring. A slot that is better than that is taken at once; others are kept
+    # in mind for a while, in which they grow no better.
     ahead = np.inf
-    for k in range(n_path - 1, 0, -1):
-        path.ahead[k] = ahead
-        for j in range(path.starts[k], path.starts[k + 1]):
-            ahead = min(ahead, ground.seconds[path.vertices[k], slots[j]] + ground.walk_s[slots[j]])
-        ahead += times[k] - times[k - 1]
-    for k in range(1, n_path):
-        for j in range(path.starts[k], path.starts[k + 1]):
-            at_once = offer(path.vertices[k], slots[j], 1.0, 0.0, late_s[slots[j]], ground, outlook)
-            until[j] = k if at_once <= path.ahead[k] else min(k + KEPT_IN_MIND, n_path - 1)
+    for k in range(n_stops - 1, 0, -1):
+        stops[k].ahead_s = ahead
+        for j in range(stops[k].first, stops[k + 1].first):
+            slot = looks[j].slot
+            ahead = min(ahead, graph.drive_s[stops[k].vertex, slot] + graph.cost_s[slot])
+        ahead += stops[k].time - stops[k - 1].time
+    for k in range(1, n_stops):
+        for j in range(stops[k].first, stops[k + 1].first):
+            slot = looks[j].slot
+            at_once = expected_cost_to_slot(stops[k].vertex, slot, 1.0, 0.0, fallback_s[slot], graph, belief)
+            looks[j].kept_until = k if at_once <= stops[k].ahead_s else min(k + KEPT_IN_MIND, n_stops - 1)
     nothing, onward, then_s = left_s, 0.0, left_s
-    for k in range(n_path - 1, 0, -1):
-        # `values` and `nothing` hold what follows at the next vertex, and `onward` is the drive there.
-        vertex, first, last = path.vertices[k], path.starts[k], path.starts[k + 1]
-        oldest = path.starts[max(k - KEPT_IN_MIND, 1)]
-        stop = np.inf
+    for k in range(n_stops - 1, 0, -1):
+        # `value` of the looks and `nothing` hold what follows at the next stop, and `onward` is the drive there.
+        vertex, first, last = stops[k].vertex, stops[k].first, stops[k + 1].first
+        oldest = stops[max(k - KEPT_IN_MIND, 1)].first
+        stop_s = np.inf
         for i in range(n_options):
             s = options[i]
-            stop = min(stop, offer(vertex, s, outlook.free[s], times[k], late_s[s], ground, outlook))
+            stop_s = min(
+                stop_s,
+                expected_cost_to_slot(
+                    vertex, s, belief.slots[s].p_free, stops[k].time, fallback_s[s], graph, belief
+                ),
+            )
         for j in range(oldest, last):
-            if until[j] < k:
+            look = looks[j]
+            if look.kept_until < k:
                 continue
-            since = times[k] - path.found[j]
-            offers[j] = min(stop, offer(vertex, slots[j], 1.0, since, late_s[slots[j]], ground, outlook))
-            later = onward + (nothing if until[j] == k else values[j])
-            # The vertex where the slot is seen comes last, and has the last word.
-            path.taken_up[j] = offers[j] <= max(path.ahead[k], later)
-            values[j] = offers[j] if path.taken_up[j] else later
+            age, slot = stops[k].time - look.time, look.slot
+            back_s = expected_cost_to_slot(vertex, slot, 1.0, age, fallback_s[slot], graph, belief)
+            look.expected_s = min(stop_s, back_s)
+            later = onward + (nothing if look.kept_until == k else look.value)
+            # The stop at which the slot is observed comes last, and decides.
+            look.parks = look.expected_s <= max(stops[k].ahead_s, later)
+            look.value = look.expected_s if look.parks else later
         then_s = onward + nothing
-        nothing = min(stop, then_s)
-        # Now back to before the looks at this vertex: the best slot that they show replaces a worse one.
-        _best_first(first, last, path)
+        nothing = min(stop_s, then_s)
+        # Now back to before the observations at this stop: the best slot that they show replaces a worse one.
+        _sort_looks(first, last, path)
         for j in range(oldest, first):
-            if until[j] < k:
+            if looks[j].kept_until < k:
                 continue
             rest, expected = 1.0, 0.0
             for i in range(first, last):
-                if offers[i] >= offers[j]:
+                if looks[i].expected_s >= looks[j].expected_s:
                     break
-                expected += rest * path.chances[i] * values[i]
-                rest *= 1.0 - path.chances[i]
-            values[j] = expected + rest * values[j]
+                expected += rest * looks[i].p_free * looks[i].value
+                rest *= 1.0 - looks[i].p_free
+            looks[j].value = expected + rest * looks[j].value
         rest, expected = 1.0, 0.0
         for i in range(first, last):
-            expected += rest * path.chances[i] * values[i]
-            rest *= 1.0 - path.chances[i]
+            expected += rest * looks[i].p_free * looks[i].value
+            rest *= 1.0 - looks[i].p_free
         nothing = expected + rest * nothing
-        onward = times[k] - times[k - 1]
+        onward = stops[k].time - stops[k - 1].time
     return onward + nothing, then_s
 
 
-@compiled
-def _best_first(first: int, last: int, path: Path) -> None:
-    """Order the looks made at one vertex by what they offer."""
+@compiled(error_model="numpy")
+def _sort_looks(first: int, last: int, path: PathBuffer) -> None:
+    """Sort the observations made at one stop by the expected time of driving to their slots."""
+    looks = path.looks
     for i in range(first + 1, last):
         j = i
-        while j > first and path.offers[j] < path.offers[j - 1]:
-            for values in (path.offers, path.values, path.chances):
-                values[j], values[j - 1] = values[j - 1], values[j]
-            for flags in (path.first_look, path.taken_up):
-                flags[j], flags[j - 1] = flags[j - 1], flags[j]
-            path.slots[j], path.slots[j - 1] = path.slots[j - 1], path.slots[j]
+        while j > first and looks[j].expected_s < looks[j - 1].expected_s:
+            # Records are views: they are exchanged field by field. (Times at one stop are equal.)
+            a, b = looks[j - 1], looks[j]
+            a.slot, b.slot = b.slot, a.slot
+            a.p_free, b.p_free = b.p_free, a.p_free
+            a.expected_s, b.expected_s = b.expected_s, a.expected_s
+            a.value, b.value = b.value, a.value
+            a.is_first, b.is_first = b.is_first, a.is_first
+            a.parks, b.parks = b.parks, a.parks
             j -= 1

@@ -1,291 +1,326 @@
-"""Laying a path: where the car would look next as long as all that it sees is taken; compiled.
+"""Rollout of a path: where the car would observe next while everything that it observes is taken.
 
-What is left where a path ends is the time that it takes to drive a part of it again and again until a slot has come
-free, or to stand and wait for one. So long as slots change, this is what most of the time goes into in a lot that is
-almost full.
+What is left at the end of a path is the time of driving a part of it again and again until a slot has come free, or of
+standing and waiting for one. In a lot that is almost full most of the time goes into this as slots change.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from planners.belief.planning_graph import (
-    LOOKS_FREE,
-    LOOKS_TAKEN,
-    UNSEEN,
+    BeliefSnapshot,
     FloatArray,
-    Ground,
     IntArray,
-    Outlook,
-    Path,
-    decayed,
-    hidden,
-    must_try,
+    PathBuffer,
+    PlanningGraph,
+    copy_weights,
+    decayed_part,
+    is_hidden,
+    needs_attempt,
 )
 from sim_sensors.compilation import compiled
 
-LOST = 0.002
-"""Chance of having found nothing worth stopping for at which a path ends; what remains is estimated."""
+NEGLIGIBLE = 0.002
+"""P(nothing worth stopping for was found) at which a path ends; what remains is estimated."""
 WORTH_A_LOOK = 0.1
-"""How far, of all the way, a slot seen taken must have come back to its usual chance to be worth another look."""
-AGAIN_S = 10.0
-"""s that must pass before a slot is looked at once more; a later look makes up for those left out."""
+"""Part of its usual P(free) to which a slot observed taken must have come back to be worth another observation."""
+LOOK_AGAIN_S = 10.0
+"""s that must pass before a slot is observed once more; a later observation makes up for those left out."""
 
 
-@compiled
-def lay(
+@compiled(error_model="numpy")
+def rollout_path(
     vertex: int,
     targets: IntArray,
     n_targets: int,
-    cost: float,
-    ground: Ground,
-    outlook: Outlook,
-    path: Path,
+    failure_s: float,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    path: PathBuffer,
 ) -> tuple[int, float]:
-    """Lay a path: past the targets, then as the thesis's planner drives while all that it sees is taken.
+    """Roll out a path: past the targets, then as the thesis's planner drives while everything observed is taken.
 
-    It may come back to slots that it saw taken, once they are likely enough to have come free.
+    It may come back to slots that it observed taken, once they are likely enough to have come free.
+
+    Args:
+        vertex: where the car is.
+        targets: vertices to pass first, in order.
+        n_targets: how many.
+        failure_s: s, failure cost of the thesis's planner.
+        graph: the lot.
+        belief: the belief.
+        path: filled.
 
     Returns:
-        The number of vertices, and the time, s, that is left at its end if nothing was found.
+        The number of stops, and the time, s, that is left at its end if nothing was found.
     """
-    n = len(outlook.kind)
-    # In a part of a lot there is always a slot more that has not been seen.
-    unproven = 0 if ground.whole else 1
-    unseen = 0 if ground.whole else n
+    stops, looks, marks = path.stops, path.looks, path.marks
+    n = len(belief.slots)
+    # In a part of a lot there is always one more slot that was not observed.
+    n_unproven = 0 if graph.whole else 1
+    n_unobserved = 0 if graph.whole else n
     for s in range(n):
-        path.looked[s] = -np.inf if outlook.kind[s] == LOOKS_FREE else -1.0
-        if outlook.kind[s] == UNSEEN and ground.seconds[vertex, s] < np.inf:
-            unseen += 1
-        if outlook.kind[s] != LOOKS_TAKEN:
-            unproven += 1
-    path.vertices[0], path.times[0] = vertex, 0.0
-    path.starts[0] = path.starts[1] = 0
-    k, looks, time, passed = 0, 0, 0.0, 0
+        state = belief.slots[s].state
+        marks[s].observed_at = -np.inf if state == OBSERVED_FREE else -1.0
+        if state == UNOBSERVED and graph.drive_s[vertex, s] < np.inf:
+            n_unobserved += 1
+        if state != OBSERVED_TAKEN:
+            n_unproven += 1
+    stops[0].vertex, stops[0].time, stops[0].first, stops[1].first = vertex, 0.0, 0, 0
+    k, n_looks, time, n_passed = 0, 0, 0.0, 0
     choose, target = True, -1
-    weights = path.weights[: len(outlook.weights)]
-    weights[:] = outlook.weights
-    while k + 2 < len(path.vertices) and looks < len(path.slots):
-        while passed < n_targets and _settled(targets[passed], vertex, time, ground, outlook, path):
-            passed += 1
+    weights = copy_weights(belief, path)
+    while k + 3 < len(stops) and n_looks < len(looks):
+        while n_passed < n_targets and _is_settled(targets[n_passed], vertex, time, graph, belief, path):
+            n_passed += 1
             choose = True
-        if passed < n_targets:
-            target = targets[passed]
+        if n_passed < n_targets:
+            target = targets[n_passed]
         elif choose or target == vertex:
-            target, value = _next_target(vertex, time, cost, ground, outlook, path)
+            target, value = _next_target(vertex, time, failure_s, graph, belief, path)
             if target < 0:
                 break
             choose = False
-            if _unsatisfied(vertex, value, looks, ground, path) <= LOST:
+            if _p_nothing_found(vertex, value, n_looks, graph, path) <= NEGLIGIBLE:
                 break
         if target == vertex:
-            time += 0.0 if _worth_a_try_now(vertex, time, ground, outlook, path) else ground.wait_s
+            time += 0.0 if _is_attempt_due(vertex, time, graph, belief, path) else graph.wait_s
         else:
-            following = int(ground.following[vertex, target])
-            time += ground.seconds[vertex, following]
+            following = int(graph.next_vertex[vertex, target])
+            time += graph.drive_s[vertex, following]
             vertex = following
         k += 1
-        path.vertices[k], path.times[k] = vertex, time
-        for i in range(ground.view_starts[vertex], ground.view_starts[vertex + 1]):
-            s = ground.view_slots[i]
-            if path.looked[s] == -np.inf or looks == len(path.slots):
-                continue
-            if hidden(s, ground.view_rates[i], outlook):
-                continue
-            path.first_look[looks] = outlook.kind[s] == UNSEEN and path.looked[s] < 0.0
-            if path.first_look[looks]:
-                chance = foreseen(weights, outlook.free_if[s], True)
-                unproven -= 1
-                unseen -= 1
-            else:
-                chance = _free_again(s, time, path.looked[s], outlook)
-                if chance == 0.0:
+        stops[k].vertex, stops[k].time = vertex, time
+        # What the car observes from here, and, where that shows nothing of the target, what an attempt shows.
+        n_views = graph.view_starts[vertex + 1] - graph.view_starts[vertex]
+        for i in range(n_views + 1):
+            if n_looks == len(looks):
+                break
+            attempts = i == n_views
+            if attempts:
+                s = vertex
+                if vertex != target or not _is_attempt_due(vertex, time, graph, belief, path):
                     continue
-            path.slots[looks], path.chances[looks], path.found[looks] = s, chance, time
-            path.looked[s] = time
-            looks += 1
-            # What was promised on setting out stays the best until it was seen: all else has but grown worse.
-            choose = choose or s == target
-        tries = vertex == target and looks < len(path.slots)
-        if tries and _worth_a_try_now(vertex, time, ground, outlook, path):
-            first = outlook.kind[vertex] == UNSEEN and path.looked[vertex] < 0.0
-            if first:
-                chance = foreseen(weights, outlook.free_if[vertex], True)
-                unproven -= 1
-                unseen -= 1
             else:
-                chance = _free_again(vertex, time, path.looked[vertex], outlook)
-            path.slots[looks], path.chances[looks], path.found[looks] = vertex, chance, time
-            path.first_look[looks], path.looked[vertex] = first, time
-            looks += 1
-            choose = True
-            # Whoever finds it free has parked.
-            time += ground.failure_s
-        path.starts[k + 1] = looks
-        if unproven == 0:
-            # The last look proves the lot full if it shows no free slot. It may be better not to make it.
-            none, walk = 1.0, np.inf
-            for j in range(path.starts[k], looks):
-                none *= 1.0 - path.chances[j]
-                walk = min(walk, ground.walk_s[path.slots[j]])
-            proof = time - path.times[k - 1] + none * ground.give_up_s + (1.0 - none) * walk
-            spared = _go_round(k - 1, path.starts[k], outlook, ground, path)
-            if spared >= proof or not outlook.told:
-                return k + 1, ground.give_up_s
+                view = graph.views[graph.view_starts[vertex] + i]
+                s = view.slot
+                if marks[s].observed_at == -np.inf or is_hidden(s, view.rate, belief):
+                    continue
+            is_first = belief.slots[s].state == UNOBSERVED and marks[s].observed_at < 0.0
+            if is_first:
+                p_free = p_free_at_first_look(weights, belief.p_free_if[s], True)
+                n_unproven -= 1
+                n_unobserved -= 1
+            else:
+                p_free = _p_free_again(s, time, marks[s].observed_at, belief)
+                if p_free == 0.0 and not attempts:
+                    continue
+            look = looks[n_looks]
+            look.slot, look.p_free, look.time, look.is_first = s, p_free, time, is_first
+            marks[s].observed_at = time
+            n_looks += 1
+            # Until it is observed, the target stays the best choice: all else only grows worse.
+            choose = choose or s == target
+            if attempts:
+                # The path goes on only if the attempt failed.
+                time += graph.failure_s
+        stops[k + 1].first = n_looks
+        if n_unproven == 0:
+            # The last observation proves the lot full if it shows no free slot. It may be better not to make it.
+            p_none, cost_s = 1.0, np.inf
+            for j in range(stops[k].first, n_looks):
+                p_none *= 1.0 - looks[j].p_free
+                cost_s = min(cost_s, graph.cost_s[looks[j].slot])
+            proof_s = time - stops[k - 1].time + p_none * graph.give_up_s + (1.0 - p_none) * cost_s
+            spared_s = _repeat_path(k - 1, stops[k].first, graph, belief, path)
+            if spared_s >= proof_s:
+                return k + 1, graph.give_up_s
             if k == 1:
-                path.vertices[1], path.times[1], path.starts[2] = path.vertices[0], ground.wait_s, 0
-                return 2, spared
-            return k, spared
-    # A half of the path tells of what follows if as many slots are left that have not been seen.
-    left = _as_before(k, looks, ground, path) if unseen >= looks - path.starts[k // 2] else np.inf
-    return k + 1, min(left, _go_round(k, looks, outlook, ground, path), ground.give_up_s)
+                stops[1].vertex, stops[1].time, stops[2].first = stops[0].vertex, graph.wait_s, 0
+                return 2, spared_s
+            return k, spared_s
+    # A half of the path is representative of what follows if as many slots are left that were not observed.
+    left_s = np.inf
+    if n_unobserved >= n_looks - stops[k // 2].first:
+        left_s = _extrapolate(k, n_looks, graph, path)
+    return k + 1, min(left_s, _repeat_path(k, n_looks, graph, belief, path), graph.give_up_s)
 
 
-@compiled
-def _settled(target: int, vertex: int, time: float, ground: Ground, outlook: Outlook, path: Path) -> bool:
-    """Whether a target cannot be driven to from a vertex, or nothing is left to do where the car has come to it."""
+@compiled(error_model="numpy")
+def _is_settled(
+    target: int, vertex: int, time: float, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
+) -> bool:
+    """Return whether a target cannot be reached from a vertex, or nothing is left to do there."""
     if target != vertex:
-        return bool(ground.following[vertex, target] < 0)
-    return not _worth_a_try_now(vertex, time, ground, outlook, path)
+        return bool(graph.next_vertex[vertex, target] < 0)
+    return not _is_attempt_due(vertex, time, graph, belief, path)
 
 
-@compiled
-def worth_a_try(vertex: int, time: float, looked: float, ground: Ground, outlook: Outlook) -> bool:
-    """Whether to find out by a try, some time from now, if the slot before a vertex is free; `looked` as in `Path`."""
-    if not must_try(vertex, ground, outlook):
+@compiled(error_model="numpy")
+def is_worth_an_attempt(
+    vertex: int, time: float, observed_at: float, graph: PlanningGraph, belief: BeliefSnapshot
+) -> bool:
+    """Return whether to attempt to park at a vertex, some time from now; `observed_at` as in `MARK`."""
+    if not needs_attempt(vertex, graph, belief):
         return False
-    if outlook.kind[vertex] == UNSEEN and looked < 0.0:
+    if belief.slots[vertex].state == UNOBSERVED and observed_at < 0.0:
         return True
-    return bool(_free_again(vertex, time, looked, outlook) > 0.0)
+    return bool(_p_free_again(vertex, time, observed_at, belief) > 0.0)
 
 
-@compiled
-def _worth_a_try_now(vertex: int, time: float, ground: Ground, outlook: Outlook, path: Path) -> bool:
-    """The same of a path that has come to the vertex."""
-    # Vertices past the slots have not been looked at.
-    if vertex >= len(path.looked):
+@compiled(error_model="numpy")
+def _is_attempt_due(
+    vertex: int, time: float, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
+) -> bool:
+    """Return whether to attempt to park at a vertex that a path has come to."""
+    if vertex >= len(path.marks):
         return False
-    return bool(worth_a_try(vertex, time, path.looked[vertex], ground, outlook))
+    return bool(is_worth_an_attempt(vertex, time, path.marks[vertex].observed_at, graph, belief))
 
 
-@compiled
-def _go_round(last: int, looks: int, outlook: Outlook, ground: Ground, path: Path) -> float:
-    """Expected s from a vertex of a path on where nothing new is looked at: a part of it is driven again and again."""
-    best, leaving, walk = np.inf, 0.0, 0.0
-    v = path.vertices[last]
-    for i in range(ground.view_starts[v], ground.view_starts[v + 1]):
-        s = ground.view_slots[i]
-        if hidden(s, ground.view_rates[i], outlook):
+@compiled(error_model="numpy")
+def _repeat_path(
+    last: int, n_looks: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
+) -> float:
+    """Return the expected time, s, from a stop on if a part of the path is driven again and again."""
+    best, leaving, cost_s = np.inf, 0.0, 0.0
+    vertex = path.stops[last].vertex
+    for i in range(graph.view_starts[vertex], graph.view_starts[vertex + 1]):
+        s = graph.views[i].slot
+        if is_hidden(s, graph.views[i].rate, belief):
             continue
-        if path.looked[s] >= 0.0 or outlook.kind[s] == LOOKS_TAKEN:
-            leaves = outlook.usual[s] * outlook.rate[s]
+        if path.marks[s].observed_at >= 0.0 or belief.slots[s].state == OBSERVED_TAKEN:
+            leaves = belief.slots[s].p_free_usual * belief.slots[s].decay_rate
             leaving += leaves
-            walk += leaves * ground.walk_s[s]
+            cost_s += leaves * graph.cost_s[s]
     if leaving > 0.0:
-        # Or the car stands and waits for what is in view.
-        best = (1.0 + walk) / leaving
+        # Or the car stands and waits for a slot in view.
+        best = (1.0 + cost_s) / leaving
     for quarter in range(4):
-        best = min(best, _round_again(quarter * last // 4, last, looks, outlook, ground, path))
+        best = min(best, _repeat_part(quarter * last // 4, last, n_looks, graph, belief, path))
     return best
 
 
-@compiled
-def _round_again(first: int, last: int, looks: int, outlook: Outlook, ground: Ground, path: Path) -> float:
-    """Expected s of driving a part of a path again and again until a slot on it has come free.
+@compiled(error_model="numpy")
+def _repeat_part(
+    first: int, last: int, n_looks: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
+) -> float:
+    """Return the expected time, s, of driving a part of a path again and again until a slot on it has come free.
 
-    All its slots were just seen taken. Each look finds a car gone with the chance that the time since the look before
-    gives, so that many looks at few slots count for no more than they are worth.
+    All its slots were just observed taken. Each observation finds the slot free with the probability that the time
+    since the one before gives, so that many observations of few slots do not count for more than they are worth.
     """
-    start, end = path.vertices[first], path.vertices[last]
-    period = path.times[last] - path.times[first] + ground.seconds[end, start]
+    stops, looks, marks = path.stops, path.looks, path.marks
+    start, end = stops[first].vertex, stops[last].vertex
+    period = stops[last].time - stops[first].time + graph.drive_s[end, start]
     if end == start:
-        period = max(period, ground.wait_s)
-    for j in range(path.starts[first], looks):
-        path.again[path.slots[j]] = -1.0
-    found, walk = 0.0, 0.0
-    for j in range(path.starts[first], looks):
-        s, since = path.slots[j], path.again[path.slots[j]]
-        gap = path.found[j] - since if since >= 0.0 else period - (path.looked[s] - path.found[j])
-        path.again[s] = path.found[j]
+        period = max(period, graph.wait_s)
+    for j in range(stops[first].first, n_looks):
+        marks[looks[j].slot].scratch = -1.0
+    found, cost_s = 0.0, 0.0
+    for j in range(stops[first].first, n_looks):
+        s = looks[j].slot
+        before = marks[s].scratch
+        gap = looks[j].time - before if before >= 0.0 else period - (marks[s].observed_at - looks[j].time)
+        marks[s].scratch = looks[j].time
         usual = 0.0
-        for h in range(len(outlook.weights)):
-            usual += path.weights[h] * outlook.free_if[s, h]
-        chance = usual * decayed(outlook.rate[s] * outlook.usual[s] / usual, gap)
-        found += chance
-        walk += chance * ground.walk_s[s]
-    return period / found + walk / found if found > 0.0 else np.inf
+        for h in range(len(belief.weights)):
+            usual += path.weights[h] * belief.p_free_if[s, h]
+        at = belief.slots[s]
+        p_free = usual * decayed_part(at.decay_rate * at.p_free_usual / usual, gap)
+        found += p_free
+        cost_s += p_free * graph.cost_s[s]
+    return period / found + cost_s / found if found > 0.0 else np.inf
 
 
-@compiled
-def _as_before(last: int, looks: int, ground: Ground, path: Path) -> float:
-    """Expected s of going on where slots are left to see, if they show up as often as on the path's second half."""
+@compiled(error_model="numpy")
+def _extrapolate(last: int, n_looks: int, graph: PlanningGraph, path: PathBuffer) -> float:
+    """Return the expected time, s, of going on to unobserved slots that are as good as those of the second half."""
+    stops, looks = path.stops, path.looks
     first = last // 2
-    found, walk = 0.0, 0.0
-    for j in range(path.starts[first], looks):
-        found += path.chances[j]
-        walk += path.chances[j] * ground.walk_s[path.slots[j]]
-    return (path.times[last] - path.times[first]) / found + walk / found if found > 0.0 else np.inf
+    found, cost_s = 0.0, 0.0
+    for j in range(stops[first].first, n_looks):
+        found += looks[j].p_free
+        cost_s += looks[j].p_free * graph.cost_s[looks[j].slot]
+    return (stops[last].time - stops[first].time) / found + cost_s / found if found > 0.0 else np.inf
 
 
-@compiled
-def _free_again(slot: int, time: float, looked: float, outlook: Outlook) -> float:
-    """P(free) some time later of a slot seen taken, really or along the path; 0 where it is not worth a look."""
-    usual = outlook.usual[slot]
-    if looked >= 0.0:
-        if time - looked < AGAIN_S:
+@compiled(error_model="numpy")
+def _p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnapshot) -> float:
+    """Return P(free) some time from now of a slot observed taken, really or along the path; 0 if not worth a look."""
+    at = belief.slots[slot]
+    if observed_at >= 0.0:
+        if time - observed_at < LOOK_AGAIN_S:
             return 0.0
-        chance = usual * decayed(outlook.rate[slot], time - looked)
+        p_free = at.p_free_usual * decayed_part(at.decay_rate, time - observed_at)
     else:
-        chance = outlook.free[slot]
-        chance += (usual - chance) * decayed(outlook.rate[slot], time)
-    return chance if chance >= WORTH_A_LOOK * usual else 0.0
+        p_free = at.p_free + (at.p_free_usual - at.p_free) * decayed_part(at.decay_rate, time)
+    return float(p_free) if p_free >= WORTH_A_LOOK * at.p_free_usual else 0.0
 
 
-@compiled
+@compiled(error_model="numpy")
 def _next_target(
-    vertex: int, time: float, cost: float, ground: Ground, outlook: Outlook, path: Path
+    vertex: int,
+    time: float,
+    failure_s: float,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    path: PathBuffer,
 ) -> tuple[int, float]:
-    """The slot that the thesis's planner would drive to at some time of a path, and its expected time, s.
+    """Return the slot that the thesis's planner would drive to at some time of a path, and its expected time, s.
 
-    With γ = 1 its plan is to drive to one slot and to try until it is free: drive + walk + cost·(1 - p)/p.
+    With γ = 1 its plan is to drive to one slot and to attempt until it is free: drive + cost + failure_s·(1 - p)/p.
     """
     best, chosen = np.inf, -1
-    row = ground.seconds[vertex]
-    for s in range(len(outlook.kind)):
-        value = row[s] + ground.walk_s[s]
-        if value >= best or path.looked[s] == -np.inf:
+    drive_s = graph.drive_s[vertex]
+    for s in range(len(belief.slots)):
+        value = drive_s[s] + graph.cost_s[s]
+        if value >= best:
             continue
-        if outlook.kind[s] == UNSEEN and path.looked[s] < 0.0:
-            value += cost * outlook.odds[s]
+        at, observed_at = belief.slots[s], path.marks[s].observed_at
+        if observed_at == -np.inf:
+            continue
+        if at.state == UNOBSERVED and observed_at < 0.0:
+            value += failure_s * at.odds
         else:
-            if value + cost * outlook.least_odds[s] >= best:
+            if value + failure_s * at.least_odds >= best:
                 continue
-            chance = _free_again(s, time + row[s], path.looked[s], outlook)
-            value += cost * (1.0 - chance) / chance if chance > 0.0 else np.inf
+            p_free = _p_free_again(s, time + drive_s[s], observed_at, belief)
+            value += failure_s * (1.0 - p_free) / p_free if p_free > 0.0 else np.inf
         if value < best:
             best, chosen = value, s
     return chosen, best
 
 
-@compiled
-def foreseen(weights: FloatArray, free_if: FloatArray, telling: bool) -> float:
-    """P(free) of a slot at its first look; where it tells, the hypotheses are left as a taken slot makes them."""
+@compiled(error_model="numpy")
+def p_free_at_first_look(weights: FloatArray, p_free_if: FloatArray, taken_follows: bool) -> float:
+    """Return P(free) of a slot at its first observation, given the hypotheses.
+
+    Args:
+        weights: (k,) of the hypotheses; updated to those after a taken slot where `taken_follows`.
+        p_free_if: (k,) P(free) under each.
+        taken_follows: whether the path goes on only if the slot is taken.
+    """
     free, taken = 0.0, 0.0
     for h in range(len(weights)):
-        free += weights[h] * free_if[h]
-        taken += weights[h] * (1.0 - free_if[h])
-    if telling:
+        free += weights[h] * p_free_if[h]
+        taken += weights[h] * (1.0 - p_free_if[h])
+    if taken_follows:
         for h in range(len(weights)):
-            weights[h] *= (1.0 - free_if[h]) / taken
+            weights[h] *= (1.0 - p_free_if[h]) / taken
     return free / (free + taken)
 
 
-@compiled
-def _unsatisfied(vertex: int, promise_s: float, looks: int, ground: Ground, path: Path) -> float:
-    """Chance that none of the slots looked at is free and as good as what driving on promises."""
-    chance = 1.0
-    for j in range(looks):
-        s = path.slots[j]
-        if ground.seconds[vertex, s] + ground.walk_s[s] <= promise_s:
-            chance *= 1.0 - path.chances[j]
-    return chance
+@compiled(error_model="numpy")
+def _p_nothing_found(
+    vertex: int, value_s: float, n_looks: int, graph: PlanningGraph, path: PathBuffer
+) -> float:
+    """Return P(no slot observed along the path is free and as good as the value of driving on)."""
+    p_none = 1.0
+    for j in range(n_looks):
+        s = path.looks[j].slot
+        if graph.drive_s[vertex, s] + graph.cost_s[s] <= value_s:
+            p_none *= 1.0 - path.looks[j].p_free
+    return p_none

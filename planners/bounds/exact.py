@@ -1,18 +1,18 @@
-"""The exact optimum of a search over belief states, on small lots.
+"""The exact optimum of a parking search over belief states, on small lots.
 
-The model is the true one of a search in which nothing changes: each slot is free with a known probability,
-independently, and stays as it is; a slot is revealed as soon as it is in view. What the car knows is then the
-set of slots seen and the set of those seen free, so the optimum follows by dynamic programming over
+The model is that of a search in which nothing changes: each slot is free with a known probability, independently,
+and stays as it is; a slot is revealed as soon as it is in view. The belief state is then the set of slots observed and
+the set of those that were free, and the optimum follows by dynamic programming over
 
-    (where the car is, seen, seen free).
+    (where the car is, observed, observed free).
 
-Three facts keep that small, and none loses anything:
+Three facts keep the state space small, without loss (w is the arrival cost of a slot, D the drive between two):
 
 - Driving through vertices that show nothing new decides nothing: the car chooses among the *frontier*, the
-  vertices that show something new and that it can reach through such as do not.
-- A slot f' seen free is forgotten where another one f is as good from there: w_f + D(f', f) <= w_f'.
-- The search is over where the best slot seen free, by a way that shows nothing new, is as near as any other
-  slot could be.
+  vertices that show something new and that it can reach through vertices that do not.
+- A slot f' observed free can be left out where another one f is as good from there: w_f + D(f', f) <= w_f'.
+- The search is over where the best slot observed free, by a route that shows nothing new, costs no more than any other
+  slot could.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
 from parkenv.world.lot import MOVES, PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
-from planners.driving.road_table import RoadTable
+from planners.road_table import RoadTable
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
@@ -51,21 +52,21 @@ class _LotMasks:
     neighbors: NDArray[np.int32]
     move_s: FloatArray
     seconds: FloatArray  # (n_vertices, n_vertices)
-    walk_s: FloatArray
-    worse_than: IntArray  # (n_slots,) the slots that make each one needless
+    cost_s: FloatArray  # (n_slots,) arrival cost
+    dominated_by: IntArray  # (n_slots,) the slots that are as good as each one
     p_free: FloatArray
     give_up_s: float
-    look_s: FloatArray  # (n_vertices,) the wait that shows what is in view of where the car begins
+    stay_s: FloatArray  # (n_vertices,) the wait that shows what is in view of the first vertex
 
 
 class ExactSolution:
     """The optimum from one belief state on.
 
     Args:
-        problem: lot, goal, speeds, costs and view range. Slots must be seen without error.
-        p_occupied: (n_slots,) probability that each slot is taken; only those of unseen slots matter.
+        problem: lot, goal, speeds, costs and view range; the sensor must not err.
+        p_occupied: (n_slots,) probability that each slot is taken; only those of unobserved slots matter.
         vertex: where the car is.
-        seen: (n_slots,) bool, slots whose state is known; none where None.
+        seen: (n_slots,) bool, slots that were observed; none where None.
         free: (n_slots,) bool, those of them that are free.
         most_states: how many belief states may be kept.
 
@@ -74,7 +75,7 @@ class ExactSolution:
         n_states: belief states that were kept.
 
     Raises:
-        InputError: more than `MOST_SLOTS` slots or `most_states` states, or looks that may err.
+        InputError: more than `MOST_SLOTS` slots or `most_states` states, or a sensor that errs.
 
     Examples:
         >>> from parkenv.lots import packaged_lot
@@ -105,7 +106,7 @@ class ExactSolution:
         seen_bits = bits_of(np.zeros(n, np.bool_) if seen is None else seen)
         free_bits = bits_of(np.zeros(n, np.bool_) if free is None else free) & seen_bits
         self._n = n
-        root = _key(seen_bits, vertex, _without_needless(free_bits, self._masks.worse_than), n)
+        root = _key(seen_bits, vertex, _without_dominated(free_bits, self._masks.dominated_by), n)
         self._enumerate(root, most_states)
         self._solve()
         self.n_states = len(self._keys)
@@ -115,14 +116,14 @@ class ExactSolution:
         return self  # immutable: copies of a plan share it
 
     def decide(self, seen: int, vertex: int, free: int) -> tuple[float, int] | None:
-        """Expected seconds and the next vertex to look from (-1: park at what is known); None if never reached.
+        """Return the expected time, s, and the next vertex to observe from (-1: park); None for a state never reached.
 
         Args:
-            seen: slots seen, as bits.
+            seen: slots observed, as bits.
             vertex: where the car decides: where it began, or a vertex that showed something new.
-            free: slots seen free, as bits.
+            free: slots observed free, as bits.
         """
-        free = _without_needless(free, self._masks.worse_than)
+        free = _without_dominated(free, self._masks.dominated_by)
         level = _popcount(seen)
         low, high = self._levels[level], self._levels[level + 1]
         key = _key(seen, vertex, free, self._n)
@@ -132,7 +133,7 @@ class ExactSolution:
         return float(self._values[at]), int(self._choices[at])
 
     def _enumerate(self, root: int, most_states: int) -> None:
-        """All states that can follow from the first one, by how many slots have been seen."""
+        """Find all states that can follow from the first one, by how many slots were observed."""
         n = self._n
         masks = self._masks
         pending: list[list[IntArray]] = [[] for _ in range(n + 1)]
@@ -155,7 +156,7 @@ class ExactSolution:
             if total > most_states:
                 raise InputError(
                     f"this lot has over {most_states} belief states, the limit of the exact planner: want fewer "
-                    f"slots than {n} (about 20 round one aisle, 16 round two), or a higher most_states"
+                    f"slots than {n} (about 20 along one aisle, 16 along two), or a higher most_states"
                 )
         self._keys = np.concatenate(found)
         self._levels = np.concatenate([[0], np.cumsum([len(keys) for keys in found])]).astype(np.int64)
@@ -179,10 +180,10 @@ class ExactSolution:
 
 
 def require_small(problem: SearchProblem) -> None:
-    """Refuse what the exact planner cannot do.
+    """Refuse problems that the exact planner cannot solve.
 
     Raises:
-        InputError: too many slots or vertices, or looks that may err.
+        InputError: too many slots or vertices, or a sensor that errs.
     """
     lot = problem.lot
     if lot.n_slots > MOST_SLOTS or lot.n_vertices > 1 << _POSITION_BITS:
@@ -191,11 +192,11 @@ def require_small(problem: SearchProblem) -> None:
             f"{MOST_SLOTS} slots and {1 << _POSITION_BITS} vertices"
         )
     if not problem.sensor_model.perfect:
-        raise InputError("the exact planner wants slots that are seen without error")
+        raise InputError("the exact planner wants a sensor model that never errs")
 
 
 def bits_of(slots: NDArray[np.bool_]) -> int:
-    """A set of slots, (n_slots,) bool, as the bits of a number."""
+    """Return a set of slots, (n_slots,) bool, as the bits of a number."""
     return int(sum(1 << int(s) for s in np.flatnonzero(slots)))
 
 
@@ -204,21 +205,21 @@ def _lot_masks(problem: SearchProblem, p_occupied: FloatArray, table: RoadTable)
     starts, slots = problem.slots_in_view
     shows = np.zeros(lot.n_vertices, dtype=np.int64)
     np.bitwise_or.at(shows, np.repeat(np.arange(lot.n_vertices), np.diff(starts)), 1 << slots)
-    n, walk = lot.n_slots, problem.walk_s
+    n, cost = lot.n_slots, problem.arrival_cost_s
     from_slot = table.seconds[:n, :n]
-    gain = walk[:, None] - (walk[None, :] + from_slot)
+    gain = cost[:, None] - (cost[None, :] + from_slot)
     as_good = (gain > 1e-9) | ((np.abs(gain) <= 1e-9) & (np.arange(n)[None, :] < np.arange(n)[:, None]))
     np.fill_diagonal(as_good, val=False)
-    # Of two that are as good as each other the lower number stays; mutual loss would forget both.
-    worse_than = np.array([bits_of(row) for row in as_good], dtype=np.int64)
+    # Of two that are as good as each other the lower number stays; else each would remove the other.
+    dominated_by = np.array([bits_of(row) for row in as_good], dtype=np.int64)
     missing = (lot.neighbors < 0).any(axis=1)
     return _LotMasks(
         shows,
         lot.neighbors,
         problem.move_s,
         table.seconds,
-        walk,
-        worse_than,
+        cost,
+        dominated_by,
         1.0 - p_occupied,
         problem.give_up_s,
         np.where(missing, problem.wait_s, np.inf),
@@ -233,9 +234,9 @@ def _graph(
         masks.neighbors,
         masks.move_s,
         masks.seconds,
-        masks.walk_s,
-        masks.worse_than,
-        masks.look_s,
+        masks.cost_s,
+        masks.dominated_by,
+        masks.stay_s,
     )
 
 
@@ -262,37 +263,37 @@ def _popcounts(bits: IntArray) -> IntArray:
 
 
 @compiled
-def _without_needless(free: int, worse_than: IntArray) -> int:
-    """Only the slots seen free that no other one makes needless."""
+def _without_dominated(free: int, dominated_by: IntArray) -> int:
+    """Keep only those slots observed free that no other one is as good as."""
     kept = free
-    for s in range(len(worse_than)):
-        if (free >> s) & 1 and worse_than[s] & free:
+    for s in range(len(dominated_by)):
+        if (free >> s) & 1 and dominated_by[s] & free:
             kept &= ~(1 << s)
     return kept
 
 
 @compiled
-def _within_known(
+def _drive_within_known(
     vertex: int,
     seen: int,
     shows: IntArray,
     neighbors: NDArray[np.int32],
     move_s: FloatArray,
-    look_s: FloatArray,
+    stay_s: FloatArray,
     reach: FloatArray,
     came_from: IntArray,
     done: NDArray[np.uint8],
 ) -> None:
-    """Drive times, s, through vertices that show nothing new, to those and to the frontier.
+    """Find drive times, s, through vertices that show nothing new, to those and to the frontier.
 
-    Where the car begins on a vertex whose view it has not had yet, the time to that vertex is that of the
-    shortest way to end a step there: a wait, or a drive round.
+    Where the car starts at a vertex that it has not observed from yet, the time to that vertex is that of the
+    shortest way to end a step there: a wait, or a round trip.
     """
     reach[:] = np.inf
     came_from[:] = -1
     done[:] = 0
     reach[vertex] = 0.0
-    again = look_s[vertex]
+    again = stay_s[vertex]
     while True:
         best, v = np.inf, -1
         for u in range(len(reach)):
@@ -318,20 +319,20 @@ def _within_known(
 
 
 @compiled
-def _best_known(free: int, reach: FloatArray, walk_s: FloatArray) -> float:
+def _best_known(free: int, reach: FloatArray, cost_s: FloatArray) -> float:
     best = np.inf
-    for s in range(len(walk_s)):
+    for s in range(len(cost_s)):
         if (free >> s) & 1:
-            best = min(best, reach[s] + walk_s[s])
+            best = min(best, reach[s] + cost_s[s])
     return best
 
 
 @compiled
-def _least_unseen(vertex: int, seen: int, seconds: FloatArray, walk_s: FloatArray) -> float:
+def _least_unseen(vertex: int, seen: int, seconds: FloatArray, cost_s: FloatArray) -> float:
     least = np.inf
-    for s in range(len(walk_s)):
+    for s in range(len(cost_s)):
         if not (seen >> s) & 1:
-            least = min(least, seconds[vertex, s] + walk_s[s])
+            least = min(least, seconds[vertex, s] + cost_s[s])
     return least
 
 
@@ -343,11 +344,11 @@ def _successors(
     neighbors: NDArray[np.int32],
     move_s: FloatArray,
     seconds: FloatArray,
-    walk_s: FloatArray,
-    worse_than: IntArray,
-    look_s: FloatArray,
+    cost_s: FloatArray,
+    dominated_by: IntArray,
+    stay_s: FloatArray,
 ) -> IntArray:
-    """States that one more look can lead to, repeats included."""
+    """List the states that one more observation can lead to, repeats included."""
     n_vertices = len(shows)
     reach, came_from = np.empty(n_vertices), np.empty(n_vertices, np.int64)
     done = np.empty(n_vertices, np.uint8)
@@ -359,11 +360,11 @@ def _successors(
         free, group = keys[i] & all_slots, keys[i] >> n
         vertex, seen = group & positions, group >> _POSITION_BITS
         if group != previous:
-            _within_known(vertex, seen, shows, neighbors, move_s, look_s, reach, came_from, done)
-            least = _least_unseen(vertex, seen, seconds, walk_s)
+            _drive_within_known(vertex, seen, shows, neighbors, move_s, stay_s, reach, came_from, done)
+            least = _least_unseen(vertex, seen, seconds, cost_s)
             previous = group
-        best = _best_known(free, reach, walk_s)
-        if best <= min(least, _best_known(free, seconds[vertex], walk_s)):
+        best = _best_known(free, reach, cost_s)
+        if best <= min(least, _best_known(free, seconds[vertex], cost_s)):
             continue
         for v in range(n_vertices):
             new = shows[v] & ~seen
@@ -375,7 +376,7 @@ def _successors(
                     larger = np.empty(2 * count, np.int64)
                     larger[:count] = found
                     found = larger
-                found[count] = _key(seen | new, v, _without_needless(free | revealed, worse_than), n)
+                found[count] = _key(seen | new, v, _without_dominated(free | revealed, dominated_by), n)
                 count += 1
                 if revealed == 0:
                     break
@@ -395,13 +396,13 @@ def _back_up(
     neighbors: NDArray[np.int32],
     move_s: FloatArray,
     seconds: FloatArray,
-    walk_s: FloatArray,
-    worse_than: IntArray,
-    look_s: FloatArray,
+    cost_s: FloatArray,
+    dominated_by: IntArray,
+    stay_s: FloatArray,
     p_free: FloatArray,
     give_up_s: float,
 ) -> None:
-    """Bellman's equation for the states with `level` slots seen, those with more being solved."""
+    """Apply Bellman's equation to the states with `level` slots observed, those with more being solved."""
     n_vertices = len(shows)
     reach, came_from = np.empty(n_vertices), np.empty(n_vertices, np.int64)
     done = np.empty(n_vertices, np.uint8)
@@ -412,19 +413,19 @@ def _back_up(
         free, group = keys[i] & all_slots, keys[i] >> n
         vertex, seen = group & positions, group >> _POSITION_BITS
         if group != previous:
-            _within_known(vertex, seen, shows, neighbors, move_s, look_s, reach, came_from, done)
-            least = _least_unseen(vertex, seen, seconds, walk_s)
+            _drive_within_known(vertex, seen, shows, neighbors, move_s, stay_s, reach, came_from, done)
+            least = _least_unseen(vertex, seen, seconds, cost_s)
             previous = group
             for v in range(n_vertices):
                 low[v] = -1
-        best = _best_known(free, reach, walk_s)
+        best = _best_known(free, reach, cost_s)
         choice = _SEARCH_ENDS
         if best == np.inf and seen == all_slots:
             best = give_up_s
-        elif best > min(least, _best_known(free, seconds[vertex], walk_s)):
+        elif best > min(least, _best_known(free, seconds[vertex], cost_s)):
             limit = best
             if best == np.inf:
-                # Slots that no way leads to leave the lot unproven; a step limit then charges the same.
+                # Slots that no route leads to leave the lot unproven; the step limit then charges the same.
                 best = give_up_s
             for v in range(n_vertices):
                 new = shows[v] & ~seen
@@ -443,13 +444,13 @@ def _back_up(
                         if (new >> s) & 1:
                             chance *= p_free[s] if (revealed >> s) & 1 else 1.0 - p_free[s]
                     if chance > 0.0:
-                        key = _key(after, v, _without_needless(free | revealed, worse_than), n)
+                        key = _key(after, v, _without_dominated(free | revealed, dominated_by), n)
                         at = low[v] + np.searchsorted(keys[low[v] : high[v]], key)
                         expected += chance * values[at]
                     if revealed == 0:
                         break
                     revealed = (revealed - 1) & new
-                # A forced look counts even where it may end in giving up.
+                # A forced observation counts even where it may end in giving up.
                 if expected < best or (choice == _SEARCH_ENDS and limit == np.inf):
                     best, choice = expected, v
         values[i] = best
@@ -457,35 +458,35 @@ def _back_up(
 
 
 @dataclass
-class ExactPlan:
-    """What the exact agent remembers.
+class ExactState:
+    """Memory of the exact agent.
 
     Attributes:
-        forecast: (n_slots,) float32, the belief before anything was seen.
+        forecast: (n_slots,) float, P(taken) before anything was observed.
         solution: the optimum from the state that it was last solved for.
-        seen: slots seen, as bits.
-        free: slots that looked free when last seen, as bits.
-        target: the vertex that it drives to for a look; -1 to park at what it knows; -2 before a decision.
+        seen: slots observed, as bits.
+        free: slots that were free when last observed, as bits.
+        target: the next vertex to observe from; -1 to park at a slot observed free; -2 before a decision.
     """
 
-    forecast: NDArray[np.float32]
+    forecast: NDArray[np.floating]
     solution: ExactSolution
     seen: int = 0
     free: int = 0
     target: int = -2
 
 
-class ExactAgent(SearchAgent[ExactPlan]):
+class ExactAgent(SearchAgent[ExactState]):
     """`exact`: follows the optimum over belief states; for lots of up to about 20 slots.
 
-    It takes what it sees for lasting. Where a slot seen free turns out taken it solves again from there.
+    It assumes that slots do not change. Where a slot observed free turns out taken it solves again from there.
 
     Args:
         problem: lot, goal, speeds and costs.
         most_states: how many belief states may be kept.
 
     Raises:
-        InputError: too large a lot, or slots that are seen with errors.
+        InputError: too large a lot, or a sensor that errs.
     """
 
     name: ClassVar[str] = "exact"
@@ -496,30 +497,26 @@ class ExactAgent(SearchAgent[ExactPlan]):
         self.most_states = most_states
         self.table = RoadTable.of(self.problem)
 
-    def begin(self, observation: Observation) -> ExactPlan:
+    def begin(self, observation: Observation, belief: SlotBelief) -> ExactState:
         """Solve from the forecast."""
-        forecast = np.array(observation["p_occupied"])
-        return ExactPlan(forecast, self._solved(forecast, int(observation["vertex"]), 0, 0))
+        forecast = belief.forecast
+        return ExactState(forecast, self._solution(forecast, int(observation["vertex"]), 0, 0))
 
-    def decide(self, observation: Observation, memory: ExactPlan) -> int:
-        """Toward the next look, or to the slot that it settles for."""
-        vertex, p = int(observation["vertex"]), observation["p_occupied"]
-        # A forecast of 0 or 1 cannot be told from a sighting, and need not be.
-        certain = (memory.forecast == 0.0) | (memory.forecast == 1.0)
-        seen = memory.seen | bits_of((p != memory.forecast) | (certain & self._in_view(vertex)))
-        free = bits_of((p < memory.forecast) | (certain & (p < 0.5))) & seen
-        news = (seen, free) != (memory.seen, memory.free)
-        if news or memory.target == -2 or vertex == memory.target:
+    def decide(self, observation: Observation, belief: SlotBelief, memory: ExactState) -> int:
+        """Drive to where the next observation is made, or to the slot chosen, and park there."""
+        vertex = int(observation["vertex"])
+        seen, free = bits_of(belief.observed), bits_of(belief.observed_free)
+        if (seen, free) != (memory.seen, memory.free) or memory.target == -2 or vertex == memory.target:
             memory.seen, memory.free = seen, free
             decision = memory.solution.decide(seen, vertex, free)
             if decision is None:
-                memory.solution = self._solved(memory.forecast, vertex, seen, free)
+                memory.solution = self._solution(memory.forecast, vertex, seen, free)
                 decision = memory.solution.decide(seen, vertex, free)
                 assert decision is not None
             memory.target = decision[1]
-        return self._toward(vertex, memory)
+        return self._move_on(vertex, memory)
 
-    def _solved(self, forecast: NDArray[np.float32], vertex: int, seen: int, free: int) -> ExactSolution:
+    def _solution(self, forecast: NDArray[np.floating], vertex: int, seen: int, free: int) -> ExactSolution:
         slots = np.arange(len(forecast))
         as_bool = [((bits >> slots) & 1).astype(np.bool_) for bits in (seen, free)]
         return ExactSolution(
@@ -532,23 +529,17 @@ class ExactAgent(SearchAgent[ExactPlan]):
             table=self.table,
         )
 
-    def _in_view(self, vertex: int) -> NDArray[np.bool_]:
-        starts, slots = self.problem.slots_in_view
-        shown = np.zeros(self.problem.lot.n_slots, dtype=np.bool_)
-        shown[slots[starts[vertex] : starts[vertex + 1]]] = True
-        return shown
-
-    def _toward(self, vertex: int, memory: ExactPlan) -> int:
+    def _move_on(self, vertex: int, memory: ExactState) -> int:
         n_vertices, lot = self.problem.lot.n_vertices, self.problem.lot
         masks = memory.solution._masks
         reach, came_from = np.empty(n_vertices), np.empty(n_vertices, np.int64)
-        _within_known(
+        _drive_within_known(
             vertex,
             memory.seen,
             masks.shows,
             lot.neighbors,
             self.problem.move_s,
-            masks.look_s,
+            masks.stay_s,
             reach,
             came_from,
             np.empty(n_vertices, np.uint8),
@@ -558,7 +549,8 @@ class ExactAgent(SearchAgent[ExactPlan]):
             free = (memory.free >> np.arange(lot.n_slots)) & 1 == 1
             if not free.any():
                 return self._wait(vertex)
-            target = int(np.where(free, reach[: lot.n_slots] + self.problem.walk_s, np.inf).argmin())
+            total_s = np.where(free, reach[: lot.n_slots] + self.problem.arrival_cost_s, np.inf)
+            target = int(total_s.argmin())
             if target == vertex:
                 return PARK
         elif target == vertex:
@@ -569,6 +561,6 @@ class ExactAgent(SearchAgent[ExactPlan]):
         return self.table.move_to(vertex, step)
 
     def _wait(self, vertex: int) -> int:
-        """A move that the graph does not have; where it has all four, one that it has."""
+        """Return a move that the graph does not have; where it has all four, one that it has."""
         missing = np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)
         return int(missing[0]) if len(missing) else int(len(MOVES) - 1)

@@ -1,23 +1,23 @@
-"""The optimum of a search over belief states where slots fill and empty, on very small lots.
+"""The optimum of a parking search over belief states where slots fill and empty, on very small lots.
 
-What the car knows of a slot is how it looked at the last look, and how long ago that was: its chance of being free
-follows from these two, p(t) = p∞ + (p(0) - p∞)·exp(-rt). On a grid of times the belief states are
+The belief about a slot follows from its last observation and the time since then: p(t) = p∞ + (p(0) - p∞)·exp(-rt).
+On a grid of times the belief states are
 
-    (where the car is, and for each slot: never seen, or free or taken so many steps ago),
+    (where the car is, and for each slot: never observed, or free or taken so many steps ago),
 
-and the least expected time from each solves Bellman's equation, which is iterated until it holds. Costs are exact;
-time since a look is rounded to whole steps, and no longer told apart after `memory_steps`.
+and the least expected time from each solves Bellman's equation, which value iteration finds. Costs are exact; the time
+since an observation is rounded to whole steps, and ages of `memory_steps` and more are not distinguished.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
@@ -38,19 +38,19 @@ class ChangingSolution:
     """The optimum from every belief state.
 
     Args:
-        problem: lot, goal, speeds and costs; slots are seen without error.
+        problem: lot, goal, speeds and costs; the sensor must not err.
         p_occupied: (n_slots,) probability that each slot is taken, which does not change.
         rate: (n_slots,) 1/s, arrival rate plus departure rate.
-        step_s: s, of the grid of times; a move or a wait ages what is known by its time, rounded to at least one step.
-        memory_steps: how many ages are told apart.
+        step_s: s, of the grid of times; a move or a wait takes its time, rounded to at least one step.
+        memory_steps: how many ages are distinguished.
 
     Attributes:
-        values: (n_vertices, n_codes) float64, s, the least expected time; inf where a state cannot come about.
-        belief_error: how far from the truth the chance of a slot can be that was seen too long ago to tell.
-        rounding_error: by which part the time that a move ages what is known may be off.
+        values: (n_vertices, n_codes) float64, s, the least expected time; inf for states that cannot occur.
+        belief_error: bound on the error of P(free) of slots whose age is not distinguished any more.
+        rounding_error: greatest relative error of the time of a move.
 
     Raises:
-        InputError: looks that may err, a value out of its range, or too many states.
+        InputError: a sensor that errs, a value out of its range, or too many states.
 
     Example:
         Where cars leave more often, the same slots, equally often taken, are found sooner.
@@ -82,7 +82,7 @@ class ChangingSolution:
                 f"step_s is {step_s} and memory_steps {memory_steps}, want seconds above 0 and at least 2"
             )
         if not problem.sensor_model.perfect:
-            raise InputError("the exact planner wants slots that are seen without error")
+            raise InputError("the exact planner wants a sensor model that never errs")
         codes = 2 * memory_steps + 1
         if codes**n * lot.n_vertices > MOST_STATES:
             raise InputError(
@@ -95,9 +95,9 @@ class ChangingSolution:
         )
         ages = np.arange(memory_steps) * step_s
         usual = 1.0 - p[:, None]
-        faded = np.exp(-r[:, None] * ages)
-        # P(free) by code: never seen, seen free so many steps ago, seen taken so many steps ago.
-        self._free = np.concatenate([usual, usual + (1.0 - usual) * faded, usual * (1.0 - faded)], axis=1)
+        decayed = np.exp(-r[:, None] * ages)
+        # P(free) by code: never observed, free so many steps ago, taken so many steps ago.
+        self._free = np.concatenate([usual, usual + (1.0 - usual) * decayed, usual * (1.0 - decayed)], axis=1)
         moves = np.concatenate([lot.neighbors, np.arange(lot.n_vertices)[:, None]], axis=1).astype(np.int64)
         waits = (lot.neighbors < 0).any(axis=1)
         moves[~waits, _WAIT] = -1
@@ -117,7 +117,7 @@ class ChangingSolution:
             steps,
             starts,
             slots,
-            problem.walk_s,
+            problem.arrival_cost_s,
             problem.give_up_s,
             memory_steps,
         )
@@ -127,18 +127,18 @@ class ChangingSolution:
             )
 
     def expected_s(self, vertex: int, codes: IntArray | None = None) -> float:
-        """Least expected time, s, from a vertex; what is known is coded as `code` does, nothing where None."""
+        """Return the least expected time, s, from a vertex in a belief state of `code`; nothing observed where None."""
         return float(self.values[vertex, self._index(codes)])
 
     def decide(self, vertex: int, codes: IntArray) -> int:
-        """The optimal action: a move, `PARK`, or 5 to wait and look again."""
+        """Return the optimal action: a move, `PARK`, or 5 to wait and observe again."""
         choice = int(self._choices[vertex, self._index(codes)])
         return {_WAIT: 5, 5: PARK}.get(choice, choice)
 
-    def code(self, seen: NDArray[np.bool_], free: NDArray[np.bool_], age_s: FloatArray) -> IntArray:
-        """Codes, (n_slots,), of slots that were seen or not, looked free or not, and were seen so long ago."""
-        age = np.minimum(np.rint(age_s / self.step_s), self.memory_steps - 1).astype(np.int64)
-        return np.where(seen, 1 + age + np.where(free, 0, self.memory_steps), 0)
+    def code(self, belief: SlotBelief) -> IntArray:
+        """Return the codes, (n_slots,), of what is known of each slot."""
+        age = np.minimum(np.rint(belief.age / self.step_s), self.memory_steps - 1).astype(np.int64)
+        return np.where(belief.observed, 1 + age + np.where(belief.observed_free, 0, self.memory_steps), 0)
 
     def _index(self, codes: IntArray | None) -> int:
         if codes is None:
@@ -156,11 +156,11 @@ def _iterate(
     steps: IntArray,
     view_starts: IntArray,
     view_slots: IntArray,
-    walk_s: FloatArray,
+    cost_s: FloatArray,
     give_up_s: float,
     memory_steps: int,
 ) -> int:
-    """Solve in place, by sweeps over the states that can come about; how many it took."""
+    """Solve in place by sweeps over the states that can occur; return how many sweeps it took."""
     n_vertices, n_states = values.shape
     n = len(free)
     n_codes = 2 * memory_steps + 1
@@ -180,7 +180,7 @@ def _iterate(
                     all_taken = all_taken and codes[s] > memory_steps
                 for i in range(view_starts[v], view_starts[v + 1]):
                     c = codes[view_slots[i]]
-                    # What is in view was seen just now, but for where the search begins, unseen.
+                    # Slots in view were observed just now, except at the start of the search.
                     possible = possible and (state == 0 or c == 1 or c == 1 + memory_steps)
                 if not possible:
                     continue
@@ -192,7 +192,7 @@ def _iterate(
                     continue
                 best, choice = np.inf, -1
                 if v < n and codes[v] == 1:
-                    best, choice = walk_s[v], 5
+                    best, choice = cost_s[v], 5
                 for m in range(moves.shape[1]):
                     u = moves[v, m]
                     if u < 0:
@@ -230,25 +230,8 @@ def _iterate(
     return sweep
 
 
-@dataclass
-class ChangingPlan:
-    """What the agent remembers.
-
-    Attributes:
-        forecast: (n_slots,) float32, the belief before anything was seen.
-        seen: (n_slots,) bool.
-        free: (n_slots,) bool, how each slot looked at the last look.
-        looked_at: (n_slots,) float64, s, when that was.
-    """
-
-    forecast: NDArray[np.float32]
-    seen: NDArray[np.bool_]
-    free: NDArray[np.bool_]
-    looked_at: FloatArray
-
-
-class ChangingAgent(SearchAgent[ChangingPlan]):
-    """Follows a `ChangingSolution`, whose forecast and rates it takes for true.
+class ChangingAgent(SearchAgent[None]):
+    """Follows a `ChangingSolution`, assuming that its forecast and rates are right.
 
     Args:
         solution: the optimum.
@@ -260,23 +243,14 @@ class ChangingAgent(SearchAgent[ChangingPlan]):
         super().__init__(solution.problem)
         self.solution = solution
 
-    def begin(self, observation: Observation) -> ChangingPlan:
-        """Nothing seen yet."""
-        n = self.problem.lot.n_slots
-        nothing = np.zeros(n, dtype=np.bool_)
-        return ChangingPlan(np.array(observation["p_occupied"]), nothing, nothing.copy(), np.zeros(n))
+    def begin(self, observation: Observation, belief: SlotBelief) -> None:
+        """Nothing has to be remembered: the belief is the state."""
 
-    def decide(self, observation: Observation, memory: ChangingPlan) -> int:
-        """Take in what is in view, and do what is best."""
-        vertex, time = int(observation["vertex"]), float(observation["time"][1])
-        p = np.asarray(observation["p_occupied"])
-        if time > 0.0:
-            starts, slots = self.problem.slots_in_view
-            shown = slots[starts[vertex] : starts[vertex + 1]]
-            memory.seen[shown], memory.looked_at[shown] = True, time
-            memory.free[shown] = p[shown] < memory.forecast[shown]
-        codes = self.solution.code(memory.seen, memory.free, time - memory.looked_at)
-        action = self.solution.decide(vertex, codes)
+    def decide(self, observation: Observation, belief: SlotBelief, memory: None) -> int:
+        """Choose the optimal action for the belief."""
+        del memory
+        vertex = int(observation["vertex"])
+        action = self.solution.decide(vertex, self.solution.code(belief))
         if action > PARK:
             return int(np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)[0])
         return action

@@ -1,1 +1,1 @@
-"""Planning and tracking the motion of the car."""
+"""Motion planning and path tracking for the car."""

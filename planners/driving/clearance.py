@@ -1,4 +1,4 @@
-"""Where a car may stand: its footprint, a rectangle, against the exact outlines of what is in the way."""
+"""Collision checks of the car's rectangular footprint against the exact outlines of obstacles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ IntArray = NDArray[np.int64]
 CELL_M = 0.1
 """Cell of the distance field, m."""
 DISCS = 4
-"""Discs in a row that cover the footprint."""
+"""Number of discs in a row that cover the footprint."""
 
 _SAMPLE_M = 0.5 * CELL_M
 # A distance in the field differs from the true one by half a cell's diagonal at either end and half a sample.
@@ -26,16 +26,16 @@ _UNSURE = math.sqrt(2.0) * CELL_M + 0.5 * _SAMPLE_M
 
 
 class Clearance(NamedTuple):
-    """What compiled searches ask whether the car may stand somewhere.
+    """Obstacles and distance field for compiled collision checks.
 
     Attributes:
         corners: (n, k_max, 2) float64, m: convex outlines, counter-clockwise or not; lines have two corners.
         n_corners: (n,) int64.
         circle: (n, 3) float64, m: x, y and radius of a circle round each outline.
-        field: (rows, columns) float32, m: about how far each cell is from the nearest outline.
+        field: (rows, columns) float32, m: approximate distance of each cell to the nearest outline.
         low: (2,) float64, m: the corner of the field's first cell.
         half: (2,) float64, m: half the car's length and width.
-        middle: m, from the rear axle to the footprint's middle.
+        middle: from the rear axle to the footprint's middle, m.
     """
 
     corners: FloatArray
@@ -50,13 +50,13 @@ class Clearance(NamedTuple):
 def clearance(
     vehicle: VehicleParameters, outlines: FloatArray, n_corners: IntArray, low: FloatArray, high: FloatArray
 ) -> Clearance:
-    """Prepare the questions.
+    """Prepare collision checks.
 
     Args:
         vehicle: the car.
         outlines: (n, k_max, 2) m, convex.
-        n_corners: (n,) how many corners of each count, 2 or more.
-        low: (2,) m, the lower corner of the window outside of which the car may not stand.
+        n_corners: (n,) number of valid corners of each outline, at least 2.
+        low: (2,) m, lower corner of the window; poses outside count as collisions.
         high: (2,) m, its upper corner.
     """
     used = np.arange(outlines.shape[1]) < n_corners[:, None]

@@ -1,4 +1,4 @@
-"""Keep a car to its lane: paths of straights and arcs along a line, driven without stopping."""
+"""Lane keeping: paths of straights and arcs along a line, driven without stopping."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import VehicleParameters
-from planners.driving.hybrid_astar import CarPath
+from planners.driving.car_path import CarPath
 from planners.driving.path_tracking import PathTracker, TrackingSettings
 
 FloatArray = NDArray[np.float64]
@@ -17,13 +17,13 @@ _STRAIGHT = 1e-5  # rad
 
 
 class LaneKeeper(PathTracker):
-    """Follows a path from whatever speed the car has, as it is done on a lane.
+    """Follow a path on a lane, starting at the current speed.
 
     Args:
         vehicle: the car.
         path: the path.
         settings: of the tracking.
-        aside: m/s², with which the car may be pulled aside at most: it slows down in turns.
+        aside: greatest lateral acceleration, m/s²; the car slows down in turns accordingly.
     """
 
     def __init__(
@@ -36,21 +36,21 @@ class LaneKeeper(PathTracker):
         super().__init__(vehicle, path, settings)
         self._set_off = True
         most = 1.5 * self._settings.acceleration
-        for stretch in self._stretches:
-            bend = np.maximum(np.abs(stretch.curvature), 1e-6)
-            pace = np.minimum(stretch.pace, np.sqrt(aside / bend))
-            step = np.diff(stretch.station)
+        for segment in self._segments:
+            bend = np.maximum(np.abs(segment.curvature), 1e-6)
+            pace = np.minimum(segment.pace, np.sqrt(aside / bend))
+            step = np.diff(segment.station)
             for i in range(len(pace) - 2, -1, -1):
                 pace[i] = min(pace[i], math.sqrt(pace[i + 1] ** 2 + 2.0 * most * step[i]))
-            stretch.pace[:] = pace
+            segment.pace[:] = pace
 
 
 def rounded(points: FloatArray, radius: float) -> CarPath:
-    """A path along a polyline whose corners are arcs.
+    """Make a path along a polyline with rounded corners.
 
     Args:
         points: (k, 2) m, two or more, in the order driven.
-        radius: m, of the arcs, as far as the legs leave room: an arc takes at most half of each leg beside it.
+        radius: of the arcs, m, less where legs are short: an arc takes at most half of each adjacent leg.
     """
     step = np.diff(points, axis=0)
     leg = np.hypot(step[:, 0], step[:, 1])
@@ -75,7 +75,7 @@ def rounded(points: FloatArray, radius: float) -> CarPath:
 
 
 def joined(first: CarPath, second: CarPath) -> CarPath:
-    """One path after the other, which begins where that ends."""
+    """Concatenate two paths; the second starts where the first ends."""
     return CarPath(
         first.start,
         np.r_[first.length, second.length],

@@ -1,4 +1,4 @@
-"""The driver that parks: plans a path through the obstacle map, follows it, and plans again where that went wrong."""
+"""The planning parking agent: plan a path through the obstacle map, track it, and replan after deviations."""
 
 from __future__ import annotations
 
@@ -11,22 +11,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.driving.encounters import SLOWEST, WATCHED_S, encounters
+from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED, encounter_times
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
-from planners.driving.hybrid_astar import CarPath, SearchSettings, plan_path
+from planners.driving.car_path import CarPath
+from planners.driving.hybrid_astar import SearchSettings, plan_path
 from planners.driving.path_tracking import PathTracker, TrackingSettings
 
 FloatArray = NDArray[np.float64]
 Observation = Mapping[str, Any]
 
 MOST_PLANS = 12
-"""Plans in one episode; after that the car stays where it is."""
+"""Greatest number of plans in one episode; after that the car stays where it is."""
 STRAYED_M, STRAYED_RAD = 0.20, math.radians(12.0)
-"""How far from its path a car may come before another is planned."""
+"""Deviation from the path, m and rad, that triggers replanning."""
 
 PATIENCE_S = 3.0
-"""After so long a wait for somebody who stands, s, the driver looks for a way around."""
+"""Time of waiting for a standing road user, s, after which a path around it is planned."""
 
 _CONTROL_S = 0.1
 _NOWHERE = 999.0  # m; unused rows of the obstacle map lie beyond
@@ -35,15 +36,15 @@ _STANDS = 0.01
 
 @dataclass
 class ParkingMemory:
-    """What the driver remembers of an episode.
+    """State of the agent within an episode.
 
     Attributes:
-        tracker: of the path that is followed; None where there is none.
-        paths: all that were planned, in the slot's frame.
+        tracker: of the current path; None without one.
+        paths: all planned paths, in the slot's frame.
         planning_s: wall time of each planning, s.
         stuck: whether no path was found.
-        others: (n, 2) m, where those who move were a step ago.
-        waited_s: for how long the car has been waiting for somebody.
+        others: (n, 2) m, positions of the moving road users one step ago.
+        waited_s: time for which the car has been waiting for road users, s.
     """
 
     tracker: PathTracker | None = None
@@ -55,15 +56,15 @@ class ParkingMemory:
 
 
 class ParkingAgent:
-    """Parks in `parkenv/Drive-v1`: hybrid A*, Reeds-Shepp, and a tracking controller.
+    """Park in `parkenv/Drive-v1`: hybrid A*, Reeds-Shepp shots, and a tracking controller.
 
-    It knows the car, and of the world what the observation says: where the car and the slot are, and, with
-    `obstacle_map=True`, the outlines of parked cars, kerbs and walls, and of those who move, for whom it waits.
+    The agent knows the car and the observation: the poses of car and slot and, with `obstacle_map=True`, the outlines
+    of parked cars, kerbs and walls, and of moving road users, for which it waits.
 
     Args:
         vehicle: the car.
-        search: settings of the planning.
-        tracking: settings of the tracking.
+        search: settings of the planner.
+        tracking: settings of the controller.
     """
 
     name = "planner"
@@ -85,17 +86,16 @@ class ParkingAgent:
         episode_start: NDArray[np.bool_] | Sequence[bool] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.float32], Sequence[ParkingMemory] | ParkingMemory]:
-        """stable-baselines3's interface: single observations, or batches of them with a leading axis.
+        """Decide on single observations, or on batches with a leading axis (stable-baselines3's interface).
 
         Args:
             observation: from `parkenv/Drive-v1` with `obstacle_map=True`, or a vector of them.
-            state: what the last call returned; None at the start.
-            episode_start: for each environment, whether its episode has just begun. With None, it has
-                where there is no state.
-            deterministic: accepted for the interface; this agent makes no distinction.
+            state: returned by the previous call; None at the start.
+            episode_start: per environment, whether its episode has just started; None: where there is no state.
+            deterministic: part of the interface; this agent is always deterministic.
 
         Returns:
-            The action, (2,) or (n_envs, 2) float32, and the state to hand back.
+            The action, (2,) or (n_envs, 2) float32, and the state for the next call.
 
         Raises:
             InputError: an observation without the obstacle map.
@@ -121,11 +121,11 @@ class ParkingAgent:
         return actions, memories
 
     def plan(self, observation: Observation, *, around_others: bool = False) -> CarPath | None:
-        """A path from where the car is to where it is to stand, in the slot's frame.
+        """Plan a path from the current pose to the wanted one, in the slot's frame; None if there is none.
 
         Args:
             observation: with the obstacle map.
-            around_others: whether those who move are in the way, too, where they are now.
+            around_others: whether moving road users, where they are now, are obstacles too.
         """
         cars = observation["cars"]
         if around_others:
@@ -167,36 +167,36 @@ class ParkingAgent:
         return np.zeros(2, dtype=np.float32)
 
     def _stop(self, speed: float, steering: float) -> NDArray[np.float32]:
-        """Brake, and leave the wheels as they are."""
-        # As hard as stops the car within the step, and no harder.
+        """Brake and keep the steering angle."""
+        # Brake only as hard as stops the car within the step.
         pedal = min(abs(speed) / (self.vehicle.max_braking * _CONTROL_S), 1.0)
         return np.array(
             [-math.copysign(pedal, speed), steering / self.vehicle.max_steering], dtype=np.float32
         )
 
     def _waits(self, observation: Observation, memory: ParkingMemory, speed: float) -> bool:
-        """Whether somebody who moves on as until now would come too near to the car on its path."""
+        """Whether a road user at constant velocity would come too close to the car on its path."""
         outlines = np.asarray(observation["movers"], dtype=np.float64)
         at = outlines.mean(axis=1)
         before, memory.others = memory.others, at
         velocity = np.zeros_like(at) if before is None else (at - before) / _CONTROL_S
         assert memory.tracker is not None
-        own = memory.tracker.poses_ahead(WATCHED_S * max(abs(speed), SLOWEST))
-        when = encounters(self.vehicle, self.vehicle.at_middle(own), list(outlines), velocity)
+        own = memory.tracker.poses_ahead(PREDICTION_TIMES_S * max(abs(speed), START_SPEED))
+        when = encounter_times(self.vehicle, self.vehicle.at_middle(own), list(outlines), velocity)
         return bool(np.isfinite(when).any())
 
 
 def _pose(goal: NDArray[np.float32]) -> FloatArray:
-    """(3,) x, y, yaw of a goal."""
+    """Pose, (3,) x, y in m and yaw in rad, of a goal."""
     return np.array([float(goal[0]), float(goal[1]), math.atan2(float(goal[3]), float(goal[2]))])
 
 
 def _obstacles(cars: NDArray[np.float32], lines: NDArray[np.float32]) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Outlines, (n, k, 2) m, and how many corners of each count."""
+    """Outlines of the obstacle map, (n, k, 2) m, and their numbers of valid corners, (n,)."""
     cars = cars[cars[:, 0, 0] < _NOWHERE]
     lines = lines[lines[:, 0, 0] < _NOWHERE]
     outlines = np.concatenate([cars, np.repeat(lines, [1, cars.shape[1] - 1], axis=1)]).astype(np.float64)
     count = np.full(len(outlines), 2, dtype=np.int64)
-    # An outline of fewer corners repeats its last.
+    # Outlines of fewer corners are padded with their last.
     count[: len(cars)] = 1 + (np.abs(np.diff(cars, axis=1)) > 0.0).any(axis=2).sum(axis=1)
     return outlines, count

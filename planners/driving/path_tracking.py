@@ -1,8 +1,8 @@
-"""Drive a car along a path: where to steer, and how fast, forward and backward.
+"""Path tracking: steering and speed along a path, forward and backward.
 
 The steering is feedback about the rear axle (Samson 1992; Paden et al., "A survey of motion planning and control
-techniques for self-driving urban vehicles", 2016, §V): like Stanley's rule it steers off the heading error and the
-offset from the path, and unlike it in reverse too, where the front axle would lead it astray.
+techniques for self-driving urban vehicles", 2016, §V): like Stanley's rule it corrects the heading error and the
+offset from the path; unlike it, it is stable in reverse, where feedback about the front axle diverges.
 """
 
 from __future__ import annotations
@@ -15,25 +15,25 @@ from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import VehicleParameters, move_along
 from parkenv.errors import InputError
-from planners.driving.hybrid_astar import CarPath
+from planners.driving.car_path import CarPath
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
 SAMPLE_M = 0.05
-"""m between the samples of a path."""
+"""Distance between samples of a path, m."""
 
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """How fast, and how firmly, a car follows a path.
+    """Speeds and gains of path tracking.
 
     Args:
-        speed, reverse_speed: m/s, at most.
-        acceleration: m/s², of getting faster and slower.
-        firmness: 1/m; an offset from the path dies out over some 2/firmness metres.
-        blend_m: m, over which the steering goes from one arc's to the next one's while the car moves.
-        control_s: s, from one command to the next.
+        speed, reverse_speed: greatest speeds, m/s.
+        acceleration: acceleration and deceleration, m/s².
+        firmness: gain, 1/m; an offset from the path decays over about 2/firmness metres.
+        blend_m: distance over which the steering changes from one arc's to the next one's, m.
+        control_s: control period, s.
 
     Raises:
         InputError: a value that is not a finite number above 0.
@@ -53,7 +53,7 @@ class TrackingSettings:
                 raise InputError(f"tracking {name} is {value!r}, want above 0")
 
 
-_CRAWL = 0.1  # m/s, the least speed that is asked for before the end
+_CRAWL = 0.1  # m/s, the least commanded speed before the end
 _ARRIVED = 0.01  # m
 _BRAKE_FROM = 0.85  # of the acceleration
 _LAG = 0.8  # steps
@@ -65,7 +65,7 @@ _REACTION_S = 0.2
 
 
 class PathTracker:
-    """Follows one path; remembers how far it has come.
+    """Track one path, with the progress made so far.
 
     Args:
         vehicle: the car.
@@ -73,9 +73,9 @@ class PathTracker:
         settings: of the tracking.
 
     Attributes:
-        done: whether the car has come to the path's end.
-        offset: m, how far from the path the car last was, left above 0.
-        askew: rad, how far its heading last was from the path's.
+        done: whether the car has reached the end of the path.
+        offset: last lateral offset from the path, m, positive to the left.
+        askew: last heading error, rad.
     """
 
     def __init__(
@@ -83,8 +83,8 @@ class PathTracker:
     ) -> None:
         self._vehicle = vehicle
         self._settings = settings = settings or TrackingSettings()
-        self._stretches = _stretches(vehicle, path, settings)
-        self._stretch = 0
+        self._segments = _segments(vehicle, path, settings)
+        self._segment = 0
         self._at = 0
         self._set_off = False
         self.done = False
@@ -100,57 +100,57 @@ class PathTracker:
             steering: rad, of the wheels.
         """
         while True:
-            stretch = self._stretches[self._stretch]
+            segment = self._segments[self._segment]
             first = max(self._at - 4, 0)
-            near = stretch.poses[first : self._at + 31]
+            near = segment.poses[first : self._at + 31]
             self._at = first + int(np.hypot(near[:, 0] - pose[0], near[:, 1] - pose[1]).argmin())
-            x, y, yaw = stretch.poses[self._at].tolist()
+            x, y, yaw = segment.poses[self._at].tolist()
             along = math.cos(yaw) * (float(pose[0]) - x) + math.sin(yaw) * (float(pose[1]) - y)
             # On to the path's point abeam of the car: between two samples the path is as good as an arc.
-            x, y, yaw = move_along(x, y, yaw, float(stretch.curvature[self._at]), along)
+            x, y, yaw = move_along(x, y, yaw, float(segment.curvature[self._at]), along)
             dx, dy = float(pose[0]) - x, float(pose[1]) - y
-            station = float(stretch.station[self._at]) + stretch.direction * along
+            station = float(segment.station[self._at]) + segment.direction * along
             self.offset = math.cos(yaw) * dy - math.sin(yaw) * dx
             self.askew = math.remainder(float(pose[2]) - yaw, 2.0 * math.pi)
-            left = float(stretch.station[-1]) - station
+            left = float(segment.station[-1]) - station
             if not (left < _CLOSE and abs(speed) < _STANDS and self._set_off):
-                return self._drive(stretch, station, left, speed, steering)
-            if self._stretch + 1 == len(self._stretches):
+                return self._drive(segment, station, left, speed, steering)
+            if self._segment + 1 == len(self._segments):
                 self.done = True
                 return 0.0, 0.0
-            self._stretch += 1
+            self._segment += 1
             self._at, self._set_off = 0, False
 
     def poses_ahead(self, distances: FloatArray) -> FloatArray:
         """Poses, (n, 3), on the path, distances, (n,) m, on from where the car last was; to the next stop at most."""
-        stretch = self._stretches[self._stretch]
-        station = np.minimum(stretch.station[self._at] + distances, stretch.station[-1])
-        at = np.searchsorted(stretch.station, station - 1e-9)
-        return np.asarray(stretch.poses[np.minimum(at, len(stretch.poses) - 1)])
+        segment = self._segments[self._segment]
+        station = np.minimum(segment.station[self._at] + distances, segment.station[-1])
+        at = np.searchsorted(segment.station, station - 1e-9)
+        return np.asarray(segment.poses[np.minimum(at, len(segment.poses) - 1)])
 
     def _drive(
-        self, stretch: _Stretch, station: float, left: float, speed: float, steering: float
+        self, segment: _Segment, station: float, left: float, speed: float, steering: float
     ) -> tuple[float, float]:
         settings, vehicle = self._settings, self._vehicle
         reach = abs(speed) * settings.control_s
         # A command is carried out, on the mean, half a step late, and the wheels take as long again to come there.
-        bend = float(np.interp(station + 1.5 * reach, stretch.station, stretch.curvature))
+        bend = float(np.interp(station + 1.5 * reach, segment.station, segment.curvature))
         if not self._set_off:
             wheels = math.atan(bend * vehicle.wheelbase)
             if abs(speed) >= _STANDS or abs(steering - wheels) > _AIMED:
                 return self._pedal(0.0, speed), self._turn(wheels)
             self._set_off = True
         w = settings.firmness
-        bend -= w * w * self.offset + 2.0 * w * stretch.direction * self.askew
+        bend -= w * w * self.offset + 2.0 * w * segment.direction * self.askew
         turn = self._turn(math.atan(bend * vehicle.wheelbase))
         if left < _ARRIVED:
             return self._pedal(0.0, speed), turn
-        # The braking that ends where the stretch does; it takes the better part of a step to set in.
+        # Brake so as to stop at the end of the segment; braking takes most of a step to build up.
         braking = 0.5 * speed * speed / max(left - _LAG * reach, 1e-3)
-        if speed * stretch.direction > 0.0 and braking > _BRAKE_FROM * settings.acceleration:
-            return -stretch.direction * min(braking / vehicle.max_braking, 1.0), turn
-        pace = float(np.interp(station + reach, stretch.station, stretch.pace))
-        return self._pedal(stretch.direction * max(pace, _CRAWL), speed), turn
+        if speed * segment.direction > 0.0 and braking > _BRAKE_FROM * settings.acceleration:
+            return -segment.direction * min(braking / vehicle.max_braking, 1.0), turn
+        pace = float(np.interp(station + reach, segment.station, segment.pace))
+        return self._pedal(segment.direction * max(pace, _CRAWL), speed), turn
 
     def _turn(self, wheels: float) -> float:
         return min(max(wheels / self._vehicle.max_steering, -1.0), 1.0)
@@ -164,8 +164,8 @@ class PathTracker:
 
 
 @dataclass(frozen=True, eq=False)
-class _Stretch:
-    """A path between two changes of direction: samples of what is driven."""
+class _Segment:
+    """A sampled path between two changes of direction."""
 
     direction: float  # 1 forward, -1 backward
     station: FloatArray  # (n,) m from its start
@@ -174,17 +174,17 @@ class _Stretch:
     pace: FloatArray  # (n,) m/s, at most
 
 
-def _stretches(vehicle: VehicleParameters, path: CarPath, settings: TrackingSettings) -> list[_Stretch]:
-    """The path cut where its direction changes, with wheels that turn at a finite rate.
+def _segments(vehicle: VehicleParameters, path: CarPath, settings: TrackingSettings) -> list[_Segment]:
+    """Split a path at changes of direction, and smooth it for a finite steering rate.
 
-    From arc to arc the curvature goes over on a ramp about their joint. Both arcs turn the car as far as before, so
-    the path is left by millimetres alone. Each stretch begins on the planned path.
+    Between two arcs the curvature changes linearly about their joint. Each arc turns the car as far as before, so the
+    deviation from the path is a few millimetres. Each segment starts on the planned path.
     """
     kept = np.abs(path.length) > 1e-9
     length, curvature = path.length[kept], path.curvature[kept]
     cuts = np.flatnonzero(np.diff(np.sign(length))) + 1
     start = tuple(path.start.tolist())
-    stretches = []
+    segments = []
     for arcs in np.split(np.arange(len(length)), cuts):
         direction = math.copysign(1.0, length[arcs[0]])
         ends = np.r_[0.0, np.cumsum(np.abs(length[arcs]))]
@@ -203,17 +203,17 @@ def _stretches(vehicle: VehicleParameters, path: CarPath, settings: TrackingSett
         fastest = settings.speed if direction > 0.0 else settings.reverse_speed
         rate = _RATE_SHARE * vehicle.steering_rate
         pace = _pace(station, np.arctan(bend * vehicle.wheelbase), fastest, rate, settings.acceleration)
-        stretches.append(_Stretch(direction, station, np.array(poses), bend, pace))
+        segments.append(_Segment(direction, station, np.array(poses), bend, pace))
         for i in arcs.tolist():
             start = move_along(*start, float(curvature[i]), float(length[i]))
-    return stretches
+    return segments
 
 
 @compiled(error_model="numpy")
 def _pace(
     station: FloatArray, wheels: FloatArray, fastest: float, rate: float, acceleration: float
 ) -> FloatArray:
-    """Speeds, (n,) m/s, at which the wheels turn no faster than `rate`, rad/s, and from which the car can stop."""
+    """Greatest speeds, (n,) m/s, for a steering rate of `rate`, rad/s, from which the car can stop at the end."""
     n = len(station)
     pace = np.empty(n)
     for i in range(n):

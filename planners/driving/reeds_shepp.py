@@ -1,7 +1,7 @@
-"""The shortest ways of a car that drives forward and backward between two poses, where nothing is in the way.
+"""Reeds-Shepp curves: shortest obstacle-free paths of a car that drives forward and backward.
 
 After Reeds and Shepp, "Optimal paths for a car that goes both forwards and backwards", Pacific Journal of
-Mathematics 145 (1990): such a way is one of 48 words of at most five pieces, each a left turn, a right turn, both of
+Mathematics 145 (1990): such a path is one of 48 words of at most five pieces, each a left turn, a right turn, both of
 the smallest radius, or straight. The words come from eight formulas (their section 8) and their mirror images in time,
 in the car's axis, and in the order of the pieces.
 """
@@ -21,7 +21,7 @@ IntArray = NDArray[np.int64]
 RIGHT, STRAIGHT, LEFT = -1, 0, 1
 PIECES = 5
 MOST_WORDS = 96
-"""Rows that hold all words between any two poses: some of the 48 come in two versions."""
+"""Rows needed for all words between two poses: some of the 48 words have two versions."""
 
 _EDGE = 1e-9
 _HALF = 0.5 * math.pi
@@ -29,7 +29,7 @@ _HALF = 0.5 * math.pi
 
 @compiled(error_model="numpy")
 def _turned(angle: float) -> float:
-    """The same direction in [-π, π)."""
+    """Normalise an angle to [-π, π)."""
     return angle - 2.0 * math.pi * math.floor((angle + math.pi) / (2.0 * math.pi))
 
 

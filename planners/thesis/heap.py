@@ -12,7 +12,7 @@ FloatArray = NDArray[np.float64]
 
 @compiled(error_model="numpy")
 def push(keys: FloatArray, vertices: NDArray[np.int32], size: int, key: float, vertex: int) -> int:
-    """Enter a vertex into a binary heap; its new size."""
+    """Insert a vertex into a binary heap; return its new size."""
     i = size
     while i > 0:
         above = (i - 1) >> 1
@@ -26,7 +26,7 @@ def push(keys: FloatArray, vertices: NDArray[np.int32], size: int, key: float, v
 
 @compiled(error_model="numpy")
 def pop(keys: FloatArray, vertices: NDArray[np.int32], size: int) -> int:
-    """Take the first vertex, which the caller has read, out of a binary heap; its new size."""
+    """Remove the first vertex, which the caller has read, from a binary heap; return its new size."""
     size -= 1
     key, vertex = keys[size], vertices[size]
     i = 0

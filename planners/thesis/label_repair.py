@@ -1,9 +1,9 @@
-"""A label-setting plan mended after some probabilities changed, instead of made anew.
+"""Repair of a label-setting plan after some probabilities changed, instead of planning from scratch.
 
-After Ramalingam and Reps (1996): what a change can make worse is the tree of vertices whose labels came by way of
-the changed stop. They take the best label that the rest offers, and labels spread on from there, from stops that
-became better, and nowhere else. Most sightings touch a handful of vertices, whatever the size of the lot. Where a
-change reaches farther than a fixed part of the lot, a fresh pass is the faster way, and is what is done.
+After Ramalingam and Reps (1996): a change can make worse only the tree of vertices whose labels came from the changed
+stop. They get the best label that their other neighbours offer, and labels spread from there and from stops that became
+better, and nowhere else. Most observations touch a handful of vertices, whatever the size of the lot. Where a change
+reaches more than a fixed part of the lot, a pass from scratch is faster and is done instead.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from planners.thesis.label_setting import (
 from sim_sensors.compilation import compiled
 
 REACH = 0.1
-"""Part of the lot's vertices that a repair may touch before a fresh pass takes over."""
+"""Part of the lot's vertices that a repair may touch before a pass from scratch takes over."""
 _LEAST_REACH = 64
 _AFFECTED = STOP + 1
 
 
 def repair(graph: StoppingGraph, labels: Labels, vertices: NDArray[np.int64], p_free: FloatArray) -> int:
-    """Bring a plan up to date, in place; it then equals a fresh one.
+    """Update a plan in place; it then equals one made from scratch.
 
     Args:
-        graph: the lot's part, the one that the plan was made with.
-        labels: the plan, which must be settled; afterwards it may not be, as after `settle`.
+        graph: that the plan was made with.
+        labels: the plan; `labels.settled` tells afterwards whether it is exact, as after `settle`.
         vertices: (k,) int64, the slots whose probability changed.
         p_free: (k,) float64, their new probabilities.
 
     Returns:
-        How many labels were set; -1 where a fresh pass was the shorter way.
+        How many labels were set; -1 where a pass from scratch was faster.
     """
     labels.p_free[vertices] = p_free
     reach = max(_LEAST_REACH, int(REACH * len(labels.cost)))
@@ -60,7 +60,7 @@ def _repair(
     move: NDArray[np.int8],
     reach: int,
 ) -> int:
-    """The number of labels set; -1, and labels that are of no use, where the reach does not suffice."""
+    """Return the number of labels set; -1, and labels that are of no use, where the reach does not suffice."""
     affected, n_affected = np.empty(reach, dtype=np.int32), 0
     keys, queued, size = np.empty(2 * reach), np.empty(2 * reach, dtype=np.int32), 0
     for i in range(len(vertices)):

@@ -1,25 +1,25 @@
 """The thesis's MDP as a stopping problem, solved exactly by one pass of label setting.
 
-A failed try leads back to the slot that it was made at, so to go on trying there until it works has a closed
-value, Q(u) = (p·(r_max - t_walk) - (1-p)·c) / (1 - γ(1-p)), and what is left to decide is where to stop: with
-costs J = -V,
+A failed attempt leads back to the slot that it was made at, so repeating it until it succeeds has a closed-form value,
+Q(u) = (p·(r_max - r_u) - (1-p)·c) / (1 - γ(1-p)), r being the arrival cost and c the failure cost. What is left to
+decide is where to stop: with costs J = -V,
 
     J(u) = min( h(u), min over edges u→v of d + γ·J(v) ),
 
-where h(u) is the least cost of staying at u: trying until it works, waiting for ever, or shuttling for ever
-along an edge and back. Labels spread from the cheapest stops against the edges, as Dijkstra's do.
+where h(u) is the least cost of staying at u: attempts until one succeeds, waiting for ever, or shuttling for ever
+along an edge and back. Labels spread from the cheapest stops against the edges, as in Dijkstra's algorithm.
 
-**Why it is exact.** Call an edge climbing where d + γ·J(v) > J(v), that is J(v) < d/(1-γ): going on over such
+**Why it is exact.** An edge is called climbing where d + γ·J(v) > J(v), that is J(v) < d/(1-γ): driving on over such
 edges for ever costs more than v. While edges climb, labels are settled in ascending order, each once; in any
-digraph that holds for all labels below d_min/(1-γ). The queue is of buckets as wide as the shortest edge. They are
+digraph that holds for all labels below d_min/(1-γ). The queue has buckets as wide as the shortest edge. They are
 exact while that is at most the least climb (Denardo and Fox 1979), which γ lowers a little at positive labels. Where
-a label that was spread still improves, for either reason, it is spread again. So when the pass comes to an end no
-edge offers less than any label: J satisfies the equation above, whose solution is unique where γ < 1. Coming to an
-end is the certificate.
+a label that was spread still improves, for either reason, it is spread again. So when the pass terminates no
+edge offers less than any label: J satisfies the equation above, whose solution is unique where γ < 1. Termination is
+the certificate.
 
-It comes to an end on two-way edges, since h holds the cost of shuttling, which makes every edge climb or tie; and
-wherever no directed circle beats every stop. Where one does, labels would fall for ever: a limit on the work
-meets that, first with a heap, whose order does not depend on climbs, and then policy iteration takes over.
+It terminates on two-way edges, since h includes the cost of shuttling, so that every edge climbs or ties; and
+wherever no directed cycle beats every stop. Where one does, labels would fall for ever: a limit on the work stops
+that, first with a heap, whose order does not depend on climbs, and then policy iteration takes over.
 At γ = 1 it is Dijkstra's algorithm with a virtual source; plans that never end cost infinity.
 """
 
@@ -41,17 +41,17 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 
 STOP = PARK
-"""The move of a vertex that its label says to stay at: for its slot, or because nothing is within reach."""
+"""The move of a vertex at which to stay: to park, or because nothing is reachable."""
 TIE_S = 1e-7
-"""Actions whose values differ by less, s, are equally good: solvers agree to well within it."""
+"""s: actions whose values differ by less are equally good; solvers agree to well within it."""
 _BUCKETS_PER_VERTEX = 2
-"""How many buckets there are at most: to pass over an empty one must cost little beside a vertex."""
+"""Buckets per vertex at most, so that passing over empty ones costs little."""
 _REFILLS = 64
-"""How often all buckets may be filled anew before a heap is the faster way."""
+"""How often all buckets may be refilled before a heap is faster."""
 
 
 class StoppingGraph(NamedTuple):
-    """What a lot's plans have in common, whatever is believed of its slots.
+    """The part of the stopping problem that does not depend on the belief.
 
     Attributes:
         neighbors: (n, 4) int32, the vertex that up, down, left, right lead to, or -1.
@@ -60,10 +60,10 @@ class StoppingGraph(NamedTuple):
         in_source: (m,) int32, where the edge comes from.
         in_move: (m,) int8, which move it is there.
         in_s: (m,) float64, s, its drive time.
-        park_reward: (n,) float64, s, r_max - r_s.
+        park_reward: (n,) float64, s, r_max - r_u.
         never_s: (n,) float64, s, least discounted cost of waiting, or shuttling along one edge, for ever; inf
             at γ = 1.
-        failure_s: s, cost of a failed try.
+        failure_s: s, what the planner believes a failed attempt to cost.
         wait_s: s, cost of a move that the graph does not have.
         gamma: discount a decision.
     """
@@ -82,7 +82,7 @@ class StoppingGraph(NamedTuple):
 
     @classmethod
     def of(cls, mdp: ParkingMDP) -> StoppingGraph:
-        """The graph of a process; its probabilities are left out."""
+        """Make the graph of a process, without its probabilities."""
         neighbors, move_s = mdp.neighbors.astype(np.int32), np.ascontiguousarray(mdp.move_s)
         in_start, in_source, in_move, in_s = edges_in(neighbors, move_s)
         never_s = _never(neighbors, move_s, mdp.wait_s, mdp.gamma)
@@ -103,14 +103,14 @@ class StoppingGraph(NamedTuple):
 
 @dataclass
 class Labels:
-    """A plan: what each vertex costs and what to do there. `label_repair.repair` changes it in place.
+    """A plan: the cost of each vertex and the action there. `label_repair.repair` changes it in place.
 
     Attributes:
         cost: (n,) float64, s, -V of each vertex.
-        move: (n,) int8, the move that the label came by, or `STOP`.
+        move: (n,) int8, the move that the label came from, or `STOP`.
         p_free: (n,) float64, the probabilities that it was made for.
         settled: whether `move` leads from every vertex to a stop, by edges that the labels follow exactly; False
-            where another solver made it.
+            where another solver made the plan.
     """
 
     cost: FloatArray
@@ -120,7 +120,7 @@ class Labels:
 
 
 def label_setting(mdp: ParkingMDP) -> Solution:
-    """Solve the process exactly; near-linear in its size. See the module for the conditions and the proof.
+    """Solve the process exactly, in near-linear time; the module states the conditions and the proof.
 
     Unlike policy iteration it takes gamma 1, where a vertex that can reach no slot has value -inf. The policy
     breaks ties as `best_move` says. `iterations` is 1, or those of policy iteration where it had to take over.
@@ -134,10 +134,10 @@ def label_setting(mdp: ParkingMDP) -> Solution:
 
 
 def settle(graph: StoppingGraph, p_free: FloatArray) -> Labels:
-    """One pass of label setting from scratch.
+    """Plan by one pass of label setting.
 
     Args:
-        graph: the lot's part.
+        graph: the stopping problem.
         p_free: (n,) float64; kept, not copied.
 
     Returns:
@@ -150,7 +150,7 @@ def settle(graph: StoppingGraph, p_free: FloatArray) -> Labels:
 
 
 def settle_again(graph: StoppingGraph, labels: Labels) -> None:
-    """One pass of label setting for a plan's present probabilities, in place."""
+    """Update a plan to its present probabilities by one pass of label setting, in place."""
     width = float(graph.in_s.min()) if len(graph.in_s) else 1.0
     labels.settled = bool(
         _settle_by_buckets(graph, labels.p_free, width, labels.cost, labels.move)
@@ -159,7 +159,7 @@ def settle_again(graph: StoppingGraph, labels: Labels) -> None:
 
 
 def by_policy_iteration(mdp: ParkingMDP, start: Labels | None = None) -> tuple[Labels, int]:
-    """The same plan by the thesis's solver, from the moves of another plan on, and its iterations.
+    """Plan by the thesis's solver, starting from the moves of another plan; return the plan and the iterations.
 
     Raises:
         InputError: gamma is 1.
@@ -171,13 +171,13 @@ def by_policy_iteration(mdp: ParkingMDP, start: Labels | None = None) -> tuple[L
 
 
 def with_p_free(mdp: ParkingMDP, p_free: FloatArray) -> ParkingMDP:
-    """The same process for other probabilities, (n,)."""
+    """Return the same process with other probabilities, (n,)."""
     return dataclasses.replace(mdp, p_free=p_free)
 
 
 @compiled(error_model="numpy")
 def stop_cost(graph: StoppingGraph, p_free: FloatArray, vertex: int) -> float:
-    """h: the least cost, s, of staying at a vertex for good."""
+    """Return h, the least cost, s, of staying at a vertex."""
     p = p_free[vertex]
     left = 1.0 - graph.gamma * (1.0 - p)
     if left <= 0.0:
@@ -188,7 +188,7 @@ def stop_cost(graph: StoppingGraph, p_free: FloatArray, vertex: int) -> float:
 
 @compiled(error_model="numpy")
 def move_cost(graph: StoppingGraph, cost: FloatArray, vertex: int, move: int) -> float:
-    """What it costs, s, to make a move and go on as the labels say; a missing move waits."""
+    """Return the cost, s, of a move followed by the plan; a missing move waits."""
     v = graph.neighbors[vertex, move]
     if v < 0:
         return graph.wait_s + graph.gamma * float(cost[vertex])
@@ -197,9 +197,9 @@ def move_cost(graph: StoppingGraph, cost: FloatArray, vertex: int, move: int) ->
 
 @compiled(error_model="numpy")
 def best_move(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, vertex: int) -> int:
-    """An optimal action of one vertex, told from the costs alone, so that solvers which agree act alike.
+    """Return an optimal action of one vertex, by the costs alone, so that solvers which agree choose the same.
 
-    Among actions that are equally good to within `TIE_S` parking goes first, then the moves in order. Where
+    Among actions that are equally good to within `TIE_S` parking comes first, then the moves in order. Where
     every cost is infinite it waits if it can.
     """
     p = p_free[vertex]
@@ -224,7 +224,7 @@ def best_move(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, vertex
 
 @compiled(error_model="numpy")
 def best_moves(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray) -> NDArray[np.int64]:
-    """`best_move` of every vertex, (n,) int64."""
+    """Return `best_move` of every vertex, (n,) int64."""
     moves = np.empty(len(cost), dtype=np.int64)
     for u in range(len(cost)):
         moves[u] = best_move(graph, p_free, cost, u)
@@ -233,7 +233,7 @@ def best_moves(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray) -> ND
 
 @compiled(error_model="numpy")
 def _is_source(graph: StoppingGraph, cost: FloatArray, u: int) -> bool:
-    """Whether labels may have to start from a vertex: not where one hop to a cheaper stop beats stopping.
+    """Return whether labels may have to start from a vertex: not where one hop to a cheaper stop beats stopping.
 
     The stop one hop off must be the cheaper one: at the cost of shuttling two vertices could otherwise each
     leave it to the other by a rounding error.
@@ -255,10 +255,10 @@ def _settle_by_buckets(
     """Fill `cost` and `move`; bucket b holds the vertices to spread whose labels lie in [b, b + 1) times `width`.
 
     Buckets are linked lists in one pool. Those beyond the last bucket wait in `later` until all buckets before
-    are empty, and then fill them anew.
+    are empty, and then refill them.
 
     Returns:
-        Whether the pass came to an end within its limits.
+        Whether the pass terminated within its limits.
     """
     n = len(cost)
     for u in range(n):
@@ -318,7 +318,7 @@ def _settle_by_buckets(
                         else:
                             entry_next[used], later = later, used
                         used += 1
-        # What is left of `later` goes on from its least label.
+        # What is left of `later` is distributed from its least label on.
         first, e = np.iinfo(np.int64).max, later
         while e >= 0:
             if to_spread[entry_vertex[e]]:
@@ -343,7 +343,7 @@ def _settle_by_buckets(
 def _settle_by_heap(
     graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, move: NDArray[np.int8]
 ) -> bool:
-    """The same with a heap, for climbs so small that buckets would be too many, or too wide."""
+    """Do the same with a heap, for climbs so small that buckets would be too many, or too wide."""
     n = len(cost)
     for u in range(n):
         cost[u] = stop_cost(graph, p_free, u)
@@ -368,7 +368,7 @@ def spread(
     """Spread the labels in a heap, and those that they improve, in ascending order.
 
     Args:
-        graph: the lot's part.
+        graph: the stopping problem.
         cost: (n,), changed in place.
         move: (n,), changed in place.
         keys: (room,) the heap's labels.
@@ -400,7 +400,7 @@ def spread(
 def edges_in(
     neighbors: NDArray[np.int32], move_s: FloatArray
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int8], FloatArray]:
-    """The edges sorted by where they lead to."""
+    """Return the edges sorted by the vertex that they lead to: rows, sources, moves and drive times, s."""
     n, n_moves = neighbors.shape
     start = np.zeros(n + 1, dtype=np.int32)
     for u in range(n):
@@ -423,7 +423,7 @@ def edges_in(
 
 @compiled
 def _never(neighbors: NDArray[np.int32], move_s: FloatArray, wait_s: float, gamma: float) -> FloatArray:
-    """The cheaper of waiting for ever and shuttling along one edge for ever, (n,) s."""
+    """Return the lower cost, (n,) s, of waiting for ever and shuttling along one edge for ever."""
     n, n_moves = neighbors.shape
     never = np.full(n, np.inf)
     if gamma == 1.0:

@@ -1,4 +1,4 @@
-"""The thesis's Markov decision process of the search for a slot (T §3.4.2)."""
+"""The thesis's Markov decision process of parking search (T §3.4.2)."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ class ParkingMDP:
 
     A move along an edge costs its drive time (eq. 3.16, 3.23); a move that the graph does not have costs
     `wait_s` and stays. Parking at vertex s reaches the goal with probability `p_free[s]` and pays
-    r_max - r_s, the walk saved against the farthest slot (eq. 3.17, 3.24); otherwise it costs `failure_s`
-    and stays. The goal's value is zero.
+    r_max - r_s, what is saved against the slot with the highest arrival cost (eq. 3.17, 3.24): the walk, and the price
+    of parking where slots have one. Otherwise it costs `failure_s` and stays. The goal's value is zero.
 
     Args:
         neighbors: (n, 4) int, the vertex that up, down, left, right lead to, or -1.
         move_s: (n, 4) float64, s, drive time of each edge.
-        p_free: (n,) float64, probability that a try to park succeeds; 0 where there is no slot.
-        walk_s: (n,) float64, s, from each vertex to the goal.
-        failure_s: s, the cost of a failed try.
+        p_free: (n,) float64, probability that a parking attempt succeeds; 0 where there is no slot.
+        arrival_cost_s: (n,) float64, s, what parking at each vertex costs on arrival (`SearchProblem.arrival_cost_s`).
+        failure_s: s, what the planner believes a failed attempt to cost.
         wait_s: s, the cost of a move that does not exist (the thesis's Δt).
         gamma: discount a decision, in (0, 1].
 
@@ -47,7 +47,7 @@ class ParkingMDP:
         Two slots on a line; the second is nearer to the goal but always taken.
 
         >>> mdp = ParkingMDP([[-1, -1, -1, 1], [-1, -1, 0, -1]], [[0, 0, 0, 2.0], [0, 0, 2.0, 0]],
-        ...                  p_free=[0.5, 0.0], walk_s=[30.0, 10.0], failure_s=10.0, wait_s=1.0, gamma=0.99)
+        ...                  p_free=[0.5, 0.0], arrival_cost_s=[30.0, 10.0], failure_s=10.0, gamma=0.99)
         >>> from planners import policy_iteration
         >>> [mdp.action_name(a) for a in policy_iteration(mdp).policy]
         ['park', 'left']
@@ -56,7 +56,7 @@ class ParkingMDP:
     neighbors: NDArray[np.int64]
     move_s: FloatArray
     p_free: FloatArray
-    walk_s: FloatArray
+    arrival_cost_s: FloatArray
     failure_s: float
     wait_s: float = 1.0
     gamma: float = 0.9999
@@ -66,30 +66,30 @@ class ParkingMDP:
         neighbors = np.asarray(self.neighbors, dtype=np.int64)
         move_s = np.asarray(self.move_s, dtype=np.float64)
         p_free = np.asarray(self.p_free, dtype=np.float64)
-        walk_s = np.asarray(self.walk_s, dtype=np.float64)
+        arrival_cost_s = np.asarray(self.arrival_cost_s, dtype=np.float64)
         n = len(neighbors)
-        wanted = {"neighbors": (n, len(MOVES)), "move_s": (n, len(MOVES)), "p_free": (n,), "walk_s": (n,)}
-        for name, array in (
-            ("neighbors", neighbors),
-            ("move_s", move_s),
-            ("p_free", p_free),
-            ("walk_s", walk_s),
+        edges = (n, len(MOVES))
+        for name, array, wanted in (
+            ("neighbors", neighbors, edges),
+            ("move_s", move_s, edges),
+            ("p_free", p_free, (n,)),
+            ("arrival_cost_s", arrival_cost_s, (n,)),
         ):
-            if array.shape != wanted[name]:
-                raise InputError(f"{name} has shape {array.shape}, want {wanted[name]}")
+            if array.shape != wanted:
+                raise InputError(f"{name} has shape {array.shape}, want {wanted}")
             object.__setattr__(self, name, array)
         if n == 0 or neighbors.max() >= n or neighbors.min() < -1:
             raise InputError(f"neighbors must hold vertices 0..{n - 1}, or -1 where there is no edge")
         if not ((p_free >= 0.0) & (p_free <= 1.0)).all():
             raise InputError("p_free must lie in [0, 1]")
-        if not (np.isfinite(walk_s).all() and (move_s[neighbors >= 0] >= 0.0).all()):
-            raise InputError("walk_s must be finite and move_s not negative")
+        if not (np.isfinite(arrival_cost_s).all() and (move_s[neighbors >= 0] >= 0.0).all()):
+            raise InputError("arrival_cost_s must be finite and move_s not negative")
         for name, least in (("failure_s", 0.0), ("wait_s", 0.0)):
             if not least <= getattr(self, name) < np.inf:
                 raise InputError(f"{name} is {getattr(self, name)}, want a finite number, at least {least:g}")
         if not 0.0 < self.gamma <= 1.0:
             raise InputError(f"gamma is {self.gamma}, want a number in (0, 1]")
-        object.__setattr__(self, "park_reward", walk_s.max() - walk_s)
+        object.__setattr__(self, "park_reward", arrival_cost_s.max() - arrival_cost_s)
 
     @classmethod
     def from_belief(
@@ -100,25 +100,26 @@ class ParkingMDP:
         failure_s: float | None = None,
         gamma: float = 0.9999,
     ) -> ParkingMDP:
-        """The process that the thesis plans on, for what is believed of the slots.
+        """Make the process that the thesis plans on from a belief about the slots.
 
         Args:
             problem: lot, goal, speeds and costs.
             p_occupied: (n_slots,) probability that each slot is taken.
-            failure_s: cost of a failed try as the planner weighs it; the problem's own where None.
+            failure_s: s, what the planner believes a failed attempt to cost; what the world charges
+                (`problem.failure_s`) where None.
             gamma: discount a decision.
         """
         n, n_slots = problem.lot.n_vertices, problem.lot.n_slots
         p_free = np.zeros(n)
         p_free[:n_slots] = 1.0 - np.asarray(p_occupied, dtype=np.float64)
-        # Nobody parks at a junction: its walk must not raise r_max.
-        walk_s = np.full(n, problem.walk_s.max())
-        walk_s[:n_slots] = problem.walk_s
+        # Junctions have no slots: their cost must not raise r_max.
+        arrival_cost_s = np.full(n, problem.arrival_cost_s.max())
+        arrival_cost_s[:n_slots] = problem.arrival_cost_s
         return cls(
             neighbors=problem.lot.neighbors.astype(np.int64),
             move_s=problem.move_s,
             p_free=p_free,
-            walk_s=walk_s,
+            arrival_cost_s=arrival_cost_s,
             failure_s=problem.failure_s if failure_s is None else failure_s,
             wait_s=problem.wait_s,
             gamma=gamma,
@@ -126,44 +127,44 @@ class ParkingMDP:
 
     @property
     def n_states(self) -> int:
-        """Vertices; the goal is not counted."""
+        """Number of vertices; the goal is not counted."""
         return len(self.neighbors)
 
     @staticmethod
     def action_name(action: int) -> str:
-        """The word for an action's number."""
+        """Return the name of an action."""
         return ACTIONS[action]
 
     def successors(self) -> NDArray[np.int64]:
-        """Where each action leads when it does not reach the goal, (n, 5): missing moves and parking stay."""
+        """Return the state after each action that does not reach the goal, (n, 5); missing moves and parking stay."""
         stay = np.arange(self.n_states)[:, None]
         return np.concatenate([np.where(self.neighbors >= 0, self.neighbors, stay), stay], axis=1)
 
     def rewards(self) -> FloatArray:
-        """Expected reward, (n, 5) s, of each action (eq. 3.23, 3.24 and the failure costs)."""
+        """Return the expected reward, (n, 5) s, of each action (eq. 3.23, 3.24 and the failure costs)."""
         move = np.where(self.neighbors >= 0, -self.move_s, -self.wait_s)
         park = self.p_free * self.park_reward - (1.0 - self.p_free) * self.failure_s
         return np.concatenate([move, park[:, None]], axis=1)
 
     def continuation(self) -> FloatArray:
-        """Discounted probability, (n, 5), that an action leads to its successor and not to the goal."""
+        """Return the discounted probability, (n, 5), that an action leads to its successor and not to the goal."""
         keep = np.full((self.n_states, len(ACTIONS)), self.gamma)
         keep[:, PARK] *= 1.0 - self.p_free
         return keep
 
     def action_values(self, values: FloatArray) -> FloatArray:
-        """Q, (n, 5) s, of each action when `values`, (n,) s, follow (inner part of eq. 3.30)."""
+        """Return Q, (n, 5) s, of each action given the values, (n,) s, of the states (inner part of eq. 3.30)."""
         return self.rewards() + self.continuation() * values[self.successors()]
 
     def expected_time(self, values: FloatArray) -> FloatArray:
-        """Expected seconds from each state to the goal: what r_max stands for, less the value."""
-        return float(self.walk_s.max()) - values
+        """Return the expected time, (n,) s, from each state to the goal: r_max less its value."""
+        return float(self.arrival_cost_s.max()) - values
 
     def check_discount(self, values: FloatArray) -> None:
         """Warn where discounting breaks the equivalence with time (eq. 3.28).
 
-        Driving in circles for ever costs at least min(d_min, Δt)/(1 - γ), trying at a taken slot for ever
-        `failure_s`/(1 - γ); as long as every state does better than both, neither can be optimal.
+        Driving in circles for ever costs at least min(d_min, Δt)/(1 - γ), attempts at a taken slot for
+        ever `failure_s`/(1 - γ); as long as every state does better than both, neither can be optimal.
         """
         if self.gamma == 1.0:
             return
@@ -176,7 +177,7 @@ class ParkingMDP:
         if worst >= bound:
             warnings.warn(
                 f"gamma {self.gamma} is too low for this lot and a failure cost of {self.failure_s:g} s: circling, or "
-                f"trying in vain for ever, costs {bound:.0f} s discounted, the worst state {worst:.0f} s",
+                f"failed attempts for ever, cost {bound:.0f} s discounted, the worst state {worst:.0f} s",
                 CirclingWarning,
                 stacklevel=2,
             )

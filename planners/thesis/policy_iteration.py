@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """What a solver found.
+    """Result of a solver.
 
     Attributes:
         values: (n,) float64, s, the utility of each state (eq. 3.26); the goal's is 0.
@@ -37,7 +37,7 @@ def policy_iteration(
     """Alternate evaluation by sparse LU (eq. 3.29) and greedy improvement (eq. 3.30).
 
     Stops when the policy no longer changes. Among actions whose values differ by rounding alone the
-    present one is kept, so ties cannot make it run for ever.
+    current one is kept, so ties cannot make it run for ever.
 
     Args:
         mdp: the process; gamma must be below 1, or evaluation of a policy that never parks has no solution.

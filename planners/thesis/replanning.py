@@ -1,4 +1,4 @@
-"""The thesis's agents: plan by the MDP, look, update, plan again (T §3.4.4)."""
+"""The thesis's agents: plan by the MDP, observe, update the belief, replan (T §3.4.4)."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
+from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
-from planners.agent import Observation, SearchAgent
+from planners.agent import Observation, PlanPreview, SearchAgent
 from planners.thesis.label_repair import repair
 from planners.thesis.label_setting import (
     Labels,
@@ -25,19 +27,21 @@ from planners.thesis.mdp import ParkingMDP
 from sim_sensors.compilation import compiled
 
 RELEVANT_CHANGE = 0.01
-"""A probability that moved less than this since the last plan is the same one, grown a little older."""
+"""Replan once a probability differs by more than this from the one that the plan was made for."""
 SOLVERS = ("label_setting", "policy_iteration")
-"""How plans are found: exactly in near-linear time, or as in the thesis. They lead to the same actions."""
+"""How plans are made: exactly in near-linear time, or as in the thesis. They lead to the same actions."""
+MOST_HOPS = 400
+"""Vertices of a plan that are previewed at most."""
 
 
 @dataclass
 class Plan:
-    """What a planning agent remembers.
+    """Memory of an agent that plans.
 
     Attributes:
-        graph: what it knows of the lot.
-        labels: what each vertex costs, and the probabilities that this was found for.
-        replans: how often it has been made anew since the episode began.
+        graph: the stopping problem.
+        labels: cost and move of each vertex, and the probabilities that they were made for.
+        replans: how often the agent has replanned since the episode began.
     """
 
     graph: StoppingGraph
@@ -46,20 +50,21 @@ class Plan:
 
     @property
     def policy(self) -> NDArray[np.int64]:
-        """The action for each vertex, (n_vertices,) int64; worked out when asked for."""
+        """The action for each vertex, (n_vertices,) int64; computed when it is read."""
         moves: NDArray[np.int64] = best_moves(self.graph, self.labels.p_free, self.labels.cost)
         return moves
 
 
 class StaticAgent(SearchAgent[Plan]):
-    """`mdp-static`: plans once on the forecast and follows that plan, whatever it sees.
+    """`mdp-static`: plans once on the forecast and follows that plan, whatever it observes.
 
-    Where its slot turns out taken it tries again, since in the thesis's model the next try is as likely
-    to succeed as the first; T §3.4.4 introduces re-planning for that reason.
+    Where its slot turns out taken it repeats the attempt, since in the thesis's model the next one is as likely
+    to succeed as the first; T §3.4.4 introduces replanning for that reason.
 
     Args:
         problem: lot, goal, speeds and costs.
-        failure_s: cost of a failed try as the planner weighs it, s; the problem's own where None.
+        failure_s: s, what the planner believes a failed attempt to cost: a high one makes it careful. What the world
+            charges (`problem.failure_s`) where None.
         gamma: discount a decision.
         solver: one of `SOLVERS`.
 
@@ -91,7 +96,10 @@ class StaticAgent(SearchAgent[Plan]):
         self._suspect_s = least_s / (1.0 - gamma) if gamma < 1.0 else np.inf
 
     def solve(self, p_occupied: NDArray[np.floating]) -> Labels:
-        """The optimal plan for a belief, (n_slots,).
+        """Make the optimal plan for a belief.
+
+        Args:
+            p_occupied: (n_slots,) P(taken).
 
         Raises:
             InputError: the belief has the wrong shape or is no probability somewhere.
@@ -111,20 +119,34 @@ class StaticAgent(SearchAgent[Plan]):
         return labels
 
     def expected_time(self, p_occupied: NDArray[np.floating]) -> NDArray[np.float64]:
-        """What the model expects a search from each vertex to take, (n_vertices,) s."""
+        """Return the time, (n_vertices,) s, that the model expects a search from each vertex to take."""
         return self._mdp.expected_time(-self.solve(p_occupied).cost)
 
-    def begin(self, observation: Observation) -> Plan:
+    def begin(self, observation: Observation, belief: SlotBelief) -> Plan:
         """Plan on the forecast."""
-        return Plan(self._graph, self.solve(observation["p_occupied"]))
+        del observation
+        return Plan(self._graph, self.solve(belief.p_occupied))
 
-    def decide(self, observation: Observation, memory: Plan) -> int:
-        """What the plan says for this vertex."""
+    def decide(self, observation: Observation, belief: SlotBelief, memory: Plan) -> int:
+        """Follow the plan."""
+        del belief
         labels = memory.labels
         return int(best_move(self._graph, labels.p_free, labels.cost, int(observation["vertex"])))
 
+    def plan_preview(self, observation: Observation, action: int, memory: Plan) -> PlanPreview:
+        """Return the path along which the plan leads to a slot."""
+        labels, vertex = memory.labels, int(observation["vertex"])
+        path: list[int] = []
+        while len(path) < MOST_HOPS and action != PARK:
+            vertex = int(self.problem.lot.neighbors[vertex, action])
+            if vertex < 0 or vertex in path or vertex == observation["vertex"]:
+                break
+            path.append(vertex)
+            action = best_move(self._graph, labels.p_free, labels.cost, vertex)
+        return PlanPreview(tuple(path))
+
     def _settled(self, labels: Labels) -> Labels:
-        """A plan that label setting could not finish, since circling pays, by policy iteration."""
+        """Return the plan; by policy iteration where label setting did not terminate, since circling pays."""
         if labels.settled:
             return labels
         return by_policy_iteration(with_p_free(self._mdp, labels.p_free), labels)[0]
@@ -136,21 +158,21 @@ class StaticAgent(SearchAgent[Plan]):
 
 
 class ReplanningAgent(StaticAgent):
-    """`mdp`: the thesis's planner. It plans again after every sighting that changes a probability.
+    """`mdp`: the thesis's planner. It replans after every observation that changes a probability.
 
-    A change counts from `RELEVANT_CHANGE` on, or where a look makes a slot certain; ageing that adds up to as
-    much counts, too. The plan is mended where the changes reach, not made anew.
+    A change counts from `RELEVANT_CHANGE` on, or where an observation makes a slot certain; decay that adds up to as
+    much counts, too. The plan is repaired where the changes reach, not made from scratch.
 
-    It goes on until it has parked or the environment declares the lot proven full. Where nothing that it
-    can reach may be free, the model's best is to wait, and so does the agent.
+    It goes on until it has parked or the lot is proven full. Where no reachable slot may be free, waiting is optimal in
+    the model, and the agent waits.
     """
 
     name: ClassVar[str] = "mdp"
 
-    def decide(self, observation: Observation, memory: Plan) -> int:
-        """Plan again if the belief has changed, starting from the last plan; then follow the plan."""
+    def decide(self, observation: Observation, belief: SlotBelief, memory: Plan) -> int:
+        """Repair the plan if the belief has changed; then follow it."""
         labels = memory.labels
-        slots, p_free = _news(observation["p_occupied"], labels.p_free, RELEVANT_CHANGE)
+        slots, p_free = _changed_slots(belief.p_occupied, labels.p_free, RELEVANT_CHANGE)
         if len(slots):
             if self.solver == "policy_iteration":
                 labels.p_free[slots] = p_free
@@ -161,38 +183,38 @@ class ReplanningAgent(StaticAgent):
             memory.labels = labels
             memory.replans += 1
             self._check_discount(labels, float(labels.cost[observation["vertex"]]))
-        return super().decide(observation, memory)
+        return super().decide(observation, belief, memory)
 
 
 _BLOCK = 1024
-"""Slots compared at a time: a plain loop that finds most blocks unchanged runs at the memory's pace."""
+"""Slots compared at a time: a plain loop that finds most blocks unchanged is bound by memory alone."""
 
 
 @compiled
-def _news(
+def _changed_slots(
     p_occupied: NDArray[np.floating], planned: NDArray[np.float64], relevant: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Every slot whose probability is not the planned one, and what it is, if any has changed enough; else none.
+    """Return all slots whose probability differs from the planned one, and P(free), if one differs enough; else none.
 
-    A look that settles a slot counts however likely it was: else a nearly hopeless slot, found taken, would go on
-    being tried.
+    An observation that makes a slot certain counts however likely it was: else the agent would go on attempting a
+    nearly hopeless slot that it has found taken.
     """
     n = len(p_occupied)
     blocks, n_blocks, n_changed = np.empty(n // _BLOCK + 1, dtype=np.int64), 0, 0
     for start in range(0, n, _BLOCK):
-        believed, before, here = p_occupied[start : start + _BLOCK], planned[start : start + _BLOCK], 0
-        for k in range(len(believed)):
-            here += 1.0 - np.float64(believed[k]) != before[k]
-        if here:
+        now, before, n_here = p_occupied[start : start + _BLOCK], planned[start : start + _BLOCK], 0
+        for k in range(len(now)):
+            n_here += 1.0 - np.float64(now[k]) != before[k]
+        if n_here:
             blocks[n_blocks] = start
-            n_blocks, n_changed = n_blocks + 1, n_changed + here
+            n_blocks, n_changed = n_blocks + 1, n_changed + n_here
     slots, p_free = np.empty(n_changed, dtype=np.int64), np.empty(n_changed)
-    matters, i = False, 0
+    relevant_change, i = False, 0
     for start in blocks[:n_blocks]:
         for s in range(start, min(start + _BLOCK, n)):
             p = 1.0 - np.float64(p_occupied[s])
             if p != planned[s]:
                 slots[i], p_free[i] = s, p
-                matters |= abs(p - planned[s]) > relevant or p == 0.0 or p == 1.0
+                relevant_change |= abs(p - planned[s]) > relevant or p == 0.0 or p == 1.0
                 i += 1
-    return (slots, p_free) if matters else (slots[:0], p_free[:0])
+    return (slots, p_free) if relevant_change else (slots[:0], p_free[:0])

@@ -1,8 +1,9 @@
-"""`mdp-tuned`: the thesis's planner at the failure cost that its own forecast recommends.
+"""`mdp-tuned`: the thesis's planner at the failure cost that simulation recommends for its forecast.
 
-The failure cost is the one number of the thesis's planner that has no right value (T §4.3 shows 10 s to be too bold
-and 90 s too careful). Here it is chosen by simulation: worlds are drawn from the forecast alone, slots being
-independent and lasting, the planner searches all of them at each cost, and the cost with the least mean time wins.
+The failure cost is the one parameter of the thesis's planner that has no right value (T §4.3 shows 10 s to be too bold
+and 90 s too careful). Here it is chosen by simulation: worlds are drawn from the forecast alone, with slots that are
+independent and do not change, the planner searches all of them at each cost, and the cost with the least mean time
+wins.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
-from planners.agent import Observation, SearchAgent, require_sight
-from planners.belief.planning_graph import Ground
+from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
+from planners.belief.planning_graph import PlanningGraph
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.routes import DriveRoutes
 from planners.thesis.replanning import Plan, ReplanningAgent
@@ -27,7 +29,7 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 
 COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
-"""Failure costs, s, to choose from: twice as high each time."""
+"""s, failure costs to choose from: twice as high each time."""
 WORLDS = 128
 _MOST_STEPS = 2000
 _KEPT = 256
@@ -35,7 +37,7 @@ _KEPT = 256
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """What the simulation found.
+    """Result of the simulation.
 
     Attributes:
         costs: (k,) float64, s, the failure costs compared.
@@ -63,8 +65,8 @@ def tune_failure_cost(
 ) -> Tuning:
     """Simulate the thesis's planner in worlds drawn from a forecast.
 
-    Slots are seen without error when they come in view, and last; a lot seen to be full costs `give_up_s`. A large
-    lot is simulated where the search will take place (`Neighborhoods`), from the gate on where it starts far away.
+    Slots are observed without error when they come in view, and do not change; a lot that is proven full costs
+    `give_up_s`. A large lot is simulated in part, where the search will take place (`Neighborhoods`).
 
     Args:
         problem: lot, goal, speeds and costs.
@@ -73,7 +75,7 @@ def tune_failure_cost(
         costs: failure costs to compare, s, each above 0.
         worlds: how many worlds are drawn; the same ones for each cost.
         seed: of the worlds.
-        near: the part of the lot to simulate, with its drives; where None it is made.
+        near: the part of the lot to simulate; made where None.
 
     Raises:
         InputError: a cost or a number of worlds that is not positive, probabilities of a wrong number or size.
@@ -87,77 +89,83 @@ def tune_failure_cost(
     if worlds < 1:
         raise InputError(f"worlds is {worlds}, want at least 1")
     near = near or Neighborhoods(problem).toward(vertex)
-    here = near.place(vertex)
+    here = near.index(vertex)
+    start = here if here >= 0 else near.index(near.entry)
     p = p[near.slots]
     taken = np.random.default_rng(seed).random((worlds, len(p))) < p
-    ground = near.ground(problem, problem.failure_s)
-    return Tuning(tried, _mean_times(here if here >= 0 else near.place(near.gate), taken, p, tried, ground))
+    # What a failed attempt costs in these worlds; what the planner believes it to cost is what is compared.
+    graph = near.planning_graph(problem, problem.failure_s)
+    return Tuning(tried, _mean_times(start, taken, p, tried, graph))
 
 
 @compiled
 def _mean_times(
-    vertex: int, taken: NDArray[np.bool_], p_occupied: FloatArray, costs: FloatArray, ground: Ground
+    vertex: int, taken: NDArray[np.bool_], p_occupied: FloatArray, costs: FloatArray, graph: PlanningGraph
 ) -> FloatArray:
+    """Return the planner's mean total time, (k,) s, at each failure cost, in worlds, (n_worlds, n_slots) bool."""
     n_worlds, n = taken.shape
     mean = np.zeros(len(costs))
-    odds, seen = np.empty(n), np.empty(n, np.bool_)
+    odds, observed = np.empty(n), np.empty(n, np.bool_)
     for c in range(len(costs)):
         for w in range(n_worlds):
-            seen[:] = False
+            observed[:] = False
             for s in range(n):
                 odds[s] = p_occupied[s] / (1.0 - p_occupied[s]) if p_occupied[s] < 1.0 else np.inf
-            mean[c] += _search(vertex, taken[w], costs[c], ground, odds, seen) / n_worlds
+            mean[c] += _total_time(vertex, taken[w], costs[c], graph, odds, observed) / n_worlds
     return mean
 
 
 @compiled
-def _search(
+def _total_time(
     vertex: int,
     taken: NDArray[np.bool_],
     cost: float,
-    ground: Ground,
+    graph: PlanningGraph,
     odds: FloatArray,
-    seen: NDArray[np.bool_],
+    observed: NDArray[np.bool_],
 ) -> float:
-    """Total time, s, of the thesis's planner in one world; its belief, P(taken)/P(free), and memory are written to."""
-    total, unseen, found = 0.0, len(taken), False
+    """Return the total time, s, of the thesis's planner in one world.
+
+    Its belief, `odds` = P(taken)/P(free), and `observed` are changed in place.
+    """
+    total, n_unobserved, found = 0.0, len(taken), False
     for _ in range(_MOST_STEPS):
-        target, value = _promise(vertex, cost, ground, odds)
+        target, value = _best_target(vertex, cost, graph, odds)
         if target < 0 or not value < np.inf:
             break
-        if target == vertex and seen[target]:
-            return float(total + ground.walk_s[target])
+        if target == vertex and observed[target]:
+            return float(total + graph.cost_s[target])
         if target == vertex:
-            # The search begins before this slot: it tries without having looked.
+            # The search begins at this slot: an attempt without an observation.
             if not taken[target]:
-                return float(total + ground.walk_s[target])
-            total += ground.failure_s
+                return float(total + graph.cost_s[target])
+            total += graph.failure_s
         else:
-            following = int(ground.following[vertex, target])
-            total += ground.seconds[vertex, following]
+            following = int(graph.next_vertex[vertex, target])
+            total += graph.drive_s[vertex, following]
             vertex = following
-        for i in range(ground.view_starts[vertex], ground.view_starts[vertex + 1]):
-            s = ground.view_slots[i]
-            if not seen[s]:
-                seen[s] = True
-                unseen -= 1
+        for i in range(graph.view_starts[vertex], graph.view_starts[vertex + 1]):
+            s = graph.views[i].slot
+            if not observed[s]:
+                observed[s] = True
+                n_unobserved -= 1
                 found = found or not taken[s]
                 odds[s] = np.inf if taken[s] else 0.0
-        if unseen == 0 and not found:
+        if n_unobserved == 0 and not found:
             break
-    return total + ground.give_up_s
+    return total + graph.give_up_s
 
 
 @compiled
-def _promise(vertex: int, cost: float, ground: Ground, odds: FloatArray) -> tuple[int, float]:
-    """The slot that the thesis's planner drives to, and the time, s, that it expects.
+def _best_target(vertex: int, cost: float, graph: PlanningGraph, odds: FloatArray) -> tuple[int, float]:
+    """Return the slot that the thesis's planner drives to, and the time, s, that it expects.
 
-    With γ = 1 its plan is to drive to one slot and to try until it is free: drive + walk + cost·(1 - p)/p.
+    With γ = 1 its plan is to drive to one slot and to attempt until it is free: drive + arrival cost + cost·(1 - p)/p.
     """
     best, chosen = np.inf, -1
-    row = ground.seconds[vertex]
+    drive_s = graph.drive_s[vertex]
     for s in range(len(odds)):
-        value = row[s] + ground.walk_s[s] + cost * odds[s]
+        value = drive_s[s] + graph.cost_s[s] + cost * odds[s]
         if value < best:
             best, chosen = value, s
     return chosen, best
@@ -165,21 +173,21 @@ def _promise(vertex: int, cost: float, ground: Ground, odds: FloatArray) -> tupl
 
 @dataclass
 class TunedPlan:
-    """What the tuned planner remembers.
+    """Memory of the tuned planner.
 
     Attributes:
         failure_s: s, the failure cost that it chose.
-        gate: the vertex that it drives to before it follows its plan, or -1.
-        plan: the thesis's planner's own memory.
+        entry: the vertex that it drives to before it follows its plan, or -1.
+        plan: memory of the thesis's planner.
     """
 
     failure_s: float
-    gate: int
+    entry: int
     plan: Plan
 
     @property
     def replans(self) -> int:
-        """How often it has planned anew since the episode began."""
+        """How often it has replanned since the episode began."""
         return self.plan.replans
 
     @property
@@ -189,9 +197,9 @@ class TunedPlan:
 
 
 class TunedAgent(SearchAgent[TunedPlan]):
-    """`mdp-tuned`: at the arrival chooses its failure cost for the forecast, then is the thesis's planner.
+    """`mdp-tuned`: chooses a failure cost for the forecast on arrival, then is the thesis's planner.
 
-    On a lot too large to be simulated it first drives to the gate of the part that was.
+    On a lot too large to be simulated it first drives to the entry of the part that was.
 
     Args:
         problem: lot, goal, speeds and costs.
@@ -215,7 +223,7 @@ class TunedAgent(SearchAgent[TunedPlan]):
         most_vertices: int = MOST_VERTICES,
     ) -> None:
         super().__init__(problem)
-        require_sight(self.name, problem)
+        require_observations(self.name, problem)
         if worlds < 1:
             raise InputError(f"worlds is {worlds}, want at least 1")
         self.worlds, self.seed, self.gamma = worlds, seed, gamma
@@ -225,8 +233,8 @@ class TunedAgent(SearchAgent[TunedPlan]):
         self._tuned: OrderedDict[tuple[int, bytes], Tuning] = OrderedDict()
 
     def tuning(self, p_occupied: NDArray[np.floating], vertex: int) -> Tuning:
-        """The simulation for a forecast, (n_slots,), and an entry; kept for the next search like it."""
-        # To the percent: arrivals within minutes of each other have the same forecast.
+        """Return the simulation for a forecast, (n_slots,), and a start; kept for the next search like it."""
+        # To the percent, so that arrivals within minutes of each other share one.
         near = self._neighborhoods.toward(vertex)
         rounded = np.round(np.asarray(p_occupied, dtype=np.float64), 2)
         key = vertex, rounded[near.slots].tobytes()
@@ -243,21 +251,27 @@ class TunedAgent(SearchAgent[TunedPlan]):
                 self._tuned.popitem(last=False)
         return self._tuned[key]
 
-    def begin(self, observation: Observation) -> TunedPlan:
-        """Choose the failure cost, and plan at it."""
+    def begin(self, observation: Observation, belief: SlotBelief) -> TunedPlan:
+        """Choose the failure cost, and plan with it."""
         vertex = int(observation["vertex"])
-        best = self.tuning(observation["p_occupied"], vertex).best
+        best = self.tuning(belief.p_occupied, vertex).best
         if best not in self._planners:
             self._planners[best] = ReplanningAgent(self.problem, failure_s=best, gamma=self.gamma)
         near = self._neighborhoods.toward(vertex)
-        gate = near.gate if near.place(vertex) < 0 else -1
-        return TunedPlan(best, gate, self._planners[best].begin(observation))
+        entry = near.entry if near.index(vertex) < 0 else -1
+        return TunedPlan(best, entry, self._planners[best].begin(observation, belief))
 
-    def decide(self, observation: Observation, memory: TunedPlan) -> int:
-        """As the thesis's planner at the chosen cost, from the gate on."""
+    def decide(self, observation: Observation, belief: SlotBelief, memory: TunedPlan) -> int:
+        """Decide as the thesis's planner at the chosen cost, from the entry on."""
         vertex = int(observation["vertex"])
-        if vertex == memory.gate:
-            memory.gate = -1
-        if memory.gate >= 0:
-            return self._routes.move_toward(vertex, memory.gate)
-        return self._planners[memory.failure_s].decide(observation, memory.plan)
+        if vertex == memory.entry:
+            memory.entry = -1
+        if memory.entry >= 0:
+            return self._routes.move_toward(vertex, memory.entry)
+        return self._planners[memory.failure_s].decide(observation, belief, memory.plan)
+
+    def plan_preview(self, observation: Observation, action: int, memory: TunedPlan) -> PlanPreview:
+        """Return the route to the entry, or the plan at the chosen cost."""
+        if memory.entry >= 0:
+            return PlanPreview(self._routes.path(int(observation["vertex"]), memory.entry))
+        return self._planners[memory.failure_s].plan_preview(observation, action, memory.plan)

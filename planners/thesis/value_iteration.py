@@ -14,9 +14,9 @@ FloatArray = NDArray[np.float64]
 
 
 def value_iteration(mdp: ParkingMDP, *, tolerance: float = 1e-9, max_iterations: int = 2_000_000) -> Solution:
-    """Apply Bellman's update until no value can be farther than `tolerance` from the optimum.
+    """Apply the Bellman update until no value is farther than `tolerance` from the optimum.
 
-    Slow where gamma is near 1 and little is free, and independent of the other solvers: it is there to
+    It is slow where gamma is near 1 and little is free, and independent of the other solvers: it is there to
     check them.
 
     Args:
@@ -32,7 +32,7 @@ def value_iteration(mdp: ParkingMDP, *, tolerance: float = 1e-9, max_iterations:
     if not tolerance > 0.0:
         raise InputError(f"tolerance is {tolerance}, want above 0")
     rewards, successors, continuation = mdp.rewards(), mdp.successors(), mdp.continuation()
-    # Starting below the optimum, from trying here for ever, keeps γ = 1 from settling on a bonus nobody earns.
+    # Starting below the optimum, from attempts here for ever: at γ = 1 values above it could be fixed points, too.
     with np.errstate(divide="ignore", invalid="ignore"):
         retry = rewards[:, -1] / (1.0 - continuation[:, -1])
     values = np.where(
@@ -41,7 +41,7 @@ def value_iteration(mdp: ParkingMDP, *, tolerance: float = 1e-9, max_iterations:
     step = tolerance if mdp.gamma == 1.0 else tolerance * (1.0 - mdp.gamma) / mdp.gamma
     sweeps = _sweep_until(values, rewards, successors, continuation, step, max_iterations)
     if sweeps > max_iterations:
-        raise RuntimeError(f"value iteration did not settle within {max_iterations} sweeps")
+        raise RuntimeError(f"value iteration did not converge within {max_iterations} sweeps")
     return Solution(values, mdp.action_values(values).argmax(axis=1), sweeps)
 
 
@@ -61,7 +61,7 @@ def _sweep_until(
             best = -np.inf
             for a in range(n_actions):
                 best = max(best, rewards[s, a] + continuation[s, a] * values[successors[s, a]])
-            # Rounding moves a value by about an ulp for ever: that is no change.
+            # Rounding changes values by an ulp for ever: that does not count.
             moved = abs(best - values[s])
             if moved > 4e-16 * abs(best):
                 change = max(change, moved)

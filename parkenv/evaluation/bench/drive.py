@@ -1,4 +1,4 @@
-"""How fast driving is simulated and parking is planned, on one core."""
+"""Benchmark of driving simulation and parking planning, on one core."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from parkenv.driving.lot_space import LotSpace
+from parkenv.driving.collision_world import CollisionWorld
 from parkenv.driving.parking_task import ParkingTasks
 from parkenv.driving.vehicle import advance
 from parkenv.envs.drive import SUBSTEPS
@@ -20,18 +20,18 @@ from parkenv.lots import packaged_lot
 from planners.driving.parking import ParkingAgent
 
 STEPS = 100
-"""Steps of an environment from one reset to the next."""
+"""Steps of an environment between two resets."""
 
 
 def drive_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
-    """Rows of `parkenv bench drive`: steps of the physics, environments included, and planning.
+    """Return the rows of `parkenv bench drive`: physics steps, environment steps and planning.
 
-    A step of the physics is 0.05 s of ours, with pymunk's step and contacts in it, and 1/15 s of highway-env's
-    parking. Resets are not counted in.
+    A physics step is 0.05 s here, pymunk's step and contacts included, and 1/15 s in highway-env's parking. Resets
+    are not counted.
 
     Args:
         seed: of the tasks and the actions.
-        seconds: how long each figure is measured.
+        seconds: duration of each measurement.
     """
     rows = rate("drive", "car and pymunk alone", bare_physics(seed, seconds), "physics steps/s")
     peers = {}
@@ -46,16 +46,16 @@ def drive_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     for lot in ("campus", "street"):
         reset, plan = reset_and_plan(lot, seed, seconds)
         rows += duration("drive", f"reset, {lot}", 1e3 * reset, "ms")
-        rows += duration("drive", f"plan of the planner, {lot}", 1e3 * plan, "ms")
+        rows += duration("drive", f"plan, {lot}", 1e3 * plan, "ms")
     if not peers:
         rows += absent("drive", "highway-env parking-v0: not installed", "physics steps/s")
     return rows
 
 
 def bare_physics(seed: int, seconds: float) -> float:
-    """Steps a second of a car that drives to and fro among parked ones, contacts told."""
+    """Return steps per second of a car that drives back and forth among parked ones, with contacts."""
     task = ParkingTasks(packaged_lot("campus")).draw(seed)
-    space, limits = LotSpace(task.vehicle, task.obstacles), task.vehicle.limits
+    space, limits = CollisionWorld(task.vehicle, task.obstacles), task.vehicle.limits
     state = task.start.copy()
 
     def work(i: int) -> None:
@@ -68,15 +68,15 @@ def bare_physics(seed: int, seconds: float) -> float:
 
 
 def environment_steps(arguments: dict[str, Any], seed: int, seconds: float) -> float:
-    """Steps a second of `parkenv/Drive-v1` as `gymnasium.make` gives it, two of the physics in each."""
+    """Return steps per second of `parkenv/Drive-v1`, each of two physics steps."""
     env = gym.make("parkenv/Drive-v1", disable_env_checker=True, **arguments)
     env.reset(seed=seed)
     return _steps(env, _pedalling(seed), seconds)
 
 
 def highway_parking(seed: int, seconds: float) -> float:
-    """Steps of the physics a second of highway-env's parking-v0, fifteen of which are a second."""
-    import_module("highway_env")  # which registers its environments
+    """Return physics steps per second of highway-env's parking-v0, each of 1/15 s."""
+    import_module("highway_env")  # registers its environments
     env = gym.make("parking-v0", disable_env_checker=True)
     env.reset(seed=seed)
     config = env.unwrapped.config  # type: ignore[attr-defined]
@@ -85,7 +85,7 @@ def highway_parking(seed: int, seconds: float) -> float:
 
 
 def reset_and_plan(lot: str, seed: int, seconds: float) -> tuple[float, float]:
-    """Median time, s, of a reset, and of a plan from where it starts."""
+    """Return the median times, s, of a reset, and of a plan from its start."""
     env = gym.make("parkenv/Drive-v1", lot=lot, obstacle_map=True, disable_env_checker=True)
     agent = ParkingAgent()
     reset = seconds_each(lambda i: env.reset(seed=seed + i), seconds, least=20)
@@ -104,7 +104,7 @@ def _pedalling(seed: int) -> Callable[[int], Any]:
 
 
 def _steps(env: gym.Env[Any, Any], action: Callable[[int], Any], seconds: float) -> float:
-    """Steps a second, the median of runs of up to `STEPS`."""
+    """Return steps per second, the median over runs of up to `STEPS`."""
     rates: list[float] = []
     actions = [action(i) for i in range(STEPS)]
     end = time.perf_counter() + seconds

@@ -1,4 +1,4 @@
-"""How many steps a second environments take, beside others'."""
+"""Benchmark of environment steps, with peers."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ _BLOCK = 200
 _DRAWN = 100
 
 Stepper = Callable[[], int]
-"""Takes some steps, and returns how many."""
+"""Runs some steps; returns their number."""
 
 
 def env_rows(
     seed: int = 0, seconds: float = 0.6, *, batch: int = BATCH, large: int = LARGE
 ) -> list[BenchRow]:
-    """Rows of `parkenv bench env`, on one core; all take random actions.
+    """Return the rows of `parkenv bench env`, on one core, with random actions.
 
-    A step is a whole `step()` of one environment, be it in a batch, with all that comes with it: observations, infos,
-    and new episodes where old ones end. Actions are drawn beforehand for all alike. Gymnasium's CartPole batch is
-    numpy on four numbers an environment, and so has no world to draw, nor a belief to keep.
+    A step is a whole `step()` of one environment, alone or in a batch: observations, infos and automatic resets
+    included. Actions are drawn beforehand. Gymnasium's CartPole batch is numpy on four numbers per environment, without
+    a world to simulate or a belief to maintain.
 
-    Steppers take turns, and each is judged by the median of its turns' rates, in seconds of this process: so a machine
-    that is busy with something else slows all of them alike.
+    Environments take turns, and each is rated by the median over its turns, in CPU seconds of this process, so that
+    other load on the machine affects all alike.
 
     Args:
         seed: of worlds and actions.
-        seconds: how long each figure is measured.
+        seconds: duration of each measurement.
         batch: searches in a batch.
         large: slots of the large lot.
     """
@@ -88,7 +88,7 @@ def _ours(scenario: Scenario, batch: int, observation: str, copy: bool) -> ParkS
 
 
 def batch_stepper(envs: gym.vector.VectorEnv[Any, Any, Any], n_actions: int, seed: int) -> Stepper:
-    """Random actions in a batch."""
+    """Step a batch with random actions."""
     actions = np.random.default_rng(seed).integers(0, n_actions, (_DRAWN, envs.num_envs))
     envs.reset(seed=seed)
 
@@ -101,7 +101,7 @@ def batch_stepper(envs: gym.vector.VectorEnv[Any, Any, Any], n_actions: int, see
 
 
 def single_stepper(env: gym.Env[Any, Any], seed: int) -> Stepper:
-    """Random actions in one environment, begun anew whenever it ends."""
+    """Step one environment with random actions, with a reset after each episode."""
     env.action_space.seed(seed)
     actions = [env.action_space.sample() for _ in range(10 * _BLOCK)]
     env.reset(seed=seed)
@@ -117,7 +117,7 @@ def single_stepper(env: gym.Env[Any, Any], seed: int) -> Stepper:
 
 
 def installed_peers(batch: int, seed: int) -> tuple[dict[str, Stepper], list[str]]:
-    """Environments of other packages, where these are installed, and the names of those that are not."""
+    """Return steppers of installed peers, and the names of missing ones."""
     found: dict[str, Stepper] = {}
     missing: list[str] = []
     for package, env_id in (("highway_env", "parking-v0"), ("minigrid", "MiniGrid-Empty-8x8-v0")):
@@ -145,11 +145,11 @@ def installed_peers(batch: int, seed: int) -> tuple[dict[str, Stepper], list[str
 
 
 def measured(steppers: dict[str, Stepper], seconds: float) -> dict[str, float]:
-    """Steps a second of each."""
+    """Return steps per second of each."""
     rates: dict[str, list[float]] = {name: [] for name in steppers}
     spent = dict.fromkeys(steppers, 0.0)
     for step in steppers.values():
-        step()  # compiles, and leaves the beginning, when all searches are of one age
+        step()  # compiles, and ends the start phase in which all searches have the same age
     while not all(rates.values()) or min(spent.values()) < seconds:
         for name, step in steppers.items():
             if rates[name] and spent[name] >= seconds:

@@ -1,4 +1,4 @@
-"""How fast plans are made and mended, beside general solvers of Markov decision processes, and cities are searched."""
+"""Benchmark of planning and replanning against general MDP solvers, and of searches in cities."""
 
 from __future__ import annotations
 
@@ -43,25 +43,25 @@ CITY = 1_000_000
 CITY_SEARCHES = 3
 """Searches of each agent there."""
 PATIENCE_S = 60.0
-"""A peer that is expected to take longer than this on a lot is not measured there."""
+"""Peers expected to take longer on a lot are not measured there."""
 MDPTOOLBOX_STATES = 5_000
-"""pymdptoolbox checks its input by a dense matrix of all states by all states, however sparse that is."""
+"""pymdptoolbox checks its input with a dense matrix of states by states."""
 LONG_S = 2.0
-"""A solver that takes longer than this is timed once, where others are timed for as long as was asked for."""
+"""Slower solvers are timed once."""
 EPSILON = 0.01
-"""How near to the optimum, s, the values of iterative peers must come."""
+"""Tolerance, s, of the values of iterative peers."""
 
 
 def planning_rows(
     seed: int = 0, seconds: float = 0.6, *, lot: ParkingLot | None = None, largest: int = SIZES[-1]
 ) -> list[BenchRow]:
-    """Rows of `parkenv bench planning`, on one core.
+    """Return the rows of `parkenv bench planning`, on one core.
 
     Args:
-        seed: of the cities and of what is found on the way.
-        seconds: how long each figure is measured.
-        lot: where re-planning is measured; the packaged campus where None.
-        largest: slots of the largest city that is planned, and of the one that is driven in at most.
+        seed: of the cities and of the observations.
+        seconds: duration of each measurement.
+        lot: for replanning; the packaged campus where None.
+        largest: slots of the largest city.
     """
     sizes = [n for n in SIZES if n <= largest]
     return [
@@ -72,7 +72,7 @@ def planning_rows(
 
 
 def solving_rows(sizes: list[int], seed: int, seconds: float) -> list[BenchRow]:
-    """A plan from scratch for cities of growing size, and how its time grows.
+    """Measure planning from scratch in cities of growing size, and its growth.
 
     Raises:
         AssertionError: a peer's plan is not as good as ours.
@@ -96,7 +96,7 @@ def solving_rows(sizes: list[int], seed: int, seconds: float) -> list[BenchRow]:
             policy, took = _timed(solve, seconds)
             _require_optimal(name, mdp, labels, policy)
             theirs[name] = 1e3 * took
-            # They grow faster than the lot does, which grows tenfold: as they did last, or a little over that.
+            # They grow faster than the lot, which grows tenfold: at least as fast as last time.
             expected[name] = took * max(12.0, took / measured.get(name, took))
             measured[name] = took
         rows += duration("plan", f"city, {n:,} vertices", 1e3 * ours, "ms", **theirs)
@@ -108,7 +108,7 @@ def solving_rows(sizes: list[int], seed: int, seconds: float) -> list[BenchRow]:
 
 
 def repair_rows(lot: ParkingLot, seed: int, seconds: float) -> list[BenchRow]:
-    """Planning again after each slot that was seen on the way; the peers plan afresh, or by policy iteration."""
+    """Measure replanning after each observed slot; peers plan from scratch, or by policy iteration."""
     mdp = forecast_process(lot, seed)
     graph = StoppingGraph.of(mdp)
     repair(graph, settle(graph, mdp.p_free.copy()), np.array([0]), np.ones(1))
@@ -127,16 +127,16 @@ def repair_rows(lot: ParkingLot, seed: int, seconds: float) -> list[BenchRow]:
     seen[: lot.n_slots // 20] = 0.0
     after = with_p_free(mdp, seen)
     warm = 1e6 * seconds_each(lambda _: by_policy_iteration(after, known), seconds)
-    peers = {"fresh pass": fresh, "policy iteration, from the last plan": warm}
-    case = f"after a sighting; {lot.name}, {lot.n_vertices} vertices"
+    peers = {"plan from scratch": fresh, "policy iteration from the last plan": warm}
+    case = f"after an observation; {lot.name}, {lot.n_vertices} vertices"
     return [
-        *duration("plan again", f"{case}: median", 1e6 * float(np.median(times)), "µs", **peers),
-        *duration("plan again", f"{case}: 99 %", 1e6 * float(np.quantile(times, 0.99)), "µs", **peers),
+        *duration("replan", f"{case}: median", 1e6 * float(np.median(times)), "µs", **peers),
+        *duration("replan", f"{case}: 99 %", 1e6 * float(np.quantile(times, 0.99)), "µs", **peers),
     ]
 
 
 def city_rows_apart(n_slots: int, seed: int) -> list[BenchRow]:
-    """`city_rows` in a process of its own, so that the memory is that of the searches."""
+    """Run `city_rows` in a process of its own, to measure its memory alone."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as apart:
         return apart.submit(city_rows, n_slots, seed).result()
 
@@ -144,12 +144,12 @@ def city_rows_apart(n_slots: int, seed: int) -> list[BenchRow]:
 def city_rows(
     n_slots: int, seed: int, agents: Sequence[str] = ("mdp", "mdp-tuned", "belief")
 ) -> list[BenchRow]:
-    """Searches through a city: what an agent takes to set out and to decide, and the memory of the process at its peak.
+    """Measure searches in a city: an agent's time for the first and for later decisions, and peak memory.
 
     Args:
         n_slots: of the city.
         seed: of the city and of the worlds.
-        agents: who searches, by name.
+        agents: names of the agents.
     """
     scenario = make_scenario(city_lot(n_slots, seed))
     env = gym.make("parkenv/Search-v1", scenario=scenario)
@@ -162,18 +162,16 @@ def city_rows(
             first.append(times[0])
             decisions += times[1:]
         case = f"{name}, city, {n_slots:,} slots"
-        rows += duration("search", f"{case}: the first plan", float(np.median(first)), "s")
-        rows += duration("search", f"{case}: a decision, median", 1e3 * float(np.median(decisions)), "ms")
-        rows += duration(
-            "search", f"{case}: a decision, 99 %", 1e3 * float(np.quantile(decisions, 0.99)), "ms"
-        )
+        rows += duration("search", f"{case}: first plan", float(np.median(first)), "s")
+        rows += duration("search", f"{case}: decision, median", 1e3 * float(np.median(decisions)), "ms")
+        rows += duration("search", f"{case}: decision, 99 %", 1e3 * float(np.quantile(decisions, 0.99)), "ms")
     if memory_gib := peak_memory_gib():
-        rows += duration("search", f"city, {n_slots:,} slots: memory at most", memory_gib, "GiB")
+        rows += duration("search", f"city, {n_slots:,} slots: peak memory", memory_gib, "GiB")
     return rows
 
 
 def peak_memory_gib() -> float | None:
-    """The most memory that this process has had so far; None where the system does not tell."""
+    """Return this process's peak memory; None where the system does not report it."""
     if find_spec("resource") is None:
         return None
     import resource
@@ -186,7 +184,7 @@ def peak_memory_gib() -> float | None:
 def drive(
     graph: StoppingGraph, labels: Labels, n_slots: int, rng: np.random.Generator
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """The sightings of one drive by the plan: each slot passed, and whether it is free, rarer than believed."""
+    """Yield the observations of a drive along the plan: slots passed, less often free than believed."""
     vertex = int(rng.integers(len(labels.cost)))
     seen: set[int] = set()
     for _ in range(1000):
@@ -201,14 +199,14 @@ def drive(
 
 
 def forecast_process(lot: ParkingLot, seed: int) -> ParkingMDP:
-    """What the planner faces who arrives on a typical working day."""
+    """Build the planning problem of an arrival on a typical working day."""
     scenario = make_scenario(lot)
     arrival = scenario.occupancy.draw_arrival(scenario.arrival, np.uint64(seed))
     return ParkingMDP.from_belief(scenario, scenario.forecast(arrival).p_occupied)
 
 
 def peers(n_states: int) -> dict[str, Callable[[ParkingMDP], Solver]]:
-    """Other solvers that are installed, each made ready for a process; what is timed returns a policy."""
+    """Return the installed peers, each a function that prepares a solver for a process."""
     found: dict[str, Callable[[ParkingMDP], Solver]] = {
         "policy iteration, sparse LU": lambda mdp: lambda: policy_iteration(mdp).policy
     }
@@ -246,7 +244,7 @@ def pymdptoolbox_solver(mdp: ParkingMDP) -> Solver:
     matrices = [vstack([by_pair[a : n * n_actions : n_actions], stay]).tocsr() for a in range(n_actions)]
     reward = np.vstack([mdp.rewards(), np.zeros(n_actions)])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of how it checks its input
+        warnings.simplefilter("ignore")  # about its input checks
         process: Any = import_module("mdptoolbox.mdp").ValueIteration(
             matrices, reward, mdp.gamma, epsilon=EPSILON, max_iter=1_000_000
         )
@@ -260,7 +258,7 @@ def pymdptoolbox_solver(mdp: ParkingMDP) -> Solver:
 
 
 def transitions(mdp: ParkingMDP) -> csr_matrix[np.float64]:
-    """Probabilities, (5n + 1, n + 1), a row for each state and action, and one for the goal, the last state."""
+    """Build the transition matrix, (5n + 1, n + 1), a row per state and action, the goal last."""
     n, successors = mdp.n_states, mdp.successors()
     n_actions = successors.shape[1]
     pair = np.arange(n * n_actions)
@@ -275,7 +273,7 @@ def transitions(mdp: ParkingMDP) -> csr_matrix[np.float64]:
 
 
 def _timed(solve: Solver, seconds: float) -> tuple[NDArray[np.int64], float]:
-    """A policy and the time it takes, s; what takes long is done once, not over and over."""
+    """Return a policy and the time to compute it, s; slow solvers run once."""
     start = time.perf_counter()
     policy = solve()
     once = time.perf_counter() - start
@@ -286,4 +284,4 @@ def _require_optimal(name: str, mdp: ParkingMDP, labels: Labels, policy: NDArray
     q = mdp.action_values(-labels.cost)
     lost = float((q.max(axis=1) - q[np.arange(mdp.n_states), policy]).max())
     if lost > EPSILON:
-        raise AssertionError(f"{name}: an action of its plan loses {lost:g} s against ours")
+        raise AssertionError(f"{name}: an action of its plan costs {lost:g} s more than ours")

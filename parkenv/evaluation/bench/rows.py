@@ -1,4 +1,4 @@
-"""Rows of a table of throughputs, and the stop-watch behind them."""
+"""Rows of the benchmark table, and timing."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 
 
 class BenchRow(TypedDict):
-    """One figure, and that of a peer in the same run.
+    """One measured value, and that of a peer in the same run.
 
     Keys:
-        part, case: what was measured, and on what.
-        value, unit: the figure; None where nothing was measured, the case says why.
-        peer, peer_value: what else does the same job, and its figure; None where there is none.
-        ratio: ours over the peer's, above 1 means that we are faster.
+        part, case: what was measured, and on which input.
+        value, unit: the value; None where nothing was measured, for a reason given in the case.
+        peer, peer_value: other software for the same task, and its value; None where there is none.
+        ratio: above 1 where ours is faster.
     """
 
     part: str
@@ -29,14 +29,14 @@ class BenchRow(TypedDict):
 
 
 def rate(part: str, case: str, value: float, unit: str, **peers: float) -> list[BenchRow]:
-    """A row for each peer, of a figure that is better the larger it is; one row without a peer.
+    """Return a row per peer for a value of which more is better; one row without peers.
 
     Args:
         part: what was measured.
-        case: on what.
-        value: how many a second.
-        unit: of what, as in `scans/s`.
-        peers: the same figure of other ways.
+        case: on which input.
+        value: per second.
+        unit: such as `scans/s`.
+        peers: the same value of others.
     """
     if not peers:
         return [_row(part, case, value, unit, None, None, None)]
@@ -44,14 +44,14 @@ def rate(part: str, case: str, value: float, unit: str, **peers: float) -> list[
 
 
 def duration(part: str, case: str, value: float, unit: str, **peers: float) -> list[BenchRow]:
-    """As `rate`, of a figure that is better the smaller it is."""
+    """Return rows as `rate` does for a value of which less is better."""
     if not peers:
         return [_row(part, case, value, unit, None, None, None)]
     return [_row(part, case, value, unit, name, other, other / value) for name, other in peers.items()]
 
 
 def absent(part: str, case: str, unit: str) -> list[BenchRow]:
-    """The row of something that could not be measured."""
+    """Return the row of a value that could not be measured."""
     return [_row(part, case, None, unit, None, None, None)]
 
 
@@ -70,12 +70,12 @@ def _row(
 
 
 def seconds_each(work: Callable[[int], object], seconds: float = 0.6, least: int = 3) -> float:
-    """Median time, s, of `work(i)` for i = 0, 1, ...; the first call warms up and is left out.
+    """Return the median time, s, of `work(i)` for i = 0, 1, ...; the first call is a warm-up.
 
     Args:
-        work: what is timed.
-        seconds: how long to go on.
-        least: how many calls are timed at least.
+        work: the timed function.
+        seconds: for how long to repeat.
+        least: least number of timed calls.
     """
     work(0)
     times: list[float] = []

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.agent_spec import label_of
+from parkenv.evaluation.experiments.agent_spec import AgentSpec, label_of
 from parkenv.evaluation.experiments.episodes import EpisodeRunner, SearchTrace
 from parkenv.evaluation.experiments.results import SETTING_COLUMNS, ResultFolder, Row, episode_key
 from parkenv.evaluation.experiments.statistics import mean_interval, summarize
@@ -184,16 +184,18 @@ def run_cases(
                 warnings.warn(message, stacklevel=2)
 
 
-def rows_of(names: Sequence[str], scenario: Scenario, seeds: Sequence[int], workers: Workers) -> list[Row]:
+def rows_of(
+    agents: Sequence[AgentSpec], scenario: Scenario, seeds: Sequence[int], workers: Workers
+) -> list[Row]:
     """A row for each agent, as `table` has them, of searches of which nothing else is kept."""
-    cases = [Case(scenario, name) for name in names]
+    cases = [Case(scenario, agent.name, options=agent.options) for agent in agents]
     blocks = [(case, block) for case in cases for block in _blocks(seeds, 5 * BLOCK)]
-    episodes: dict[str, list[Row]] = {case.agent: [] for case in cases}
+    episodes: dict[str, list[Row]] = {case.label: [] for case in cases}
     for number, (rows, _) in workers.results([partial(case.run, block) for case, block in blocks]):
-        episodes[blocks[number][0].agent] += rows
+        episodes[blocks[number][0].label] += rows
     by_seed = {name: sorted(rows, key=lambda row: row["seed"]) for name, rows in episodes.items()}
-    first = by_seed[names[0]]
-    return [summarize(c.columns, by_seed[c.agent], None if i == 0 else first) for i, c in enumerate(cases)]
+    first = by_seed[cases[0].label]
+    return [summarize(c.columns, by_seed[c.label], None if i == 0 else first) for i, c in enumerate(cases)]
 
 
 def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:

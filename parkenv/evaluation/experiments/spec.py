@@ -13,10 +13,12 @@ from parkenv.files.spec_file import Axis, FilePath, Several, Spec
 from parkenv.scenarios.spec import (
     SCENARIO_NAMES,
     Cost,
+    Hours,
     Probability,
     RigName,
     ScenarioSpec,
     Speed,
+    TrafficSpec,
     scenario_spec,
 )
 
@@ -151,3 +153,83 @@ class BenchmarkSpec(Workplace):
         min_length=1,
         max_length=1_000,
     )
+
+
+BUSY = TrafficSpec(cars=3, pedestrians=5)
+"""Traffic where sensors are simulated and the scenario names none."""
+Weather = Literal["sunny", "overcast", "low_sun", "dusk", "rain"]
+CaptureDistance = Annotated[float, Field(ge=0.1, le=1_000.0)]
+"""m between captures."""
+
+
+class SurveySpec(Workplace):
+    """Drives past every slot with simulated sensors, into a map file."""
+
+    kind: Literal["survey"] = "survey"
+    scenario: ScenarioItem = scenario_spec("campus")
+    sessions: int = Field(6, ge=1, le=100_000)
+    rig: RigName | None = Field(None, description="The scenario's if absent.")
+    detector: str = Field("hog", description="hog, side, front, a model file (.npz) or MODULE:CLASS.")
+    hours: Several[Hours] = Field(
+        ("08:00-10:00", "11:00-14:00", "16:00-18:00"), min_length=1, max_length=1_000,
+        description="When drives begin, one window after the other, on the scenario's days.",
+    )  # fmt: skip
+    weather: Weather | None = Field(None, description="Drawn for each session if absent.")
+    every: CaptureDistance = 1.25
+    pose_noise: float = Field(0.0, ge=0.0, le=100.0, description="Localisation error of the car, m.")
+    seed: int = Field(0, ge=0, lt=2**31)
+
+
+class DemoSpec(Workplace):
+    """A survey, the map that it gives, and searches on other days with this map."""
+
+    kind: Literal["demo"] = "demo"
+    scenario: ScenarioItem = scenario_spec("campus")
+    sessions: int = Field(4, ge=1, le=100_000)
+    episodes: int = Field(6, ge=2, le=MAX_EPISODES, description="Searches of each agent.")
+    every: CaptureDistance = 2.5
+    detector: str = "hog"
+    seed: int = Field(0, ge=0, lt=2**31)
+
+
+class TrainingSpec(Workplace):
+    """Training by reinforcement learning, one model for each seed; values that are absent are the environment's."""
+
+    kind: Literal["train"] = "train"
+    env: Literal["search", "drive"] = Field("search", description="Search for a slot, or drive into one.")
+    algorithm: str | None = Field(None, description="maskable-ppo for search, ppo for drive if absent.")
+    scenarios: Several[ScenarioItem] | None = Field(
+        None, min_length=1, max_length=1_000, description="Trained on in turns; evaluations use the first."
+    )
+    test_on: Several[ScenarioItem] | None = Field(
+        None, min_length=1, max_length=1_000, description="Tested on in the end; the same if absent."
+    )
+    steps: int | None = Field(None, ge=1, le=10**12, description="Decisions of a training.")
+    seeds: int = Field(5, ge=1, le=10_000, description="How many trainings.")
+    seed: int = Field(0, ge=0, lt=2**31, description="Of the first.")
+    clone: str | None = Field(
+        None, description="Behaviour cloning of this planner first (search; ppo, maskable-ppo)."
+    )
+    demonstrations: int | None = Field(
+        None, ge=1, le=MAX_EPISODES, description="Searches of the planner to clone."
+    )
+    k: int | None = Field(None, ge=1, le=1_000, description="Slots in an observation (search).")
+    evaluate_every: int | None = Field(None, ge=1, le=10**12, description="Decisions between evaluations.")
+    evaluation_episodes: int | None = Field(
+        None,
+        ge=2,
+        le=1_000_000,
+        description="Episodes of an evaluation; the test in the end has twice as many.",
+    )
+    planners: Several[AgentItem] | None = Field(None, max_length=1_000, description="Drawn for comparison.")
+    tensorboard: bool = False
+
+    @model_validator(mode="after")
+    def _of_env(self) -> Self:
+        if self.env == "drive":
+            for name in ("clone", "demonstrations", "k"):
+                if getattr(self, name) is not None:
+                    raise PydanticCustomError("whole", "{name} goes with env search", {"name": name})
+        if self.demonstrations is not None and self.clone is None:
+            raise PydanticCustomError("whole", "demonstrations goes with clone")
+        return self

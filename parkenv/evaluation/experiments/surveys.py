@@ -15,15 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.evaluation.experiments.spec import BUSY, SurveySpec
 from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.files.atomic_write import atomic_write
 from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
 from parkenv.mapping.inference import SessionLog, predict
+from parkenv.mapping.odometry import PoseNoise
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
 from parkenv.mapping.survey_score import DISTANCE_ENDS, METHODS
-from parkenv.world.occupancy import DAY_S, Arrival, ArrivalWindow
+from parkenv.scenarios.build import build
+from parkenv.world.occupancy import Arrival, ArrivalWindow
 from parkenv.world.scenario import Scenario
+from parkenv.world.week import DAY_S
 
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
@@ -48,6 +52,26 @@ class SurveyRun:
 
     rows: list[Row]
     shown: SessionResult | None
+
+
+def survey_of(spec: SurveySpec) -> tuple[Scenario, SurveySettings]:
+    """The world and the settings that a specification of a survey describes.
+
+    Raises:
+        InputError: the scenario cannot be made.
+    """
+    described = spec.scenario if spec.scenario.traffic else spec.scenario.changed(traffic=BUSY)
+    days = spec.scenario.arrivals.days
+    settings = SurveySettings(
+        rig=spec.rig or spec.scenario.rig,
+        every=spec.every,
+        weather=spec.weather,
+        windows=tuple(ArrivalWindow.parse(hours, days) for hours in spec.hours),
+        pose_noise=PoseNoise(spec.pose_noise, 0.02 * spec.pose_noise),
+        seed=spec.seed,
+        detector=spec.detector,
+    )
+    return build(described), settings
 
 
 def session_row(result: SessionResult) -> Row:
@@ -135,6 +159,7 @@ def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_
     return {
         "scenario": scenario.name,
         "rig": settings.rig,
+        "detector": settings.detector,
         "weather": settings.weather or "any",
         "sessions": len(run.rows),
         "slots": scenario.lot.n_slots,

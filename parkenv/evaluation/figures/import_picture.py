@@ -1,4 +1,4 @@
-"""A picture to check an import by: what became of a file, and what is missing."""
+"""A figure to check a lot import with: what was read from a file, and what is missing."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ AREA, AREA_EDGE = "#d9d3e3", "#8d7ca8"
 ROAD = "#333a42"
 TIE = "#9aa0a6"
 ARROW_EVERY = 15.0
-"""Metres between two arrows on a one-way lane."""
+"""m, between two arrows on a one-way lane."""
 
 
 def save_import_picture(draft: LotDraft, path: str | Path) -> None:
     """Draw a draft, complete or not, into a PNG.
 
-    Slots are filled by what they were made from, each with a line from its mouth to the lane that
-    serves it; lanes carry arrows where they are one-way; below stands what is missing.
+    Slots are coloured by their source, each with a line from its mouth to the lane that serves it; one-way
+    lanes carry arrows; what is missing is listed below.
 
     Raises:
         InputError: the file cannot be written.

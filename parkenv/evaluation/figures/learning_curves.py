@@ -1,4 +1,4 @@
-"""What agents achieve against decisions made in training, with the planners for comparison."""
+"""Learning curves: scores against decisions made in training, with planners for comparison."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from parkenv.evaluation.figures.picture_files import INK, STYLE, save_picture
 from parkenv.evaluation.figures.time_figures import spread
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
-"""Of trainings, as many as can be told apart."""
+"""Of trainings, as many as are distinguishable."""
 OFF_SCALE = 2.0
-"""Times above this many times the least one are off the figure."""
-_APART = 0.045  # of the axis, the least distance of two words beside the lines
+"""Times above this multiple of the least one are off the figure."""
+_APART = 0.045  # of the axis, least distance of two labels
 
 Curves = Sequence[Sequence[Mapping[str, Any]]]
 
 
 def columns_of(measure: str) -> tuple[str, str, str]:
-    """What the ends of the interval and the median of a measure are called: of seconds, or of shares."""
+    """Return the column names of the interval's ends and the median of a measure."""
     unit = "_s" if measure.endswith("_s") else ""
     return f"low{unit}", f"high{unit}", f"median{unit}"
 
 
 def across_seeds(curves: Curves, measure: str = "total_s") -> list[dict[str, float]]:
-    """Mean over seeds, with its 95 % interval, and median, at the examinations that all seeds have.
+    """Return the mean over seeds with its 95 % interval, and the median, at evaluations that all seeds have.
 
     Args:
         curves: of each seed, the rows of its `curve.csv`.
@@ -43,10 +43,10 @@ def across_seeds(curves: Curves, measure: str = "total_s") -> list[dict[str, flo
     """
     low_name, high_name, median_name = columns_of(measure)
     rows = []
-    for examinations in zip(*curves, strict=False):
-        values = [row[measure] for row in examinations]
+    for evaluations in zip(*curves, strict=False):
+        values = [row[measure] for row in evaluations]
         mean, low, high = mean_interval(values)
-        row = {"steps": float(np.mean([row["steps"] for row in examinations])), measure: mean}
+        row = {"steps": float(np.mean([row["steps"] for row in evaluations])), measure: mean}
         rows.append(row | {low_name: low, high_name: high, median_name: float(np.median(values))})
     return rows
 
@@ -56,8 +56,8 @@ def save_learning_curves(
 ) -> None:
     """Draw each algorithm's total time, and planners as horizontal lines.
 
-    Of one algorithm it is the mean over seeds in its interval; of several, where intervals would hide each other, the
-    median, for which one search driven in circles does not count, and single seeds thinly.
+    One algorithm is drawn as the mean over seeds with its interval; several, whose intervals would hide each other, as
+    medians, which a single search driven in circles does not distort. Single seeds are thin lines.
 
     Args:
         curves: of each algorithm, of each seed, the rows of its `curve.csv`.
@@ -73,7 +73,7 @@ def save_learning_curves(
             drawn = _draw(axes, name, its, "total_s", color, alone=len(curves) == 1)
             highest = max(highest, *drawn[len(drawn) // 10 :])
         low = min(*planners.values(), *(r["total_s"] for its in curves.values() for c in its for r in c))
-        # An untrained policy drives in circles; where it ends is what is to be seen.
+        # An untrained policy drives in circles; the end of the curves has to be readable.
         high = min(max([highest, *planners.values()]), OFF_SCALE * low)
         margin = 0.06 * (high - low) or 1.0
         axes.set_ylim(low - margin, high + margin)
@@ -94,14 +94,14 @@ def save_learning_curves(
 def save_success_curves(
     curves: Mapping[str, Curves], kinds: Sequence[str], planner: Mapping[str, float], title: str, path: Path
 ) -> None:
-    """Draw each algorithm's share of parkings that succeed, a panel for each kind of slot, beside the planner's.
+    """Draw each algorithm's success rate, a panel per kind of slot, with the planner's.
 
-    As `save_learning_curves` does, of one algorithm the mean over seeds, of several the median.
+    As in `save_learning_curves`, one algorithm is drawn as the mean over seeds, several as medians.
 
     Args:
         curves: of each algorithm, of each seed, the rows of its `curve.csv`; see `DriveTraining.examine`.
         kinds: of slots.
-        planner: share of the same parkings that the planner brings to an end, by kind; empty to draw none.
+        planner: success rate of the planner in the same parkings, by kind; empty to draw none.
         title: of the figure.
         path: of the PNG.
     """
@@ -121,7 +121,7 @@ def save_success_curves(
             axes.set(title=kind, xlabel="decisions in training", ylim=(-0.03, 1.1))
             axes.set_yticks(np.linspace(0.0, 1.0, 6))
             axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-        panels[0].set_ylabel("parkings that succeed")
+        panels[0].set_ylabel("success rate")
         panels[-1].legend(
             loc="lower right", frameon=True, facecolor="white", edgecolor="none", framealpha=0.8
         )
@@ -130,7 +130,7 @@ def save_success_curves(
 
 
 def _draw(axes: Axes, name: str, curves: Curves, measure: str, color: str, *, alone: bool) -> Sequence[float]:
-    """Draw the mean over seeds in its interval, or the median among others, single seeds thinly; returns the line."""
+    """Draw the mean over seeds with its interval, or the median, and thin single seeds; returns the line."""
     rows = across_seeds(curves, measure)
     low, high, median = columns_of(measure)
     steps, line = [row["steps"] for row in rows], [row[measure if alone else median] for row in rows]

@@ -1,4 +1,4 @@
-"""Pictures of parkings: what was driven, from above."""
+"""Figures of driven parkings, from above."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ _SIZE = (480, 640, 3)
 
 
 def save_parkings(ends: Sequence[tuple[ParkingLot, DriveState]], path: Path) -> None:
-    """Write a PNG with how each of some parkings ended and what was driven to it, two in a row.
+    """Write a PNG of the final states and driven paths of parkings, two in a row.
 
     Args:
-        ends: the lot and the state at the end of each.
+        ends: lot and final state of each.
         path: the file to write.
     """
     pictures = [DriveRenderer(lot).frame(state) for lot, state in ends]

@@ -1,4 +1,4 @@
-"""Pictures of an occupancy process: how full, and how fast cars come and go, over the day."""
+"""Figures of an occupancy process: occupancy, arrival and departure rates over the day."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from parkenv.evaluation.figures.picture_files import save_picture
-from parkenv.world.occupancy import DAY_S, HOUR_S, OccupancyProcess
+from parkenv.world.occupancy import OccupancyProcess
+from parkenv.world.week import DAY_S, HOUR_S
 
 _DAYS = (("weekday", 0, "#0072b2"), ("weekend", 5, "#e69f00"))
 
 
 def save_rates(process: OccupancyProcess, path: Path, *, title: str = "") -> None:
-    """Draw mean occupancy with the spread over slots, and the profiles of both rates, for either day class.
+    """Draw mean occupancy with the spread over slots, and the profiles of both rates, for each day class.
 
     Args:
-        process: whose rates; Monday stands for weekdays, Saturday for the weekend.
+        process: the process; Monday represents weekdays, Saturday the weekend.
         path: the PNG to write.
-        title: a line above.
+        title: of the figure.
     """
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     full, rates = figure.subplots(1, 2)
@@ -32,19 +33,27 @@ def save_rates(process: OccupancyProcess, path: Path, *, title: str = "") -> Non
         full.plot(hours, middle, color=color, linewidth=0.8, linestyle=":")
         steps = np.arange(24)
         for profile, style in ((process.arrival_profile, "-"), (process.departure_profile, "--")):
-            what = "arrivals" if style == "-" else "departures"
+            event = "arrivals" if style == "-" else "departures"
             rates.step(
                 steps,
                 profile[24 * day : 24 * day + 24] * HOUR_S,
                 where="post",
                 color=color,
                 linestyle=style,
-                label=f"{what}, {name}",
+                label=f"{event}, {name}",
             )
     full.set(
-        xlabel="hour of the day", ylabel="occupied", ylim=(0, 1.02), title="How full (band: 80 % of slots)"
+        xlabel="hour of the day",
+        ylabel="fraction occupied",
+        ylim=(0, 1.02),
+        title="Occupancy (band: 80 % of slots)",
     )
-    rates.set(xlabel="hour of the day", ylabel="per hour and slot", yscale="log", title="How fast")
+    rates.set(
+        xlabel="hour of the day",
+        ylabel="per hour and slot",
+        yscale="log",
+        title="Arrival and departure rates",
+    )
     for ax in (full, rates):
         ax.set(xlim=(0, 24), xticks=range(0, 25, 4))
         ax.grid(alpha=0.25)

@@ -1,4 +1,4 @@
-"""Pictures of what simulated sensors deliver."""
+"""Figures of simulated sensor data."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SEEN = 0.05
 
 
 def with_boxes(image: Image, boxes: VehicleBoxes) -> Image:
-    """A copy of an image, (h, w, 3) RGB, with the boxes of the vehicles that are seen, farthest first."""
+    """Return a copy of an image, (h, w, 3) RGB, with the boxes of visible vehicles, farthest first."""
     drawn = image.copy()
     for i in np.flatnonzero(boxes.visible_fraction >= SEEN)[::-1]:
         left, top, right, bottom = boxes.visible_box[i].tolist()
@@ -45,7 +45,7 @@ def with_boxes(image: Image, boxes: VehicleBoxes) -> Image:
 
 
 def draw_scan(ax: Axes, lot: ParkingLot, capture: Capture, rig: SensorRig) -> None:
-    """The lot from above, the vehicle, and where every beam ended."""
+    """Draw the lot from above with the vehicle and the ends of its beams."""
     draw_lot(lot, ax)
     x, y, yaw = capture.pose
     for name, laser, mount in rig.lasers:
@@ -56,21 +56,21 @@ def draw_scan(ax: Axes, lot: ParkingLot, capture: Capture, rig: SensorRig) -> No
         ends = np.stack([at_x + ranges[hit] * np.cos(angle), at_y + ranges[hit] * np.sin(angle)], axis=1)
         ax.scatter(ends[:, 0], ends[:, 1], s=2.0, color="#d0103a", linewidths=0, zorder=4)
     ax.quiver(x, y, np.cos(yaw), np.sin(yaw), color="#ffd000", scale=18, width=0.012, zorder=5)
-    # What is out of the laser's reach tells nothing here.
+    # The rest of the lot is out of the laser's range.
     ax.set(xlim=(x - 24.0, x + 24.0), ylim=(y - 18.0, y + 18.0))
 
 
 def save_sensor_preview(
     lot: ParkingLot, rig: SensorRig, capture: Capture, boxes: VehicleBoxes, title: str, path: Path
 ) -> None:
-    """The camera's frame with boxes, its depth, the stereo pair's disparity and the scan from above.
+    """Draw the camera frame with true boxes, its depth, the stereo disparity and the scan from above.
 
     Args:
         lot: the lot.
         rig: with at least a camera, a stereo camera and a laser.
         capture: by that rig.
         boxes: of the first camera's frame.
-        title: a line above.
+        title: of the figure.
         path: the PNG to write.
     """
     frame = capture.images[rig.cameras[0][0]]
@@ -81,7 +81,7 @@ def save_sensor_preview(
         places = ((0.02, 0.5), (0.02, 0.02), (0.5, 0.02), (0.5, 0.5))
         axes = [figure.add_axes((x, y, 0.46, 0.43)) for x, y in places]
         axes[0].imshow(with_boxes(frame.image, boxes))
-        axes[0].set_title("camera; true boxes, view, distance, visible share")
+        axes[0].set_title("camera; true boxes: view, distance, visible fraction")
         shown = axes[1].imshow(frame.depth, cmap="viridis_r", norm=LogNorm(NEAREST, FARTHEST))
         axes[1].set_title("depth of the first opaque surface, m")
         metres = figure.colorbar(shown, ax=axes[1], fraction=0.034, pad=0.01)

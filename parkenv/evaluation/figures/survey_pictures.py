@@ -1,4 +1,4 @@
-"""Pictures of a survey: what was detected, what a session made of the lot, what the map says (T Fig. 4.4-4.7)."""
+"""Figures of a survey: detections, one session's grid and slots, and the map (T Fig. 4.4-4.7)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from parkenv.world.lot import ParkingLot
 
 FloatArray = NDArray[np.float64]
 
-SIDE_COLOR, END_COLOR, NOWHERE_COLOR = (255, 208, 0), (86, 180, 233), (200, 200, 200)
+SIDE_COLOR, END_COLOR, UNRANGED_COLOR = (255, 208, 0), (86, 180, 233), (200, 200, 200)
 TAKEN, FREE, UNKNOWN = "#d1495b", "#2a9d8f", "#9aa0a6"
 WRONG = "#ffd000"
 WEATHER_COLORS = {
@@ -41,18 +41,18 @@ WEATHER_COLORS = {
 def draw_detections(
     image: NDArray[np.uint8], found: Detections, placed: NDArray[np.int64] | None = None
 ) -> NDArray[np.uint8]:
-    """A copy of an image, (h, w, 3) RGB, with what was detected in it.
+    """Return a copy of an image, (h, w, 3) RGB, with its detections.
 
     Args:
         image: the image.
-        found: in it.
-        placed: rows of those that stand somewhere; others are drawn thin and grey. All of them where None.
+        found: its detections.
+        placed: rows of those that were ranged; others are drawn thin and grey. All where None.
     """
     drawn = image.copy()
     for i, (box, p, end) in enumerate(zip(found.boxes, found.probability, found.end_on, strict=True)):
         left, top, right, bottom = (round(float(v)) for v in box)
         if placed is not None and i not in placed:
-            cv2.rectangle(drawn, (left, top), (right, bottom), NOWHERE_COLOR, 1, cv2.LINE_AA)
+            cv2.rectangle(drawn, (left, top), (right, bottom), UNRANGED_COLOR, 1, cv2.LINE_AA)
             continue
         color = END_COLOR if end else SIDE_COLOR
         cv2.rectangle(drawn, (left, top), (right, bottom), color, 2, cv2.LINE_AA)
@@ -61,9 +61,9 @@ def draw_detections(
 
 
 def save_detections(result: SessionResult, path: Path) -> None:
-    """Some frames of a session with their detections (T Fig. 4.4).
+    """Draw some frames of a session with their detections (T Fig. 4.4).
 
-    Yellow are sides, blue fronts and rears, thin and grey what no beam met or what is seen too little of.
+    Sides are yellow, fronts and rears blue, detections that could not be ranged thin and grey.
     """
     with mpl.rc_context(STYLE):
         n = len(result.shown)
@@ -81,7 +81,7 @@ def save_detections(result: SessionResult, path: Path) -> None:
 
 
 def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
-    """One session from above (T Fig. 4.5): the grid, the cars that were found, and the slots."""
+    """Draw a session from above (T Fig. 4.5): grid, detected cars and slots."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(11.0, _height(lot, 11.0, 3)))
         axes = figure.subplots(3, 1)
@@ -95,20 +95,20 @@ def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
         axes[0].imshow(
             shown, origin="lower", extent=extent, cmap="cividis", vmin=0, vmax=1, alpha=0.85, zorder=3
         )
-        axes[0].set_title("occupancy grid: P(a car stands here)")
+        axes[0].set_title("occupancy grid: P(occupied)")
         cars = result.session.cars
         axes[1].quiver(
             cars[:, 0], cars[:, 1], np.cos(cars[:, 2]), np.sin(cars[:, 2]), pivot="mid", headwidth=1, headlength=0,
             headaxislength=0, scale=60, width=0.0016, color="#ffb000", zorder=3,
         )  # fmt: skip
-        axes[1].set_title(f"{len(cars)} sightings of cars, each with the direction fitted to its beams")
+        axes[1].set_title(f"{len(cars)} detected cars, each with the heading fitted to its beams")
         _draw_states(lot, result, axes[2])
         figure.tight_layout()
         save_picture(figure, path)
 
 
 def save_graph(lot: ParkingLot, predicted: Prediction, result: SessionResult, path: Path) -> None:
-    """The lot's graph with what the map predicts of each slot and what one session saw of it (T Fig. 4.7)."""
+    """Draw the drive graph with the map's prediction and one session's observation of each slot (T Fig. 4.7)."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(11.0, _height(lot, 11.0, 1) + 0.5), layout="constrained")
         ax = figure.subplots()
@@ -118,7 +118,7 @@ def save_graph(lot: ParkingLot, predicted: Prediction, result: SessionResult, pa
         seen[~states.in_view] = (*to_rgb(UNKNOWN), 1.0)
         draw_discs(lot, ax, predicted.p_occupied, seen)
         ax.set_title(
-            f"{lot.name}: the graph; outside what the map predicts, inside what one session saw "
+            f"{lot.name}: the drive graph; ring: map, disc: one session "
             f"({result.session.weather.replace('_', ' ')})"
         )
         scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(0, 1), BELIEF_MAP)
@@ -127,7 +127,7 @@ def save_graph(lot: ParkingLot, predicted: Prediction, result: SessionResult, pa
 
 
 def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, path: Path) -> None:
-    """Slots that the cars of all sessions have shown, over the true ones that nobody told."""
+    """Draw the slots discovered from the cars of all sessions over the true ones."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(11.0, _height(lot, 11.0, 1)), layout="constrained")
         ax = figure.subplots()
@@ -136,23 +136,23 @@ def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, 
         ends = found.xy[:, None] + 2.0 * np.array([-1.0, 1.0])[None, :, None] * ahead[:, None]
         ax.add_collection(LineCollection(list(ends), colors=WRONG, linewidths=1.6, zorder=3))
         ax.plot(*found.xy.T, linestyle="none", marker="o", markersize=3.0, color=WRONG, zorder=3.1)
-        off = f", {score.error:.2f} m off in the mean" if score.recall else ""
+        off = f", mean error {score.error:.2f} m" if score.recall else ""
         ax.set_title(
-            f"{lot.name}: {len(found.xy)} slots found without a map; {score.precision:.0%} of them are true, "
-            f"{score.recall:.0%} of {lot.n_slots} found{off}"
+            f"{lot.name}: {len(found.xy)} slots discovered without a map; precision {score.precision:.0%}, "
+            f"recall {score.recall:.0%} of {lot.n_slots}{off}"
         )
         save_picture(figure, path)
 
 
 def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
-    """In which weather and from which distance cars are missed: rows of `surveys.detection_by_distance`."""
+    """Draw detection rates by weather and distance, rows of `surveys.detection_by_distance`."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.0, 3.8), layout="constrained")
         ax = figure.subplots()
         for i, weather in enumerate(dict.fromkeys(row["weather"] for row in rows)):
             its = [row for row in rows if row["weather"] == weather]
             color = WEATHER_COLORS.get(weather, UNKNOWN)
-            # Side by side, or the bars of the intervals hide each other.
+            # Side by side, so that the intervals do not hide each other.
             x = np.array([np.mean(row["distance_m"]) for row in its]) + 0.09 * (i - 2)
             rate = np.array([row["rate"] for row in its])
             low, high = np.array([row["rate_ci95"] for row in its]).T
@@ -162,7 +162,7 @@ def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Pa
             ax.vlines(x, low, high, color=color, linewidth=1.2, alpha=0.7)
         ax.set(
             xlabel="distance from the camera to the car's middle, m",
-            ylabel="detected in a frame in which it stands clear",
+            ylabel="detection rate in frames without occlusion",
             ylim=(0.0, 1.03),
         )
         ax.grid(axis="y")
@@ -172,16 +172,16 @@ def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Pa
 
 
 def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, title: str, path: Path) -> None:
-    """What the map predicts of every slot (T Fig. 4.6), beside the truth where it is known."""
+    """Draw the map's prediction of every slot (T Fig. 4.6), and the true probabilities where they are known."""
     with mpl.rc_context(STYLE):
         panels = [("predicted", predicted.p_occupied)] + (
             [("true probability", true)] if true is not None else []
         )
-        panels.append(("how sure: width of the interval", predicted.high - predicted.low))
+        panels.append(("uncertainty: width of the 95 % interval", predicted.high - predicted.low))
         figure = Figure(figsize=(11.0, _height(lot, 11.0, len(panels))))
         axes = np.atleast_1d(figure.subplots(len(panels), 1))
         for ax, (name, values) in zip(axes, panels, strict=True):
-            # cividis is read alike by those who do not tell red from green.
+            # cividis reads the same with any colour vision.
             draw_lot(lot, ax, slot_color=mpl.colormaps["cividis"](values))
             ax.set_title(f"{title}: {name}")
             bar = figure.colorbar(
@@ -193,7 +193,7 @@ def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, ti
 
 
 def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:
-    """Slots by what the filter says, with a bright edge where it is wrong."""
+    """Draw the slot filter's states, with a bright edge around wrong ones."""
     states, wrong = result.states, (result.states.occupied != result.truth) & result.states.in_view
     color = np.array([to_rgb(TAKEN if o else FREE) for o in states.occupied])
     color[~states.in_view] = to_rgb(UNKNOWN)
@@ -204,7 +204,7 @@ def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:
     handles = [Patch(color=c, label=name) for name, c in names.items()]
     handles.append(Patch(fill=False, edgecolor=WRONG, linewidth=2.0, label=f"wrong ({wrong.sum()})"))
     ax.legend(handles=handles, loc="lower right", ncols=4, fontsize=8)
-    ax.set_title(f"slots: {result.slot_accuracy:.1%} right")
+    ax.set_title(f"slots: {result.slot_accuracy:.1%} correct")
 
 
 def _height(lot: ParkingLot, width: float, panels: int) -> float:

@@ -1,4 +1,4 @@
-"""A film of a whole trip, seen from above: near the car, with the lot in a corner."""
+"""A film of a whole trip from above: the surroundings of the car, with the whole lot in a corner."""
 
 from __future__ import annotations
 
@@ -23,7 +23,6 @@ from parkenv.envs.rendering import (
     SearchRenderer,
     StillLayer,
     clock,
-    draw_still_layer,
 )
 from parkenv.envs.search_state import SearchState
 from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
@@ -33,12 +32,12 @@ from parkenv.world.scenario import Scenario
 FloatArray = NDArray[np.float64]
 
 SPEEDUP = 5
-"""How much faster than in life a film runs."""
+"""How much faster than real time a film runs."""
 FPS = 10
 LAST_S = 2.0
-"""s that the last picture stays."""
+"""s for which the last frame stays."""
 COLORS = 96
-"""Colours of a film: enough for flat pictures, and small files."""
+"""Colours of a film: enough for drawings, with small files."""
 
 _SLOT_PX = 26.0  # a slot's width in the picture near the car
 _INSET = 0.34
@@ -46,12 +45,12 @@ _STEP_S = 0.1
 
 
 class TripRenderer(SearchRenderer):
-    """Draws a search with the car where it really is.
+    """Draws a search with the car at its driven pose.
 
     Args:
         scenario: where it takes place.
-        driver: who drives.
-        near: whether to show what is near the car, or the whole lot as `SearchRenderer` does.
+        driver: drives the car.
+        near: whether to show the car's surroundings instead of the whole lot.
     """
 
     def __init__(self, scenario: Scenario, driver: LotDriver, *, near: bool) -> None:
@@ -62,7 +61,7 @@ class TripRenderer(SearchRenderer):
             self._whole = None
 
     def rows(self) -> tuple[int, int]:
-        """First and last row, px, that the lot takes of a picture of all of it."""
+        """Return the first and last row, px, of the lot in a frame of the whole lot."""
         assert self._whole is not None
         west, south, east, north = self.scenario.lot.bounds()
         corners = self._whole(np.array([[west, south], [east, north], [west, north], [east, south]]))
@@ -76,19 +75,10 @@ class TripRenderer(SearchRenderer):
         """Return the layer of the lot's part near the car, or of the whole lot."""
         if not self._near:
             return super().still_layer(state)
-        scale = _SLOT_PX / self._slot_width
-        stride = np.array(self._size) / scale / 3
-        column, row = np.round(self._middle()[:2] / stride).astype(int)
-        if self._still is None or self._window_at != (column, row):
-            self._window_at = column, row
-            center = np.array([column, row]) * stride
-            self._still = draw_still_layer(
-                self.scenario.lot, self.outline, MapView.around(center, self._size, scale)
-            )
-        return self._still
+        return self._window(self._middle()[:2], _SLOT_PX, 3)
 
     def _draw_trail(self, image: Image, view: MapView, state: SearchState) -> None:
-        del state  # where the car has been is not part of it
+        del state  # the driven path is not part of it
         if len(self.trail) > 1:
             points = fixed_point(view(np.array(self.trail)))
             thickness = 2 if self._near else 3
@@ -120,13 +110,13 @@ class TripRenderer(SearchRenderer):
         ):
             write_text(image, part, (x, baseline), WHITE, 15, 500)
             x += 124 if ":" in part else 76
-        text = f"parked in {driver.log.tries[-1].slot}" if state.parked else driver.doing
-        left_again = ":" in text
-        write_text(image, text, (x, baseline), GAVE_UP if left_again else CAR, 15, 600)
+        text = f"parked in {driver.log.attempts[-1].slot}" if state.parked else driver.doing
+        failed = ":" in text
+        write_text(image, text, (x, baseline), GAVE_UP if failed else CAR, 15, 600)
 
 
 def film_trip(search: DrivenSearch, seed: int) -> tuple[Trip, list[Image]]:
-    """Drive a trip, and take pictures of it, (480, 640, 3) uint8 each, `FPS` a second of film."""
+    """Drive a trip and render it: frames of (480, 640, 3) uint8, `FPS` per second of film."""
     driver, env = search.driver, search.env
     near = TripRenderer(search.scenario, driver, near=True)
     far = TripRenderer(search.scenario, driver, near=False)
@@ -140,26 +130,26 @@ def film_trip(search: DrivenSearch, seed: int) -> tuple[Trip, list[Image]]:
         state = env.state
         occupied = state.world.occupied(everything, driver.time)
         if state.parked:
-            occupied[state.vertex] = False  # nobody else stands where the car does
+            occupied[state.vertex] = False  # the searching car itself stands there
         frames.append(_inset(near.frame(state, occupied), far.frame(state, occupied), low, high))
 
-    def watch() -> None:
+    def on_control() -> None:
         nonlocal steps
-        spot = driver.vehicle.at_middle(driver.state[:3])[:2]
+        place = driver.vehicle.at_middle(driver.state[:3])[:2]
         for renderer in (near, far):
-            if not renderer.trail or np.hypot(*(spot - renderer.trail[-1])) > 0.3:
-                renderer.trail.append(spot)
+            if not renderer.trail or np.hypot(*(place - renderer.trail[-1])) > 0.3:
+                renderer.trail.append(place)
         if steps % every == 0:
             take()
         steps += 1
 
-    trip = search.run(seed, on_control=watch)
+    trip = search.run(seed, on_control=on_control)
     take()
     return trip, frames + frames[-1:] * round(LAST_S * FPS)
 
 
 def _inset(near: Image, far: Image, low: int, high: int) -> Image:
-    """A picture with the whole lot, rows `low` to `high` of another, small in its corner."""
+    """Return a frame with rows `low` to `high` of the whole lot's frame small in its corner."""
     width, height = round(_INSET * WIDTH), round(_INSET * (high - low))
     small = cv2.resize(far[low:high], (width, height), interpolation=cv2.INTER_AREA)
     image = near.copy()

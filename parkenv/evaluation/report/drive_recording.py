@@ -1,4 +1,4 @@
-"""Survey drives driven again and written down, capture by capture, for a page that shows them."""
+"""Record survey drives capture by capture for the replay of a report."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from parkenv.perception.pipeline import CameraView, PerceptionResult
 from sim_sensors.rig import poses_along
 
 PICTURE_WIDTH = 480
-"""px, of the camera's frames."""
+"""px, of recorded camera frames."""
 JPEG_QUALITY = 68
 SCAN_REACH = 16.0
-"""m; beams that end farther away are left out."""
+"""m; longer beams are left out."""
 LEVELS = 15
 """Shades of the occupancy grid."""
 
@@ -30,12 +30,12 @@ Recording = dict[str, Any]
 
 
 def record_drive(survey: Survey, number: int, most_frames: int) -> Recording:
-    """Drive a session again.
+    """Drive a session again and record it.
 
     Args:
-        survey: as it was driven.
+        survey: the survey.
         number: of the session.
-        most_frames: captures that are kept, at equal distances; the last one is always among them.
+        most_frames: captures to keep, at equal distances, always with the last one.
     """
     captures = len(poses_along(survey.route.path, survey.settings.every))
     step = max(1, math.ceil(captures / most_frames))
@@ -107,7 +107,7 @@ def _frame(frame: SurveyFrame, first_time: float) -> Recording:
 
 
 def _boxes(view: CameraView) -> list[list[float]]:
-    """Left, top, right, bottom as shares of the picture; probability; whether it is an end; whether it is placed."""
+    """List left, top, right, bottom as fractions of the image; probability; is an end; is ranged."""
     height, width = view.image.shape[:2]
     found = view.detections
     made = []
@@ -120,7 +120,7 @@ def _boxes(view: CameraView) -> list[list[float]]:
 
 
 def _scan(result: PerceptionResult) -> list[int]:
-    """Where beams end, decimetres from the car, x and y in turns."""
+    """List the ends of beams, decimetres from the car, x and y alternating."""
     x, y, _ = result.vehicle
     points = [
         scan.points(np.flatnonzero(np.nan_to_num(scan.distance, nan=np.inf) < SCAN_REACH))[::2]
@@ -132,7 +132,7 @@ def _scan(result: PerceptionResult) -> list[int]:
 
 
 def _changes(before: NDArray[np.int64], now: NDArray[np.int64]) -> list[int]:
-    """Slot and value, in turns, of those that have changed."""
+    """List alternating slot and value of those that have changed."""
     changed = np.flatnonzero(before != now)
     pairs: list[int] = np.stack([changed, now[changed]], axis=1).ravel().tolist()
     return pairs
@@ -147,7 +147,7 @@ def _jpeg(image: NDArray[np.uint8]) -> str:
 
 
 def _grid_png(grid: OccupancyGrid) -> str:
-    """The grid with north up, half as fine as it is kept: 0 where nothing was seen, then from free to taken."""
+    """Encode the grid, north up, at half its resolution: 0 where unobserved, then from free to taken."""
     rows, columns = (2 * (n // 2) for n in grid.log_odds.shape)
     blocks = (rows // 2, 2, columns // 2, 2)
     p = grid.probability[:rows, :columns].reshape(blocks).max(axis=(1, 3))
@@ -161,7 +161,7 @@ def _grid_png(grid: OccupancyGrid) -> str:
 
 
 def _palette() -> list[int]:
-    """Nothing, then from a pale blue to a dark violet."""
+    """Transparent, then from pale blue to dark violet."""
     share = np.linspace(0.0, 1.0, LEVELS)[:, None]
     colors = np.array([[150, 190, 215]]) * (1 - share) + np.array([[112, 48, 170]]) * share
     return [0, 0, 0, *np.round(colors).astype(int).ravel().tolist()]
@@ -169,9 +169,9 @@ def _palette() -> list[int]:
 
 _PALETTE = _palette()
 _OPACITY = bytes([0, *np.round(np.linspace(50, 235, LEVELS)).astype(int).tolist()])
-"""Of each colour: where no car stands, slots are to be seen through it."""
+"""Opacity of each colour: slots are visible through free cells."""
 
 
 def data_uri(kind: str, content: bytes) -> str:
-    """A file's content as an address."""
+    """Encode a file's content as a data URI."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"

@@ -1,4 +1,4 @@
-// Survey drives: the camera's frame with what was detected, the scan, the grid and the slots, in step.
+// Survey drives: camera frame with detections, laser scan, occupancy grid and slots, synchronised.
 
 const SIDE = "#ffd000";
 const END = "#56b4e9";
@@ -20,12 +20,12 @@ class DriveReplay {
     this.player = new Player(root, {
       name: "drive", speeds: [1, 2, 5, 10, 20, 50], speed: 10,
       show: (seconds) => this.show(seconds),
-      told: (seconds) => `${seconds2(seconds)} of ${seconds2(this.player.duration)} s`,
+      describe: (seconds) => `${seconds2(seconds)} of ${seconds2(this.player.duration)} s`,
     });
     const strip = make("div", { class: "strips" }, this.player.time);
     this.player.time.style.gridColumn = "1 / -1";
     root.append(
-      make("p", { class: "quiet" }, "The drive, run again through the same sensors and the same stack: what the camera saw and what was detected in it, what the laser met and where cars were put, and what all captures so far come to."),
+      make("p", { class: "quiet" }, "The drive is simulated again with the same sensors and perception pipeline: camera frames with detections, laser scans with ranged cars, and the occupancy grid and slots from all captures so far."),
       make("div", { class: "controls" }, make("label", {}, "Drive ", this.choice)),
       make("div", { class: "drive" },
         make("div", {}, panel("Camera", this.when, this.picture), panel("Around the car", null, this.around)),
@@ -66,7 +66,7 @@ class DriveReplay {
     this.picture.height = Math.round(width * 0.75 * ratio);
   }
 
-  /** A picture of a frame, decoded once; drawn when it is there. */
+  /** Return an image of a frame, decoded once; redraw when it is loaded. */
   image(number, name) {
     const key = `${name}${number}`;
     if (!this.pictures.has(key)) {
@@ -115,10 +115,10 @@ class DriveReplay {
     const fact = (name, value) => make("span", {}, make("b", {}, value), name);
     this.facts.replaceChildren(
       fact("cars in this frame", String(frame.boxes.filter((box) => box[6]).length)),
-      fact(`of ${this.belief.length} slots judged`, String(judged)),
-      fact("of those right", judged ? `${((100 * right) / judged).toFixed(1)} %` : "–"),
+      fact(`of ${this.belief.length} slots classified`, String(judged)),
+      fact("of those correct", judged ? `${((100 * right) / judged).toFixed(1)} %` : "–"),
     );
-    this.when.textContent = `capture ${this.number + 1} of ${this.record.frames.length} kept; ${this.record.weather}`;
+    this.when.textContent = `capture ${this.number + 1} of ${this.record.frames.length} shown; ${this.record.weather}`;
   }
 
   drawPicture(frame) {
@@ -144,7 +144,7 @@ class DriveReplay {
     this.picture.setAttribute("aria-label", `Camera, with ${frame.boxes.length} detections`);
   }
 
-  /** A lot with the way so far and the car; what else, draws `more`. */
+  /** Draw a lot with the path so far and the car; `more` draws what lies between. */
   drawMap(view, frame, more) {
     const [x, y, yaw] = frame.pose;
     view.begin([x, y]);
@@ -156,7 +156,7 @@ class DriveReplay {
     view.canvas.setAttribute("aria-label", `The lot after ${seconds2(frame.t)} s`);
   }
 
-  /** What the filter says of each slot, pale where more is drawn on it, and a bright edge where that is wrong now. */
+  /** Draw the slot filter's state, pale unless `strong`, with a bright edge around slots that are wrong now. */
   drawSlots(view, strong) {
     view.drawSlots((i) => this.belief[i], () => strong, () => false);
     const wrong = (i) => this.belief[i] >= 0 && (this.belief[i] > 127) !== Boolean(this.taken[i]);
@@ -179,7 +179,7 @@ class DriveReplay {
     context.restore();
   }
 
-  /** Where beams end, and the cars that were fitted to them. */
+  /** Draw the ends of the beams, and the cars fitted to them. */
   drawScan(view, frame) {
     const { context } = view;
     const [x, y] = frame.pose;
@@ -196,8 +196,8 @@ function driveLegend() {
   const grid = make("span", { class: "scale", style: "background: linear-gradient(90deg, #96bed755, #7030aa)" });
   return make(
     "div", { class: "legend lot" },
-    key(SIDE, "a car's side", true), key(END, "front or rear", true), key(NOWHERE, "stands nowhere", true),
+    key(SIDE, "a car's side", true), key(END, "front or rear", true), key(NOWHERE, "not ranged", true),
     make("span", { class: "key" }, "free ", scale, "taken, slots"), make("span", { class: "key" }, "free ", grid, "car, grid"),
-    key(SCAN, "scan"), key("var(--ink)", "car fitted to its beams", true), key("var(--car)", "slot judged wrong", true),
+    key(SCAN, "scan"), key("var(--ink)", "car fitted to its beams", true), key("var(--car)", "slot classified wrong", true),
   );
 }

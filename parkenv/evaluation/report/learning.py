@@ -1,4 +1,4 @@
-"""Learning curves of `parkenv train`, as a page draws them."""
+"""Learning curves of `parkenv train` as the page draws them."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from parkenv.evaluation.report.run_folder import RunFolder
 
 
 def learning_of(run: RunFolder) -> list[dict[str, Any]]:
-    """A panel of curves for what is learnt: total time of searches, or success with each kind of slot.
+    """Build the panels of learning curves: total time of searches, or success by kind of slot.
 
     Args:
-        run: any; one that is no training has no curves.
+        run: any run; only trainings have curves.
     """
-    curve, lines = run.summary.get("curve"), run.summary.get("examined")
+    curve, lines = run.summary.get("curve"), run.summary.get("evaluated")
     if run.kind != "train" or not curve or not isinstance(lines, Mapping):
         return []
     seeds = [run.table(f"seed_{row['seed']}/curve.csv") for row in run.summary["rows"]]
@@ -47,9 +47,9 @@ def _panel(
     *,
     share: bool,
 ) -> dict[str, Any]:
-    """Points of the mean are decisions, mean, and the ends of its 95 % interval, which one seed has none of.
+    """Build a panel: points of the mean are decisions, mean, and the ends of its 95 % interval (None for one seed).
 
-    Of other trainings it is the median, as in the figure: there one search driven in circles would hide the rest.
+    Other trainings show their median, which a single search driven in circles does not distort.
     """
     low, high, median = columns_of(column)
     return {

@@ -1,12 +1,12 @@
-// Learning curves: the mean over trainings in its interval, single trainings thin, planners as dashed lines.
+// Learning curves: the mean over trainings with its interval, single trainings as thin lines, planners dashed.
 
-/** What lies above this many times the least time is off the chart: an untrained policy drives in circles. */
+/** Times above this multiple of the least one are off the chart: an untrained policy drives in circles. */
 const OFF_CHART = 2;
 
-/** Of other trainings. */
+/** Colours of other trainings. */
 const BESIDE = ["#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#888888"];
 
-/** Positions at least so far apart, in order, as near to where they were as that allows. */
+/** Move positions apart to a least distance, in order, as little as possible. */
 function spread(positions, apart) {
   const placed = [...positions];
   for (let round = 0; round < 60; round += 1) {
@@ -80,7 +80,7 @@ function showLearning(root, panels) {
   const key = (color, name) => make("span", { class: "key" }, make("span", { class: "swatch", style: `background: ${color}` }), name);
   const keys = beside.length ? [key("var(--drive)", "this training"), ...beside.map((name, i) => key(BESIDE[i % BESIDE.length], name))] : [];
   root.append(
-    make("p", { class: "quiet" }, `Examinations in the course of training, in worlds that are not trained on: the mean over ${n} training${n > 1 ? "s with its 95 % interval, each training thin" : ""}${beside.length ? "; the medians of other trainings in their colours" : ""}. Dashed: others in the same worlds.`),
+    make("p", { class: "quiet" }, `Evaluations during training, in held-out worlds: the mean over ${n} training${n > 1 ? "s with its 95 % interval, each training as a thin line" : ""}${beside.length ? "; medians of other trainings in colour" : ""}. Dashed: other agents in the same worlds.`),
     make("div", { class: "card chart" }, grid, make("div", { class: "legend" }, ...keys)),
   );
 }

@@ -1,8 +1,8 @@
-// How numbers and words are written.
+// Formatting of numbers and words.
 
 const MINUS = "−";
 
-/** A number with so many digits; numbers from a thousand on need none. */
+/** Format a number with some digits; numbers of a thousand or more get none. */
 function written(value, digits, signed = false) {
   if (value === null || value === undefined) return "–";
   const kept = Math.abs(value) >= 1000 ? 0 : digits;
@@ -11,28 +11,28 @@ function written(value, digits, signed = false) {
   return (value < 0 && !zero ? MINUS : signed && !zero ? "+" : "") + text;
 }
 
-/** A value as its column says. */
+/** Format a value as its column specifies. */
 function asColumn(column, value) {
   if (value === null || value === undefined) return "–";
   if (typeof value === "boolean") return value ? "yes" : "no";
   if (typeof value === "string") return value;
   if (column.share) return `${written(100 * value, column.digits, column.signed)} %`;
   const digits = Number.isInteger(value) && column.digits > 1 ? 0 : column.digits;
-  // A cost of 2.5 s must not be rounded to a whole one, where whole ones are usual.
+  // A cost of 2.5 s must not be rounded where the others are whole numbers.
   const text = column.digits === 0 && !Number.isInteger(value) ? String(Number(value.toPrecision(4))) : written(value, digits, column.signed);
   return text;
 }
 
 const DAYS = ["Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun"];
 
-/** Seconds since Monday 00:00 as day and hour; a day of a record keeps its own name. */
+/** Format seconds since Monday 00:00 as day and hour; days of a log keep their names. */
 function moment(seconds, day) {
   const minutes = Math.floor((seconds % 86400) / 60);
   const name = typeof day === "string" && day !== "" ? day : DAYS[Math.floor(seconds / 86400) % 7];
   return `${name} ${String(Math.floor(minutes / 60)).padStart(2, "0")}:${String(minutes % 60).padStart(2, "0")}`;
 }
 
-/** A made element: tag, attributes, children. */
+/** Create an element from tag, attributes and children. */
 function make(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
@@ -50,7 +50,7 @@ function makeSvg(tag, attributes = {}, ...children) {
   return element;
 }
 
-/** A model's file is told from others by its last folders, not by where they lie. */
+/** Shorten a model's file name to its last folder. */
 function shortName(agent) {
   const colon = agent.indexOf(":");
   if (colon < 0) return agent;

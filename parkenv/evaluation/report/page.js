@@ -1,4 +1,4 @@
-// The page: theme, parts that there are, and what to do again.
+// The page: theme, sections, figures, and the command that reproduces the run.
 
 const data = JSON.parse(document.getElementById("report-data").textContent);
 const part = (id) => document.getElementById(id);
@@ -68,7 +68,7 @@ const command = make("code", { id: "command" }, data.run.command);
 const seed = data.run.seed === null ? "" : `, first seed ${data.run.seed}`;
 part("run").append(
   make("div", { class: "card command" }, command, copy),
-  make("p", { class: "quiet" }, `parkenv ${data.run.parkenv}${seed}. The same version and command give the same numbers, but for wall times.`),
+  make("p", { class: "quiet" }, `parkenv ${data.run.parkenv}${seed}. The same version and command reproduce all numbers except wall times.`),
 );
 
 for (const link of document.querySelectorAll("nav a")) link.hidden = part(link.dataset.for).hidden;

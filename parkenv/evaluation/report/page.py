@@ -1,4 +1,4 @@
-"""The page itself: data, figures, style and program in one HTML file that needs no network."""
+"""The report page: data, figures, style and program in one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ from parkenv.files.atomic_write import atomic_write
 
 FORMAT, VERSION = "parkenv-report", 1
 SCHEMA = Path(__file__).with_name("report.schema.json")
-"""What the data in a page looks like."""
+"""JSON schema of the data in a page."""
 SCRIPTS = (
     "numbers.js", "tables.js", "time_chart.js", "learning_chart.js", "lot_view.js", "player.js", "search_replay.js",
     "drive_replay.js", "page.js",
 )  # fmt: skip
-"""Parts of the program, in the order in which they need each other."""
+"""Parts of the program, in order of dependence."""
 MOST_WIDTH = 1800
-"""px, to which figures are scaled down."""
+"""px; wider figures are scaled down."""
 LOSSLESS = 150_000
-"""Bytes above which a figure is compressed with loss."""
+"""Bytes above which a figure is compressed lossily."""
 _QUALITY = 86
 _HERE = Path(__file__).parent
 _FIGURES = (
@@ -54,13 +54,13 @@ def page_data(
     drives: Sequence[Mapping[str, Any]] = (),
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """All that a page shows but the figures; `report.schema.json` says how.
+    """Build the data of a page, all but the figures; see `report.schema.json`.
 
     Args:
-        run: what was run.
+        run: the run.
         encounters: from `search_recording.record`.
         drives: from `drive_recording.record_drive`.
-        notes: lines for the reader, such as what could not be replayed.
+        notes: for the reader, such as why there is no replay.
     """
     lots: list[Any] = []
 
@@ -91,17 +91,17 @@ def page_data(
 
 
 def write_page(run: RunFolder, data: Mapping[str, Any], path: Path) -> None:
-    """Write the file, whole or not at all.
+    """Write the page atomically.
 
     Args:
-        run: whose figures are shown.
+        run: has the figures.
         data: from `page_data`.
         path: of the HTML file.
 
     Raises:
         InputError: the file cannot be written.
     """
-    # A "<" within a string must not end the element that the data stands in.
+    # A "<" in a string must not end the script element that holds the data.
     embedded = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     text = Template((_HERE / "page.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(data["run"]["title"]),
@@ -129,7 +129,7 @@ def _figure(path: Path) -> str:
         with PillowImage.open(path) as opened:
             picture = opened.convert("RGB")
     except OSError as error:
-        raise InputError(f"{path}: is no picture that can be read: {error}") from error
+        raise InputError(f"{path}: not a readable image: {error}") from error
     if picture.width > MOST_WIDTH:
         picture = picture.resize((MOST_WIDTH, round(picture.height * MOST_WIDTH / picture.width)))
     source, (width, height) = _webp(picture), picture.size
@@ -141,7 +141,7 @@ def _figure(path: Path) -> str:
 
 
 def _webp(picture: PillowImage.Image) -> str:
-    """Lossless where that is small, as it is with charts."""
+    """Compress without loss where that is small, as for charts."""
     content = io.BytesIO()
     picture.save(content, "WEBP", lossless=True)
     if content.tell() > LOSSLESS:
@@ -151,7 +151,7 @@ def _webp(picture: PillowImage.Image) -> str:
 
 
 def _caption(path: Path) -> str:
-    """What a figure shows, from the name that its command gave it."""
+    """Derive a figure's caption from its file name."""
     for prefix, title in _FIGURES:
         if path.name.startswith(prefix):
             rest = path.stem.removeprefix(prefix).strip("_")
@@ -161,13 +161,13 @@ def _caption(path: Path) -> str:
 
 
 def _setting(word: str) -> str:
-    for name, said, unit in (
+    for name, label, unit in (
         ("failure", "failure cost", "s"),
         ("walk", "walk", "km/h"),
         ("drive", "drive", "km/h"),
     ):
         if word.startswith(name) and (number := word.removeprefix(name)):
-            return f"{said} {number} {unit}"
+            return f"{label} {number} {unit}"
     return word
 
 
@@ -193,19 +193,19 @@ def _listed(names: Sequence[str], most: int = 4) -> str:
 
 
 def _findings(kind: str, summary: Mapping[str, Any]) -> list[str]:
-    """What the numbers say, in a sentence each."""
+    """Summarise the results in sentences."""
     if kind == "compare":
-        return _quickest(summary["rows"])
+        return _comparison_findings(summary["rows"])
     if kind == "survey":
-        return [_surveyed(row) for row in summary["rows"]]
+        return [_survey_finding(row) for row in summary["rows"]]
     if kind == "demo":
-        return [_surveyed(summary["survey"]), *_quickest(summary["rows"])]
+        return [_survey_finding(summary["survey"]), *_comparison_findings(summary["rows"])]
     if kind == "train":
-        return _learnt(summary)
+        return _training_findings(summary)
     return []
 
 
-def _learnt(summary: Mapping[str, Any]) -> list[str]:
+def _training_findings(summary: Mapping[str, Any]) -> list[str]:
     rows = [row for row in summary["rows"] if isinstance(row.get("total_s"), float)]
     if not rows:
         return []
@@ -214,29 +214,29 @@ def _learnt(summary: Mapping[str, Any]) -> list[str]:
     between = f"{times[0]:.1f} s"
     if len(times) > 1:
         between = f"{times[0]:.1f} to {times[-1]:.1f} s over {len(times)} trainings"
-    told = f"Tested on {name} in worlds of no examination, the models take {between}"
+    finding = f"Tested on {name} in held-out worlds, the models take {between}"
     planners = [row for row in summary.get("planners", []) if row["scenario"] == name]
     if planners:
         best = min(planners, key=lambda row: float(row["total_s"]))
-        told += f"; {best['agent']}, the best of the planners beside them, takes {best['total_s']:.1f} s"
-    return [f"{told}."]
+        finding += f"; the best planner there, {best['agent']}, takes {best['total_s']:.1f} s"
+    return [f"{finding}."]
 
 
-def _surveyed(row: Row) -> str:
+def _survey_finding(row: Row) -> str:
     return (
         f"{row['sessions']} drive{'s' if row['sessions'] > 1 else ''} past {row['slots']} slots: "
-        f"{row['car_detection_rate']:.1%} of the parked cars were found, {row['slot_accuracy']:.1%} of the slots "
-        "judged right."
+        f"{row['car_detection_rate']:.1%} of the parked cars were detected, {row['slot_accuracy']:.1%} of the slots "
+        "classified correctly."
     )
 
 
-def _quickest(rows: Sequence[Row]) -> list[str]:
+def _comparison_findings(rows: Sequence[Row]) -> list[str]:
     settings: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         settings.setdefault(
             (row["scenario"], row["failure_cost_s"], row["v_walk_kmh"], row["v_drive_kmh"]), []
         ).append(row)
-    told = []
+    findings = []
     speeds = len({key[2:] for key in settings}) > 1
     for (name, failure, walk, drive), its in settings.items():
         agents = [row for row in its if row["agent"] != "oracle"]
@@ -246,8 +246,8 @@ def _quickest(rows: Sequence[Row]) -> list[str]:
         at = f", walking at {walk:g} and driving at {drive:g} km/h" if speeds else ""
         interval = best["total_s_ci95"]
         between = f" [{interval[0]:.1f}, {interval[1]:.1f}]" if None not in interval else ""
-        told.append(
-            f"{name}, failure cost {failure:g} s{at}: {best['agent']} was the quickest in the mean, "
-            f"{best['total_s']:.1f} s{between}; nobody could have been faster than {best['bound_s']:.1f} s."
+        findings.append(
+            f"{name}, failure cost {failure:g} s{at}: {best['agent']} has the lowest mean total time, "
+            f"{best['total_s']:.1f} s{between}; the clairvoyant lower bound is {best['bound_s']:.1f} s."
         )
-    return told
+    return findings

@@ -1,4 +1,4 @@
-// Time: a slider, play and pause, steps from moment to moment, the keyboard.
+// Playback: a slider, play and pause, steps between recorded moments, the keyboard.
 
 const ICONS = {
   play: "M4 2.5v11l9.5-5.5z",
@@ -12,14 +12,14 @@ function icon(name) {
   return makeSvg("svg", { viewBox: "0 0 16 16", "aria-hidden": "true" }, makeSvg("path", { d: ICONS[name] }));
 }
 
-/** The player that the keyboard goes to: the one last used, or else the first. */
+/** The player that receives keys: the last one used, else the first. */
 let active = null;
 
 class Player {
-  /** show(seconds) is called whenever the time changes; told(seconds) says it in words. */
-  constructor(root, { show, told, speeds, speed, name }) {
+  /** show(seconds) is called when the time changes; describe(seconds) returns it as text. */
+  constructor(root, { show, describe, speeds, speed, name }) {
     this.show = show;
-    this.told = told;
+    this.describe = describe;
     this.seconds = 0;
     this.playing = false;
     this.slider = make("input", { type: "range", min: 0, max: 1, step: 0.01, value: 0, "aria-label": `Time in the ${name}` });
@@ -27,7 +27,7 @@ class Player {
     this.playKey = make("button", { type: "button", class: "play", "aria-label": "Play", title: "Play or pause (space)" }, icon("play"));
     const firstKey = make("button", { type: "button", "aria-label": "To the start", title: "To the start (Home)" }, icon("first"));
     const backKey = make("button", { type: "button", class: "step-back", "aria-label": "Step back", title: "Step back (←)" }, icon("back"));
-    const onKey = make("button", { type: "button", class: "step-on", "aria-label": "Step on", title: "Step on (→)" }, icon("on"));
+    const onKey = make("button", { type: "button", class: "step-on", "aria-label": "Step forward", title: "Step forward (→)" }, icon("on"));
     this.speedChoice = make("select", { "aria-label": "Speed" }, ...speeds.map((s) => make("option", { value: s, selected: s === speed }, `${s}×`)));
     this.time = make("div", { class: "time" }, this.slider);
     const hint = make("span", { class: "hint" }, make("kbd", {}, "space"), " play   ", make("kbd", {}, "←"), " ", make("kbd", {}, "→"), " step   ", make("kbd", {}, "Home"), " start");
@@ -42,7 +42,7 @@ class Player {
     active ??= this;
   }
 
-  /** Another recording: how long it is, and the moments to step between. */
+  /** Load a recording: its duration, and the moments to step between. */
   load(duration, stops) {
     this.pause();
     this.duration = duration;
@@ -54,7 +54,7 @@ class Player {
   goTo(seconds) {
     this.seconds = Math.min(Math.max(seconds, 0), this.duration);
     this.slider.value = this.seconds;
-    const words = this.told(this.seconds);
+    const words = this.describe(this.seconds);
     this.slider.setAttribute("aria-valuetext", words);
     this.output.textContent = words;
     this.show(this.seconds);
@@ -76,14 +76,14 @@ class Player {
     this.playing = true;
     this.face("pause", "Pause");
     let before = null;
-    const turn = (now) => {
+    const tick = (now) => {
       if (!this.playing) return;
       if (before !== null) this.goTo(this.seconds + ((now - before) / 1000) * Number(this.speedChoice.value));
       before = now;
       if (this.seconds >= this.duration) this.pause();
-      else requestAnimationFrame(turn);
+      else requestAnimationFrame(tick);
     };
-    requestAnimationFrame(turn);
+    requestAnimationFrame(tick);
   }
 
   pause() {

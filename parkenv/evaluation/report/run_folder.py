@@ -1,4 +1,4 @@
-"""What a command left in its folder: the summary, the figures, and the searches that it counted."""
+"""Read a run folder: summary, figures and episodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Searches run again and written down, step by step, for a page that shows them."""
+"""Record searches step by step for the replay of a report."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from parkenv.envs.search_state import SearchState
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.report.lot_data import describe_lot
-from parkenv.evaluation.report.plan_preview import PlanPreview
 from parkenv.evaluation.simulate import EpisodeResult, Observer, Step
 from parkenv.world.occupancy import World
-from planners.agent import make_agent
+from planners.agent import Agent, make_agent
 
 MOST_SLOTS = 20_000
-"""Lots with more are not drawn: a page with every slot of theirs would not load."""
+"""Lots with more slots have no replay: the page would not load."""
 STEADY_S = 600.0
-"""s up to which the truth is written down second by second; later on at the decisions alone."""
+"""s up to which the true occupancy is recorded every second; later only at decisions."""
 FULL = 255
-"""What a belief of 1 is written as."""
+"""The recorded value of a belief of 1."""
 AGREES_S = 1e-6
 
 Recording = dict[str, Any]
@@ -32,10 +31,10 @@ Recording = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Encounter:
-    """Agents that meet the same world.
+    """Agents in the same world.
 
     Attributes:
-        cases: one for each agent, of one setting.
+        cases: one per agent, of one setting.
         seed: of the world.
     """
 
@@ -44,11 +43,11 @@ class Encounter:
 
 
 def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[Encounter]:
-    """The first searches of every setting, in turns, until there are about so many; at least one world.
+    """Choose the first searches of each setting in turn, up to a number; at least one world.
 
     Args:
-        cases: with the seeds of their searches.
-        episodes: how many searches are wanted.
+        cases: each with the seeds of its searches.
+        episodes: how many searches to choose.
     """
     settings: dict[tuple[Any, ...], list[tuple[Case, Sequence[int]]]] = {}
     for case, seeds in cases:
@@ -58,11 +57,11 @@ def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[E
     count = 0
     for number in range(max((len(seeds) for _, seeds in cases), default=0)):
         for its in settings.values():
-            there = tuple(case for case, seeds in its if number < len(seeds))
-            if not there or (chosen and count + len(there) > episodes):
+            present = tuple(case for case, seeds in its if number < len(seeds))
+            if not present or (chosen and count + len(present) > episodes):
                 continue
-            chosen.append(Encounter(there, its[0][1][number]))
-            count += len(there)
+            chosen.append(Encounter(present, its[0][1][number]))
+            count += len(present)
     return chosen
 
 
@@ -78,7 +77,7 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
     state: SearchState | None = None
     for case in encounter.cases:
         agent = make_agent(case.agent, case.scenario, **case.options)
-        recorder = SearchRecorder(case.label, PlanPreview(case.scenario.public(), agent))
+        recorder = SearchRecorder(case.label, agent)
         EpisodeRunner(case.scenario, case.label, agent, case.rig, case.detector).run(
             encounter.seed, (recorder,)
         )
@@ -103,14 +102,14 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
         "view_range_m": round(float(scenario.sensor_model.view_range), 2),
         "v_walk": round(float(scenario.v_walk), 4),
         "sensors": first.rig,
-        "forecast": _bytes(state.belief.prior),
+        "forecast": _bytes(state.belief.forecast),
         **_truth(state.world, scenario.lot.n_slots, start, sorted(moments)),
     }
     return {"lot": describe_lot(scenario.lot), "world": world, "searches": searches}
 
 
 def _truth(world: World, n_slots: int, start: float, moments: Sequence[float]) -> Recording:
-    """What stood in the slots at the arrival, and when that changed: [centiseconds, slot, ...]."""
+    """Record the occupancy at the arrival, and its changes: [centiseconds, slot, ...]."""
     everything = np.arange(n_slots)
     taken = world.occupied(everything, start)
     first, changes = taken, []
@@ -127,7 +126,7 @@ class SearchRecorder(Observer):
 
     Args:
         name: of the agent.
-        preview: the agent's plan, see `PlanPreview`.
+        agent: whose plans are recorded, if it has `plan_preview`.
 
     Attributes:
         state: of the environment, hidden occupancy included.
@@ -137,17 +136,19 @@ class SearchRecorder(Observer):
     state: SearchState
     recording: Recording
 
-    def __init__(self, name: str, preview: PlanPreview) -> None:
-        self._name, self._preview = name, preview
+    def __init__(self, name: str, agent: Agent) -> None:
+        self._name = name
+        self._preview_of = getattr(agent, "plan_preview", None)
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
         """Record the arrival."""
         del observation
         self.state = env.unwrapped.state  # type: ignore[attr-defined]
         belief = self.state.belief
-        self._known = np.array(_bytes(belief.prior))
+        self._known = np.array(_bytes(belief.forecast))
         self._seen = np.zeros(len(self._known), dtype=np.bool_)
         self._plan = [-1]
+        self._vertex = self.state.vertex
         self._rows: dict[str, list[Any]] = {
             name: [] for name in ("t", "vertex", "failed", "belief", "seen", "action", "plan")
         }
@@ -155,12 +156,14 @@ class SearchRecorder(Observer):
 
     def on_step(self, step: Step) -> None:
         """Record the decision, the plan behind it, and the state after it."""
-        plan = self._preview.ahead(step.observation, int(step.action), step.memory)
+        plan: list[int] = []
+        if self._preview_of is not None:
+            plan = list(self._preview_of(step.observation, int(step.action), step.memory).path)
         # Most plans are what is left of the last one.
         self._rows["plan"].append(None if plan == self._plan[1:] else plan)
         self._rows["action"].append(int(step.action))
-        moved = self.state.vertex != int(step.observation["vertex"])
-        self._plan = plan if moved else [-1, *plan]
+        self._plan = plan if self.state.vertex != self._vertex else [-1, *plan]
+        self._vertex = self.state.vertex
         self._record_state(step.info["failed_s"])
 
     def on_end(self, result: EpisodeResult) -> None:
@@ -186,8 +189,8 @@ class SearchRecorder(Observer):
         rows["vertex"].append(state.vertex)
         rows["failed"].append(round(100 * failed_s))
         rows["belief"].append(np.stack([changed, now[changed]], axis=1).ravel().tolist())
-        rows["seen"].append(np.flatnonzero(belief.seen & ~self._seen).tolist())
-        self._known, self._seen = now, self._seen | belief.seen
+        rows["seen"].append(np.flatnonzero(belief.observed & ~self._seen).tolist())
+        self._known, self._seen = now, self._seen | belief.observed
 
 
 def _bytes(p: NDArray[np.floating]) -> list[int]:

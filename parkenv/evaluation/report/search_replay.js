@@ -3,7 +3,7 @@
 const MOST_PANELS = 4;
 const PARK = 4;
 
-/** The first index whose value is above a limit, less one: the last moment that has come. */
+/** Return the last index whose value is at most a limit, -1 if none. */
 function lastUpTo(values, limit) {
   let [low, high] = [0, values.length];
   while (low < high) {
@@ -14,7 +14,7 @@ function lastUpTo(values, limit) {
   return low - 1;
 }
 
-/** What stood in the slots of a world, moment by moment. */
+/** The true occupancy of a world over time. */
 class Truth {
   constructor(world, slots) {
     this.world = world;
@@ -39,7 +39,7 @@ class Truth {
   }
 }
 
-/** One search, moment by moment. */
+/** One search over time. */
 class Track {
   constructor(search, world, lot) {
     this.search = search;
@@ -62,7 +62,7 @@ class Track {
     this.seen = new Uint8Array(this.lot.slots.length);
   }
 
-  /** The last moment at or before a time, with belief and seen brought there. */
+  /** Return the last recorded moment at or before a time, with belief and observed slots updated to it. */
   at(seconds) {
     const k = Math.max(0, lastUpTo(this.search.t, Math.round(100 * seconds + 1e-6)));
     if (k + 1 < this.applied) this.rewind();
@@ -74,7 +74,7 @@ class Track {
     return k;
   }
 
-  /** Where the car is and looks, at a time. */
+  /** Return the car's pose at a time. */
   pose(seconds, k) {
     const { search, lot } = this;
     const [x, y] = lot.vertices[search.vertex[k]];
@@ -93,7 +93,7 @@ class Track {
     return [x, y, lot.yaw[search.vertex[k]] ?? 0];
   }
 
-  /** The parts of the time that have gone by, s. */
+  /** Split the elapsed time into its parts, s. */
   split(seconds, k) {
     const { search } = this;
     let failed = search.failed[k] / 100;
@@ -107,10 +107,10 @@ class Track {
   status(seconds, k) {
     const { search, lot } = this;
     const name = (slot) => lot.slot_ids[slot];
-    if (seconds >= search.total_s - 0.005) return search.parked ? `at the goal; parked in ${name(search.slot)}` : search.truncated ? "cut off" : "lot full, gone elsewhere";
-    if (seconds >= this.end) return search.parked ? `parked in ${name(search.slot)}, walking` : search.truncated ? "cut off" : "lot is full: going elsewhere";
+    if (seconds >= search.total_s - 0.005) return search.parked ? `at the goal; parked in ${name(search.slot)}` : search.truncated ? "truncated" : "lot full, gave up";
+    if (seconds >= this.end) return search.parked ? `parked in ${name(search.slot)}, walking` : search.truncated ? "truncated" : "lot is full: giving up";
     const here = search.vertex[k];
-    if (search.action[k] === PARK) return here < lot.slots.length && search.failed[k + 1] > search.failed[k] ? `${name(here)} is taken: failed` : "waiting";
+    if (search.action[k] === PARK) return here < lot.slots.length && search.failed[k + 1] > search.failed[k] ? `${name(here)} is taken: failed attempt` : "waiting";
     if (search.vertex[k + 1] === here) return "waiting";
     const plan = this.plans[k];
     const end = plan[plan.length - 1];
@@ -141,16 +141,16 @@ class SearchReplay {
     this.player = new Player(root, {
       name: "search", speeds: [1, 2, 5, 10, 20, 50], speed: 5,
       show: (seconds) => this.show(seconds),
-      told: (seconds) => `${seconds2(seconds)} of ${seconds2(this.player.duration)} s`,
+      describe: (seconds) => `${seconds2(seconds)} of ${seconds2(this.player.duration)} s`,
     });
     transport.append(this.strips, this.player.keys);
     const world = make("label", {}, "World ", this.worldChoice);
     root.append(
-      make("p", { class: "quiet" }, "The same worlds, run again: every agent meets the same cars at the same times. Fill: what the agent believes. Dark cars: what is really there, which agents do not see until they come near."),
+      make("p", { class: "quiet" }, "The searches are simulated again: every agent meets the same cars at the same times. Slot colours show the agent's belief, dark cars the true occupancy, which agents observe only nearby."),
       make("div", { class: "controls" }, world, this.chips, this.followKey),
       this.panels, transport, lotLegend(),
     );
-    // Where a whole lot would come out too small, the car is followed.
+    // Follow the car if the whole lot would be too small.
     const lot = data.lots[worlds[0].lot];
     this.follow = Math.min(root.clientWidth, 1280) / (lot.bounds[2] - lot.bounds[0]) < 2.6;
     this.open(0);
@@ -240,7 +240,7 @@ class SearchReplay {
   layStrips(duration) {
     const rows = this.shown.flatMap(({ track }) => {
       const { search } = track;
-      const strip = make("div", { class: "strip", title: "drive, failed tries, walk" });
+      const strip = make("div", { class: "strip", title: "drive, failed attempts, walk" });
       const part = (from, to, color) => {
         if (to > from) strip.append(make("span", { style: `left: ${(100 * from) / duration}%; width: ${(100 * (to - from)) / duration}%; background: var(${color})` }));
       };
@@ -269,7 +269,7 @@ class SearchReplay {
     this.strips.replaceChildren(...rows, this.player.time, this.playhead);
   }
 
-  /** A line through all strips, at the time. */
+  /** Move the line through all strips to the current time. */
   movePlayhead(seconds) {
     const strips = this.strips.querySelectorAll(".strip");
     if (!strips.length || !this.playhead) return;
@@ -321,25 +321,25 @@ class SearchReplay {
       view.drawScale();
 
       const parts = track.split(seconds, k);
-      const told = track.status(seconds, k);
-      status.textContent = told;
+      const statusText = track.status(seconds, k);
+      status.textContent = statusText;
       clock.replaceChildren(seconds2(Math.min(seconds, search.total_s)), make("small", {}, " s"));
       panel.classList.toggle("done", over);
       panel.dataset.vertex = search.vertex[k];
       panel.dataset.total = search.total_s;
-      canvas.setAttribute("aria-label", `${search.agent} after ${seconds2(seconds)} s: ${told}`);
+      canvas.setAttribute("aria-label", `${search.agent} after ${seconds2(seconds)} s: ${statusText}`);
       const words = [["drive", "--drive"], ["failed", "--failed"], ["walk", "--walk"], ["gave_up", "--gave-up"]]
         .filter(([name]) => name !== "gave_up" || search.gave_up_s > 0)
         .map(([name, color]) => make("span", {}, make("i", { style: `background: var(${color})` }), `${name.replace("_", " ")} `, make("b", {}, seconds2(parts[name]))));
       if (over && search.agrees !== null) {
-        words.push(make("span", { class: search.agrees ? "check" : "check bad", title: "Whether this search, run again, came to the total that it was counted with" }, search.agrees ? "✓ as counted" : `counted as ${seconds2(search.counted_s)} s`));
+        words.push(make("span", { class: search.agrees ? "check" : "check bad", title: "Whether the simulation reproduced the total time in episodes.csv" }, search.agrees ? "✓ as in episodes.csv" : `episodes.csv: ${seconds2(search.counted_s)} s`));
       }
       split.replaceChildren(...words);
     }
   }
 }
 
-/** What the marks on a lot mean. */
+/** The legend of the lot's marks. */
 function lotLegend() {
   const key = (mark, text) => make("span", { class: "key" }, mark, text);
   const svg = (width, ...children) => makeSvg("svg", { width, height: 16, viewBox: `0 0 ${width} 16`, "aria-hidden": "true" }, ...children);
@@ -352,7 +352,7 @@ function lotLegend() {
   const goal = svg(18, makeSvg("circle", { cx: 9, cy: 8, r: 7, style: "fill: var(--goal)" }), makeSvg("circle", { cx: 9, cy: 8, r: 2.6, style: "fill: var(--halo)" }));
   return make(
     "div", { class: "legend lot" },
-    key(make("span", {}, "free ", scale), "taken: belief in slots seen"), key(pale, "forecast, not seen yet"),
-    key(car, "a car is there"), key(mine, "the searching car"), key(plan, "its plan"), key(walk, "the walk"), key(goal, "goal"),
+    key(make("span", {}, "free ", scale), "taken: belief, slots observed"), key(pale, "forecast, slots not observed yet"),
+    key(car, "parked car"), key(mine, "searching car"), key(plan, "its plan"), key(walk, "walk"), key(goal, "goal"),
   );
 }

@@ -1,4 +1,4 @@
-// Tables: every number of the summary, sorted by a click or by Enter on a heading.
+// Tables: every number of the summary; click a heading, or press Enter on it, to sort.
 
 const SETTING = ["scenario", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh"];
 
@@ -9,7 +9,7 @@ function sortValue(value) {
 
 function compareValues(a, b) {
   const [x, y] = [sortValue(a), sortValue(b)];
-  // What is missing comes last, whichever way.
+  // Missing values come last in either order.
   if (x === null || x === undefined) return y === null || y === undefined ? 0 : Infinity;
   if (y === null || y === undefined) return -Infinity;
   if (typeof x === "string" || typeof y === "string") return String(x).localeCompare(String(y), "en", { numeric: true });
@@ -51,7 +51,7 @@ function factsTable(table) {
     if (column.unit && typeof table.rows[0][i] === "number") cell.append(` ${column.unit}`);
     body.append(make("tr", { role: "row", "data-row": 0, title: column.help }, make("th", { role: "rowheader", scope: "row" }, column.label), cell));
   });
-  // The style sheet sets it in columns, which would take its being a table from those who listen to the page.
+  // The style sheet lays it out in columns; the roles keep it a table for screen readers.
   return make("table", { role: "table", class: "facts", "data-table": table.name, "aria-label": table.title }, body);
 }
 
@@ -121,7 +121,7 @@ function sortableTable(table) {
         type: "button", class: "chip", "aria-pressed": String(group === null),
         onclick: (event) => {
           for (const chip of chips.children) chip.setAttribute("aria-pressed", String(chip === event.currentTarget));
-          // What the choice says need not stand in every row.
+          // The chosen setting need not be repeated in every row.
           element.classList.toggle("one-setting", group !== null);
           lines.forEach((line, i) => { line.hidden = group !== null && settingOf(rows[i]) !== group; });
         },

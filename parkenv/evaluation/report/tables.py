@@ -1,4 +1,4 @@
-"""The tables of a page: which columns, what they are called, and how their numbers are written."""
+"""The tables of a report: their columns, labels and number formats."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ Cell = float | int | str | bool | None | list[float | None]
 
 
 class Column(NamedTuple):
-    """How a column is shown.
+    """Format of a column.
 
     Attributes:
-        key: as the summary has it.
-        label: as people say it.
-        unit: behind the numbers; empty for none.
+        key: in the summary.
+        label: heading.
+        unit: of the numbers; empty for none.
         digits: after the point.
         share: whether it is a fraction, to be written as a percentage.
         signed: whether a plus is written.
-        help: what it means.
+        help: explanation.
     """
 
     key: str
@@ -37,28 +37,28 @@ _KNOWN = {
     for column in (
         Column("scenario", "scenario"),
         Column("test_scenario", "tested on"),
-        Column("occupancy_level", "fullness", share=True, digits=0, help="Mean occupancy that the lot was set to"),
+        Column("occupancy_level", "occupancy level", share=True, digits=0, help="Mean occupancy the lot was set to"),
         Column("agent", "agent"),
-        Column("failure_cost_s", "failure cost", "s", 0, help="What a try at a taken slot costs"),
+        Column("failure_cost_s", "failure cost", "s", 0, help="Time of a failed parking attempt"),
         Column("v_walk_kmh", "walk", "km/h", 0),
         Column("v_drive_kmh", "drive", "km/h", 0),
         Column("episodes", "searches", digits=0),
         Column("seed", "seed", digits=0),
-        Column("total_s", "total time", "s", help="Drive, failed tries and walk: mean and 95 % interval"),
-        Column("difference_s", "to the first agent", "s", signed=True, help="Paired by world; 95 % interval"),
-        Column("regret_s", "regret", "s", help="How much longer than one who knows every slot's future"),
-        Column("drive_s", "drive", "s", help="Seconds driven, waits included"),
-        Column("failed_s", "failed tries", "s", help="Seconds lost by tries at taken slots"),
+        Column("total_s", "total time", "s", help="Drive + failed attempts + walk + give-up penalty"),
+        Column("difference_s", "minus first agent", "s", signed=True, help="Paired by world; 95 % interval"),
+        Column("regret_s", "regret", "s", help="Difference to the clairvoyant lower bound"),
+        Column("drive_s", "drive", "s", help="Time driving, waits included"),
+        Column("failed_s", "failed attempts", "s", help="Time of failed parking attempts"),
         Column("walk_s", "walk", "s"),
-        Column("gave_up_s", "gave up", "s", help="Seconds charged for lots found full, and for searches cut off"),
-        Column("bound_s", "bound", "s", help="The least time in these worlds of one who knows it all"),
+        Column("gave_up_s", "give-up penalty", "s", help="Charged where the lot is full or the search was truncated"),
+        Column("bound_s", "bound", "s", help="Clairvoyant lower bound: least time with full knowledge of the future"),
         Column("parked_fraction", "parked", share=True, digits=0),
-        Column("failed_parks", "tries failed", digits=2),
-        Column("replans", "re-plans", help="How often an agent changed its plan in a search"),
+        Column("failed_parks", "failed attempts", digits=2),
+        Column("replans", "replans", help="How often the agent replanned in a search"),
         Column("driven_m", "driven", "m", 0),
         Column("walked_m", "walked", "m", 0),
         Column("slots_passed", "slots passed"),
-        Column("occupancy", "occupied", share=True, digits=0, help="Share of the slots that is taken at the arrival"),
+        Column("occupancy", "occupied", share=True, digits=0, help="Share of slots taken at the arrival"),
         Column("decision_ms", "decision", "ms", 2, help="Median wall time of a decision"),
         Column("decision_ms_p99", "p99", "ms", 2, help="99th percentile of the wall time of a decision"),
         Column("gap_to_exact", "over exact", share=True, digits=2, signed=True),
@@ -71,25 +71,25 @@ _KNOWN = {
         Column("detection_precision", "detections that are cars", share=True),
         Column("range_abs_error_m.median", "distance of a car, median error", "m", 3),
         Column("range_abs_error_m.p95", "distance of a car, 95th percentile", "m", 2),
-        Column("slot_accuracy", "slots judged right", share=True, help="A slot never in view counts as wrong"),
-        Column("slot_accuracy_seen", "slots judged right, of those seen", share=True),
+        Column("slot_accuracy", "slot accuracy", share=True, help="Slots never in view count as wrong"),
+        Column("slot_accuracy_seen", "slot accuracy, slots in view", share=True),
         Column("unknown_fraction", "slots never in view", share=True),
-        Column("occupancy_mae", "map against the true probabilities", digits=3, help="Mean absolute error of P(taken)"),
-        Column("occupancy_mae_expected", "the same of counts alone", digits=3, help="Of as many drives at that hour"),
-        Column("seconds_per_frame", "time to understand a frame", "s", 3),
-        Column("slots_found.precision", "slots found without a map that are true", share=True),
-        Column("slots_found.recall", "true slots found without a map", share=True),
-        Column("slots_found.error", "place of a slot found, mean error", "m", 2),
-        Column("slots_found.yaw_error", "heading of a slot found, mean error", "rad", 3),
+        Column("occupancy_mae", "map error", digits=3, help="Mean absolute error of P(taken)"),
+        Column("occupancy_mae_expected", "map error of raw counts", digits=3, help="Of as many drives at that hour"),
+        Column("seconds_per_frame", "perception time per frame", "s", 3),
+        Column("slots_found.precision", "discovered slots, precision", share=True),
+        Column("slots_found.recall", "discovered slots, recall", share=True),
+        Column("slots_found.error", "discovered slots, mean position error", "m", 2),
+        Column("slots_found.yaw_error", "discovered slots, mean heading error", "rad", 3),
         Column("distance_m", "distance", "m", 0),
-        Column("rate", "share detected", share=True, help="In frames in which a car stands clear"),
+        Column("rate", "share detected", share=True, help="In frames in which the car is not occluded"),
         Column("in_frame", "cars in frames", digits=0),
         Column("detected", "detected", digits=0),
-        Column("success", "parkings that succeed", share=True),
+        Column("success", "successful parkings", share=True),
         Column("parked", "parked", digits=0),
         Column("found", "found", digits=0),
         Column("detections", "detections", digits=0),
-        Column("right", "right", digits=0),
+        Column("right", "correct", digits=0),
         Column("occupied_fraction", "occupied", share=True, digits=0),
         Column("key", "drive"),
         Column("weather", "weather"),
@@ -101,13 +101,13 @@ _ORDER = (
     "total_s", "difference_s", "gap_to_exact", "regret_s", "drive_s", "failed_s", "walk_s", "gave_up_s",
     "parked_fraction",
 )  # fmt: skip
-"""Columns that come first, in this order; others follow as they come."""
+"""First columns, in this order; others follow."""
 _TABLES_OF_THEIR_OWN = ("by_weather",)
 _UNITS = (("_kmh", "km/h"), ("_ms", "ms"), ("_s", "s"), ("_m", "m"), ("_deg", "°"), ("_rad", "rad"))
 
 
 def column_of(key: str) -> Column:
-    """How a column is shown; one that nobody has described is named after its key.
+    """Return the format of a column; unknown ones are labelled by their key.
 
     Examples:
         >>> column_of("total_s").label, column_of("brake_distance_m")[:3]
@@ -122,16 +122,16 @@ def column_of(key: str) -> Column:
 
 
 def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False) -> dict[str, Any]:
-    """A table of the page's data.
+    """Build a table of the page's data.
 
-    Intervals (`NAME_ci95`) stand in the column of what they belong to. Columns that are the same in all rows are put
-    into words beside the table, in `same`.
+    Intervals (`NAME_ci95`) join the column of their value. Columns that are equal in all rows go to `same`, which is
+    printed above the table.
 
     Args:
-        name: what the page calls it.
+        name: identifies it in the page.
         title: above it.
-        rows: with equal keys, more or less.
-        facts: whether it is one row that is better read from top to bottom.
+        rows: with about the same keys.
+        facts: whether it is one row, shown from top to bottom.
     """
     flat = [_flat(row) for row in rows]
     keys = list(dict.fromkeys(key for row in flat for key in row))
@@ -140,7 +140,7 @@ def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False)
     same = []
     if len(rows) > 1:
         same = [k for k in keys if len({repr(v) for v in values[k]}) == 1]
-        # What is compared stays, even where it comes out equal.
+        # Compared values stay even if they are equal.
         same = [
             k for k in same if values[k][0] is None or k in _ORDER[:6] or k in ("episodes", "rig", "slots")
         ]
@@ -160,7 +160,7 @@ def _described(key: str) -> dict[str, Any]:
 
 
 def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Cell]:
-    """One level, intervals folded in; lists of rows are left out, they are tables of their own."""
+    """Flatten nested keys and join intervals; lists of rows are left out, as they have their own tables."""
     made: dict[str, Cell] = {}
     for key, value in row.items():
         name = prefix + key
@@ -179,27 +179,25 @@ def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Cell]:
 
 
 def tables_of(kind: str, summary: Mapping[str, Any], sessions: Sequence[Row]) -> list[dict[str, Any]]:
-    """The tables of a command's summary.
+    """Build the tables of a command's summary.
 
     Args:
-        kind: the command.
-        summary: what it wrote.
+        kind: name of the command.
+        summary: its summary.
         sessions: of a survey, the rows of `sessions.csv`.
     """
     rows = summary["rows"]
     surveyed = rows[0] if kind == "survey" and rows else summary.get("survey")
     tables = []
     if kind != "survey":
-        title = {"train": "Models that were trained", "demo": "Searches through the sensors"}.get(
-            kind, "Results"
-        )
+        title = {"train": "Trained models", "demo": "Searches with simulated sensors"}.get(kind, "Results")
         tables.append(table_of("rows", title, rows))
     if summary.get("transfer"):
-        tables.append(table_of("transfer", "In worlds of no examination", summary["transfer"]))
+        tables.append(table_of("transfer", "Test in held-out worlds", summary["transfer"]))
     if summary.get("planners"):
         tables.append(table_of("planners", "Planners in the same worlds", summary["planners"]))
     if summary.get("occupancy_rows"):
-        tables.append(table_of("occupancy_rows", "Against how full the lot is", summary["occupancy_rows"]))
+        tables.append(table_of("occupancy_rows", "By occupancy level", summary["occupancy_rows"]))
     if surveyed:
         tables.append(table_of("survey", "The survey", [surveyed], facts=True))
         if by_weather := surveyed.get("by_weather"):
@@ -207,11 +205,11 @@ def tables_of(kind: str, summary: Mapping[str, Any], sessions: Sequence[Row]) ->
             tables.append(table_of("by_weather", "By weather", its))
         if found := surveyed.get("detection_by_distance"):
             its = [{**row, "weather": _plain(row["weather"])} for row in found]
-            tables.append(table_of("detection_by_distance", "How far away cars are found", its))
+            tables.append(table_of("detection_by_distance", "Detection rate by distance", its))
     if sessions:
         kept = [c for c in _SESSION if c in sessions[0]]
         its = [{c: _plain(row[c]) if c == "weather" else row[c] for c in kept} for row in sessions]
-        tables.append(table_of("sessions", "Drive by drive", its))
+        tables.append(table_of("sessions", "Survey drives", its))
     return tables
 
 

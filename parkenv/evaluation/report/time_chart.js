@@ -1,10 +1,10 @@
-// Where the time goes: a stacked bar an agent, with the interval of its mean, a panel for each setting.
+// Mean total time: a stacked bar per agent with the confidence interval of its mean, a panel per setting.
 
-const PARTS = [["drive_s", "drive", "--drive"], ["failed_s", "failed tries", "--failed"], ["walk_s", "walk", "--walk"], ["gave_up_s", "gave up", "--gave-up"]];
+const PARTS = [["drive_s", "drive", "--drive"], ["failed_s", "failed attempts", "--failed"], ["walk_s", "walk", "--walk"], ["gave_up_s", "give-up penalty", "--gave-up"]];
 /** Bars longer than this many times the shortest agent's are cut. */
 const CUT = 2.6;
 
-/** A round step that gives about so many ticks. */
+/** Return a round step that gives about `count` ticks. */
 function tickStep(span, count) {
   const raw = span / count;
   const power = 10 ** Math.floor(Math.log10(raw));
@@ -52,7 +52,7 @@ function timePanel(rows, end, width) {
   return svg;
 }
 
-/** The chart of a table that has the parts of the time, or nothing. */
+/** Draw the chart of a table that has the parts of the total time; returns whether it does. */
 function showTimeChart(root, table) {
   const named = (row) => Object.fromEntries([...table.same.map((column) => [column.key, column.value]), ...table.columns.map((column, i) => [column.key, row[i]])]);
   const rows = table.rows.map(named);
@@ -67,7 +67,7 @@ function showTimeChart(root, table) {
   }
   if (groups.size > 12) return false;
   const totals = rows.filter((row) => row.agent !== "oracle").map((row) => row.total_s[0]);
-  // Few agents are far off; what is to be compared are the others.
+  // A few agents far off must not squash the others.
   const shortest = Math.min(...totals);
   const shown = rows.map((row) => row.total_s[2] ?? row.total_s[0]).filter((seconds) => seconds <= CUT * shortest);
   const longest = Math.max(...rows.map((row) => row.total_s[2] ?? row.total_s[0]));
@@ -75,7 +75,7 @@ function showTimeChart(root, table) {
   const step = tickStep(Math.min(longest, raw), 5);
   const end = Math.ceil(raw / step) * step;
   const grid = make("div", { class: groups.size > 1 ? "grid" : "single" });
-  // A page is laid out once; from there on a chart grows and shrinks with it.
+  // The size is fixed once; later the chart scales with the page.
   const width = Math.min(Math.max(root.clientWidth / (groups.size > 1 ? 2 : 1) - 60, 420), 900);
   for (const its of groups.values()) {
     const words = settingInWords(varying, varying.map((column) => its[0][column.key]));
@@ -86,9 +86,9 @@ function showTimeChart(root, table) {
   const line = makeSvg("svg", { width: 22, height: 14 }, makeSvg("path", { class: "whisker", d: "M2 7H20M2 3V11M20 3V11", fill: "none" }));
   const dashes = makeSvg("svg", { width: 10, height: 16 }, makeSvg("line", { class: "bound", x1: 5, x2: 5, y1: 0, y2: 16 }));
   keys.push(make("span", { class: "key" }, line, "95 % interval of the mean"));
-  if (rows.some((row) => row.bound_s)) keys.push(make("span", { class: "key" }, dashes, "clairvoyant bound"));
+  if (rows.some((row) => row.bound_s)) keys.push(make("span", { class: "key" }, dashes, "clairvoyant lower bound"));
   root.append(
-    make("p", { class: "quiet" }, "Mean seconds from the entry of the lot to the goal. Bars that would be far longer than the others are cut."),
+    make("p", { class: "quiet" }, "Mean seconds from the entry of the lot to the goal. Bars far longer than the others are cut off."),
     make("div", { class: "card chart" }, make("div", { class: "legend" }, ...keys), grid),
   );
   return true;

@@ -17,28 +17,27 @@ from parkenv.errors import InputError
 from parkenv.evaluation.simulate import EpisodeResult, Observer, Step, simulate
 from parkenv.evaluation.training.configs import MAX_STEPS, REWARD_SCALE
 from parkenv.world.scenario import Scenario
-from planners.agent import make_agent
-from planners.bounds.oracle import OracleAgent
+from planners.agent import ClairvoyantAgent, make_agent
 
 UPDATES = 3000
 """Steps of the optimizer, enough for a policy that seldom deviates from the demonstrations."""
-IMITATORS = ("ppo", "maskable-ppo")
+CLONEABLE = ("ppo", "maskable-ppo")
 """Algorithms whose policies can be cloned from demonstrations."""
 BATCH = 512
 LEARNING_RATE = 1e-3
 
 
-def require_imitable(algorithm: str, agent: str, scenario: Scenario) -> None:
+def require_cloneable(algorithm: str, agent: str, scenario: Scenario) -> None:
     """Check that an algorithm can clone an agent, before demonstrations are collected.
 
     Raises:
         InputError: an algorithm without behaviour cloning, an unknown agent, or the oracle.
     """
-    if algorithm not in IMITATORS:
-        raise InputError(f"{algorithm} has no behaviour cloning; take {' or '.join(IMITATORS)}")
-    if isinstance(make_agent(agent, scenario), OracleAgent):
+    if algorithm not in CLONEABLE:
+        raise InputError(f"{algorithm} has no behaviour cloning; take {' or '.join(CLONEABLE)}")
+    if isinstance(make_agent(agent, scenario), ClairvoyantAgent):
         raise InputError(
-            f"{agent} cannot be imitated: it decides on the hidden occupancy, which no policy observes"
+            f"{agent} cannot be cloned: it decides on the hidden occupancy, which no policy observes"
         )
 
 
@@ -74,7 +73,7 @@ class Demonstrations:
             simulate(env, planner, seed, (recorder,))
         if not recorder.finished:
             raise InputError(
-                f"{agent} finished none of {len(seeds)} searches on {scenario.name}: nothing to imitate"
+                f"{agent} finished none of {len(seeds)} searches on {scenario.name}: nothing to clone"
             )
         local, masks, actions, rewards = zip(*itertools.chain.from_iterable(recorder.finished), strict=True)
         lengths = np.cumsum([len(decisions) for decisions in recorder.finished])[:-1]
@@ -118,7 +117,7 @@ def clone(
 
     Args:
         model: fresh, of ppo or maskable-ppo.
-        demonstrations: what to imitate.
+        demonstrations: decisions to clone.
         seed: of the mini-batches.
         updates: steps of the optimizer.
     """

@@ -1,4 +1,4 @@
-"""How each algorithm is trained: the settings that were found to do well, in one place."""
+"""Training configs: for each algorithm the settings that performed well."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Any, TypeVar
 from parkenv.errors import InputError
 
 REWARD_SCALE = 0.01
-"""Returns of some -100 s become about -1."""
+"""Scales returns of about -100 s to about -1."""
 MAX_STEPS = 500
-"""Decisions after which a search is given up in training: who is not parked by then drives in circles."""
+"""Step limit of training episodes: a search that takes longer drives in circles."""
 
 
 @dataclass(frozen=True)
-class Recipe:
+class TrainingConfig:
     """Settings of one algorithm.
 
     Args:
-        n_envs: searches at once.
-        policy: stable-baselines3's word for the kind of network.
-        settings: of the algorithm's constructor, by its own names.
-        final_learning_rate: share of the learning rate that is left in the end; it falls in a straight line.
+        n_envs: number of parallel environments.
+        policy: stable-baselines3's name of the policy class.
+        settings: arguments of the algorithm's constructor.
+        final_learning_rate: fraction of the learning rate at the end of training; it falls linearly.
     """
 
     n_envs: int
@@ -42,16 +42,16 @@ _ON_POLICY: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [128, 128]},
 }
 
-RECIPES: dict[str, Recipe] = {
-    "ppo": Recipe(256, "MultiInputPolicy", _ON_POLICY, 0.05),
-    "maskable-ppo": Recipe(256, "MultiInputPolicy", _ON_POLICY, 0.05),
-    "recurrent-ppo": Recipe(
+SEARCH_CONFIGS: dict[str, TrainingConfig] = {
+    "ppo": TrainingConfig(256, "MultiInputPolicy", _ON_POLICY, 0.05),
+    "maskable-ppo": TrainingConfig(256, "MultiInputPolicy", _ON_POLICY, 0.05),
+    "recurrent-ppo": TrainingConfig(
         128,
         "MultiInputLstmPolicy",
         {**_ON_POLICY, "policy_kwargs": {"net_arch": [128], "lstm_hidden_size": 64}},
         0.05,
     ),
-    "dqn": Recipe(
+    "dqn": TrainingConfig(
         64,
         "MultiInputPolicy",
         {
@@ -61,7 +61,7 @@ RECIPES: dict[str, Recipe] = {
             "batch_size": 512,
             "train_freq": 1,
             "gradient_steps": 2,
-            # Nearer to 1, driving in circles for ever counts for more than all else there is to learn.
+            # Closer to 1, the value of driving in circles for ever dominates what is to be learned.
             "gamma": 0.995,
             "target_update_interval": 2_000,
             "exploration_fraction": 0.3,
@@ -71,21 +71,21 @@ RECIPES: dict[str, Recipe] = {
         0.05,
     ),
 }
-"""Of each algorithm that learns to search."""
+"""Config of each algorithm for searching."""
 
 
 WAY_IN = "way-in"
-"""Starts on the planner's way into the slot."""
+"""Starts on the planned path into the slot."""
 
 
 @dataclass(frozen=True)
-class Stage:
-    """How hard the tasks of a level are; see `parkenv.driving.parking_task.ParkingTasks`.
+class CurriculumLevel:
+    """Difficulty of the tasks of a level; see `parkenv.driving.parking_task.ParkingTasks`.
 
     Args:
-        starts: way-out or lane; or way-in: where the planner that parks would be by then, on its way from the lane.
-        distance: m, least and greatest; of the way that is left for way-in.
-        slack: m that are kept clear around the slot.
+        starts: `way-out` or `lane`, or `way-in`: on the planned path from the lane into the slot.
+        distance: least and greatest, m; for `way-in` the remaining length of the path.
+        slack: free space around the slot, m.
     """
 
     starts: str
@@ -94,41 +94,41 @@ class Stage:
 
 
 CURRICULUM = (
-    Stage("way-out", (0.3, 1.5), 0.0),
-    Stage("way-out", (1.0, 4.0), 0.0),
-    Stage("way-out", (2.0, 8.0), 0.0),
-    Stage("way-out", (4.0, 14.0), 0.0),
-    Stage(WAY_IN, (2.0, 5.0), 0.0),
-    Stage(WAY_IN, (3.0, 7.0), 0.0),
-    Stage(WAY_IN, (5.0, 9.0), 0.0),
-    Stage(WAY_IN, (6.0, 11.0), 0.0),
-    Stage(WAY_IN, (8.0, 14.0), 0.0),
-    Stage("lane", (4.0, 14.0), 0.0),
+    CurriculumLevel("way-out", (0.3, 1.5), 0.0),
+    CurriculumLevel("way-out", (1.0, 4.0), 0.0),
+    CurriculumLevel("way-out", (2.0, 8.0), 0.0),
+    CurriculumLevel("way-out", (4.0, 14.0), 0.0),
+    CurriculumLevel(WAY_IN, (2.0, 5.0), 0.0),
+    CurriculumLevel(WAY_IN, (3.0, 7.0), 0.0),
+    CurriculumLevel(WAY_IN, (5.0, 9.0), 0.0),
+    CurriculumLevel(WAY_IN, (6.0, 11.0), 0.0),
+    CurriculumLevel(WAY_IN, (8.0, 14.0), 0.0),
+    CurriculumLevel("lane", (4.0, 14.0), 0.0),
 )
-"""From a step before the slot to the task itself, that of `parkenv/Drive-v1` as it is.
+"""Levels from a start just outside the slot to the full task of `parkenv/Drive-v1`.
 
-A random drive out of a parallel slot stays in it, and teaches to put right how one stands there; what lies between the
-slot and the lane is learned along the planner's way, from its end backward.
+A random drive out of a parallel slot ends inside it, so these starts teach to correct the pose in the slot; the part
+between slot and lane is learned along the planned path, from its end backwards.
 """
 
 
 @dataclass(frozen=True, kw_only=True)
-class DriveRecipe(Recipe):
-    """Settings of one algorithm that learns to drive into slots.
+class DriveTrainingConfig(TrainingConfig):
+    """Settings of one algorithm for driving into slots.
 
     Args:
-        reward: `sparse`, with goals of hindsight; or `dense`.
-        reward_scale: rewards are seconds times this.
-        contact_cost: s, what a contact costs in training.
-        steps: decisions of a training, unless another number is asked for.
-        curriculum: levels, from the easiest to the task itself.
+        reward: `sparse`, with hindsight experience replay, or `dense`.
+        reward_scale: factor from seconds to rewards.
+        contact_cost: cost of a contact in training, s.
+        steps: default number of decisions.
+        curriculum: levels, from the easiest to the full task.
     """
 
     reward: str
     reward_scale: float
     contact_cost: float
     steps: int
-    curriculum: tuple[Stage, ...] = CURRICULUM
+    curriculum: tuple[CurriculumLevel, ...] = CURRICULUM
 
 
 _OFF_POLICY: dict[str, Any] = {
@@ -140,12 +140,12 @@ _OFF_POLICY: dict[str, Any] = {
     "gradient_steps": 4,
     "gamma": 0.98,
     "tau": 0.005,
-    # From 1, its default, entropy counts for more than parking does, for thousands of updates: who parks gets no more.
+    # With the default of 1, entropy outweighs the reward of parking for thousands of updates.
     "ent_coef": "auto_0.02",
     "replay_buffer_kwargs": {"n_sampled_goal": 4, "goal_selection_strategy": "future"},
     "policy_kwargs": {"net_arch": [128, 128]},
 }
-_HINDSIGHT = DriveRecipe(
+_HINDSIGHT = DriveTrainingConfig(
     16,
     "MultiInputPolicy",
     _OFF_POLICY,
@@ -156,11 +156,11 @@ _HINDSIGHT = DriveRecipe(
     steps=300_000,
 )
 
-# A contact has to cost more than to stand still for ever, which is 0.4 s / (1 - gamma) in sparse rewards, and about
-# twice that in dense ones: for much less (60 s), who does not know how to park yet runs into something to have it over.
-# For much more (100 s), the narrow way into a parallel slot is learned two or three times as slowly.
-DRIVE_RECIPES: dict[str, DriveRecipe] = {
-    "ppo": DriveRecipe(
+# A contact must cost more than standing still for ever, which is 0.4 s / (1 - gamma) in sparse rewards and about twice
+# that in dense ones: with much less (60 s), an untrained policy ends episodes by a contact. With much more (100 s), the
+# narrow path into a parallel slot is learned two or three times as slowly.
+DRIVE_CONFIGS: dict[str, DriveTrainingConfig] = {
+    "ppo": DriveTrainingConfig(
         256,
         "MultiInputPolicy",
         {
@@ -170,7 +170,7 @@ DRIVE_RECIPES: dict[str, DriveRecipe] = {
             "n_epochs": 6,
             "gamma": 0.99,
             "gae_lambda": 0.95,
-            # What is tried narrows more slowly than without.
+            # Exploration narrows more slowly than without.
             "ent_coef": 0.004,
             "policy_kwargs": {"net_arch": [128, 128], "log_std_init": -0.5},
         },
@@ -183,22 +183,22 @@ DRIVE_RECIPES: dict[str, DriveRecipe] = {
     "sac": _HINDSIGHT,
     "tqc": _HINDSIGHT,
 }
-"""Of each algorithm that learns to drive."""
+"""Config of each algorithm for driving."""
 
-AnyRecipe = TypeVar("AnyRecipe", bound=Recipe)
+AnyConfig = TypeVar("AnyConfig", bound=TrainingConfig)
 
 
-def recipe_of(algorithm: str, recipes: Mapping[str, AnyRecipe], task: str) -> AnyRecipe:
-    """The recipe of an algorithm.
+def config_of(algorithm: str, configs: Mapping[str, AnyConfig], task: str) -> AnyConfig:
+    """Look up the config of an algorithm.
 
     Args:
         algorithm: its name.
-        recipes: those of the task.
+        configs: of the task.
         task: search or drive.
 
     Raises:
-        InputError: there is none for it.
+        InputError: the algorithm has none.
     """
-    if algorithm not in recipes:
-        raise InputError(f"ALGORITHM is {algorithm!r}, want one of {', '.join(recipes)} for {task}")
-    return recipes[algorithm]
+    if algorithm not in configs:
+        raise InputError(f"ALGORITHM is {algorithm!r}, want one of {', '.join(configs)} for {task}")
+    return configs[algorithm]

@@ -1,8 +1,8 @@
-"""Many drives of `parkenv/Drive-v1` at once, compiled: what learners practise on.
+"""Many drives of `parkenv/Drive-v1` at once, compiled: the training environment's engine.
 
-The car, its limits, the tasks, the goals and the rewards are the environment's own. Contacts are not asked of pymunk,
-but counted where an outline crosses the car's, so that a touch within a hair may be judged otherwise. What learners
-achieve in the end is tested in the environment itself.
+Car, limits, tasks, goals and rewards are those of the environment. A contact is an outline that crosses the car's,
+not a collision in pymunk, so that grazing contacts may be judged differently. Trained models are tested in the
+environment itself.
 """
 
 from __future__ import annotations
@@ -14,53 +14,62 @@ from numpy.typing import NDArray
 
 from parkenv.driving.parking_task import AREA, KINDS, ParkingTask
 from parkenv.driving.vehicle import SPEED, YAW, VehicleParameters, advance
-from parkenv.envs.drive import CONTROL_S, MOST_CARS, MOST_LINES, SUBSTEPS, goal_error, obstacle_map
-from planners.driving.driver_view import HOLD, N_SEEN, DriverView, Outlines, command, see
+from parkenv.envs.drive import CONTROL_S, SUBSTEPS
+from parkenv.envs.drive_goals import goal_error
+from parkenv.envs.drive_observation import MOST_CARS, MOST_LINES, obstacle_map
+from planners.driving.policy_interface import (
+    ACTION_REPEAT,
+    OBSERVATION_SIZE,
+    Outlines,
+    PolicyInterface,
+    encode_observation,
+    pedal_command,
+)
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 
-UNDER_WAY, PARKED, CONTACT, LEFT = range(4)
-"""How it stands with a drive."""
+RUNNING, PARKED, CONTACT, LEFT_AREA = range(4)
+"""Status of a drive."""
 
-_MOST_THINGS = MOST_CARS + MOST_LINES
-_MOST_EDGES = 24 * MOST_CARS + MOST_LINES  # as many as the obstacle map holds
+_MAX_OBSTACLES = MOST_CARS + MOST_LINES
+_MAX_EDGES = 24 * MOST_CARS + MOST_LINES  # as many as the obstacle map holds
 
 
 class DriveBatch:
-    """Drives side by side, each with a task of its own.
+    """A batch of drives, each with its own task.
 
     Args:
-        n: how many.
+        n: number of drives.
         vehicle: the car of all tasks; None for the default.
 
     Attributes:
         state: (n, 6) float64 of the vehicles; x, y and yaw in each slot's frame.
         time: (n,) float64, s since the start.
-        status: (n,) int64, `UNDER_WAY`, `PARKED`, `CONTACT` or `LEFT`, the area of the task.
-        approach: (n,) float64: the last decision's sum of 0.1 s × (distance / 10 m + angle / π), of the dense reward.
-        took: (n,) float64, s that the last decision took, without the step that parked.
+        status: (n,) int64, `RUNNING`, `PARKED`, `CONTACT` or `LEFT_AREA`.
+        approach: (n,) float64, s: 0.1 s × (distance / 10 m + angle / π), summed over the last decision (dense reward).
+        took: (n,) float64, s: duration of the last decision, without the step that parked.
     """
 
     def __init__(self, n: int, vehicle: VehicleParameters | None = None) -> None:
         vehicle = vehicle or VehicleParameters()
-        self.view = DriverView(vehicle)
+        self.view = PolicyInterface(vehicle)
         self.state = np.zeros((n, 6))
         self.time, self.approach, self.took = np.zeros(n), np.zeros(n), np.zeros(n)
         self.status = np.zeros(n, dtype=np.int64)
         self._desired = np.zeros((n, 7), dtype=np.float32)
         self._about = np.zeros((n, 5))
         self._slot_yaw = np.zeros(n)
-        self._edges = np.zeros((n, _MOST_EDGES, 4))
-        self._first = np.zeros((n, _MOST_THINGS + 1), dtype=np.int64)
-        self._circle = np.zeros((n, _MOST_THINGS, 3))
-        self._things = np.zeros(n, dtype=np.int64)
+        self._edges = np.zeros((n, _MAX_EDGES, 4))
+        self._first = np.zeros((n, _MAX_OBSTACLES + 1), dtype=np.int64)
+        self._circle = np.zeros((n, _MAX_OBSTACLES, 3))
+        self._obstacles = np.zeros(n, dtype=np.int64)
         self._limits, self._half, self._body = vehicle.limits, self.view.half, self.view.body
 
     def start(self, i: int, task: PreparedTask, pose: FloatArray | None = None) -> None:
-        """Let drive i begin anew, with a task; standing at its start, or at a pose of the rear axle, slot frame."""
+        """Restart drive i with a task, at the task's start or at `pose`, (3,) of the rear axle, slot frame."""
         outlines = task.outlines
         self.state[i], self._desired[i], self._about[i] = task.start, task.desired, task.about
         if pose is not None:
@@ -69,43 +78,46 @@ class DriveBatch:
         self._edges[i, : len(outlines.edges)] = outlines.edges
         self._first[i, : len(outlines.first)] = outlines.first
         self._circle[i, : len(outlines.circle)] = outlines.circle
-        self._things[i] = len(outlines.circle)
-        self.time[i], self.status[i] = 0.0, UNDER_WAY
+        self._obstacles[i] = len(outlines.circle)
+        self.time[i], self.status[i] = 0.0, RUNNING
 
     def drive(self, actions: Float32Array) -> None:
-        """Carry out a decision in each drive that is under way.
+        """Apply one decision to each running drive.
 
         Args:
-            actions: (n, 2) float32; see `planners.driving.driver_view`.
+            actions: (n, 2) float32; see `planners.driving.policy_interface`.
         """
         _drive(
             np.ascontiguousarray(actions, dtype=np.float32),
             self.state, self.time, self.status, self.approach, self.took,
-            self._desired, self._about, self._slot_yaw, self._edges, self._first, self._circle, self._things,
+            self._desired, self._about, self._slot_yaw, self._edges, self._first, self._circle, self._obstacles,
             self._limits, self._half, self.view.pedals, self.view.vehicle.middle,
         )  # fmt: skip
 
     def observation(self, rows: IntArray | None = None) -> dict[str, Float32Array]:
-        """What the drivers see.
+        """Observations of the drives.
 
         Args:
-            rows: (k,) int64, which drives to look at; None for all.
+            rows: (k,) int64, indices of drives; None for all.
 
         Returns:
-            observation (k, `N_SEEN`), see `planners.driving.driver_view.see`, achieved_goal and desired_goal
-                (k, 7); float32.
+            observation (k, `OBSERVATION_SIZE`), see `planners.driving.policy_interface.encode_observation`;
+                achieved_goal and desired_goal (k, 7); float32.
         """
         rows = np.arange(len(self.state)) if rows is None else rows
-        seen, achieved = np.empty((len(rows), N_SEEN), np.float32), np.empty((len(rows), 7), np.float32)
+        seen, achieved = (
+            np.empty((len(rows), OBSERVATION_SIZE), np.float32),
+            np.empty((len(rows), 7), np.float32),
+        )
         _observe(
-            rows, self.state, self._about, self._edges, self._first, self._circle, self._things, self._body,
+            rows, self.state, self._about, self._edges, self._first, self._circle, self._obstacles, self._body,
             self.view.vehicle.middle, seen, achieved,
         )  # fmt: skip
         return {"observation": seen, "achieved_goal": achieved, "desired_goal": self._desired[rows]}
 
 
 class PreparedTask:
-    """A task as a batch takes it: all in the slot's frame.
+    """A task in the slot's frame, ready for a batch.
 
     Args:
         task: the task.
@@ -139,7 +151,7 @@ def _drive(
     edges: FloatArray,
     first: IntArray,
     circle: FloatArray,
-    things: IntArray,
+    obstacles: IntArray,
     limits: FloatArray,
     half: FloatArray,
     pedals: FloatArray,
@@ -150,23 +162,23 @@ def _drive(
         state = states[i]
         approach[i] = took[i] = 0.0
         steering = min(max(float(actions[i, 1]), -1.0), 1.0)
-        for _ in range(HOLD):
-            if status[i] != UNDER_WAY:
+        for _ in range(ACTION_REPEAT):
+            if status[i] != RUNNING:
                 break
-            pedal = command(actions[i], state[SPEED], pedals)
+            pedal = pedal_command(actions[i], state[SPEED], pedals)
             for _ in range(SUBSTEPS):
                 advance(state, pedal, steering, limits)
                 time[i] += 0.5 * CONTROL_S
-                if _touches(state, edges[i], first[i], circle[i], things[i], half, middle):
+                if _touches(state, edges[i], first[i], circle[i], obstacles[i], half, middle):
                     status[i] = CONTACT
                     break
-            _achieve(state, about[i], middle, achieved)
+            _achieved_goal(state, about[i], middle, achieved)
             distance, angle, success = goal_error(achieved, desired[i], half)
             c, s = math.cos(slot_yaw[i]), math.sin(slot_yaw[i])
             east, north = c * achieved[0] - s * achieved[1], s * achieved[0] + c * achieved[1]
-            if status[i] == UNDER_WAY and max(abs(east), abs(north)) > AREA:
-                status[i] = LEFT
-            if status[i] == UNDER_WAY and success > 0.5:
+            if status[i] == RUNNING and max(abs(east), abs(north)) > AREA:
+                status[i] = LEFT_AREA
+            if status[i] == RUNNING and success > 0.5:
                 status[i] = PARKED
             else:
                 took[i] += CONTROL_S
@@ -181,7 +193,7 @@ def _observe(
     edges: FloatArray,
     first: IntArray,
     circle: FloatArray,
-    things: IntArray,
+    obstacles: IntArray,
     body: FloatArray,
     middle: float,
     seen: Float32Array,
@@ -189,14 +201,16 @@ def _observe(
 ) -> None:
     for k in range(len(rows)):
         i = rows[k]
-        _achieve(states[i], about[i], middle, achieved[k])
+        _achieved_goal(states[i], about[i], middle, achieved[k])
         at = np.array([float(achieved[k, 0]), float(achieved[k, 1])])
-        m = things[i]
-        see(at, states[i], (edges[i], first[i, : m + 1], circle[i, :m]), body, about[i], seen[k])
+        m = obstacles[i]
+        encode_observation(
+            at, states[i], (edges[i], first[i, : m + 1], circle[i, :m]), body, about[i], seen[k]
+        )
 
 
 @compiled(error_model="numpy")
-def _achieve(state: FloatArray, about: FloatArray, middle: float, achieved: Float32Array) -> None:
+def _achieved_goal(state: FloatArray, about: FloatArray, middle: float, achieved: Float32Array) -> None:
     c, s = math.cos(state[YAW]), math.sin(state[YAW])
     achieved[0], achieved[1] = state[0] + middle * c, state[1] + middle * s
     achieved[2], achieved[3], achieved[4] = c, s, state[SPEED]
@@ -209,7 +223,7 @@ def _touches(
     edges: FloatArray,
     first: IntArray,
     circle: FloatArray,
-    things: int,
+    obstacles: int,
     half: FloatArray,
     middle: float,
 ) -> bool:
@@ -217,7 +231,7 @@ def _touches(
     c, s = math.cos(state[YAW]), math.sin(state[YAW])
     x, y = state[0] + middle * c, state[1] + middle * s
     own = math.hypot(half[0], half[1])
-    for i in range(things):
+    for i in range(obstacles):
         dx, dy = circle[i, 0] - x, circle[i, 1] - y
         if dx * dx + dy * dy > (own + circle[i, 2]) ** 2:
             continue

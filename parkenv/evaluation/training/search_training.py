@@ -16,8 +16,14 @@ from parkenv.envs.search_sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.simulate import charge_truncation
-from parkenv.evaluation.training.cloning import Demonstrations, clone, require_imitable
-from parkenv.evaluation.training.configs import MAX_STEPS, RECIPES, REWARD_SCALE, Recipe, recipe_of
+from parkenv.evaluation.training.cloning import Demonstrations, clone, require_cloneable
+from parkenv.evaluation.training.configs import (
+    MAX_STEPS,
+    REWARD_SCALE,
+    SEARCH_CONFIGS,
+    TrainingConfig,
+    config_of,
+)
 from parkenv.evaluation.training.rl_training import Row, Training
 from parkenv.world.scenario import Scenario
 from planners.learned import OBSERVATION, LearnedAgent, ModelCard
@@ -25,77 +31,77 @@ from planners.learned import OBSERVATION, LearnedAgent, ModelCard
 
 @dataclass(frozen=True, eq=False)
 class SearchTraining(Training):
-    """Learning to search.
+    """Training of a search agent; its score is the mean total time.
 
     Args:
-        algorithm: one of `RECIPES`.
-        steps: decisions to make.
-        examine_every: decisions between examinations.
-        scenarios: worlds to learn in, in turns.
-        examined_on: seeds of the worlds of the examinations, of the first scenario.
-        k: slots that the observation tells of.
-        demonstrations: to imitate first; None to begin from nothing.
+        algorithm: one of `SEARCH_CONFIGS`.
+        steps: decisions in total.
+        evaluate_every: decisions between evaluations.
+        scenarios: to train on, in rotation.
+        evaluation_seeds: seeds of the held-out worlds, of the first scenario.
+        k: number of slots in the observation.
+        demonstrations: for behaviour cloning before training; None for none.
 
     Raises:
-        InputError: an unknown algorithm, one that cannot imitate, or a number out of its range.
+        InputError: an unknown algorithm, one without behaviour cloning, or a number out of its range.
     """
 
     scenarios: tuple[Scenario, ...]
-    examined_on: range
+    evaluation_seeds: range
     k: int = 5
     demonstrations: Demonstrations | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.demonstrations is not None:
-            require_imitable(self.algorithm, self.demonstrations.agent, self.scenarios[0])
+            require_cloneable(self.algorithm, self.demonstrations.agent, self.scenarios[0])
 
     @property
-    def recipe(self) -> Recipe:
-        """Settings of the algorithm."""
-        return recipe_of(self.algorithm, RECIPES, "search")
+    def config(self) -> TrainingConfig:
+        """Training config of the algorithm."""
+        return config_of(self.algorithm, SEARCH_CONFIGS, "search")
 
     @property
-    def scores(self) -> tuple[str, ...]:
-        """Mean total time, s, its 95 % interval, and the share of the searches that ended in a slot."""
+    def metrics(self) -> tuple[str, ...]:
+        """Mean total time, s, its 95 % interval, and the fraction of episodes that ended parked."""
         return ("total_s", "low_s", "high_s", "parked_fraction")
 
-    def practice(self, seed: int, curve: Sequence[Row]) -> VecEnv:
-        """Searches in all scenarios."""
+    def make_env(self, seed: int, curve: Sequence[Row]) -> VecEnv:
+        """Make a batch of searches in all scenarios."""
         del curve
         env = SearchVecEnv(
-            self.recipe.n_envs, self.scenarios, REWARD_SCALE, self.k, max_episode_steps=MAX_STEPS
+            self.config.n_envs, self.scenarios, REWARD_SCALE, self.k, max_episode_steps=MAX_STEPS
         )
         env.seed(seed)
         return env
 
-    def examine(self, model: Any, practice: VecEnv) -> Row:
-        """Search in the examination's worlds."""
-        del practice
-        times, parked = examined(model, self.scenarios[0], self.examined_on, self.k)
-        return dict(zip(self.scores, (*mean_interval(times), float(parked.mean())), strict=True))
+    def evaluate(self, model: Any, env: VecEnv) -> Row:
+        """Run one episode in each held-out world."""
+        del env
+        times, parked = episode_times(model, self.scenarios[0], self.evaluation_seeds, self.k)
+        return dict(zip(self.metrics, (*mean_interval(times), float(parked.mean())), strict=True))
 
-    def merit(self, row: Row) -> tuple[float, ...]:
-        """The less time, the better."""
+    def score(self, row: Row) -> tuple[float, ...]:
+        """Minus the mean total time."""
         return (-row["total_s"],)
 
     def prepare(self, model: Any, seed: int) -> None:
-        """Imitate, if there is something to imitate."""
+        """Clone the demonstrations, if there are any."""
         if self.demonstrations is not None:
             clone(model, self.demonstrations, seed)
 
-    def card(self, seed: int, steps: int) -> ModelCard:
-        """What the model file is to say."""
-        recipe = self.recipe
-        settings = {"n_envs": recipe.n_envs, "policy": recipe.policy, **recipe.settings}
+    def model_card(self, seed: int, steps: int) -> ModelCard:
+        """Metadata of the model file."""
+        config = self.config
+        settings = {"n_envs": config.n_envs, "policy": config.policy, **config.settings}
         settings["imitated"] = None if self.demonstrations is None else self.demonstrations.agent
         names = tuple(s.name for s in self.scenarios)
         return ModelCard(self.algorithm, names, self.k, OBSERVATION, seed, steps, settings, __version__)
 
 
 def search_times(agent: LearnedAgent, scenario: Scenario, seeds: Sequence[int]) -> Row:
-    """How long the searches of a model take, in the words of `parkenv compare`."""
-    times, parked = examined(agent.model, scenario, seeds, agent.local_k)
+    """Total times of a model, as columns of `parkenv compare`."""
+    times, parked = episode_times(agent.model, scenario, seeds, agent.local_k)
     mean, low, high = mean_interval(times)
     return {
         "episodes": len(times),
@@ -105,18 +111,18 @@ def search_times(agent: LearnedAgent, scenario: Scenario, seeds: Sequence[int]) 
     }
 
 
-def examined(
+def episode_times(
     model: Any, scenario: Scenario, seeds: Sequence[int], k: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Total times of a model's searches, (n,) s, and whether it parked, (n,) bool.
+    """Total times of a model's episodes, (n,) s, and whether it parked, (n,) bool.
 
-    A search that is not over after `MAX_STEPS` decisions is charged `give_up_s`, as in `parkenv compare`.
+    An episode that has not ended after `MAX_STEPS` decisions is charged `give_up_s`, as in `parkenv compare`.
 
     Args:
         model: of stable-baselines3 or sb3-contrib, over the `local` observation.
-        scenario: the world.
-        seeds: a search for each.
-        k: slots that the observation tells of.
+        scenario: to search in.
+        seeds: one episode each.
+        k: number of slots in the observation.
     """
     n = len(seeds)
     batch = ParkSearchVectorEnv(

@@ -1,7 +1,7 @@
-"""What driving takes, measured over many trips: the speed on the lanes, the manoeuvre, and a try that fails.
+"""Calibrate the search environment from driven trips: speed on the lanes, manoeuvre time, time of a failed attempt.
 
-The drive graph charges an edge's length at `v_drive`, nothing for the manoeuvre into a slot, and `failure_s` for a try
-at a taken one. Here these come from trips that were driven.
+The drive graph charges an edge's length at `v_drive`, nothing for the manoeuvre into a slot, and `failure_s` for a
+failed attempt. Here these values are measured in driven trips.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.evaluation.figures.picture_files import INK, STYLE, save_picture
 from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
-from parkenv.evaluation.trips.driver import EDGE_KINDS, Leg, Try
+from parkenv.evaluation.trips.executor import EDGE_KINDS, Leg, ParkingAttempt
 from parkenv.evaluation.trips.lot_driver import DrivingStyle
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.versioned_json import JsonFormat
@@ -38,24 +38,25 @@ from parkenv.world.scenario import KMH, Scenario
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
 
-SEEN, UNSEEN = "seen", "unseen"
+OBSERVED, UNOBSERVED = "observed", "unobserved"
+"""Whether the agent observes slots from the lane."""
 BLOCK = 5
-"""Trips a task."""
+"""Trips per task."""
 _FORMAT = JsonFormat("parkenv-calibration", 1, "a calibration of `parkenv calibrate`")
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What was measured in a scenario, and may take the place of what is assumed of it.
+    """Values measured in a scenario, which may replace its assumed ones.
 
     Args:
         scenario: its name.
         v_drive: m/s, m of the drive graph over the time on the lanes.
-        failure_s: s that a try at a taken slot takes, less the way that the car then need not drive any more.
-        manoeuvre_s: s from the decision to park until the car stands in the slot. The drive graph charges nothing for
-            it: whoever parks has this to add to the total time.
-        trips: how many it comes from.
-        speed_limit: m/s, that was kept to on the lanes.
+        failure_s: s, time of an attempt at a taken slot, less the time of the onward way that it has covered already.
+        manoeuvre_s: s, from the decision to park until the car stands in the slot. The drive graph charges nothing for
+            it, so it adds to the total time of every agent that parks.
+        trips: number of trips.
+        speed_limit: m/s, on the lanes.
 
     Raises:
         InputError: a value out of its range, by name.
@@ -77,19 +78,19 @@ class Calibration:
                 raise InputError(f"calibration {name} is {value!r}, want a finite number {least}")
 
     def applied(self, scenario: Scenario) -> Scenario:
-        """A scenario with the measured speed and failure cost, under its own name."""
+        """Return the scenario with the measured speed and failure cost, under the same name."""
         return scenario.replace(v_drive=self.v_drive, failure_s=self.failure_s)
 
     def to_file(self, path: Path) -> None:
-        """Write it as JSON, whole or not at all."""
+        """Write it as JSON, atomically."""
         _FORMAT.write(path, dataclasses.asdict(self))
 
     @classmethod
     def from_file(cls, path: Path) -> Self:
-        """Read what `to_file` wrote.
+        """Read a file of `to_file`.
 
         Raises:
-            InputError: the file cannot be read, or is no calibration.
+            InputError: the file cannot be read, or is not a calibration.
         """
         content = _FORMAT.read(path)
         names = [f.name for f in dataclasses.fields(cls)]
@@ -104,9 +105,9 @@ class TripPlan:
 
     Args:
         scenario: the scenario.
-        agent: who decides.
-        style: how is driven.
-        rig: whose sensors see the slots, by name; None where the scenario's sighting model stands for them.
+        agent: name of the agent.
+        style: of driving.
+        rig: name of the sensor rig; None for the scenario's sensor model.
     """
 
     scenario: Scenario
@@ -114,37 +115,37 @@ class TripPlan:
     style: DrivingStyle
     rig: str | None = None
 
-    def run(self, sight: str, seeds: Sequence[int]) -> list[Row]:
-        """Drive some trips: a row each, as `trip_row` has it."""
-        scenario, rig = (self.scenario, self.rig) if sight == SEEN else (unseen(self.scenario), None)
+    def run(self, slots: str, seeds: Sequence[int]) -> list[Row]:
+        """Drive trips; returns `trip_row` of each."""
+        scenario, rig = (self.scenario, self.rig) if slots == OBSERVED else (unseen(self.scenario), None)
         search = DrivenSearch(scenario, self.agent, style=self.style, rig=rig)
-        return [trip_row(search.run(seed), sight) for seed in seeds]
+        return [trip_row(search.run(seed), slots) for seed in seeds]
 
 
-def trip_row(trip: Trip, sight: str) -> Row:
-    """A trip as JSON holds it."""
+def trip_row(trip: Trip, slots: str) -> Row:
+    """Return a trip as JSON data; `slots` tells whether slots were observed from the lane."""
     row = dataclasses.asdict(trip)
     return {
-        "sight": sight,
+        "slots": slots,
         **row,
         "legs": [list(leg) for leg in trip.legs],
-        "tries": [list(t) for t in trip.tries],
+        "attempts": [list(t) for t in trip.attempts],
     }
 
 
 class TripFolder:
-    """The file of trips, which gains a line for every trip that is finished.
+    """The file of trips, to which every finished trip adds a line.
 
     Args:
         path: the folder; it exists.
-        settings: what changes the outcome of a trip.
-        resume: go on with what is there.
+        settings: all that affects the outcome of a trip.
+        resume: continue an earlier run.
 
     Attributes:
-        rows: finished trips by sight and seed.
+        rows: finished trips by (slots, seed).
 
     Raises:
-        InputError: the folder holds trips and `resume` is not set, or they are of other settings.
+        InputError: the folder holds trips and `resume` is not set, or their settings differ.
     """
 
     def __init__(self, path: Path, settings: Row, *, resume: bool = False) -> None:
@@ -153,13 +154,13 @@ class TripFolder:
         if self._file.exists():
             if not resume:
                 raise InputError(
-                    f"--out {path}: holds trips; add --resume to go on with them, or name another folder"
+                    f"--out {path}: holds trips; add --resume to continue, or name another folder"
                 )
             require_same_settings(path, settings, "trips")
             whole, _, _ = self._file.read_text(encoding="utf-8").rpartition("\n")
             for line in whole.splitlines():
                 row = json.loads(line)
-                self.rows[row["sight"], row["seed"]] = row
+                self.rows[row["slots"], row["seed"]] = row
         write_settings(path, settings)
         self.put_in_order()
 
@@ -167,10 +168,10 @@ class TripFolder:
         """Append finished trips."""
         with self._file.open("a", encoding="utf-8") as file:
             file.writelines(json.dumps(row) + "\n" for row in rows)
-        self.rows |= {(row["sight"], row["seed"]): row for row in rows}
+        self.rows |= {(row["slots"], row["seed"]): row for row in rows}
 
     def put_in_order(self) -> None:
-        """Write the file anew, by sight and seed."""
+        """Sort the file by slots and seed."""
         with atomic_write(self._file) as beside:
             beside.write_text(
                 "".join(json.dumps(row) + "\n" for _, row in sorted(self.rows.items())), encoding="utf-8"
@@ -184,16 +185,16 @@ def drive_trips(
     workers: Workers = HERE,
     on_progress: Callable[[int], None] = lambda _: None,
 ) -> list[Row]:
-    """Drive what the folder does not hold yet, each seed with and without sight of the slots; all rows in order.
+    """Drive the missing trips, each seed with and without observations of slots; returns all rows in order.
 
-    Who sees the slots hardly ever tries a taken one; that is what the trips without sight are for.
+    An agent that observes slots hardly ever attempts a taken one; trips without observations provide failed attempts.
     """
     tasks = [
-        partial(plan.run, sight, block)
-        for sight in (SEEN, UNSEEN)
-        for block in _blocks([s for s in seeds if (sight, s) not in folder.rows])
+        partial(plan.run, slots, block)
+        for slots in (OBSERVED, UNOBSERVED)
+        for block in _blocks([s for s in seeds if (slots, s) not in folder.rows])
     ]
-    wanted = [(sight, seed) for sight in (SEEN, UNSEEN) for seed in seeds]
+    wanted = [(slots, seed) for slots in (OBSERVED, UNOBSERVED) for seed in seeds]
     on_progress(sum(key in folder.rows for key in wanted))
     for _, rows in workers.results(tasks):
         folder.add(rows)
@@ -208,25 +209,25 @@ def _blocks(seeds: Sequence[int]) -> Iterator[Sequence[int]]:
 
 
 def samples(rows: Sequence[Row], speed: float) -> dict[str, FloatArray]:
-    """What the distributions are of.
+    """Collect the samples of each measured quantity.
 
     Args:
         rows: of trips.
-        speed: m/s on the lanes, by which the way that a failed try leads on is turned into time.
+        speed: m/s on the lanes, which turns the onward way of a failed attempt into time.
 
     Returns:
-        `speed_kmh`: of each trip with sight on the lanes; `manoeuvre_s`, and of each kind of slot, of trips with sight;
-        `failed_s`, and of each kind of slot, of every failed try: the time until the car is back on the lane;
-        `lost_s`: likewise, less the way on; `s_per_m`, of each kind of edge that was driven.
+        `speed_kmh` on the lanes, of each trip with observations; `manoeuvre_s`, also by kind of slot, of those;
+        `failed_s`, also by kind of slot: time of a failed attempt until the car is back on the lane; `lost_s`: the
+        same, less the onward way; `s_per_m` by kind of edge.
     """
-    seen = [row for row in rows if row["sight"] == SEEN]
-    tries = [Try(*t) for row in rows for t in row["tries"]]
-    failed = [t for t in tries if t.reason]
-    done = [Try(*t) for row in seen for t in row["tries"] if not t[4]]
-    legs = [Leg(*leg) for row in seen for leg in row["legs"]]
+    observed = [row for row in rows if row["slots"] == OBSERVED]
+    attempts = [ParkingAttempt(*t) for row in rows for t in row["attempts"]]
+    failed = [t for t in attempts if t.reason]
+    done = [ParkingAttempt(*t) for row in observed for t in row["attempts"] if not t[4]]
+    legs = [Leg(*leg) for row in observed for leg in row["legs"]]
     lists: dict[str, list[float]] = {
         "speed_kmh": [
-            r["graph_m"] / r["lanes_s"] / KMH for r in seen if r["lanes_s"] > 0.0 and not r["failed_s"]
+            r["graph_m"] / r["lanes_s"] / KMH for r in observed if r["lanes_s"] > 0.0 and not r["failed_s"]
         ],
         "manoeuvre_s": [t.seconds for t in done],
         **{f"manoeuvre_s.{kind}": [t.seconds for t in done if t.kind == kind] for kind in KINDS},
@@ -242,7 +243,7 @@ def samples(rows: Sequence[Row], speed: float) -> dict[str, FloatArray]:
 
 
 def summary_of(values: FloatArray) -> Row:
-    """Median, mean with its 95 % interval, and p95 of a sample."""
+    """Return median, mean with its 95 % interval, and 95th percentile of a sample."""
     mean, low, high = mean_interval(values)
     return {
         "n": len(values),
@@ -254,24 +255,25 @@ def summary_of(values: FloatArray) -> Row:
 
 
 def calibrate(rows: Sequence[Row], scenario: Scenario, speed_limit: float) -> tuple[Calibration, list[Row]]:
-    """The calibration that trips give, and a row for each distribution.
+    """Compute the calibration, and a row for each distribution.
 
-    The speed is that of all trips with sight together, so that the drive times of the graph are right on average.
+    The speed is the total distance of trips with observations over their total time, so that drive times on the graph
+    are right on average.
 
     Raises:
-        InputError: no trip has parked, or no try has failed.
+        InputError: no trip parked, or no attempt failed.
     """
-    seen = [row for row in rows if row["sight"] == SEEN]
-    metres = np.array([row["graph_m"] for row in seen])
-    seconds = np.array([row["lanes_s"] for row in seen])
+    observed = [row for row in rows if row["slots"] == OBSERVED]
+    metres = np.array([row["graph_m"] for row in observed])
+    seconds = np.array([row["lanes_s"] for row in observed])
     known = samples(rows, speed_limit)
-    for name, what in (("manoeuvre_s", "trip has parked"), ("lost_s", "try has failed")):
+    for name, event in (("manoeuvre_s", "trip has parked"), ("lost_s", "attempt has failed")):
         if name not in known:
-            raise InputError(f"of {len(rows)} trips in {scenario.name!r} no {what}: drive more of them")
+            raise InputError(f"of {len(rows)} trips in {scenario.name!r} no {event}: drive more trips")
     speed = float(metres.sum() / seconds.sum())
     table = [{"what": name, **summary_of(values)} for name, values in known.items()]
     ratio = [speed / KMH, speed / KMH]
-    if len(seen) > 1 and np.ptp(metres / seconds) > 0.0:
+    if len(observed) > 1 and np.ptp(metres / seconds) > 0.0:
         interval = stats.bootstrap(
             (metres, seconds),
             lambda m, s, axis: m.sum(axis=axis) / s.sum(axis=axis) / KMH,
@@ -282,29 +284,29 @@ def calibrate(rows: Sequence[Row], scenario: Scenario, speed_limit: float) -> tu
             rng=np.random.default_rng(0),
         ).confidence_interval
         ratio = [float(interval.low), float(interval.high)]
-    table.insert(0, {"what": "v_drive_kmh", "n": len(seen), "mean": speed / KMH, "mean_ci95": ratio})
+    table.insert(0, {"what": "v_drive_kmh", "n": len(observed), "mean": speed / KMH, "mean_ci95": ratio})
     made = Calibration(
         scenario=scenario.name,
         v_drive=speed,
         failure_s=float(known["lost_s"].mean()),
         manoeuvre_s=float(known["manoeuvre_s"].mean()),
-        trips=len(seen),
+        trips=len(observed),
         speed_limit=speed_limit,
     )
     return made, table
 
 
 def save_distributions(rows: Sequence[Row], speed_limit: float, title: str, path: Path) -> None:
-    """Draw what was measured: speed, manoeuvre and failed tries by slot kind, edges by their kind."""
+    """Draw the distributions: speed, manoeuvres and failed attempts by kind of slot, edges by kind."""
     known = samples(rows, speed_limit)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10.0, 6.4), layout="constrained")
         figure.suptitle(title, x=0.02, ha="left", weight="bold")
         axes = figure.subplots(2, 2).ravel()
         panels = (
-            ("speed on the lanes, a trip (km/h)", ["speed_kmh"], [""]),
+            ("speed on the lanes, per trip (km/h)", ["speed_kmh"], [""]),
             ("manoeuvre into the slot (s)", [f"manoeuvre_s.{k}" for k in KINDS], list(KINDS)),
-            ("failed try, until back on the lane (s)", [f"failed_s.{k}" for k in KINDS], list(KINDS)),
+            ("failed attempt, until back on the lane (s)", [f"failed_s.{k}" for k in KINDS], list(KINDS)),
         )
         colors = ("#0072b2", "#d55e00", "#009e73")
         for ax, (heading, names, labels) in zip(axes, panels, strict=False):
@@ -324,12 +326,12 @@ def save_distributions(rows: Sequence[Row], speed_limit: float, title: str, path
                     float(values.mean()), 1.0, f" {values.mean():.1f}", color=INK, fontsize=8,
                     transform=ax.get_xaxis_transform(), va="top",
                 )  # fmt: skip
-            ax.set_ylabel("trips" if names == ["speed_kmh"] else "tries")
+            ax.set_ylabel("trips" if names == ["speed_kmh"] else "attempts")
             if labels != [""]:
                 ax.legend()
         ax = axes[3]
         kinds = [k for k in EDGE_KINDS if f"s_per_m.{k}" in known]
         ax.boxplot([known[f"s_per_m.{k}"] for k in kinds], tick_labels=kinds, whis=(5, 95), showfliers=False)
         ax.axhline(1.0 / speed_limit, color="#d55e00", lw=1.0, ls="--")
-        ax.set_title("edges (s per m of the graph; dashed: speed limit)")
+        ax.set_title("edges (s/m; dashed: speed limit)")
         save_picture(figure, path)

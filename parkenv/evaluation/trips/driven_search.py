@@ -1,4 +1,4 @@
-"""The whole trip: an agent decides on the drive graph, and a car drives it, from the entry into the slot."""
+"""Whole trips: an agent decides on the drive graph, and a simulated car drives, from the entry into the slot."""
 
 from __future__ import annotations
 
@@ -12,25 +12,10 @@ from gymnasium.wrappers import TimeLimit
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.envs.perception import OnboardPerception
 from parkenv.envs.search import SearchEnv
-from parkenv.envs.search_step import (
-    DRIVEN_M,
-    FAILED_PARKS,
-    STEP_DRIVE,
-    STEP_FAILED,
-    STEP_WALK,
-    STEPS,
-    TIME,
-    drive_or_park,
-    learn,
-    look,
-    renew,
-    settle,
-    touched,
-)
 from parkenv.envs.sensor_sampler import Station
 from parkenv.errors import InputError
 from parkenv.evaluation.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
-from parkenv.evaluation.trips.driver import Driver, Leg, Try
+from parkenv.evaluation.trips.executor import Leg, MotionExecutor, ParkingAttempt
 from parkenv.evaluation.trips.lot_driver import DrivingStyle, LotDriver
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import Scenario
@@ -39,123 +24,115 @@ from sim_sensors.rig import SensorRig
 
 
 class DrivenSearchEnv(SearchEnv):
-    """`parkenv/Search-v1` in which time passes as it does on the road.
+    """`parkenv/Search-v1` with continuous driving: edges, waits and attempts take the time that a simulated car needs.
 
-    World, observations and decisions are those of `parkenv/Search-v1`. What an edge, a try and the parking take is
-    asked of a driver; a try fails as well where the car does not get into a free slot, which it then holds for taken.
-    The time of the manoeuvre into the slot counts as driven.
+    World, observations and decisions are those of `parkenv/Search-v1`. An attempt also fails where the car does not get
+    into a free slot, which then counts as taken. The time of the manoeuvre into the slot counts as driven.
 
     Args:
         scenario: the scenario.
-        driver: who drives; with a `GraphDriver` this is `parkenv/Search-v1` itself.
+        executor: carries out the decisions.
         perception: sensors on the car, whose scenario this is: the belief is updated from what they measure on the
             driven path, as in `parkenv/SearchPerception-v1`. None: slots are observed from the vertices, with the
             scenario's sensor model.
     """
 
     def __init__(
-        self, scenario: Scenario, driver: Driver, perception: OnboardPerception | None = None
+        self, scenario: Scenario, executor: MotionExecutor, perception: OnboardPerception | None = None
     ) -> None:
         super().__init__(scenario)
-        self.driver, self.perception = driver, perception
+        self.executor, self.perception = executor, perception
         self._refused: set[int] = set()
-        self.manoeuvre: Try | None = None
+        self.manoeuvre: ParkingAttempt | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start a search, and the car at the entry."""
+        """Start a search with the car at the entry."""
         if self.perception is not None:
             self.perception.reset()
         result = super().reset(seed=seed, options=options)
         state = self.state
         self._refused.clear()
         self.manoeuvre = None
-        self.driver.begin(state.key, state.world, state.vertex, state.time)
+        self.executor.begin(state.key, state.world, state.vertex, state.time)
         return result
 
-    def _advance(self, action: int) -> None:
-        """Have the action driven, and let as much time pass as that took."""
-        state, search = self._state, self.search
-        numbers = search.numbers[0]
-        vertex, before = state.vertex, state.time
+    def _advance(self, action: int) -> tuple[Any, ...]:
+        """Drive the action, and advance the world by the time that it took."""
+        state, control = self._state, self._control
+        vertex, begin = state.vertex, state.time
         possible = self.scenario.action_masks[vertex, action] == 1
         if possible and action == PARK:
-            self._park(vertex, before)
+            self._park(vertex, begin)
         elif possible:
-            seconds = self.driver.drive(vertex, action)
-            drive_or_park(search, 0, action)
-            numbers[STEP_DRIVE], numbers[TIME] = seconds, before + seconds
+            seconds = self.executor.drive(vertex, action)
+            control.drive_or_park(action)
+            control.set_step_time(begin, drive_s=seconds)
         else:
-            self.driver.wait(self.scenario.wait_s)
-            drive_or_park(search, 0, action)
+            self.executor.wait(self.scenario.wait_s)
+            control.drive_or_park(action)
         if not state.parked:
-            self._see(on_the_way=possible and action != PARK)
+            self._observe(moved=possible and action != PARK)
             for slot in self._refused:
-                # It looks free, and is of no use to this car.
-                learn(search, 0, touched(search, 0, slot), True, 1.0)
-        settle(search, 0)
-        renew(search, 0)
-        self._clock[:] = state.time, state.time - state.arrival.time
+                # It looks free, but this car does not fit into it.
+                control.set_taken(slot)
+        return control.finish_step()
 
-    def _see(self, *, on_the_way: bool) -> None:
-        """Tell the belief what the slots look like from where the car is, and from where it has been on its way."""
+    def _observe(self, *, moved: bool) -> None:
+        """Update the belief from the observations at the car's place and on its way there."""
         perception = self.perception
         if perception is None:
-            look(self.search, 0)
+            self._control.observe()
             return
-        # After a try, or a wait, the car looks around once more; what it saw from amid the manoeuvre is of no use.
-        track = self.driver.track if on_the_way else self.driver.track[-1:]
+        # After an attempt or a wait, the car observes once; captures within a manoeuvre are useless.
+        track = self.executor.track if moved else self.executor.track[-1:]
         stations: list[Station] = []
         if track:
-            chosen = perception.sampler.select_stations(np.array([spot.driven_m for spot in track]))
-            spots = [track[i] for i in chosen.tolist()]
-            stations = [Station(s.time, s.pose, self.driver.movers_at(s)) for s in spots]
-        perception.update_belief(self.search, perception.sampler.sample(self._state, stations))
+            chosen = perception.sampler.select_stations(np.array([point.driven_m for point in track]))
+            points = [track[i] for i in chosen.tolist()]
+            stations = [Station(s.time, s.pose, self.executor.movers_at(s)) for s in points]
+        captures = perception.sampler.sample(self._state, stations)
+        perception.update_belief(self._control, self._state.vertex, captures)
 
-    def _park(self, slot: int, before: float) -> None:
-        search, state = self.search, self._state
-        numbers, counts = search.numbers[0], search.counts[0]
-        taken = bool(state.world.occupied(np.array([slot]), before)[0])
-        outcome = self.driver.park(slot, taken)
+    def _park(self, slot: int, begin: float) -> None:
+        taken = bool(self._state.world.occupied(np.array([slot]), begin)[0])
+        outcome = self.executor.park(slot, taken)
         if taken or not outcome.reason:
-            drive_or_park(search, 0, PARK)
+            self._control.drive_or_park(PARK)
         else:
             self._refused.add(slot)
-            counts[FAILED_PARKS] += 1
-            counts[STEPS] += 1
-            numbers[STEP_WALK] = 0.0
+            self._control.fail_attempt()
         if not outcome.reason:
             self.manoeuvre = outcome
         lost = outcome.seconds if outcome.reason else 0.0
-        numbers[STEP_DRIVE], numbers[STEP_FAILED] = outcome.seconds - lost, lost
-        numbers[TIME] = before + outcome.seconds
+        self._control.set_step_time(begin, drive_s=outcome.seconds - lost, failed_s=lost)
 
 
 @dataclass(frozen=True)
 class Trip:
-    """One trip, driven from the entry to the goal.
+    """One trip from the entry to the goal.
 
     Attributes:
         seed: of the world.
-        agent: who decided.
-        total_s: all of it, the sum of the next five.
-        lanes_s: along the lanes, waiting included.
+        agent: name of the agent.
+        total_s: the sum of the next five.
+        lanes_s: driving on the lanes, waiting included.
         manoeuvre_s: from the decision to park until the car stood in the slot.
-        failed_s: of tries that failed.
-        walk_s: to the goal.
-        gave_up_s: of going elsewhere.
+        failed_s: of failed attempts.
+        walk_s: walk to the goal.
+        gave_up_s: give-up penalty.
         parked: whether the car was parked.
-        slot: where, by name.
-        slot_kind: how that slot lies to its lane.
-        graph_m: m of the graph's edges.
-        driven_m: m that the car drove, in either direction.
-        contacts: how often it touched something.
-        strays: how often it was off its way.
-        rescues: how often it was stuck and put back on the lane.
-        waited_s: s of braking and standing for others who were in the way.
-        legs: the edges, in order.
-        tries: the tries to park, in order.
+        slot: its name; empty where not parked.
+        slot_kind: its orientation to the lane.
+        graph_m: m, length of the driven edges in the graph.
+        driven_m: m driven, forward and backward.
+        contacts: number of collisions.
+        strays: how often it left its path.
+        rescues: how often it was stuck and was put back on the lane.
+        waited_s: s, braking and standing for other road users.
+        legs: the driven edges, in order.
+        attempts: in order.
     """
 
     seed: int
@@ -176,30 +153,24 @@ class Trip:
     rescues: int
     waited_s: float
     legs: tuple[Leg, ...]
-    tries: tuple[Try, ...]
-
-    @property
-    def failed(self) -> list[Try]:
-        """The tries that failed."""
-        return [t for t in self.tries if t.reason]
+    attempts: tuple[ParkingAttempt, ...]
 
 
 class DrivenSearch:
     """Drives trips in one scenario.
 
     Args:
-        scenario: the scenario, whose traffic moves through the lot.
-        agent: who decides: a name that `make_agent` knows.
+        scenario: the scenario with its traffic.
+        agent: name of an agent, see `make_agent`.
         vehicle: the car.
-        style: how it is driven.
+        style: of driving.
         rig: sensors that ride along and tell the car which slots are taken: laser, stereo, both_sides, or a
             `sim_sensors.rig.SensorRig`; None where the scenario's sighting model stands for them.
         weather: as of `parkenv/SearchPerception-v1`.
-        captures: how many there are at most on an edge.
+        captures: most captures per edge.
 
     Raises:
-        InputError: an unknown agent, rig or weather; a speed that the car does not have; or a lot in which the car fits
-            nowhere.
+        InputError: an unknown agent, rig or weather, a speed above the car's, or a lot without a slot for the car.
 
     Example:
         >>> import math
@@ -243,7 +214,7 @@ class DrivenSearch:
         if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
             raise InputError(f"seed is {seed!r}, want a whole number of at least 0")
         env, driver = self.env, self.driver
-        driver.watch = on_control
+        driver.on_control = on_control
         result = simulate(self._limited, self._agent, int(seed), observers)
         info = result.info
         parked = env.manoeuvre
@@ -263,12 +234,12 @@ class DrivenSearch:
             parked=bool(info["parked"]),
             slot=parked.slot if parked else "",
             slot_kind=parked.kind if parked else "",
-            graph_m=float(env.search.numbers[0, DRIVEN_M]),
+            graph_m=env.state.driven_m,
             driven_m=log.driven_m,
             contacts=len(log.contacts),
             strays=log.strays,
             rescues=log.rescues,
             waited_s=log.waited_s,
             legs=tuple(log.legs),
-            tries=tuple(log.tries),
+            attempts=tuple(log.attempts),
         )

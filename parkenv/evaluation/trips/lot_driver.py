@@ -1,4 +1,4 @@
-"""A car that is driven through a lot: along the lanes, into slots, and out of those that turn out taken."""
+"""Drive a car through a lot: along the lanes, into slots, and back out of those that turn out taken."""
 
 from __future__ import annotations
 
@@ -11,20 +11,33 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
 from parkenv.driving.driven_lines import DrivenEdge, DrivenLine, DrivenLines
-from parkenv.driving.encounters import SLOWEST, WATCHED_S
-from parkenv.driving.lot_space import LotSpace, Obstacles, Thing
-from parkenv.driving.lot_surroundings import REACH_M, LotSurroundings
+from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED
+from parkenv.driving.lot_obstacles import REACH_M, LotObstacles
 from parkenv.driving.parking_task import KINDS, ParkingTasks
-from parkenv.driving.polite_traffic import PoliteTraffic
 from parkenv.driving.road_users import RoadUsers
 from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
-from parkenv.envs.drive import ANGLE_TOLERANCE, CONTROL_S, POSITION_TOLERANCE, SUBSTEPS
+from parkenv.driving.yielding_traffic import YieldingTraffic
+from parkenv.envs.drive import CONTROL_S, SUBSTEPS
+from parkenv.envs.drive_goals import ANGLE_TOLERANCE, POSITION_TOLERANCE
 from parkenv.errors import InputError
-from parkenv.evaluation.trips.driver import ACROSS, ALONG, NO_ROOM, NO_WAY, ROUND, TAKEN, TURN, Leg, Spot, Try
+from parkenv.evaluation.trips.executor import (
+    ACROSS,
+    ALONG,
+    NO_ROOM,
+    NO_WAY,
+    ROUND,
+    TAKEN,
+    TURN,
+    Leg,
+    ParkingAttempt,
+    TrackPoint,
+)
 from parkenv.world.occupancy import World
 from parkenv.world.scenario import Scenario
-from planners.driving.hybrid_astar import CarPath, SearchSettings, plan_path
+from planners.driving.car_path import CarPath
+from planners.driving.hybrid_astar import SearchSettings, plan_path
 from planners.driving.lane_keeping import LaneKeeper, joined, rounded
 from planners.driving.parking import STRAYED_M, STRAYED_RAD
 from planners.driving.path_tracking import PathTracker, TrackingSettings
@@ -35,15 +48,15 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 RESCUE_S = 60.0
-"""s that pass until a car that is stuck is back on the lane."""
+"""s until a stuck car is back on the lane."""
 PATIENCE_S = 3.0
-"""s for which the car stands before somebody who waits, too, until those give way."""
+"""s for which the car and another waiting road user stand until the other gives way."""
 TURN_IN_M = 9.0
-"""m, from the rear axle to the middle of a junction where the driver decides where to go on."""
+"""m, from the rear axle to the middle of a junction at which the turn begins."""
 
 _LEAD_M = 1.5
 _LANE = SearchSettings(change_m=8.0, attempts=((0.25, 0.5), (0.15, 0.5), (0.08, 0.5), (0.03, 0.25)))
-_WIDE = (0.6, 0.3, 0.06)  # by how much wider than need be turns are driven, where there is room
+_WIDE = (0.6, 0.3, 0.06)  # margins, by which turns are wider than necessary where there is room
 _ONTO = (4.0, 6.5, 9.0, 12.0)  # m after a junction, where a turn into the lane may end
 _BACK = (0.0, 3.0, 6.0, 9.0)  # m after a slot, or after where the car turns round
 _CHANGE_S = 3.0  # s, about what a change of direction takes
@@ -52,27 +65,27 @@ _NEAR_M, _ALIGNED = 0.4, math.radians(10.0)
 _AROUND = math.radians(150.0)
 _STRAYED_M = 1.0
 _MOST_PLANS = 6
-_LOOK_STEP = 0.2
+_NOTICE_STEP = 0.2
 _LEAST_NOTICE = 0.8
 _WAITS_M = 7.0
 _BEND_M = 8.0
 _LONGEST_S = 240.0
-_SOON_S = 0.8  # brake hard for who is in the way by then
+_SOON_S = 0.8  # brake hard for encounters within this time
 _NOBODY: NDArray[np.float64] = np.empty(0)
 
 
 @dataclass(frozen=True)
 class DrivingStyle:
-    """How the car is driven.
+    """Parameters of driving.
 
     Args:
-        speed: m/s, on the lanes at most; None for the scenario's `v_drive`.
-        acceleration: m/s², of getting faster, and of getting slower before turns.
-        braking: m/s², of stopping to park.
-        notice_m: m on along its path, where the car notices at the latest that a slot is taken which it drives into.
+        speed: m/s, highest on the lanes; None for the scenario's `v_drive`.
+        acceleration: m/s², and deceleration before turns.
+        braking: m/s², before parking.
+        notice_m: m along its path, the distance at which the car notices at the latest that a slot is taken.
 
     Raises:
-        InputError: a value that is not a finite number above 0, or a car that would notice too late to stop.
+        InputError: a value that is not a finite number above 0, or a notice distance too short to stop.
 
     Example:
         >>> DrivingStyle(notice_m=0.1)
@@ -102,20 +115,20 @@ class DrivingStyle:
 
 @dataclass
 class DriveLog:
-    """What was driven.
+    """Record of a drive.
 
     Attributes:
-        legs: the edges.
-        tries: the tries to park.
-        driven_m: m, in either direction.
-        contacts: what was touched, by name, once each time.
-        strays: how often the car was off its way and sought another.
-        rescues: how often there was none, and it was put back on the lane.
-        waited_s: s of braking and standing for others who were in the way.
+        legs: driven edges.
+        attempts: parking attempts.
+        driven_m: m, forward and backward.
+        contacts: kinds of obstacles touched, one per collision.
+        strays: how often the car left its path and planned another.
+        rescues: how often there was none, and the car was put back on the lane.
+        waited_s: s, braking and standing for other road users.
     """
 
     legs: list[Leg] = field(default_factory=list)
-    tries: list[Try] = field(default_factory=list)
+    attempts: list[ParkingAttempt] = field(default_factory=list)
     driven_m: float = 0.0
     contacts: list[str] = field(default_factory=list)
     strays: int = 0
@@ -124,29 +137,28 @@ class DriveLog:
 
 
 class LotDriver:
-    """Drives a car for real: a kinematic bicycle among bodies of pymunk, by lane keeping and planned manoeuvres.
+    """Drives a kinematic bicycle among pymunk bodies, by lane keeping and planned manoeuvres.
 
-    Ways along lanes are straights and arcs; where a lane is left for another the way between is planned among kerbs,
-    walls and slots as if all were filled, so it can be driven at any time. Parking, turning round and leaving a slot
-    are planned among the cars that really stand there. Who comes during a manoeuvre waits until the car is
-    out of the way.
+    Paths along lanes are straights and arcs; paths between lanes are planned among kerbs, walls and slots as if all
+    slots were filled, so they can be driven at any time. Parking, turning round and leaving a slot are planned among
+    the cars that are parked there. Cars that arrive during a manoeuvre wait until it is over.
 
-    The scenario's traffic moves about meanwhile. The car brakes for who is, or will be, in its way; they wait for it
-    likewise; and where both have stood for `PATIENCE_S`, the others give way, see `RoadUsers`.
+    The scenario's traffic moves meanwhile. The car brakes for road users in its way now or soon, and they for it; where
+    both have stood for `PATIENCE_S`, the others give way, see `RoadUsers`.
 
     Args:
-        scenario: whose lot, cars and traffic they are.
+        scenario: with lot, parked cars and traffic.
         vehicle: the car.
-        style: how it is driven.
+        style: of driving.
 
     Attributes:
-        log: what was driven since `begin`.
+        log: of the drive since `begin`.
         state: (6,) of the vehicle, see `parkenv.driving.vehicle`.
         time: now, s.
-        doing: what the car is about, in a word or two.
-        track: where it has been since the last decision, every 0.1 s.
-        others: everybody else who moves; None where nobody does.
-        watch: called after every step of the control, 0.1 s, for pictures.
+        doing: current activity, for displays.
+        track: the car's places since the last decision, every 0.1 s.
+        others: moving road users; None without traffic.
+        on_control: called after every control step, 0.1 s.
     """
 
     def __init__(
@@ -162,22 +174,22 @@ class LotDriver:
             )
         lot = scenario.lot
         self._lines = DrivenLines(lot)
-        self._around = LotSurroundings(scenario)
+        self._around = LotObstacles(scenario)
         self._kinds = ParkingTasks(lot).slot_kinds
         self._on_lane = TrackingSettings(
             speed=speed, acceleration=self.style.acceleration, blend_m=2.0, firmness=0.5
         )
         self._turns: dict[tuple[int, int, int, int], CarPath | None] = {}
-        self.watch: Callable[[], None] = lambda: None
+        self.on_control: Callable[[], None] = lambda: None
         self.log = DriveLog()
-        self.track: list[Spot] = []
+        self.track: list[TrackPoint] = []
         self.others: RoadUsers | None = None
         self.doing = ""
         self.state = np.zeros(STATE_SIZE)
         self.time = 0.0
 
     def begin(self, key: np.uint64, world: World, vertex: int, time: float) -> None:
-        """Start at a vertex at a time, s, in the world of a key; at full speed, as who comes from a street."""
+        """Start at a vertex at a time, s, in the world of a key; at full speed."""
         self._around.begin(key, world)
         self.log = DriveLog()
         self.track = []
@@ -192,12 +204,12 @@ class LotDriver:
         self.others = None
         traffic = self.scenario.traffic
         if traffic.cars or traffic.pedestrians:
-            rounds = PoliteTraffic(self.scenario.lot, traffic, key, self._around.slots)
+            rounds = YieldingTraffic(self.scenario.lot, traffic, key, self._around.slots)
             self.others = RoadUsers(rounds, self.vehicle)
         self._enter(self._standing(self.scenario.lot.vertex_xy[vertex]))
 
     def drive(self, source: int, column: int) -> float:
-        """Drive along an edge of the graph until the car has come to its end; s."""
+        """Drive along an edge of the graph to its end; returns s."""
         lot = self.scenario.lot
         target, length = int(lot.neighbors[source, column]), float(lot.edge_length[source, column])
         edge = self._lines.edge(source, target, length)
@@ -207,7 +219,7 @@ class LotDriver:
         self.doing = "searching"
         kind = ACROSS
         if not edge.across:
-            kind = self._take(edge)
+            kind = self._plan_edge(edge)
             self._refresh()
             while not self._arrived(edge, target) and self.time - began < _LONGEST_S:
                 if not self._keep_lane():
@@ -216,12 +228,12 @@ class LotDriver:
         self.log.legs.append(leg)
         return leg.seconds
 
-    def park(self, slot: int, taken: bool) -> Try:
-        """Stop, plan a manoeuvre into a slot and drive it; where it is taken or too narrow, drive back on the lane.
+    def park(self, slot: int, taken: bool) -> ParkingAttempt:
+        """Stop, plan a manoeuvre into a slot and drive it; if it is taken or too narrow, drive back onto the lane.
 
         Args:
             slot: its index.
-            taken: whether a car stands in it. The car finds out when it is about to drive into it.
+            taken: whether a car is parked in it, which this car notices when it is about to drive in.
         """
         lot, vehicle, began = self.scenario.lot, self.vehicle, self.time
         self.track = []
@@ -242,34 +254,34 @@ class LotDriver:
         if reason:
             self.doing = f"{lot.slot_ids[slot]}: {reason}"
             onward = self._back(slot)
-        result = Try(lot.slot_ids[slot], kind, way, self.time - began, reason, onward)
-        self.log.tries.append(result)
+        result = ParkingAttempt(lot.slot_ids[slot], kind, way, self.time - began, reason, onward)
+        self.log.attempts.append(result)
         return result
 
     def wait(self, seconds: float) -> float:
-        """Brake, and stay for some time; s."""
+        """Brake, and stand for some time; returns s."""
         until, self.track = self.time + seconds, []
         self._refresh()
         while self.time < until - 1e-9:
             self._brake(self.style.braking)
         return seconds
 
-    def movers_at(self, spot: Spot) -> Movers | None:
-        """Who else was where when the car was at a spot of its `track`."""
-        return None if self.others is None else self.others.movers(spot.clocks)
+    def movers_at(self, point: TrackPoint) -> Movers | None:
+        """Return the road users at the time of a point of `track`."""
+        return None if self.others is None else self.others.movers(point.clocks)
 
     # --- Lanes
 
     def _place(self, edge: DrivenEdge) -> None:
-        """Put the car where the first edge begins."""
+        """Place the car at the start of the first edge."""
         line = self._lines.lines[edge.line]
         self.state[:3] = line.pose(edge.start - self.vehicle.middle)
         self.state[SPEED] = self._on_lane.speed
         self._placed = True
-        self._make_room()
+        self._clear_area()
 
-    def _take(self, edge: DrivenEdge) -> str:
-        """Lay the way along an edge from where the car is; the edge's kind."""
+    def _plan_edge(self, edge: DrivenEdge) -> str:
+        """Plan the path along an edge from the car's place; returns the edge's kind."""
         if self._line == edge.line and self._keeper is not None and not self._keeper.done:
             return ALONG
         line = self._lines.lines[edge.line]
@@ -300,16 +312,16 @@ class LotDriver:
         self._keeper = LaneKeeper(self.vehicle, rounded(points, _BEND_M), self._on_lane)
 
     def _turn(self, before: int, edge: DrivenEdge, at: float) -> CarPath | None:
-        """From the line that the car is on to another that crosses it at station `at`; None where there is no way."""
+        """Plan the turn from the car's line to one that crosses it at station `at`; None if there is none."""
         here, line = self._lines.lines[before], self._lines.lines[edge.line]
-        # The line of the junction's middle, not of the other lane's side.
+        # Measured to the middle of the junction, not to the near side of the other lane.
         now = here.station_of(self.state[:2])
         leave = at - TURN_IN_M + _LEAD_M
         if now > leave:
             leave = math.ceil(2.0 * (now + 0.2)) / 2.0
         key = before, edge.line, round(10 * leave), round(10 * edge.start)
         if key not in self._turns:
-            there = self._around.at_worst(here.pose(at)[:2])
+            there = self._around.worst_case(here.pose(at)[:2])
             path = self._planned_onto(here.pose(leave), line, edge.start, _ONTO, there, _WIDE)
             if path is not None:
                 ends = line.station_of(path.sampled()[0][-1, :2])
@@ -322,7 +334,7 @@ class LotDriver:
         return joined(rounded(here.between(now, leave), _BEND_M), path)
 
     def _turn_onto(self, line: DrivenLine) -> str:
-        """Get onto a line from wherever the car is, and along it from there; the edge's kind."""
+        """Drive from the car's place onto a line, and continue along it; returns the edge's kind."""
         self._halt(self.style.braking)
         askew = 0.0
         for _ in range(_MOST_PLANS):
@@ -353,7 +365,7 @@ class LotDriver:
         there: Obstacles,
         reserves: Sequence[float],
     ) -> CarPath | None:
-        """The best way from a pose onto a line, as wide a turn as there is room for without going backward."""
+        """Plan the fastest path from a pose onto a line, with the widest turn possible without reversing."""
         best: tuple[float, CarPath] | None = None
         for reserve in reserves:
             settings = SearchSettings(
@@ -379,7 +391,7 @@ class LotDriver:
         return None if best is None else best[1]
 
     def _keep_lane(self) -> bool:
-        """A step along the way; whether there is more of it."""
+        """Drive one control step along the lane; returns False at its end."""
         assert self._keeper is not None
         pose, speed, steering = self.state[:3], float(self.state[SPEED]), float(self.state[STEERING])
         command = self._keeper.command(pose, speed, steering)
@@ -390,7 +402,7 @@ class LotDriver:
             assert self._line is not None
             self._turn_onto(self._lines.lines[self._line])
             return True
-        if not self._lets_go_first(self._keeper):
+        if not self._yields(self._keeper):
             self._step(*command)
         return True
 
@@ -406,7 +418,7 @@ class LotDriver:
         return bool(ahead >= (0.0 if slot else -TURN_IN_M))
 
     def _is_on(self, line: DrivenLine) -> bool:
-        """Whether the car drives along a line."""
+        """Return whether the car is aligned with a line."""
         pose = line.pose(line.station_of(self.state[:2]))
         return _away(pose, self.state[:3]) < _NEAR_M and _askew(pose, self.state[:3]) < _ALIGNED
 
@@ -415,7 +427,7 @@ class LotDriver:
     def _drive_in(
         self, targets: dict[str, FloatArray], there: Obstacles, inside: FloatArray | None
     ) -> tuple[str, str]:
-        """Drive to the target that is reached soonest; which that is, and why the slot was left, if it was."""
+        """Drive to the target that is reached first; returns its name, and the reason of a failure."""
         ways = list(targets)
         for _ in range(_MOST_PLANS):
             paths = {way: path for way in ways if (path := self._planned_to(targets[way], there)) is not None}
@@ -438,9 +450,9 @@ class LotDriver:
         return way, NO_WAY
 
     def _noticing(self, tracker: PathTracker, inside: FloatArray) -> Callable[[], bool]:
-        """Whether the car would run into an outline within `notice_m` on its way."""
+        """Return a function that tells whether the path meets an outline within `notice_m`."""
         body = shapely.Polygon(inside)
-        ahead = np.arange(0.0, self.style.notice_m + _LOOK_STEP, _LOOK_STEP)
+        ahead = np.arange(0.0, self.style.notice_m + _NOTICE_STEP, _NOTICE_STEP)
 
         def notices() -> bool:
             corners = self.vehicle.corners(tracker.poses_ahead(ahead))
@@ -449,12 +461,12 @@ class LotDriver:
         return notices
 
     def _planned_to(self, target: FloatArray, there: Obstacles) -> CarPath | None:
-        """A way to where the footprint's middle is to be."""
+        """Plan a path to a pose of the footprint's middle."""
         goal = self.vehicle.at_rear_axle(target)
         return plan_path(self.vehicle, there.corners, there.n_corners, self.state[:3], goal)
 
     def _follow(self, tracker: PathTracker, notices: Callable[[], bool] | None = None) -> bool:
-        """Follow a path to its end, or until the car has strayed and stands; False if it stopped as it noticed."""
+        """Follow a path to its end, or stop off the path; returns False where `notices` stopped the car."""
         while True:
             pose, speed, steering = self.state[:3], float(self.state[SPEED]), float(self.state[STEERING])
             command = tracker.command(pose, speed, steering)
@@ -468,11 +480,11 @@ class LotDriver:
             if abs(tracker.offset) > STRAYED_M or abs(tracker.askew) > STRAYED_RAD:
                 self._halt(self.style.braking, tracker)
                 return True
-            if not self._lets_go_first(tracker):
+            if not self._yields(tracker):
                 self._step(*command)
 
     def _back(self, slot: int) -> float:
-        """Drive back on the lane, in the direction of the slot or of before, whichever is sooner; `onward_m`."""
+        """Drive back onto the slot's lane or the previous one, whichever is faster; returns `onward_m`."""
         ways = [self._lines.at(slot)]
         if self._line is not None and self._line != ways[0][0]:
             line = self._lines.lines[self._line]
@@ -504,48 +516,48 @@ class LotDriver:
         own = self._lines.lines[index].station_of(self.vehicle.at_middle(self.state[:3])[:2])
         return own - station
 
-    # --- The car and what is around it
+    # --- The car and its surroundings
 
     def _rescue(self, line: DrivenLine) -> None:
-        """Put a car that is stuck back on a line."""
+        """Put a stuck car back onto a line."""
         self.log.rescues += 1
         self.time += RESCUE_S
         pose = line.pose(line.station_of(self.state[:2]))
         self.state = np.r_[pose, np.zeros(STATE_SIZE - 3)]
-        self._make_room()
+        self._clear_area()
 
-    def _make_room(self) -> None:
-        """Have nobody stand where the car was put."""
+    def _clear_area(self) -> None:
+        """Hide road users that stand where the car was put."""
         if self.others is not None:
-            self.others.make_room(self.vehicle.corners(self.state[:3]))
+            self.others.clear_area(self.vehicle.corners(self.state[:3]))
 
-    def _lets_go_first(self, tracker: PathTracker) -> bool:
-        """Brake, or stand, for a step if somebody is in the way along a path; whether so."""
+    def _yields(self, tracker: PathTracker) -> bool:
+        """Brake or stand for a step if a road user is in the way along a path; returns whether it did."""
         if self.others is None:
             return False
         speed = abs(float(self.state[SPEED]))
-        ahead = tracker.poses_ahead(WATCHED_S * max(speed, SLOWEST))
-        when = self.others.in_way(self.vehicle.at_middle(ahead))
+        ahead = tracker.poses_ahead(PREDICTION_TIMES_S * max(speed, START_SPEED))
+        when = self.others.encounter_times(self.vehicle.at_middle(ahead))
         if np.isinf(when).all():
             self._stood_s = 0.0
             return False
         if speed == 0.0:
             self._stood_s += CONTROL_S
             if self._stood_s >= PATIENCE_S:
-                self.others.give_way(np.isfinite(when))
+                self.others.hide_standing(np.isfinite(when))
                 self._stood_s = 0.0
         self.log.waited_s += CONTROL_S
         self._brake(self.vehicle.max_braking if when.min() < _SOON_S else self.style.braking, tracker)
         return True
 
     def _halt(self, braking: float, tracker: PathTracker | None = None) -> None:
-        """Brake until the car stands."""
+        """Brake to a standstill."""
         self._refresh()
         while self.state[SPEED] != 0.0:
             self._brake(braking, tracker)
 
     def _brake(self, braking: float, tracker: PathTracker | None = None) -> None:
-        """Brake for a step of the control, along the path that the car is on."""
+        """Brake for one control step along the current path."""
         speed, steering = float(self.state[SPEED]), float(self.state[STEERING])
         tracker = tracker or self._keeper
         wheels = steering / self.vehicle.max_steering
@@ -555,58 +567,60 @@ class LotDriver:
         self._step(-math.copysign(min(share, 1.0), speed) if speed else 0.0, wheels)
 
     def _step(self, acceleration: float, steering: float) -> None:
-        """Drive for a step of the control."""
+        """Drive one control step."""
         others = self.others
         if others is not None:
-            others.onward(CONTROL_S, self.vehicle.corners(self.state[:3]))
+            others.advance(CONTROL_S, self.vehicle.corners(self.state[:3]))
         for step in range(SUBSTEPS):
             if others is not None:
-                self._space.move(others.between((step + 1) / SUBSTEPS))
+                self._space.move(others.interpolate((step + 1) / SUBSTEPS))
             way = advance(self.state, acceleration, steering, self.vehicle.limits)
             self.log.driven_m += abs(way)
             touched = self._space.touched(*self.state[:3].tolist())
             if touched and not self._touches:
-                self.log.contacts.append(Thing(touched).words)
+                self.log.contacts.append(ObstacleKind(touched).label)
             self._touches = bool(touched)
             self.time += PHYSICS_S
         clocks = _NOBODY if others is None else others.clocks
-        self.track.append(Spot(self.time, self.log.driven_m, self.vehicle.at_middle(self.state[:3]), clocks))
-        self.watch()
+        self.track.append(
+            TrackPoint(self.time, self.log.driven_m, self.vehicle.at_middle(self.state[:3]), clocks)
+        )
+        self.on_control()
         if np.abs(self.state[:2] - self._space_at).max() > REACH_M - 10.0:
             self._refresh()
 
     def _refresh(self) -> None:
-        """Bring what stands around up to date, unless that was done a moment ago and nearby."""
+        """Update the obstacles around the car."""
         self._enter(self._standing(self.state[:2]))
 
     def _standing(self, center: FloatArray, looks_free: int | None = None) -> Obstacles:
-        """What stands around a point, (2,) m, but for a car that is overlooked, and those that wait for this one."""
+        """Return the obstacles around a point, (2,) m, without waiting cars and a car in `looks_free`."""
         taken = set(self._around.taken(center, self.time))
         if self._knew is not None:
             new = np.array(sorted(taken - self._knew), dtype=np.int64)
             close = np.hypot(*(self.scenario.lot.slot_xy[new] - self.state[:2]).T) < _WAITS_M
             taken -= set(new[close].tolist())
         self._knew = taken
-        return self._around.now(center, self.time, sorted(taken - {looks_free}))
+        return self._around.at_time(center, self.time, sorted(taken - {looks_free}))
 
     def _enter(self, there: Obstacles) -> None:
-        """Drive among these."""
+        """Build the collision world of these obstacles."""
         if self.others is None:
-            self._space = LotSpace(self.vehicle, there)
+            self._space = CollisionWorld(self.vehicle, there)
         else:
-            self._space = LotSpace(self.vehicle, there, self.others.outlines)
+            self._space = CollisionWorld(self.vehicle, there, self.others.outlines)
             self._space.move(self.others.poses)
         self._space_at = self.state[:2].copy()
 
 
 def _with(there: Obstacles, outline: FloatArray) -> Obstacles:
-    """Obstacles, and a parked car."""
-    things = [(Thing(t), o) for t, o in zip(there.thing.tolist(), there.outlines(), strict=True)]
-    return Obstacles.of([*things, (Thing.PARKED_CAR, outline)])
+    """Add a parked car to obstacles."""
+    things = [(ObstacleKind(t), o) for t, o in zip(there.kind.tolist(), there.outlines(), strict=True)]
+    return Obstacles.of([*things, (ObstacleKind.PARKED_CAR, outline)])
 
 
 def _seconds_of(path: CarPath) -> float:
-    """About how long it takes to drive a path in the way of manoeuvres."""
+    """Estimate the time of a manoeuvre along a path, s."""
     changes = path.direction_changes + (len(path.length) > 0 and path.length[0] < 0.0)
     return path.driven_m / _PACE + _CHANGE_S * changes
 
@@ -616,5 +630,5 @@ def _away(a: FloatArray, b: FloatArray) -> float:
 
 
 def _askew(a: FloatArray, b: FloatArray) -> float:
-    """Angle, rad, between two headings."""
+    """Return the angle between two headings, rad."""
     return abs(math.remainder(float(a[2] - b[2]), 2.0 * math.pi))

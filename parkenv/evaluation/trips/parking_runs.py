@@ -1,4 +1,4 @@
-"""Parkings driven to their end, and the table that many of them come down to."""
+"""Run parking episodes and summarise them in a table."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ from parkenv.evaluation.simulate import Observer, Step, simulate
 from parkenv.files.atomic_write import atomic_write
 from parkenv.world.lot import ParkingLot
 from planners.agent import Agent
-from planners.driving.drivers import PLANNER, make_driver
 from planners.driving.parking import ParkingMemory
+from planners.driving.parking_agents import PLANNER, make_parking_agent
 
 CHUNK = 25
-"""Parkings that one worker drives at a time."""
+"""Episodes per task of a worker."""
 
 
 @dataclass(frozen=True)
 class ParkingCase:
-    """Where is parked, and how.
+    """A parking task distribution on one lot.
 
     Args:
         lot: the lot.
-        kinds: of slots; None: those that the lot has.
-        ways: of standing in perpendicular and oblique ones.
-        occupancy: share of the other slots that are taken.
-        slack: m that are kept clear around the slot.
+        kinds: kinds of slots; None for all that the lot has.
+        ways: orientations in perpendicular and oblique slots.
+        occupancy: fraction of the other slots that are occupied.
+        slack: distance around the slot kept clear of parked cars, m.
     """
 
     lot: ParkingLot
@@ -47,7 +47,7 @@ class ParkingCase:
     slack: float = 0.0
 
     def environment(self, render_mode: str | None = None) -> gym.Env[Any, Any]:
-        """`parkenv/Drive-v1` with the obstacle map."""
+        """Make `parkenv/Drive-v1` with the obstacle map."""
         return gym.make(
             "parkenv/Drive-v1",
             lot=self.lot,
@@ -63,12 +63,12 @@ class ParkingCase:
 
 @dataclass
 class Parking:
-    """One parking.
+    """Result of one parking episode.
 
     Attributes:
-        row: what came of it.
-        state: the episode at its end; its trail is what was driven.
-        frames: pictures of every `every` steps, where they were asked for.
+        row: its metrics.
+        state: final state of the episode, with the driven trail.
+        frames: rendered frames, if requested.
     """
 
     row: dict[str, Any]
@@ -77,7 +77,7 @@ class Parking:
 
 
 class _ParkingRecorder(Observer):
-    """Keeps steering angle and heading after every step, and frames.
+    """Record steering angle and heading after every step, and frames.
 
     Args:
         every: steps between frames; 0 for none.
@@ -90,13 +90,13 @@ class _ParkingRecorder(Observer):
         self.frames: list[Any] = []
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Keep the start."""
+        """Record the start."""
         del observation
         self._env, self.drive = env, cast(DriveEnv, env.unwrapped)
         self._record(frame=True)
 
     def on_step(self, step: Step) -> None:
-        """Keep the step; the last one always has a frame."""
+        """Record the step; the last one always has a frame."""
         over = step.terminated or step.truncated
         self._record(frame=over or (self._every > 0 and len(self.yaws) % self._every == 0))
 
@@ -109,17 +109,17 @@ class _ParkingRecorder(Observer):
 
 
 def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0) -> Parking:
-    """Drive one parking to its end.
+    """Run one parking episode.
 
     Args:
         env: `parkenv/Drive-v1`; with `render_mode="rgb_array"` for pictures.
-        agent: the driver.
+        agent: the parking agent.
         seed: of the task.
-        every: steps from picture to picture; 0 for none.
+        every: steps between frames; 0 for none.
 
     Returns:
         A row with lot, seed, kind, way, slot, parked, reason (of a failure), time_s, driven_m, direction_changes,
-        wheel_rad (how far the wheels were turned in all), turned_rad (how far the heading was), position_error_m,
+        wheel_rad and turned_rad (total change of steering angle and heading), position_error_m,
         angle_error_deg; of a planner also plans, planning_s (all of them), path_m, expansions, margin_m.
     """
     recorder = _ParkingRecorder(every)
@@ -160,27 +160,27 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
 def park_all(
     cases: Sequence[ParkingCase], seeds: Sequence[int], workers: Workers = HERE, driver: str = PLANNER
 ) -> Iterator[list[Parking]]:
-    """Every seed in every case by one driver, some at a time and in order.
+    """Drive every seed of every case with one driver; yields the parkings in order.
 
-    What is measured in wall time differs from run to run; nothing else does, on any number of workers.
+    Only wall times differ from run to run, on any number of workers.
 
     Args:
-        cases: where is parked.
+        cases: the tasks.
         seeds: of the tasks.
-        workers: who runs it.
-        driver: a name for `planners.driving.drivers.make_driver`.
+        workers: where they run.
+        driver: a name for `planners.driving.parking_agents.make_parking_agent`.
     """
     parts = [seeds[i : i + CHUNK] for i in range(0, len(seeds), CHUNK)]
     yield from workers.in_order([partial(_park_some, case, part, driver) for case in cases for part in parts])
 
 
 def _park_some(case: ParkingCase, seeds: Sequence[int], driver: str) -> list[Parking]:
-    env, agent = case.environment(), make_driver(driver)
+    env, agent = case.environment(), make_parking_agent(driver)
     return [park_once(env, agent, seed) for seed in seeds]
 
 
 def parking_table(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each kind of slot and way of standing in it, and one for all: `kind` "all".
+    """Summarise parkings: a row for each kind of slot and way of parking, and one for all (`kind` "all").
 
     Returns:
         kind, way, episodes, parked, success and its 95 % interval (Wilson), contacts; median and p95 of planning_ms
@@ -194,7 +194,7 @@ def parking_table(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def write_parkings(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Write the rows of parkings as CSV, whole or not at all."""
+    """Write the rows of parkings as CSV, atomically."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     with atomic_write(path) as beside, beside.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")

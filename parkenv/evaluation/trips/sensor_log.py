@@ -1,4 +1,4 @@
-"""What sensors measured and the stack made of it, as a recording for the Rerun viewer (https://rerun.io)."""
+"""Record sensor data and perception results for the Rerun viewer (https://rerun.io)."""
 
 from __future__ import annotations
 
@@ -38,23 +38,23 @@ TIMELINE = "drive"
 PAUSE_S = 5.0
 """Between two drives."""
 GRID_EVERY = 10
-"""Captures between two pictures of the grid: it is large, and changes little."""
+"""Captures between two images of the grid, which is large and changes little."""
 JPEG_QUALITY = 80
-UNSEEN = 40
-SIDE, END, NOWHERE = (255, 208, 0), (86, 180, 233), (150, 150, 150)
+UNOBSERVED_GREY = 40
+SIDE, END, UNRANGED = (255, 208, 0), (86, 180, 233), (150, 150, 150)
 INK, PATH, SCAN, GOAL = (120, 126, 134), (0, 114, 178), (213, 94, 0), (204, 121, 167)
 
 
 class SensorLog:
-    """A recording on one time line: images, boxes, scans, grid, slots, path.
+    """A recording on one timeline: images, boxes, scans, grid, slots, path.
 
-    Entities are `lot/...` (m, z up: outlines of the slots, coloured by what is believed of each), `car` with its
-    cameras, images and boxes below it, `scan/...`, `grid`, `cars` that were found, and `path`.
+    Entities are `lot/...` (m, z up: outlines of the slots, coloured by belief), `car` with its cameras, images and
+    boxes below it, `scan/...`, `grid`, detected `cars`, and `path`.
 
     Args:
-        recording: where to.
-        lot: which is drawn once.
-        rig: whose sensors measured.
+        recording: the stream to write to.
+        lot: drawn once.
+        rig: the sensors.
     """
 
     def __init__(self, recording: rr.RecordingStream, lot: ParkingLot, rig: SensorRig) -> None:
@@ -68,7 +68,7 @@ class SensorLog:
         self._draw_rig()
 
     def begin(self) -> None:
-        """Another drive begins, behind what was recorded so far."""
+        """Begin another drive, after the ones recorded so far."""
         self._begun = 0.0 if not self._n_captures else self._time + PAUSE_S
         self._path = []
 
@@ -93,7 +93,7 @@ class SensorLog:
             self._rec.log(at, rr.EncodedImage(contents=_jpeg(view.image), media_type="image/jpeg"))
             found = view.detections
             standing = np.isin(np.arange(len(found)), view.cars.detection)
-            colors = np.where(standing[:, None], np.where(found.end_on[:, None], END, SIDE), NOWHERE).astype(
+            colors = np.where(standing[:, None], np.where(found.end_on[:, None], END, SIDE), UNRANGED).astype(
                 np.uint8
             )
             labels = [f"{p:.2f}" for p in found.probability]
@@ -122,7 +122,7 @@ class SensorLog:
         self._n_captures += 1
 
     def slots(self, p_occupied: FloatArray, known: NDArray[np.bool_] | None = None) -> None:
-        """What is believed of every slot, (n_slots,), now; grey where nothing is `known`."""
+        """Record P(taken) of every slot, (n_slots,); grey where not `known`."""
         import rerun as rr
 
         colors = (255.0 * colormaps["cividis"](p_occupied)).astype(np.uint8)
@@ -136,7 +136,7 @@ class SensorLog:
         )
 
     def grid(self, grid: OccupancyGrid) -> None:
-        """The occupancy grid as it is now, every `GRID_EVERY` moments."""
+        """Record the occupancy grid at every `GRID_EVERY`-th capture."""
         if (self._n_captures - 1) % GRID_EVERY:
             return
         import rerun as rr
@@ -146,7 +146,7 @@ class SensorLog:
         side = grid.cell * np.array([columns, rows])
         corners = low + np.array([[0, 0, 0], [side[0], 0, 0], [side[0], side[1], 0], [0, side[1], 0]])
         picture = (255.0 * colormaps["cividis"](grid.probability)[..., :3]).astype(np.uint8)
-        picture[~grid.seen] = UNSEEN
+        picture[~grid.seen] = UNOBSERVED_GREY
         self._rec.log(
             "grid",
             rr.Mesh3D(
@@ -197,10 +197,10 @@ class SensorLog:
 
 
 def require_viewer() -> None:
-    """Say how to install the Rerun SDK where it is missing.
+    """Check that the Rerun SDK is installed.
 
     Raises:
-        InputError: it is.
+        InputError: it is not.
     """
     if find_spec("rerun") is None:
         raise InputError("a recording needs the Rerun SDK; install it with: pip install 'parkenv[viewer]'")
@@ -208,7 +208,7 @@ def require_viewer() -> None:
 
 @contextmanager
 def sensor_log(path: str | Path, lot: ParkingLot, rig: SensorRig) -> Iterator[SensorLog]:
-    """A log that becomes the file `path`, an .rrd, when the block ends.
+    """Open a log that becomes the file `path`, an .rrd, at the end of the block.
 
     Raises:
         InputError: the extra `viewer` is not installed, or the file cannot be written.
@@ -246,12 +246,12 @@ def sensor_log(path: str | Path, lot: ParkingLot, rig: SensorRig) -> Iterator[Se
 
 
 def record_session(survey: Survey, number: int, log: SensorLog) -> None:
-    """Drive a session of a survey, as it is driven for the map, and record it.
+    """Drive a survey session, as for the map, and record it.
 
     Args:
-        survey: of which.
+        survey: the survey.
         number: of the session.
-        log: where to; of the survey's lot and rig.
+        log: of the survey's lot and rig.
     """
     log.begin()
     begun: list[float] = []
@@ -301,7 +301,7 @@ def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: Sensor
         env: the environment.
         agent: made for its scenario.
         seed: of the world.
-        log: where to; of the environment's lot and rig.
+        log: of the environment's lot and rig.
     """
     simulate(TimeLimit(env, STEP_LIMIT), agent, seed, (_SearchLogger(log, env.perception),))
 
@@ -312,7 +312,7 @@ def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
     Args:
         search: with a rig.
         seed: of the world.
-        log: where to; of the lot and the rig of `search`.
+        log: of the lot and rig of `search`.
 
     Raises:
         InputError: a search without a rig.

@@ -1,4 +1,4 @@
-"""What the user of an import adds to what the file says."""
+"""Options of an import."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NEAR_ON_GLOBE = 1.0
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What the user adds to a file of a real place, or wants instead of what it says.
+    """Goals, entries and bounds that complete or replace those of a file.
 
     Args:
         goals: places that people walk to, pairs of numbers: metres east and north in the lot's frame or, in a file

@@ -45,7 +45,7 @@ class LotDraft:
         outlines: (k, 2) m each, parking areas in the file; for pictures.
         found: what was found, a line each.
         left_out: elements that were not used.
-        missing: what a search needs and the file lacks, a sentence each that says how to give it.
+        missing: what a search needs and the file lacks, a sentence each that states how to give it.
         frame: of the lot on the globe; None if the file has none.
         loose: (k, 2) m, centres of slots whose shape is unknown; for pictures.
     """

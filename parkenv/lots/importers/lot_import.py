@@ -27,7 +27,7 @@ def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDra
         options: goals, entries and bounds that the user gives.
 
     Returns:
-        A draft; `LotDraft.lot()` makes it a lot, or says what is missing.
+        A draft; `LotDraft.lot()` makes it a lot, or states what is missing.
 
     Raises:
         InputError: the file cannot be read, holds no parking, or is of an unknown kind.

@@ -14,7 +14,7 @@ from parkenv.world.lot import Lane
 CAR_SPACES = ("normal", "yes", "car", "parent", "parents", "women", "woman", "customers", "residents")
 """Values of `parking_space` that any car may use."""
 LARGEST_SPACE = 30.0
-"""m²; a larger space without a capacity stands for several."""
+"""m²; a larger space without a capacity counts as several and is left out."""
 
 
 def why_no_slot(

@@ -125,7 +125,7 @@ def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> L
     """Draft a lot from a list of slots.
 
     See `parkenv.lots.importers.slot_layout` for the rules. Where they are ambiguous the draft has slot centres
-    only, and says so; it can still be drawn. A list states neither entries nor goals.
+    only, and states so; it can still be drawn. A list states neither entries nor goals.
 
     Raises:
         InputError: see `read_slot_list`.

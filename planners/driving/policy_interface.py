@@ -1,7 +1,7 @@
-"""What a driver that learns sees of `parkenv/Drive-v1`, and what its decisions make the car do.
+"""Observation and action of learned parking agents, on top of `parkenv/Drive-v1`.
 
-It sees how much room there is in every direction, from a car's outline to the nearest of the others', and decides how
-fast to go and where to steer for the next 0.4 s. Where it is and where it is to stand, it reads off the goals.
+The policy observes the free distance in every direction, from the car's outline to the nearest obstacle, and decides
+speed and steering for the next 0.4 s. Its own pose and the wanted one are in the goals.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 
-VIEW = "drive-1"
-"""The layout of what is seen and decided: a model of another one would read nonsense."""
-HOLD = 4
-"""Steps of the environment for which a decision holds."""
+INTERFACE = "drive-1"
+"""Version of the layout of observation and action; models of another version are refused."""
+ACTION_REPEAT = 4
+"""Environment steps per decision."""
 BEAMS = 48
-"""Directions in which room is measured, all around, the first one ahead."""
+"""Number of directions in which free distance is measured, all around, the first one ahead."""
 FARTHEST_M = 10.0
-"""Room beyond this is not told apart."""
+"""Greatest measured free distance, m."""
 SPEEDS = (2.0, 1.5)
-"""m/s, the greatest speed forward and backward that a decision can ask for: about the planner's."""
+"""Greatest commanded speed forward and backward, m/s: about the planner's."""
 STAND = 0.2
-"""A decision whose first number is smaller than this, either way, asks the car to stand."""
-N_SEEN = 8 + BEAMS
-"""Numbers of the observation; see `seen`."""
+"""Dead band of the speed command, within which the car stands."""
+OBSERVATION_SIZE = 8 + BEAMS
+"""Length of the observation vector."""
 
 _CONTROL_S = 0.1
 _NOWHERE = 999.0  # m; unused rows of the obstacle map lie beyond
@@ -42,12 +42,12 @@ _CIRCLE = 2.0 * math.pi / BEAMS
 
 
 class Outlines(NamedTuple):
-    """What is in the way, in the slot's frame, as compiled code walks it.
+    """Obstacles in the slot's frame, as arrays for compiled code.
 
     Attributes:
-        edges: (n_edges, 4) float64, m: x, y of either end; those of one thing stand together.
-        first: (n + 1,) int64: where the edges of each thing begin.
-        circle: (n, 3) float64, m: x, y and radius of a circle round each thing.
+        edges: (n_edges, 4) float64, m: x, y of both ends; edges of one obstacle are consecutive.
+        first: (n + 1,) int64: index of the first edge of each obstacle.
+        circle: (n, 3) float64, m: x, y and radius of a circle round each obstacle.
     """
 
     edges: FloatArray
@@ -56,11 +56,11 @@ class Outlines(NamedTuple):
 
     @classmethod
     def of_map(cls, cars: Float32Array, lines: Float32Array) -> Outlines:
-        """From `cars` and `lines` of an observation with the obstacle map, (n, 24, 2) and (m, 2, 2) m."""
+        """Convert `cars`, (n, 24, 2) m, and `lines`, (m, 2, 2) m, of an observation with the obstacle map."""
         cars = cars[cars[:, 0, 0] < _NOWHERE].astype(np.float64)
         lines = lines[lines[:, 0, 0] < _NOWHERE].astype(np.float64)
         around = np.concatenate([cars, np.roll(cars, -1, axis=1)], axis=2)
-        # An outline of fewer corners repeats its last.
+        # Outlines of fewer corners are padded with their last.
         long = (np.abs(around[..., :2] - around[..., 2:]) > 0.0).any(axis=2)
         edges = np.concatenate([around[long], lines.reshape(-1, 4)])
         count = np.concatenate([long.sum(axis=1), np.ones(len(lines), dtype=np.int64)])
@@ -78,8 +78,8 @@ class Outlines(NamedTuple):
 
 
 @dataclass(frozen=True)
-class DriverView:
-    """The eyes and the feet of a driver of one car.
+class PolicyInterface:
+    """Constants of the interface for one car.
 
     Args:
         vehicle: the car.
@@ -89,12 +89,12 @@ class DriverView:
 
     @cached_property
     def half(self) -> FloatArray:
-        """(2,) half the car's length and width, m."""
+        """Half the car's length and width, (2,) m."""
         return 0.5 * np.array([self.vehicle.length, self.vehicle.width])
 
     @cached_property
     def body(self) -> FloatArray:
-        """(BEAMS,) from the car's middle to its outline in the direction of each beam, m."""
+        """Distance from the car's middle to its outline along each beam, (BEAMS,) m."""
         angle = _CIRCLE * np.arange(BEAMS)
         directions = np.abs(np.stack([np.cos(angle), np.sin(angle)]))
         reach: FloatArray = (self.half[:, None] / np.maximum(directions, 1e-9)).min(axis=0)
@@ -102,28 +102,28 @@ class DriverView:
 
     @cached_property
     def pedals(self) -> FloatArray:
-        """(4,) what `command` takes: the greatest braking and acceleration, m/s², and `SPEEDS`."""
+        """Parameters of `pedal_command`, (4,): the greatest braking and acceleration, m/s², and `SPEEDS`."""
         return np.array([self.vehicle.max_braking, self.vehicle.max_acceleration, *SPEEDS])
 
 
 @compiled(error_model="numpy")
-def command(action: Float32Array, speed: float, pedals: FloatArray) -> float:
-    """The pedal, -1 to 1, that brings the car to the speed that a decision asks for.
+def pedal_command(action: Float32Array, speed: float, pedals: FloatArray) -> float:
+    """The acceleration command, -1 to 1, that reaches the commanded speed.
 
     Args:
-        action: (2,) speed, as a share of the greatest, and steering, both -1 to 1.
+        action: (2,) speed as a fraction of the greatest, and steering, both -1 to 1.
         speed: the car's, m/s.
-        pedals: of a `DriverView`.
+        pedals: of a `PolicyInterface`.
     """
-    asked = min(max(float(action[0]), -1.0), 1.0)
-    size = (abs(asked) - STAND) / (1.0 - STAND)
-    wanted = 0.0 if size <= 0.0 else size * pedals[2] if asked > 0.0 else -size * pedals[3]
+    target = min(max(float(action[0]), -1.0), 1.0)
+    size = (abs(target) - STAND) / (1.0 - STAND)
+    wanted = 0.0 if size <= 0.0 else size * pedals[2] if target > 0.0 else -size * pedals[3]
     needed = (wanted - speed) / _CONTROL_S
     return float(min(max(needed / (pedals[0] if needed * speed < 0.0 else pedals[1]), -1.0), 1.0))
 
 
 @compiled(error_model="numpy")
-def see(
+def encode_observation(
     middle: FloatArray,
     state: FloatArray,
     outlines: tuple[FloatArray, IntArray, FloatArray],
@@ -131,22 +131,22 @@ def see(
     about: FloatArray,
     seen: Float32Array,
 ) -> None:
-    """Fill in what is seen of the car and around it.
+    """Fill the observation vector: the car's state and the free distance around it.
 
     Args:
         middle: (2,) x, y of the footprint's middle, m, slot frame.
         state: (6,) of the vehicle, with the yaw in the slot frame.
         outlines: see `Outlines`.
-        body: of a `DriverView`.
-        about: (5,) half of what the slot is longer and wider than the car, m, and a 1 for its kind.
-        seen: (`N_SEEN`,) filled: speed, steering angle and acceleration, all scaled to about one; `about`; and the
-            room at each beam, 1 / (1 + m) from the car's outline on, so that 1 is a contact.
+        body: of a `PolicyInterface`.
+        about: (5,) half the differences of length and width of slot and car, m, and the slot's kind, one-hot.
+        seen: (`OBSERVATION_SIZE`,) float32, output: speed, steering angle and acceleration, scaled to about one;
+            `about`; and for each beam 1 / (1 + free distance in m), so that 1 is a contact.
     """
     seen[0], seen[1], seen[2] = state[SPEED] / 2.0, state[STEERING] / 0.6, state[ACCELERATION] / 3.0
     for k in range(5):
         seen[3 + k] = about[k]
     edges, first, circle = outlines
-    # Nearness, 1 / m, is what edges are compared by: it needs no special case for beams that run beside an edge.
+    # Edges are compared by inverse distance, 1/m, which needs no special case for beams parallel to an edge.
     near = np.full(BEAMS, 1.0 / (FARTHEST_M + 3.0))
     ahead, aside = np.empty(BEAMS), np.empty(BEAMS)
     for b in range(BEAMS):
@@ -163,7 +163,7 @@ def see(
             if abs(twice) < 1e-12:
                 continue
             for b in range(BEAMS):
-                # The ray meets the edge where its ends lie on either side of it.
+                # The ray meets the edge where the edge's ends lie on either side of the ray.
                 left, right = ahead[b] * qy - aside[b] * qx, aside[b] * px - ahead[b] * py
                 if left * twice >= 0.0 and right * twice >= 0.0:
                     near[b] = max(near[b], (left + right) / twice)

@@ -1,9 +1,10 @@
-"""What `parkenv train` trains: a course, and what the command tells of it."""
+"""The tasks of `parkenv train`: defaults, checks, settings, and reports of a training."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,62 +14,78 @@ from parkenv.cli.tables import make_table
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
+    from parkenv.evaluation.experiments.spec import TrainingSpec
     from parkenv.evaluation.experiments.workers import Workers
     from parkenv.evaluation.training.rl_training import Training
+    from parkenv.scenarios.spec import ScenarioSpec
 
-EXAMINED_FROM, TESTED_FROM = 2_000_000, 3_000_000
-"""First seeds of the worlds in which models are examined, and tested at the end."""
+EVALUATION_SEED, TEST_SEED = 2_000_000, 3_000_000
+"""First world seeds of the evaluations during training, and of the final test."""
 
 FIGURE = "learning_curve.png"
 
 Row = dict[str, Any]
 
 
-class Course(ABC):
-    """What is trained, and what the command tells of it."""
+@dataclass(eq=False)
+class TrainingTask(ABC):
+    """A kind of training: its defaults, checks and report.
 
-    algorithm: str
+    Args:
+        spec: the training's spec; the task supplies defaults for what it leaves open.
+    """
+
+    spec: TrainingSpec
+
+    @property
+    @abstractmethod
+    def algorithm(self) -> str:
+        """Name of the algorithm."""
 
     @property
     @abstractmethod
     def folder(self) -> str:
-        """Where results go by default."""
+        """Default name of the output folder."""
 
     @abstractmethod
-    def recipe(self) -> Any:
-        """The algorithm's, or an `InputError`."""
-
-    def check(self) -> None:
-        """Refuse now what could not be trained, tested or drawn later.
+    def config(self) -> Any:
+        """Training config of the algorithm.
 
         Raises:
-            InputError: an option that cannot be used, or a package that is not there.
+            InputError: the algorithm has none for this task.
+        """
+
+    def check(self) -> None:
+        """Check before training that everything can be trained, tested and drawn.
+
+        Raises:
+            InputError: an invalid option, or a missing package.
         """
         from planners.learned import algorithm_class
 
-        self.recipe()
+        self.config()
         algorithm_class(self.algorithm)
 
     @abstractmethod
     def settings(self) -> Row:
-        """What a training that is gone on with must have in common with this one."""
+        """Settings that a resumed training must share with this one."""
 
     @abstractmethod
-    def examination(self, settings: Row) -> Row:
-        """What examinations are of, by the settings of a training: equal where curves can be set side by side."""
+    def evaluation_settings(self, settings: Row) -> Row:
+        """The settings that evaluations depend on: curves are comparable where these are equal."""
 
     @property
     @abstractmethod
     def measures(self) -> tuple[str, ...]:
-        """Columns of `curve.csv` that are drawn."""
+        """Columns of `curve.csv` to draw."""
 
     @abstractmethod
     def training(self, console: Console) -> Training:
-        """Made when it is sure that there will be one."""
+        """Make the training, with demonstrations where it needs any."""
 
     @abstractmethod
-    def told(self, row: Row) -> str:
-        """An examination in a word."""
+    def score_text(self, row: Row) -> str:
+        """The score of an evaluation for the progress bar."""
 
     @abstractmethod
     def report(
@@ -80,31 +97,41 @@ class Course(ABC):
         out: Path,
         beside: dict[str, list[list[Row]]],
     ) -> Row:
-        """Test the models, draw the figure, print the table; what goes into the summary."""
+        """Test the models, draw the figure, print the table; return the entries of the summary."""
+
+
+def scenario_settings(scenarios: Sequence[ScenarioSpec]) -> Row:
+    """The settings that training depends on: scenarios and fingerprints of their files."""
+    from parkenv.evaluation.experiments.experiment import fingerprints, flat_tables
+
+    return {
+        "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in scenarios},
+        "files": fingerprints([file for s in scenarios for file in s.files()]),
+    }
 
 
 def name_of(settings: Row) -> str:
-    """What a training is called beside others."""
-    name, imitated, scenarios = (
+    """Name of a training in a figure with others."""
+    name, cloned, scenarios = (
         str(settings["algorithm"]),
-        settings.get("imitate"),
+        settings.get("clone"),
         settings.get("scenario", ()),
     )
     if len(scenarios) > 1:
         name += f" on {', '.join(scenarios)}"
-    return f"{name} after imitating {imitated}" if imitated else name
+    return f"{name} after cloning {cloned}" if cloned else name
 
 
-def curves_beside(folders: Sequence[str], out: Path, course: Course) -> dict[str, list[list[Row]]]:
-    """Curves of other trainings, by name, of each seed the rows of its `curve.csv`.
+def curves_beside(folders: Sequence[str], out: Path, task: TrainingTask) -> dict[str, list[list[Row]]]:
+    """Read the curves of other trainings: by name, the rows of `curve.csv` of each seed.
 
     Args:
-        folders: that `parkenv train` wrote to; `--beside`.
-        out: the folder of the training that they are to be drawn beside.
-        course: of that training.
+        folders: output folders of `parkenv train` (`--beside`).
+        out: folder of the training to draw them with.
+        task: of that training.
 
     Raises:
-        InputError: a folder without a training, or with one that was examined otherwise; the same one twice; or too
+        InputError: a folder without a training, or one with other evaluations; the same one twice; or too
             many to tell apart.
     """
     from parkenv.evaluation.experiments.results import read_settings
@@ -113,25 +140,25 @@ def curves_beside(folders: Sequence[str], out: Path, course: Course) -> dict[str
 
     if len(folders) >= len(COLORS):
         raise InputError(f"--beside names {len(folders)} folders, want at most {len(COLORS) - 1}")
-    own, known = course.settings(), {out.resolve()}
+    own, known = task.settings(), {out.resolve()}
     beside: dict[str, list[list[Row]]] = {}
     for folder in map(Path, folders):
         if folder.resolve() in known:
-            raise InputError(f"--beside: {folder} is drawn already")
+            raise InputError(f"--beside: {folder} is already drawn")
         known.add(folder.resolve())
         settings = read_settings(folder)
         curves = [read_curve(its) for its in sorted(folder.glob(f"seed_*/{CURVE}"))]
         curves = [curve for curve in curves if curve]
         if settings is None or not curves:
             raise InputError(f"--beside: {folder} holds no training")
-        theirs = course.examination(settings)
-        for name, value in course.examination(own).items():
+        theirs = task.evaluation_settings(settings)
+        for name, value in task.evaluation_settings(own).items():
             if theirs[name] != value:
                 raise InputError(
-                    f"--beside: {name} is {theirs[name]!r} in {folder} and {value!r} here; their examinations cannot "
+                    f"--beside: {name} is {theirs[name]!r} in {folder} and {value!r} here; their evaluations cannot "
                     "be compared"
                 )
-        if not {"steps", *course.measures} <= {*curves[0][0]} or "algorithm" not in settings:
+        if not {"steps", *task.measures} <= {*curves[0][0]} or "algorithm" not in settings:
             raise InputError(f"--beside: {folder} was not written by this version of parkenv")
         name = name_of(settings)
         if name == name_of(own) or name in beside:
@@ -141,7 +168,7 @@ def curves_beside(folders: Sequence[str], out: Path, course: Course) -> dict[str
 
 
 def row_of(agent: str, scenario: str, number: int, curve: list[Row], own: Row, model: Path) -> Row:
-    """A row of the summary for one training."""
+    """A row of the summary for one seed."""
     last = curve[-1]
     return {
         "agent": agent, "scenario": scenario, "seed": number, "steps": last["steps"], **own,
@@ -155,10 +182,10 @@ def print_tests(
     algorithm: str,
     transfer: list[Row],
     planners: list[Row],
-    told: Callable[[Row], str],
+    text_of: Callable[[Row], str],
     *further: str,
 ) -> None:
-    """A column for each world, and for what else tells rows apart; a line for each model and planner."""
+    """Print a table: a column per scenario and further key, a line per model and planner."""
     columns = list(
         dict.fromkeys((row["test_scenario"], *(row[name] for name in further)) for row in transfer)
     )
@@ -166,8 +193,8 @@ def print_tests(
     agents = {f"{algorithm}, seed {n}": n for n in dict.fromkeys(row["seed"] for row in transfer)}
     for agent, number in agents.items():
         its = {(r["test_scenario"], *(r[f] for f in further)): r for r in transfer if r["seed"] == number}
-        table.add_row(agent, *(told(its[column]) for column in columns))
+        table.add_row(agent, *(text_of(its[column]) for column in columns))
     for agent in dict.fromkeys(row["agent"] for row in planners):
         its = {(r["scenario"], *(r[f] for f in further)): r for r in planners if r["agent"] == agent}
-        table.add_row(agent, *(told(its[column]) for column in columns))
+        table.add_row(agent, *(text_of(its[column]) for column in columns))
     console.print(table)

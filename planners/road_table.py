@@ -1,4 +1,4 @@
-"""Every drive of a lot, or of a part of it, at once: times between all vertices, and the way from each to each."""
+"""All shortest drives of a lot or of a part of it: times between all vertices, and the routes."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class RoadTable:
-    """All drives of a lot.
+    """Shortest drives between all vertices.
 
     Attributes:
-        seconds: (n_vertices, n_vertices) float64, s, from row to column; inf where no way leads.
-        following: (n_vertices, n_vertices) int16, the vertex that comes next on a shortest way from row to
-            column, -1 where no way leads and on the diagonal.
-        neighbors: (n_vertices, 4) int32, where each move leads, or -1.
-        move_s: (n_vertices, 4) float64, s, of each of them.
+        seconds: (n_vertices, n_vertices) float64, s, from row to column; inf where unreachable.
+        following: (n_vertices, n_vertices) int16, the next vertex on a shortest route from row to column, -1
+            where unreachable and on the diagonal.
+        neighbors: (n_vertices, 4) int32, target of each move, or -1.
+        move_s: (n_vertices, 4) float64, s, duration of each move.
     """
 
     seconds: FloatArray
@@ -36,12 +36,12 @@ class RoadTable:
 
     @classmethod
     def of(cls, problem: SearchProblem) -> Self:
-        """The table of a problem's whole lot."""
+        """Make the table of the whole lot."""
         return cls.over(problem.lot.neighbors, problem.move_s)
 
     @classmethod
     def over(cls, neighbors: NDArray[np.int32], move_s: FloatArray) -> Self:
-        """The table of a graph: (n_vertices, 4) neighbours, -1 for none, and drive times, s."""
+        """Make the table of a graph: (n_vertices, 4) neighbours, -1 for none, and drive times, s."""
         n = len(neighbors)
         source, move = np.nonzero(neighbors >= 0)
         target, drive = neighbors[source, move], move_s[source, move]
@@ -56,18 +56,18 @@ class RoadTable:
         return cls(seconds, following, neighbors, move_s)
 
     def move(self, vertex: int, target: int) -> int:
-        """The first move of a shortest way.
+        """Return the first move of a shortest route.
 
         Raises:
-            InputError: no way leads to the target, or the car is there already.
+            InputError: no route leads to the target, or the car is there already.
         """
         following = int(self.following[vertex, target])
         if following < 0:
-            raise InputError(f"no way leads on from vertex {vertex} to vertex {target}")
+            raise InputError(f"no route leads from vertex {vertex} to vertex {target}")
         return self.move_to(vertex, following)
 
     def move_to(self, vertex: int, neighbor: int) -> int:
-        """The quickest move that leads to a neighbouring vertex."""
+        """Return the fastest move that leads to a neighbouring vertex."""
         leads = self.neighbors[vertex] == neighbor
         return int(np.where(leads, self.move_s[vertex], np.inf).argmin())
 

@@ -1,4 +1,4 @@
-"""Cars that drive and people who walk through a lot, and wait for a car that is in their way."""
+"""Moving cars and pedestrians in a lot that wait for a car in their way."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from parkenv.driving.lot_space import Thing
+from parkenv.driving.collision_world import ObstacleKind
 from parkenv.driving.vehicle import placed
 from parkenv.world.lot import ParkingLot
 from parkenv.world.traffic import LotTraffic, Traffic
@@ -22,50 +22,50 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 LOOK_AHEAD_S = (0.1, 0.6, 1.2)
-"""s ahead of themselves at which they look for the car."""
+"""Times, s, for which road users predict their own positions when they check for the car."""
 GAP_M = 0.4
-"""m that they keep from it."""
+"""Clearance to the car, m."""
 
 _FAR_M = 12.0
 _LATER_S = 4.0
 _MOST_TRIES = 50
 
 
-class PoliteTraffic:
-    """Everybody who moves, on rounds that are a pure function of (lot, key), each with a clock of their own.
+class YieldingTraffic:
+    """Road users on closed routes that are a pure function of (lot, key), each with its own clock.
 
-    A clock stands while its owner waits, so where they are depends on the car that parks, and on nothing else.
+    The clock of a road user stops while it waits, so positions depend on the parking car and on nothing else.
 
     Args:
-        lot: whose lanes are driven and walked; people walk to its first goal.
-        traffic: how much there is.
+        lot: with the lanes to drive and walk on; pedestrians walk to its first goal.
+        traffic: numbers of cars and pedestrians.
         key: of the world.
-        slots: whose vehicle models are driven.
+        slots: provide the vehicle models.
 
     Attributes:
-        outlines: what each is, the cars first, and its outline, (k, 2) m, in its own frame.
+        outlines: kind and outline, (k, 2) m in its own frame, of each road user, cars first.
     """
 
     def __init__(self, lot: ParkingLot, traffic: Traffic, key: np.uint64, slots: SlotLot) -> None:
         self._rounds = LotTraffic(lot, 0, traffic, key, slots)
-        self.outlines: list[tuple[Thing, FloatArray]] = []
+        self.outlines: list[tuple[ObstacleKind, FloatArray]] = []
         movers = self._rounds.at(0.0)
         if movers is not None:
             models = [slots.fleet.models[i].footprint() for i in movers.vehicle_model.tolist()]
             people = [pedestrian_footprint(0.0)] * movers.n_walkers
             self.outlines = [
-                *((Thing.MOVING_CAR, outline) for outline in models),
-                *((Thing.PEDESTRIAN, outline) for outline in people),
+                *((ObstacleKind.MOVING_CAR, outline) for outline in models),
+                *((ObstacleKind.PEDESTRIAN, outline) for outline in people),
             ]
 
     def poses(self, clocks: FloatArray) -> FloatArray:
-        """(n, 3) x, y in m and yaw in rad at clocks, (n,) s."""
+        """Poses, (n, 3) x, y in m and yaw in rad, at clocks, (n,) s."""
         return self._rounds.poses_at(clocks)
 
     def movers(self, clocks: FloatArray) -> Movers | None:
-        """Who is where at clocks, (n,) s, for those who look through sensors; None where nobody is about.
+        """Road users at clocks, (n,) s, for the sensors; None without any.
 
-        Whose clock is no number is left out.
+        Road users whose clock is NaN are left out.
         """
         there = np.isfinite(clocks)
         known = np.where(there, clocks, 0.0)
@@ -85,8 +85,8 @@ class PoliteTraffic:
             walker_look=seen[0].walker_look[walks],
         )
 
-    def started(self, car: FloatArray) -> FloatArray:
-        """Clocks, (n,) s, at which nobody is near a car with these corners, (4, 2) m."""
+    def initial_clocks(self, car: FloatArray) -> FloatArray:
+        """Clocks, (n,) s, at which no road user is close to a car with these corners, (4, 2) m."""
         clocks = np.zeros(len(self.outlines))
         for _ in range(_MOST_TRIES):
             near = ~self._clear(clocks, car, LOOK_AHEAD_S[-1:]) | ~self._clear(clocks, car, (0.0,))
@@ -95,12 +95,12 @@ class PoliteTraffic:
             clocks[near] += _LATER_S
         return clocks
 
-    def onward(self, clocks: FloatArray, seconds: float, car: FloatArray) -> FloatArray:
-        """The clocks after some seconds, in which those wait who would come too near to the car."""
+    def advance_clocks(self, clocks: FloatArray, seconds: float, car: FloatArray) -> FloatArray:
+        """Advance the clocks by `seconds`, except those of road users that would come too close to the car."""
         return np.where(self._clear(clocks, car, LOOK_AHEAD_S), clocks + seconds, clocks)
 
     def _clear(self, clocks: FloatArray, car: FloatArray, ahead: tuple[float, ...]) -> NDArray[np.bool_]:
-        """(n,) bool: whose way is clear."""
+        """Mask, (n,), of the road users whose way is clear."""
         clear = np.ones(len(clocks), dtype=bool)
         body = shapely.Polygon(car)
         middle = car.mean(axis=0)
@@ -111,5 +111,5 @@ class PoliteTraffic:
                 outline = shapely.Polygon(placed(self.outlines[i][1], poses[i]))
                 clear[i] = shapely.distance(body, outline) > GAP_M
             if not close.any():
-                break  # at these speeds nobody comes near within the time that is looked ahead
+                break  # at these speeds no road user comes close within the prediction time
         return clear

@@ -1,4 +1,4 @@
-"""What a car may run into, as bodies and shapes of pymunk: parked cars, kerbs, walls, and who moves."""
+"""Collision detection with pymunk: parked cars, kerbs, walls, and moving road users."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
-class Thing(IntEnum):
-    """What something that stands in the way is."""
+class ObstacleKind(IntEnum):
+    """Kind of an obstacle; `NOTHING` where the car touches none."""
 
     NOTHING = 0
     PARKED_CAR = 1
@@ -29,8 +29,8 @@ class Thing(IntEnum):
     PEDESTRIAN = 5
 
     @property
-    def words(self) -> str:
-        """Its name in a message."""
+    def label(self) -> str:
+        """Name for messages."""
         return self.name.lower().replace("_", " ")
 
 
@@ -39,13 +39,13 @@ _EGO = 100
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """What stands still around a car; world frame.
+    """Static obstacles around a car; world frame.
 
     Args:
-        corners: (n, k_max, 2) float64, m: convex outlines; a line has two corners. What an outline of fewer corners
-            leaves over repeats its last.
+        corners: (n, k_max, 2) float64, m: convex outlines; a line has two corners. Outlines of fewer corners are
+            padded with their last.
         n_corners: (n,) int64, 2 to k_max.
-        thing: (n,) int64, a `Thing` each.
+        kind: (n,) int64, an `ObstacleKind` each.
 
     Raises:
         InputError: shapes that do not fit together, or a value that is not finite.
@@ -53,14 +53,14 @@ class Obstacles:
 
     corners: FloatArray
     n_corners: IntArray
-    thing: IntArray
+    kind: IntArray
 
     def __post_init__(self) -> None:
         corners = np.array(self.corners, dtype=np.float64)
-        count, thing = (np.array(a, dtype=np.int64) for a in (self.n_corners, self.thing))
-        if corners.ndim != 3 or corners.shape[2] != 2 or not count.shape == thing.shape == corners.shape[:1]:
+        count, kind = (np.array(a, dtype=np.int64) for a in (self.n_corners, self.kind))
+        if corners.ndim != 3 or corners.shape[2] != 2 or not count.shape == kind.shape == corners.shape[:1]:
             raise InputError(
-                f"obstacles: corners {corners.shape}, n_corners {count.shape}, thing {thing.shape}, want (n, k, 2), "
+                f"obstacles: corners {corners.shape}, n_corners {count.shape}, kind {kind.shape}, want (n, k, 2), "
                 "(n,) and (n,)"
             )
         if not np.isfinite(corners).all():
@@ -69,57 +69,56 @@ class Obstacles:
             raise InputError(
                 f"obstacles: n_corners {count.min()} to {count.max()}, want 2 to {corners.shape[1]}"
             )
-        for name, values in (("corners", corners), ("n_corners", count), ("thing", thing)):
+        for name, values in (("corners", corners), ("n_corners", count), ("kind", kind)):
             values.flags.writeable = False
             object.__setattr__(self, name, values)
 
     def __len__(self) -> int:
-        return len(self.thing)
+        return len(self.kind)
 
     @classmethod
-    def of(cls, outlines: Sequence[tuple[Thing, FloatArray]]) -> Self:
-        """From pairs of what a thing is and its outline, (k, 2) m."""
+    def of(cls, outlines: Sequence[tuple[ObstacleKind, FloatArray]]) -> Self:
+        """Make obstacles from pairs of kind and outline, (k, 2) m."""
         k_max = max((len(outline) for _, outline in outlines), default=2)
         corners = np.empty((len(outlines), k_max, 2))
         for row, (_, outline) in zip(corners, outlines, strict=True):
             row[: len(outline)] = outline
             row[len(outline) :] = outline[-1]
         count = np.array([len(outline) for _, outline in outlines], dtype=np.int64)
-        return cls(corners, count, np.array([int(thing) for thing, _ in outlines], dtype=np.int64))
+        return cls(corners, count, np.array([int(kind) for kind, _ in outlines], dtype=np.int64))
 
-    def only(self, *things: Thing) -> Self:
-        """Those of these kinds."""
-        chosen = np.isin(self.thing, things)
-        return type(self)(self.corners[chosen], self.n_corners[chosen], self.thing[chosen])
+    def only(self, *kinds: ObstacleKind) -> Self:
+        """The obstacles of some kinds."""
+        chosen = np.isin(self.kind, kinds)
+        return type(self)(self.corners[chosen], self.n_corners[chosen], self.kind[chosen])
 
     def outlines(self) -> list[FloatArray]:
-        """The outline of each, (k, 2) m."""
+        """The outline of each obstacle without padding, (k, 2) m."""
         return [c[:k] for c, k in zip(self.corners, self.n_corners, strict=True)]
 
 
-class LotSpace:
-    """A pymunk space with everything that a car may run into, and the car in it.
+class CollisionWorld:
+    """A pymunk space with a car, static obstacles and moving ones, for collision queries.
 
-    The car's pose is told, not simulated: it follows its own kinematics, see `parkenv.driving.vehicle`. The space
-    says what it touches. Its footprint is longer than twice the way of any step, so nothing that it drives over
-    can fall between two steps.
+    Poses are set, not simulated: the car follows its own kinematics (`parkenv.driving.vehicle`). The car is longer
+    than twice the distance of any step, so it cannot pass an obstacle between two steps.
 
     Args:
         vehicle: the car.
-        obstacles: what stands still.
-        movers: outlines, (k, 2) m in their own frames, of what moves, and what they are.
+        obstacles: static obstacles.
+        movers: kind and outline, (k, 2) m in its own frame, of each moving obstacle.
     """
 
     def __init__(
         self,
         vehicle: VehicleParameters,
         obstacles: Obstacles,
-        movers: Sequence[tuple[Thing, FloatArray]] = (),
+        movers: Sequence[tuple[ObstacleKind, FloatArray]] = (),
     ) -> None:
         self.space = pymunk.Space()
         ground = self.space.static_body
-        for thing, outline in zip(obstacles.thing.tolist(), obstacles.outlines(), strict=True):
-            self._add(ground, thing, outline)
+        for kind, outline in zip(obstacles.kind.tolist(), obstacles.outlines(), strict=True):
+            self._add(ground, kind, outline)
         self.car = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self.space.add(self.car)
         self._add(self.car, _EGO, vehicle.corners(np.zeros(3)))
@@ -129,17 +128,17 @@ class LotSpace:
             self.space.add(body)
             self._add(body, int(kind), outline)
             self.movers.append(body)
-        self._touched = int(Thing.NOTHING)
-        for kind in Thing:
-            if kind is not Thing.NOTHING:
+        self._touched = int(ObstacleKind.NOTHING)
+        for kind in ObstacleKind:
+            if kind is not ObstacleKind.NOTHING:
                 self.space.on_collision(_EGO, int(kind), pre_solve=self._touch, data=int(kind))
 
     def touched(self, x: float, y: float, yaw: float) -> int:
-        """Put the car somewhere and let a step of the physics pass; what it touches, a `Thing`.
+        """Place the car at a pose of its rear axle, m and rad; return the `ObstacleKind` that it touches.
 
         Args:
-            x: m, of the rear axle's middle.
-            y: m, of the same.
+            x: of the middle of the rear axle, m.
+            y: of the middle of the rear axle, m.
             yaw: rad.
         """
         car = self.car
@@ -150,7 +149,7 @@ class LotSpace:
         return self._touched
 
     def move(self, poses: ArrayLike) -> None:
-        """Put what moves somewhere: (n_movers, 3) x, y in m and yaw in rad."""
+        """Place the moving obstacles: (n_movers, 3) x, y in m and yaw in rad."""
         for body, (x, y, yaw) in zip(self.movers, np.asarray(poses, dtype=np.float64).tolist(), strict=True):
             body.position = x, y
             body.angle = yaw
@@ -165,5 +164,5 @@ class LotSpace:
 
     def _touch(self, arbiter: pymunk.Arbiter, space: pymunk.Space, kind: Any) -> None:
         del arbiter, space
-        # Of several things the least number counts, whatever order they come in.
+        # The least kind of several contacts counts, in whatever order they are reported.
         self._touched = min(self._touched, kind) if self._touched else kind

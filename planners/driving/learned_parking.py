@@ -1,4 +1,4 @@
-"""A model that `parkenv train --env drive` made, at the wheel of `parkenv/Drive-v1`."""
+"""Parking agent with a model of `parkenv train --env drive`, for `parkenv/Drive-v1`."""
 
 from __future__ import annotations
 
@@ -12,20 +12,28 @@ from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import ACCELERATION, SPEED, STATE_SIZE, STEERING, YAW, VehicleParameters
 from parkenv.errors import InputError
-from planners.driving.driver_view import HOLD, N_SEEN, VIEW, DriverView, Outlines, command, see
+from planners.driving.policy_interface import (
+    ACTION_REPEAT,
+    INTERFACE,
+    OBSERVATION_SIZE,
+    Outlines,
+    PolicyInterface,
+    encode_observation,
+    pedal_command,
+)
 from planners.learned import load_model
 
 Observation = Mapping[str, Any]
 
 
 @dataclass
-class DriverMemory:
-    """What the driver remembers of an episode.
+class LearnedParkingMemory:
+    """State of the agent within an episode.
 
     Attributes:
-        outlines: what is in the way.
-        action: (2,) float32, the decision that holds.
-        left: for how many steps more it does.
+        outlines: the obstacles.
+        action: (2,) float32, the current decision.
+        left: number of steps for which it still holds.
     """
 
     outlines: Outlines
@@ -33,47 +41,46 @@ class DriverMemory:
     left: int = 0
 
 
-class LearnedDriver:
-    """A trained model as the driver of a car, on any lot.
+class LearnedParkingAgent:
+    """A trained model as a parking agent, on any lot.
 
     Args:
-        algorithm: that made it.
+        algorithm: that trained the model.
         path: the model file.
-        vehicle: the car; the one it was trained with is the default.
+        vehicle: the car; by default the one used in training.
 
     Raises:
-        InputError: a file that is no model, of another algorithm, another task or another observation.
+        InputError: a file that is not a model, or of another algorithm, task or observation.
 
     Attributes:
-        card: what the file says of itself.
-        model: of stable-baselines3 or sb3-contrib; it sees what `planners.driving.driver_view` says.
+        card: metadata of the model file.
+        model: of stable-baselines3 or sb3-contrib, over the observation of `planners.driving.policy_interface`.
     """
 
     def __init__(
         self, algorithm: str, path: str | os.PathLike[str], vehicle: VehicleParameters | None = None
     ) -> None:
         self.name = f"{algorithm}:{path}"
-        self.card, self.model = load_model(algorithm, path, "drive", VIEW)
-        self.view = DriverView(vehicle or VehicleParameters())
+        self.card, self.model = load_model(algorithm, path, "drive", INTERFACE)
+        self.view = PolicyInterface(vehicle or VehicleParameters())
 
     def predict(
         self,
         observation: Observation,
-        state: Sequence[DriverMemory] | DriverMemory | None = None,
+        state: Sequence[LearnedParkingMemory] | LearnedParkingMemory | None = None,
         episode_start: NDArray[np.bool_] | Sequence[bool] | None = None,
         deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], Sequence[DriverMemory] | DriverMemory]:
-        """stable-baselines3's interface: single observations, or batches of them with a leading axis.
+    ) -> tuple[NDArray[np.float32], Sequence[LearnedParkingMemory] | LearnedParkingMemory]:
+        """Decide on single observations, or on batches with a leading axis (stable-baselines3's interface).
 
         Args:
             observation: from `parkenv/Drive-v1` with `obstacle_map=True`, or a vector of them.
-            state: what the last call returned; None at the start.
-            episode_start: for each environment, whether its episode has just begun. With None, it has
-                where there is no state.
-            deterministic: whether to take the policy's likeliest decision.
+            state: returned by the previous call; None at the start.
+            episode_start: per environment, whether its episode has just started; None: where there is no state.
+            deterministic: whether to use the mode of the policy instead of a sample.
 
         Returns:
-            The action, (2,) or (n_envs, 2) float32, and the state to hand back.
+            The action, (2,) or (n_envs, 2) float32, and the state for the next call.
 
         Raises:
             InputError: an observation without the obstacle map.
@@ -93,12 +100,14 @@ class LearnedDriver:
 
     def _decide(
         self, observation: Observation, state: Any, start: Any, deterministic: bool
-    ) -> tuple[NDArray[np.float32], list[DriverMemory]]:
+    ) -> tuple[NDArray[np.float32], list[LearnedParkingMemory]]:
         n = len(observation["achieved_goal"])
         memories: list[Any] = [None] * n if state is None else list(state)
         for i in range(n):
             if memories[i] is None or (start is not None and start[i]):
-                memories[i] = DriverMemory(Outlines.of_map(observation["cars"][i], observation["lines"][i]))
+                memories[i] = LearnedParkingMemory(
+                    Outlines.of_map(observation["cars"][i], observation["lines"][i])
+                )
         due = [i for i in range(n) if memories[i].left == 0]
         if due:
             seen = {key: np.asarray(observation[key])[due] for key in ("achieved_goal", "desired_goal")}
@@ -107,20 +116,20 @@ class LearnedDriver:
             )
             decided, _ = self.model.predict(seen, deterministic=deterministic)
             for i, action in zip(due, decided, strict=True):
-                memories[i].action, memories[i].left = action, HOLD
+                memories[i].action, memories[i].left = action, ACTION_REPEAT
         actions = np.empty((n, 2), dtype=np.float32)
         for i, memory in enumerate(memories):
-            pedal = command(memory.action, float(observation["observation"][i][4]), self.view.pedals)
+            pedal = pedal_command(memory.action, float(observation["observation"][i][4]), self.view.pedals)
             actions[i] = pedal, memory.action[1]
             memory.left -= 1
         return actions, memories
 
     def _seen(self, own: NDArray[np.float32], outlines: Outlines) -> NDArray[np.float32]:
-        """The part of the model's observation that does not depend on goals; `own` is the environment's."""
+        """The model's observation without the goals; `own` is the environment's `observation`."""
         values = own.astype(np.float64)
         state = np.zeros(STATE_SIZE)
         state[[SPEED, STEERING, ACCELERATION]] = values[4:7]
         state[YAW] = np.arctan2(values[3], values[2])
-        seen = np.empty(N_SEEN, dtype=np.float32)
-        see(values[:2], state, tuple(outlines), self.view.body, values[7:12], seen)
+        seen = np.empty(OBSERVATION_SIZE, dtype=np.float32)
+        encode_observation(values[:2], state, tuple(outlines), self.view.body, values[7:12], seen)
         return seen

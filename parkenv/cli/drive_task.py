@@ -1,7 +1,8 @@
-"""The course in which `parkenv train` teaches to drive into slots."""
+"""Training of parking agents by `parkenv train --env drive`."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -9,9 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 
-from parkenv.cli import arguments as args
-from parkenv.cli.training_course import EXAMINED_FROM, FIGURE, TESTED_FROM, Course, Row, print_tests, row_of
+from parkenv.cli.training_task import (
+    EVALUATION_SEED,
+    FIGURE,
+    TEST_SEED,
+    Row,
+    TrainingTask,
+    print_tests,
+    row_of,
+    scenario_settings,
+)
 from parkenv.errors import InputError
+from parkenv.scenarios.build import build
+from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.workers import Workers
@@ -20,99 +31,98 @@ if TYPE_CHECKING:
 
 
 @dataclass(eq=False)
-class DriveCourse(Course):
-    """Drives into the slots of some lots.
+class DriveTask(TrainingTask):
+    """Train to park on the lots of some scenarios."""
 
-    Args:
-        algorithm: by name.
-        lot, test_on: names or files of lots, divided by commas, to train and to test on; None to test on the same.
-        asked_steps, asked_every: decisions of a training, and between examinations; None for what the recipe says.
-        examined_on: drives into each lot's slots of each kind an examination; the test has twice as many.
-        planners: planner or none.
-    """
+    @property
+    def algorithm(self) -> str:
+        """See `TrainingTask`."""
+        return self.spec.algorithm or "ppo"
 
-    algorithm: str
-    lot: str
-    test_on: str | None
-    asked_steps: int | None
-    asked_every: int | None
-    examined_on: int
-    planners: str
+    @property
+    def _scenarios(self) -> Sequence[ScenarioSpec]:
+        return self.spec.scenarios or (scenario_spec("campus"), scenario_spec("street"))
+
+    @property
+    def evaluation_episodes(self) -> int:
+        """Episodes per evaluation, lot and kind of slot."""
+        return self.spec.evaluation_episodes or 64
 
     @property
     def folder(self) -> str:
-        """See `Course`."""
+        """See `TrainingTask`."""
         return f"drive-{self.algorithm}"
 
-    def recipe(self) -> Any:
-        """See `Course`."""
-        from parkenv.evaluation.training.configs import DRIVE_RECIPES, recipe_of
+    def config(self) -> Any:
+        """See `TrainingTask`."""
+        from parkenv.evaluation.training.configs import DRIVE_CONFIGS, config_of
 
-        return recipe_of(self.algorithm, DRIVE_RECIPES, "drive")
+        return config_of(self.algorithm, DRIVE_CONFIGS, "drive")
 
     @property
     def steps(self) -> int:
         """Decisions of a training."""
-        return self.asked_steps or int(self.recipe().steps)
+        return self.spec.steps or int(self.config().steps)
 
     @property
-    def examine_every(self) -> int:
-        """Decisions between examinations."""
-        return self.asked_every or max(1, self.steps // 20)
+    def evaluate_every(self) -> int:
+        """Decisions between evaluations."""
+        return self.spec.evaluate_every or max(1, self.steps // 20)
 
     @cached_property
     def lots(self) -> list[ParkingLot]:
-        """Where it is trained."""
-        from parkenv.lots import load_lot
-
-        return [load_lot(name) for name in args.words("--lot", self.lot)]
+        """Lots to train on."""
+        return [build(scenario).lot for scenario in self._scenarios]
 
     @cached_property
     def tested(self) -> list[ParkingLot]:
-        """Where it is tested."""
-        from parkenv.lots import load_lot
-
-        return [load_lot(name) for name in args.words("--test-on", self.test_on or self.lot)]
+        """Lots to test on."""
+        return [build(scenario).lot for scenario in self.spec.test_on or self._scenarios]
 
     def check(self) -> None:
-        """See `Course`."""
-        from parkenv.evaluation.training.drive_practice import places_of
-        from planners.driving.drivers import PLANNER
+        """See `TrainingTask`."""
+        from parkenv.evaluation.training.drive_training_env import slot_groups
+        from planners.driving.parking_agents import PLANNER
 
         super().check()
         for lots in (self.lots, self.tested):
-            places_of(lots)
-        if self.planners not in (PLANNER, "none"):
-            raise InputError(f"--planners is {self.planners!r}, want {PLANNER} or none with --env drive")
+            slot_groups(lots)
+        if any(agent.label != PLANNER for agent in self.spec.planners or ()):
+            raise InputError(
+                f"--planners names other agents than {PLANNER}; with --env drive want {PLANNER} or none"
+            )
 
     def settings(self) -> Row:
-        """See `Course`."""
+        """See `TrainingTask`."""
         return {
             "algorithm": self.algorithm, "env": "drive", "lot": [lot.name for lot in self.lots], "steps": self.steps,
-            "examine_every": self.examine_every, "examined_on": self.examined_on,
+            "evaluate_every": self.evaluate_every, "evaluation_episodes": self.evaluation_episodes,
+            **scenario_settings(self._scenarios),
         }  # fmt: skip
 
-    def examination(self, settings: Row) -> Row:
-        """See `Course`."""
-        return {name: settings.get(name) for name in ("env", "lot", "examined_on")}
+    def evaluation_settings(self, settings: Row) -> Row:
+        """See `TrainingTask`."""
+        return {name: settings.get(name) for name in ("env", "lot", "evaluation_episodes")}
 
     @property
     def measures(self) -> tuple[str, ...]:
-        """See `Course`."""
-        from parkenv.evaluation.training.drive_practice import places_of
+        """See `TrainingTask`."""
+        from parkenv.evaluation.training.drive_training_env import slot_groups
 
-        return tuple(f"{place.kind}_success" for place in places_of(self.lots))
+        return tuple(f"{group.kind}_success" for group in slot_groups(self.lots))
 
     def training(self, console: Console) -> DriveTraining:
-        """See `Course`."""
+        """See `TrainingTask`."""
         del console
         from parkenv.evaluation.training.drive_training import DriveTraining
 
-        examined = range(EXAMINED_FROM, EXAMINED_FROM + self.examined_on)
-        return DriveTraining(self.algorithm, self.steps, self.examine_every, tuple(self.lots), examined)
+        evaluation_seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.evaluation_episodes)
+        return DriveTraining(
+            self.algorithm, self.steps, self.evaluate_every, tuple(self.lots), evaluation_seeds
+        )
 
-    def told(self, row: Row) -> str:
-        """See `Course`."""
+    def score_text(self, row: Row) -> str:
+        """See `TrainingTask`."""
         return f"{row['success']:.0%} parked"
 
     def report(
@@ -124,20 +134,20 @@ class DriveCourse(Course):
         out: Path,
         beside: dict[str, list[list[Row]]],
     ) -> Row:
-        """See `Course`."""
+        """See `TrainingTask`."""
         from parkenv.evaluation.figures.learning_curves import across_seeds, save_success_curves
         from parkenv.evaluation.training.drive_training import parked_on
         from parkenv.evaluation.trips.parking_runs import parking_table
-        from planners.driving.drivers import PLANNER
+        from planners.driving.parking_agents import PLANNER
 
-        examined = range(EXAMINED_FROM, EXAMINED_FROM + self.examined_on)
-        at_test = range(TESTED_FROM, TESTED_FROM + 2 * self.examined_on)
+        evaluation_seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.evaluation_episodes)
+        at_test = range(TEST_SEED, TEST_SEED + 2 * self.evaluation_episodes)
         names = " and ".join(lot.name for lot in self.lots)
         lines: dict[str, float] = {}
         tables: list[Row] = []
-        if self.planners != "none":
+        if self.spec.planners is None or self.spec.planners:
             with console.status("The planner parks in the same tasks"):
-                parkings = parked_on(self.lots, examined, workers, PLANNER)
+                parkings = parked_on(self.lots, evaluation_seeds, workers, PLANNER)
                 lines = {row["kind"]: row["success"] for row in parking_table(parkings)}
                 for lot in self.tested:
                     table = parking_table(parked_on([lot], at_test, workers, PLANNER))
@@ -161,12 +171,12 @@ class DriveCourse(Course):
                     )
                 )
         kinds = [name.removesuffix("_success") for name in curves[0][0] if name.endswith("_success")]
-        title = f"{names}: {self.examined_on} parkings of each kind that were not trained on"
+        title = f"{names}: {self.evaluation_episodes} parkings of each kind in held-out tasks"
         save_success_curves({self.algorithm: curves, **beside}, kinds, lines, title, out / FIGURE)
-        heading = "Parkings that succeed, contacts, median s of those, in tasks of no examination"
+        heading = "Parkings that succeed, contacts, median s of those, in held-out tasks"
         print_tests(console, heading, self.algorithm, transfer, tables, _parkings, "kind")
         return {
-            "rows": rows, "transfer": transfer, "planners": tables, "examined": lines,
+            "rows": rows, "transfer": transfer, "planners": tables, "evaluated": lines,
             "curve": {kind: across_seeds(curves, f"{kind}_success") for kind in kinds},
             "beside": {
                 name: {kind: across_seeds(its, f"{kind}_success") for kind in kinds} for name, its in beside.items()

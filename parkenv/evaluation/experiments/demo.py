@@ -1,0 +1,49 @@
+"""The demo: a survey, and searches on other days that know its map alone."""
+
+from __future__ import annotations
+
+from parkenv.evaluation.experiments.compare import Case
+from parkenv.evaluation.experiments.spec import DemoSpec, SurveySpec
+from parkenv.evaluation.experiments.surveys import survey_of
+from parkenv.mapping.inference import MapPrior, SessionLog
+from parkenv.mapping.survey import SurveySettings
+from parkenv.scenarios.spec import RigName
+from parkenv.world.scenario import Scenario
+from parkenv.world.sensor_model import SensorModel
+
+AGENTS = ("mdp", "greedy-goal", "greedy-drive", "first-free")
+RIG: RigName = "laser"
+_HOURS = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
+_APART = 1_000_000
+"""Between the seeds of the survey and those of the searches: their worlds differ."""
+
+
+def demo_survey(spec: DemoSpec) -> tuple[Scenario, SurveySettings]:
+    """The world of the demo and its survey.
+
+    Raises:
+        InputError: the scenario cannot be made.
+    """
+    survey = SurveySpec(
+        scenario=spec.scenario,
+        sessions=spec.sessions,
+        rig=RIG,
+        hours=_HOURS,
+        every=spec.every,
+        seed=spec.seed,
+        detector=spec.detector,
+    )
+    return survey_of(survey)
+
+
+def demo_cases(spec: DemoSpec, scenario: Scenario, log: SessionLog) -> list[tuple[Case, range]]:
+    """Every agent with the surveyed map, through simulated sensors, with the seeds of its searches.
+
+    Args:
+        spec: of the demo.
+        scenario: from `demo_survey`.
+        log: the sessions of the map.
+    """
+    known = scenario.replace(prior=MapPrior(log), sensor_model=SensorModel.named(RIG))
+    seeds = range(spec.seed + _APART, spec.seed + _APART + spec.episodes)
+    return [(Case(known, name, rig=RIG, detector=spec.detector), seeds) for name in AGENTS]

@@ -1,0 +1,117 @@
+"""The exact expected time of an agent's search: every observation that can occur, weighted by its probability."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from parkenv.belief.slot_belief import SlotBelief
+from parkenv.errors import InputError
+from parkenv.world.lot import PARK
+from parkenv.world.scenario import SearchProblem
+from planners.agent import Agent
+
+MOST_STEPS = 2000
+"""Decisions after which a search is truncated and charged `give_up_s`, as comparisons do."""
+
+
+def expected_time(agent: Agent, problem: SearchProblem, p_occupied: ArrayLike, vertex: int) -> float:
+    """Return the mean total time, s, of an agent's search where slots do not change and the forecast is right.
+
+    The rules are those of `parkenv/Search-v1` in a world in which each slot is taken with its probability,
+    independently of the others, and nothing changes. The agent decides in every history of observations that can
+    occur, so this is for lots of about a dozen slots.
+
+    Args:
+        agent: one whose memory can be copied.
+        problem: lot, goal, speeds, costs and view range; the sensor must not err.
+        p_occupied: (n_slots,) the forecast.
+        vertex: where the search begins.
+
+    Raises:
+        InputError: a sensor that errs, or a forecast that is not one.
+
+    Examples:
+        >>> from parkenv.lots import packaged_lot
+        >>> from planners import make_agent
+        >>> from planners.bounds.exact import ExactSolution
+        >>> problem = SearchProblem(lot=packaged_lot("mini"), give_up_s=300.0)
+        >>> entry, forecast = int(problem.lot.entry_vertices[0]), np.full(10, 0.7)
+        >>> best = ExactSolution(problem, forecast, entry).expected_s
+        >>> theirs = expected_time(make_agent("greedy-goal", problem), problem, forecast, entry)
+        >>> bool(best < theirs < 2.0 * best)
+        True
+    """
+    n = problem.lot.n_slots
+    p = np.asarray(p_occupied, dtype=np.float64)
+    if p.shape != (n,) or not ((p >= 0.0) & (p <= 1.0)).all():
+        raise InputError(f"p_occupied: want {n} probabilities, got shape {p.shape}")
+    if not problem.sensor_model.perfect:
+        raise InputError("expected_time wants a sensor model that never errs")
+    return _Histories(agent, problem).mean(vertex, SlotBelief.of_forecast(p, np.zeros(n)), 0, None)
+
+
+class _Histories:
+    """The tree of what an agent can observe."""
+
+    def __init__(self, agent: Agent, problem: SearchProblem) -> None:
+        self.agent, self.problem = agent, problem
+        self.masks = problem.action_masks
+
+    def mean(self, vertex: int, belief: SlotBelief, steps: int, memory: Any) -> float:
+        """Return the expected time, s, from here; `belief` has its time, and `memory` is this history's own."""
+        problem, begun = self.problem, belief.time
+        while True:
+            if steps >= MOST_STEPS:
+                return belief.time - begun + problem.give_up_s
+            action, memory = self.agent.predict(self._observation(vertex, belief), memory)
+            chosen = int(action)
+            steps += 1
+            if chosen == PARK and vertex < problem.lot.n_slots:
+                p_free = 1.0 - belief.p_occupied[vertex]
+                parked_s = belief.time - begun + problem.arrival_cost_s[vertex]
+                if p_free == 1.0:
+                    return float(parked_s)
+                failed = belief.decay(problem.failure_s).update([vertex], [True])
+                failed_s = failed.time - begun + self._observe(vertex, failed, steps, memory)
+                return float(p_free * parked_s + (1.0 - p_free) * failed_s)
+            if not self.masks[vertex, chosen]:
+                belief = belief.decay(problem.wait_s)
+            else:
+                belief = belief.decay(float(problem.move_s[vertex, chosen]))
+                vertex = int(problem.lot.neighbors[vertex, chosen])
+            if not belief.observed[self._in_view(vertex)].all():
+                return belief.time - begun + self._observe(vertex, belief, steps, memory)
+
+    def _observe(self, vertex: int, belief: SlotBelief, steps: int, memory: Any) -> float:
+        """Return the expected time, s, from the moment at which the car observes from a vertex."""
+        in_view = self._in_view(vertex)
+        new = in_view[~belief.observed[in_view]]
+        total = 0.0
+        for outcome in itertools.product((False, True), repeat=len(new)):
+            taken = np.array(outcome, dtype=np.bool_)
+            chance = float(np.prod(np.where(taken, belief.p_occupied[new], 1.0 - belief.p_occupied[new])))
+            if chance == 0.0:
+                continue
+            after = belief.update(new, taken)
+            if after.observed_taken.all():
+                total += chance * self.problem.give_up_s
+            else:
+                total += chance * self.mean(vertex, after, steps, copy.deepcopy(memory))
+        return total
+
+    def _in_view(self, vertex: int) -> NDArray[np.int64]:
+        starts, slots = self.problem.slots_in_view
+        return slots[starts[vertex] : starts[vertex + 1]]
+
+    def _observation(self, vertex: int, belief: SlotBelief) -> dict[str, Any]:
+        return {
+            "vertex": np.int64(vertex),
+            "time": np.array([belief.time, belief.time], dtype=np.float32),
+            "action_mask": self.masks[vertex].copy(),
+            **belief.to_observation(),
+        }

@@ -1,0 +1,63 @@
+"""Paths of arcs for a car that drives forward and backward."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.driving.vehicle import move_along
+
+FloatArray = NDArray[np.float64]
+
+SHORTEST_ARC = 1e-6
+"""Arcs shorter than this, m, are ignored."""
+
+
+@dataclass(frozen=True, eq=False)
+class CarPath:
+    """A sequence of arcs driven forward or backward.
+
+    Args:
+        start: (3,) x, y in m and yaw in rad of the rear axle.
+        length: (k,) length of each arc, m, negative backward.
+        curvature: (k,) 1/m, positive to the left.
+        expansions: nodes that the search expanded.
+        margin: clearance to obstacles, m.
+    """
+
+    start: FloatArray
+    length: FloatArray
+    curvature: FloatArray
+    expansions: int = 0
+    margin: float = 0.0
+
+    @property
+    def driven_m(self) -> float:
+        """Length, m."""
+        return float(np.abs(self.length).sum())
+
+    @property
+    def direction_changes(self) -> int:
+        """Number of changes between forward and backward."""
+        sign = np.sign(self.length[np.abs(self.length) > SHORTEST_ARC])
+        return int((sign[1:] != sign[:-1]).sum())
+
+    @property
+    def turned_rad(self) -> float:
+        """Total absolute change of heading, rad: a measure of smoothness."""
+        return float(np.abs(self.length * self.curvature).sum())
+
+    def sampled(self, step: float = 0.05) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Sample the path: poses, (n, 3), and curvature, (n,) 1/m, and direction, (n,) ±1, of the arc ending there."""
+        poses, curvature, direction = [tuple(self.start.tolist())], [float(self.curvature[0])], [0.0]
+        direction[0] = math.copysign(1.0, self.length[0])
+        for length, bend in zip(self.length.tolist(), self.curvature.tolist(), strict=True):
+            n = max(1, math.ceil(abs(length) / step))
+            for _ in range(n):
+                poses.append(move_along(*poses[-1], bend, length / n))
+            curvature += [bend] * n
+            direction += [math.copysign(1.0, length)] * n
+        return np.array(poses), np.array(curvature), np.array(direction)

@@ -1,0 +1,128 @@
+"""A detector of the user's own, in every place that takes one."""
+
+import json
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from parkenv import InputError, make_scenario
+from parkenv.mapping.survey import Survey, SurveySettings
+from parkenv.perception.detector import Detections
+from parkenv.perception.detector_registry import detector_version, make_detector
+from parkenv.perception.hog_detector import HogDetector
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+OWN = "ground_detector:GroundDetector"
+
+
+@pytest.fixture
+def in_examples(monkeypatch):
+    """Run where the example's module is: the module is looked up in the working directory."""
+    monkeypatch.chdir(EXAMPLES)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+
+
+class RandomBoxes:
+    """As many boxes of a car's shape, anywhere in the lower half of the image."""
+
+    def detect(self, image):
+        rng = np.random.default_rng(int(image[::40, ::40].sum()))
+        height, width = image.shape[:2]
+        size = rng.uniform((100, 60), (360, 180), (3, 2))
+        corner = rng.uniform((0, 0.3 * height), (width - 100, 0.6 * height), (3, 2))
+        return Detections(np.hstack([corner, corner + size]), np.full(3, 0.5))
+
+
+def drive(detector):
+    settings = SurveySettings(every=3.0, weather="overcast", detector=detector)
+    boxes = []
+    result = Survey(make_scenario("mini"), settings).drive(
+        0, on_frame=lambda frame: boxes.append(frame.result.views[0].detections.boxes)
+    )
+    return result, boxes
+
+
+@pytest.mark.usefixtures("in_examples")
+def test_a_survey_with_a_detector_of_ones_own_beats_chance_and_is_not_hog():
+    own, own_boxes = drive(OWN)
+    hog, hog_boxes = drive("hog")
+    random, _ = drive(f"{__name__}:RandomBoxes")
+    own_precision, chance = (r.score.right / r.score.detections for r in (own, random))
+    assert own.found >= 0.5 * own.parked
+    assert own_precision > max(0.4, 2.0 * chance)
+    assert own.slot_accuracy >= 0.9
+    assert not all(
+        a.shape == b.shape and np.array_equal(a, b) for a, b in zip(own_boxes, hog_boxes, strict=True)
+    )
+    assert own.session.key != hog.session.key, "a map file keeps sessions of different detectors apart"
+
+
+@pytest.mark.usefixtures("in_examples")
+def test_the_environment_observes_slots_with_it():
+    scenario = make_scenario("mini")
+    seen = {}
+    for detector in ("hog", OWN, make_detector(OWN)):
+        env = gym.make(
+            "parkenv/SearchPerception-v1", scenario=scenario, weather="overcast", detector=detector
+        )
+        env.reset(seed=0)
+        env.step(3)
+        (*_, result) = env.unwrapped.perception.results
+        seen[str(detector)] = result.views[0].detections
+    hog, by_name, by_object = seen.values()
+    np.testing.assert_array_equal(by_name.boxes, by_object.boxes)
+    assert len(by_name) > 0
+    assert hog.boxes.shape != by_name.boxes.shape or not np.array_equal(hog.boxes, by_name.boxes)
+
+
+@pytest.mark.usefixtures("in_examples")
+def test_the_command_line_takes_it(tmp_path):
+    from command_line import parkenv
+
+    out = tmp_path / "s"
+    words = ("survey", "--scenario", "mini", "-n", "1", "--every", "5", "--jobs", "1", "--out", str(out))
+    assert parkenv(*words, "--detector", OWN).returncode == 0
+    (row,) = json.loads((out / "summary.json").read_text())["rows"]
+    assert row["detector"] == OWN
+    assert detector_version(OWN) in (out / "sessions.csv").read_text()
+
+
+def test_detectors_are_made_by_name(tmp_path):
+    assert [len(make_detector(name).models) for name in ("hog", "side", "front", None)] == [2, 1, 1, 2]
+    file = tmp_path / "mine.npz"
+    make_detector("side").models[0].save(file)
+    loaded = make_detector(str(file))
+    assert isinstance(loaded, HogDetector)
+    np.testing.assert_array_equal(loaded.models[0].weights, make_detector("side").models[0].weights)
+    before = detector_version(str(file))
+    make_detector("front").models[0].save(file)
+    assert detector_version(str(file)) != before, "another model under the same name is another detector"
+    assert detector_version("hog") == "hog"
+    for wrong, message in (
+        ("yolo", "unknown detector 'yolo'; want hog, side, front"),
+        ("no_such_module:Mine", "detector 'no_such_module:Mine': no module"),
+        (f"{__name__}:Nothing", "has no 'Nothing'"),
+        (f"{__name__}:Path", r"has no method detect\(image\)"),
+        (3, r"detector is a int without a method detect\(image\)"),
+    ):
+        with pytest.raises(InputError, match=message):
+            make_detector(wrong)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"boxes": np.zeros((2, 3))}, r"boxes has shape \(2, 3\), want \(2, 4\)"),
+        ({"boxes": [[0, 0, 1, 1], [5, 5, 4, 9]]}, r"boxes\[1\] is \[5.0, 5.0, 4.0, 9.0\], want left < right"),
+        ({"probability": [0.5, 1.5]}, "want 0 to 1"),
+        ({"probability": [0.5, np.nan]}, "finite"),
+        ({"end_on": [True]}, r"end_on has shape \(1,\), want \(2,\)"),
+    ],
+)
+def test_detections_are_checked(wrong, message):
+    good = {"boxes": [[0, 0, 1, 1], [2, 2, 4, 4]], "probability": [0.5, 0.6]}
+    with pytest.raises(InputError, match=message):
+        Detections(**{**good, **wrong})

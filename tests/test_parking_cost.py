@@ -1,0 +1,99 @@
+"""A price on slots counts like the walk, for the solvers, the planners, the bound and the heuristics."""
+
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from small_lots import features
+
+from parkenv import OccupancyProcess, ParkingLot, Scenario
+from parkenv.lots import packaged_lot
+from planners import ParkingMDP, label_setting, make_agent, policy_iteration, value_iteration
+from planners.agent import ClairvoyantAgent
+from planners.bounds.oracle import best_slot
+from planners.routes import DriveRoutes
+
+DEAR_S = 600.0
+
+
+def priced(lot, cost_s):
+    return ParkingLot(**{**features(lot), "slot_parking_cost_s": cost_s})
+
+
+def empty_lot(lot):
+    """All slots are free, and forecast to be so about as often as not."""
+    occupancy = OccupancyProcess.from_demand(np.full(lot.n_slots, -25.0), np.zeros(168), 1e9)
+    prior = OccupancyProcess.from_demand(np.full(lot.n_slots, -0.5), np.zeros(168), 1e9)
+    return Scenario(name="empty", lot=lot, occupancy=occupancy, prior=prior)
+
+
+def parked_at(agent, scenario):
+    """The slot in which a search ends."""
+    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    observation, _ = env.reset(seed=0)
+    state = env.unwrapped.state
+    if isinstance(agent, ClairvoyantAgent):
+        agent.prepare(state.world, state.time)
+    memory, over = None, False
+    while not over:
+        action, memory = agent.predict(observation, memory)
+        observation, _, over, _, _ = env.step(action)
+    assert state.parked
+    return state.vertex
+
+
+@pytest.mark.parametrize(
+    "name", ["mdp", "mdp-static", "mdp-tuned", "belief", "exact", "oracle", "greedy-goal", "first-free"]
+)
+def test_agents_park_elsewhere_where_that_pays(name):
+    lot = packaged_lot("mini")
+    plain = empty_lot(lot)
+    chosen = parked_at(make_agent(name, plain), plain)
+    # The half of the lot that it has chosen is dear.
+    walk_m = lot.walk_m()
+    near = walk_m <= np.median(walk_m) if walk_m[chosen] <= np.median(walk_m) else walk_m > np.median(walk_m)
+    dear = empty_lot(priced(lot, np.where(near, DEAR_S, 0.0)))
+    assert not near[parked_at(make_agent(name, dear), dear)]
+    # A price that all slots share changes nothing.
+    alike = empty_lot(priced(lot, np.full(lot.n_slots, DEAR_S)))
+    assert parked_at(make_agent(name, alike), alike) == chosen
+
+
+@pytest.mark.parametrize("gamma", [0.999, 1.0])
+def test_solvers_agree_on_priced_slots(gamma):
+    rng = np.random.default_rng(3)
+    lot = packaged_lot("street")
+    problem = empty_lot(priced(lot, rng.uniform(0.0, 120.0, lot.n_slots))).public()
+    p_occupied = rng.uniform(0.0, 1.0, lot.n_slots)
+    mdp = ParkingMDP.from_belief(problem, p_occupied, failure_s=10.0, gamma=gamma)
+    by_labels = label_setting(mdp)
+    np.testing.assert_allclose(by_labels.values, value_iteration(mdp).values, atol=1e-5)
+    if gamma < 1.0:
+        np.testing.assert_allclose(by_labels.values, policy_iteration(mdp).values, atol=1e-6)
+    else:
+        # Without discount the value is a closed form: the best slot to drive to and to attempt until it is free.
+        routes, odds = DriveRoutes(problem), p_occupied / (1.0 - p_occupied)
+        for vertex in range(0, lot.n_vertices, 7):
+            drive_s = routes.seconds_from(vertex)[: lot.n_slots]
+            expected = (drive_s + problem.arrival_cost_s + 10.0 * odds).min()
+            assert mdp.expected_time(by_labels.values)[vertex] == pytest.approx(expected)
+
+
+def test_the_bound_counts_prices():
+    rng = np.random.default_rng(4)
+    lot = packaged_lot("campus")
+    scenario = replace(
+        empty_lot(priced(lot, rng.uniform(0.0, 120.0, lot.n_slots))),
+        occupancy=OccupancyProcess.from_demand(np.full(lot.n_slots, 2.0), np.zeros(168), 600.0),
+    )
+    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    for seed in range(5):
+        env.reset(seed=seed)
+        state = env.unwrapped.state
+        routes = DriveRoutes(scenario)
+        drive_s = routes.seconds_from(state.vertex)[: lot.n_slots]
+        free_at = [float(state.world.next_free([s], state.time + d)[0]) for s, d in enumerate(drive_s)]
+        total_s = np.array(free_at) - state.time + scenario.walk_s + scenario.lot.slot_parking_cost_s
+        best = best_slot(scenario, routes, state.world, state.vertex, state.time)
+        assert best.total_s == pytest.approx(total_s.min())
