@@ -503,20 +503,20 @@ def test_models_of_another_task_are_refused(trained, name):
         make_parking_agent("mdp")
 
 
-def test_a_driver_wants_the_obstacle_map_and_serves_many_episodes(trained):
+def test_an_agent_wants_the_obstacle_map_and_serves_many_episodes(trained):
     algorithm, folder = trained
-    driver = make_parking_agent(f"{algorithm}:{folder / 'model.zip'}")
+    agent = make_parking_agent(f"{algorithm}:{folder / 'model.zip'}")
     blind = DriveEnv(lot=MINI)
     with pytest.raises(InputError, match="obstacle_map=True"):
-        driver.predict(blind.reset(seed=0)[0])
+        agent.predict(blind.reset(seed=0)[0])
     envs = gym.vector.SyncVectorEnv([lambda: DriveEnv(lot=MINI, obstacle_map=True) for _ in range(3)])
     single = DriveEnv(lot=MINI, obstacle_map=True)
     together, _ = envs.reset(seed=[4, 5, 6])
     alone, _ = single.reset(seed=5)
     state = memory = None
     for _ in range(10):
-        actions, state = driver.predict(together, state)
-        action, memory = driver.predict(alone, memory)
+        actions, state = agent.predict(together, state)
+        action, memory = agent.predict(alone, memory)
         np.testing.assert_allclose(actions[1], action, atol=1e-5)
         together, *_ = envs.step(actions)
         alone, *_ = single.step(action)
@@ -601,8 +601,8 @@ def test_a_short_training_learns_to_park_from_nearby(tmp_path, monkeypatch):
     near = slot_groups((MINI,))[0].tasks(slack=1.0, distance=(1.0, 6.0), starts="way-out")
     tasks = [PreparedTask(near.draw(7_000 + k)) for k in range(60)]
     standing, trained = (
-        (evaluate_parking(driver, tasks)[0] == PARKED).mean()
-        for driver in (Always(0.0, 0.0), make_parking_agent(f"ppo:{tmp_path / 'checkpoint.zip'}").model)
+        (evaluate_parking(agent, tasks)[0] == PARKED).mean()
+        for agent in (Always(0.0, 0.0), make_parking_agent(f"ppo:{tmp_path / 'checkpoint.zip'}").model)
     )
     assert trained > standing
 

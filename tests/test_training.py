@@ -249,8 +249,8 @@ def without_network(path):
 @pytest.mark.parametrize(
     ("spoil", "algorithm", "wanted"),
     [
-        (torn, "maskable-ppo", "no model file, or a torn one"),
-        (with_card("{"), "maskable-ppo", "no model file, or a torn one"),
+        (torn, "maskable-ppo", "no model file, or a damaged one"),
+        (with_card("{"), "maskable-ppo", "no model file, or a damaged one"),
         (with_card("[]"), "maskable-ppo", "holds a list, want what it was trained for"),
         (without_network, "maskable-ppo", "its network cannot be read"),
         (without_card, "maskable-ppo", "parkenv.json is missing"),

@@ -88,7 +88,7 @@ def park(
         case.environment().close()  # validates the options before the first episode
         cases.append(case)
     labels = _labels(args.words("--agents", agents))
-    drivers = {label: make_parking_agent(name) for label, name in labels.items()}
+    parking_agents = {label: make_parking_agent(name) for label, name in labels.items()}
     make_folder(out)
     console = make_console()
     progress = Progress(
@@ -122,7 +122,7 @@ def park(
     for label, its in parkings.items():
         folder = out if len(labels) == 1 else out / label
         make_folder(folder)
-        _picture(its, cases, drivers[label], film, folder)
+        _picture(its, cases, parking_agents[label], film, folder)
     _show(console, f"{', '.join(names)}: {episodes} episodes per lot", table)
     for row in [row for row in rows if not row["parked"]][:SHOWN_ROWS]:
         who = f"{row['agent']}, " if len(labels) > 1 else ""
@@ -157,7 +157,7 @@ def _one_of_each(parkings: list[Parking]) -> list[Parking]:
 def _picture(
     parkings: list[Parking],
     cases: list[ParkingCase],
-    driver: Agent,
+    agent: Agent,
     film: dict[str, Any] | None,
     folder: Path,
 ) -> None:
@@ -173,7 +173,7 @@ def _picture(
             save_parkings([(lots[p.row["lot"]], p.state) for p in shown], folder / name)
     if film is not None:
         case = next(case for case in cases if case.lot.name == film["lot"])
-        frames = park_once(case.environment("rgb_array"), driver, film["seed"], every=2).frames
+        frames = park_once(case.environment("rgb_array"), agent, film["seed"], every=2).frames
         save_film(frames, folder / "parking.gif", fps=10.0)
 
 

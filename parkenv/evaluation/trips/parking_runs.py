@@ -158,9 +158,9 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
 
 
 def park_all(
-    cases: Sequence[ParkingCase], seeds: Sequence[int], workers: Workers = HERE, driver: str = PLANNER
+    cases: Sequence[ParkingCase], seeds: Sequence[int], workers: Workers = HERE, agent: str = PLANNER
 ) -> Iterator[list[Parking]]:
-    """Drive every seed of every case with one driver; yields the parkings in order.
+    """Run every seed of every case with one agent; yield the parkings in order.
 
     Only wall times differ from run to run, on any number of workers.
 
@@ -168,14 +168,14 @@ def park_all(
         cases: the tasks.
         seeds: of the tasks.
         workers: where they run.
-        driver: a name for `planners.driving.parking_agents.make_parking_agent`.
+        agent: a name for `planners.driving.parking_agents.make_parking_agent`.
     """
     parts = [seeds[i : i + CHUNK] for i in range(0, len(seeds), CHUNK)]
-    yield from workers.in_order([partial(_park_some, case, part, driver) for case in cases for part in parts])
+    yield from workers.in_order([partial(_park_some, case, part, agent) for case in cases for part in parts])
 
 
-def _park_some(case: ParkingCase, seeds: Sequence[int], driver: str) -> list[Parking]:
-    env, agent = case.environment(), make_parking_agent(driver)
+def _park_some(case: ParkingCase, seeds: Sequence[int], name: str) -> list[Parking]:
+    env, agent = case.environment(), make_parking_agent(name)
     return [park_once(env, agent, seed) for seed in seeds]
 
 
