@@ -314,9 +314,16 @@ def result_tables(rows: list[Row], width: int) -> list[Table]:
             f"{name}: failure cost {failure:g} s, walk {walk:g} km/h, drive {drive:g} km/h, "
             f"{max(r['episodes'] for r in its_rows)} searches"
         )
-        for columns in [results + _DETAILS] if width >= WIDE else [results, _DETAILS]:
+        details = _DETAILS
+        if any(row["parking_cost_s"] for row in its_rows):
+            details = (
+                *_DETAILS[:3],
+                ("parking cost", lambda r: _seconds(r["parking_cost_s"])),
+                *_DETAILS[3:],
+            )
+        for columns in [results + details] if width >= WIDE else [results, details]:
             headings = ("agent", *(heading for heading, _ in columns))
-            table = make_table(title if columns is not _DETAILS else None, headings)
+            table = make_table(title if columns is not details else None, headings)
             for row in its_rows:
                 table.add_row(row["agent"], *(text(row) for _, text in columns))
             tables.append(table)

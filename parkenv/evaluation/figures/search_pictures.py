@@ -58,7 +58,8 @@ def draw_search(trace: SearchTrace, ax: Axes) -> None:
 def _title(trace: SearchTrace, width: float) -> str:
     """Describe the search in lines that fit a width in inches at the current font size."""
     scenario, metrics = trace.scenario, trace.metrics
-    terms = [f"{metrics[key]:.0f} {name}" for key, (name, _) in TIME_COLORS.items()]
+    shown = {key: name for key, (name, _) in TIME_COLORS.items() if key != "parking_cost_s" or metrics[key]}
+    terms = [f"{metrics[key]:.0f} {name}" for key, name in shown.items()]
     if not metrics["gave_up_s"]:
         terms.pop()
     replans = metrics.get("replans", 0)

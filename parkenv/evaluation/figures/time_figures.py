@@ -125,7 +125,11 @@ def draw_time_split(rows: Sequence[Row]) -> Figure:
             lowest = (len(panels) - 1 - column) // columns
             axes[lowest, column].tick_params(labelbottom=True)
             axes[lowest, column].set_xlabel("mean total time, s; 95 % interval", color="#444444")
-        handles: list[Any] = [Patch(color=color, label=name) for name, color in TIME_COLORS.values()]
+        handles: list[Any] = [
+            Patch(color=color, label=name)
+            for key, (name, color) in TIME_COLORS.items()
+            if key != "parking_cost_s" or any(row[key] > 0.0 for row in rows)
+        ]
         handles.append(
             Line2D([], [], color=INK, linestyle=(0, (3, 2)), linewidth=1.2, label="clairvoyant lower bound")
         )

@@ -1,6 +1,6 @@
 // Mean total time: a stacked bar per agent with the confidence interval of its mean, a panel per setting.
 
-const PARTS = [["drive_s", "drive", "--drive"], ["failed_s", "failed attempts", "--failed"], ["walk_s", "walk", "--walk"], ["gave_up_s", "give-up penalty", "--gave-up"]];
+const PARTS = [["drive_s", "drive", "--drive"], ["failed_s", "failed attempts", "--failed"], ["walk_s", "walk", "--walk"], ["parking_cost_s", "parking cost", "--parking-cost"], ["gave_up_s", "give-up penalty", "--gave-up"]];
 /** Bars longer than this many times the shortest agent's are cut. */
 const CUT = 2.6;
 
