@@ -109,7 +109,7 @@ def test_a_comparison_shows_what_parking_cost(tmp_path):
         "--occupancy-levels", "none", "--no-figures", "--out", tmp_path / "run",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "parking cost" in done.stdout
+    assert "parking" in done.stdout
     for row in json.loads((tmp_path / "run" / "summary.json").read_text())["rows"]:
         assert 4.0 < row["parking_cost_s"] <= 30.0
         parts = sum(row[name] for name in ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s"))

@@ -216,7 +216,9 @@ def _show(console: Any, driven: Any) -> None:
     end = f"parked in {driven.slot}" if driven.parked else "not parked"
     console.print(
         f"{end}: {driven.total_s:.1f} s = {driven.lanes_s:.1f} s on the lanes + {driven.manoeuvre_s:.1f} s manoeuvre + "
-        f"{driven.failed_s:.1f} s failed + {driven.walk_s:.1f} s walk + {driven.gave_up_s:.1f} s give-up penalty"
+        f"{driven.failed_s:.1f} s failed + {driven.walk_s:.1f} s walk"
+        + (f" + {driven.parking_cost_s:.1f} s parking cost" if driven.parking_cost_s else "")
+        + (f" + {driven.gave_up_s:.1f} s give-up penalty" if driven.gave_up_s else "")
     )
     if driven.waited_s or driven.contacts:
         console.print(f"  {driven.waited_s:.1f} s of it behind and before others; {driven.contacts} contacts")

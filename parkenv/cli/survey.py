@@ -102,7 +102,13 @@ def run_survey_of(
         raise InputError("--overwrite: a survey adds sessions to its map; name another folder for a new one")
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.experiments.spec import SPEC_FILE
-    from parkenv.evaluation.experiments.surveys import run_survey, slots_found, summarize, survey_of
+    from parkenv.evaluation.experiments.surveys import (
+        mean_occupancy,
+        run_survey,
+        slots_found,
+        summarize,
+        survey_of,
+    )
     from parkenv.evaluation.figures.survey_pictures import (
         save_detection_reach,
         save_detections,
@@ -116,7 +122,6 @@ def run_survey_of(
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
     from parkenv.mapping.survey import Survey
-    from parkenv.world.occupancy import Arrival
 
     if rerun is not None:
         require_viewer()
@@ -146,7 +151,7 @@ def run_survey_of(
     time = 86_400.0 * window.weekdays[0] + 0.5 * (window.start_s + window.end_s)
     predicted = predict(log, time)
     save_map(
-        its.lot, predicted, its.occupancy.forecast(Arrival(time)).p_occupied,
+        its.lot, predicted, mean_occupancy(its.occupancy, window),
         f"{its.name} after {row['sessions']} sessions", out / f"map_{its.name}.png",
     )  # fmt: skip
     title = f"{its.name}, rig {settings.rig}, {row['sessions']} sessions"

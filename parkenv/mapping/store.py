@@ -1,4 +1,4 @@
-"""The map file: sessions and what was seen in them, in SQLite; a session is there whole or not at all."""
+"""The map file: survey sessions in an SQLite database, one transaction per session."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Session:
     """One survey drive.
 
     Attributes:
-        key: what tells it from all others; a survey that goes on does not drive it again.
+        key: unique name; a resumed survey does not drive it again.
         time: s since Monday 00:00, when it began.
         rig, weather: words.
         p_occupied: (n_slots,) float64; NaN where the slot was never in view.
@@ -80,9 +80,9 @@ class MapStore:
     """A map file.
 
     Args:
-        path: the file; made where it does not exist, unless `create` is off.
-        lot: whose slots it is about.
-        create: whether to make a file that is not there.
+        path: the file; created if it does not exist, unless `create` is off.
+        lot: the lot that the map describes.
+        create: whether to create a missing file.
 
     Raises:
         InputError: no such file; no map file, one of a newer parkenv or of another lot; or it cannot be written.
@@ -107,11 +107,11 @@ class MapStore:
         self.close()
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._db.close()
 
     def has(self, key: str) -> bool:
-        """Whether a session is there."""
+        """Return whether the file holds a session."""
         with self._said_plainly():
             return self._db.execute("SELECT 1 FROM session WHERE key = ?", (key,)).fetchone() is not None
 
@@ -135,7 +135,7 @@ class MapStore:
                 raise InputError(f"{self.path}: holds a session {session.key!r} already") from error
 
     def sessions(self) -> list[Session]:
-        """All sessions, by key."""
+        """Return all sessions, ordered by key."""
         found = []
         with self._said_plainly(), self._transaction():
             rows = self._db.execute("SELECT id, key, time, rig, weather FROM session ORDER BY key").fetchall()
@@ -152,14 +152,14 @@ class MapStore:
         return found
 
     def log(self) -> SessionLog:
-        """All sessions, for predictions."""
+        """Return all sessions as a log for predictions."""
         sessions = self.sessions()
         p = np.array([s.p_occupied for s in sessions]).reshape(len(sessions), self._lot.n_slots)
         known = np.isfinite(p)
         return SessionLog(np.array([s.time for s in sessions]), np.where(known, p, 0.0) > 0.5, known)
 
     def cars(self) -> FloatArray:
-        """(n, 3) x, y in m and yaw in rad of every car seen in any session."""
+        """Return the poses of all cars of all sessions, (n, 3) x, y in m and yaw in rad."""
         with self._said_plainly(), self._transaction():
             rows = self._db.execute("SELECT x, y, yaw FROM car ORDER BY session, rowid").fetchall()
         return np.array(rows, dtype=np.float64).reshape(-1, 3)
@@ -232,7 +232,7 @@ class MapStore:
 
     @contextmanager
     def _said_plainly(self) -> Iterator[None]:
-        """What is wrong with the file in words."""
+        """Describe a database error in one line."""
         try:
             yield
         except sqlite3.DatabaseError as error:
@@ -240,7 +240,7 @@ class MapStore:
 
 
 def lot_digest(lot: ParkingLot) -> str:
-    """What tells a lot's slots from those of another: equal for equal places."""
+    """Return a hash of the lot's slot poses."""
     places = np.column_stack([lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width])
     # Adding 0 makes one of the two zeros.
     return hashlib.sha256((np.round(places, 3) + 0.0).tobytes()).hexdigest()[:16]

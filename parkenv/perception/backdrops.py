@@ -1,4 +1,4 @@
-"""Random texture behind the cars of a simulated picture: a model must not learn that backgrounds are calm.
+"""Random textures behind the cars of simulated images: a model must not learn that backgrounds are smooth.
 
 Real streets have brick, leaves, fences, shop windows and posters right behind the cars; the simulated ones have flat
 walls. Grain, bars and boxes of random shape and contrast stand in for all of them (domain randomization, Tobin et al.
@@ -21,7 +21,7 @@ _ON_THE_GROUND = 0.15
 
 
 def with_backdrop(grey: Image, far: NDArray[np.bool_], rng: np.random.Generator) -> Image:
-    """The picture with texture over all that is far, and now and then a little of it over the rest.
+    """Add texture to the background of an image, and sometimes a little to the rest.
 
     Args:
         grey: (h, w) uint8.

@@ -1,4 +1,4 @@
-"""Random streets and car parks to take training pictures of: rows of cars, and what stands before and behind them."""
+"""Random streets and car parks for training images: rows of cars with foreground and background objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Train a car model: aligned crops of cars, whatever holds none, and what the model itself takes for cars wrongly."""
+"""Train a car model from aligned crops of cars, images without cars, and mined hard negatives."""
 
 from __future__ import annotations
 

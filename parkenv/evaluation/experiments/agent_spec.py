@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, ConfigDict, model_validator
 
 from parkenv.errors import InputError
-from parkenv.files.spec_file import Spec
+from parkenv.files.spec_file import OrText, Spec
 
 OptionValue = bool | int | float | str
 
@@ -111,5 +111,5 @@ def _tables(value: object) -> object:
     return parse_agent(value) if isinstance(value, str) else value
 
 
-AgentItem = Annotated[AgentSpec, BeforeValidator(_tables, json_schema_input_type=str | AgentSpec)]
+AgentItem = Annotated[AgentSpec, BeforeValidator(_tables), OrText()]
 """An agent in a file: `"mdp"`, `"mdp(failure_s=90)"` or a table."""

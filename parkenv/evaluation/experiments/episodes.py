@@ -144,4 +144,4 @@ class EpisodeRunner:
     def _bound_s(self) -> float:
         state = self._state
         choice = best_slot(self.scenario, self._routes, state.world, state.path[0], state.arrival.time)
-        return min(choice.total_s, self.scenario.give_up_s)
+        return float(min(choice.total_s, self.scenario.give_up_s))

@@ -25,7 +25,9 @@ from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
 from parkenv.mapping.survey_score import DISTANCE_ENDS, METHODS
 from parkenv.scenarios.build import build
-from parkenv.world.occupancy import Arrival, ArrivalWindow
+from parkenv.world.occupancy import Arrival, ArrivalWindow, OccupancyModel
+from parkenv.world.occupancy_log import weekday_of
+from parkenv.world.recorded_occupancy import RecordedOccupancy
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S
 
@@ -236,6 +238,21 @@ def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
     return result
 
 
+def mean_occupancy(occupancy: OccupancyModel, window: ArrivalWindow) -> FloatArray:
+    """P(taken) of every slot in the middle of a window, (n_slots,): the truth that a map is compared with.
+
+    Of a process it is the marginal on the window's first day; of a recorded log, the fraction of its days on which
+    the slot was taken then.
+    """
+    middle = 0.5 * (window.start_s + window.end_s)
+    if isinstance(occupancy, RecordedOccupancy):
+        arrivals = [Arrival(weekday_of(day) * DAY_S + middle, day) for day in occupancy.days_in(window)]
+        slots = np.arange(occupancy.n_slots)
+        taken = [occupancy.world(np.uint64(0), arrival).occupied(slots, arrival.time) for arrival in arrivals]
+        return np.asarray(np.mean(taken, axis=0, dtype=np.float64))
+    return occupancy.forecast(Arrival(DAY_S * window.weekdays[0] + middle)).p_occupied
+
+
 def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: SessionLog) -> tuple[float, float]:
     """How far the map's predictions are from the true probabilities, and how far counts alone would be.
 
@@ -253,7 +270,7 @@ def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: Session
     for window in windows:
         time = DAY_S * window.weekdays[0] + 0.5 * (window.start_s + window.end_s)
         draws = int(((hour >= window.start_s) & (hour <= window.end_s)).sum())
-        true = scenario.occupancy.forecast(Arrival(time)).p_occupied
+        true = mean_occupancy(scenario.occupancy, window)
         errors.append(np.abs(predict(log, time).p_occupied - true))
         # Mean absolute deviation of a binomial share, by its normal limit.
         chances.append(np.sqrt(2.0 / np.pi * true * (1.0 - true) / max(draws, 1)))

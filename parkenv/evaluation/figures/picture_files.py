@@ -42,6 +42,8 @@ TIME_COLORS = {
     "gave_up_s": ("give-up penalty", "#8c8c8c"),
 }
 """Names and colours of the parts of the total time."""
+OPTIONAL_TIMES = ("parking_cost_s", "gave_up_s")
+"""Parts that are mentioned only where they are not 0."""
 
 
 def save_picture(figure: Figure, path: str | Path) -> None:

@@ -176,7 +176,7 @@ class SearchRecorder(Observer):
             "parked": parked,
             "slot": self.state.vertex if parked else None,
             "truncated": result.truncated,
-            **{name: info[name] for name in (*TIME_COLORS, "total_s")},
+            **{name: info[name] for name in ("total_s", *TIME_COLORS)},
             "failed_parks": int(info["failed_parks"]),
             "replans": int(getattr(result.memory, "replans", 0)),
         }

@@ -44,13 +44,13 @@ _KNOWN = {
         Column("v_drive_kmh", "drive", "km/h", 0),
         Column("episodes", "searches", digits=0),
         Column("seed", "seed", digits=0),
-        Column("total_s", "total time", "s", help="Drive + failed attempts + walk + parking cost + give-up penalty"),
+        Column("total_s", "total time", "s", help="Drive + failed attempts + walk + give-up penalty"),
         Column("difference_s", "minus first agent", "s", signed=True, help="Paired by world; 95 % interval"),
         Column("regret_s", "regret", "s", help="Difference to the clairvoyant lower bound"),
         Column("drive_s", "drive", "s", help="Time driving, waits included"),
         Column("failed_s", "failed attempts", "s", help="Time of failed parking attempts"),
         Column("walk_s", "walk", "s"),
-        Column("parking_cost_s", "parking cost", "s", help="Cost of the slot: its price times the value of time"),
+        Column("parking_cost_s", "parking cost", "s", help="Cost of the slot, as time"),
         Column("gave_up_s", "give-up penalty", "s", help="Charged where the lot is full or the search was truncated"),
         Column("bound_s", "bound", "s", help="Clairvoyant lower bound: least time with full knowledge of the future"),
         Column("parked_fraction", "parked", share=True, digits=0),
@@ -100,7 +100,8 @@ _KNOWN = {
 _ORDER = (
     "scenario", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh", "agent", "seed",
     "total_s", "difference_s", "gap_to_exact", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s",
-    "gave_up_s", "parked_fraction",
+    "gave_up_s",
+    "parked_fraction",
 )  # fmt: skip
 """First columns, in this order; others follow."""
 _TABLES_OF_THEIR_OWN = ("by_weather",)
@@ -145,8 +146,7 @@ def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False)
         same = [
             k for k in same if values[k][0] is None or k in _ORDER[:6] or k in ("episodes", "rig", "slots")
         ]
-    # Costs of slots matter in lots that have them.
-    shown = [k for k in keys if k not in same and (k != "parking_cost_s" or any(values[k]))]
+    shown = [k for k in keys if k not in same]
     return {
         "name": name,
         "title": title,

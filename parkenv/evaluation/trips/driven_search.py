@@ -116,11 +116,12 @@ class Trip:
     Attributes:
         seed: of the world.
         agent: name of the agent.
-        total_s: the sum of the next five.
+        total_s: the sum of the next six.
         lanes_s: driving on the lanes, waiting included.
         manoeuvre_s: from the decision to park until the car stood in the slot.
         failed_s: of failed attempts.
         walk_s: walk to the goal.
+        parking_cost_s: of the slot, as time.
         gave_up_s: give-up penalty.
         parked: whether the car was parked.
         slot: its name; empty where not parked.
@@ -142,6 +143,7 @@ class Trip:
     manoeuvre_s: float
     failed_s: float
     walk_s: float
+    parking_cost_s: float
     gave_up_s: float
     parked: bool
     slot: str
@@ -175,7 +177,7 @@ class DrivenSearch:
     Example:
         >>> import math
         >>> trip = DrivenSearch(make_scenario("mini")).run(seed=1)
-        >>> parts = trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.gave_up_s
+        >>> parts = trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.parking_cost_s + trip.gave_up_s
         >>> trip.parked, math.isclose(trip.total_s, parts)
         (True, True)
     """
@@ -220,17 +222,15 @@ class DrivenSearch:
         parked = env.manoeuvre
         manoeuvre_s = parked.seconds if parked else 0.0
         lanes_s = float(info["drive_s"]) - manoeuvre_s
-        failed_s, walk_s, gave_up_s = (float(info[name]) for name in ("failed_s", "walk_s", "gave_up_s"))
+        terms = {name: float(info[name]) for name in ("failed_s", "walk_s", "parking_cost_s", "gave_up_s")}
         log = driver.log
         return Trip(
             seed=int(seed),
             agent=self.agent,
-            total_s=lanes_s + manoeuvre_s + failed_s + walk_s + gave_up_s,
+            total_s=sum((lanes_s, manoeuvre_s, *terms.values())),
             lanes_s=lanes_s,
             manoeuvre_s=manoeuvre_s,
-            failed_s=failed_s,
-            walk_s=walk_s,
-            gave_up_s=gave_up_s,
+            **terms,
             parked=bool(info["parked"]),
             slot=parked.slot if parked else "",
             slot_kind=parked.kind if parked else "",
