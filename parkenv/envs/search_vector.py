@@ -200,10 +200,10 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     ## Episode end
     As in `parkenv/Search-v1`; truncated after `max_episode_steps`. What then happens is `autoreset_mode`: NEXT_STEP,
-    the next step ignores the action and begins a new search, with a reward of 0; SAME_STEP, a new search begins at once,
-    and the last observations and infos are `info["final_obs"]` and `info["final_info"]`; DISABLED, the searches to reset
-    are named in `reset(options={"reset_mask": ...})`. Where a search ends, `info` has its metrics, as the single
-    environment's, with `_drive_s` and so on saying which searches they are of.
+    the next step ignores the action and begins a new search, with a reward of 0; SAME_STEP, a new search begins at
+    once, and the last observations and infos are `info["final_obs"]` and `info["final_info"]`; DISABLED, the searches
+    to reset are named in `reset(options={"reset_mask": ...})`. Where a search ends, `info` has its metrics, as the
+    single environment's; `_drive_s` and so on say which searches they are of.
 
     ## Arguments
     - `num_envs`: number of environments.
