@@ -285,13 +285,6 @@ class Scene:
             np.concatenate([scenery.ids, (self.present + 1).astype(np.int32)]),
         )
 
-    @cached_property
-    def coarse_instances(self) -> Instances:
-        """As `instances`, with the coarse mesh of every vehicle."""
-        coarse = self.pool.coarse
-        assert coarse is not None
-        return Instances(coarse[self.instances.mesh], self.instances.pose, self.instances.ids)
-
     def footprints(self) -> Footprints:
         """Return the obstacles 0.5 m above the ground: convex polygons of vehicles and posts, and wall segments."""
         outline, count = self.fleet.outlines

@@ -1,4 +1,4 @@
-"""`parkenv survey`: drive past every slot again and again; `parkenv map`: what that tells."""
+"""`parkenv survey`: drive past every slot and write a map file; `parkenv map`: the predictions of a map file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def survey(
     lot: args.LotOption = None,
     occupancy: args.OccupancyOption = None,
     sessions: Annotated[
-        int, typer.Option("--sessions", min=1, help="How many drives; the thesis made 21.")
+        int, typer.Option("--sessions", min=1, help="Number of survey drives; the thesis made 21.")
     ] = 6,
     rig: args.SurveyRigOption = None,
     detector: args.DetectorOption = "hog",
@@ -35,7 +35,7 @@ def survey(
         typer.Option(
             "--hours",
             metavar="HH:MM-HH:MM[,...]",
-            help="When drives begin; one window after the other.  [default: 08:00-10:00,11:00-14:00,16:00-18:00]",
+            help="When sessions begin; the windows are used in turn.  [default: 08:00-10:00,11:00-14:00,16:00-18:00]",
         ),
     ] = None,
     days: args.DaysOption = None,
@@ -56,10 +56,10 @@ def survey(
     ] = Path("results/survey"),
     report: args.ReportOption = False,
 ) -> None:
-    """Drive past every slot with simulated sensors, find the parked cars, and keep what was seen in a map file.
+    """Drive past every slot with simulated sensors, detect the parked cars, and write the observations to a map file.
 
-    The camera's pictures go through the detector, the laser (or the stereo pair) ranges what it finds, a Bayes filter
-    decides for each slot, and every drive is one session of the map. The same command goes on where it was stopped.
+    Cars are detected in the camera images and located with the laser (or the stereo camera); a Bayes filter estimates
+    the state of each slot; every drive is one session of the map. The same command resumes an interrupted survey.
 
     Examples:
     * `parkenv survey --sessions 21`
@@ -219,7 +219,7 @@ def show_map(
         Path | None, typer.Option("--out", "-o", help="Folder for map.png, slots.csv, summary.json.")
     ] = None,
 ) -> None:
-    """Ask a map file how often slots are taken.
+    """Show the predictions of a map file: how often each slot is taken.
 
     Examples:
     * `parkenv map results/survey/map.sqlite --weekday tue --hour 9.5`

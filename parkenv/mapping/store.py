@@ -92,7 +92,7 @@ class MapStore:
         self.path, self._lot = path, lot
         if not path.exists() and not create:
             raise InputError(f"{path}: no such map file; parkenv survey makes one")
-        with self._said_plainly():
+        with self._errors_in_words():
             self._db = sqlite3.connect(path, timeout=_PATIENCE_S, isolation_level=None)
             try:
                 self._open()
@@ -112,7 +112,7 @@ class MapStore:
 
     def has(self, key: str) -> bool:
         """Return whether the file holds a session."""
-        with self._said_plainly():
+        with self._errors_in_words():
             return self._db.execute("SELECT 1 FROM session WHERE key = ?", (key,)).fetchone() is not None
 
     def add(self, session: Session) -> None:
@@ -127,7 +127,7 @@ class MapStore:
                 f"session {session.key!r} has {session.p_occupied.shape} slots, want ({self._lot.n_slots},)"
             )
         seen = np.flatnonzero(np.isfinite(session.p_occupied)).tolist()
-        with self._said_plainly():
+        with self._errors_in_words():
             try:
                 with self._transaction("IMMEDIATE"):
                     self._insert(session, seen)
@@ -137,7 +137,7 @@ class MapStore:
     def sessions(self) -> list[Session]:
         """Return all sessions, ordered by key."""
         found = []
-        with self._said_plainly(), self._transaction():
+        with self._errors_in_words(), self._transaction():
             rows = self._db.execute("SELECT id, key, time, rig, weather FROM session ORDER BY key").fetchall()
             for number, key, time, rig, weather in rows:
                 p = np.full(self._lot.n_slots, np.nan)
@@ -160,7 +160,7 @@ class MapStore:
 
     def cars(self) -> FloatArray:
         """Return the poses of all cars of all sessions, (n, 3) x, y in m and yaw in rad."""
-        with self._said_plainly(), self._transaction():
+        with self._errors_in_words(), self._transaction():
             rows = self._db.execute("SELECT x, y, yaw FROM car ORDER BY session, rowid").fetchall()
         return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
@@ -231,7 +231,7 @@ class MapStore:
             raise
 
     @contextmanager
-    def _said_plainly(self) -> Iterator[None]:
+    def _errors_in_words(self) -> Iterator[None]:
         """Describe a database error in one line."""
         try:
             yield

@@ -158,12 +158,12 @@ class PinholeCamera:
         """
         weather = Weather() if weather is None else weather
         pose = checked_pose(scene, pose)
-        radiance, geometry = self._look(scene, pose, weather)
+        radiance, geometry = self._render_radiance(scene, pose, weather)
         chosen = self.sensor.gain(radiance) if gain is None else gain
         image = self.sensor.expose(radiance, seed, chosen, rain=weather.rain)
         return Frame(image, *geometry)
 
-    def _look(
+    def _render_radiance(
         self, scene: Drawable, pose: FloatArray, weather: Weather
     ) -> tuple[Float32Array, tuple[Float32Array, Float32Array, NDArray[np.int32]]]:
         """Return radiance; and depth, glass depth and ids."""
@@ -243,7 +243,7 @@ class StereoCamera:
         frames = []
         gain = None
         for side, eye in enumerate((pose, self.right_pose(pose))):
-            radiance, geometry = self.camera._look(scene, checked_pose(scene, eye), weather)
+            radiance, geometry = self.camera._render_radiance(scene, checked_pose(scene, eye), weather)
             gain = sensor.gain(radiance) if gain is None else gain
             frames.append(Frame(sensor.expose(radiance, 2 * seed + side, gain, rain=weather.rain), *geometry))
         return StereoFrame(*frames)

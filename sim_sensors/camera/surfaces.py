@@ -208,7 +208,7 @@ class ShapeBuilder:
         triangles = np.concatenate([t + start for t, start in zip(self._triangles, counts, strict=False)])
         finish = np.concatenate(self._finish)
         smooth = np.repeat(self._smooth, [len(t) for t in self._triangles])
-        spot = _spots(points)
+        spot = _point_numbers(points)
         corner = spot[triangles]
         doubled = np.cross(
             points[triangles[:, 1]] - points[triangles[:, 0]],
@@ -241,7 +241,7 @@ def _as_keys(rows: FloatArray) -> IntArray:
     return np.asarray(keys)
 
 
-def _spots(points: FloatArray) -> IntArray:
+def _point_numbers(points: FloatArray) -> IntArray:
     """Return (n,) int64 numbers that are equal for points at the same position."""
     cell = np.round(points / WELD_M).astype(np.int64)
     keys = (cell[:, 0] * 73856093) ^ (cell[:, 1] * 19349663 << 8) ^ (cell[:, 2] * 83492791 << 16)

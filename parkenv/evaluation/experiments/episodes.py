@@ -88,12 +88,7 @@ class EpisodeRunner:
     """
 
     def __init__(
-        self,
-        scenario: Scenario,
-        name: str,
-        agent: Agent,
-        rig: str | None = None,
-        detector: str | None = None,
+        self, scenario: Scenario, name: str, agent: Agent, rig: str | None = None, detector: str | None = None
     ) -> None:
         self.scenario = scenario
         self.name = name
