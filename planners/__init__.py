@@ -1,6 +1,6 @@
-"""Planners and strategies: from what is known of a lot to an action.
+"""Planners and heuristic baselines: from the belief about a lot's slots to an action.
 
-They know the lot and a belief, never what stands in the slots; the oracle alone is shown that.
+They know the lot and the belief, never the hidden occupancy; the oracle alone is shown that.
 """
 
 from planners.agent import AGENT_NAMES, Agent, SearchAgent, make_agent

@@ -1,4 +1,4 @@
-"""What a network makes of goals before it learns: where the car is to go, seen from the goal and from the car."""
+"""Features of a goal-conditioned policy: the goal in the car's frame and the car in the goal's frame."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
-WIDE_M = 8.0
-"""m, about which positions are scaled to one."""
+SCALE_M = 8.0
+"""m, the scale of coarse positions."""
 N_FEATURES = 17
 
 
 class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
-    """The observation, and the goal as seen from the car and the car as seen from the goal.
+    """Appends the goal in the car's frame and the car in the goal's frame to the observation.
 
-    Nothing here is learned. As only differences between the two goals count, what is learned about one place holds for
-    any other, and so does hindsight: a goal of afterthought looks as a slot does.
+    Nothing here is learned. The features depend only on the difference between achieved and desired goal, so that a
+    policy generalises over places, and hindsight goals look like slots.
 
     Args:
         observation_space: a `Dict` of observation, achieved_goal and desired_goal.
@@ -27,15 +27,15 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
         super().__init__(observation_space, shape[0] + N_FEATURES)
 
     def forward(self, observations: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Features, (n, n_observation + `N_FEATURES`)."""
+        """Compute the features, (n, n_observation + `N_FEATURES`)."""
         own, goal = observations["achieved_goal"], observations["desired_goal"]
         away, cosine, sine = own[:, :2] - goal[:, :2], own[:, 2:4], goal[:, 2:4]
-        ahead, aside = _turned(away, sine)  # in the goal's frame
-        before, beside = _turned(-away, cosine)  # in the car's
-        along, across = _turned(cosine, sine)  # the car's heading against the goal's
+        ahead, aside = _rotate(away, sine)  # in the goal's frame
+        before, beside = _rotate(-away, cosine)  # in the car's
+        along, across = _rotate(cosine, sine)  # the car's heading against the goal's
         speed, wanted = own[:, 4], goal[:, 4]
         distance = torch.hypot(ahead, aside)
-        # Where it is to stop counts by the decimetre, where it is to go by the metre.
+        # Near the goal decimetres matter, far from it metres.
         fine = torch.stack(
             [
                 ahead,
@@ -47,7 +47,7 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
                 10.0 * (speed - wanted),
             ]
         )
-        coarse = [value / WIDE_M for value in (ahead, aside, before, beside)]
+        coarse = [value / SCALE_M for value in (ahead, aside, before, beside)]
         pace = [speed / 2.0, wanted / 2.0, (speed - wanted) / 2.0]
         features = torch.stack(
             [*torch.tanh(fine), *coarse, along, across, *pace, torch.log1p(distance)], dim=1
@@ -55,7 +55,7 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
         return torch.cat([observations["observation"], features], dim=1)
 
 
-def _turned(points: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Points, (n, 2), in frames whose x axes are directions, (n, 2) cosines and sines."""
+def _rotate(points: torch.Tensor, direction: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rotate points, (n, 2), into frames whose x axes are given, (n, 2) cosines and sines."""
     x, y, c, s = points[:, 0], points[:, 1], direction[:, 0], direction[:, 1]
     return c * x + s * y, c * y - s * x

@@ -1,7 +1,7 @@
-"""Models that reinforcement learning made: their files, and the agents that they are.
+"""Trained models as agents, and their files.
 
-A model file is stable-baselines3's own archive with one more member, `parkenv.json`: what it was trained on, with which
-settings, and what it observes.
+A model file is stable-baselines3's archive with one more member, `parkenv.json`, the model card: what the model was
+trained on, with which settings, and what it observes.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ ALGORITHMS = {
     "sac": ("stable_baselines3", "SAC"),
     "tqc": ("sb3_contrib", "TQC"),
 }
-"""Names of algorithms, and where they are."""
+"""Module and class of each algorithm."""
 OBSERVATION = "local-1"
-"""Of `parkenv.envs.local_observation`: a model of another layout would read nonsense."""
+"""Version of the layout of `parkenv.envs.local_observation` that models must have been trained on."""
 TASKS = {"search": "parkenv compare", "drive": "parkenv park"}
-"""What models are trained for, and which command runs them."""
+"""Tasks of models, and the command that runs each."""
 _CARD = "parkenv.json"
 _FORMAT = "parkenv-model"
 _VERSION = 1
@@ -41,17 +41,17 @@ _VERSION = 1
 
 @dataclass(frozen=True)
 class ModelCard:
-    """What a model file says of itself.
+    """Metadata of a model file.
 
     Args:
         algorithm: one of `ALGORITHMS`.
         scenarios: names of those it was trained on; of lots, if it drives.
-        k: how many slots its observation tells of; 0, if it drives.
-        observation: the layout of that.
+        k: slots in its observation; 0, if it drives.
+        observation: version of the observation's layout.
         seed: of the training.
-        steps: decisions made in training.
-        settings: of the algorithm, as its recipe states them.
-        parkenv: version of the package that trained it.
+        steps: environment steps of the training.
+        settings: of the algorithm, from its training config.
+        parkenv: version of the package that it was trained with.
         task: one of `TASKS`.
     """
 
@@ -67,40 +67,38 @@ class ModelCard:
 
     @classmethod
     def of_file(cls, path: str | os.PathLike[str]) -> Self:
-        """Read it from a model file.
+        """Read the card of a model file.
 
         Raises:
-            InputError: no such file, a torn one, one without a card, or of another version.
+            InputError: no such file, a damaged one, one without a card, or of another version.
         """
         try:
             with zipfile.ZipFile(path) as archive:
                 if (bad := archive.testzip()) is not None:
-                    raise InputError(f"{path}: is torn: {bad} in it cannot be read")
+                    raise InputError(f"{path}: is damaged: {bad} in it cannot be read")
                 if _CARD not in archive.namelist():
                     raise InputError(f"{path}: no model of `parkenv train`: {_CARD} is missing in it")
                 content = json.loads(archive.read(_CARD))
         except (OSError, ValueError, zipfile.BadZipFile) as error:
-            raise InputError(f"{path}: no model file, or a torn one ({error})") from error
+            raise InputError(f"{path}: no model file, or a damaged one ({error})") from error
         if not isinstance(content, dict):
-            raise InputError(
-                f"{path}: {_CARD} in it holds a {type(content).__name__}, want what it was trained for"
-            )
+            raise InputError(f"{path}: {_CARD} in it holds a {type(content).__name__}, want a model card")
         if content.pop("format", None) != _FORMAT or content.pop("version", None) != _VERSION:
-            raise InputError(f"{path}: want a {_FORMAT} of version {_VERSION}; train it anew")
+            raise InputError(f"{path}: want a {_FORMAT} of version {_VERSION}; train it again")
         try:
             return cls(**{**content, "scenarios": tuple(content["scenarios"])})
         except (KeyError, TypeError) as error:
             raise InputError(f"{path}: its card is incomplete ({error})") from error
 
     def add_to(self, path: str | os.PathLike[str]) -> None:
-        """Put it into the archive that stable-baselines3 saved."""
+        """Add the card to an archive that stable-baselines3 saved."""
         content = {"format": _FORMAT, "version": _VERSION, **asdict(self)}
         with zipfile.ZipFile(path, "a") as archive:
             archive.writestr(_CARD, json.dumps(content, indent=2))
 
 
 def algorithm_class(name: str) -> Any:
-    """stable-baselines3's class of an algorithm.
+    """Return stable-baselines3's class of an algorithm.
 
     Raises:
         InputError: an unknown name, or the extra `rl` is not installed.
@@ -117,13 +115,13 @@ def algorithm_class(name: str) -> Any:
 def load_model(
     algorithm: str, path: str | os.PathLike[str], task: str, observation: str
 ) -> tuple[ModelCard, Any]:
-    """What a file says of its model, and the model.
+    """Load a model and its card.
 
     Args:
-        algorithm: that made it.
+        algorithm: that it was trained with.
         path: the model file.
         task: one of `TASKS`.
-        observation: the layout that is observed.
+        observation: version of the layout that the environment observes.
 
     Raises:
         InputError: a file that is no model, of another algorithm, another task or another observation.
@@ -140,29 +138,29 @@ def load_model(
             f"{path}: observes {card.observation!r}, this version of parkenv gives {observation!r}; "
             f"it was trained with parkenv {card.parkenv}"
         )
-    # A model that learns no more needs no memory, and hindsight none of an environment's goals.
+    # A model that is not trained further needs no replay buffer.
     unneeded: dict[str, Any] = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
     kind = algorithm_class(algorithm)
     try:
         return card, kind.load(Path(path), device="cpu", custom_objects=unneeded)
-    except Exception as error:  # whatever a damaged network makes torch stumble over
+    except Exception as error:  # torch raises many kinds for damaged files
         raise InputError(f"{path}: its network cannot be read ({type(error).__name__}: {error})") from error
 
 
 class LearnedAgent:
-    """A trained model as an agent; it observes what `parkenv.envs.local_observation` says, on any lot.
+    """A trained model as an agent for any lot; it observes `parkenv.envs.local_observation`.
 
     Args:
-        problem: where it is to search.
-        algorithm: that made it.
+        problem: lot, goal, speeds and costs.
+        algorithm: that it was trained with.
         path: the model file.
 
     Raises:
         InputError: a file that is no model, of another algorithm, another task or another observation.
 
     Attributes:
-        card: what the file says of itself.
-        local_k: how many slots the observation has to tell of.
+        card: metadata of the file.
+        local_k: slots that the observation must have.
     """
 
     def __init__(
@@ -180,14 +178,14 @@ class LearnedAgent:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, Any]:
-        """stable-baselines3's interface, over `LocalObservation`.
+        """Choose an action by stable-baselines3's interface, for observations of `LocalObservation`.
 
         Raises:
-            InputError: another observation, or nothing can be done, says the mask.
+            InputError: another observation, or a mask that allows no action.
         """
         if "local" not in observation:
             raise InputError(
-                f"{self.name} observes what parkenv.envs.local_observation.LocalObservation says, got "
+                f"{self.name} wants observations of parkenv.envs.local_observation.LocalObservation, got "
                 f"{', '.join(observation)}"
             )
         given, wanted = observation["local"].shape[-1:], self.model.observation_space["local"].shape

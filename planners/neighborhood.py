@@ -69,6 +69,8 @@ class Neighborhood:
             slots, rates = seen[seen >= 0], rates[row][seen >= 0]
         views = np.empty(len(slots), VIEW)
         views["slot"], views["rate"] = slots, rates
+        # Copies: numba compiles a function once more for arrays that are read-only, as those of the whole lot are.
+        neighbors, starts = neighbors.copy(), starts.copy()
         table, own_rate = RoadTable.over(neighbors, problem.move_s[vertices]), np.zeros(n_slots)
         own = slots == np.repeat(np.arange(len(vertices)), np.diff(starts))
         own_rate[slots[own]] = rates[own]

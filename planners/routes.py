@@ -29,7 +29,8 @@ class DriveRoutes:
     """
 
     def __init__(self, problem: SearchProblem) -> None:
-        self._neighbors, self._move_s = problem.lot.neighbors, problem.move_s
+        # Copies: numba compiles a function once more for arrays that are read-only.
+        self._neighbors, self._move_s = problem.lot.neighbors.copy(), problem.move_s.copy()
         n_moves = len(MOVES)
         self._out_start = np.arange(0, n_moves * len(self._neighbors) + 1, n_moves, dtype=np.int32)
         self._out_target, self._out_s = self._neighbors.ravel(), self._move_s.ravel()

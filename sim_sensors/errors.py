@@ -1,5 +1,5 @@
-"""What the simulated sensors raise."""
+"""Errors of the simulated sensors."""
 
 
 class SensorError(ValueError):
-    """A scene, a sensor or a pose that cannot be simulated as it was given."""
+    """An invalid scene, sensor or pose."""

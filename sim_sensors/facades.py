@@ -1,4 +1,4 @@
-"""Walls with windows, from a formula instead of a picture."""
+"""Procedural texture of walls with windows."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from sim_sensors.compilation import compiled
 def facade(
     along: float, z: float, nz: float, footprint: float, lit_windows: float, grain: Tile
 ) -> tuple[float, float, float]:
-    """Factor on the wall's albedo, light from a window, mirror reflection: storeys with windows in frames."""
+    """Return the factor on the wall's albedo, the light of a window and the reflection, for storeys of windows."""
     courses = sample_tile(grain, along * 0.4, z * 2.5, pixel_level(footprint))
     wall = 0.7 + 0.55 * courses
     if abs(nz) > 0.5:

@@ -1,4 +1,4 @@
-"""The truth about the vehicles in a frame: where each one is, how much of it is seen, and from which side."""
+"""Ground truth of the vehicles in a frame: bounding boxes, visible fractions, and viewing sides."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIDE_LIMIT = math.radians(60.0)
 
 
 class View(IntEnum):
-    """From where a vehicle is seen, by the angle in the ground plane between its axis and the line of sight."""
+    """Viewing side of a vehicle, by the angle in the ground plane between its axis and the line of sight."""
 
     END = 0  # front or rear: below 30°
     OBLIQUE = 1
@@ -31,7 +31,7 @@ class View(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class VehicleBoxes:
-    """Every vehicle that would show in the image if it stood alone, nearest first.
+    """Every vehicle that would be visible without occlusion, nearest first.
 
     Attributes:
         ids: (n,) int32, as in the instances.
@@ -52,16 +52,15 @@ class VehicleBoxes:
 
 
 def vehicle_boxes(camera: PinholeCamera, scene: Drawable, pose: FloatArray, frame: Frame) -> VehicleBoxes:
-    """Boxes of the vehicles (instances with an id above 0) in a frame that the camera took.
+    """Return the boxes of the vehicles (instances with an id above 0) in a frame of the camera.
 
-    Each vehicle is drawn once more without depth test, in one image that remembers who was last at a pixel; so the
-    cost is that of the rasteriser alone.
+    Each vehicle is rasterized again without depth test, in one image that stores the last vehicle at each pixel.
 
     Args:
-        camera: that took the frame.
-        scene: that it looked at.
-        pose: from where, (4, 4).
-        frame: its ids are counted.
+        camera: the camera of the frame.
+        scene: the scene of the frame.
+        pose: (4, 4) camera to world.
+        frame: its instance ids are counted.
     """
     pose = checked_pose(scene, pose)
     size = (camera.width, camera.height)
@@ -97,7 +96,7 @@ def _views(offset: FloatArray, yaw: FloatArray) -> NDArray[np.int8]:
 def _extents_alone(
     corners: NDArray[np.float32], instance: IntArray, n: int, width: int, height: int
 ) -> tuple[NDArray[np.int64], IntArray]:
-    """Pixels and box of each instance without the others; its triangles come one after the other."""
+    """Return the pixel count and box of each instance without the others; its triangles are consecutive."""
     last = np.full((height, width), -1, dtype=np.int32)
     count = np.zeros(n, dtype=np.int64)
     box = _empty_boxes(n, width, height)

@@ -1,4 +1,4 @@
-"""The geometry that the camera draws: triangle meshes, where copies of them stand, and the ground."""
+"""Geometry for the camera: triangle meshes, instances of them, and the ground."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Float32Array = NDArray[np.float32]
 
 
 class Material(IntEnum):
-    """How a surface takes the light; the camera's shading goes by it."""
+    """Materials, which the camera shades differently."""
 
     PAINT = 0  # clear-coated, glossy
     GLASS = 1  # seen through, with reflections
@@ -33,7 +33,7 @@ class Material(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles of one thing in its own frame: x forward, y left, z up from the ground, m.
+    """Triangles of one object in its own frame: x forward, y left, z up from the ground, m.
 
     Attributes:
         vertices: (v, 3) float32, m. Creases have a vertex for either side.
@@ -52,7 +52,7 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class MeshPool:
-    """Many meshes in one row of arrays, so that compiled code walks them without objects.
+    """Many meshes in shared arrays, for compiled code.
 
     Attributes:
         vertices, normals, triangles, material, color: as in `Mesh`, one mesh after the other; the indices
@@ -76,13 +76,13 @@ class MeshPool:
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """Where copies of meshes stand.
+    """Poses of copies of meshes.
 
     Attributes:
         mesh: (n,) int32, index into the pool.
         pose: (n, 4) float64, x, y, z in m and yaw in rad, world frame.
         ids: (n,) int32, what the camera writes into its instance image: 0 for scenery, above for vehicles.
-        still: the first of these instances, where the others move: shadows of what stands still are kept for as
+        still: the static ones, which come first, if others move: shadows of static instances are kept for as
             long as this object lives. None: nothing moves.
     """
 

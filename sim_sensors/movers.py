@@ -1,4 +1,4 @@
-"""What moves through a scene: vehicles that drive and people who walk, at one moment."""
+"""Moving vehicles and pedestrians of a scene at one moment."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ LOOKS = 12
 
 @dataclass(frozen=True, eq=False)
 class Movers:
-    """Vehicles that drive and people who walk, at one moment; world frame.
+    """Moving vehicles and pedestrians at one moment; world frame.
 
     Args:
         vehicle_pose: (m, 3): x, y in m, yaw in rad.
         vehicle_model: (m,) int, index into the scene's `fleet.models`.
         walker_pose: (p, 3): x, y in m, yaw in rad.
         walker_stride: (p,) turns, phase of the stride.
-        walker_look: (p,) int, 0 to `LOOKS` - 1: who it is.
+        walker_look: (p,) int, 0 to `LOOKS` - 1: appearance.
 
     Raises:
         SensorError: a wrong shape, a value that is not finite, an index below 0 or no such person.
@@ -60,21 +60,21 @@ class Movers:
 
     @property
     def n_vehicles(self) -> int:
-        """How many vehicles drive."""
+        """Number of moving vehicles."""
         return len(self.vehicle_pose)
 
     @property
     def n_walkers(self) -> int:
-        """How many people walk."""
+        """Number of pedestrians."""
         return len(self.walker_pose)
 
     @property
     def gait(self) -> IntArray:
-        """(p,) int64: which of the `GAITS` pictures of a stride each walker shows."""
+        """Phase of each pedestrian's stride, (p,) int64, 0 to `GAITS` - 1."""
         return np.round(self.walker_stride * GAITS).astype(np.int64) % GAITS
 
 
 @lru_cache(maxsize=1)
 def people_meshes() -> tuple[Mesh, ...]:
-    """Every person in every gait, `GAITS` after `GAITS`."""
+    """Return the mesh of every pedestrian in every gait, `GAITS` for each appearance."""
     return tuple(pedestrian_mesh(gait / GAITS, look) for look in range(LOOKS) for gait in range(GAITS))

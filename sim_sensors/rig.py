@@ -1,4 +1,4 @@
-"""Which sensor sits where on the car, and what all of them deliver at once."""
+"""Sensor rigs: the sensors on a car, their poses, and their joint measurements."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ FloatArray = NDArray[np.float64]
 
 RIGHT, LEFT = -math.pi / 2, math.pi / 2
 EYE_M = 1.3
-"""Height, m, of the rigs' cameras."""
+"""m, height of the rigs' cameras."""
 WIDE = PinholeCamera.from_field_of_view(horizontal=math.pi / 2)
-"""The rigs' camera: a car drives past the noses of others at a distance of 1.5 m, and is to see them whole."""
+"""The rigs' camera: wide enough to see parked cars completely from 1.5 m in front of them."""
 
 
 class Sensed(Drawable, Protocol):
-    """What a rig can be driven through: what a camera draws, and what a laser meets."""
+    """A scene that a rig can measure: geometry for cameras, and a plane for laser scanners."""
 
     @property
     def scan_plane(self) -> ScanPlane:
@@ -34,17 +34,17 @@ class Sensed(Drawable, Protocol):
 
 
 RIG_NAMES = ("laser", "stereo", "both_sides")
-"""Rigs that `SensorRig.named` knows."""
+"""Names of rigs for `SensorRig.named`."""
 
 
 @dataclass(frozen=True)
 class Mount:
-    """Where a sensor sits: vehicle frame, x forward, y left, z up from the ground, origin below its middle.
+    """The pose of a sensor on the vehicle: x forward, y left, z up, origin on the ground below the vehicle's centre.
 
     Args:
-        x, y, z: m.
-        yaw: rad, where it looks, counter-clockwise from forward.
-        pitch: rad, above 0 looks up.
+        x, y, z: m, position.
+        yaw: rad, direction of the sensor, counter-clockwise from forward.
+        pitch: rad, positive upwards.
 
     Raises:
         SensorError: a number that is not finite, or a sensor on or below the ground.
@@ -64,13 +64,13 @@ class Mount:
             raise SensorError(f"mount z is {self.z} m, want above the ground")
 
     def in_world(self, vehicle: FloatArray) -> tuple[float, float, float]:
-        """Position, m, and yaw, rad, in the world frame on a vehicle at x, y, yaw."""
+        """Return x, y in m and yaw in rad in the world frame, for a vehicle at (3,) x, y, yaw."""
         x, y, yaw = vehicle
         cosine, sine = math.cos(yaw), math.sin(yaw)
         return x + cosine * self.x - sine * self.y, y + sine * self.x + cosine * self.y, yaw + self.yaw
 
     def camera_pose(self, vehicle: FloatArray) -> FloatArray:
-        """Camera-to-world matrix, (4, 4), of a camera here on a vehicle at x, y, yaw."""
+        """Return the camera-to-world matrix, (4, 4), of a camera at this mount, for a vehicle at (3,) x, y, yaw."""
         x, y, yaw = self.in_world(vehicle)
         return camera_pose(x, y, self.z, yaw, self.pitch)
 
@@ -81,7 +81,7 @@ class Capture:
 
     Attributes:
         pose: (3,) float64, x, y in m and yaw in rad of the vehicle, world frame.
-        images: by the camera's name; the frames hold depth and ids as well, which are the truth.
+        images: by the camera's name; a frame also holds the true depth and instance ids.
         pairs: by the stereo camera's name.
         scans: by the laser's name, (n_beams,) float32, m, `inf` for no return.
     """
@@ -94,15 +94,15 @@ class Capture:
 
 @dataclass(frozen=True)
 class SensorRig:
-    """Sensors on a car; the calibration as data.
+    """The sensors of a car and their poses.
 
     Args:
-        cameras: name, camera and mount of each; the optical axis is the mount's forward.
-        stereo_cameras: the same of stereo cameras; the mount is the left camera's.
-        lasers: the same of laser scanners; angle 0 is the mount's forward.
+        cameras: name, camera and mount of each; the optical axis is the mount's forward direction.
+        stereo_cameras: the same for stereo cameras; the mount is that of the left camera.
+        lasers: the same for laser scanners; angle 0 is the mount's forward direction.
 
     Raises:
-        SensorError: no sensor at all, or a name that stands twice.
+        SensorError: no sensor at all, or a name that is used twice.
 
     Examples:
         >>> rig = SensorRig.thesis()
@@ -120,14 +120,14 @@ class SensorRig:
             raise SensorError("the rig has no sensor, want at least one camera, stereo camera or laser")
         for name in names:
             if names.count(name) > 1:
-                raise SensorError(f"sensor name {name!r} stands twice, want different ones")
+                raise SensorError(f"sensor name {name!r} is used twice, want different names")
 
     @classmethod
     def named(cls, name: str) -> SensorRig:
-        """One of `RIG_NAMES`: `laser` is the thesis's, `stereo` and `both_sides` are as their methods say.
+        """Return one of the rigs in `RIG_NAMES`: `laser` is `thesis()`, the others are the methods of their name.
 
         Raises:
-            SensorError: another name.
+            SensorError: an unknown name.
         """
         if name not in RIG_NAMES:
             raise SensorError(f"rig is {name!r}, want one of {', '.join(RIG_NAMES)}")
@@ -135,7 +135,7 @@ class SensorRig:
 
     @classmethod
     def thesis(cls) -> SensorRig:
-        """The thesis's robot (T §4.1, Fig. 4.3): a camera to the right above a 270° laser, on one vertical axis."""
+        """Return the thesis's rig (T §4.1, Fig. 4.3): a camera to the right above a 270° laser, on one axis."""
         return cls(
             cameras=(("right", WIDE, Mount(z=EYE_M, yaw=RIGHT)),),
             lasers=(("laser", LaserScanner(), Mount(z=0.5)),),
@@ -143,12 +143,12 @@ class SensorRig:
 
     @classmethod
     def stereo(cls) -> SensorRig:
-        """A stereo pair to the right and no laser."""
+        """Return a rig with a stereo camera to the right and no laser."""
         return cls(stereo_cameras=(("right", StereoCamera(WIDE), Mount(z=EYE_M, yaw=RIGHT)),))
 
     @classmethod
     def both_sides(cls) -> SensorRig:
-        """The thesis's rig with a second camera, to the left."""
+        """Return the thesis's rig with a second camera, to the left."""
         return cls(
             cameras=(
                 ("right", WIDE, Mount(z=EYE_M, yaw=RIGHT)),
@@ -169,11 +169,11 @@ class SensorRig:
         """Measure with every sensor at one pose; equal arguments give equal results.
 
         Args:
-            scene: what is around. The vehicle that carries the rig is not part of it.
+            scene: the surroundings, without the vehicle that carries the rig.
             pose: (3,) x, y in m and yaw in rad of the vehicle, world frame.
-            weather: the light; a sunny day where None.
-            seed: of all sensors' noise.
-            noise: whether the laser's ranges are noisy; images always are.
+            weather: None: a sunny day.
+            seed: of the noise of all sensors.
+            noise: whether the laser's ranges have noise; images always have.
 
         Raises:
             SensorError: a pose that is not three finite numbers; what the sensors raise.
@@ -200,13 +200,13 @@ class SensorRig:
         weather: Weather | None = None,
         seed: int = 0,
     ) -> Iterator[Capture]:
-        """Captures along a path; see `poses_along`. The k-th one is seeded with `seed + k`."""
+        """Yield captures along a path (see `poses_along`); the k-th one uses the seed `seed + k`."""
         for k, pose in enumerate(poses_along(path, every)):
             yield self.capture(scene, pose, weather, seed + k)
 
 
 def poses_along(path: ArrayLike, every: float) -> FloatArray:
-    """Vehicle poses every so many metres along a polyline, heading as it does, both ends included.
+    """Return vehicle poses at equal distances along a polyline, headed along it, both ends included.
 
     Args:
         path: (k, 2) m, at least two different points.
@@ -216,7 +216,7 @@ def poses_along(path: ArrayLike, every: float) -> FloatArray:
         (n, 3) float64, x, y, yaw.
 
     Raises:
-        SensorError: a path of another shape, not finite or of no length, or a distance that is not positive.
+        SensorError: a path of the wrong shape, not finite or without length, or a distance that is not positive.
     """
     points = np.asarray(path, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2 or not np.isfinite(points).all():
@@ -231,7 +231,7 @@ def poses_along(path: ArrayLike, every: float) -> FloatArray:
         raise SensorError("path has no length, want two different points")
     station = np.r_[0.0, np.cumsum(length)]
     at = np.arange(0.0, station[-1], every)
-    # A last step much shorter than the others would be rounding, not driving.
+    # A last step much shorter than the others is a rounding error.
     at = np.r_[at[at < station[-1] - 1e-6 * every], station[-1]]
     leg = np.clip(np.searchsorted(station, at, side="right") - 1, 0, len(length) - 1)
     share = (at - station[leg]) / length[leg]

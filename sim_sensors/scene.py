@@ -1,4 +1,4 @@
-"""A scene: vehicles among surroundings, as the sensors need it; changing one vehicle leaves the rest as it is."""
+"""Scenes: vehicles and their surroundings for the sensors; scenes that differ in one vehicle share the rest."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ NO_VEHICLE = -1
 
 
 class OverlapWarning(UserWarning):
-    """Two vehicles of a scene stand in the same place."""
+    """Two vehicles of a scene overlap."""
 
 
 class Footprints(NamedTuple):
-    """What a horizontal plane at knee height meets, as `footprints.ScanPlane` takes it.
+    """The obstacles in a horizontal plane 0.5 m above the ground, as `footprints.ScanPlane` takes them.
 
     Attributes:
         corners: (n, k, 2) float64, m, world frame, counter-clockwise: a row for every vehicle place, then the posts,
@@ -50,11 +50,11 @@ class Footprints(NamedTuple):
 class Fleet:
     """The meshes of a scene: its surroundings, and every vehicle model with its coarse version.
 
-    Shared by all scenes that differ only in which of these vehicles stand where.
+    Scenes that differ only in the poses of these vehicles share it.
 
     Args:
         models: the vehicle models.
-        surroundings: what else stands about.
+        surroundings: ground and scenery.
     """
 
     def __init__(self, models: Sequence[VehicleModel], surroundings: Surroundings) -> None:
@@ -62,7 +62,7 @@ class Fleet:
         self.surroundings = surroundings
 
     def with_model(self, model: VehicleModel) -> Fleet:
-        """One more model, after the others; the meshes made so far are taken over."""
+        """Return a fleet with one more model, after the others; existing meshes are shared."""
         larger = Fleet((*self.models, model), self.surroundings)
         if "pool" in self.__dict__:
             pair = [model.mesh(DETAILED), model.mesh(COARSE)]
@@ -71,7 +71,7 @@ class Fleet:
 
     @cached_property
     def _scenery(self) -> tuple[list[Mesh], list[int]]:
-        """Distinct meshes of the surroundings, and which of them each thing has."""
+        """Distinct meshes of the surroundings, and the index of each object's mesh."""
         meshes: list[Mesh] = []
         place: dict[int, int] = {}
         index = []
@@ -84,7 +84,7 @@ class Fleet:
 
     @cached_property
     def pool(self) -> MeshPool:
-        """Meshes of the surroundings, people who walk, then the detailed and the coarse mesh of model after model."""
+        """Meshes of the surroundings and of pedestrians, then the detailed and the coarse mesh of each model."""
         meshes = [*self._scenery[0], *people_meshes()]
         before = len(meshes)
         for model in self.models:
@@ -92,16 +92,16 @@ class Fleet:
         return _joined(None, meshes, scenery=before)
 
     def mesh_of(self, model: IntArray) -> NDArray[np.int32]:
-        """Index in the pool of the detailed mesh of each model."""
+        """Return the index in the pool of the detailed mesh of each model."""
         return (len(self._scenery[0]) + LOOKS * GAITS + 2 * model).astype(np.int32)
 
     def mesh_of_walkers(self, movers: Movers) -> NDArray[np.int32]:
-        """Index in the pool of the mesh of everyone who walks."""
+        """Return the index in the pool of each pedestrian's mesh."""
         return (len(self._scenery[0]) + GAITS * movers.walker_look + movers.gait).astype(np.int32)
 
     @cached_property
     def scenery_instances(self) -> Instances:
-        """Everything but the vehicles."""
+        """All instances except the vehicles."""
         things = self.surroundings.standing
         pose = np.zeros((len(things), 4))
         if things:
@@ -130,10 +130,10 @@ class Fleet:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Vehicles in numbered places, and what stands around them. World frame, SI units.
+    """Vehicles in numbered places, and their surroundings. World frame, SI units.
 
-    A place may be empty; its number and so the ids of the other vehicles stay when a vehicle leaves. Make one with
-    `from_arrays`, or from a parking lot with `slot_scenes.scene_of_slots`.
+    A place may be empty, so the ids of the other vehicles stay when a vehicle leaves. Make a scene with `from_arrays`,
+    or from parking slots with `slot_scenes.scene_of_slots`.
 
     Args:
         vehicle_pose: (n, 3) float64: x, y in m, yaw in rad, of each place.
@@ -192,7 +192,7 @@ class Scene:
         paints: Sequence[tuple[int, int, int] | None] | None = None,
         surroundings: Surroundings | None = None,
     ) -> Scene:
-        """A scene of given vehicles.
+        """Make a scene of given vehicles.
 
         Args:
             poses: (n, 3): x, y in m, yaw in rad.
@@ -224,17 +224,17 @@ class Scene:
 
     @property
     def n_vehicles(self) -> int:
-        """How many places there are, empty ones counted."""
+        """Number of places, including empty ones."""
         return len(self.vehicle_pose)
 
     @cached_property
     def present(self) -> IntArray:
-        """The places where a vehicle stands, ascending."""
+        """The occupied places, ascending."""
         return np.flatnonzero(self.vehicle_model != NO_VEHICLE)
 
     @property
     def vehicle_boxes(self) -> FloatArray:
-        """(n, 3) float64, m: length, width, height of each vehicle, its mirrors left out; 0 for an empty place."""
+        """Length, width, height of each vehicle without mirrors, (n, 3) float64, m; 0 for an empty place."""
         boxes = np.zeros((self.n_vehicles, 3))
         boxes[self.present] = self.fleet.sizes[self.vehicle_model[self.present]]
         return boxes
@@ -251,7 +251,7 @@ class Scene:
 
     @cached_property
     def instances(self) -> Instances:
-        """Where every mesh stands, detailed; `pool.coarse` names the coarse ones."""
+        """The poses of all meshes, detailed; `pool.coarse` maps them to coarse ones."""
         still, movers = self.still_instances, self.movers
         if movers is None:
             return still
@@ -274,7 +274,7 @@ class Scene:
 
     @cached_property
     def still_instances(self) -> Instances:
-        """Where everything stands that does not move."""
+        """The instances that do not move."""
         scenery = self.fleet.scenery_instances
         pose = np.zeros((len(self.present), 4))
         pose[:, [0, 1, 3]] = self.vehicle_pose[self.present]
@@ -285,15 +285,8 @@ class Scene:
             np.concatenate([scenery.ids, (self.present + 1).astype(np.int32)]),
         )
 
-    @cached_property
-    def coarse_instances(self) -> Instances:
-        """As `instances`, every vehicle by its coarse mesh."""
-        coarse = self.pool.coarse
-        assert coarse is not None
-        return Instances(coarse[self.instances.mesh], self.instances.pose, self.instances.ids)
-
     def footprints(self) -> Footprints:
-        """What a laser at knee height meets: a convex polygon for each vehicle and post, and wall segments."""
+        """Return the obstacles 0.5 m above the ground: convex polygons of vehicles and posts, and wall segments."""
         outline, count = self.fleet.outlines
         posts, post_count = self.fleet.posts
         corners = np.zeros((self.n_vehicles + len(posts), FOOTPRINT_CORNERS, 2))
@@ -324,12 +317,12 @@ class Scene:
 
     @cached_property
     def scan_plane(self) -> ScanPlane:
-        """`footprints` as the laser scans them; the ids are those of `instances`."""
+        """`footprints` for the laser scanner; the ids are those of `instances`."""
         corners, n_corners, ids, walls = self.footprints()
         return ScanPlane(corners, n_corners, walls, ids)
 
     def footprint(self, i: int) -> FloatArray:
-        """(k, 2) float64, m, world frame: the footprint of the vehicle in place i; (0, 2) if it is empty."""
+        """Return the footprint of the vehicle in place i, (k, 2) float64, m, world frame; (0, 2) if it is empty."""
         self._check_place(i)
         if self.vehicle_model[i] == NO_VEHICLE:
             return np.empty((0, 2))
@@ -342,12 +335,12 @@ class Scene:
     def with_vehicle(
         self, i: int, *, pose: ArrayLike | None = None, model: VehicleModel | None = None
     ) -> Scene:
-        """A scene in which place i has another vehicle, or the same one elsewhere; all else is shared.
+        """Return a scene with another vehicle in place i, or the same one at another pose; all else is shared.
 
         Args:
             i: the place.
-            pose: (3,): x, y in m, yaw in rad; None: where it is.
-            model: None: the one that it has. One that the fleet lacks is added to a copy of its meshes.
+            pose: (3,): x, y in m, yaw in rad; None: unchanged.
+            model: None: unchanged. A model that the fleet lacks is added to a copy of its meshes.
 
         Raises:
             SensorError: no such place, a pose that is not finite, or no model for an empty place.
@@ -366,15 +359,15 @@ class Scene:
         return self._changed(i, self.vehicle_pose[i] if pose is None else pose, number, fleet)
 
     def without_vehicle(self, i: int) -> Scene:
-        """A scene in which place i is empty; all else is shared."""
+        """Return a scene in which place i is empty; all else is shared."""
         self._check_place(i)
         return self._changed(i, self.vehicle_pose[i], NO_VEHICLE, self.fleet)
 
     def with_movers(self, movers: Movers | None) -> Scene:
-        """The same scene at a moment when other vehicles drive and people walk through it; all else is shared.
+        """Return the scene with moving vehicles and pedestrians; all else is shared.
 
         Args:
-            movers: None: nobody. The k-th vehicle has the id `n_vehicles` + 1 + k, people have 0.
+            movers: None: no moving objects. The k-th vehicle has the id `n_vehicles` + 1 + k, people have 0.
 
         Raises:
             SensorError: a model that the fleet does not have.
@@ -411,7 +404,7 @@ class Scene:
 
 
 def overlapping(pose: FloatArray, size: FloatArray) -> IntArray:
-    """Pairs of vehicles whose rectangles overlap.
+    """Return the pairs of vehicles whose rectangles overlap.
 
     Args:
         pose: (n, 3) x, y in m, yaw in rad.
@@ -429,7 +422,7 @@ def overlapping(pose: FloatArray, size: FloatArray) -> IntArray:
 
 
 def _rectangles_meet(pose: FloatArray, size: FloatArray) -> bool:
-    """Whether two rectangles, (2, 3) poses and sizes, overlap: no side of either separates them."""
+    """Return whether two rectangles, (2, 3) poses and sizes, overlap (separating axis test)."""
     axis = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)
     axes = np.concatenate([axis, np.stack([-axis[:, 1], axis[:, 0]], axis=-1)])
     across = np.stack([-axis[:, 1], axis[:, 0]], axis=-1)
@@ -445,7 +438,7 @@ def _moved(outline: FloatArray, pose: tuple[float, float, float]) -> FloatArray:
 
 
 def _placed(outline: FloatArray, pose: FloatArray) -> FloatArray:
-    """(n, k, 2) outlines turned and shifted by (n, 3) poses."""
+    """Transform (n, k, 2) outlines by (n, 3) poses."""
     c, s = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
     x = c * outline[..., 0] - s * outline[..., 1] + pose[:, 0, None]
     y = s * outline[..., 0] + c * outline[..., 1] + pose[:, 1, None]
@@ -460,7 +453,7 @@ def _padded(outlines: Sequence[FloatArray]) -> tuple[FloatArray, IntArray]:
 
 
 def _joined(pool: MeshPool | None, meshes: Sequence[Mesh], scenery: int = 0) -> MeshPool:
-    """A pool with meshes appended: first `scenery` that have no coarse version, then detailed and coarse in turn."""
+    """Append meshes to a pool: first `scenery` meshes without a coarse version, then pairs of detailed and coarse."""
     start = 0 if pool is None else len(pool.radius)
     parts: list[Mesh | MeshPool] = [*([] if pool is None else [pool]), *meshes]
     if not parts:

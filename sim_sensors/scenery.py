@@ -1,4 +1,4 @@
-"""What stands about besides vehicles: buildings, walls, kerbs, trees, lamp posts, people."""
+"""Meshes of scenery: buildings, walls, kerbs, trees, lamp posts, pedestrians."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _made(build: ShapeBuilder, colors: dict[_Part, ArrayLike]) -> Mesh:
 
 
 def building_mesh(outline: ArrayLike, height: float, seed: int) -> Mesh:
-    """A block with storeys of windows set back into its walls, doors, a plinth and a cornice.
+    """Make a building with storeys of recessed windows, doors, a plinth and a cornice.
 
     Args:
         outline: (k, 2) m, a simple polygon, counter-clockwise.
@@ -92,7 +92,7 @@ def building_mesh(outline: ArrayLike, height: float, seed: int) -> Mesh:
         seed: of colours and of which bays have doors.
 
     Returns:
-        The mesh in the outline's own frame; seen from inside, and from above, it is not finished.
+        The mesh in the outline's frame; it has no interior and no roof.
     """
     corner = np.asarray(outline, dtype=np.float64)
     rng = np.random.default_rng([seed, 11])
@@ -120,14 +120,14 @@ def building_mesh(outline: ArrayLike, height: float, seed: int) -> Mesh:
 
 
 class _Facade(NamedTuple):
-    """One side of a building, its outside to the right of the way along it."""
+    """One side of a building, with its outside to the right of its direction."""
 
     start: FloatArray
     along: FloatArray
     length: float
 
     def place(self, u: FloatArray, z: FloatArray, depth: FloatArray) -> FloatArray:
-        """Points at u along the wall, z up and `depth` out of it, m."""
+        """Return points at u along the wall, z up and `depth` outwards, m."""
         out = np.array([self.along[1], -self.along[0]])
         base = self.start + u[..., None] * self.along + depth[..., None] * out
         return np.concatenate([base, z[..., None]], axis=-1)
@@ -187,7 +187,7 @@ def _add_window(build: ShapeBuilder, facade: _Facade, box: tuple[float, float, f
 
 
 def _ears(corner: FloatArray) -> list[tuple[int, int, int]]:
-    """Triangles of a simple counter-clockwise polygon."""
+    """Triangulate a simple counter-clockwise polygon by ear clipping."""
     left = list(range(len(corner)))
     triangles = []
     while len(left) > 3:
@@ -311,7 +311,7 @@ GAITS = 8
 
 
 def pedestrian_mesh(phase: float, seed: int) -> Mesh:
-    """A walking person at the origin who looks along x.
+    """Make a walking pedestrian at the origin, headed along x.
 
     Args:
         phase: of the stride, in turns; 0 and 0.5 are the widest steps.
@@ -381,7 +381,7 @@ def _add_limb(
 
 
 def pedestrian_footprint(phase: float) -> FloatArray:
-    """(6, 2) float64, m: hull of both legs at knee height, person's frame, counter-clockwise."""
+    """Return the hull of both legs at knee height, (6, 2) float64, m, pedestrian's frame, counter-clockwise."""
     stride = abs(np.cos(2 * np.pi * phase))
     front, back = 0.19 + 0.19 * stride, -0.02 - 0.18 * stride  # a knee is bent forward
     middle = 0.5 * (front + back)

@@ -1,4 +1,4 @@
-"""A parking lot's slots and their occupancy as a scene: who parks where, and how crookedly."""
+"""Scenes of parking slots and their occupancy: vehicle models and parking poses."""
 
 from __future__ import annotations
 
@@ -20,27 +20,28 @@ IntArray = NDArray[np.int64]
 LINE_M = 0.10
 """Width of painted slot lines."""
 LIBRARY_MODELS = 100
-"""How many vehicle models a lot's cars are drawn from."""
+"""Number of vehicle models from which cars are drawn."""
 PAVED_MARGIN_M = 7.0
 KERB_ROOM_M = 0.1
-"""How much wider than a car its slot must be along the kerb."""
+"""m; a kerbside slot must be this much wider than its car."""
 NOSE_GAP_M = 0.05
-"""What is left at least between a car and the inner end of its slot; another row may begin there."""
+"""m; least distance between a car and the closed end of its slot, where another row may begin."""
 
 
 @dataclass(frozen=True)
 class ParkingManners:
-    """How cars stand in their slots.
+    """Distribution of parking poses.
 
-    Every car's offsets are normal with these deviations, cut at three and cut again so that the car's rectangle stays
-    within its slot; one that is too long for it stands out at the mouth. A model is chosen only for slots that it fits.
+    The offsets of a car are normal with these standard deviations, clipped at three of them and so that the car's
+    rectangle stays within its slot; a car that is too long extends out of the open end. A model is used only in slots
+    that it fits.
 
     Args:
-        lateral_m: deviation to the side of the slot's middle line, m.
-        along_m: deviation along it, m.
-        yaw_rad: deviation of the heading, rad.
-        nose_out: share of cars that stand against the slot's yaw, backed in; kerbside slots have none.
-        door_room_m: how much wider than a car its slot must be, kerbside ones excepted.
+        lateral_m: standard deviation across the slot, m.
+        along_m: standard deviation along the slot, m.
+        yaw_rad: standard deviation of the heading, rad.
+        nose_out: fraction of cars that are backed in, against the slot's yaw; none in kerbside slots.
+        door_room_m: how much wider than a car its slot must be, except kerbside slots.
         overhang_m: how much longer than its slot a car may be; in a kerbside slot it must be as much shorter.
     """
 
@@ -62,16 +63,15 @@ class ParkingManners:
 
 @lru_cache(maxsize=4)
 def vehicle_library(n_models: int = LIBRARY_MODELS) -> tuple[VehicleModel, ...]:
-    """The models of seeds 0 to n - 1, bodies, sizes and paints by how common they are."""
+    """Return the vehicle models of seeds 0 to n - 1, with bodies, sizes and paints by their frequency."""
     return tuple(VehicleModel.from_seed(None, seed) for seed in range(n_models))
 
 
 @dataclass(frozen=True, eq=False)
 class SlotLot:
-    """Slots, and which car every arrival at each of them would be.
+    """Parking slots, and the car of every arrival at each of them.
 
-    The car in a slot and how it stands are drawn from (seed, slot, arrival) alone: neither other slots nor the order
-    of arrivals matter.
+    The model and pose of a car depend on (seed, slot, arrival) alone, not on other slots or the order of arrivals.
 
     Args:
         slot_xy: (n, 2) m, centres.
@@ -80,8 +80,8 @@ class SlotLot:
         slot_width: (n,) or () m.
         kerbside: (n,) or () bool, slots that lie along the lane.
         surroundings: ground and scenery; None: asphalt under and around the slots, and their painted lines.
-        manners: how cars stand.
-        n_models: how many vehicle models there are.
+        manners: distribution of parking poses.
+        n_models: number of vehicle models.
         seed: 0 or more.
 
     Raises:
@@ -137,7 +137,7 @@ class SlotLot:
 
     @cached_property
     def fitting(self) -> list[IntArray]:
-        """For each slot the models that fit it."""
+        """For each slot, the models that fit it."""
         size = np.array([m.size for m in vehicle_library(self.n_models)])
         spare = np.where(self._column("kerbside"), -self.manners.overhang_m, self.manners.overhang_m)
         # Kerbside, doors open over the pavement and the street.
@@ -152,11 +152,11 @@ class SlotLot:
         return out
 
     def arrival(self, slot: int, number: int) -> tuple[FloatArray, int]:
-        """The car of one arrival.
+        """Return the car of one arrival.
 
         Args:
-            slot: its index.
-            number: 0 or more: the how manieth car since the start.
+            slot: index of the slot.
+            number: index of the car among the arrivals at this slot, 0 or more.
 
         Returns:
             (3,) float64, x, y in m and yaw in rad; index of its model in the fleet.
@@ -180,11 +180,11 @@ class SlotLot:
         return np.array([*xy, yaw + turn + (np.pi if backed_in else 0.0)]), chosen
 
     def scene(self, occupied: ArrayLike, arrivals: ArrayLike = 0) -> Scene:
-        """The lot under an occupancy; place i of the scene is slot i.
+        """Return the scene of an occupancy; place i of the scene is slot i.
 
         Args:
             occupied: (n,) bool.
-            arrivals: (n,) or () int, 0 or more: which arrival stands in each slot.
+            arrivals: (n,) or () int, 0 or more: index of the arrival in each slot.
         """
         n = len(self._column("slot_xy"))
         taken = np.asarray(occupied)
@@ -205,13 +205,13 @@ class SlotLot:
         return Scene(pose, model, self.fleet)
 
     def filled(self, scene: Scene, slot: int, arrival: int) -> Scene:
-        """A scene of this lot after one arrival at a slot; use `Scene.without_vehicle` for a departure."""
+        """Return the scene after one arrival at a slot; use `Scene.without_vehicle` for a departure."""
         pose, model = self.arrival(slot, arrival)
         return scene.with_vehicle(slot, pose=pose, model=self.fleet.models[model])
 
 
 def slot_surroundings(lot: SlotLot, lanes: Sequence[ArrayLike] = (), **more: object) -> Surroundings:
-    """Asphalt under slots and lanes, and the slots' painted lines: both sides, of kerbside ones the ends too.
+    """Return asphalt under slots and lanes, and painted lines: both sides of slots, and the ends of kerbside ones.
 
     Args:
         lot: the slots.
@@ -231,7 +231,7 @@ def slot_surroundings(lot: SlotLot, lanes: Sequence[ArrayLike] = (), **more: obj
 
 
 def slot_lines(lot: SlotLot) -> FloatArray:
-    """(k, 5) float64: ends and width, m, of the lines of all slots; a line between two slots comes once."""
+    """Return ends and width of the lines of all slots, (k, 5) float64, m; a line between two slots appears once."""
     xy, yaw = np.asarray(lot.slot_xy), np.asarray(lot.slot_yaw)
     half = 0.5 * np.column_stack([np.asarray(lot.slot_length), np.asarray(lot.slot_width)])
     heading = np.column_stack([np.cos(yaw), np.sin(yaw)])
@@ -261,7 +261,7 @@ def scene_of_slots(
     manners: ParkingManners | None = None,
     **surroundings: object,
 ) -> Scene:
-    """A lot and its occupancy as a scene, in one call.
+    """Make a scene of parking slots and their occupancy in one call.
 
     Args:
         slot_xy: (n, 2) m, centres.
@@ -270,7 +270,7 @@ def scene_of_slots(
         slot_width: (n,) or () m.
         occupied: (n,) bool.
         kerbside: (n,) or () bool, slots that lie along the lane.
-        arrivals: (n,) or () int, 0 or more: which arrival stands in each slot.
+        arrivals: (n,) or () int, 0 or more: index of the arrival in each slot.
         lanes: polylines, (k, 2) m, that are paved.
         seed: 0 or more.
         manners: how cars stand.

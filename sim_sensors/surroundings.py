@@ -1,4 +1,4 @@
-"""What of a scene does not drive away: the ground and all that stands on it, given as plain arrays."""
+"""The static surroundings of a scene, from plain arrays: ground and scenery."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ WALL_THICKNESS_M = 0.24
 
 
 class Standing(NamedTuple):
-    """One thing on the ground: its mesh, x, y, yaw, and its outline at knee height in its own frame, if it has one."""
+    """A static object: its mesh, pose x, y, yaw, and its outline 0.5 m above the ground in its own frame, if any."""
 
     mesh: Mesh
     pose: tuple[float, float, float]
@@ -42,7 +42,7 @@ class Standing(NamedTuple):
 
 
 def floats(name: str, value: ArrayLike, columns: int) -> FloatArray:
-    """`value` as a finite, read-only (n, columns) float64 array; an empty one may have any shape.
+    """Return `value` as a finite, read-only (n, columns) float64 array; an empty one may have any shape.
 
     Raises:
         SensorError: another shape, or a value that is not finite.
@@ -138,12 +138,12 @@ class Surroundings:
 
     @cached_property
     def ground(self) -> Ground:
-        """For the camera."""
+        """The ground for the camera."""
         return Ground(tuple(np.asarray(p) for p in self.paved), self._table("markings"), self.seed)
 
     @cached_property
     def standing(self) -> tuple[Standing, ...]:
-        """Everything that stands on the ground; equal things share their mesh."""
+        """All static objects; equal ones share their mesh."""
         things: list[Standing] = []
         for i, (outline, height) in enumerate(
             zip(self._outlines, self._table("building_heights"), strict=True)
@@ -180,9 +180,9 @@ class Surroundings:
 
     @cached_property
     def wall_segments(self) -> FloatArray:
-        """(m, 2, 2) float64, m: what a laser at knee height meets of buildings and walls, as line segments.
+        """Line segments of buildings and walls 0.5 m above the ground, (m, 2, 2) float64, m.
 
-        A free-standing wall is met on both faces and at both ends.
+        A free-standing wall has both faces and both ends.
         """
         sides = [np.stack([a, np.roll(a, -1, axis=0)], axis=1) for a in self._outlines]
         for x0, y0, x1, y1, height in self._table("walls").tolist():

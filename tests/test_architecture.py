@@ -1,6 +1,7 @@
 """The architecture: which module may import which, and what importing costs."""
 
 import ast
+import importlib
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
@@ -133,3 +134,23 @@ def test_the_command_line_answers_without_loading_the_world():
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout
     assert loaded.strip() == "[]"
+
+
+def test_a_laser_alone_loads_no_camera():
+    program = (
+        "import sys; from sim_sensors.laser import LaserScanner;"
+        "print([m for m in sys.modules if m.startswith('sim_sensors.camera') or m == 'cv2'])"
+    )
+    loaded = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    ).stdout
+    assert loaded.strip() == "[]"
+
+
+@pytest.mark.parametrize(
+    "package", ["sim_sensors", "sim_sensors.camera", "sim_sensors.laser", "sim_sensors.vehicles"]
+)
+def test_every_name_that_a_package_lists_can_be_imported(package):
+    module = importlib.import_module(package)
+    for name in module.__all__:
+        assert getattr(module, name).__name__ == name

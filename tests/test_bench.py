@@ -93,7 +93,7 @@ def test_steps_are_measured_and_peers_that_are_not_there_are_named(monkeypatch):
     monkeypatch.setattr(bench_env, "find_spec", lambda name: None)
     rows = bench_env.env_rows(seed=0, seconds=0.0, batch=4, large=300)
     measured = [row for row in rows if row["part"] in ("batch", "single") and row["value"] is not None]
-    assert len(measured) == 5
+    assert len(measured) == 6
     assert all(row["value"] > 0 and row["ratio"] == row["value"] / row["peer_value"] for row in measured)
     absent = [row["case"] for row in rows if row["value"] is None]
     assert absent == [
@@ -101,5 +101,5 @@ def test_steps_are_measured_and_peers_that_are_not_there_are_named(monkeypatch):
         for name in ("highway_env parking-v0", "minigrid MiniGrid-Empty-8x8-v0", "envpool CartPole-v1")
     ]
     memory = {row["case"]: row["value"] for row in rows if row["part"] == "memory"}
-    # Of each slot 48 + 12 + 4 bytes, and 4 + 16 of the full belief.
-    assert memory["batch of 4, 200 slots, full belief"] == pytest.approx(200 * 84 / 1024, rel=0.1)
+    # Of each slot 40 + 32 + 4 bytes, and 4 + 16 of the full belief.
+    assert memory["batch of 4, 200 slots, full belief"] == pytest.approx(200 * 96 / 1024, rel=0.1)

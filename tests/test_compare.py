@@ -1,6 +1,7 @@
 """`parkenv compare` and its neighbours from the outside: results, resuming, faults."""
 
 import csv
+import dataclasses
 import json
 import os
 import re
@@ -65,7 +66,7 @@ def test_the_summary_is_what_the_episodes_say_and_jobs_do_not_matter(tmp_path):
         low, high = row["total_s_ci95"]
         assert low < row["total_s"] < high
         assert row["total_s"] == pytest.approx(
-            row["drive_s"] + row["failed_s"] + row["walk_s"] + row["gave_up_s"]
+            row["drive_s"] + row["failed_s"] + row["walk_s"] + row["parking_cost_s"] + row["gave_up_s"]
         )
         assert row["regret_s"] >= -1e-9
         assert row["episodes"] == 25
@@ -189,6 +190,24 @@ def test_agents_may_be_given_maps_that_are_wrong(tmp_path):
     assert not (tmp_path / "time_split_mini-map-says-1.png").exists()
 
 
+def test_parking_costs_of_a_lot_file_reach_rows_table_and_figures(tmp_path):
+    lot = packaged_lot("mini")
+    write_lot(
+        dataclasses.replace(lot, slot_parking_cost_s=np.full(lot.n_slots, 12.5)), tmp_path / "lot.geojson"
+    )
+    done = parkenv(
+        "compare", "--lot", tmp_path / "lot.geojson", "--agents", "mdp,first-free", "-n", 4, "--jobs", 1,
+        "--occupancy-levels", "none", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "price" in done.stdout
+    for row in json.loads((tmp_path / "out" / "summary.json").read_text())["rows"]:
+        assert row["parking_cost_s"] == pytest.approx(12.5 * row["parked_fraction"])
+        parts = ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s")
+        assert row["total_s"] == pytest.approx(sum(row[name] for name in parts))
+        assert row["regret_s"] >= -1e-6
+
+
 def test_where_the_optimum_is_known_the_table_says_how_far_off_others_are(tmp_path):
     done = parkenv(*small(tmp_path, agents="exact,greedy-drive", episodes=6))
     assert done.returncode == 0, done.stderr
@@ -254,7 +273,9 @@ def test_degenerate_samples_have_sane_intervals():
 def test_differences_are_paired_by_seed():
     def episode(seed, total):
         zero = dict.fromkeys(("drive_s", "failed_s", "walk_s", "gave_up_s", "failed_parks", "replans"), 0.0)
-        more = dict.fromkeys(("driven_m", "walked_m", "slots_passed", "occupancy", "bound_s"), 0.0)
+        more = dict.fromkeys(
+            ("parking_cost_s", "driven_m", "walked_m", "slots_passed", "occupancy", "bound_s"), 0.0
+        )
         return {"seed": seed, "total_s": total, "parked": True, **zero, **more}
 
     first = [episode(s, 100.0 * s) for s in range(20)]

@@ -1,4 +1,4 @@
-"""Drivers that learn: they practise on what the environment is, trainings can be stopped, and their models drive."""
+"""Training of parking agents: the training environment matches the environment, trainings resume, models drive."""
 
 import dataclasses
 import json
@@ -59,7 +59,7 @@ from planners.driving.policy_interface import (
 from planners.learned import ModelCard
 
 MINI, STREET = packaged_lot("mini"), packaged_lot("street")
-EXAMINED = range(2_000_000, 2_000_006)
+EVALUATED = range(2_000_000, 2_000_006)
 STEPS = {"ppo": 2_000, "sac": 1_000, "tqc": 1_000}
 
 
@@ -74,7 +74,7 @@ class Always:
 
 
 def training_of(algorithm, steps, every=None, lots=(MINI,)):
-    return DriveTraining(algorithm, steps, every or steps // 2, lots, EXAMINED)
+    return DriveTraining(algorithm, steps, every or steps // 2, lots, EVALUATED)
 
 
 FULL_SIZE = dict(DRIVE_CONFIGS)
@@ -87,11 +87,11 @@ SMALL = {
 
 @pytest.fixture(scope="module", autouse=True)
 def small():
-    """The recipes, with networks and batches that are fast to train."""
+    """The training configs, with networks and batches that are fast to train."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, recipe in DRIVE_CONFIGS.items():
-            changed = {**recipe.settings, **SMALL[name], "policy_kwargs": {"net_arch": [16]}}
-            patch.setitem(DRIVE_CONFIGS, name, dataclasses.replace(recipe, n_envs=16, settings=changed))
+        for name, config in DRIVE_CONFIGS.items():
+            changed = {**config.settings, **SMALL[name], "policy_kwargs": {"net_arch": [16]}}
+            patch.setitem(DRIVE_CONFIGS, name, dataclasses.replace(config, n_envs=16, settings=changed))
         yield
 
 
@@ -103,7 +103,7 @@ def trained(request, tmp_path_factory):
     return request.param, folder
 
 
-# What is practised on
+# The training environment
 
 
 @pytest.mark.parametrize("lot", [MINI, STREET, packaged_lot("campus")], ids=lambda lot: lot.name)
@@ -214,7 +214,7 @@ def test_a_decision_asks_for_a_speed_and_gets_it(asked, reached):
 # Practice
 
 
-def practice_of(algorithm, n=4, lots=(MINI, STREET), levels=None):
+def training_env(algorithm, n=4, lots=(MINI, STREET), levels=None):
     return DriveTrainingEnv(n, slot_groups(lots), DRIVE_CONFIGS[algorithm], levels)
 
 
@@ -225,8 +225,8 @@ def test_places_are_the_kinds_of_slots_that_there_are():
     ]  # fmt: skip
 
 
-def test_equal_seeds_give_equal_practice_and_ends_are_told():
-    several = [practice_of("ppo", 6) for _ in range(2)]
+def test_equal_seeds_give_equal_episodes_and_report_their_ends():
+    several = [training_env("ppo", 6) for _ in range(2)]
     rng, ends = np.random.default_rng(1), 0
     for env in several:
         env.seed(5)
@@ -247,7 +247,7 @@ def test_equal_seeds_give_equal_practice_and_ends_are_told():
 
 
 def test_a_level_is_mastered_by_parking_and_by_nothing_else():
-    env = practice_of("ppo")
+    env = training_env("ppo")
     for _ in range(TRIED):
         env._record_outcome("parallel", 0, True)
         env._record_outcome("perpendicular", 5, True)  # of another level
@@ -264,7 +264,7 @@ def test_levels_make_tasks_harder():
     """At the first level the car is in its slot or just before it; at the last one it is on the lane."""
     away = []
     for level in (0, len(DRIVE_CONFIGS["ppo"].curriculum) - 1):
-        env = practice_of("ppo", 64, levels=dict.fromkeys(("perpendicular", "parallel"), level))
+        env = training_env("ppo", 64, levels=dict.fromkeys(("perpendicular", "parallel"), level))
         env.seed(0)
         seen = env.reset()
         away.append(np.median(np.hypot(*seen["achieved_goal"][:, :2].T)))
@@ -291,7 +291,7 @@ def test_the_way_in_leads_from_the_slot_back_to_the_start_and_touches_nothing(pl
 def test_drives_on_the_way_in_begin_as_far_from_its_end_as_the_level_says():
     curriculum = DRIVE_CONFIGS["ppo"].curriculum
     level = next(i for i, stage in enumerate(curriculum) if stage.starts == WAY_IN)
-    env = practice_of("ppo", 64, lots=(STREET,), levels={"parallel": level})
+    env = training_env("ppo", 64, lots=(STREET,), levels={"parallel": level})
     env.seed(1)
     env.reset()
     ways = [task.path for task in env._cached[env._groups["parallel"][0], level]]
@@ -307,7 +307,7 @@ def test_drives_on_the_way_in_begin_as_far_from_its_end_as_the_level_says():
 
 
 def test_who_stands_for_too_long_is_cut_off():
-    env = practice_of("ppo", 8)
+    env = training_env("ppo", 8)
     env.seed(0)
     env.reset()
     stand, creep = np.zeros((8, 2), np.float32), np.tile(np.float32([0.4, 0.0]), (8, 1))
@@ -324,9 +324,9 @@ def test_who_stands_for_too_long_is_cut_off():
         assert not any(info.get("TimeLimit.truncated", False) for info in env.step(stand)[3])
 
 
-def test_the_kind_that_lags_is_practised_most():
+def test_the_kind_that_lags_is_drawn_most():
     last = len(DRIVE_CONFIGS["ppo"].curriculum) - 1
-    env = practice_of("ppo", 400, levels={"perpendicular": last, "parallel": last - 3})
+    env = training_env("ppo", 400, levels={"perpendicular": last, "parallel": last - 3})
     env.seed(0)
     env.reset()
     parallel = sum(kind == "parallel" for kind, _ in env._at)
@@ -336,14 +336,14 @@ def test_the_kind_that_lags_is_practised_most():
 @pytest.mark.parametrize(
     ("make", "wanted"),
     [
-        (lambda: practice_of("ppo", 0), "num_envs is 0"),
-        (lambda: practice_of("ppo", levels={"parallel": 10}), "level of parallel slots is 10, want 0 to 9"),
+        (lambda: training_env("ppo", 0), "num_envs is 0"),
+        (lambda: training_env("ppo", levels={"parallel": 10}), "level of parallel slots is 10, want 0 to 9"),
         (lambda: DriveTrainingEnv(2, (), DRIVE_CONFIGS["sac"]), "at least one kind of slots"),
         (
-            lambda: DriveTraining("dqn", 10, 10, (MINI,), EXAMINED),
+            lambda: DriveTraining("dqn", 10, 10, (MINI,), EVALUATED),
             "'dqn', want one of ppo, sac, tqc for drive",
         ),
-        (lambda: DriveTraining("sac", 0, 10, (MINI,), EXAMINED), "steps is 0, want at least 1"),
+        (lambda: DriveTraining("sac", 0, 10, (MINI,), EVALUATED), "steps is 0, want at least 1"),
     ],
 )
 def test_bad_settings_are_refused_in_words(make, wanted):
@@ -354,8 +354,8 @@ def test_bad_settings_are_refused_in_words(make, wanted):
 # Hindsight
 
 
-def test_rewards_of_hindsight_are_those_of_the_drive():
-    env = practice_of("sac", 32, levels=dict.fromkeys(("perpendicular", "parallel"), 0))
+def test_relabelled_rewards_are_those_of_the_drive():
+    env = training_env("sac", 32, levels=dict.fromkeys(("perpendicular", "parallel"), 0))
     env.seed(2)
     before = env.reset()
     rng, parked, contacts, given = np.random.default_rng(0), 0, 0, []
@@ -373,13 +373,13 @@ def test_rewards_of_hindsight_are_those_of_the_drive():
         before = after
     assert parked > 5
     assert contacts > 5
-    recipe = DRIVE_CONFIGS["sac"]
-    wanted = [recipe.reward_scale * seconds for seconds in (-0.4 - recipe.contact_cost, -0.4, 0.0)]
+    config = DRIVE_CONFIGS["sac"]
+    wanted = [config.reward_scale * seconds for seconds in (-0.4 - config.contact_cost, -0.4, 0.0)]
     assert np.unique(np.concatenate(given)) == pytest.approx(wanted)
 
 
-def test_a_goal_of_hindsight_ends_the_drive_unless_something_was_touched():
-    env = practice_of("sac", 2, lots=(MINI,))
+def test_a_relabelled_goal_ends_the_drive_unless_something_was_touched():
+    env = training_env("sac", 2, lots=(MINI,))
     env.seed(0)
     buffer = TerminalGoalReplayBuffer(
         2_000, env.observation_space, env.action_space, env, n_envs=2, device="cpu", copy_info_dict=True
@@ -401,8 +401,8 @@ def test_a_goal_of_hindsight_ends_the_drive_unless_something_was_touched():
         batch.next_observations[f"{which}_goal"].numpy() for which in ("achieved", "desired")
     )
     reached = (achieved == desired).all(axis=1)
-    recipe = DRIVE_CONFIGS["sac"]
-    contact = np.float32(-recipe.reward_scale * (0.4 + recipe.contact_cost))
+    config = DRIVE_CONFIGS["sac"]
+    contact = np.float32(-config.reward_scale * (0.4 + config.contact_cost))
     assert (rewards == 0.0).sum() > 100
     assert done[rewards == 0.0].all()
     assert (rewards[reached] == 0.0).any()
@@ -413,7 +413,7 @@ def test_a_goal_of_hindsight_ends_the_drive_unless_something_was_touched():
 # Trainings
 
 
-def test_a_model_is_trained_examined_and_driven(trained):
+def test_a_model_is_trained_evaluated_and_driven(trained):
     algorithm, folder = trained
     training = training_of(algorithm, STEPS[algorithm])
     curve = read_curve(folder / "curve.csv")
@@ -424,8 +424,8 @@ def test_a_model_is_trained_examined_and_driven(trained):
     card = ModelCard.of_file(folder / "checkpoint.zip")
     assert (card.task, card.algorithm, card.scenarios) == ("drive", algorithm, ("mini",))
     assert card.settings["contact_cost"] == DRIVE_CONFIGS[algorithm].contact_cost
-    rows = parked_on([MINI], EXAMINED, HERE, f"{algorithm}:{folder / 'checkpoint.zip'}")
-    assert len(rows) == len(EXAMINED)
+    rows = parked_on([MINI], EVALUATED, HERE, f"{algorithm}:{folder / 'checkpoint.zip'}")
+    assert len(rows) == len(EVALUATED)
     assert np.mean([row["parked"] for row in rows]) == curve[-1]["success"]
 
 
@@ -460,16 +460,16 @@ def test_a_training_goes_on_from_its_checkpoint(trained, tmp_path):
 
 
 def test_levels_and_memory_outlive_an_interruption(tmp_path, monkeypatch):
-    """Stopped after its third examination, a training goes on with the drives that it remembers."""
+    """Stopped after its third evaluation, a training resumes with its replay buffer."""
     training = training_of("sac", STEPS["sac"], 300)
-    examine, examinations = DriveTraining.evaluate, []
+    evaluate, evaluations = DriveTraining.evaluate, []
 
     def stopping(self, model, env):
-        if len(examinations) == 3:
+        if len(evaluations) == 3:
             raise KeyboardInterrupt
-        examinations.append(model.num_timesteps)
+        evaluations.append(model.num_timesteps)
         env.levels["perpendicular"] = 2
-        return examine(self, model, env)
+        return evaluate(self, model, env)
 
     monkeypatch.setattr(DriveTraining, "evaluate", stopping)
     with pytest.raises(KeyboardInterrupt):
@@ -480,7 +480,7 @@ def test_levels_and_memory_outlive_an_interruption(tmp_path, monkeypatch):
     def looking(self, model, env):
         sizes.append(model.replay_buffer.size() * model.n_envs)
         levels.append(env.levels["perpendicular"])
-        return examine(self, model, env)
+        return evaluate(self, model, env)
 
     monkeypatch.setattr(DriveTraining, "evaluate", looking)
     training.train(0, tmp_path)
@@ -503,33 +503,33 @@ def test_models_of_another_task_are_refused(trained, name):
         make_parking_agent("mdp")
 
 
-def test_a_driver_wants_the_obstacle_map_and_serves_many_episodes(trained):
+def test_an_agent_wants_the_obstacle_map_and_serves_many_episodes(trained):
     algorithm, folder = trained
-    driver = make_parking_agent(f"{algorithm}:{folder / 'model.zip'}")
+    agent = make_parking_agent(f"{algorithm}:{folder / 'model.zip'}")
     blind = DriveEnv(lot=MINI)
     with pytest.raises(InputError, match="obstacle_map=True"):
-        driver.predict(blind.reset(seed=0)[0])
+        agent.predict(blind.reset(seed=0)[0])
     envs = gym.vector.SyncVectorEnv([lambda: DriveEnv(lot=MINI, obstacle_map=True) for _ in range(3)])
     single = DriveEnv(lot=MINI, obstacle_map=True)
     together, _ = envs.reset(seed=[4, 5, 6])
     alone, _ = single.reset(seed=5)
     state = memory = None
     for _ in range(10):
-        actions, state = driver.predict(together, state)
-        action, memory = driver.predict(alone, memory)
+        actions, state = agent.predict(together, state)
+        action, memory = agent.predict(alone, memory)
         np.testing.assert_allclose(actions[1], action, atol=1e-5)
         together, *_ = envs.step(actions)
         alone, *_ = single.step(action)
     envs.close()
 
 
-def test_the_examination_is_the_environments_own_tasks():
+def test_the_evaluation_uses_the_environments_own_tasks():
     """Who drives blindly ahead ends in the batch as in the environment."""
     training = training_of("ppo", 10, lots=(STREET,))
     status, times = evaluate_parking(Always(0.5, 0.1), training._tasks["parallel"])
     view = PolicyInterface(VehicleParameters())
     env = DriveEnv(lot=STREET, kinds=("parallel",))
-    for k, seed in enumerate(EXAMINED):
+    for k, seed in enumerate(EVALUATED):
         env.reset(seed=seed)
         over = False
         while not over:
@@ -601,8 +601,8 @@ def test_a_short_training_learns_to_park_from_nearby(tmp_path, monkeypatch):
     near = slot_groups((MINI,))[0].tasks(slack=1.0, distance=(1.0, 6.0), starts="way-out")
     tasks = [PreparedTask(near.draw(7_000 + k)) for k in range(60)]
     standing, trained = (
-        (evaluate_parking(driver, tasks)[0] == PARKED).mean()
-        for driver in (Always(0.0, 0.0), make_parking_agent(f"ppo:{tmp_path / 'checkpoint.zip'}").model)
+        (evaluate_parking(agent, tasks)[0] == PARKED).mean()
+        for agent in (Always(0.0, 0.0), make_parking_agent(f"ppo:{tmp_path / 'checkpoint.zip'}").model)
     )
     assert trained > standing
 

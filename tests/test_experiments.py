@@ -1,15 +1,23 @@
 """Experiment files: what they run, how a run folder is gone on with, and how bad files are refused."""
 
 import json
+import re
+from pathlib import Path
 
+import jsonschema
 import pytest
 
 from parkenv import InputError
+from parkenv.cli.schema import schemas
 from parkenv.evaluation.experiments.agent_spec import AgentSpec, parse_agent, split_agents
 from parkenv.evaluation.experiments.experiment import Experiment, run_experiment
 from parkenv.evaluation.experiments.spec import SPEC_FILE, ExperimentSpec
+from parkenv.files.spec_file import read_tables
 from parkenv.world.scenario import KMH
 from tests.command_line import parkenv
+
+ROOT = Path(__file__).parents[1]
+COURTYARD = ROOT / "examples" / "courtyard"
 
 SWEEP = """
 agents = ["first-free", { name = "mdp", failure_s = 90 }, "mdp"]
@@ -166,3 +174,48 @@ def test_a_grid_without_bounds_is_refused_before_any_work(tmp_path):
     text = f"episodes = 1\n[grid]\nfailure_s = {axis}\n{speeds}"
     assert "is 9000000000 searches, want at most 10000000" in refusal(tmp_path, text)
     assert "bad.toml: No such file" in parkenv("run", tmp_path / "none" / "bad.toml").stderr
+
+
+def rows_of_the_page():
+    """The tables of refused files in the documentation: what the file says, and the answer."""
+    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8").partition("## Files that are refused")[2]
+    for kind, part in zip(("scenario", "experiment"), page.split("In an experiment file:"), strict=True):
+        for text, answer in re.findall(r"^\| `(.+?)` \| (.+?) \|$", part, flags=re.MULTILINE):
+            yield pytest.param(kind, text, answer, id=text)
+
+
+@pytest.mark.parametrize(("kind", "text", "answer"), [*rows_of_the_page()])
+def test_the_documentation_says_how_files_are_refused(tmp_path, kind, text, answer):
+    if kind == "experiment":
+        message = refusal(tmp_path, text)
+        # An agent's option is checked by the agent, when the scenarios are made.
+        assert f"bad.toml: {answer}" in message or f"error: {answer}" in message
+    else:
+        (tmp_path / "own.toml").write_text(f'lot = "mini"\n{text}\n')
+        done = parkenv("plan", "--scenario", tmp_path / "own.toml", "--out", tmp_path / "out")
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
+        assert f"own.toml: {answer}" in done.stderr or f"scenario 'own': {answer}" in done.stderr
+
+
+def test_the_examples_of_the_documentation_are_run(tmp_path):
+    sweep = ExperimentSpec.read(COURTYARD / "sweep.toml").changed(episodes=1, jobs=1)
+    rows = run_experiment(sweep, tmp_path / "sweep").rows
+    assert len(rows) == 5 * 3 * 3 * 2
+    assert {row["scenario"] for row in rows} == {"courtyard", "mini", "garage"}
+    planned = parkenv("plan", "--scenario", COURTYARD / "courtyard.toml", "--out", tmp_path / "plan")
+    assert planned.returncode == 0, planned.stderr
+
+
+def test_schemas_are_published_as_they_are():
+    made = schemas()
+    published = {
+        file.name: json.loads(file.read_text()) for file in (ROOT / "docs" / "schemas").glob("*.json")
+    }
+    assert published == {f"{kind}.schema.json": schema for kind, schema in made.items()}, (
+        "run: parkenv schema --out docs/schemas"
+    )
+    for file, kind in ((COURTYARD / "courtyard.toml", "scenario"), (COURTYARD / "sweep.toml", "compare")):
+        jsonschema.validate(read_tables(file), made[kind])
+        with pytest.raises(jsonschema.ValidationError):
+            jsonschema.validate(read_tables(file) | {"episods": 3}, made[kind])

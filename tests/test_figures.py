@@ -22,8 +22,8 @@ from parkenv.world.occupancy import OccupancyProcess
 from planners.agent import AGENT_NAMES, make_agent
 
 
-def row(agent="mdp", drive=30.0, failed=5.0, walk=60.0, gave_up=0.0, **more):
-    total = drive + failed + walk + gave_up
+def row(agent="mdp", drive=30.0, failed=5.0, walk=60.0, price=0.0, gave_up=0.0, **more):
+    total = drive + failed + walk + price + gave_up
     return {
         "scenario": "campus",
         "agent": agent,
@@ -36,6 +36,7 @@ def row(agent="mdp", drive=30.0, failed=5.0, walk=60.0, gave_up=0.0, **more):
         "drive_s": drive,
         "failed_s": failed,
         "walk_s": walk,
+        "parking_cost_s": price,
         "gave_up_s": gave_up,
         "bound_s": 50.0,
     } | more
@@ -74,15 +75,20 @@ def test_time_split_has_a_panel_for_each_setting(tmp_path, panels, monkeypatch):
 
 
 def test_bars_stack_the_terms_and_an_agent_off_the_scale_is_cut():
-    rows = [row("mdp"), row("greedy-goal", drive=80.0, failed=0.0), row("mdp-static", failed=5000.0)]
+    rows = [
+        row("mdp"),
+        row("greedy-goal", drive=70.0, failed=0.0, price=10.0),
+        row("mdp-static", failed=5000.0),
+    ]
     limit = time_figures._limit(rows)
     assert 140.0 < limit < 200.0
     ax = axes()
     time_figures._draw_split(ax, rows, limit)
-    drive, failed, walk, gave_up = ([bar.get_width() for bar in bars] for bars in ax.containers)
-    assert drive == [30.0, 80.0, 30.0]
+    drive, failed, walk, price, gave_up = ([bar.get_width() for bar in bars] for bars in ax.containers)
+    assert drive == [30.0, 70.0, 30.0]
     assert failed == pytest.approx([5.0, 0.0, limit - 30.0])
     assert walk == [60.0, 60.0, 0.0]
+    assert price == pytest.approx([0.0, 10.0, 0.0])
     assert gave_up == [0.0, 0.0, 0.0]
     assert [text.get_text() for text in ax.texts] == ["95 s", "140 s", "5,090 s"]
     assert [text.get_weight() for text in ax.texts] == ["bold", "normal", "normal"]
@@ -186,6 +192,7 @@ def test_a_search_that_gave_up_or_never_moved_is_drawn(tmp_path):
         "drive_s": 0.0,
         "failed_s": 0.0,
         "walk_s": 0.0,
+        "parking_cost_s": 0.0,
         "gave_up_s": 1800.0,
         "parked": False,
     }
@@ -295,3 +302,11 @@ def test_only_asked_for_figures_are_drawn(tmp_path):
         ComparisonResults([], {}, table, (), flat), tmp_path, ("time_split", "time_against_map")
     )
     assert [file.name for file in files] == ["time_split_mini.png", "time_against_map_mini.png"]
+
+
+def test_a_parking_cost_is_in_the_key_only_where_slots_have_one():
+    for price in (0.0, 12.0):
+        figure = draw_time_split([row(price=price), row("oracle")])
+        labels = [text.get_text() for text in figure.legends[0].get_texts()]
+        assert ("parking cost" in labels) == (price > 0.0)
+        assert "give-up penalty" not in labels

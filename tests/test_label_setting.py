@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv import InputError, make_scenario
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.spec import SCENARIO_NAMES
 from parkenv.world.lot import PARK
@@ -313,7 +314,8 @@ def test_a_hopeless_slot_found_taken_is_news_and_a_drift_is_not():
     scenario = make_scenario("mini")
     agent = make_agent("mdp", scenario)
     belief = np.full(10, 0.995, dtype=np.float32)
-    observation = {"vertex": 3, "p_occupied": belief}
+    stated = SlotBelief.of_forecast(belief, np.full(10, 1e-4)).to_observation()
+    observation = {"vertex": 3, "time": np.zeros(2, dtype=np.float32), **stated}
     _, memory = agent.predict(observation)
     drifted = belief.copy()
     drifted[[1, 2]] += 0.002

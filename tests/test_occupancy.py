@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from parkenv.errors import InputError
 from parkenv.world.keyed_random import keyed_exponential, keyed_uniform, world_key
-from parkenv.world.occupancy import HOUR_S, WEEK_S, Arrival, ArrivalWindow, OccupancyProcess
+from parkenv.world.occupancy import Arrival, ArrivalWindow, OccupancyProcess
+from parkenv.world.week import HOUR_S, WEEK_S
 
 NINE = Arrival(9 * HOUR_S)
 KEY = world_key(7, 0)
@@ -211,14 +212,14 @@ def test_a_copy_of_a_world_goes_its_own_way():
     twin = copy.deepcopy(world)
     twin.occupied(np.arange(20), 3 * WEEK_S)
     assert twin.process is world.process
-    assert not world._flips.any()
+    assert not world._cursors["sojourn"].any()
 
 
 def test_a_million_slots_cost_nothing_until_seen():
     process = constant_process(1_000_000, 1e-4, 1e-4)
     world = process.world(KEY, NINE)
     assert world.occupied([5, 999_999], NINE.time).shape == (2,)
-    assert world._flips.sum() == 2
+    assert world._cursors["sojourn"].sum() == 2
 
 
 # Forecast, constructors, files

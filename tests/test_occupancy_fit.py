@@ -6,9 +6,10 @@ from scipy.optimize import check_grad
 
 from parkenv.errors import InputError
 from parkenv.world.keyed_random import world_key
-from parkenv.world.occupancy import DAY_S, HOUR_S, Arrival, OccupancyProcess
+from parkenv.world.occupancy import Arrival, OccupancyProcess
 from parkenv.world.occupancy_fit import fit_constant_rates, fit_process, log_likelihood
 from parkenv.world.occupancy_log import OccupancyLog
+from parkenv.world.week import DAY_S, HOUR_S
 
 REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
 FIRST_MONDAY = np.datetime64("2024-01-01")

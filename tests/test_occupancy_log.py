@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 
 from parkenv.errors import InputError
 from parkenv.world.keyed_random import world_key
-from parkenv.world.occupancy import DAY_S, HOUR_S, Arrival, ArrivalWindow
+from parkenv.world.occupancy import Arrival, ArrivalWindow
 from parkenv.world.occupancy_log import OccupancyLog, day_class
 from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
+from parkenv.world.week import DAY_S, HOUR_S
 
 REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
 HEADER = "datetime,camera,slot_id,weather,occupied\n"
@@ -231,10 +232,10 @@ def test_no_two_slots_of_a_larger_lot_share_a_record():
     log = random_log(n_slots=4)
     model = RecordedOccupancy(log, np.arange(13.0))
     for day in MONDAYS:
-        layout = model._layout(at(day, 9))
-        assert len(set(layout.record.tolist())) == 13
-        assert np.bincount(layout.log_slot).tolist().count(3) == 3
-        assert len(layout.held_out) == 4
+        mapped = model.mapped_log(day)
+        assert len(set(mapped.record.tolist())) == 13
+        assert np.bincount(mapped.log_slot).tolist().count(3) == 3
+        assert len(mapped.held_out) == 4
 
 
 def test_a_day_on_which_a_slot_was_not_seen_is_passed_over():
@@ -243,9 +244,9 @@ def test_a_day_on_which_a_slot_was_not_seen_is_passed_over():
     log = OccupancyLog(
         log.slot_ids, log.days, log.slot[seen], log.day[seen], log.second[seen], log.occupied[seen]
     )
-    layout = RecordedOccupancy(log, np.zeros(2))._layout(at(MONDAYS[0], 9))
-    assert sorted(layout.record.tolist()) == [0, 1 * 2 + 1]
-    assert layout.held_out == {0, 1}
+    mapped = RecordedOccupancy(log, np.zeros(2)).mapped_log(MONDAYS[0])
+    assert sorted(mapped.record.tolist()) == [0, 1 * 2 + 1]
+    assert mapped.held_out == {0, 1}
 
 
 @pytest.mark.parametrize("n", [2, 4, 11])
@@ -253,7 +254,7 @@ def test_a_day_on_which_a_slot_was_not_seen_is_passed_over():
 def test_the_forecast_knows_nothing_of_the_days_that_are_replayed(n, day):
     walk, arrival = np.arange(float(n)), at(day, 9.2)
     model = RecordedOccupancy(random_log(), walk)
-    held_out = [model.log.days[d] for d in model._layout(arrival).held_out]
+    held_out = [model.log.days[d] for d in model.mapped_log(arrival.day).held_out]
     assert day in held_out
     before = model.forecast(arrival)
     changed = RecordedOccupancy(random_log(change_days=held_out), walk)
@@ -349,9 +350,9 @@ def test_a_mapping_is_read_and_used(tmp_path):
     path = write(tmp_path, "log_slot_id,slot_id\ns3,B\ns0,A\ns3,C\n", "mapping.csv")
     mapping = read_mapping(path, ["A", "B", "C"], log)
     assert mapping.tolist() == [0, 3, 3]
-    layout = RecordedOccupancy(log, np.array([3.0, 2.0, 1.0]), mapping)._layout(at(MONDAYS[0], 9))
+    mapped = RecordedOccupancy(log, np.array([3.0, 2.0, 1.0]), mapping).mapped_log(MONDAYS[0])
     monday, next_monday = (log.days.index(day) * 4 for day in MONDAYS[:2])
-    assert layout.record.tolist() == [monday, next_monday + 3, monday + 3]
+    assert mapped.record.tolist() == [monday, next_monday + 3, monday + 3]
 
 
 @pytest.mark.parametrize(

@@ -121,7 +121,7 @@ def test_a_drive_captures_along_its_path(scene):
         (lambda: SensorRig(), "no sensor"),
         (
             lambda: SensorRig(lasers=(("a", LaserScanner(), Mount()), ("a", LaserScanner(), Mount()))),
-            "'a' stands twice",
+            "'a' is used twice",
         ),
         (lambda: Mount(z=0.0), "above the ground"),
         (lambda: Mount(x=math.nan), "finite"),

@@ -83,7 +83,6 @@ def test_the_pool_holds_every_mesh_and_its_coarse_one():
     vehicles = scene.instances.mesh[scene.instances.ids > 0]
     assert (count[pool.coarse[vehicles]] * 4 < count[vehicles]).all()
     assert np.array_equal(pool.coarse[pool.coarse], pool.coarse)
-    assert np.array_equal(scene.coarse_instances.pose, scene.instances.pose)
     model = scene.fleet.models[1]
     m = vehicles[1]
     np.testing.assert_array_equal(

@@ -13,12 +13,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numba.core.errors import TypingError
 
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
-from parkenv.envs.search_alone import held
 from parkenv.envs.wrappers import ThesisReward
 from parkenv.lots import grid_lot
 from parkenv.scenarios.spec import SCENARIO_NAMES
@@ -227,13 +225,6 @@ def test_the_mask_tells_what_the_graph_has():
         assert observation["action_mask"][PARK] == (vertex < lot.n_slots)
         np.testing.assert_array_equal(env.action_masks(), observation["action_mask"] == 1)
         observation, *_ = env.step(int(np.flatnonzero(observation["action_mask"][:PARK])[-1]))
-
-
-def test_arrays_of_other_types_are_not_held():
-    search = gym.make("parkenv/Search-v1", scenario="mini").unwrapped.search
-    other = search._replace(place=search.place.astype(np.int64))
-    with pytest.raises(TypingError):
-        held(other, np.zeros(2, dtype=np.float32))
 
 
 def test_state_deepcopy_and_pickle_bring_an_episode_back():

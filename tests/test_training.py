@@ -37,14 +37,14 @@ from planners.agent import make_agent
 from planners.learned import ALGORITHMS, LearnedAgent, ModelCard
 
 SCENARIO = make_scenario("mini")
-EXAMINED = range(2_000_000, 2_000_020)
+EVALUATED = range(2_000_000, 2_000_020)
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A short training in a folder."""
     folder = tmp_path_factory.mktemp("trained")
-    training = SearchTraining("maskable-ppo", 80_000, 32_768, (SCENARIO,), EXAMINED)
+    training = SearchTraining("maskable-ppo", 80_000, 32_768, (SCENARIO,), EVALUATED)
     train_one(training, 0, folder)
     return folder
 
@@ -118,18 +118,18 @@ def test_a_model_learns_to_park_and_evaluate_policy_agrees_with_compare(trained)
     assert best < 60.0 < curve[0]["total_s"], "it parks now, and did not when it began"
     name = f"maskable-ppo:{trained / 'model.zip'}"
     agent = make_agent(name, SCENARIO)
-    times, _ = episode_times(agent.model, SCENARIO, EXAMINED, 5)
+    times, _ = episode_times(agent.model, SCENARIO, EVALUATED, 5)
     assert times.mean() == pytest.approx(best)
-    rows, _ = Case(SCENARIO, name).run(EXAMINED)
+    rows, _ = Case(SCENARIO, name).run(EVALUATED)
     assert [row["total_s"] for row in rows] == pytest.approx(times)
     env = LocalObservation(gym.make("parkenv/Search-v1", scenario=SCENARIO))
-    env.reset(seed=EXAMINED[0])
+    env.reset(seed=EVALUATED[0])
     returns, _ = evaluate_policy(agent, env, n_eval_episodes=5, return_episode_rewards=True, warn=False)
     assert len(returns) == 5
 
 
 def test_equal_seeds_give_equal_trainings_and_another_seed_another(trained, tmp_path):
-    training = SearchTraining("maskable-ppo", 80_000, 32_768, (SCENARIO,), EXAMINED)
+    training = SearchTraining("maskable-ppo", 80_000, 32_768, (SCENARIO,), EVALUATED)
     again, other = (train_one(training, seed, tmp_path / str(seed)).curve for seed in (0, 1))
     before = read_curve(trained / "curve.csv")
     assert [row["total_s"] for row in again] == [row["total_s"] for row in before]
@@ -140,7 +140,7 @@ def test_a_training_goes_on_from_its_checkpoint(trained, tmp_path):
     folder = tmp_path / "gone_on"
     shutil.copytree(trained, folder)
     before = read_curve(folder / "curve.csv")
-    longer = SearchTraining("maskable-ppo", 110_000, 32_768, (SCENARIO,), EXAMINED)
+    longer = SearchTraining("maskable-ppo", 110_000, 32_768, (SCENARIO,), EVALUATED)
     curve = longer.train(0, folder)
     assert curve[: len(before)] == before
     assert curve[-1]["steps"] >= 110_000
@@ -148,9 +148,9 @@ def test_a_training_goes_on_from_its_checkpoint(trained, tmp_path):
 
 
 def test_a_training_gone_on_with_is_examined_when_one_without_a_stop_is(tmp_path):
-    # A rollout is longer than the time between examinations.
+    # A rollout is longer than the time between evaluations.
     stopped, whole = (
-        SearchTraining("maskable-ppo", n, 8_000, (SCENARIO,), EXAMINED) for n in (16_384, 40_000)
+        SearchTraining("maskable-ppo", n, 8_000, (SCENARIO,), EVALUATED) for n in (16_384, 40_000)
     )
     first = stopped.train(0, tmp_path)
     assert [row["steps"] for row in first] == [0, 16_384]
@@ -160,7 +160,7 @@ def test_a_training_gone_on_with_is_examined_when_one_without_a_stop_is(tmp_path
 
 
 def test_a_kill_between_the_last_checkpoint_and_its_examination_loses_neither(tmp_path, monkeypatch):
-    training = SearchTraining("maskable-ppo", 32_768, 16_384, (SCENARIO,), EXAMINED)
+    training = SearchTraining("maskable-ppo", 32_768, 16_384, (SCENARIO,), EVALUATED)
     with monkeypatch.context() as patch:
 
         def killed(path, curve):
@@ -182,14 +182,14 @@ class Waits:
         return int(np.flatnonzero(observation["action_mask"] == 0)[0]), state
 
 
-def test_a_planner_that_finishes_nothing_cannot_be_imitated(monkeypatch):
+def test_a_planner_that_finishes_nothing_cannot_be_cloned(monkeypatch):
     monkeypatch.setattr("parkenv.evaluation.training.cloning.make_agent", lambda *_: Waits())
     with pytest.raises(InputError, match="finished none of 1 searches on mini: nothing to clone"):
         Demonstrations.collect("waits", SCENARIO, [5_000_000])
 
 
 @pytest.mark.slow
-def test_imitation_begins_near_the_planner():
+def test_cloning_begins_near_the_planner():
     campus = make_scenario("campus")
     shown = Demonstrations.collect("first-free", campus, range(5_000_000, 5_000_300))
     assert shown.local.shape == (len(shown.actions), 86)
@@ -197,18 +197,18 @@ def test_imitation_begins_near_the_planner():
     assert (shown.times > 0.0).all()
     venv = SearchVecEnv(4, campus, reward_scale=0.01, max_episode_steps=MAX_STEPS)
     model = MaskablePPO("MultiInputPolicy", venv, seed=0, policy_kwargs={"net_arch": [64, 64]})
-    fresh, _ = episode_times(model, campus, EXAMINED, 5)
+    fresh, _ = episode_times(model, campus, EVALUATED, 5)
     clone(model, shown, 0, updates=2000)
-    cloned, _ = episode_times(model, campus, EXAMINED, 5)
-    planner = np.mean([row["total_s"] for row in Case(campus, "first-free").run(EXAMINED)[0]])
+    cloned, _ = episode_times(model, campus, EVALUATED, 5)
+    planner = np.mean([row["total_s"] for row in Case(campus, "first-free").run(EVALUATED)[0]])
     # The mean would be of those few searches in which a clone drives in circles.
     assert np.median(cloned) < 1.2 * planner < np.median(fresh)
 
 
-def test_what_cannot_imitate_says_so():
+def test_algorithms_without_cloning_are_refused():
     shown = Demonstrations.collect("mdp", SCENARIO, range(5_000_000, 5_000_002))
     with pytest.raises(InputError, match="dqn has no behaviour cloning"):
-        SearchTraining("dqn", 10, 10, (SCENARIO,), EXAMINED, demonstrations=shown)
+        SearchTraining("dqn", 10, 10, (SCENARIO,), EVALUATED, demonstrations=shown)
 
 
 def test_a_model_runs_on_lots_that_it_was_not_trained_on(trained):
@@ -249,8 +249,8 @@ def without_network(path):
 @pytest.mark.parametrize(
     ("spoil", "algorithm", "wanted"),
     [
-        (torn, "maskable-ppo", "no model file, or a torn one"),
-        (with_card("{"), "maskable-ppo", "no model file, or a torn one"),
+        (torn, "maskable-ppo", "no model file, or a damaged one"),
+        (with_card("{"), "maskable-ppo", "no model file, or a damaged one"),
         (with_card("[]"), "maskable-ppo", "holds a list, want what it was trained for"),
         (without_network, "maskable-ppo", "its network cannot be read"),
         (without_card, "maskable-ppo", "parkenv.json is missing"),
@@ -310,10 +310,10 @@ def test_every_algorithm_trains_a_model_that_searches(algorithm, tmp_path, monke
     sizes = {"batch_size": 256, **({"learning_starts": 200} if algorithm == "dqn" else {})}
     small = dataclasses.replace(config, n_envs=16, settings={**config.settings, **sizes})
     monkeypatch.setitem(SEARCH_CONFIGS, algorithm, small)
-    train_one(SearchTraining(algorithm, 1_000, 1_000, (SCENARIO,), EXAMINED[:4]), 0, tmp_path)
+    train_one(SearchTraining(algorithm, 1_000, 1_000, (SCENARIO,), EVALUATED[:4]), 0, tmp_path)
     curve = read_curve(tmp_path / "curve.csv")
     assert curve[-1]["steps"] >= 1_000
-    row = search_times(LearnedAgent(SCENARIO, algorithm, tmp_path / "model.zip"), SCENARIO, EXAMINED[:4])
+    row = search_times(LearnedAgent(SCENARIO, algorithm, tmp_path / "model.zip"), SCENARIO, EVALUATED[:4])
     assert row["episodes"] == 4
 
 

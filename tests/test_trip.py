@@ -233,7 +233,7 @@ def test_a_trip_is_the_sum_of_its_parts_and_parks_without_a_contact(name, seed, 
     assert trip.parked
     assert trip.contacts == 0
     assert trip.total_s == pytest.approx(
-        trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.gave_up_s
+        trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.parking_cost_s + trip.gave_up_s
     )
     assert trip.lanes_s == pytest.approx(sum(leg.seconds for leg in trip.legs))
     assert trip.graph_m == pytest.approx(sum(leg.graph_m for leg in trip.legs))

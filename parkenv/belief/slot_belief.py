@@ -190,7 +190,7 @@ def decay_to_prior(prior: float, rate: float, p_observed: float, elapsed: float)
     return float(prior + (p_observed - prior) * decay_factor(rate * elapsed))
 
 
-@compiled(inline="always")
+@compiled(error_model="numpy", forceinline=True)
 def bayes_update(p: float, looks_taken: bool, hit_rate: float, false_alarm_rate: float) -> float:
     """P(taken) of a slot after one observation (Bayes' rule).
 

@@ -20,6 +20,7 @@ from parkenv.cli import (
     plan,
     report,
     run,
+    schema,
     sensor_model,
     sensors,
     survey,
@@ -39,6 +40,7 @@ app = typer.Typer(
 )
 app.command("compare")(compare.compare)
 app.command("run")(run.run)
+app.command("schema")(schema.schema)
 app.command("plan")(plan.plan)
 app.command("park")(park.park)
 app.command("trip")(calibrate.trip)

@@ -286,9 +286,10 @@ _DETAILS: tuple[Column, ...] = (
     ("drive", lambda r: _seconds(r["drive_s"])),
     ("failed", lambda r: _seconds(r["failed_s"])),
     ("walk", lambda r: _seconds(r["walk_s"])),
+    ("parking", lambda r: _seconds(r["parking_cost_s"])),
     ("gave up", lambda r: _seconds(r["gave_up_s"])),
     ("parked", lambda r: f"{r['parked_fraction']:.0%}"),
-    ("re-plans", lambda r: f"{r['replans']:.1f}"),
+    ("replans", lambda r: f"{r['replans']:.1f}"),
     ("ms/decision", lambda r: f"{r['decision_ms']:.2f}" if "decision_ms" in r else ""),
     ("p99", lambda r: f"{r['decision_ms_p99']:.2f}" if "decision_ms" in r else ""),
 )
@@ -314,9 +315,11 @@ def result_tables(rows: list[Row], width: int) -> list[Table]:
             f"{name}: failure cost {failure:g} s, walk {walk:g} km/h, drive {drive:g} km/h, "
             f"{max(r['episodes'] for r in its_rows)} searches"
         )
-        for columns in [results + _DETAILS] if width >= WIDE else [results, _DETAILS]:
+        costs = any(row["parking_cost_s"] for row in its_rows)
+        details = tuple(column for column in _DETAILS if costs or column[0] != "parking")
+        for columns in [results + details] if width >= WIDE else [results, details]:
             headings = ("agent", *(heading for heading, _ in columns))
-            table = make_table(title if columns is not _DETAILS else None, headings)
+            table = make_table(title if columns is not details else None, headings)
             for row in its_rows:
                 table.add_row(row["agent"], *(text(row) for _, text in columns))
             tables.append(table)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -78,14 +79,15 @@ def run_demo(
     from parkenv.evaluation.experiments.demo import AGENTS, demo_cases, demo_survey
     from parkenv.evaluation.experiments.results import ResultFolder, make_folder
     from parkenv.evaluation.experiments.spec import SPEC_FILE
-    from parkenv.evaluation.experiments.surveys import run_survey, summarize
+    from parkenv.evaluation.experiments.surveys import mean_occupancy, run_survey, summarize
     from parkenv.evaluation.experiments.warm_up import warm_up_tasks
     from parkenv.evaluation.figures.registry import ComparisonResults, draw_figures
     from parkenv.evaluation.figures.survey_pictures import save_detections, save_map, save_session
     from parkenv.evaluation.trips.sensor_log import require_viewer
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
-    from parkenv.world.occupancy import Arrival
+    from parkenv.world.occupancy import DAY_NAMES
+    from parkenv.world.week import DAY_S
 
     if rerun is not None:
         require_viewer()
@@ -117,10 +119,14 @@ def run_demo(
         bar = progress.add_task("2/3 drawing the map", total=1)
         with MapStore(map_file, its.lot, create=False) as store:
             log = store.log()
-        noon = 86_400.0 + 0.5 * (its.arrival.start_s + its.arrival.end_s)
-        true = its.occupancy.forecast(Arrival(noon)).p_occupied
-        title = f"{its.name}, Tuesday {int(noon % 86_400 // 3600):02d}:30, {spec.sessions} sessions"
-        save_map(its.lot, predict(log, noon), true, title, out / "map.png")
+        shown = replace(its.arrival, weekdays=its.arrival.weekdays[:2][-1:])
+        time = DAY_S * shown.weekdays[0] + 0.5 * (shown.start_s + shown.end_s)
+        hour, minute = divmod(int(time % DAY_S // 60), 60)
+        title = (
+            f"{its.name}, {DAY_NAMES[shown.weekdays[0]]} {hour:02d}:{minute:02d}, {spec.sessions} sessions"
+        )
+        true = mean_occupancy(its.occupancy, shown)
+        save_map(its.lot, predict(log, time), true, title, out / "map.png")
         if run.shown is not None:
             save_detections(run.shown, out / "detections.png")
             save_session(its.lot, run.shown, out / "session.png")

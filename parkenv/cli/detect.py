@@ -1,4 +1,4 @@
-"""`parkenv detect`, `train-detector`, `evaluate-detector`: the car detector on image files."""
+"""`parkenv detect`, `train-detector`, `evaluate-detector`: car detection in image files."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ _MODEL_HELP = "side, front, or an .npz that train-detector wrote"
 def detect(
     files: Annotated[list[Path], typer.Argument(help="Image files, or folders of them.")],
     model: Annotated[
-        list[str] | None, typer.Option("--model", help=f"{_MODEL_HELP}; may stand twice.")
+        list[str] | None, typer.Option("--model", help=f"{_MODEL_HELP}; can be repeated.")
     ] = None,
     threshold: Annotated[
-        float, typer.Option("--threshold", help="Probability from which it is a car.")
+        float, typer.Option("--threshold", help="Least probability of a reported car.")
     ] = 0.5,
     least_height: Annotated[
-        float | None, typer.Option("--least-height", min=8.0, help="Smallest region looked for, px.")
+        float | None,
+        typer.Option("--least-height", min=8.0, help="Height of the smallest regions searched, px."),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help="Folder for pictures and summary.json.")
@@ -59,7 +60,7 @@ def detect(
     console = make_console()
     rows = []
     table = make_table(None, ["file", "left", "top", "right", "bottom", "probability", "view"])
-    for file in track(chosen, "Looking", console=console, disable=not console.is_terminal):
+    for file in track(chosen, "Detecting", console=console, disable=not console.is_terminal):
         image = read_image(file)
         found = detector.detect(image)
         for box, p, end in zip(
@@ -80,7 +81,7 @@ def detect(
         write_summary(
             out, {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": None, "rows": rows}
         )
-        console.print(f"Pictures are in {out}")
+        console.print(f"Images are in {out}")
 
 
 def train_detector(
@@ -91,37 +92,41 @@ def train_detector(
     ] = None,
     crops: Annotated[
         Path | None,
-        typer.Option("--crops", help="A folder with positives/ and negatives/ (or vehicles/...)."),
+        typer.Option(
+            "--crops", help="A folder with positives/ and negatives/ (or vehicles/ and non-vehicles/)."
+        ),
     ] = None,
     front: Annotated[
-        bool, typer.Option("--front", help="A model of fronts and rears: a square window.")
+        bool, typer.Option("--front", help="Train a model of fronts and rears, with a square window.")
     ] = False,
     normalization: Annotated[
         str, typer.Option("--normalization", help="neighbors, cell (the thesis's), or blocks.")
     ] = "neighbors",
-    penalty: Annotated[float, typer.Option("--penalty", help="C of the support vector machine.")] = 0.01,
-    rounds: Annotated[int, typer.Option("--rounds", min=0, help="How often hard negatives are mined.")] = 3,
+    penalty: Annotated[
+        float, typer.Option("--penalty", help="Penalty C of the support vector machine.")
+    ] = 0.01,
+    rounds: Annotated[int, typer.Option("--rounds", min=0, help="Rounds of hard-negative mining.")] = 3,
     jitter: Annotated[
-        int, typer.Option("--jitter", min=0, help="Shifted copies of each car; 0 where cars lie anyhow.")
+        int,
+        typer.Option("--jitter", min=0, help="Shifted copies of each car; 0 if the crops are not aligned."),
     ] = 2,
     misaligned: Annotated[
         int,
         typer.Option(
-            "--misaligned", min=0, help="Crops beside each car that are none; 0 where cars lie anyhow."
+            "--misaligned",
+            min=0,
+            help="Misaligned crops of each car as negatives; 0 if the crops are not aligned.",
         ),
     ] = 2,
     folds: Annotated[
         int,
-        typer.Option(
-            "--folds", min=0, help="Also judge the training on crops held out, in so many parts (0: do not)."
-        ),
+        typer.Option("--folds", min=0, help="Folds of a cross-validation on the crops; 0: none."),
     ] = 0,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of jitter, solver and folds.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of jitter, solver and folds.")] = 0,
 ) -> None:
-    """Train a car model on photographs: crops of cars that lie alike, and images without cars.
+    """Train a car model on photographs: aligned crops of cars, and images without cars.
 
-    With `--folds` the crops are cut into 30 blocks of file order, which are held out by turns: pictures that follow one
-    another often show the same car.
+    With `--folds`, 30 blocks of consecutive files are held out in turn: consecutive images often show the same car.
 
     Examples:
     * `parkenv train-detector --uiuc CarData --out side.npz`
@@ -173,7 +178,7 @@ def _cross_validation_table(scores: Sequence[CropScore]) -> Table:
     from parkenv.perception.cross_validation import FALSE_POSITIVES
 
     rates = [f"recall at {rate:.1%} false positives" for rate in FALSE_POSITIVES]
-    table = make_table("On crops held out", ["part", "cars", "others", "AUC", *rates])
+    table = make_table("Held-out crops", ["part", "cars", "others", "AUC", *rates])
     for i, score in enumerate(scores):
         table.add_row(
             str(i + 1),
@@ -191,14 +196,14 @@ def _cross_validation_table(scores: Sequence[CropScore]) -> Table:
 
 
 def evaluate_detector(
-    uiuc: Annotated[Path, typer.Option("--uiuc", help="UIUC's folder as it is published (CarData).")],
+    uiuc: Annotated[Path, typer.Option("--uiuc", help="UIUC's folder as published (CarData).")],
     model: Annotated[str, typer.Option("--model", help=_MODEL_HELP)] = "side",
     seed: args.SeedOption = 0,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for summary.json and the curves.")] = Path(
         "results/detector"
     ),
 ) -> None:
-    """Recall and precision of a side model on UIUC's test sets, by their own rule.
+    """Measure recall and precision of a side model on UIUC's test sets, by their matching rule.
 
     Example:
     * `parkenv evaluate-detector --uiuc CarData --model side`
@@ -211,7 +216,7 @@ def evaluate_detector(
     make_folder(out)
     console = make_console()
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
-        task = progress.add_task("Looking", total=None)
+        task = progress.add_task("Detecting", total=None)
         scores = score_on_uiuc(loaded, uiuc, on_image=lambda: progress.advance(task))
     table = make_table(None, list(scores[0].row))
     for score in scores:

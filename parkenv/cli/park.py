@@ -32,12 +32,15 @@ def park(
             "`parkenv train --env drive`.",
         ),
     ] = "planner",
-    lot: Annotated[
-        str,
+    scenario: Annotated[
+        str | None,
         typer.Option(
-            "--lot", help="Packaged lots (campus, jam, street, mini) or lot files, separated by commas."
+            "--scenario",
+            metavar="NAME|FILE[,...]",
+            help="Scenarios in whose lots the car parks: packaged ones, or scenario files.  [default: campus,street]",
         ),
-    ] = "campus,street",
+    ] = None,
+    lot: args.LotOption = None,
     kind: Annotated[
         str,
         typer.Option(
@@ -48,16 +51,18 @@ def park(
         str, typer.Option("--way", help="Orientation in the slot: nose-in, back-in; or both.")
     ] = "both",
     episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Episodes per lot.")] = 100,
-    occupancy: Annotated[
+    occupancy_level: Annotated[
         float,
-        typer.Option("--occupancy", min=0.0, max=1.0, help="Fraction of the other slots that are occupied."),
+        typer.Option(
+            "--occupancy-level", min=0.0, max=1.0, help="Fraction of the other slots that are occupied."
+        ),
     ] = 0.85,
     slack: Annotated[
         float,
         typer.Option("--slack", min=0.0, help="Distance around the slot kept clear of parked cars, m."),
     ] = 0.0,
     seed: args.SeedOption = 0,
-    jobs: args.JobsOption = 1,
+    jobs: args.JobsOption = 0,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Output folder for pictures, episodes.csv and summary.json.")
     ] = Path("results/park"),
@@ -68,7 +73,7 @@ def park(
     failures, if any; with several agents, into one folder per agent.
 
     Examples:
-    * `parkenv park --episodes 250 --lot campus,street,jam --jobs 2`
+    * `parkenv park --episodes 250 --scenario campus,street,jam`
 
     * `parkenv park --agents planner,sac:results/drive-sac/seed_0/model.zip`
 
@@ -77,18 +82,18 @@ def park(
     from parkenv.driving.parking_task import KINDS, WAYS
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, parking_table, write_parkings
-    from parkenv.lots import load_lot
+    from parkenv.scenarios.build import build
     from planners.driving.parking_agents import make_parking_agent
 
     kinds = None if kind == "all" else _chosen("--kind", kind, KINDS)
     ways = WAYS if way == "both" else _chosen("--way", way, WAYS)
     cases = []
-    for name in args.words("--lot", lot):
-        case = ParkingCase(load_lot(name), kinds, ways, occupancy, slack)
+    for spec in args.scenario_specs(scenario, lot=lot, default="campus,street"):
+        case = ParkingCase(build(spec).lot, kinds, ways, occupancy_level, slack)
         case.environment().close()  # validates the options before the first episode
         cases.append(case)
     labels = _labels(args.words("--agents", agents))
-    drivers = {label: make_parking_agent(name) for label, name in labels.items()}
+    parking_agents = {label: make_parking_agent(name) for label, name in labels.items()}
     make_folder(out)
     console = make_console()
     progress = Progress(
@@ -122,7 +127,7 @@ def park(
     for label, its in parkings.items():
         folder = out if len(labels) == 1 else out / label
         make_folder(folder)
-        _picture(its, cases, drivers[label], film, folder)
+        _picture(its, cases, parking_agents[label], film, folder)
     _show(console, f"{', '.join(names)}: {episodes} episodes per lot", table)
     for row in [row for row in rows if not row["parked"]][:SHOWN_ROWS]:
         who = f"{row['agent']}, " if len(labels) > 1 else ""
@@ -157,7 +162,7 @@ def _one_of_each(parkings: list[Parking]) -> list[Parking]:
 def _picture(
     parkings: list[Parking],
     cases: list[ParkingCase],
-    driver: Agent,
+    agent: Agent,
     film: dict[str, Any] | None,
     folder: Path,
 ) -> None:
@@ -173,7 +178,7 @@ def _picture(
             save_parkings([(lots[p.row["lot"]], p.state) for p in shown], folder / name)
     if film is not None:
         case = next(case for case in cases if case.lot.name == film["lot"])
-        frames = park_once(case.environment("rgb_array"), driver, film["seed"], every=2).frames
+        frames = park_once(case.environment("rgb_array"), agent, film["seed"], every=2).frames
         save_film(frames, folder / "parking.gif", fps=10.0)
 
 

@@ -1,4 +1,4 @@
-"""`parkenv sensors`: look through the simulated sensors."""
+"""`parkenv sensors`: preview the simulated sensors."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
 from parkenv.scenarios.build import build
 
-app = typer.Typer(help="Look through the simulated sensors.", no_args_is_help=True)
+app = typer.Typer(help="Preview the simulated sensors.", no_args_is_help=True)
 
 
 @app.callback()
 def _sensors() -> None:
-    """Look through the simulated sensors."""
+    """Preview the simulated sensors."""
 
 
 @app.command()
@@ -32,7 +32,9 @@ def preview(
         ),
     ] = "all",
     seed: args.SeedOption = 0,
-    drive: Annotated[float, typer.Option("--drive", min=0.0, help="Metres of the video; 0 for none.")] = 20.0,
+    drive: Annotated[
+        float, typer.Option("--drive", min=0.0, help="Length of the video, m; 0 for none.")
+    ] = 20.0,
     every: Annotated[float, typer.Option("--every", min=0.05, help="Metres between its frames.")] = 0.5,
     cars: args.CarsOption = None,
     pedestrians: args.PedestriansOption = None,
@@ -40,11 +42,10 @@ def preview(
         "results/sensors"
     ),
 ) -> None:
-    """Draw what the sensors see on the way from the entry to the slot nearest to the goal.
+    """Draw the measurements of the sensors on the way from the entry to the slot nearest to the goal.
 
-    A picture for each weather, from where most cars stand beside the way: the side camera's frame with the true
-    boxes, its depth, the stereo pair's disparity, and the laser's scan from above. And a short video of the
-    side camera driving past.
+    One figure for each weather, at the place with most parked cars: the side camera's image with the true boxes, its
+    depth, the stereo camera's disparity, and the laser scan from above; and a short video of the side camera.
 
     Examples:
     * `parkenv sensors preview`
@@ -91,10 +92,8 @@ def preview(
     rig = dataclasses.replace(SensorRig.thesis(), stereo_cameras=(("pair", stereo, stereo_mount),))
     name, camera, mount = rig.cameras[0]
     eye = mount.camera_pose(poses[middle])
-    console.print(
-        "The first picture after an installation waits for the renderer to be compiled, about 20 s."
-    )
-    for preset in track(names, "Taking pictures", console=console, disable=not console.is_terminal):
+    console.print("The first image after an installation waits about 20 s for the renderer to be compiled.")
+    for preset in track(names, "Rendering", console=console, disable=not console.is_terminal):
         light = Weather.draw(preset, seed)
         scene = scenes.at(arrival.time, poses[middle])
         capture = rig.capture(scene, poses[middle], light, seed)
@@ -112,4 +111,4 @@ def preview(
             frame = camera.render(scene, eye, light, seed + k)
             frames.append(with_boxes(frame.image, vehicle_boxes(camera, scene, eye, frame)))
         save_film(frames, out / "drive.gif", fps=8.0)
-    console.print(f"Pictures are in {out}")
+    console.print(f"Images are in {out}")

@@ -1,4 +1,4 @@
-"""`parkenv survey`: drive past every slot again and again; `parkenv map`: what that tells."""
+"""`parkenv survey`: drive past every slot and write a map file; `parkenv map`: the predictions of a map file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def survey(
     lot: args.LotOption = None,
     occupancy: args.OccupancyOption = None,
     sessions: Annotated[
-        int, typer.Option("--sessions", min=1, help="How many drives; the thesis made 21.")
+        int, typer.Option("--sessions", min=1, help="Number of survey drives; the thesis made 21.")
     ] = 6,
     rig: args.SurveyRigOption = None,
     detector: args.DetectorOption = "hog",
@@ -35,7 +35,7 @@ def survey(
         typer.Option(
             "--hours",
             metavar="HH:MM-HH:MM[,...]",
-            help="When drives begin; one window after the other.  [default: 08:00-10:00,11:00-14:00,16:00-18:00]",
+            help="When sessions begin; the windows are used in turn.  [default: 08:00-10:00,11:00-14:00,16:00-18:00]",
         ),
     ] = None,
     days: args.DaysOption = None,
@@ -56,10 +56,10 @@ def survey(
     ] = Path("results/survey"),
     report: args.ReportOption = False,
 ) -> None:
-    """Drive past every slot with simulated sensors, find the parked cars, and keep what was seen in a map file.
+    """Drive past every slot with simulated sensors, detect the parked cars, and write the observations to a map file.
 
-    The camera's pictures go through the detector, the laser (or the stereo pair) ranges what it finds, a Bayes filter
-    decides for each slot, and every drive is one session of the map. The same command goes on where it was stopped.
+    Cars are detected in the camera images and located with the laser (or the stereo camera); a Bayes filter estimates
+    the state of each slot; every drive is one session of the map. The same command resumes an interrupted survey.
 
     Examples:
     * `parkenv survey --sessions 21`
@@ -102,7 +102,13 @@ def run_survey_of(
         raise InputError("--overwrite: a survey adds sessions to its map; name another folder for a new one")
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.experiments.spec import SPEC_FILE
-    from parkenv.evaluation.experiments.surveys import run_survey, slots_found, summarize, survey_of
+    from parkenv.evaluation.experiments.surveys import (
+        mean_occupancy,
+        run_survey,
+        slots_found,
+        summarize,
+        survey_of,
+    )
     from parkenv.evaluation.figures.survey_pictures import (
         save_detection_reach,
         save_detections,
@@ -116,7 +122,6 @@ def run_survey_of(
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
     from parkenv.mapping.survey import Survey
-    from parkenv.world.occupancy import Arrival
 
     if rerun is not None:
         require_viewer()
@@ -146,7 +151,7 @@ def run_survey_of(
     time = 86_400.0 * window.weekdays[0] + 0.5 * (window.start_s + window.end_s)
     predicted = predict(log, time)
     save_map(
-        its.lot, predicted, its.occupancy.forecast(Arrival(time)).p_occupied,
+        its.lot, predicted, mean_occupancy(its.occupancy, window),
         f"{its.name} after {row['sessions']} sessions", out / f"map_{its.name}.png",
     )  # fmt: skip
     title = f"{its.name}, rig {settings.rig}, {row['sessions']} sessions"
@@ -214,7 +219,7 @@ def show_map(
         Path | None, typer.Option("--out", "-o", help="Folder for map.png, slots.csv, summary.json.")
     ] = None,
 ) -> None:
-    """Ask a map file how often slots are taken.
+    """Show the predictions of a map file: how often each slot is taken.
 
     Examples:
     * `parkenv map results/survey/map.sqlite --weekday tue --hour 9.5`
@@ -229,7 +234,8 @@ def show_map(
     from parkenv.files.atomic_write import atomic_write
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
-    from parkenv.world.occupancy import DAY_NAMES, DAY_S, HOUR_S
+    from parkenv.world.occupancy import DAY_NAMES
+    from parkenv.world.week import DAY_S, HOUR_S
 
     its = build(args.one_scenario(args.scenario_specs(scenario, lot=lot)))
     if weekday is not None and weekday not in DAY_NAMES:

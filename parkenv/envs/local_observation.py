@@ -1,4 +1,4 @@
-"""What lies around the car, as a vector of the same length on every lot: for policies that go from lot to lot.
+"""The car's surroundings as a vector of the same length on every lot, for policies that transfer between lots.
 
 The vector has 46 + 8k numbers from 0 to 1. A time of s seconds is written as s / (s + 60), so that a minute is a half
 and what is far away or missing comes near, or to, 1. A chance of p is written as p. "Ahead" of a move are those k slots
@@ -8,14 +8,14 @@ nearest by drive to which the shortest drive from here begins with that move.
 |---|---|
 | 0 | whether there is a slot here |
 | 1 | chance that it is free; 0 where there is none |
-| 2 | walk from it to the goal; 1 where there is none |
+| 2 | walk from it to the goal, and its parking cost; 1 where there is none |
 | 3 | time since the search began |
-| 4 | how many slots have been seen, n / (n + 20) |
-| 5 | share of them that looked free when first seen |
-| 6 | share of them that was forecast to be free |
+| 4 | number of slots observed, n / (n + 20) |
+| 5 | share of them that were free when first observed |
+| 6 | share of them that were forecast to be free |
 | 7-10 | forecast share of free slots among the quarters of the lot by walk, nearest to the goal first |
-| 11 | chance that the remembered slot is free: of those seen free the one with the shortest drive and walk; 0 if none |
-| 12 | walk from it; 1 if there is none |
+| 11 | chance that the remembered slot is free: the one observed free with the shortest drive and walk; 0 if none |
+| 12 | walk from it and its parking cost; 1 if there is none |
 | 13 | drive to it as the crow flies; 1 if there is none |
 | 14 + 8a | for the moves a up, down, left, right: whether the graph has it |
 | 15 + 8a | its drive; 1 if there is none, as all times below |
@@ -23,12 +23,12 @@ nearest by drive to which the shortest drive from here begins with that move.
 | 17 + 8a | whether it leads back to where the car came from |
 | 18 + 8a | chance that at least one of the slots ahead is free |
 | 19 + 8a | expected drive and walk by way of the best free slot ahead; a minute more than the worst where none is |
-| 20 + 8a | share of the slots ahead that have been seen |
+| 20 + 8a | share of the slots ahead that were observed |
 | 21 + 8a | drive from there to the remembered slot as the crow flies |
 | 46 + 8i | for the k slots nearest by drive, nearest first: chance that it is free; 0 if there is none |
-| 47 + 8i | whether it has been seen |
+| 47 + 8i | whether it was observed |
 | 48 + 8i | drive to it; 1 if there is none |
-| 49 + 8i | walk from it; 1 if there is none |
+| 49 + 8i | walk from it and its parking cost; 1 if there is none |
 | 50 + 8i to 53 + 8i | whether the drive to it begins with up, down, left, right |
 """
 
@@ -45,36 +45,22 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from parkenv.envs.search import SearchEnv
-from parkenv.envs.search_step import (
-    ARRIVAL,
-    BEFORE,
-    BELIEF,
-    EXPECTED_FREE,
-    FLAGS,
-    LOOKED,
-    LOOKED_TAKEN,
+from parkenv.envs.search_kernel import add_column, decay_belief, forecast_of
+from parkenv.envs.search_records import (
+    BLOCK_BITS,
+    BLOCK_SIZE,
+    N_ACTIONS,
     N_REGIONS,
-    N_SEEN,
-    NOBODY,
-    REGION,
-    REMEMBERED,
-    SCENARIO,
-    SEEN,
-    SEEN_FREE,
-    STEPS,
-    TIME,
-    VERTEX,
-    Search,
-    begin_slot,
-    forecast,
-    inlined,
-    kernel,
-    relax_touched,
-    spot,
+    SENTINEL,
+    block_at,
+    scenario_at,
+    search_at,
+    slot_at,
 )
-from parkenv.envs.search_tables import N_ACTIONS, TARGETS, VIEWED, VIEWS, WALK_S
 from parkenv.errors import InputError
 from parkenv.world.lot import MOVES
+from parkenv.world.occupancy_kernel import inlined, kernel
+from parkenv.world.pointers import float64s, int32s, int64s
 from parkenv.world.scenario import SearchProblem
 from sim_sensors.compilation import compiled
 
@@ -126,7 +112,7 @@ class Surroundings(NamedTuple):
 
         Args:
             problems: with the lots.
-            k: slots that are told of, and that lie ahead of a move.
+            k: number of slots that are described, nearby and ahead of each move.
 
         Raises:
             InputError: k is not a whole number of at least 1.
@@ -201,85 +187,98 @@ class LocalObservation(
         """What lies around the car now."""
         local = np.empty(self._surroundings.fixed.shape[1], dtype=np.float32)
         assert isinstance(self.env.unwrapped, SearchEnv)
-        observe_surroundings(self.env.unwrapped.search, self._surroundings, 0, local)
+        observe_one(self.env.unwrapped.searches.address, self._surroundings, local)
         return {"local": local, "action_mask": observation["action_mask"]}
 
 
 @kernel
-def observe_surroundings(search: Search, around: Surroundings, e: int, local: NDArray[np.float32]) -> None:
-    """Write what lies around the car of search `e`; to be called after each step and each beginning."""
-    counts, numbers = search.counts, search.numbers
-    lot, time = counts[e, SCENARIO], numbers[e, TIME]
-    if counts[e, STEPS] == 0:
-        _foresee_regions(search, around, e)
-    _remember(search, around, e)
-    row = around.first[lot] + counts[e, VERTEX]
+def observe_one(address: int, around: Surroundings, local: NDArray[np.float32]) -> None:
+    """`observe_surroundings` of the only search there is."""
+    observe_surroundings(search_at(address, 0), around, 0, local)
+
+
+@kernel
+def observe_surroundings(search: Any, around: Surroundings, lot: int, local: NDArray[np.float32]) -> None:
+    """Write what lies around the car, in a lot of `around`; to be called after each reset and each step."""
+    if search.n_steps == 0:
+        _forecast_regions(search, around, lot)
+    _remember(search, around, lot)
+    scenario, first = scenario_at(search.scenario, 0), around.first[lot]
+    row = first + search.vertex
     for i in range(local.size):
         local[i] = around.fixed[row, i]
-    memory, marks, columns = search.memory[e], search.marks[e], around.columns
-    relax_touched(search, e)
-    _find_asked(search, around, e, row)
+    columns = around.columns
+    decay_belief(search)
+    _find_columns(search, around, row)
     if local[0] == 1.0:
-        local[1] = 1.0 - memory[spot(columns[around.near[row, 0]]) + BELIEF]
-    local[3] = _squashed(time - numbers[e, ARRIVAL])
-    n_seen = counts[e, N_SEEN]
-    if n_seen > 0:
-        local[4] = n_seen / (n_seen + MANY_SLOTS)
-        local[5] = numbers[e, SEEN_FREE] / n_seen
-        local[6] = numbers[e, EXPECTED_FREE] / n_seen
+        local[1] = 1.0 - _p_occupied(search, columns[around.near[row, 0]])
+    local[3] = _squashed(search.time - search.arrival)
+    if search.n_observed > 0:
+        local[4] = search.n_observed / (search.n_observed + MANY_SLOTS)
+        local[5] = search.n_observed_free / search.n_observed
+        local[6] = search.n_expected_free / search.n_observed
     for region in range(N_REGIONS):
-        local[7 + region] = numbers[e, REGION + region]
-    remembered = counts[e, REMEMBERED]
+        local[7 + region] = search.free_by_region[region]
+    remembered = search.remembered_slot
     if remembered != _NOWHERE:
-        local[11] = 1.0 - memory[spot(np.int64(search.place[e, remembered])) + BELIEF]
-        local[12] = _squashed(search.reals[search.at[lot, WALK_S] + remembered])
-        local[13] = _squashed(_crow_s(around, row, around.first[lot] + remembered))
-    targets = search.at[lot, TARGETS] + counts[e, VERTEX] * N_ACTIONS
+        local[11] = 1.0 - _p_occupied(search, int32s(search.columns)[remembered])
+        local[12] = _squashed(_arrival_cost_s(scenario, remembered))
+        local[13] = _squashed(_crow_s(around, row, first + remembered))
     for move in range(N_MOVES):
         at = HERE + PER_MOVE * move
         if local[at] == 0.0:
             continue
-        target = search.ints[targets + move]
-        local[at + 3] = 1.0 if target == counts[e, BEFORE] else 0.0
+        target = int64s(scenario.targets)[search.vertex * N_ACTIONS + move]
+        local[at + 3] = 1.0 if target == search.previous_vertex else 0.0
         if remembered != _NOWHERE:
-            local[at + 7] = _squashed(
-                _crow_s(around, around.first[lot] + target, around.first[lot] + remembered)
-            )
+            local[at + 7] = _squashed(_crow_s(around, first + target, first + remembered))
         ahead, total_s = around.ahead[row, move], around.total_s[row, move]
-        none_free, expected, n_ahead, n_seen_ahead, worst = 1.0, 0.0, 0, 0, 0.0
+        none_free, expected, n_ahead, n_observed_ahead, worst = 1.0, 0.0, 0, 0, 0.0
         for i in range(ahead.size):
             which = ahead[i]
             if which == _NOWHERE:
                 break
             worst = total_s[i]
             column = columns[which]
-            p_taken = memory[spot(column) + BELIEF]
+            p_taken = _p_occupied(search, column)
             expected += none_free * (1.0 - p_taken) * worst
             none_free *= p_taken
             n_ahead += 1
-            n_seen_ahead += (marks[column, FLAGS] // SEEN) & 1
+            n_observed_ahead += int(slot_at(search.slots, column).observed)
         if n_ahead > 0:
             local[at + 4] = 1.0 - none_free
             local[at + 5] = _squashed(expected + none_free * (worst + MINUTE))
-            local[at + 6] = n_seen_ahead / n_ahead
+            local[at + 6] = n_observed_ahead / n_ahead
     for i in range(around.near.shape[1]):
         which = around.near[row, i]
         if which == _NOWHERE:
             break
         column = columns[which]
-        local[FIRST_NEAR + PER_NEAR * i] = 1.0 - memory[spot(column) + BELIEF]
-        local[FIRST_NEAR + PER_NEAR * i + 1] = (marks[column, FLAGS] // SEEN) & 1
+        local[FIRST_NEAR + PER_NEAR * i] = 1.0 - _p_occupied(search, column)
+        local[FIRST_NEAR + PER_NEAR * i + 1] = 1.0 if slot_at(search.slots, column).observed else 0.0
 
 
 @inlined
-def _find_asked(search: Search, around: Surroundings, e: int, row: int) -> None:
+def _p_occupied(search: Any, column: int) -> float:
+    """The belief in the slot of a column, as `decay_belief` left it."""
+    return float(block_at(search.blocks, column >> BLOCK_BITS).p_occupied[column & (BLOCK_SIZE - 1)])
+
+
+@inlined
+def _arrival_cost_s(scenario: Any, slot: int) -> float:
+    """Walk from a slot to the goal, and cost of parking there, s."""
+    return float(float64s(scenario.walk_s)[slot] + float64s(scenario.parking_cost_s)[slot])
+
+
+@inlined
+def _find_columns(search: Any, around: Surroundings, row: int) -> None:
     """Write the columns of the slots of a row of `around` into `around.columns`."""
-    place, begin = search.place[e], around.starts[row]
+    columns, begin = int32s(search.columns), around.starts[row]
     for i in range(around.starts[row + 1] - begin):
-        slot = around.slots[begin + i]
-        column = np.int64(place[slot])
-        if column == NOBODY:
-            column = begin_slot(search, e, slot)
+        slot = np.int64(around.slots[begin + i])
+        column = np.int64(columns[slot])
+        if column == SENTINEL:
+            column = add_column(search, slot)
         around.columns[i] = column
 
 
@@ -296,39 +295,40 @@ def _crow_s(around: Surroundings, one: int, other: int) -> float:
     return math.sqrt(dx * dx + dy * dy)
 
 
-@inlined
-def _foresee_regions(search: Search, around: Surroundings, e: int) -> None:
-    """What is forecast of a few slots of each quarter of the lot."""
-    lot = search.counts[e, SCENARIO]
+@kernel
+def _forecast_regions(search: Any, around: Surroundings, lot: int) -> None:
+    """Compute the forecast of a few slots of each quarter of the lot."""
     for region in range(N_REGIONS):
         free = 0.0
         for i in range(SAMPLES):
-            free += 1.0 - forecast(search, e, around.samples[lot, region, i])[0]
-        search.numbers[e, REGION + region] = free / SAMPLES
+            free += 1.0 - forecast_of(search, np.int64(around.samples[lot, region, i]))[0]
+        search.free_by_region[region] = free / SAMPLES
 
 
-@inlined
-def _remember(search: Search, around: Surroundings, e: int) -> None:
-    """Keep in mind the best slot that was seen free, and forget it when it is seen taken."""
-    at, ints, counts, place, marks = search.at, search.ints, search.counts, search.place[e], search.marks[e]
-    lot, vertex, time = counts[e, SCENARIO], counts[e, VERTEX], search.numbers[e, TIME]
-    best, least = counts[e, REMEMBERED], np.inf
-    if best != _NOWHERE and marks[place[best], FLAGS] & LOOKED_TAKEN != 0:
+@kernel
+def _remember(search: Any, around: Surroundings, lot: int) -> None:
+    """Remember the best slot that was observed free, and drop it when it is observed taken."""
+    scenario, columns = scenario_at(search.scenario, 0), int32s(search.columns)
+    first, first_view, vertex = around.first[lot], around.first_view[lot], search.vertex
+    best, least = search.remembered_slot, np.inf
+    if best != _NOWHERE and slot_at(search.slots, columns[best]).observed_taken:
         best = _NOWHERE
     if best != _NOWHERE:
-        crow_s = _crow_s(around, around.first[lot] + vertex, around.first[lot] + best)
-        least = search.reals[at[lot, WALK_S] + best] + crow_s
-    views, viewed, first = at[lot, VIEWS] + vertex, at[lot, VIEWED], around.first_view[lot]
-    for i in range(ints[views], ints[views + 1]):
-        if around.view_s[first + i] >= least:
+        least = _arrival_cost_s(scenario, best) + _crow_s(around, first + vertex, first + best)
+    viewed, starts = int64s(scenario.viewed), int64s(scenario.view_starts)
+    for i in range(starts[vertex], starts[vertex + 1]):
+        if around.view_s[first_view + i] >= least:
             continue
-        slot = ints[viewed + i]
-        column = place[slot]
-        if marks[column, FLAGS] & (SEEN | LOOKED_TAKEN) != SEEN:
+        column = np.int64(columns[viewed[i]])
+        record = slot_at(search.slots, column)
+        if not record.observed or record.observed_taken:
             continue
-        if search.memory[e, spot(column) + LOOKED] == time:
-            best, least = np.int64(slot), around.view_s[first + i]
-    counts[e, REMEMBERED] = best
+        if (
+            block_at(search.blocks, column >> BLOCK_BITS).observed_at[column & (BLOCK_SIZE - 1)]
+            == search.time
+        ):
+            best, least = viewed[i], around.view_s[first_view + i]
+    search.remembered_slot = best
 
 
 def _view_s(problem: SearchProblem) -> FloatArray:
@@ -336,7 +336,7 @@ def _view_s(problem: SearchProblem) -> FloatArray:
     starts, slots = problem.slots_in_view
     viewer = np.repeat(np.arange(problem.lot.n_vertices), np.diff(starts))
     away = problem.lot.vertex_xy[slots] - problem.lot.vertex_xy[viewer]
-    seconds: FloatArray = np.hypot(away[:, 0], away[:, 1]) / problem.v_drive + problem.walk_s[slots]
+    seconds: FloatArray = np.hypot(away[:, 0], away[:, 1]) / problem.v_drive + problem.arrival_cost_s[slots]
     return seconds
 
 
@@ -344,7 +344,7 @@ def _around(problem: SearchProblem, k: int) -> tuple[NDArray[Any], ...]:
     """Of one lot: how many slots each row has, and the arrays of `Surroundings` without `first` and `starts`."""
     lot = problem.lot
     n = lot.n_vertices
-    neighbors, move_s, walk_s = lot.neighbors, problem.move_s, problem.walk_s
+    neighbors, move_s, walk_s = lot.neighbors, problem.move_s, problem.arrival_cost_s
     near, near_s, near_move, ahead, ahead_s = _nearest(neighbors, move_s, lot.n_slots, k)
     total_s = ahead_s + np.where(ahead >= 0, walk_s[ahead], np.inf)
     order = np.argsort(total_s, axis=2, kind="stable")

@@ -1,4 +1,4 @@
-"""`parkenv/SearchPerception-v1`: the search with the real detection and mapping stack in the loop."""
+"""`parkenv/SearchPerception-v1`: the search with the real perception pipeline in the loop."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.envs.search import SearchEnv
+from parkenv.envs.search_control import SearchControl
 from parkenv.envs.search_state import SearchState
-from parkenv.envs.search_step import VERTEX, Search, drive_or_park, renew, settle, take_in, tell_time
 from parkenv.envs.sensor_sampler import SensorSampler
 from parkenv.envs.sensors import with_camera_images
 from parkenv.perception.capture import TimedCapture
@@ -68,57 +68,76 @@ class OnboardPerception:
         self.results: tuple[PerceptionResult, ...] = ()
         self.observation = SlotObservation.none()
 
-    def update_belief(self, search: Search, captures: Sequence[TimedCapture]) -> None:
+    def update_belief(self, control: SearchControl, vertex: int, captures: Sequence[TimedCapture]) -> None:
         """Run the pipeline on the captures of a step, and update the belief with the observed slots.
 
         Args:
-            search: of this scenario; the belief of its first episode is updated.
-            captures: measured on the way to the current vertex, oldest first.
+            control: of a search in this scenario.
+            vertex: where the car is.
+            captures: measured on the way there, oldest first.
         """
         self.results, observed = self.pipeline.observe(captures)
-        vertex = search.counts[0, VERTEX]
         rows = slice(self._view_starts[vertex], self._view_starts[vertex + 1])
         # The sensor model has rates for the slots within its range only.
         in_range, rates = self._view_slots[rows], self._rates.of(rows)
         rated, used = np.isin(in_range, observed.slots), np.isin(observed.slots, in_range)
         self.observation = SlotObservation(observed.slots[used], observed.taken[used])
-        take_in(search, 0, *self.observation, rates.hit[rated], rates.false_alarm[rated])
+        control.apply_observations(*self.observation, rates.hit[rated], rates.false_alarm[rated])
 
 
 class SearchPerceptionEnv(SearchEnv):
-    """`parkenv/Search-v1` whose belief is what the detection and mapping stack makes of simulated sensors.
+    """`parkenv/Search-v1` with the real perception pipeline in the loop: the belief comes from simulated sensors.
 
     ## Description
-    World, decisions, rewards and observations are those of `parkenv/Search-v1`; equal seeds give equal worlds. But
-    nobody tells the car which slots are taken: on the way of every step its camera and laser take pictures and scans
-    (as in `parkenv/SearchSensors-v1`), cars are detected and ranged, beams are followed into the slots, and what that
-    says of each slot goes into the belief. So the car errs where its eyes do, and sees slots that no circle holds.
+    World, decisions and rewards are those of `parkenv/Search-v1`, and equal seeds give equal worlds. But slots are not
+    observed by a sensor model. During every step the car's camera and laser measure (as in
+    `parkenv/SearchSensors-v1`), cars are detected and located, beams are traced into the slots, and the observed states
+    of the slots update the belief. So the belief has the errors of a real detector, and the observed slots depend on
+    occlusion, not on distance alone.
 
     ## Action space
-    `Discrete(5)`: up, down, left, right, park, as in `parkenv/Search-v1`.
+    `Discrete(5)`, as in `parkenv/Search-v1`:
+
+    | Num | Action | Effect |
+    |-----|--------|--------|
+    | 0-3 | up, down, left, right | drive along that edge of the graph; wait `wait_s` if there is none |
+    | 4 | park | park and walk to the goal if the slot here is free; lose `failure_s` if it is taken |
 
     ## Observation space
-    As in `parkenv/Search-v1`.
+    The `Dict` of `parkenv/Search-v1`:
+
+    | Key | Space | Meaning |
+    |-----|-------|---------|
+    | `vertex` | `Discrete(n_vertices)` | position of the car; vertex i < n_slots is in front of slot i |
+    | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
+    | `p_occupied` | `Box(0, 1, (n_slots,), float32)` | current belief that each slot is taken |
+    | `belief` | `Box((4 * n_slots,), float32)` | forecast, decay rate, p at the last observation, time of it |
+    | `action_mask` | `Box(0, 1, (5,), int8)` | the actions that the graph has here |
 
     ## Rewards
-    As in `parkenv/Search-v1`.
+    Minus the seconds of the step, as in `parkenv/Search-v1`.
 
     ## Starting state
-    As in `parkenv/Search-v1`. The weather is drawn for each search unless it is given.
+    As in `parkenv/Search-v1`. The weather is drawn for each episode unless it is given.
 
     ## Episode end
-    As in `parkenv/Search-v1`; *proven full* is what the stack takes for full.
+    As in `parkenv/Search-v1`. The lot counts as full when the *observed* states of all slots are taken.
 
     ## Arguments
-    - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v1`. Its `sighting` is what the
-      car takes its eyes to be worth, and how far away slots may be of which it takes note; where that is perfect,
-      what was measured of the rig (`SensorModel.named`).
-    - `rig`: laser (the thesis's: a camera and a 270° laser), stereo, both_sides, or a `sim_sensors.rig.SensorRig`
-      that can see and range.
-    - `weather`: sunny, overcast, low_sun, dusk or rain; None draws one.
-    - `captures`: how many there are at most on an edge.
-    - `every`: m; on short edges captures are at least so far apart.
-    - `detector`: a `parkenv.perception.detector.Detector`; the shipped models where None.
+    | Name | Default | Meaning |
+    |------|---------|---------|
+    | `scenario`, `render_mode`, changes | | as in `parkenv/Search-v1` |
+    | `rig` | `"laser"` | `laser` (the thesis's camera and 270° laser), `stereo`, `both_sides`, or a `SensorRig` |
+    | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
+    | `captures` | 2 | largest number of captures on an edge |
+    | `every` | 1.25 | m, least distance between captures on an edge |
+    | `detector` | `None` | a `Detector`, or its name: `hog`, `side`, `front`, a model file, `MODULE:CLASS` |
+
+    The scenario's `sensor_model` gives the error rates that the belief update assumes, and its range: farther slots
+    are not updated. If it is perfect, the fitted model of the rig replaces it (`SensorModel.named`).
+
+    `info` is that of `parkenv/Search-v1`. `env.unwrapped.perception` has the results of the last step: `results`
+    (captures, detections, located cars, range scans) and `observation` (the observed slots and their states).
 
     ```python
     >>> import gymnasium as gym
@@ -170,16 +189,15 @@ class SearchPerceptionEnv(SearchEnv):
         self._before = (self.state.vertex, self.state.time)
         return super().step(action)
 
-    def _advance(self, action: int) -> None:
+    def _advance(self, action: int) -> tuple[Any, ...]:
         """Act, measure on the way, and update the belief from the measurements."""
-        drive_or_park(self.search, 0, action)
-        self._state.come_along()
-        if not self._state.parked:
-            captures = self.perception.sampler.sample_step(self._state, self._before)
-            self.perception.update_belief(self.search, captures)
-        settle(self.search, 0)
-        renew(self.search, 0)
-        tell_time(self.search, 0, self._clock)
+        control, state = self._control, self._state
+        control.drive_or_park(action)
+        state.extend_path()
+        if not state.parked:
+            captures = self.perception.sampler.sample_step(state, self._before)
+            self.perception.update_belief(control, state.vertex, captures)
+        return control.finish_step()
 
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
         """Return the lot from above, with the newest camera images beside it."""

@@ -29,8 +29,9 @@ from parkenv.envs.drawing import (
 from parkenv.envs.search_state import SearchState
 from parkenv.envs.window import Window
 from parkenv.world.lot import ParkingLot
-from parkenv.world.occupancy import DAY_NAMES, DAY_S
+from parkenv.world.occupancy import DAY_NAMES
 from parkenv.world.scenario import Scenario
+from parkenv.world.week import DAY_S
 from sim_sensors.compilation import compiled
 
 WIDTH, HEIGHT = 640, 480

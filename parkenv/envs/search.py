@@ -1,7 +1,8 @@
-"""`parkenv/Search-v1`: decide at every stop where to drive, or to park."""
+"""`parkenv/Search-v1`: decide at every vertex where to drive, or to park."""
 
 from __future__ import annotations
 
+from operator import index
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
@@ -9,18 +10,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.envs.search_alone import begin_alone, held, step_alone
+from parkenv.envs.search_control import SearchControl
+from parkenv.envs.search_kernel import begin_search, init_external_prior, step_exact, step_noisy
+from parkenv.envs.search_records import NEVER_OBSERVED, ScenarioRecords, Searches
 from parkenv.envs.search_state import SearchState
-from parkenv.envs.search_step import (
-    EPISODE,
-    NEVER_OBSERVED,
-    SEED_STATE,
-    STEP_GAVE_UP,
-    VERTEX,
-    Search,
-    foresee,
-)
-from parkenv.envs.search_tables import SearchTables
 from parkenv.errors import InputError
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.keyed_random import seed_state
@@ -35,25 +28,22 @@ LATEST = 1e8
 MAX_DECAY_RATE = 1e6
 """Bound, 1/s, of `decay_rate`."""
 _REBUILT = (
-    "search",
+    "searches",
     "_state",
-    "_numbers",
-    "_counts",
-    "_p_occupied",
-    "_belief",
-    "_clock",
-    "_held",
+    "_control",
+    "_address",
+    "_copy_time",
+    "_copy_p_occupied",
+    "_copy_belief",
     "_seeded_with",
     "_begun",
     "_over",
 )
-_USUAL = (np.int64, int)
-"""Types that actions mostly have."""
-REWARD_TERMS = ("drive", "failed", "walk", "gave_up")
+REWARD_TERMS = ("drive", "failed", "walk", "parking", "gave_up")
 
 
 class SavedSearch(NamedTuple):
-    """What `SearchEnv.get_state` hands out: copies of all that changes, and the stops so far."""
+    """What `SearchEnv.get_state` returns: copies of all that changes, and the vertices passed so far."""
 
     arrays: tuple[NDArray[Any], ...]
     path: list[int]
@@ -63,9 +53,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     """Find a free slot and walk from it to the goal, in as little time as possible.
 
     ## Description
-    A car comes into a parking lot. It knows the lot and how often each slot tends to be taken, sees the
-    slots near it as it drives past them, and decides at every stop where to go on, or to try to park
-    there. Slots fill and empty while it drives. After Bogoslavskyi's thesis (Freiburg 2014), §3.4.
+    A car searches a parking lot for a free slot. It knows the lot and an occupancy forecast for each slot, observes
+    the slots near it as it drives past them, and decides at every vertex of the drive graph where to drive, or to try
+    to park there. Slots fill and empty meanwhile. After Bogoslavskyi's thesis (Freiburg 2014), §3.4.
 
     ## Action space
     `Discrete(5)`
@@ -73,16 +63,16 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     | Num | Action | Effect |
     |-----|--------|--------|
     | 0-3 | up, down, left, right | drive along that edge of the graph; where there is none, wait `wait_s` |
-    | 4 | park | park and walk to the goal if the slot here is free; lose `failure_s` if it is taken |
+    | 4 | park | park and walk to the goal if the slot here is free; a failed attempt, `failure_s`, if it is taken |
 
-    Where there is no slot, parking is waiting, too.
+    Where there is no slot, parking means waiting, too.
 
     ## Observation space
     A `Dict`:
 
     | Key | Space | Meaning |
     |-----|-------|---------|
-    | `vertex` | `Discrete(n_vertices)` | where the car is; vertex i < n_slots lies before slot i |
+    | `vertex` | `Discrete(n_vertices)` | where the car is; vertex i < n_slots is the stop position of slot i |
     | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
     | `p_occupied` | `Box(0, 1, (n_slots,), float32)` | belief that each slot is taken, now |
     | `belief` | `Box((4 * n_slots,), float32)` | what `p_occupied` is computed from, four parts as below |
@@ -102,24 +92,25 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     `p_occupied = forecast + (p_observed - forecast) * exp(-decay_rate * (time[1] - observed_at))`.
 
     ## Rewards
-    Minus the seconds that the step took; parking adds minus the seconds of the walk, so the return is
-    minus the total time to the goal. `info["reward_terms"]` holds the terms `drive` (moving or waiting),
-    `failed` (tries at taken slots), `walk` and `gave_up`; they add up to the reward.
+    Minus the seconds that the step took. Parking adds minus the seconds of the walk and the parking cost of the slot
+    (`ParkingLot.slot_parking_cost_s`, 0 by default), so the return is minus the total time to the goal.
+    `info["reward_terms"]` holds the terms `drive` (moving or waiting), `failed` (failed attempts), `walk`, `parking`
+    (the slot's cost) and `gave_up`; they add up to the reward.
 
     ## Starting state
-    At the scenario's entry, at a time drawn from its arrival window. The first observation is the forecast
-    alone; slots are seen from the first step on, from wherever a step ends.
-    With `reset(seed=s)` arrival, entry and every slot's comings and goings are the same whatever the agent
-    does; later `reset()` calls go through further worlds of the same seed.
+    At the scenario's entry, at a time drawn from its arrival window. The first observation holds the forecast alone;
+    slots are observed from the first step on, from the vertex where a step ends.
+    `reset(seed=s)` fixes arrival, entry and the state of every slot at every time, whatever the agent does; later
+    `reset()` calls go through further worlds of the same seed.
 
     ## Episode end
-    - Terminated: parked; or the lot is *proven full*, that is every slot has been seen in this search and
-      looked taken at its last look. Then the driver goes elsewhere, which costs `give_up_s`.
+    - Terminated: parked; or the lot is *proven full*: every slot was observed in this search, and taken when last
+      observed. Then the driver parks elsewhere, for the give-up penalty `give_up_s`.
     - Truncated: after the step limit of the spec, 2000 (`max_episode_steps` of `gymnasium.make`).
 
-    At the end `info` holds drive_s, failed_s, walk_s, gave_up_s, total_s, driven_m, walked_m, failed_parks,
-    slots_passed (slots whose vertex was driven to) and parked. A wrapper's time limit is not part of
-    `get_state`: it goes on counting.
+    `info` holds the episode's metrics so far: drive_s, failed_s, walk_s, parking_cost_s, gave_up_s, total_s, driven_m,
+    walked_m, failed_parks, slots_passed (slots whose vertex the car stopped at) and parked. A wrapper's time limit is
+    not part of `get_state`: it keeps counting.
 
     ## Keys
     For `gymnasium.utils.play.play(env, wait_on_player=True, noop=4)` (needs the extra `human`): w, s, a, d drive up,
@@ -165,21 +156,22 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self.action_space = spaces.Discrete(len(ACTIONS))
         self.observation_space = search_space(lot.n_slots, lot.n_vertices)
         self._masks = list(self.scenario.action_masks)
+        self._step = step_exact if self.scenario.sensor_model.perfect else step_noisy
         self._vertices = list(np.arange(lot.n_vertices))
         self._renderer: SearchRenderer | None = None
         self._make_search()
 
     def _make_search(self) -> None:
-        tables = SearchTables.of([self.scenario])
-        self.search = Search.on(tables, np.zeros(1, dtype=np.int64), full_belief=True)
-        self._state = SearchState(self.scenario, self.search)
-        # The rows of this one search, as far as a step reads them.
-        self._numbers = self.search.numbers[0, : STEP_GAVE_UP + 1]
-        self._counts = self.search.counts[0, : VERTEX + 1]
-        self._p_occupied = self.search.p_occupied[0]
-        self._belief = self.search.belief[0].reshape(-1)
-        self._clock = np.zeros(2, dtype=np.float32)
-        self._held = held(self.search, self._clock)
+        self.searches = Searches(
+            ScenarioRecords([self.scenario]), np.zeros(1, dtype=np.int64), full_belief=True
+        )
+        self._address = self.searches.address
+        self._state = SearchState(self.scenario, self.searches)
+        self._control = SearchControl(self.searches)
+        # Bound methods that copy what is observed: looking them up takes a tenth of a step.
+        self._copy_time = self.searches.records["clock"][0].copy
+        self._copy_p_occupied = self.searches.p_occupied[0].copy
+        self._copy_belief = self.searches.belief[0].reshape(-1).copy
         self._seeded_with: int | None = None
         self._begun, self._over = False, True
 
@@ -196,15 +188,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     def get_state(self) -> SavedSearch:
         """A copy of the episode, which `set_state` brings back."""
-        return SavedSearch(tuple(a.copy() for a in self.search.changing()), list(self.state.path))
+        return SavedSearch(self.searches.save(), list(self.state.path))
 
     def set_state(self, state: SavedSearch) -> None:
-        """Go on from a state that `get_state` of an environment with the same scenario returned."""
-        slots, n_slots = state.arrays[-1].shape[-1], self.scenario.lot.n_slots
-        if slots != n_slots:
-            raise InputError(f"state is of a lot with {slots} slots, this one has {n_slots}")
-        for mine, saved in zip(self.search.changing(), state.arrays, strict=True):
-            mine[...] = saved
+        """Continue from a state that `get_state` of an environment with the same scenario returned."""
+        self.searches.restore(state.arrays)
         self._state.path = list(state.path)
         self._begun, self._over = True, self._state.over
 
@@ -227,18 +215,18 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if options:
             raise InputError(f"reset takes no options, got {', '.join(options)}")
         if self.np_random_seed < 0:
-            # Whoever set `np_random` by hand: its seed is not known.
+            # `np_random` was set by hand: its seed is not known.
             super().reset(seed=int(self.np_random.integers(1 << 62)))
-        counts = self.search.counts
-        counts[0, EPISODE] = 0 if seed is not None else counts[0, EPISODE] + 1
+        record = self.searches.records[0]
+        record["episode"] = 0 if seed is not None else record["episode"] + 1
         if seed is not None or self._seeded_with != self.np_random_seed:
             self._seeded_with = self.np_random_seed
-            counts.view(np.uint64)[0, SEED_STATE] = seed_state(self.np_random_seed)
-        begin_alone(self._held)
-        if len(self.search.asked):
+            record["seed_state"] = seed_state(self.np_random_seed)
+        begin_search(self._address)
+        if len(self.searches.external_prior):
             forecast = self.scenario.forecast(self._state.arrival)
-            self.search.asked[0] = forecast.p_occupied, forecast.decay_rate
-            foresee(self.search, 0)
+            self.searches.external_prior[0] = forecast.p_occupied, forecast.decay_rate
+            init_external_prior(self._address)
         self._begun, self._over = True, False
         self._state.path = [self._state.vertex]
         if self.render_mode == "human":
@@ -249,38 +237,50 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         """Drive along an edge, or try to park; see the class."""
         if self._over:
             raise gym.error.ResetNeeded("the search has not begun, or is over: call reset()")
-        self._advance(_action_number(action))
-        # Taken as Python's numbers all at once: one by one, numpy's take most of a step's time.
+        try:
+            number = index(action)
+        except TypeError:
+            number = _action_number(action)
+        if not 0 <= number <= PARK:
+            raise _wrong_action(action)
         (
-            drive_s, failed_s, walk_s, gave_up_s, driven_m, walked_m,
-            drive, failed, walk, gave_up,
-        ) = self._numbers.tolist()  # fmt: skip
-        failed_parks, slots_passed, parked, over, vertex = self._counts.tolist()
+            reward, drive, failed, walk, parking, gave_up,
+            drive_s, failed_s, walk_s, parking_cost_s, gave_up_s, total_s, driven_m, walked_m,
+            failed_parks, slots_passed, parked, over, vertex,
+        ) = self._advance(number)  # fmt: skip
         state = self._state
         if vertex != state.path[-1]:
             state.path.append(vertex)
+        self._over = over
         # A time limit ends the episode from outside, so the metrics are there at every step.
         info = {
-            "reward_terms": {"drive": -drive, "failed": -failed, "walk": -walk, "gave_up": -gave_up},
+            "reward_terms": {
+                "drive": drive,
+                "failed": failed,
+                "walk": walk,
+                "parking": parking,
+                "gave_up": gave_up,
+            },
             "drive_s": drive_s,
             "failed_s": failed_s,
             "walk_s": walk_s,
+            "parking_cost_s": parking_cost_s,
             "gave_up_s": gave_up_s,
-            "total_s": drive_s + failed_s + walk_s + gave_up_s,
+            "total_s": total_s,
             "driven_m": driven_m,
             "walked_m": walked_m,
             "failed_parks": failed_parks,
             "slots_passed": slots_passed,
-            "parked": parked == 1,
+            "parked": parked,
         }
         if self.render_mode == "human":
             self.render()
-        self._over = over == 1
-        return self._observation(state), -(drive + failed + walk + gave_up), self._over, False, info
+        return self._observation(state), reward, over, False, info
 
-    def _advance(self, action: int) -> None:
-        """Act, and look around."""
-        step_alone(self._held, action)
+    def _advance(self, action: int) -> tuple[Any, ...]:
+        """Act, observe, and return what `parkenv.envs.search_kernel.step_result` does."""
+        result: tuple[Any, ...] = self._step(self._address, action)
+        return result
 
     def action_masks(self) -> NDArray[np.bool_]:
         """(5,) bool, which actions the graph has here; the name that sb3-contrib looks for."""
@@ -327,9 +327,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         vertex = state.path[-1]
         return {
             "vertex": self._vertices[vertex],
-            "time": self._clock.copy(),
-            "p_occupied": self._p_occupied.copy(),
-            "belief": self._belief.copy(),
+            "time": self._copy_time(),
+            "p_occupied": self._copy_p_occupied(),
+            "belief": self._copy_belief(),
             "action_mask": self._masks[vertex].copy(),
         }
 
@@ -337,25 +337,28 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
     """What is observed in a lot of some size; see `SearchEnv`."""
     # Of forecast, decay_rate, p_observed, observed_at.
-    low, high = [0.0, 0.0, 0.0, NEVER_OBSERVED], [1.0, MAX_DECAY_RATE, 1.0, LATEST]
-    bounds = (np.repeat(np.array(row, np.float32), n_slots) for row in (low, high))
+    low, high = (
+        np.repeat(np.array(bounds, np.float32), n_slots)
+        for bounds in ([0.0, 0.0, 0.0, NEVER_OBSERVED], [1.0, MAX_DECAY_RATE, 1.0, LATEST])
+    )
     return spaces.Dict(
         {
             "vertex": spaces.Discrete(n_vertices),
             "time": spaces.Box(0.0, LATEST, (2,), np.float32),
             "p_occupied": spaces.Box(0.0, 1.0, (n_slots,), np.float32),
-            "belief": spaces.Box(*bounds, dtype=np.float32),
+            "belief": spaces.Box(low, high, dtype=np.float32),
             "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
         }
     )
 
 
 def _action_number(action: Any) -> int:
-    """The action as an int; arrays of one element will do, as models return them."""
-    # Compared as Python's: numpy's take longer.
-    if type(action) in _USUAL and 0 <= (usual := int(action)) <= PARK:
-        return usual
+    """The element of an array of one, as models return it."""
     number = np.asarray(action)
-    if number.size != 1 or not np.issubdtype(number.dtype, np.integer) or not 0 <= number.item() <= PARK:
-        raise InputError(f"action is {action!r}, want a whole number from 0 to {PARK} ({', '.join(ACTIONS)})")
+    if number.size != 1 or not np.issubdtype(number.dtype, np.integer):
+        raise _wrong_action(action)
     return int(number.item())
+
+
+def _wrong_action(action: Any) -> InputError:
+    return InputError(f"action is {action!r}, want a whole number from 0 to {PARK} ({', '.join(ACTIONS)})")

@@ -1,4 +1,4 @@
-"""Many searches at once, compiled: the `vector_entry_point` of `parkenv/Search-v1`."""
+"""A compiled batch of searches: the `vector_entry_point` of `parkenv/Search-v1`."""
 
 from __future__ import annotations
 
@@ -14,40 +14,29 @@ from numpy.typing import NDArray
 
 from parkenv.envs.local_observation import Surroundings, local_space, observe_surroundings
 from parkenv.envs.search import REWARD_TERMS, search_space
+from parkenv.envs.search_kernel import arrive, init_prior, refresh_belief, take_step, tell_time
+from parkenv.envs.search_records import N_ACTIONS, ScenarioRecords, Searches, scenario_at, search_at
 from parkenv.envs.search_state import arrival_of
-from parkenv.envs.search_step import (
-    DRIVE_S,
-    DRIVEN_M,
-    EPISODE,
-    FAILED_PARKS,
-    N_PASSED,
-    N_TERMS,
-    OVER,
-    PARKED,
-    SCENARIO,
-    SEED_STATE,
-    STEP_DRIVE,
-    STEPS,
-    VERTEX,
-    WALKED_M,
-    Search,
-    arrive,
-    foresee,
-    kernel,
-    renew,
-    step_one,
-    tell_time,
-)
-from parkenv.envs.search_tables import MASKS, N_ACTIONS, SearchTables
 from parkenv.errors import InputError
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.keyed_random import seed_state
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy import BoolArray, FloatArray, IntArray
+from parkenv.world.occupancy_kernel import kernel
+from parkenv.world.pointers import uint8s
 from parkenv.world.scenario import Scenario
 
 OBSERVATIONS = ("full", "occupancy", "local")
-TIME_METRICS = ("drive_s", "failed_s", "walk_s", "gave_up_s", "total_s", "driven_m", "walked_m")
+TIME_METRICS = (
+    "drive_s",
+    "failed_s",
+    "walk_s",
+    "parking_cost_s",
+    "gave_up_s",
+    "total_s",
+    "driven_m",
+    "walked_m",
+)
 COUNT_METRICS = ("failed_parks", "slots_passed")
 # Gymnasium's names of the arrays that say which searches a metric is of.
 _WHICH = tuple(f"_{name}" for name in ("reward_terms", "parked", *TIME_METRICS, *COUNT_METRICS))
@@ -60,8 +49,8 @@ class Steps(NamedTuple):
     Attributes:
         rewards: (n,) float64.
         terminated, truncated: (n,) bool.
-        terms: (4, n) float64, the reward's, where a search has ended; left over elsewhere, as all that follows.
-        times: (7, n) float64, `TIME_METRICS`.
+        terms: (5, n) float64, the reward's, where a search has ended; left over elsewhere, as all that follows.
+        times: (8, n) float64, `TIME_METRICS`.
         tallies: (2, n) int64, `COUNT_METRICS`.
         parked: (n,) bool.
     """
@@ -80,21 +69,24 @@ class Steps(NamedTuple):
         flags = [np.zeros(n, dtype=np.bool_) for _ in range(3)]
         tallies = np.zeros((len(COUNT_METRICS), n), dtype=np.int64)
         times = np.zeros((len(TIME_METRICS), n))
-        return cls(np.zeros(n), flags[0], flags[1], np.zeros((N_TERMS, n)), times, tallies, flags[2])
+        return cls(
+            np.zeros(n), flags[0], flags[1], np.zeros((len(REWARD_TERMS), n)), times, tallies, flags[2]
+        )
 
 
 @kernel
-def arrive_all(search: Search, which: BoolArray) -> None:
+def arrive_all(address: int, which: BoolArray) -> None:
     """Put cars at the entries of their next worlds."""
     for e in range(len(which)):
         if which[e]:
-            search.counts[e, EPISODE] += 1
-            arrive(search, e)
+            search = search_at(address, e)
+            search.episode += 1
+            arrive(search)
 
 
 @kernel
 def step_full(
-    search: Search,
+    address: int,
     actions: IntArray,
     fresh: BoolArray,
     idle: BoolArray,
@@ -108,20 +100,22 @@ def step_full(
     for e in range(len(actions)):
         if idle[e]:
             continue
+        search = search_at(address, e)
         if fresh[e]:
-            foresee(search, e)
+            init_prior(search)
         else:
-            step_one(search, e, actions[e])
-            renew(search, e)
+            take_step(search, actions[e])
+            refresh_belief(search)
         _report(search, e, fresh[e], limit, steps, mask)
-        vertex[e] = search.counts[e, VERTEX]
-        tell_time(search, e, time[e])
+        tell_time(search)
+        vertex[e], time[e, 0], time[e, 1] = search.vertex, search.clock[0], search.clock[1]
 
 
 @kernel
 def step_local(
-    search: Search,
+    address: int,
     around: Surroundings,
+    scenario_of: IntArray,
     actions: IntArray,
     fresh: BoolArray,
     idle: BoolArray,
@@ -134,15 +128,16 @@ def step_local(
     for e in range(len(actions)):
         if idle[e]:
             continue
+        search = search_at(address, e)
         if not fresh[e]:
-            step_one(search, e, actions[e])
+            take_step(search, actions[e])
         _report(search, e, fresh[e], limit, steps, mask)
-        observe_surroundings(search, around, e, local[e])
+        observe_surroundings(search, around, scenario_of[e], local[e])
 
 
 @kernel
 def first_wrong(actions: IntArray) -> int:
-    """The first action's index that is none, or -1."""
+    """Return the index of the first number that is no action, or -1."""
     for e in range(len(actions)):
         if not 0 <= actions[e] < N_ACTIONS:
             return e
@@ -150,35 +145,30 @@ def first_wrong(actions: IntArray) -> int:
 
 
 @kernel
-def _report(search: Search, e: int, fresh: bool, limit: int, steps: Steps, mask: NDArray[np.int8]) -> None:
+def _report(search: Any, e: int, fresh: bool, limit: int, steps: Steps, mask: NDArray[np.int8]) -> None:
     """Reward, ends, metrics where it ends, and what can be done next."""
-    counts, numbers = search.counts, search.numbers
-    bits = search.ints[search.at[counts[e, SCENARIO], MASKS] + counts[e, VERTEX]]
+    masks = uint8s(scenario_at(search.scenario, 0).action_masks)
     for action in range(N_ACTIONS):
-        mask[e, action] = (bits >> action) & 1
+        mask[e, action] = masks[search.vertex * N_ACTIONS + action]
     if fresh:
         steps.rewards[e] = 0.0
         steps.terminated[e] = steps.truncated[e] = False
         return
-    cost = 0.0
-    for term in range(N_TERMS):
-        cost += numbers[e, STEP_DRIVE + term]
-    steps.rewards[e] = -cost
-    steps.terminated[e] = counts[e, OVER] == 1
-    steps.truncated[e] = counts[e, STEPS] >= limit
+    drive, failed, walk = search.step_drive_s, search.step_failed_s, search.step_walk_s
+    parking, gave_up = search.step_parking_cost_s, search.step_gave_up_s
+    steps.rewards[e] = -(drive + failed + walk + parking + gave_up)
+    steps.terminated[e] = search.over
+    steps.truncated[e] = search.n_steps >= limit
     if not (steps.terminated[e] or steps.truncated[e]):
         return
-    total = 0.0
-    for term in range(N_TERMS):
-        steps.terms[term, e] = -numbers[e, STEP_DRIVE + term]
-        steps.times[term, e] = numbers[e, DRIVE_S + term]
-        total += numbers[e, DRIVE_S + term]
-    steps.times[N_TERMS, e] = total
-    steps.times[N_TERMS + 1, e] = numbers[e, DRIVEN_M]
-    steps.times[N_TERMS + 2, e] = numbers[e, WALKED_M]
-    steps.tallies[0, e] = counts[e, FAILED_PARKS]
-    steps.tallies[1, e] = counts[e, N_PASSED]
-    steps.parked[e] = counts[e, PARKED] == 1
+    terms, times = steps.terms[:, e], steps.times[:, e]
+    terms[0], terms[1], terms[2], terms[3], terms[4] = -drive, -failed, -walk, -parking, -gave_up
+    times[0], times[1], times[2] = search.drive_s, search.failed_s, search.walk_s
+    times[3], times[4] = search.parking_cost_s, search.gave_up_s
+    times[5] = search.drive_s + search.failed_s + search.walk_s + search.parking_cost_s + search.gave_up_s
+    times[6], times[7] = search.driven_m, search.walked_m
+    steps.tallies[0, e], steps.tallies[1, e] = search.failed_parks, search.slots_passed
+    steps.parked[e] = search.parked
 
 
 class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]]):
@@ -210,20 +200,20 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     ## Episode end
     As in `parkenv/Search-v1`; truncated after `max_episode_steps`. What then happens is `autoreset_mode`: NEXT_STEP,
-    whatever is done in the next step begins a new search, for a reward of 0; SAME_STEP, a new search begins at once,
-    and the last observations and infos are `info["final_obs"]` and `info["final_info"]`; DISABLED, those to begin anew
-    are named in `reset(options={"reset_mask": ...})`. Where a search ends, `info` has its metrics, as the single
-    environment's, with `_drive_s` and so on saying which searches they are of.
+    the next step ignores the action and begins a new search, with a reward of 0; SAME_STEP, a new search begins at
+    once, and the last observations and infos are `info["final_obs"]` and `info["final_info"]`; DISABLED, the searches
+    to reset are named in `reset(options={"reset_mask": ...})`. Where a search ends, `info` has its metrics, as the
+    single environment's; `_drive_s` and so on say which searches they are of.
 
     ## Arguments
-    - `num_envs`: how many.
+    - `num_envs`: number of environments.
     - `scenario`: a `Scenario` or the name of a packaged one; or a sequence of such, of which search i gets the one at
       i modulo their number.
     - `observation`: full, occupancy or local.
-    - `k`: how many slots `local` tells of.
+    - `k`: number of slots that `local` describes.
     - `max_episode_steps`: 2000 from `make_vec`.
     - `autoreset_mode`: NEXT_STEP, SAME_STEP or DISABLED of `gymnasium.vector.AutoresetMode`, or its value.
-    - `copy`: False hands out arrays that the next step overwrites, and saves their copying.
+    - `copy`: False returns arrays that the next step overwrites, which saves their copying.
     - further keywords replace fields of the scenarios, e.g. `failure_s=90.0`.
 
     ```python
@@ -295,12 +285,14 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         n = self.num_envs
-        scenario_of = np.arange(n) % len(self.scenarios)
-        self._search = Search.on(SearchTables.of(self.scenarios), scenario_of, self._full)
+        self._scenario_of = np.arange(n) % len(self.scenarios)
+        self._searches = Searches(ScenarioRecords(self.scenarios), self._scenario_of, self._full)
         empty: Any = create_empty_array(self.single_observation_space, n)
         self._seen: dict[str, NDArray[Any]] = empty
-        kept_up = {"p_occupied": self._search.p_occupied, "belief": self._search.belief.reshape(n, -1)}
-        self._seen |= {name: array for name, array in kept_up.items() if name in self._seen}
+        if self._full:
+            self._seen["p_occupied"] = self._searches.p_occupied
+        if "belief" in self._seen:
+            self._seen["belief"] = self._searches.belief.reshape(n, -1)
         self._steps = Steps.of(n)
         self._limit = max_episode_steps or np.iinfo(np.int64).max
         self._mode, self._copy = mode, copy
@@ -311,14 +303,16 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     @property
     def reward_terms(self) -> dict[str, FloatArray]:
         """The terms of the last step's rewards, (n_envs,) each."""
-        terms = -self._search.numbers[:, STEP_DRIVE : STEP_DRIVE + N_TERMS]
-        return dict(zip(REWARD_TERMS, terms.T, strict=True))
+        fields = ("step_drive_s", "step_failed_s", "step_walk_s", "step_parking_cost_s", "step_gave_up_s")
+        return {
+            term: -self._searches.records[field] for term, field in zip(REWARD_TERMS, fields, strict=True)
+        }
 
     @property
     def bytes_each(self) -> float:
-        """Memory of one search, bytes, in a lot of whose slots all have been looked at; the tables are shared."""
-        buffers = (*self._seen.values(), *self._steps, *self._search.changing())
-        return sum({a.ctypes.data: a.nbytes for a in buffers}.values()) / self.num_envs
+        """Memory of one search, bytes, once all slots of its lot were observed; the scenarios' tables are shared."""
+        own = (a for name, a in self._seen.items() if name not in ("p_occupied", "belief"))
+        return (self._searches.n_bytes + sum(a.nbytes for a in (*own, *self._steps))) / self.num_envs
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -326,11 +320,12 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         """Start a search in every environment, or in those of `options["reset_mask"]`, (n_envs,) bool.
 
         Args:
-            seed: the first one's, counted up from there; or one for each, None to go on; or None to go on.
+            seed: of the first environment, the next ones counting up from it; or a sequence with one for each, where
+                None continues with the next world of the environment's seed; or None, which does so for all.
             options: nothing but `reset_mask`.
 
         Raises:
-            InputError: another option, or as many seeds as there are no environments.
+            InputError: an unknown option, or a number of seeds that is not the number of environments.
         """
         which = self._chosen(options)
         if seed is None or isinstance(seed, (int, np.integer)):
@@ -348,12 +343,11 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             known = self.np_random_seed
             first = int(self.np_random.integers(1 << 62)) if known is None or known < 0 else known
             seeds = [first + i if one is None else one for i, one in enumerate(seeds)]
-        counts = self._search.counts
+        records = self._searches.records
         for i in np.flatnonzero(which):
             one = seeds[i]
             if one is not None:
-                counts.view(np.uint64)[i, SEED_STATE] = seed_state(one)
-                counts[i, EPISODE] = -1
+                records[i]["seed_state"], records[i]["episode"] = seed_state(one), -1
         self._begun = True
         self._arrive(which)
         self._step(np.zeros(self.num_envs, dtype=np.int64), which, ~which)
@@ -403,30 +397,30 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return self._observations(), *results, info
 
     def _step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
-        """Begin the searches that are fresh, leave the idle ones alone, step the others."""
+        """Begin the searches that are fresh, skip the idle ones, step the others."""
         seen, steps = self._seen, self._steps
         if self._surroundings is None:
             step_full(
-                self._search, actions, fresh, idle, self._limit, steps,
+                self._searches.address, actions, fresh, idle, self._limit, steps,
                 seen["vertex"], seen["time"], seen["action_mask"],
             )  # fmt: skip
         else:
             step_local(
-                self._search, self._surroundings, actions, fresh, idle, self._limit, steps,
+                self._searches.address, self._surroundings, self._scenario_of, actions, fresh, idle, self._limit, steps,
                 seen["local"], seen["action_mask"],
             )  # fmt: skip
 
     def _arrive(self, which: BoolArray) -> None:
         """Put some of the cars at the entries of their next worlds."""
-        search = self._search
-        arrive_all(search, which)
-        if not len(search.asked):
+        searches = self._searches
+        arrive_all(searches.address, which)
+        if not len(searches.external_prior):
             return
         for i in np.flatnonzero(which):
             scenario = self.scenarios[i % len(self.scenarios)]
-            forecast = scenario.forecast(arrival_of(scenario, search, int(i)))
+            forecast = scenario.forecast(arrival_of(scenario, searches.records[i]))
             n = len(forecast.p_occupied)
-            search.asked[i, :, :n] = forecast.p_occupied, forecast.decay_rate
+            searches.external_prior[i, :, :n] = forecast.p_occupied, forecast.decay_rate
 
     def _observations(self) -> dict[str, NDArray[Any]]:
         return {name: a.copy() for name, a in self._seen.items()} if self._copy else dict(self._seen)

@@ -1,4 +1,4 @@
-"""`parkenv/SearchSensors-v1`: the search through raw sensors."""
+"""`parkenv/SearchSensors-v1`: the search with raw sensor data."""
 
 from __future__ import annotations
 
@@ -17,59 +17,65 @@ from parkenv.world.scenario import Scenario
 from sim_sensors.rig import SensorRig
 
 FARTHEST = 1e7
-"""Bound, m, of the observed positions: Gymnasium wants one, and no lot is as large."""
+"""Bound, m, of the observed positions: Gymnasium requires one, and every lot is smaller."""
 
 _NOT_SENSED = ("p_occupied", "belief")
 
 
 class SearchSensorsEnv(SearchEnv):
-    """`parkenv/Search-v1` for those who bring their own eyes: images, scans and poses instead of a belief.
+    """`parkenv/Search-v1` with raw sensor data instead of a belief: images, laser scans and poses.
 
     ## Description
-    World, decisions, rewards and ends are those of `parkenv/Search-v1`; equal seeds give equal worlds. What the
-    car sees is measured by simulated sensors on the way: up to `captures` times on every edge, evenly, the last
-    time where it stops. The vehicle stands on its vertex (x, y) and looks along the lane; between two vertices
-    it looks where it drives. One capture is made where the search starts, and one after waiting or a failed try.
+    World, decisions and rewards are those of `parkenv/Search-v1`, and equal seeds give equal worlds. The agent brings
+    its own perception. Simulated sensors measure up to `captures` times on every edge, at equal distances, the last
+    time at its end. The vehicle stands on its vertex and is headed along the lane; between two vertices it is headed
+    along the edge. One capture is made at the start, and one after waiting or a failed attempt.
 
-    Where nothing has been forecast, an agent can read the forecast in `parkenv/Search-v1`'s first observation.
+    The forecast of the slots is not observed; it is in the first observation of `parkenv/Search-v1` with the same seed.
 
     ## Action space
-    `Discrete(5)`: up, down, left, right, park, as in `parkenv/Search-v1`.
+    `Discrete(5)`, as in `parkenv/Search-v1`:
+
+    | Num | Action | Effect |
+    |-----|--------|--------|
+    | 0-3 | up, down, left, right | drive along that edge of the graph; wait `wait_s` if there is none |
+    | 4 | park | park and walk to the goal if the slot here is free; lose `failure_s` if it is taken |
 
     ## Observation space
-    A `Dict`; K = `captures`, newest last; rows from `count` on are 0.
+    A `Dict`. K = `captures`; the newest capture is the last of `count`; rows from `count` on are 0.
 
     | Key | Space | Meaning |
     |-----|-------|---------|
-    | `vertex` | `Discrete(n_vertices)` | where the car is; vertex i < n_slots lies before slot i |
+    | `vertex` | `Discrete(n_vertices)` | position of the car; vertex i < n_slots is in front of slot i |
     | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
-    | `action_mask` | `Box(0, 1, (5,), int8)` | which actions the graph has here |
-    | `count` | `Discrete(K + 1)` | how many captures the last step made; 0 once parked |
+    | `action_mask` | `Box(0, 1, (5,), int8)` | the actions that the graph has here |
+    | `count` | `Discrete(K + 1)` | number of captures of the last step; 0 after parking |
     | `pose` | `Box(-1e7, 1e7, (K, 3), float32)` | x, y in m, yaw in rad of the vehicle, lot frame |
     | `captured_at` | `Box(0, 1e8, (K,), float32)` | s since the search began |
-    | `image.<camera>` | `Box(0, 255, (K, h, w, 3), uint8)` | RGB, a key for each camera of the rig |
-    | `image.<pair>` | `Box(0, 255, (K, 2, h, w, 3), uint8)` | left and right, for each stereo camera |
-    | `scan.<laser>` | `Box(0, max_range, (K, n_beams), float32)` | m; `max_range` where nothing was met |
+    | `image.<camera>` | `Box(0, 255, (K, h, w, 3), uint8)` | RGB, for each camera of the rig |
+    | `image.<pair>` | `Box(0, 255, (K, 2, h, w, 3), uint8)` | RGB, left and right, for each stereo camera |
+    | `scan.<laser>` | `Box(0, max_range, (K, n_beams), float32)` | m; `max_range` for no return |
 
-    Beam n looks along -3π/4 + n·0.25° from forward, counter-clockwise, in the laser's frame. Where sensors sit
-    and how they are built is `env.unwrapped.rig`. The thesis's rig has `image.right` and `scan.laser`.
+    Beam n points along -3π/4 + n·0.25° from forward, counter-clockwise, in the laser's frame. `env.unwrapped.rig` has
+    the poses and models of the sensors. The thesis's rig has `image.right` and `scan.laser`.
 
     ## Rewards
-    As in `parkenv/Search-v1`.
+    Minus the seconds of the step, as in `parkenv/Search-v1`.
 
     ## Starting state
-    As in `parkenv/Search-v1`. The weather is drawn for each search unless it is given.
+    As in `parkenv/Search-v1`. The weather is drawn for each episode unless it is given.
 
     ## Episode end
-    As in `parkenv/Search-v1`; the lot is proven full by that environment's perfect looks.
+    As in `parkenv/Search-v1`, whose error-free observations decide whether the lot is full.
 
     ## Arguments
-    - `scenario`, `render_mode`, and fields of the scenario: as in `parkenv/Search-v1`. `traffic=Traffic(cars=4,
-      pedestrians=6)` lets others drive and walk through the pictures.
-    - `rig`: laser (the thesis's: a camera and a 270° laser), stereo, both_sides, or a `sim_sensors.rig.SensorRig`.
-    - `weather`: sunny, overcast, low_sun, dusk or rain; None draws one.
-    - `captures`: how many there are at most on an edge.
-    - `every`: m; on short edges captures are at least so far apart.
+    | Name | Default | Meaning |
+    |------|---------|---------|
+    | `scenario`, `render_mode`, changes | | as in `parkenv/Search-v1`; `traffic=Traffic(4, 6)` adds road users |
+    | `rig` | `"laser"` | `laser` (the thesis's camera and 270° laser), `stereo`, `both_sides`, or a `SensorRig` |
+    | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
+    | `captures` | 4 | largest number of captures on an edge |
+    | `every` | 1.0 | m, least distance between captures on an edge |
 
     ```python
     >>> import gymnasium as gym

@@ -19,7 +19,9 @@ from pydantic import (
     ValidationError,
     ValidationInfo,
 )
-from pydantic_core import ErrorDetails
+from pydantic.annotated_handlers import GetJsonSchemaHandler
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, ErrorDetails
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
@@ -61,6 +63,16 @@ def _resolved(value: object, info: ValidationInfo) -> object:
 
 FilePath = Annotated[Path, BeforeValidator(_resolved)]
 """An existing file; relative paths start at the folder of the file that names them."""
+
+
+class OrText:
+    """Annotation of a table for which text may stand, such as the name of a file: both are in the JSON schema."""
+
+    def __get_pydantic_json_schema__(
+        self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        return {"anyOf": [{"type": "string"}, handler(core_schema)]}
+
 
 Several = Annotated[tuple[T, ...], Strict(False)]
 """A list in a file, a tuple in the object."""

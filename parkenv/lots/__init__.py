@@ -5,8 +5,9 @@
 
 from parkenv.lots.checks import check_lot
 from parkenv.lots.generators import city_lot, grid_lot
-from parkenv.lots.geojson import LotProblem, write_lot
+from parkenv.lots.geojson import write_lot
 from parkenv.lots.importers.lot_import import import_lot
+from parkenv.lots.lot_contents import LotProblem
 from parkenv.lots.lot_files import PACKAGED_LOTS, load_lot, packaged_lot, read_lot
 
 __all__ = [

@@ -17,54 +17,23 @@ middle of the features. `properties.kind` is the kind of a feature:
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
-from parkenv.lots.generators import Slots, bay_row
+from parkenv.lots.geojson_slots import FARTHEST, SLOT_SHAPE, RawFeature, is_coordinate, read_slots
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.slot_polygons import slots_from_polygons
-from parkenv.world.drive_graph import GraphError, build_drive_graph, linestrings
-from parkenv.world.lot import SLOT_SIDE, Lane, Mouth, ParkingLot, corner_points, is_building, mouth_points
+from parkenv.lots.lot_contents import KINDS, LotContents
+from parkenv.world.lot import Lane, Mouth, ParkingLot, is_building
 
 FloatArray = NDArray[np.float64]
 
 LOT_VERSION = 1
-KINDS = {
-    "slot": ("Polygon",),
-    "lane": ("LineString",),
-    "entry": ("Point",),
-    "goal": ("Point",),
-    "wall": ("LineString", "Polygon"),
-}
-"""The kinds of features, and the geometry types allowed for each."""
-SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")
-"""The properties that define a slot exactly."""
-MOUTHS = {mouth.name.lower(): mouth for mouth in Mouth}
-FARTHEST = 1e8
-"""Greatest coordinate, m: enough for any map grid, and small enough for float64 to keep the millimetre."""
-SLOT_AGREEMENT = 0.01
-"""Greatest distance, m, between a slot's polygon and the rectangle that its properties describe."""
-
-
-@dataclass(frozen=True)
-class LotProblem:
-    """An error or warning about a lot file; `feature` is the 0-based index in the FeatureCollection."""
-
-    severity: Literal["error", "warning"]
-    feature: int | None
-    message: str
-
-    def __str__(self) -> str:
-        where = "" if self.feature is None else f"feature {self.feature}: "
-        return f"{self.severity}: {where}{self.message}"
 
 
 def write_lot(lot: ParkingLot, path: str | Path) -> None:
@@ -122,48 +91,6 @@ def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
 # ---- reading: all errors are collected, so nothing below raises out of `read_contents` ----
 
 
-@dataclass
-class LotContents:
-    """The valid features of a file; `numbers[kind]` are their feature numbers, `errors` the faults of the others."""
-
-    name: str
-    slot_ids: list[str] = field(default_factory=list)
-    slots: Slots = field(default_factory=lambda: bay_row((0.0, 0.0), 0.0, 0))
-    lanes: list[Lane] = field(default_factory=list)
-    entries: list[FloatArray] = field(default_factory=list)
-    goals: list[FloatArray] = field(default_factory=list)
-    walls: list[FloatArray] = field(default_factory=list)
-    numbers: dict[str, list[int]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
-    errors: list[LotProblem] = field(default_factory=list)
-
-    def columns(self) -> dict[str, Any]:
-        """The keyword arguments that `ParkingLot` takes."""
-        return {
-            "name": self.name,
-            "slot_ids": tuple(self.slot_ids),
-            **self.slots.columns(),
-            "lanes": tuple(self.lanes),
-            "entries": np.array(self.entries),
-            "goals": np.array(self.goals),
-            "walls": tuple(self.walls),
-        }
-
-    def error(self, feature: int | None, message: str) -> None:
-        """Record an error of a feature, or of the file as a whole."""
-        self.errors.append(LotProblem("error", feature, message))
-
-
-@dataclass(frozen=True)
-class _RawFeature:
-    """A feature with a valid geometry: its parts are slices of one array of all positions."""
-
-    number: int
-    kind: str
-    properties: dict[str, Any]
-    parts: list[slice]
-    given_id: object
-
-
 def read_contents(path: Path) -> LotContents:
     """Read all valid features of a file, and record all errors. Does not raise."""
     contents = LotContents(path.stem)
@@ -174,7 +101,7 @@ def read_contents(path: Path) -> LotContents:
         contents.error(None, str(error))
         return contents
 
-    raw: list[_RawFeature] = []
+    raw: list[RawFeature] = []
     positions: list[tuple[float, float]] = []
     kinds_seen: set[object] = set()
     for number, feature in enumerate(document["features"]):
@@ -205,12 +132,12 @@ def read_contents(path: Path) -> LotContents:
     for feature in raw:
         if feature.kind != "slot":
             _add_feature(contents, feature, [xy[part] for part in feature.parts])
-    _read_slots(contents, [feature for feature in raw if feature.kind == "slot"], xy, exact=local)
+    read_slots(contents, [feature for feature in raw if feature.kind == "slot"], xy, exact=local)
     contents.errors.sort(key=lambda problem: -1 if problem.feature is None else problem.feature)
     return contents
 
 
-def _add_feature(contents: LotContents, feature: _RawFeature, parts: list[FloatArray]) -> None:
+def _add_feature(contents: LotContents, feature: RawFeature, parts: list[FloatArray]) -> None:
     """Add a lane, an entry, a goal, or a wall with one part per ring."""
     if feature.kind == "lane":
         try:
@@ -266,7 +193,7 @@ def _check_head(document: Any, stem: str) -> tuple[str, bool]:
 
 def _check_feature(
     number: int, feature: Any, positions: list[tuple[float, float]], kinds_seen: set[object]
-) -> _RawFeature:
+) -> RawFeature:
     """Validate a feature and append its positions to `positions`."""
     if not isinstance(feature, dict) or feature.get("type") != "Feature":
         raise InputError("want a GeoJSON object of type 'Feature'")
@@ -303,159 +230,10 @@ def _check_feature(
         if shape == "Polygon" and positions[start] != positions[-1]:
             raise InputError(f"{kind}: the polygon's ring is open, want its first position again at the end")
         parts.append(slice(start, len(positions)))
-    return _RawFeature(number, kind, properties, parts, properties.get("id", feature.get("id")))
+    return RawFeature(number, kind, properties, parts, properties.get("id", feature.get("id")))
 
 
 def _position(kind: str, position: Any) -> tuple[float, float]:
-    if isinstance(position, list) and len(position) >= 2 and all(map(_is_number, position)):
+    if isinstance(position, list) and len(position) >= 2 and all(map(is_coordinate, position)):
         return float(position[0]), float(position[1])
     raise InputError(f"{kind}: position {position!r:.60}, want two finite numbers, at most {FARTHEST:.0e}")
-
-
-def _is_number(value: Any) -> bool:
-    # NaN compares as false; a bool is an int to Python but no number to JSON.
-    return type(value) in (float, int) and abs(value) <= FARTHEST
-
-
-def _read_slots(contents: LotContents, raw: list[_RawFeature], xy: FloatArray, exact: bool) -> None:
-    """Validate the slots of a file and add the valid ones.
-
-    Exact properties are used in a local frame only: after a projection stale ones would go unnoticed.
-    """
-    if not raw:
-        return
-    polygons = _polygons([xy[feature.parts[0]] for feature in raw])
-    area = shapely.area(shapely.convex_hull(polygons))
-    valid = shapely.is_valid(polygons)
-    first_with: dict[str, int] = {}
-    valid_rows: list[int] = []
-    ids: list[str] = []
-    shapes: list[tuple[float, ...] | None] = []
-    costs: list[float] = []
-    for i, feature in enumerate(raw):
-        try:
-            slot_id = _slot_id(feature)
-            if slot_id in first_with:
-                raise InputError(f"slot: id {slot_id!r:.40} appears already in feature {first_with[slot_id]}")
-            first_with[slot_id] = feature.number
-            if area[i] < SLOT_SIDE**2:
-                raise InputError(f"slot {slot_id!r:.40}: the polygon is flat, want an area to park on")
-            if not valid[i]:
-                reason = shapely.is_valid_reason(polygons[i])
-                raise InputError(f"slot {slot_id!r:.40}: the polygon is not a simple one: {reason}")
-            cost = _parking_cost(feature.properties, slot_id)
-            shapes.append(_slot_shape(feature.properties, slot_id) if exact else None)
-        except InputError as error:
-            contents.error(feature.number, str(error))
-            continue
-        valid_rows.append(i)
-        ids.append(slot_id)
-        costs.append(cost)
-
-    polygons = polygons[valid_rows]
-    bare = np.array([shape is None for shape in shapes], dtype=bool)
-    slots = slots_from_polygons(polygons[bare], contents.lanes)
-    if not bare.all():
-        # x, y, yaw, length, width, mouth
-        table = np.empty((len(valid_rows), 6))
-        table[bare] = np.column_stack([slots.xy, slots.yaw, slots.length, slots.width, slots.mouth])
-        table[~bare] = [shape for shape in shapes if shape is not None]
-        slots = Slots(table[:, :2], table[:, 2], table[:, 3], table[:, 4], table[:, 5].astype(np.int8))
-
-    boxes = shapely.polygons(corner_points(slots.xy, slots.yaw, slots.length, slots.width))
-    apart = shapely.hausdorff_distance(polygons, boxes)
-    disagrees = ~bare & (apart > SLOT_AGREEMENT)
-    thin = slots.width < SLOT_SIDE
-    for k in np.flatnonzero(disagrees):
-        contents.error(
-            raw[valid_rows[k]].number,
-            f"slot {ids[k]!r:.40}: the polygon lies {apart[k]:.2f} m from what center, yaw, length and width "
-            f"say, want at most {SLOT_AGREEMENT:g} m",
-        )
-    for k in np.flatnonzero(thin):
-        contents.error(
-            raw[valid_rows[k]].number,
-            f"slot {ids[k]!r:.40}: the polygon is {slots.width[k]:.3f} m wide, want at least {SLOT_SIDE:g} m",
-        )
-    kept = np.flatnonzero(~disagrees & ~thin)
-    contents.slots = replace(slots, parking_cost_s=np.array(costs, dtype=np.float64))[kept]
-    contents.slot_ids = [ids[k] for k in kept]
-    contents.numbers["slot"] = [raw[valid_rows[k]].number for k in kept]
-
-
-def _polygons(rings: Sequence[FloatArray]) -> NDArray[np.object_]:
-    which = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
-    return np.asarray(shapely.polygons(shapely.linearrings(np.concatenate(rings), indices=which)))
-
-
-def _slot_id(feature: _RawFeature) -> str:
-    given = feature.number if feature.given_id is None else feature.given_id
-    if type(given) is int:
-        return str(given)
-    if not isinstance(given, str) or not given:
-        raise InputError(f"slot: id is {given!r:.40}, want a text")
-    return given
-
-
-def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
-    """Seconds that parking in a slot costs; 0 where the file does not say."""
-    cost = properties.get("parking_cost_s", 0.0)
-    if not _is_number(cost) or cost < 0.0:
-        raise InputError(f"slot {slot_id!r:.40}: parking_cost_s is {cost!r:.40}, want seconds, at least 0")
-    return float(cost)
-
-
-def _slot_shape(properties: dict[str, Any], slot_id: str) -> tuple[float, ...] | None:
-    """Exact x, y, yaw, length, width and mouth, or None for a slot with its polygon only."""
-    absent = [name for name in SLOT_SHAPE if name not in properties]
-    if len(absent) == len(SLOT_SHAPE):
-        return None
-    if absent:
-        raise InputError(f"slot {slot_id!r:.40}: no {absent[0]}, want all of {', '.join(SLOT_SHAPE)} or none")
-    center, yaw, length, width, mouth = (properties[name] for name in SLOT_SHAPE)
-    if not (isinstance(center, list) and len(center) == 2 and all(map(_is_number, center))):
-        raise InputError(f"slot {slot_id!r:.40}: center is {center!r:.40}, want two finite numbers")
-    if not _is_number(yaw):
-        raise InputError(f"slot {slot_id!r:.40}: yaw is {yaw!r:.40}, want a finite number")
-    for name, value in (("length", length), ("width", width)):
-        if not _is_number(value) or value < SLOT_SIDE:
-            raise InputError(f"slot {slot_id!r:.40}: {name} is {value!r:.40}, want at least {SLOT_SIDE:g} m")
-    if not isinstance(mouth, str) or mouth not in MOUTHS:
-        raise InputError(f"slot {slot_id!r:.40}: mouth is {mouth!r:.40}, want one of {', '.join(MOUTHS)}")
-    return (*center, yaw, length, width, MOUTHS[mouth])
-
-
-def graph_errors(contents: LotContents) -> list[LotProblem]:
-    """Errors of the drive graph: slots and entries that no lane serves, junctions of too many lanes."""
-    lanes = [(lane.points, lane.oneway) for lane in contents.lanes]
-    if not lanes:
-        return []
-    slots = contents.slots
-    mouth_xy = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
-    left = {"slot": np.arange(len(slots)), "entry": np.arange(len(contents.entries))}
-    entries = np.array(contents.entries).reshape(-1, 2)
-    errors = []
-    while True:
-        # Faulty features are left out and the rest is tried again, so that all faults are found.
-        try:
-            build_drive_graph(lanes, mouth_xy[left["slot"]], entries[left["entry"]])
-        except GraphError as error:
-            kind = error.problems[0].kind
-            for problem in error.problems:
-                if kind == "junction":
-                    distance = shapely.distance(
-                        linestrings([points for points, _ in lanes]), shapely.Point(problem.xy)
-                    )
-                    feature = contents.numbers["lane"][int(np.argmin(distance))]
-                    message = f"lane: the junction {problem.message}"
-                else:
-                    index = left[kind][problem.index]
-                    feature = contents.numbers[kind][index]
-                    name = f"slot {contents.slot_ids[index]!r:.40}" if kind == "slot" else kind
-                    message = f"{name} {problem.message}"
-                errors.append(LotProblem("error", feature, message))
-            if kind == "junction":
-                return errors
-            left[kind] = np.delete(left[kind], [problem.index for problem in error.problems])
-        else:
-            return errors

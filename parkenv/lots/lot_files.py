@@ -8,7 +8,8 @@ from pathlib import Path
 from parkenv.errors import InputError
 from parkenv.lots.dragon_lake import dragon_lake_lot
 from parkenv.lots.file_formats import LotFormat, lot_format
-from parkenv.lots.geojson import graph_errors, read_contents
+from parkenv.lots.geojson import read_contents
+from parkenv.lots.lot_contents import graph_errors
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.lot import ParkingLot
 

@@ -1,4 +1,4 @@
-"""Slots found without a map of them: where cars stand again and again (T §6)."""
+"""Discover slots from the poses of detected cars, without a given map (T §6)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ _ROOM = (4.2, 1.9)  # m along and across a slot, closer than which there is no o
 
 
 class FoundSlots(NamedTuple):
-    """Slots that cars have shown.
+    """Discovered slots.
 
     Attributes:
-        xy: (n, 2) m, their middles.
-        yaw: (n,) rad, along them, in [0, π).
-        cars: (n,) int64, how many cars were seen there.
+        xy: (n, 2) m, centres.
+        yaw: (n,) rad, along the slot, in [0, π).
+        cars: (n,) int64, number of cars detected there.
     """
 
     xy: FloatArray
@@ -34,12 +34,12 @@ class FoundSlots(NamedTuple):
 
 
 class DiscoveryScore(NamedTuple):
-    """Found slots against true ones.
+    """Errors of discovered slots.
 
     Attributes:
-        precision: share of the found slots that are true ones.
-        recall: share of the true slots that were found.
-        error: m, mean distance of the matched.
+        precision: fraction of the discovered slots that are true slots.
+        recall: fraction of the true slots that were discovered.
+        error: m, mean distance of matched slots.
         yaw_error: rad, mean.
     """
 
@@ -50,7 +50,7 @@ class DiscoveryScore(NamedTuple):
 
 
 def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSlots:
-    """Slots from the poses of cars over many sessions: dense places are slots, single cars are not.
+    """Find slots in the poses of cars from many sessions: dense places are slots, single cars are not.
 
     The densest place is a slot, then the densest of those where another slot does not reach, and so on: two cars never
     stood in each other, so neighbours do not grow together however many sessions there are, as the clusters of a
@@ -124,7 +124,7 @@ def _inside(away: FloatArray, direction: float) -> NDArray[np.bool_]:
 def score_discovery(
     found: FoundSlots, lot: ParkingLot, *, within: float = 1.0, turned: float = math.radians(15.0)
 ) -> DiscoveryScore:
-    """Match found slots to the lot's, one to one, the nearest pairs first.
+    """Match discovered slots to those of the lot, one to one, nearest pairs first.
 
     Args:
         found: from `discover`.

@@ -1,4 +1,4 @@
-"""How often each slot is taken, from sessions at different times (T §3.3.3), and at which hour (T §6)."""
+"""Occupancy probability of each slot, from sessions at different times (T §3.3.3), by hour (T §6)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from scipy.stats import beta
 
 from parkenv.errors import InputError
-from parkenv.world.occupancy import DAY_S, HOUR_S, MAX_PROBABILITY, MIN_PROBABILITY, Arrival, Forecast
+from parkenv.world.occupancy import Arrival, Forecast
+from parkenv.world.occupancy_kernel import MAX_PROBABILITY, MIN_PROBABILITY
+from parkenv.world.week import DAY_S, HOUR_S
 
 FloatArray = NDArray[np.float64]
 
@@ -28,7 +30,7 @@ _HOUR_WIDTH = 1.0
 
 @dataclass(frozen=True, eq=False)
 class SessionLog:
-    """What was seen of every slot in each session.
+    """The observed state of every slot in each session.
 
     Args:
         time: (k,) s since Monday 00:00.
@@ -53,18 +55,18 @@ class SessionLog:
 
     @property
     def n_slots(self) -> int:
-        """How many slots there are."""
+        """Number of slots."""
         return int(self.occupied.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a map predicts of every slot.
+    """The map's prediction for every slot.
 
     Attributes:
         p_occupied: (n_slots,) float64.
-        low, high: (n_slots,) float64, bounds that hold P(occupied) with the asked probability.
-        sessions: (n_slots,) int64, in how many sessions the slot was in view.
+        low, high: (n_slots,) float64, bounds of the credible interval of P(occupied).
+        sessions: (n_slots,) int64, number of sessions in which the slot was in view.
     """
 
     p_occupied: FloatArray
@@ -74,7 +76,7 @@ class Prediction:
 
 
 def counted(log: SessionLog) -> FloatArray:
-    """The thesis's prediction, (n_slots,): N_occupied / (N_occupied + N_free) (eq. 3.10-3.12); 0.5 where never seen."""
+    """Return the thesis's prediction, (n_slots,): N_occupied / (N_occupied + N_free); 0.5 if unseen (eq. 3.10-3.12)."""
     seen = log.known.sum(axis=0)
     taken = (log.occupied & log.known).sum(axis=0)
     return np.where(seen > 0, taken / np.maximum(seen, 1), 0.5)
@@ -138,13 +140,13 @@ class MapPrior:
         return self.log.n_slots
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """What the map predicts at the arrival."""
+        """Return the map's prediction for the arrival."""
         p = np.clip(predict(self.log, arrival.time).p_occupied, MIN_PROBABILITY, MAX_PROBABILITY)
         return Forecast(p, np.full(self.n_slots, 1.0 / self.relaxation_s))
 
 
 def _alike(then: FloatArray, time: float) -> FloatArray:
-    """How much sessions say of another time, 0 to 1: those of the same weekday or kind of day, near the hour."""
+    """Return the weight of sessions for another time, 0 to 1: by weekday or kind of day, and by hour."""
     day, today = np.floor(then / DAY_S) % 7, np.floor(time / DAY_S) % 7
     same = np.where(day == today, 1.0, np.where((day >= 5) == (today >= 5), OTHER_WEEKDAY, 0.0))
     apart = np.abs(then % DAY_S - time % DAY_S) / HOUR_S

@@ -1,4 +1,4 @@
-"""Where a car takes itself to be: odometry that drifts, and a satellite fix that wanders (T §3.3)."""
+"""Localisation errors of the car: drifting odometry corrected by satellite fixes (T §3.3)."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class PoseNoise:
             raise InputError(f"length is {self.length} m, want above 0")
 
     def estimated(self, poses: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Poses as the car has them, (n, 3), of true ones along a way, (n, 3) x, y in m and yaw in rad."""
+        """Return estimated poses, (n, 3), for true poses along a path, (n, 3) x, y in m and yaw in rad."""
         scale = np.array([self.position, self.position, self.heading])
         step = np.hypot(*np.diff(poses[:, :2], axis=0, prepend=poses[:1, :2]).T)
         kept = np.exp(-step / self.length)

@@ -1,4 +1,4 @@
-"""The drive that passes every slot of a lot on the side where the camera looks."""
+"""Survey route: a closed drive that passes every slot on the side of the camera."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class SurveyRoute(NamedTuple):
     """A closed drive.
 
     Attributes:
-        vertices: (k,) int64, the stops passed, in order.
+        vertices: (k,) int64, in driving order.
         path: (k, 2) float64, m, lot frame.
-        against: how many slots are passed against a one-way lane, since they lie on its left.
+        against: number of slots passed against the direction of a one-way lane, because they are on its left.
         length: m.
     """
 
@@ -34,7 +34,7 @@ class SurveyRoute(NamedTuple):
 
 
 class _Pass(NamedTuple):
-    """One way along a lane from a junction to the next: the stops, junctions included, and its length, m."""
+    """A section of a lane from one junction to the next: its vertices, junctions included, and its length, m."""
 
     stops: tuple[int, ...]
     length: float
@@ -89,7 +89,7 @@ def survey_route(lot: ParkingLot, entry: int = 0, *, both_sides: bool = False) -
 
 
 def _passes(lot: ParkingLot) -> list[_Pass]:
-    """Every way from junction to junction that the lanes allow."""
+    """Return all allowed sections from junction to junction."""
     found = []
     for junction in range(lot.n_slots, lot.n_vertices):
         for column in np.flatnonzero(lot.neighbors[junction] >= 0):
@@ -105,7 +105,7 @@ def _passes(lot: ParkingLot) -> list[_Pass]:
 
 
 def _straight_on(lot: ParkingLot, vertex: int) -> tuple[int | None, float]:
-    """The next stop along a slot's lane, and how far it is; None at a junction."""
+    """Return the next vertex along a slot's lane and its distance; None at a junction."""
     if vertex >= lot.n_slots:
         return None, 0.0
     heading = lot.vertex_yaw[vertex]
@@ -123,7 +123,7 @@ def _straight_on(lot: ParkingLot, vertex: int) -> tuple[int | None, float]:
 
 
 def _left_slots(lot: ParkingLot, way: _Pass) -> int:
-    """How many slots along a lane lie on the left of its direction."""
+    """Return the number of slots on the left of a section."""
     slots = np.array(way.stops[1:-1], dtype=np.int64)
     yaw = lot.vertex_yaw[slots]
     away = lot.slot_xy[slots] - lot.vertex_xy[slots]
@@ -131,7 +131,7 @@ def _left_slots(lot: ParkingLot, way: _Pass) -> int:
 
 
 def _join(drive: nx.MultiDiGraph[Any], ways: nx.DiGraph[Any], start: int) -> None:
-    """Link what must be driven to the start, part by part, by the cheapest way there and back."""
+    """Connect all required sections to the start by the shortest ways there and back."""
     drive.add_node(start)
     while True:
         parts = list(nx.weakly_connected_components(drive))
@@ -147,7 +147,7 @@ def _join(drive: nx.MultiDiGraph[Any], ways: nx.DiGraph[Any], start: int) -> Non
 
 
 def _balance(drive: nx.MultiDiGraph[Any], ways: nx.DiGraph[Any]) -> None:
-    """Add the cheapest ways that make as many passes arrive as leave, everywhere."""
+    """Add the cheapest sections that balance arrivals and departures at every vertex (Eulerian circuit)."""
     flow_graph = nx.DiGraph()
     flow_graph.add_nodes_from(ways)
     for v in drive:

@@ -1,4 +1,4 @@
-"""The map file: sessions and what was seen in them, in SQLite; a session is there whole or not at all."""
+"""The map file: survey sessions in an SQLite database, one transaction per session."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Session:
     """One survey drive.
 
     Attributes:
-        key: what tells it from all others; a survey that goes on does not drive it again.
+        key: unique name; a resumed survey does not drive it again.
         time: s since Monday 00:00, when it began.
         rig, weather: words.
         p_occupied: (n_slots,) float64; NaN where the slot was never in view.
@@ -80,9 +80,9 @@ class MapStore:
     """A map file.
 
     Args:
-        path: the file; made where it does not exist, unless `create` is off.
-        lot: whose slots it is about.
-        create: whether to make a file that is not there.
+        path: the file; created if it does not exist, unless `create` is off.
+        lot: the lot that the map describes.
+        create: whether to create a missing file.
 
     Raises:
         InputError: no such file; no map file, one of a newer parkenv or of another lot; or it cannot be written.
@@ -92,7 +92,7 @@ class MapStore:
         self.path, self._lot = path, lot
         if not path.exists() and not create:
             raise InputError(f"{path}: no such map file; parkenv survey makes one")
-        with self._said_plainly():
+        with self._errors_in_words():
             self._db = sqlite3.connect(path, timeout=_PATIENCE_S, isolation_level=None)
             try:
                 self._open()
@@ -107,12 +107,12 @@ class MapStore:
         self.close()
 
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the file."""
         self._db.close()
 
     def has(self, key: str) -> bool:
-        """Whether a session is there."""
-        with self._said_plainly():
+        """Return whether the file holds a session."""
+        with self._errors_in_words():
             return self._db.execute("SELECT 1 FROM session WHERE key = ?", (key,)).fetchone() is not None
 
     def add(self, session: Session) -> None:
@@ -127,7 +127,7 @@ class MapStore:
                 f"session {session.key!r} has {session.p_occupied.shape} slots, want ({self._lot.n_slots},)"
             )
         seen = np.flatnonzero(np.isfinite(session.p_occupied)).tolist()
-        with self._said_plainly():
+        with self._errors_in_words():
             try:
                 with self._transaction("IMMEDIATE"):
                     self._insert(session, seen)
@@ -135,9 +135,9 @@ class MapStore:
                 raise InputError(f"{self.path}: holds a session {session.key!r} already") from error
 
     def sessions(self) -> list[Session]:
-        """All sessions, by key."""
+        """Return all sessions, ordered by key."""
         found = []
-        with self._said_plainly(), self._transaction():
+        with self._errors_in_words(), self._transaction():
             rows = self._db.execute("SELECT id, key, time, rig, weather FROM session ORDER BY key").fetchall()
             for number, key, time, rig, weather in rows:
                 p = np.full(self._lot.n_slots, np.nan)
@@ -152,15 +152,15 @@ class MapStore:
         return found
 
     def log(self) -> SessionLog:
-        """All sessions, for predictions."""
+        """Return all sessions as a log for predictions."""
         sessions = self.sessions()
         p = np.array([s.p_occupied for s in sessions]).reshape(len(sessions), self._lot.n_slots)
         known = np.isfinite(p)
         return SessionLog(np.array([s.time for s in sessions]), np.where(known, p, 0.0) > 0.5, known)
 
     def cars(self) -> FloatArray:
-        """(n, 3) x, y in m and yaw in rad of every car seen in any session."""
-        with self._said_plainly(), self._transaction():
+        """Return the poses of all cars of all sessions, (n, 3) x, y in m and yaw in rad."""
+        with self._errors_in_words(), self._transaction():
             rows = self._db.execute("SELECT x, y, yaw FROM car ORDER BY session, rowid").fetchall()
         return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
@@ -231,8 +231,8 @@ class MapStore:
             raise
 
     @contextmanager
-    def _said_plainly(self) -> Iterator[None]:
-        """What is wrong with the file in words."""
+    def _errors_in_words(self) -> Iterator[None]:
+        """Describe a database error in one line."""
         try:
             yield
         except sqlite3.DatabaseError as error:
@@ -240,7 +240,7 @@ class MapStore:
 
 
 def lot_digest(lot: ParkingLot) -> str:
-    """What tells a lot's slots from those of another: equal for equal places."""
+    """Return a hash of the lot's slot poses."""
     places = np.column_stack([lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width])
     # Adding 0 makes one of the two zeros.
     return hashlib.sha256((np.round(places, 3) + 0.0).tobytes()).hexdigest()[:16]

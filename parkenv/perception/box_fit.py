@@ -1,4 +1,4 @@
-"""A car fitted to the beams that end on it: the rectangle whose sides they lie on."""
+"""Fit a car's rectangle to the end points of laser beams."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class FittedCar(NamedTuple):
 
     Attributes:
         x, y: m, its middle.
-        yaw: rad, along it, in [0, π): where its nose is the beams do not say.
-        length, width: m; at least a usual car's.
-        seen_length, seen_width: m, how much of a flank and of an end was met; near 0 for a side that was not seen.
+        yaw: rad, along the car, in [0, π): beams do not distinguish front and rear.
+        length, width: m; at least those of a typical car.
+        seen_length, seen_width: m, visible part of a side and of an end; near 0 for a side that is not visible.
     """
 
     x: float
@@ -106,7 +106,7 @@ def fit_box(
 
 @compiled
 def _direction(points: FloatArray) -> float:
-    """The angle in [0, π/2) of the rectangle to whose nearer sides the points are closest."""
+    """Return the angle in [0, π/2) of the rectangle whose visible sides are closest to the points."""
     best, answer = -1.0, 0.0
     for step in range(_STEPS):
         theta = 0.5 * math.pi * step / _STEPS

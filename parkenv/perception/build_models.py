@@ -1,6 +1,6 @@
-"""Train the models that come with the package: `python -m parkenv.perception.build_models`.
+"""Train the packaged models, on simulated images alone: `python -m parkenv.perception.build_models`.
 
-On simulated pictures alone. It takes some minutes; the same seed gives the same files.
+This takes some minutes; equal seeds give equal files.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FOLDER = Path(__file__).parent / "models"
 
 
 def build(photos: list[SimulatedPhoto], seed: int, progress: Callable[[str], None]) -> dict[str, CarModel]:
-    """The side and the front model from simulated pictures."""
+    """Train the side and the front model on simulated images."""
     settings = TrainingSettings(penalty=0.1, jitter=4, seed=seed)
     empty = [p.labelled.image for p in photos if not len(p.labelled.boxes)]
     peopled = [p.labelled for p in photos if len(p.labelled.boxes)]
@@ -60,7 +60,7 @@ def build(photos: list[SimulatedPhoto], seed: int, progress: Callable[[str], Non
 
 
 def main(scenes: int = 60, seed: int = 0, folder: Path = FOLDER) -> None:
-    """Make the pictures, train, and write `side.npz` and `front.npz`."""
+    """Render the images, train, and write `side.npz` and `front.npz`."""
     pictures = track(simulated_photos(scenes, seed), "Taking pictures", total=FRAMES * scenes)
     folder.mkdir(parents=True, exist_ok=True)
     for name, model in build(list(pictures), seed, typer.echo).items():

@@ -1,4 +1,4 @@
-"""Labelled photographs of cars: the UIUC set as it is published, and plain folders of crops."""
+"""Labelled photographs of cars: the UIUC car data set as published, and plain folders of crops."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _POSITIVE, _NEGATIVE = ("positives", "vehicles", "pos"), ("negatives", "non-vehi
 
 @dataclass(frozen=True, eq=False)
 class Crops:
-    """Pictures of cars, aligned alike, and pictures without any.
+    """Aligned images of cars, and images without cars.
 
     Attributes:
-        positives: grey, uint8, each filled by its car as the others are.
+        positives: grey, uint8, with the car at the same place in each.
         negatives: grey, uint8, of any size.
     """
 
@@ -41,7 +41,7 @@ class Crops:
 
 @dataclass(frozen=True, eq=False)
 class LabelledImage:
-    """A photograph and where its cars are.
+    """A photograph with the boxes of its cars.
 
     Attributes:
         name: of the file.
@@ -55,7 +55,7 @@ class LabelledImage:
 
 
 def read_uiuc_training(folder: Path) -> Crops:
-    """UIUC's training part: `TrainImages/pos-N.pgm` and `neg-N.pgm`, in a folder or in its `.tar.gz`.
+    """Read UIUC's training images: `TrainImages/pos-N.pgm` and `neg-N.pgm`, in a folder or in its `.tar.gz`.
 
     Raises:
         InputError: neither is there, an image is missing or torn.
@@ -79,7 +79,7 @@ def read_uiuc_training(folder: Path) -> Crops:
 
 
 def read_uiuc_test(folder: Path, test_set: str) -> list[LabelledImage]:
-    """One of UIUC's test sets, with the published true locations.
+    """Read one of UIUC's test sets, with the published true locations.
 
     Args:
         folder: the published `CarData`.
@@ -114,7 +114,7 @@ def read_uiuc_test(folder: Path, test_set: str) -> list[LabelledImage]:
 
 
 def read_crop_folder(folder: Path) -> Crops:
-    """A folder with `positives` and `negatives` in it (or `vehicles` and `non-vehicles`), images at any depth.
+    """Read a folder with `positives` and `negatives` (or `vehicles` and `non-vehicles`), images at any depth.
 
     Raises:
         InputError: one of the two is missing or holds no image, or an image cannot be read.

@@ -1,4 +1,4 @@
-"""How good training is on crops that it has not seen, where only one set of crops is at hand."""
+"""Cross-validation of training on one set of crops."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _Image = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class CropScore:
-    """How well a model tells crops of cars from others.
+    """Classification scores of a model on held-out crops.
 
     Attributes:
         auc: area under the curve of true against false positives.
-        recall: share of the cars found at each share of `FALSE_POSITIVES`.
-        n_cars, n_others: how many crops that was.
+        recall: fraction of the cars found at each false-positive rate of `FALSE_POSITIVES`.
+        n_cars, n_others: number of crops.
     """
 
     auc: float
@@ -39,7 +39,7 @@ class CropScore:
 
 
 def score_on_crops(model: CarModel, crops: Crops) -> CropScore:
-    """Judge a model on crops, each stretched into its window."""
+    """Score a model on crops, each resized to its window."""
     from sklearn.metrics import roc_auc_score
 
     window = (model.descriptor.width, model.descriptor.height)
@@ -66,12 +66,12 @@ def cross_validated(
     progress: Callable[[str], None] = lambda _: None,
     **training: Any,
 ) -> list[CropScore]:
-    """Train on all blocks of file order but some, and judge on these, until each block was judged once.
+    """Train on all blocks of consecutive files but some, and score on these, until each block was held out once.
 
     Args:
         crops: of cars and of others.
-        folds: how many models are trained.
-        seed: of which blocks go together.
+        folds: number of models to train.
+        seed: of the assignment of blocks to folds.
         progress: called with a line for each fold.
         **training: of `train`.
 

@@ -1,4 +1,4 @@
-"""How good a detector is: recall against precision, by UIUC's rule of what counts as found."""
+"""Detection scores: recall and precision by the matching rule of UIUC."""
 
 from __future__ import annotations
 
@@ -30,21 +30,21 @@ class RecallPrecision:
 
     @property
     def equal_error(self) -> float:
-        """Where recall and precision meet: the greatest value that both reach at one threshold."""
+        """Equal-error rate: the greatest value that recall and precision both reach at one threshold."""
         if not len(self.recall):
             return 0.0
         return float(np.minimum(self.recall, self.precision).max())
 
     @property
     def average_precision(self) -> float:
-        """Area under the curve, precision taken as the best at this recall or a higher one."""
+        """Area under the curve, with the best precision at this recall or a higher one."""
         if not len(self.recall):
             return 0.0
         best = np.maximum.accumulate(self.precision[::-1])[::-1]
         return float(np.sum(np.diff(self.recall, prepend=0.0) * best))
 
     def at_equal_error(self) -> tuple[float, float, float]:
-        """Threshold, recall and precision there."""
+        """Return threshold, recall and precision at the equal-error point."""
         i = int(np.minimum(self.recall, self.precision).argmax())
         return float(self.threshold[i]), float(self.recall[i]), float(self.precision[i])
 
@@ -56,7 +56,7 @@ def recall_precision(
     *,
     scales: bool = True,
 ) -> RecallPrecision:
-    """Match detections to true boxes, best detection first, one a car.
+    """Match detections to true boxes, best detection first, one per car.
 
     Args:
         boxes: of each image, (n, 4) left, top, right, bottom of what was found.
@@ -85,7 +85,7 @@ def recall_precision(
 
 
 def matches(found: FloatArray, true: FloatArray, *, scales: bool = True) -> NDArray[np.bool_]:
-    """Which detections of an image, (n, 4), best first, find a car that no better one has found."""
+    """Return which detections of an image, (n, 4), best first, match a car that no better one has matched."""
     hit = np.zeros(len(found), dtype=np.bool_)
     if not len(true):
         return hit
@@ -104,6 +104,6 @@ def matches(found: FloatArray, true: FloatArray, *, scales: bool = True) -> NDAr
 
 
 def recall_at(false_positives: float, positive: FloatArray, negative: FloatArray) -> float:
-    """Share of positive scores above the score that this share of the negative ones exceeds."""
+    """Return the fraction of positive scores above the score that this fraction of the negative ones exceeds."""
     limit = np.quantile(negative, 1.0 - false_positives, method="higher")
     return float((positive > limit).mean())

@@ -1,11 +1,11 @@
-"""Histograms of oriented gradients over a whole image: the thesis's descriptor, and two ways to normalise it better.
+"""Histograms of oriented gradients (HOG): the thesis's descriptor, and two better normalizations.
 
-A window of the image is described by the cells in it (T §3.2.1): 8×8 pixels a cell, nine unsigned orientations, so
-1152 values for a side view of 128×64 and 2304 for a front of 128×128. Histograms are made once for an image, and every
-window on the grid of cells is a slice of them.
+The descriptor of a window consists of its cells (T §3.2.1): 8×8 pixels per cell, nine unsigned orientations, so 1152
+values for a side view of 128×64 and 2304 for a front of 128×128. Histograms are computed once per image; every window
+on the grid of cells is a slice of them.
 
-Gradients are those of the square root of the grey values (Dalal and Triggs 2005, §6.1): a dark car on a dark street
-then has as much of an outline as one in the sun, and a longer exposure changes nothing but the scale.
+Gradients are those of the square root of the grey values (Dalal and Triggs 2005, §6.1): outlines in dark and bright
+images then have similar strength, and the exposure changes only the scale.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _ROOT = np.round(np.sqrt(255.0 * np.arange(256))).astype(np.uint8)
 
 @dataclass(frozen=True)
 class Descriptor:
-    """What is computed of a window.
+    """The features of a window.
 
     Args:
         width, height: px of the window, whole cells.
@@ -69,7 +69,7 @@ class Descriptor:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Rows, values a place, columns: the shape of a window's features."""
+        """Shape of a window's features: rows, values per cell, columns."""
         rows, columns = self.height // CELL, self.width // CELL
         if self.normalization == "blocks":
             return rows - 1, _BLOCK * _BLOCK * ORIENTATIONS, columns - 1
@@ -77,11 +77,11 @@ class Descriptor:
 
     @property
     def size(self) -> int:
-        """How many values describe a window."""
+        """Number of values in a window's descriptor."""
         return math.prod(self.shape)
 
     def features(self, image: Image) -> Float32Array:
-        """The features of a whole image; a window that begins on the grid of cells is a slice of `shape`.
+        """Compute the features of a whole image; a window on the grid of cells is a slice of `shape`.
 
         Args:
             image: (h, w) uint8, grey.
@@ -94,10 +94,10 @@ class Descriptor:
         return features
 
     def describe(self, crop: Image) -> Float32Array:
-        """The values of one window, (size,) float32.
+        """Compute the descriptor of one window, (size,) float32.
 
         Args:
-            crop: (height, width) uint8, grey. Beyond its border the image is taken to go on as it ends.
+            crop: (height, width) uint8, grey; its border pixels are replicated.
 
         Raises:
             InputError: a crop of another size.
@@ -111,7 +111,7 @@ class Descriptor:
 
 
 def rooted(image: Image) -> Image:
-    """The square root of the grey values, 255 stays 255.
+    """Take the square root of the grey values; 255 stays 255.
 
     Raises:
         InputError: another shape or dtype.
@@ -126,10 +126,10 @@ def _checked(image: Image) -> Image:
 
 
 def cell_histograms(image: Image) -> Float32Array:
-    """Gradient energy by orientation in every cell.
+    """Compute the histogram of oriented gradients of every cell.
 
-    Central differences of the grey values; each pixel's gradient goes, by its magnitude and linear in distance, to the
-    two nearest orientations and the four nearest cells.
+    Gradients are central differences; the magnitude of each is distributed, linearly by distance, over the two nearest
+    orientations and the four nearest cells.
 
     Args:
         image: (h, w) uint8; pixels beyond the last whole cell are left out.
@@ -159,7 +159,7 @@ _HALF = CELL // 2
 def _gradients(
     above: Image, row: Image, below: Image, magnitude: Float32Array, weighted_bin: Float32Array
 ) -> None:
-    """Of each pixel the magnitude, and the magnitude times the orientation in bins, -0.5 to 8.5."""
+    """Compute for each pixel the magnitude, and the magnitude times the orientation in bins, -0.5 to 8.5."""
     one_bin = np.float32(ORIENTATIONS / math.pi)
     for x in range(len(magnitude)):
         gx = np.float32(np.int32(row[x + 2]) - np.int32(row[x]))
@@ -185,7 +185,7 @@ def _gradients(
 
 @compiled(fastmath=_FAST, error_model="numpy")
 def _share(m: np.float32, q: np.float32, k: np.float32) -> np.float32:
-    """What a gradient gives to bin k: its magnitude, less for each bin that it is away."""
+    """Return the weight of a gradient in bin k: its magnitude, falling linearly with the distance in bins."""
     return max(np.float32(0.0), m - abs(q - m * k))
 
 
@@ -234,7 +234,7 @@ def _bin_rows(
 
 @compiled(fastmath=_FAST, error_model="numpy")
 def _pool(sums: Float32Array, tent: Float32Array, out: Float32Array) -> None:
-    """From columns of pixels to columns of cells, each cell with a tent two cells wide."""
+    """Sum columns of pixels to columns of cells, with a triangular window two cells wide."""
     for k in range(ORIENTATIONS):
         for c in range(out.shape[1]):
             total = np.float32(0.0)
@@ -294,7 +294,7 @@ def _by_cell(cells: Float32Array) -> Float32Array:
 
 @compiled(fastmath=_FAST, error_model="numpy")
 def _block_scales(cells: Float32Array) -> Float32Array:
-    """(rows + 1, columns + 1): one over the norm of the 2×2 cells about each corner, the border's cells doubled."""
+    """Return 1/norm of the 2×2 cells around each corner, (rows + 1, columns + 1); border cells count twice."""
     rows, values, columns = cells.shape
     energy = np.zeros((rows + 2, columns + 2), dtype=np.float32)
     for y in range(rows):
@@ -357,7 +357,7 @@ def _by_blocks(cells: Float32Array) -> Float32Array:
 
 @compiled(fastmath=_FAST, error_model="numpy")
 def correlate(features: Float32Array, weights: Float32Array) -> Float32Array:
-    """The dot product of the weights with every window of the features.
+    """Correlate: the dot product of the weights with every window of the features.
 
     Args:
         features: (rows, values, columns) float32.

@@ -1,4 +1,4 @@
-"""Images from files, and what a folder of them must hold."""
+"""Reading images from files and folders."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LARGEST = 100_000_000
 
 
 def read_image(path: Path) -> Image:
-    """An image file as (h, w) grey or (h, w, 3) RGB, uint8; transparency is dropped.
+    """Read an image file as (h, w) grey or (h, w, 3) RGB, uint8; transparency is dropped.
 
     Raises:
         InputError: no such file, no image, a torn one, more than 8 bits a channel, or over 100 million pixels.
@@ -27,7 +27,7 @@ def read_image(path: Path) -> Image:
 
 
 def decode_image(data: bytes, name: str) -> Image:
-    """As `read_image`, of bytes; `name` is what messages call them."""
+    """Decode an image from bytes as `read_image` does; `name` is for error messages."""
     raw = np.frombuffer(data, dtype=np.uint8)
     image = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if len(raw) else None
     if image is None or _torn(data):
@@ -43,7 +43,7 @@ def decode_image(data: bytes, name: str) -> Image:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """The image files in a folder and those below it, in order of their names, numbers counted as such.
+    """Return the image files in a folder and its subfolders, in natural order of their names.
 
     Raises:
         InputError: no such folder, or one without images.
@@ -57,7 +57,7 @@ def images_in(folder: Path) -> list[Path]:
 
 
 def natural_order(path: Path) -> list[tuple[str, int]]:
-    """A sort key by which pos-9 comes before pos-10."""
+    """Return a sort key that puts pos-9 before pos-10."""
     return list(_parts(str(path)))
 
 
@@ -82,7 +82,7 @@ def _bytes_of(path: Path) -> bytes:
 
 
 def _torn(data: bytes) -> bool:
-    """Whether a PNG, JPEG or PGM ends before its time; OpenCV fills what is missing in silence."""
+    """Return whether a PNG, JPEG or PGM file is truncated; OpenCV fills the missing part without an error."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data[-16:]
     if data.startswith(b"\xff\xd8"):

@@ -1,4 +1,4 @@
-"""Labelled pictures of simulated cars, as hard and varied as they can be made: what shipped models are trained on."""
+"""Labelled images of simulated cars, varied and difficult: the training data of the packaged models."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ FRAMES = 20
 
 @dataclass(frozen=True, eq=False)
 class SimulatedPhoto:
-    """A picture, its cars, and the crops that it gives.
+    """An image, its cars, and crops of them.
 
     Attributes:
         labelled: the grey picture with the boxes of all cars in it.
@@ -57,10 +57,10 @@ class SimulatedPhoto:
 
 
 def simulated_photos(n_scenes: int, seed: int = 0) -> Iterator[SimulatedPhoto]:
-    """Pictures of random streets in random light, twenty of each, every fifth without a car.
+    """Render images of random streets in random light, twenty of each, every fifth without cars.
 
-    Cars stand along the street, across it or aslant; half of the pictures are taken with long lenses, the others as
-    rigs see. Texture lies over what is behind the cars, and every picture goes through random exposure, blur and noise.
+    Cars are parked along the street, perpendicular or at an angle; half of the images have a long focal length, the
+    others are those of a rig. The background gets random texture, and every image random exposure, blur and noise.
 
     Args:
         n_scenes: how many streets.
@@ -76,7 +76,7 @@ def simulated_photos(n_scenes: int, seed: int = 0) -> Iterator[SimulatedPhoto]:
 
 
 def region_of(box: FloatArray, car: tuple[float, float, float, float], aspect: float) -> FloatArray:
-    """What a window shows whose car has this box: as wide as the car asks for, on the car's own ground.
+    """Return the image region of a window that is aligned to a car's box.
 
     Args:
         box: (4,) px, left, top, right, bottom of the car.
@@ -91,7 +91,7 @@ def region_of(box: FloatArray, car: tuple[float, float, float, float], aspect: f
 
 
 def roughened(image: Image, rng: np.random.Generator) -> Image:
-    """The image through another camera: exposure, contrast, gamma, blur, sharpening, noise."""
+    """Simulate another camera: exposure, contrast, gamma, blur, sharpening, noise."""
     values = image.astype(np.float32) / 255.0
     height = len(values)
     # As a photographer would, it is exposed for what stands on the ground, and not for the sky.
@@ -144,7 +144,7 @@ def _photo(
 
 
 def _from_afar(street: Street, car: int, rng: np.random.Generator) -> tuple[PinholeCamera, FloatArray]:
-    """As photographers and cameras across the street see: a long lens, straight at one car."""
+    """Place the camera across the street, with a long lens, facing one car."""
     width, height = _AFAR_SIZE
     away, height_m = rng.uniform(7.0, 32.0), rng.uniform(0.9, 2.4)
     extent, smallest, largest = (4.6, 90.0, 230.0) if street.kind == "along" else (1.8, 56.0, 170.0)
@@ -162,7 +162,7 @@ def _from_afar(street: Street, car: int, rng: np.random.Generator) -> tuple[Pinh
 
 
 def _as_rigs_see(street: Street, rng: np.random.Generator) -> tuple[PinholeCamera, FloatArray]:
-    """As the camera of a car that drives past the slots sees: wide and near."""
+    """Place the camera on a car that passes the slots: a wide angle at close range."""
     camera = PinholeCamera.from_field_of_view(horizontal=rng.uniform(0.8, 1.6))
     pose = camera_pose(
         rng.uniform(-14.0, 14.0), street.front - rng.uniform(1.6, 9.0), rng.uniform(1.0, 1.8),
@@ -174,7 +174,7 @@ def _as_rigs_see(street: Street, rng: np.random.Generator) -> tuple[PinholeCamer
 def _crops(
     grey: Image, boxes: VehicleBoxes, clear: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[list[Image], list[Image]]:
-    """Sides and ends of the clear cars that are whole in the picture and seen straight."""
+    """Return crops of sides and ends of unoccluded cars that are completely in the image and seen straight on."""
     crops: dict[View, list[Image]] = {View.SIDE: [], View.END: []}
     height, width = grey.shape
     for i in np.flatnonzero(clear).tolist():
@@ -193,7 +193,7 @@ def _crops(
 
 
 def _patch(grey: Image, region: FloatArray, size: tuple[int, int], rng: np.random.Generator) -> Image:
-    """The region at a resolution as photographs have it: coarse ones are drawn out, fine ones stay at most double."""
+    """Cut out a region at the resolution of photographs: enlarge small ones, reduce large ones to double."""
     edge = int(max(region[2] - region[0], region[3] - region[1])) + 2
     wider = cv2.copyMakeBorder(grey, edge, edge, edge, edge, cv2.BORDER_REPLICATE)
     left, top, right, bottom = np.round(region + edge).astype(int)

@@ -11,7 +11,7 @@ from typing import Annotated, Literal, Self
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from parkenv.errors import InputError
-from parkenv.files.spec_file import FilePath, Spec, nearest, read_tables
+from parkenv.files.spec_file import FilePath, OrText, Spec, nearest, read_tables
 from parkenv.world.occupancy import ArrivalWindow
 
 PackagedLot = Literal["campus", "jam", "street", "mini"]
@@ -202,7 +202,7 @@ def _days(value: object) -> object:
 class Arrivals(Spec):
     """When searches begin."""
 
-    days: Annotated[str, BeforeValidator(_days, json_schema_input_type=str | list[str])] = "weekdays"
+    days: Annotated[str, BeforeValidator(_days)] = "weekdays"
     hours: Hours = "08:00-13:00"
 
     def window(self) -> ArrivalWindow:
@@ -285,23 +285,19 @@ class ScenarioSpec(Spec):
     """A scenario file: a lot, its occupancy, what the car knows, the goal, and what time costs."""
 
     name: Annotated[str, AfterValidator(_name)] = Field("", description="In tables; the file's by default.")
-    lot: Annotated[LotSpec, BeforeValidator(_lot_tables, json_schema_input_type=str | LotSpec)]
-    goal: Annotated[
-        int | tuple[float, float], BeforeValidator(_goal, json_schema_input_type=int | list[float])
-    ] = Field(0, description="Index of one of the lot's goals, or a point [x, y] in m.")
+    lot: Annotated[LotSpec, BeforeValidator(_lot_tables), OrText()]
+    goal: Annotated[int | tuple[float, float], BeforeValidator(_goal)] = Field(
+        0, description="Index of one of the lot's goals, or a point [x, y] in m."
+    )
     entry: int | None = Field(None, ge=0, description="Index of the entry; drawn for each search if absent.")
-    occupancy: Annotated[
-        OccupancySpec, BeforeValidator(_occupancy_tables, json_schema_input_type=str | OccupancySpec)
-    ] = OccupancySpec()
-    forecast: Annotated[
-        ForecastSpec, BeforeValidator(_forecast_tables, json_schema_input_type=str | ForecastSpec)
-    ] = ForecastSpec()
+    occupancy: Annotated[OccupancySpec, BeforeValidator(_occupancy_tables), OrText()] = OccupancySpec()
+    forecast: Annotated[ForecastSpec, BeforeValidator(_forecast_tables), OrText()] = ForecastSpec()
     arrivals: Arrivals = Arrivals()
     speeds: Speeds = Speeds()
     costs: Costs = Costs()
-    sensor_model: Annotated[
-        SensorModelSpec, BeforeValidator(_sensor_tables, json_schema_input_type=str | SensorModelSpec)
-    ] = SensorModelSpec(name="perfect")
+    sensor_model: Annotated[SensorModelSpec, BeforeValidator(_sensor_tables), OrText()] = SensorModelSpec(
+        name="perfect"
+    )
     rig: RigName = Field("laser", description="The sensors of the car, where they are simulated.")
     traffic: TrafficSpec | None = Field(
         None, description="Other road users; none if absent, some in surveys."

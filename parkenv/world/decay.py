@@ -1,4 +1,4 @@
-"""How a sighting fades: exp(-x), in arithmetic that is the same wherever it is compiled into."""
+"""The decay of an observation: exp(-x), in arithmetic that gives the same result wherever it is compiled into."""
 
 import math
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from parkenv.errors import InputError
-from parkenv.world.occupancy import MAX_PROBABILITY, MIN_PROBABILITY, Arrival, Forecast, PriorModel
+from parkenv.world.occupancy import Arrival, Forecast, PriorModel
+from parkenv.world.occupancy_kernel import MAX_PROBABILITY, MIN_PROBABILITY
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """Random numbers that are a pure function of (key, stream, slot, index).
 
-Nothing is stored between draws, so a world does not depend on who looks, at which slot, or in which order.
+Nothing is stored between draws, so a world does not depend on which slots are observed, or in which order.
 The mixing function is the finaliser of SplitMix64 (Steele, Lea, Flood, "Fast splittable pseudorandom number
 generators", OOPSLA 2014), applied once for each of stream, slot and index.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from parkenv.errors import InputError
 from sim_sensors.compilation import compiled
 
-# What the numbers are for; two purposes must not share a stream.
+# One stream for each purpose, so that their numbers are independent.
 ARRIVAL_STREAM = 0
 OCCUPANCY_STREAM = 1
 ENTRY_STREAM = 2
@@ -39,16 +39,23 @@ def _mix64(word: np.uint64) -> np.uint64:
     return z ^ (z >> _SHIFT_31)
 
 
-@compiled
+@compiled(inline="always")
 def keyed_uniform(key: np.uint64, stream: int, slot: int, index: int) -> float:
     """Uniform float64 in the open interval (0, 1), callable from Python and from compiled code.
 
     `key` comes from `world_key`; `stream`, `slot` and `index` are non-negative integers below 2**63.
     """
-    # Every operand is cast by hand: uint64 with int64 would be promoted to float64.
-    h = _mix64(np.uint64(key) + _GOLDEN * np.uint64(stream))
-    h = _mix64(h + _GOLDEN * np.uint64(slot))
-    h = _mix64(h + _GOLDEN * np.uint64(index))
+    # Cast here, so that the function below is compiled once and not for each constant that is passed; and all to
+    # uint64, since uint64 with int64 would be promoted to float64.
+    u: float = _uniform(np.uint64(key), np.uint64(stream), np.uint64(slot), np.uint64(index))
+    return u
+
+
+@compiled
+def _uniform(key: np.uint64, stream: np.uint64, slot: np.uint64, index: np.uint64) -> float:
+    h = _mix64(key + _GOLDEN * stream)
+    h = _mix64(h + _GOLDEN * slot)
+    h = _mix64(h + _GOLDEN * index)
     # 52 bits and a half: neither 0 nor 1 can come out.
     return (float(h >> _SHIFT_12) + 0.5) * 2.0**-52
 
@@ -67,14 +74,14 @@ def _absorbed(state: np.uint64, word: np.uint64) -> np.uint64:
 
 @compiled
 def episode_key(seed_state: np.uint64, episode: int) -> np.uint64:
-    """Key of a world, from `seed_state` and an episode number below 2**64 (compiled; for batches too)."""
+    """Return the key of a world, from `seed_state` and an episode number below 2**64."""
     # The number of words goes in first, so that no two (seed, episode) pairs spell the same words.
     key: np.uint64 = _absorbed(_absorbed(seed_state, np.uint64(1)), np.uint64(episode))
     return key
 
 
 def seed_state(seed: int) -> np.uint64:
-    """What is mixed of a seed, a non-negative integer of any size, before the episode number."""
+    """Return the state after mixing a seed, a non-negative integer of any size, before the episode number."""
     return _with_words(np.uint64(0), "seed", seed)
 
 

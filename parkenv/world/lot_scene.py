@@ -108,15 +108,15 @@ class LotScenes:
             ego: (3,) x, y in m and yaw in rad of the car with the sensors, which is not part of the scene.
         """
         taken = self._world.occupied(self._everything, time)
-        stretch = self._world.stretch(self._everything, time)
+        sojourn = self._world.sojourn(self._everything, time)
         if self._scene is None:
-            self._scene = self._slots.scene(taken, self._first_car + stretch)
+            self._scene = self._slots.scene(taken, self._first_car + sojourn)
         else:
-            for slot in np.flatnonzero(stretch != self._stretch).tolist():
+            for slot in np.flatnonzero(sojourn != self._stretch).tolist():
                 if taken[slot]:
-                    car = self._first_car + int(stretch[slot])
+                    car = self._first_car + int(sojourn[slot])
                     self._scene = self._slots.filled(self._scene, slot, car)
                 else:
                     self._scene = self._scene.without_vehicle(slot)
-        self._stretch = stretch
+        self._stretch = sojourn
         return self._scene.with_movers(self._traffic.at(time, ego))

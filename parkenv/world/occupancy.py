@@ -1,4 +1,4 @@
-"""Which slots are taken when: the contracts of a world, and a process that generates worlds.
+"""Which slots are taken when: the protocols of worlds and forecasts, and a process that generates worlds.
 
 Times are seconds since Monday 00:00 of the scenario's week; rates are 1/s.
 """
@@ -15,28 +15,30 @@ from scipy.optimize import brentq
 
 from parkenv.errors import InputError
 from parkenv.files.versioned_json import JsonFormat
-from parkenv.world.decay import decay_factor
-from parkenv.world.keyed_random import ARRIVAL_STREAM, OCCUPANCY_STREAM, keyed_exponential, keyed_uniform
-from sim_sensors.compilation import compiled
+from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform
+from parkenv.world.occupancy_kernel import (
+    CURSOR,
+    MAX_PROBABILITY,
+    MIN_PROBABILITY,
+    PROCESS,
+    cursor_at,
+    find_sojourn_end,
+    kernel,
+    process_at,
+    process_forecast,
+    process_state,
+)
+from parkenv.world.pointers import address_of
+from parkenv.world.week import DAY_S, HOUR_S, WEEK_HOURS, hour_of_week
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-HOUR_S = 3600.0
-DAY_S = 86_400.0
-WEEK_S = 604_800.0
-WEEK_HOURS = 168
 DAY_NAMES = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 DAY_GROUPS = {"weekdays": (0, 1, 2, 3, 4), "weekend": (5, 6), "all": (0, 1, 2, 3, 4, 5, 6)}
 
-# No forecast is certain: a planner must be able to recover from a wrong one.
-MIN_PROBABILITY = 0.001
-MAX_PROBABILITY = 0.999
-
 MAX_RATE = 1e3
-_NEVER_WEEKS = 1e9
-_FORGOTTEN = 1e-17
 _FORMAT = JsonFormat("parkenv-occupancy-process", 1, "an occupancy process")
 
 
@@ -113,11 +115,11 @@ class Arrival:
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """What is known of a lot before anything has been seen.
+    """What is known of a lot before anything was observed.
 
     Args:
         p_occupied: (n,) float64, probability at the arrival.
-        decay_rate: (n,) float64, 1/s, arrival rate plus departure rate: how fast a sighting goes stale.
+        decay_rate: (n,) float64, 1/s, arrival rate plus departure rate: how fast an observation loses its value.
     """
 
     p_occupied: FloatArray
@@ -133,23 +135,23 @@ class World(Protocol):
     def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
         """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
 
-    def stretch(self, slots: ArrayLike, time: float) -> IntArray:
-        """(k,) int64: the number of the stretch of constant state that each slot is in; it tells cars apart."""
+    def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
+        """(k,) int64: the number of the sojourn, the stretch of constant state, of each slot; it tells cars apart."""
 
 
 class PriorModel(Protocol):
-    """Says what can be known beforehand."""
+    """Forecasts occupancy."""
 
     @property
     def n_slots(self) -> int:
         """Number of slots."""
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """What is known at the arrival; it never peeks at the world."""
+        """Return what is known at the arrival; it does not depend on the world."""
 
 
 class OccupancyModel(PriorModel, Protocol):
-    """Draws arrivals and worlds, and says what can be known beforehand."""
+    """Draws arrivals and worlds, and forecasts occupancy."""
 
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
         """The arrival of the episode with this key."""
@@ -158,253 +160,87 @@ class OccupancyModel(PriorModel, Protocol):
         """The world of the episode with this key."""
 
 
-@compiled
-def hour_of_week(time: float) -> tuple[float, int, float]:
-    """Week, hour of the week and second of the hour."""
-    week = np.floor(time / WEEK_S)
-    second = time - week * WEEK_S
-    hour = min(int(second // HOUR_S), WEEK_HOURS - 1)
-    return week, hour, second - hour * HOUR_S
-
-
-@compiled
-def _time_after(profile: FloatArray, table: FloatArray, since: float, hazard: float) -> float:
-    """When the hazard that a unit slot has gathered since `since` reaches `hazard`; table[-1] must be > 0."""
-    week, hour, second = hour_of_week(since)
-    target = table[hour] + profile[hour] * second + hazard
-    more_weeks = np.floor(target / table[WEEK_HOURS])
-    if not more_weeks < _NEVER_WEEKS:
-        return np.inf
-    rest = target - more_weeks * table[WEEK_HOURS]
-    # table[hour] < rest <= table[hour + 1], hence a positive rate, but for rounding at the ends.
-    hour = min(max(np.searchsorted(table, rest) - 1, 0), WEEK_HOURS - 1)
-    second = min((rest - table[hour]) / profile[hour], HOUR_S) if profile[hour] > 0.0 else 0.0
-    end: float = max((week + more_weeks) * WEEK_S + hour * HOUR_S + second, since)
-    return end
-
-
-@compiled
-def _marginal_at_hour(
-    arrival_factor: float,
-    departure_factor: float,
-    arrival_profile: FloatArray,
-    departure_profile: FloatArray,
-    now: int,
-) -> float:
-    """P(occupied) when hour `now` of the week begins, in the periodic regime of p' = λ(t)(1−p) − μ(t)p.
-
-    The affine map over the week that ends at `time` is gathered backwards, latest piece first, so it can
-    stop as soon as the past is forgotten. A slot that never changes has no regime; it gets 0.5.
-    """
-    p, gain, gathered = 0.0, 1.0, 0.0
-    for back in range(1, WEEK_HOURS + 1):
-        hour = (now - back) % WEEK_HOURS
-        arrival = arrival_factor * arrival_profile[hour]
-        rate = arrival + departure_factor * departure_profile[hour]
-        if rate > 0.0:
-            moved = -math.expm1(-rate * HOUR_S)
-            p += gain * (arrival / rate) * moved
-            gain *= 1.0 - moved
-            gathered += rate * HOUR_S
-            if gain < _FORGOTTEN:
-                return float(p)
-    return float(p / -math.expm1(-gathered)) if gathered > 0.0 else 0.5
-
-
-@compiled
-def marginal_from(
-    arrival_factor: float,
-    departure_factor: float,
-    arrival_profile: FloatArray,
-    departure_profile: FloatArray,
+@kernel
+def _seek(
+    process: int,
+    key: np.uint64,
+    arrival: float,
     hour: int,
     second: float,
-    kept: FloatArray,
-    row: int,
-) -> float:
-    """P(occupied) of one slot at a second of an hour of the week (compiled; for batches too).
-
-    Args:
-        arrival_factor: of the slot.
-        departure_factor: of the slot.
-        arrival_profile: (168,) 1/s.
-        departure_profile: (168,) 1/s.
-        hour: of the week.
-        second: of the hour.
-        kept: what was worked out before; 0 where nothing was.
-        row: where in `kept` the slot's probability at the beginning of the hour is, or goes.
-    """
-    start = kept[row]
-    if start == 0.0:
-        start = _marginal_at_hour(arrival_factor, departure_factor, arrival_profile, departure_profile, hour)
-        kept[row] = start
-    arrival = arrival_factor * arrival_profile[hour]
-    rate = arrival + departure_factor * departure_profile[hour]
-    p: float = marginal_later(start, arrival, rate, second)
-    return p
-
-
-@compiled(inline="always")
-def marginal_later(start: float, arrival: float, rate: float, second: float) -> float:
-    """P(occupied) some seconds after it was `start`, by constant rates of arrival, and of arrival plus departure."""
-    equilibrium = arrival / rate if rate > 0.0 else 0.0
-    return float(equilibrium + (start - equilibrium) * decay_factor(rate * second))
-
-
-@compiled
-def _marginals(
-    factors: FloatArray, profiles: FloatArray, hour: int, second: float, kept: FloatArray
-) -> FloatArray:
-    n = factors.shape[1]
-    p = np.empty(n)
-    for s in range(n):
-        p[s] = marginal_from(
-            factors[0, s], factors[1, s], profiles[0], profiles[1], hour, second, kept, hour * n + s
-        )
-    return p
-
-
-@compiled
-def holding_end(
-    key: np.uint64, slot: int, flip: int, since: float, factor: float, profile: FloatArray, table: FloatArray
-) -> float:
-    """When the stretch of constant state ends that began at `since`, s (compiled; for batches too).
-
-    Args:
-        key: the world's key.
-        slot: index of the slot.
-        flip: number of the stretch, 1 for the first.
-        since: s.
-        factor: of the rate at which the state is left.
-        profile: (168,) 1/s, of that rate.
-        table: (169,) its hazard, gathered since Monday 00:00, at full hours.
-    """
-    if factor * table[WEEK_HOURS] <= 0.0:
-        return np.inf
-    hazard = keyed_exponential(key, OCCUPANCY_STREAM, slot, flip) / factor
-    end: float = _time_after(profile, table, since, hazard)
-    return end
-
-
-@compiled
-def _seek(
-    slot: int,
-    time: float,
-    key: np.uint64,
-    arrival: float,
-    factors: FloatArray,
-    profiles: FloatArray,
-    tables: FloatArray,
-    kept: FloatArray,
-    span: FloatArray,
-    flips: IntArray,
-    states: NDArray[np.uint8],
-) -> None:
-    """Move one slot's cursor to the stretch of constant state that holds `time`, s, at or after `arrival`.
-
-    Rows of factors, profiles and tables are the rates of leaving state 0 and state 1. Changed in place:
-    span, (n, 2) s, begin and end of the stretch; flips, (n,) stretches begun so far, 0 = cursor not set;
-    states, (n,) 1 = occupied.
-    """
-    if flips[slot] == 0 or time < span[slot, 0]:
-        _, hour, second = hour_of_week(arrival)
-        row = hour * flips.size + slot
-        p = marginal_from(
-            factors[0, slot], factors[1, slot], profiles[0], profiles[1], hour, second, kept, row
-        )
-        state = 1 if keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < p else 0
-        states[slot] = state
-        flips[slot] = 1
-        span[slot, 0] = arrival
-        span[slot, 1] = holding_end(
-            key, slot, 1, arrival, factors[state, slot], profiles[state], tables[state]
-        )
-    while time >= span[slot, 1]:
-        state = 1 - states[slot]
-        states[slot] = state
-        flips[slot] += 1
-        span[slot, 0] = span[slot, 1]
-        span[slot, 1] = holding_end(
-            key, slot, flips[slot], span[slot, 0], factors[state, slot], profiles[state], tables[state]
-        )
-
-
-@compiled
-def _look(
     slots: IntArray,
     time: float,
-    key: np.uint64,
-    arrival: float,
-    factors: FloatArray,
-    profiles: FloatArray,
-    tables: FloatArray,
-    kept: FloatArray,
-    span: FloatArray,
-    flips: IntArray,
-    states: NDArray[np.uint8],
-) -> BoolArray:
-    occupied = np.empty(slots.size, np.bool_)
-    for i, slot in enumerate(slots):
-        if not 0 <= slot < flips.size:
-            raise IndexError("slot index out of range")
-        _seek(slot, time, key, arrival, factors, profiles, tables, kept, span, flips, states)
-        occupied[i] = states[slot] == 1
-    return occupied
+    cursors: int,
+    occupied: BoolArray,
+    ends: FloatArray,
+) -> None:
+    """Write the state of each of `slots` at `time` and, if `ends` has room, when its sojourn ends."""
+    of_all = process_at(process, 0)
+    for i in range(slots.size):
+        slot, cursor = slots[i], cursor_at(cursors, slots[i])
+        if time < cursor.since:
+            cursor.sojourn, cursor.valid_until = 0, 0.0
+        occupied[i] = process_state(of_all, key, arrival, hour, second, slot, cursor, time)
+        if ends.size > 0:
+            find_sojourn_end(of_all, key, slot, cursor)
+            ends[i] = cursor.valid_until
+
+
+@kernel
+def _marginals(process: int, hour: int, second: float, marginals: FloatArray) -> None:
+    for slot in range(marginals.size):
+        marginals[slot] = process_forecast(process_at(process, 0), hour, second, slot)[0]
 
 
 class ProcessWorld:
     """One episode of an `OccupancyProcess`: a pure function of (process, key, arrival).
 
-    Lazy: only slots that are looked at cost anything. A slot keeps a cursor on its latest stretch; a query
-    before the cursor starts that slot again, so answers never depend on the order of the queries.
+    Lazy: only slots that are asked about cost anything. A slot keeps a cursor on its latest sojourn; a query before the
+    cursor restarts that slot, so answers never depend on the order of the queries.
     """
 
     def __init__(self, process: "OccupancyProcess", key: np.uint64, arrival: Arrival) -> None:
         if not math.isfinite(arrival.time):
             raise InputError(f"Arrival.time: got {arrival.time}, wanted finite seconds")
-        n = process.n_slots
-        # np.zeros takes memory from the system untouched, so a million slots that nobody sees cost nothing.
-        self._span = np.zeros((n, 2))
-        self._flips = np.zeros(n, np.int64)
-        self._states = np.zeros(n, np.uint8)
+        # np.zeros takes memory from the system untouched, so a million slots that nobody asks about cost nothing.
+        self._cursors = np.zeros(process.n_slots, CURSOR)
+        _, self._hour, self._second = hour_of_week(float(arrival.time))
         self.process = process
         self.key = np.uint64(key)
         self.arrival = arrival
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
         """(k,) bool: is each of the slots (k,) taken at `time`, which is at or after the arrival?"""
-        return self._look(np.asarray(slots, np.int64), time)
+        return self._seek(self._checked(slots), time, np.empty(0))
 
     def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
         """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
-        slots = np.asarray(slots, np.int64)
-        return np.where(self._look(slots, time), self._span[slots, 1], time)
+        slots = self._checked(slots)
+        ends = np.empty(slots.size)
+        return np.where(self._seek(slots, time, ends), ends, time)
 
-    def stretch(self, slots: ArrayLike, time: float) -> IntArray:
-        """(k,) int64: how many stretches of constant state each slot has begun since the arrival."""
-        slots = np.asarray(slots, np.int64)
-        self._look(slots, time)
-        begun: IntArray = self._flips[slots]
+    def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
+        """(k,) int64: how many sojourns, stretches of constant state, each slot has begun since the arrival."""
+        slots = self._checked(slots)
+        self._seek(slots, time, np.empty(0))
+        begun: IntArray = self._cursors["sojourn"][slots].astype(np.int64)
         return begun
 
-    def _look(self, slots: IntArray, time: float) -> BoolArray:
-        arrival = self.arrival.time
+    def _checked(self, slots: ArrayLike) -> IntArray:
+        slots = np.ascontiguousarray(slots, np.int64)
+        if slots.size and not (slots.min() >= 0 and slots.max() < len(self._cursors)):
+            raise IndexError("slot index out of range")
+        return slots
+
+    def _seek(self, slots: IntArray, time: float, ends: FloatArray) -> BoolArray:
+        arrival = float(self.arrival.time)
         if not arrival <= time < math.inf:
             raise InputError(f"time: got {time}, wanted finite seconds at or after the arrival at {arrival}")
-        process = self.process
-        occupied: BoolArray = _look(
-            slots,
-            float(time),
-            self.key,
-            float(arrival),
-            process.factors,
-            process.profiles,
-            process.tables,
-            process.kept,
-            self._span,
-            self._flips,
-            self._states,
-        )
+        occupied = np.empty(slots.size, np.bool_)
+        cursors = address_of(self._cursors, CURSOR)
+        _seek(
+            self.process.address, self.key, arrival, self._hour, self._second,
+            slots, float(time), cursors, occupied, ends,
+        )  # fmt: skip
         return occupied
 
 
@@ -424,8 +260,9 @@ class OccupancyProcess:
     Attributes:
         factors: (2, n) float64, read-only, the two factors stacked; row = the state that is left.
         profiles: (2, 168) float64, 1/s, read-only, likewise.
-        tables: (2, 169) float64, read-only, the profiles' hazard gathered since Monday 00:00, at full hours.
-        kept: (168 * n,) float64, marginals at full hours, hour by hour, that have been asked for; 0 elsewhere.
+        hazards: (2, 169) float64, read-only, the profiles summed up from Monday 00:00, at full hours.
+        hourly_marginals: (168, n) float64, P(taken) at full hours, computed when first needed; 0 before.
+        record: (1,) of the dtype PROCESS, for compiled code.
 
     Raises:
         InputError: a wrong shape, a value that is negative or not finite, or a rate above 1000/s.
@@ -437,8 +274,9 @@ class OccupancyProcess:
     departure_profile: FloatArray
     factors: FloatArray = field(init=False, repr=False)
     profiles: FloatArray = field(init=False, repr=False)
-    tables: FloatArray = field(init=False, repr=False)
-    kept: FloatArray = field(init=False, repr=False)
+    hazards: FloatArray = field(init=False, repr=False)
+    hourly_marginals: FloatArray = field(init=False, repr=False)
+    record: NDArray[np.void] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         arrival = _checked("arrival_factor", self.arrival_factor)
@@ -450,12 +288,15 @@ class OccupancyProcess:
             raise InputError(
                 f"OccupancyProcess: got a rate of {fastest:g}/s, wanted factor * profile <= {MAX_RATE:g}"
             )
-        tables = np.pad(np.cumsum(profiles * HOUR_S, axis=1), ((0, 0), (1, 0)))
-        for name, array in (("factors", factors), ("profiles", profiles), ("tables", tables)):
+        hazards = np.pad(np.cumsum(profiles * HOUR_S, axis=1), ((0, 0), (1, 0)))
+        for name, array in (("factors", factors), ("profiles", profiles), ("hazards", hazards)):
             array.flags.writeable = False
             object.__setattr__(self, name, array)
         # Memory that nobody has touched costs nothing, so a million slots may have their whole week.
-        object.__setattr__(self, "kept", np.zeros(WEEK_HOURS * arrival.size))
+        marginals = np.zeros((WEEK_HOURS, arrival.size))
+        addresses = (address_of(a, np.float64) for a in (factors, profiles, hazards, marginals))
+        object.__setattr__(self, "hourly_marginals", marginals)
+        object.__setattr__(self, "record", np.array([(arrival.size, *addresses)], PROCESS))
         for name, row in zip(_FIELDS, (factors[0], profiles[0], factors[1], profiles[1]), strict=True):
             object.__setattr__(self, name, row)
 
@@ -463,14 +304,14 @@ class OccupancyProcess:
         return OccupancyProcess, tuple(getattr(self, name) for name in _FIELDS)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "OccupancyProcess":
-        return self  # immutable: copies of a world share it
+        return self  # immutable: copies share it
 
     @classmethod
     def from_demand(cls, attraction: ArrayLike, demand: ArrayLike, mean_stay_s: float = 2 * HOUR_S) -> Self:
         """Process whose equilibrium occupancy has the logit `attraction[s] + demand[h]`.
 
         Args:
-            attraction: (n,) float64, logit, how much a slot is liked.
+            attraction: (n,) float64, logit, popularity of each slot.
             demand: (168,) float64, logit, by hour of the week.
             mean_stay_s: s, mean time that a car stays, the same for all slots and hours.
         """
@@ -510,6 +351,11 @@ class OccupancyProcess:
     def n_slots(self) -> int:
         """Number of slots."""
         return int(self.factors.shape[1])
+
+    @property
+    def address(self) -> int:
+        """Address of the PROCESS record, for compiled code; valid while this process lives."""
+        return address_of(self.record, PROCESS)
 
     def take(self, slots: ArrayLike) -> "OccupancyProcess":
         """Process of a lot whose slot i has the rates of our slot `slots[i]`; (n,) int64."""
@@ -555,9 +401,10 @@ class OccupancyProcess:
         return scaled(brentq(excess, low, high, xtol=1e-10))
 
     def marginal(self, time: float) -> FloatArray:
-        """(n,) float64: P(occupied) at `time`, when nothing has been seen."""
-        _, hour, second = hour_of_week(time)
-        marginals: FloatArray = _marginals(self.factors, self.profiles, hour, second, self.kept)
+        """(n,) float64: P(occupied) at `time`, before anything was observed."""
+        _, hour, second = hour_of_week(float(time))
+        marginals = np.empty(self.n_slots)
+        _marginals(self.address, hour, second, marginals)
         return marginals
 
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
@@ -571,7 +418,7 @@ class OccupancyProcess:
 
     def forecast(self, arrival: Arrival) -> Forecast:
         """The marginal at the arrival, clipped to [0.001, 0.999], and the rates of that hour."""
-        _, hour, _ = hour_of_week(arrival.time)
+        _, hour, _ = hour_of_week(float(arrival.time))
         rates = self.factors * self.profiles[:, hour, None]
         return Forecast(
             np.clip(self.marginal(arrival.time), MIN_PROBABILITY, MAX_PROBABILITY), rates[0] + rates[1]

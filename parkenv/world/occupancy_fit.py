@@ -15,7 +15,8 @@ from scipy.optimize import brentq, minimize
 from scipy.special import expit
 
 from parkenv.errors import InputError
-from parkenv.world.occupancy import HOUR_S, BoolArray, FloatArray, IntArray, OccupancyProcess
+from parkenv.world.occupancy import BoolArray, FloatArray, IntArray, OccupancyProcess
+from parkenv.world.week import HOUR_S
 from sim_sensors.compilation import compiled
 
 if TYPE_CHECKING:

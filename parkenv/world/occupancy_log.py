@@ -20,19 +20,13 @@ from typing import Any, Literal, NamedTuple, Self, TextIO
 import numpy as np
 
 from parkenv.errors import InputError
-from parkenv.world.occupancy import (
-    DAY_S,
-    HOUR_S,
-    BoolArray,
-    FloatArray,
-    IntArray,
-)
+from parkenv.world.occupancy import BoolArray, FloatArray, IntArray
+from parkenv.world.week import DAY_HOURS, DAY_S, HOUR_S
 from sim_sensors.compilation import compiled
 
 DayClass = Literal["weekday", "weekend"]
 
 MAX_GAP_S = 7200.0
-DAY_HOURS = 24
 
 _KNOWN = ("datetime", "camera", "slot_id", "weather", "occupied")
 

@@ -8,16 +8,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
 from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.world.occupancy import (
     DAY_NAMES,
-    DAY_S,
-    HOUR_S,
-    MAX_PROBABILITY,
-    MIN_PROBABILITY,
     Arrival,
     ArrivalWindow,
     BoolArray,
@@ -26,11 +22,16 @@ from parkenv.world.occupancy import (
     IntArray,
 )
 from parkenv.world.occupancy_fit import fit_constant_rates
-from parkenv.world.occupancy_log import DAY_HOURS, OccupancyLog, csv_columns, csv_rows, day_class, weekday_of
-from sim_sensors.compilation import compiled
-
-PRIOR_DAYS = 1.0
-"""Weight, in days, of the lot's mean in a slot's forecast."""
+from parkenv.world.occupancy_kernel import (
+    RECORDED_DAY,
+    kernel,
+    recorded_day_at,
+    recorded_forecast,
+    recorded_look,
+)
+from parkenv.world.occupancy_log import OccupancyLog, csv_columns, csv_rows, day_class, weekday_of
+from parkenv.world.pointers import address_of, float64s, int64s, uint8s
+from parkenv.world.week import DAY_S
 
 
 def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
@@ -72,72 +73,79 @@ def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log:
     return mapping
 
 
-@compiled
-def _replay(
-    slots: IntArray,
-    second: float,
-    free: bool,
-    first: IntArray,
-    stop: IntArray,
-    from_s: FloatArray,
-    taken: BoolArray,
-) -> FloatArray:
-    """1.0 or 0.0: taken at `second` or not; with `free`, the second from which the slot is free."""
-    answer = np.empty(slots.size)
-    for i, slot in enumerate(slots):
-        if not 0 <= slot < first.size:
-            raise IndexError("slot index out of range")
-        end = stop[slot]
-        look = first[slot] + np.searchsorted(from_s[first[slot] : end], second, side="right") - 1
-        if not free:
-            answer[i] = 1.0 if taken[look] else 0.0
-            continue
-        answer[i] = second
-        while look < end and taken[look]:
+@kernel
+def _occupied(days: int, slots: IntArray, second: float, occupied: BoolArray) -> None:
+    """Write whether each slot is taken at a second of the day."""
+    day = recorded_day_at(days, 0)
+    for i in range(slots.size):
+        occupied[i] = uint8s(day.occupied)[recorded_look(day, slots[i], second)] != 0
+
+
+@kernel
+def _next_free(days: int, slots: IntArray, second: float, free_from: FloatArray) -> None:
+    """Write the second, not before `second`, from which each slot is free; inf if never."""
+    day = recorded_day_at(days, 0)
+    for i in range(slots.size):
+        look, end = recorded_look(day, slots[i], second), int64s(day.first)[int64s(day.record)[slots[i]] + 1]
+        free_from[i] = second
+        while look < end and uint8s(day.occupied)[look] != 0:
             look += 1
-            answer[i] = from_s[look] if look < end else np.inf
-    return answer
+            free_from[i] = float64s(day.from_s)[look] if look < end else np.inf
 
 
-@compiled
-def _changes(
-    slots: IntArray, second: float, first: IntArray, stop: IntArray, from_s: FloatArray, taken: BoolArray
-) -> IntArray:
-    """How often each slot's state has changed from its first record to `second`."""
-    count = np.zeros(slots.size, np.int64)
-    for i, slot in enumerate(slots):
-        if not 0 <= slot < first.size:
-            raise IndexError("slot index out of range")
-        look = first[slot] + 1
-        while look < stop[slot] and from_s[look] <= second:
+@kernel
+def _changes(days: int, slots: IntArray, second: float, count: IntArray) -> None:
+    """Write how often each slot's state has changed from its first look to `second`."""
+    day = recorded_day_at(days, 0)
+    taken = uint8s(day.occupied)
+    for i in range(slots.size):
+        first = int64s(day.first)[int64s(day.record)[slots[i]]]
+        count[i] = 0
+        for look in range(first + 1, recorded_look(day, slots[i], second) + 1):
             count[i] += taken[look] != taken[look - 1]
-            look += 1
-    return count
+
+
+@kernel
+def _forecast(days: int, second: float, p: FloatArray) -> None:
+    for slot in range(p.size):
+        p[slot] = recorded_forecast(recorded_day_at(days, 0), slot, second)
 
 
 class RecordedWorld:
     """One recorded day, replayed; past the end of the day its last state holds."""
 
-    def __init__(self, log: OccupancyLog, records: IntArray, arrival: Arrival) -> None:
-        self.log = log
+    def __init__(self, occupancy: "RecordedOccupancy", arrival: Arrival) -> None:
         self.arrival = arrival
-        self._first, self._stop = log.first[records], log.first[records + 1]
-        self._midnight = weekday_of(arrival.day) * DAY_S
+        self._occupancy = occupancy  # keeps what the record points to
+        self._day = occupancy.day_records([arrival.day])
+        self._midnight = float(self._day["midnight"][0])
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
         """(k,) bool: is each of the slots (k,) taken at `time`, which is at or after the arrival?"""
-        return self._look(slots, time, free=False) > 0
+        slots, second = self._checked(slots), self._second(time)
+        occupied = np.empty(slots.size, np.bool_)
+        _occupied(address_of(self._day, RECORDED_DAY), slots, second, occupied)
+        return occupied
 
     def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
         """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
-        return np.maximum(self._look(slots, time, free=True) + self._midnight, time)
+        slots, second = self._checked(slots), self._second(time)
+        free_from = np.empty(slots.size)
+        _next_free(address_of(self._day, RECORDED_DAY), slots, second, free_from)
+        return np.maximum(free_from + self._midnight, time)
 
-    def stretch(self, slots: ArrayLike, time: float) -> IntArray:
-        """(k,) int64: how often the state of each slot has changed since the day's first record of it."""
-        second = self._second(time)
-        looks = (self._first, self._stop, self.log.from_s, self.log.occupied)
-        count: IntArray = _changes(np.asarray(slots, np.int64), second, *looks)
+    def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
+        """(k,) int64: how often the state of each slot has changed since the day's first look at it."""
+        slots, second = self._checked(slots), self._second(time)
+        count = np.empty(slots.size, np.int64)
+        _changes(address_of(self._day, RECORDED_DAY), slots, second, count)
         return count
+
+    def _checked(self, slots: ArrayLike) -> IntArray:
+        slots = np.ascontiguousarray(slots, np.int64)
+        if slots.size and not (slots.min() >= 0 and slots.max() < self._occupancy.n_slots):
+            raise IndexError("slot index out of range")
+        return slots
 
     def _second(self, time: float) -> float:
         """Second of the recorded day."""
@@ -147,15 +155,9 @@ class RecordedWorld:
             )
         return float(time) - self._midnight
 
-    def _look(self, slots: ArrayLike, time: float, free: bool) -> FloatArray:
-        second = self._second(time)
-        looks = (self._first, self._stop, self.log.from_s, self.log.occupied)
-        answer: FloatArray = _replay(np.asarray(slots, np.int64), second, free, *looks)
-        return answer
 
-
-class Layout(NamedTuple):
-    """What does not depend on the second of an arrival on a given day."""
+class MappedLog(NamedTuple):
+    """The log mapped to the lot for one replayed day: what does not depend on the second of the arrival."""
 
     log_slot: IntArray  # (n,)
     record: IntArray  # (n,)
@@ -167,39 +169,9 @@ class Layout(NamedTuple):
     decay_rate: float
 
 
-@compiled(error_model="numpy")
-def recorded_forecast(
-    log_slot: int, second: float, share: FloatArray, lot_share: FloatArray, n_days: FloatArray, n_records: int
-) -> float:
-    """P(taken) at a second of the day, from the hour around it; arguments as in `Layout` (for batches, too)."""
-    low, high = max(second - HOUR_S / 2, 0.0), min(second + HOUR_S / 2, DAY_S)
-    taken = in_all = 0.0
-    for hour in range(int(low // HOUR_S), min(int(high // HOUR_S), DAY_HOURS - 1) + 1):
-        weight = (min((hour + 1) * HOUR_S, high) - max(hour * HOUR_S, low)) / (high - low)
-        taken += weight * share[log_slot * DAY_HOURS + hour]
-        in_all += weight * lot_share[hour]
-    p = (taken + PRIOR_DAYS * in_all / n_records) / (n_days[log_slot] + PRIOR_DAYS)
-    return float(min(max(p, MIN_PROBABILITY), MAX_PROBABILITY))
-
-
-@compiled
-def _forecast(
-    log_slots: IntArray,
-    second: float,
-    share: FloatArray,
-    lot_share: FloatArray,
-    n_days: IntArray,
-    n_records: int,
-) -> FloatArray:
-    p = np.empty(log_slots.size)
-    for i, log_slot in enumerate(log_slots):
-        p[i] = recorded_forecast(log_slot, second, share, lot_share, n_days, n_records)
-    return p
-
-
 @dataclass(frozen=True, eq=False)
 class RecordedOccupancy:
-    """A log laid on the n slots of a lot: every episode replays a recorded day.
+    """A log mapped to the n slots of a lot: every episode replays a recorded day.
 
     The lot's slots, nearest to the goal first, get the log's m slots, fullest first (mean occupancy on the
     days of the arrival's class, weekday or weekend): rank r gets log rank floor(r·m/n). If the lot is larger,
@@ -207,7 +179,7 @@ class RecordedOccupancy:
     which the log slot was seen, cyclically, so no two slots share a record. If it is smaller, the ranks are
     thinned evenly.
 
-    Nothing of the days that a world replays is used to lay it out or to forecast it.
+    Nothing of the days that a world replays is used to map or to forecast it.
 
     Args:
         log: the recorded looks.
@@ -218,7 +190,7 @@ class RecordedOccupancy:
     log: OccupancyLog
     walk_m: FloatArray
     mapping: IntArray | None = None
-    _layouts: dict[int, Layout] = field(init=False, repr=False, default_factory=dict)
+    _mapped_logs: dict[int, MappedLog] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         walk = np.array(self.walk_m, float)
@@ -253,7 +225,8 @@ class RecordedOccupancy:
 
     def world(self, key: np.uint64, arrival: Arrival) -> RecordedWorld:  # noqa: ARG002 - the day decides all
         """The replay of the arrival's day."""
-        return RecordedWorld(self.log, self._layout(arrival).record, arrival)
+        self._at(arrival)
+        return RecordedWorld(self, arrival)
 
     def forecast(self, arrival: Arrival) -> Forecast:
         """What the other days of the class say of the hour around the arrival.
@@ -262,29 +235,47 @@ class RecordedOccupancy:
         day to the mean of all the log's slots, and clipped to [0.001, 0.999]. The relaxation rate is that of
         one chain with constant rates, fitted to all looks on those days.
         """
-        layout = self._layout(arrival)
-        second = arrival.time - weekday_of(arrival.day) * DAY_S
-        p = _forecast(
-            layout.log_slot, second, layout.share, layout.lot_share, layout.n_days, layout.n_records
-        )
-        return Forecast(p, np.full(self.n_slots, layout.decay_rate))
+        rate = self._at(arrival).decay_rate
+        p = np.empty(self.n_slots)
+        day = self.day_records([arrival.day])
+        _forecast(address_of(day, RECORDED_DAY), arrival.time - float(day["midnight"][0]), p)
+        return Forecast(p, np.full(self.n_slots, rate))
 
-    def _layout(self, arrival: Arrival) -> Layout:
+    def day_records(self, days: Sequence[str]) -> NDArray[np.void]:
+        """(k,) of the dtype RECORDED_DAY: recorded days for compiled code; valid while this object lives."""
+        log = self.log
+        records = np.empty(len(days), RECORDED_DAY)
+        for record, day in zip(records, days, strict=True):
+            mapped = self.mapped_log(day)
+            record["midnight"], record["decay_rate"] = weekday_of(day) * DAY_S, mapped.decay_rate
+            record["n_records"] = mapped.n_records
+            for name in ("log_slot", "record", "n_days"):
+                record[name] = address_of(getattr(mapped, name), np.int64)
+            for name in ("share", "lot_share"):
+                record[name] = address_of(getattr(mapped, name), np.float64)
+            record["first"], record["from_s"] = (
+                address_of(log.first, np.int64),
+                address_of(log.from_s, np.float64),
+            )
+            record["occupied"] = address_of(log.occupied, np.bool_)
+        return records
+
+    def _at(self, arrival: Arrival) -> MappedLog:
         if arrival.day not in self.log.days:
             raise InputError(f"Arrival.day: got {arrival.day!r}, wanted a recorded day of {self.log.source}")
         second = arrival.time - weekday_of(arrival.day) * DAY_S
         if not 0 <= second < DAY_S:
             raise InputError(f"Arrival.time: got {arrival.time}, wanted a second of {arrival.day}")
-        return self.layout(arrival.day)
+        return self.mapped_log(arrival.day)
 
-    def layout(self, day: str) -> Layout:
-        """How the log lies on the lot when `day`, one of the log's, is replayed."""
+    def mapped_log(self, day: str) -> MappedLog:
+        """The log mapped to the lot for the replay of `day`, one of the log's."""
         index = self.log.days.index(day)
-        if index not in self._layouts:
-            self._layouts[index] = self._lay_out(index)
-        return self._layouts[index]
+        if index not in self._mapped_logs:
+            self._mapped_logs[index] = self._map_log(index)
+        return self._mapped_logs[index]
 
-    def _lay_out(self, day: int) -> Layout:
+    def _map_log(self, day: int) -> MappedLog:
         log = self.log
         same_class = np.flatnonzero(log.weekend == log.weekend[day])
         replay_order = np.roll(same_class, -int(np.searchsorted(same_class, day)))
@@ -311,7 +302,7 @@ class RecordedOccupancy:
         rates = fit_constant_rates((looks.end - looks.start)[used], looks.before[used], looks.after[used])
         share = log.replayed_share[:, others].sum(axis=1)
         n_days = log.recorded[:, others].sum(axis=1)
-        return Layout(
+        return MappedLog(
             log_slot,
             days * len(log.slot_ids) + log_slot,
             frozenset(held_out),

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from planners.belief.path_rollout import p_free_at_first_look
+from planners.belief.path_rollout import p_free_when_first_observed
 from planners.belief.planning_graph import (
     BeliefSnapshot,
     FloatArray,
@@ -93,22 +93,24 @@ def evaluate_path(
     if n_stops < 2:
         return np.inf, np.inf
     for j in range(path.stops[n_stops].first):
-        path.looks[j].parks = False
+        path.observations[j].parks = False
     value, then_s = np.inf, np.inf
     for _ in range(2 if len(belief.weights) > 1 else 1):
-        _set_first_looks(n_stops, belief, path)
+        _set_first_observations(n_stops, belief, path)
         value, then_s = _stop_optimally(n_stops, left_s, options, n_options, fallback_s, graph, belief, path)
     return value, then_s
 
 
 @compiled(error_model="numpy")
-def _set_first_looks(n_stops: int, belief: BeliefSnapshot, path: PathBuffer) -> None:
+def _set_first_observations(n_stops: int, belief: BeliefSnapshot, path: PathBuffer) -> None:
     """Set P(free) of the first observations along a path, each given that the car did not park before."""
     weights = copy_weights(belief, path)
     for j in range(path.stops[n_stops].first):
-        look = path.looks[j]
-        if look.is_first:
-            look.p_free = p_free_at_first_look(weights, belief.p_free_if[look.slot], look.parks)
+        observation = path.observations[j]
+        if observation.is_first:
+            observation.p_free = p_free_when_first_observed(
+                weights, belief.p_free_if[observation.slot], observation.parks
+            )
 
 
 @compiled(error_model="numpy")
@@ -123,24 +125,26 @@ def _stop_optimally(
     path: PathBuffer,
 ) -> tuple[float, float]:
     """Evaluate a path on which P(free) of all observations is known."""
-    stops, looks = path.stops, path.looks
+    stops, observations = path.stops, path.observations
     # A bound on what any later observation can bring. A slot that is better than that is taken at once; others are kept
     # in mind for a while, in which they grow no better.
     ahead = np.inf
     for k in range(n_stops - 1, 0, -1):
         stops[k].ahead_s = ahead
         for j in range(stops[k].first, stops[k + 1].first):
-            slot = looks[j].slot
+            slot = observations[j].slot
             ahead = min(ahead, graph.drive_s[stops[k].vertex, slot] + graph.cost_s[slot])
         ahead += stops[k].time - stops[k - 1].time
     for k in range(1, n_stops):
         for j in range(stops[k].first, stops[k + 1].first):
-            slot = looks[j].slot
+            slot = observations[j].slot
             at_once = expected_cost_to_slot(stops[k].vertex, slot, 1.0, 0.0, fallback_s[slot], graph, belief)
-            looks[j].kept_until = k if at_once <= stops[k].ahead_s else min(k + KEPT_IN_MIND, n_stops - 1)
+            observations[j].kept_until = (
+                k if at_once <= stops[k].ahead_s else min(k + KEPT_IN_MIND, n_stops - 1)
+            )
     nothing, onward, then_s = left_s, 0.0, left_s
     for k in range(n_stops - 1, 0, -1):
-        # `value` of the looks and `nothing` hold what follows at the next stop, and `onward` is the drive there.
+        # `value` of the observations and `nothing` hold what follows at the next stop, and `onward` is the drive there.
         vertex, first, last = stops[k].vertex, stops[k].first, stops[k + 1].first
         oldest = stops[max(k - KEPT_IN_MIND, 1)].first
         stop_s = np.inf
@@ -153,48 +157,48 @@ def _stop_optimally(
                 ),
             )
         for j in range(oldest, last):
-            look = looks[j]
-            if look.kept_until < k:
+            observation = observations[j]
+            if observation.kept_until < k:
                 continue
-            age, slot = stops[k].time - look.time, look.slot
+            age, slot = stops[k].time - observation.time, observation.slot
             back_s = expected_cost_to_slot(vertex, slot, 1.0, age, fallback_s[slot], graph, belief)
-            look.expected_s = min(stop_s, back_s)
-            later = onward + (nothing if look.kept_until == k else look.value)
+            observation.expected_s = min(stop_s, back_s)
+            later = onward + (nothing if observation.kept_until == k else observation.value)
             # The stop at which the slot is observed comes last, and decides.
-            look.parks = look.expected_s <= max(stops[k].ahead_s, later)
-            look.value = look.expected_s if look.parks else later
+            observation.parks = observation.expected_s <= max(stops[k].ahead_s, later)
+            observation.value = observation.expected_s if observation.parks else later
         then_s = onward + nothing
         nothing = min(stop_s, then_s)
         # Now back to before the observations at this stop: the best slot that they show replaces a worse one.
-        _sort_looks(first, last, path)
+        _sort_observations(first, last, path)
         for j in range(oldest, first):
-            if looks[j].kept_until < k:
+            if observations[j].kept_until < k:
                 continue
             rest, expected = 1.0, 0.0
             for i in range(first, last):
-                if looks[i].expected_s >= looks[j].expected_s:
+                if observations[i].expected_s >= observations[j].expected_s:
                     break
-                expected += rest * looks[i].p_free * looks[i].value
-                rest *= 1.0 - looks[i].p_free
-            looks[j].value = expected + rest * looks[j].value
+                expected += rest * observations[i].p_free * observations[i].value
+                rest *= 1.0 - observations[i].p_free
+            observations[j].value = expected + rest * observations[j].value
         rest, expected = 1.0, 0.0
         for i in range(first, last):
-            expected += rest * looks[i].p_free * looks[i].value
-            rest *= 1.0 - looks[i].p_free
+            expected += rest * observations[i].p_free * observations[i].value
+            rest *= 1.0 - observations[i].p_free
         nothing = expected + rest * nothing
         onward = stops[k].time - stops[k - 1].time
     return onward + nothing, then_s
 
 
 @compiled(error_model="numpy")
-def _sort_looks(first: int, last: int, path: PathBuffer) -> None:
+def _sort_observations(first: int, last: int, path: PathBuffer) -> None:
     """Sort the observations made at one stop by the expected time of driving to their slots."""
-    looks = path.looks
+    observations = path.observations
     for i in range(first + 1, last):
         j = i
-        while j > first and looks[j].expected_s < looks[j - 1].expected_s:
+        while j > first and observations[j].expected_s < observations[j - 1].expected_s:
             # Records are views: they are exchanged field by field. (Times at one stop are equal.)
-            a, b = looks[j - 1], looks[j]
+            a, b = observations[j - 1], observations[j]
             a.slot, b.slot = b.slot, a.slot
             a.p_free, b.p_free = b.p_free, a.p_free
             a.expected_s, b.expected_s = b.expected_s, a.expected_s

@@ -24,9 +24,9 @@ from sim_sensors.compilation import compiled
 
 NEGLIGIBLE = 0.002
 """P(nothing worth stopping for was found) at which a path ends; what remains is estimated."""
-WORTH_A_LOOK = 0.1
+WORTH_OBSERVING = 0.1
 """Part of its usual P(free) to which a slot observed taken must have come back to be worth another observation."""
-LOOK_AGAIN_S = 10.0
+OBSERVE_AGAIN_S = 10.0
 """s that must pass before a slot is observed once more; a later observation makes up for those left out."""
 
 
@@ -56,7 +56,7 @@ def rollout_path(
     Returns:
         The number of stops, and the time, s, that is left at its end if nothing was found.
     """
-    stops, looks, marks = path.stops, path.looks, path.marks
+    stops, observations, marks = path.stops, path.observations, path.marks
     n = len(belief.slots)
     # In a part of a lot there is always one more slot that was not observed.
     n_unproven = 0 if graph.whole else 1
@@ -69,10 +69,10 @@ def rollout_path(
         if state != OBSERVED_TAKEN:
             n_unproven += 1
     stops[0].vertex, stops[0].time, stops[0].first, stops[1].first = vertex, 0.0, 0, 0
-    k, n_looks, time, n_passed = 0, 0, 0.0, 0
+    k, n_observations, time, n_passed = 0, 0, 0.0, 0
     choose, target = True, -1
     weights = copy_weights(belief, path)
-    while k + 3 < len(stops) and n_looks < len(looks):
+    while k + 3 < len(stops) and n_observations < len(observations):
         while n_passed < n_targets and _is_settled(targets[n_passed], vertex, time, graph, belief, path):
             n_passed += 1
             choose = True
@@ -83,7 +83,7 @@ def rollout_path(
             if target < 0:
                 break
             choose = False
-            if _p_nothing_found(vertex, value, n_looks, graph, path) <= NEGLIGIBLE:
+            if _p_nothing_found(vertex, value, n_observations, graph, path) <= NEGLIGIBLE:
                 break
         if target == vertex:
             time += 0.0 if _is_attempt_due(vertex, time, graph, belief, path) else graph.wait_s
@@ -96,7 +96,7 @@ def rollout_path(
         # What the car observes from here, and, where that shows nothing of the target, what an attempt shows.
         n_views = graph.view_starts[vertex + 1] - graph.view_starts[vertex]
         for i in range(n_views + 1):
-            if n_looks == len(looks):
+            if n_observations == len(observations):
                 break
             attempts = i == n_views
             if attempts:
@@ -110,29 +110,34 @@ def rollout_path(
                     continue
             is_first = belief.slots[s].state == UNOBSERVED and marks[s].observed_at < 0.0
             if is_first:
-                p_free = p_free_at_first_look(weights, belief.p_free_if[s], True)
+                p_free = p_free_when_first_observed(weights, belief.p_free_if[s], True)
                 n_unproven -= 1
                 n_unobserved -= 1
             else:
                 p_free = _p_free_again(s, time, marks[s].observed_at, belief)
                 if p_free == 0.0 and not attempts:
                     continue
-            look = looks[n_looks]
-            look.slot, look.p_free, look.time, look.is_first = s, p_free, time, is_first
+            observation = observations[n_observations]
+            observation.slot, observation.p_free, observation.time, observation.is_first = (
+                s,
+                p_free,
+                time,
+                is_first,
+            )
             marks[s].observed_at = time
-            n_looks += 1
+            n_observations += 1
             # Until it is observed, the target stays the best choice: all else only grows worse.
             choose = choose or s == target
             if attempts:
                 # The path goes on only if the attempt failed.
                 time += graph.failure_s
-        stops[k + 1].first = n_looks
+        stops[k + 1].first = n_observations
         if n_unproven == 0:
             # The last observation proves the lot full if it shows no free slot. It may be better not to make it.
             p_none, cost_s = 1.0, np.inf
-            for j in range(stops[k].first, n_looks):
-                p_none *= 1.0 - looks[j].p_free
-                cost_s = min(cost_s, graph.cost_s[looks[j].slot])
+            for j in range(stops[k].first, n_observations):
+                p_none *= 1.0 - observations[j].p_free
+                cost_s = min(cost_s, graph.cost_s[observations[j].slot])
             proof_s = time - stops[k - 1].time + p_none * graph.give_up_s + (1.0 - p_none) * cost_s
             spared_s = _repeat_path(k - 1, stops[k].first, graph, belief, path)
             if spared_s >= proof_s:
@@ -143,9 +148,9 @@ def rollout_path(
             return k, spared_s
     # A half of the path is representative of what follows if as many slots are left that were not observed.
     left_s = np.inf
-    if n_unobserved >= n_looks - stops[k // 2].first:
-        left_s = _extrapolate(k, n_looks, graph, path)
-    return k + 1, min(left_s, _repeat_path(k, n_looks, graph, belief, path), graph.give_up_s)
+    if n_unobserved >= n_observations - stops[k // 2].first:
+        left_s = _extrapolate(k, n_observations, graph, path)
+    return k + 1, min(left_s, _repeat_path(k, n_observations, graph, belief, path), graph.give_up_s)
 
 
 @compiled(error_model="numpy")
@@ -182,7 +187,7 @@ def _is_attempt_due(
 
 @compiled(error_model="numpy")
 def _repeat_path(
-    last: int, n_looks: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
+    last: int, n_observations: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> float:
     """Return the expected time, s, from a stop on if a part of the path is driven again and again."""
     best, leaving, cost_s = np.inf, 0.0, 0.0
@@ -199,32 +204,36 @@ def _repeat_path(
         # Or the car stands and waits for a slot in view.
         best = (1.0 + cost_s) / leaving
     for quarter in range(4):
-        best = min(best, _repeat_part(quarter * last // 4, last, n_looks, graph, belief, path))
+        best = min(best, _repeat_part(quarter * last // 4, last, n_observations, graph, belief, path))
     return best
 
 
 @compiled(error_model="numpy")
 def _repeat_part(
-    first: int, last: int, n_looks: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
+    first: int, last: int, n_observations: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> float:
     """Return the expected time, s, of driving a part of a path again and again until a slot on it has come free.
 
     All its slots were just observed taken. Each observation finds the slot free with the probability that the time
     since the one before gives, so that many observations of few slots do not count for more than they are worth.
     """
-    stops, looks, marks = path.stops, path.looks, path.marks
+    stops, observations, marks = path.stops, path.observations, path.marks
     start, end = stops[first].vertex, stops[last].vertex
     period = stops[last].time - stops[first].time + graph.drive_s[end, start]
     if end == start:
         period = max(period, graph.wait_s)
-    for j in range(stops[first].first, n_looks):
-        marks[looks[j].slot].scratch = -1.0
+    for j in range(stops[first].first, n_observations):
+        marks[observations[j].slot].scratch = -1.0
     found, cost_s = 0.0, 0.0
-    for j in range(stops[first].first, n_looks):
-        s = looks[j].slot
+    for j in range(stops[first].first, n_observations):
+        s = observations[j].slot
         before = marks[s].scratch
-        gap = looks[j].time - before if before >= 0.0 else period - (marks[s].observed_at - looks[j].time)
-        marks[s].scratch = looks[j].time
+        gap = (
+            observations[j].time - before
+            if before >= 0.0
+            else period - (marks[s].observed_at - observations[j].time)
+        )
+        marks[s].scratch = observations[j].time
         usual = 0.0
         for h in range(len(belief.weights)):
             usual += path.weights[h] * belief.p_free_if[s, h]
@@ -236,28 +245,28 @@ def _repeat_part(
 
 
 @compiled(error_model="numpy")
-def _extrapolate(last: int, n_looks: int, graph: PlanningGraph, path: PathBuffer) -> float:
+def _extrapolate(last: int, n_observations: int, graph: PlanningGraph, path: PathBuffer) -> float:
     """Return the expected time, s, of going on to unobserved slots that are as good as those of the second half."""
-    stops, looks = path.stops, path.looks
+    stops, observations = path.stops, path.observations
     first = last // 2
     found, cost_s = 0.0, 0.0
-    for j in range(stops[first].first, n_looks):
-        found += looks[j].p_free
-        cost_s += looks[j].p_free * graph.cost_s[looks[j].slot]
+    for j in range(stops[first].first, n_observations):
+        found += observations[j].p_free
+        cost_s += observations[j].p_free * graph.cost_s[observations[j].slot]
     return (stops[last].time - stops[first].time) / found + cost_s / found if found > 0.0 else np.inf
 
 
 @compiled(error_model="numpy")
 def _p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnapshot) -> float:
-    """Return P(free) some time from now of a slot observed taken, really or along the path; 0 if not worth a look."""
+    """Return P(free) some time from now of a slot observed taken, really or along the path; 0 if too low."""
     at = belief.slots[slot]
     if observed_at >= 0.0:
-        if time - observed_at < LOOK_AGAIN_S:
+        if time - observed_at < OBSERVE_AGAIN_S:
             return 0.0
         p_free = at.p_free_usual * decayed_part(at.decay_rate, time - observed_at)
     else:
         p_free = at.p_free + (at.p_free_usual - at.p_free) * decayed_part(at.decay_rate, time)
-    return float(p_free) if p_free >= WORTH_A_LOOK * at.p_free_usual else 0.0
+    return float(p_free) if p_free >= WORTH_OBSERVING * at.p_free_usual else 0.0
 
 
 @compiled(error_model="numpy")
@@ -295,7 +304,7 @@ def _next_target(
 
 
 @compiled(error_model="numpy")
-def p_free_at_first_look(weights: FloatArray, p_free_if: FloatArray, taken_follows: bool) -> float:
+def p_free_when_first_observed(weights: FloatArray, p_free_if: FloatArray, taken_follows: bool) -> float:
     """Return P(free) of a slot at its first observation, given the hypotheses.
 
     Args:
@@ -315,12 +324,12 @@ def p_free_at_first_look(weights: FloatArray, p_free_if: FloatArray, taken_follo
 
 @compiled(error_model="numpy")
 def _p_nothing_found(
-    vertex: int, value_s: float, n_looks: int, graph: PlanningGraph, path: PathBuffer
+    vertex: int, value_s: float, n_observations: int, graph: PlanningGraph, path: PathBuffer
 ) -> float:
     """Return P(no slot observed along the path is free and as good as the value of driving on)."""
     p_none = 1.0
-    for j in range(n_looks):
-        s = path.looks[j].slot
+    for j in range(n_observations):
+        s = path.observations[j].slot
         if graph.drive_s[vertex, s] + graph.cost_s[s] <= value_s:
-            p_none *= 1.0 - path.looks[j].p_free
+            p_none *= 1.0 - path.observations[j].p_free
     return p_none

@@ -46,13 +46,13 @@ STOP = np.dtype(
     [
         ("vertex", np.int64),
         ("time", np.float64),
-        ("first", np.int64),  # number of its first look; its last one is before that of the next stop
-        ("ahead_s", np.float64),  # scratch: least time that any later look leaves to the goal
+        ("first", np.int64),  # number of its first observation; its last one precedes that of the next stop
+        ("ahead_s", np.float64),  # scratch: least time that any later observation leaves to the goal
     ]
 )
 """A stop of a path."""
 
-LOOK = np.dtype(
+OBSERVATION = np.dtype(
     [
         ("slot", np.int64),
         ("p_free", np.float64),  # given that the search has come so far
@@ -117,13 +117,13 @@ class PathBuffer(NamedTuple):
 
     Attributes:
         stops: `STOP` records, one more than stops.
-        looks: `LOOK` records, the observations in order.
+        observations: `OBSERVATION` records, the observations in order.
         marks: (n_slots,) `MARK` records.
         weights: float64, scratch: probabilities of the hypotheses along the path.
     """
 
     stops: Records
-    looks: Records
+    observations: Records
     marks: Records
     weights: FloatArray
 
@@ -131,10 +131,10 @@ class PathBuffer(NamedTuple):
 def path_buffer(n_slots: int, n_vertices: int) -> PathBuffer:
     """Make room for a path on a lot of that size."""
     most_stops = min(4 * n_vertices + 16, MOST_STOPS)
-    most_looks = n_slots + min(n_slots + 64, MOST_STOPS)
+    most_observations = n_slots + min(n_slots + 64, MOST_STOPS)
     return PathBuffer(
         np.zeros(most_stops + 1, STOP),
-        np.zeros(most_looks, LOOK),
+        np.zeros(most_observations, OBSERVATION),
         np.zeros(n_slots, MARK),
         np.zeros(MOST_HYPOTHESES),
     )

@@ -83,7 +83,8 @@ class StoppingGraph(NamedTuple):
     @classmethod
     def of(cls, mdp: ParkingMDP) -> StoppingGraph:
         """Make the graph of a process, without its probabilities."""
-        neighbors, move_s = mdp.neighbors.astype(np.int32), np.ascontiguousarray(mdp.move_s)
+        # Copies: numba compiles a function once more for arrays that are read-only.
+        neighbors, move_s = mdp.neighbors.astype(np.int32), np.array(mdp.move_s, order="C")
         in_start, in_source, in_move, in_s = edges_in(neighbors, move_s)
         never_s = _never(neighbors, move_s, mdp.wait_s, mdp.gamma)
         return cls(

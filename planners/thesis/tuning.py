@@ -81,10 +81,10 @@ def tune_failure_cost(
         InputError: a cost or a number of worlds that is not positive, probabilities of a wrong number or size.
     """
     p = np.asarray(p_occupied, dtype=np.float64)
-    tried = np.asarray(costs, dtype=np.float64)
+    compared = np.asarray(costs, dtype=np.float64)
     if p.shape != (problem.lot.n_slots,) or not ((p >= 0.0) & (p <= 1.0)).all():
         raise InputError(f"p_occupied: want {problem.lot.n_slots} probabilities, got shape {p.shape}")
-    if not len(tried) or not (np.isfinite(tried) & (tried > 0.0)).all():
+    if not len(compared) or not (np.isfinite(compared) & (compared > 0.0)).all():
         raise InputError(f"costs are {list(costs)}, want finite seconds above 0")
     if worlds < 1:
         raise InputError(f"worlds is {worlds}, want at least 1")
@@ -95,7 +95,7 @@ def tune_failure_cost(
     taken = np.random.default_rng(seed).random((worlds, len(p))) < p
     # What a failed attempt costs in these worlds; what the planner believes it to cost is what is compared.
     graph = near.planning_graph(problem, problem.failure_s)
-    return Tuning(tried, _mean_times(start, taken, p, tried, graph))
+    return Tuning(compared, _mean_times(start, taken, p, compared, graph))
 
 
 @compiled

@@ -1,4 +1,4 @@
-"""The light of a weather as it reaches a point: from the sun, the sky, and what a direction shows in a mirror."""
+"""Light that reaches a point: from the sun, the sky, and by mirror reflection."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _GROUND_TONE = 0.12  # albedo of the ground where it is only mirrored or bounces
 
 
 class Light(NamedTuple):
-    """A weather's light as the compiled code takes it; colours are linear RGB radiance, relative (see `Weather`).
+    """The light of a weather for compiled code; colours are relative linear RGB radiance (see `Weather`).
 
     Attributes:
         sun_direction: (3,) float64, unit vector to the sun, world frame.
         sun, sky, horizon: (3,) float64, as in `Weather`.
         haze, wetness, lit_windows: as in `Weather`.
         background, mirrored: (n, n, 3) float32, the sky, sharp and blurred, as `look_up` takes it.
-        ground: (3,) float64, of open ground, where it is only mirrored or bounces light.
+        ground: (3,) float64, radiance of open ground in reflections and as bounced light.
     """
 
     sun_direction: FloatArray
@@ -47,7 +47,7 @@ class Light(NamedTuple):
 
 
 def daylight(weather: Weather) -> Light:
-    """The light of a weather."""
+    """Return the light of a weather."""
     background, mirrored = sky_domes(weather)
     sun, sky = np.array(weather.sun), np.array(weather.sky)
     return Light(
@@ -68,13 +68,13 @@ def daylight(weather: Weather) -> Light:
 def mirrored(
     px: float, py: float, pz: float, rx: float, ry: float, rz: float, light: Light, maps: LightMaps
 ) -> Color:
-    """What the direction (rx, ry, rz) shows from a point: the sky, or the ground with its shadows."""
+    """Return the radiance seen from a point in direction (rx, ry, rz): the sky, or the ground with its shadows."""
     if rz >= 0.0:
         red, green, blue = look_up(light.mirrored, rx, ry, rz)
         return red, green, blue
     reach = max(pz, 0.05) / max(-rz, 0.02)
     hidden = open_sky(maps, px + rx * reach, py + ry * reach)
-    # Toward the horizon stand other cars, kerbs, hedges: darker than the open ground.
+    # Other cars, kerbs and hedges towards the horizon are darker than the open ground.
     far = min(1.0, reach * 0.12)
     tone = (0.25 + 0.75 * hidden) * (1.0 - 0.45 * far)
     return light.ground[0] * tone, light.ground[1] * tone, light.ground[2] * tone

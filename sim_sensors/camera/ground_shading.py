@@ -1,4 +1,4 @@
-"""The colour of the ground: asphalt and grass in sun and shade, and the water that stands on them."""
+"""Shading of the ground: asphalt and grass in sun and shadow, and puddles."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sim_sensors.compilation import compiled
 
 @compiled(**LEAF)
 def ground_level(row_z: float, height: float, focal: float, texel: float) -> float:
-    """Pyramid level at which a texel of the ground is about a pixel, in the middle of a row.
+    """Return the pyramid level at which a texel of the ground is about a pixel, in the middle of a row.
 
     Args:
         row_z: world z of the row's ray at unit depth.
@@ -23,7 +23,7 @@ def ground_level(row_z: float, height: float, focal: float, texel: float) -> flo
         texel: m, side of a texel of the finest level.
     """
     depth = -height / min(row_z, -1e-3)
-    # Across a pixel sees depth/f, along the ground depth²/(f·h): the geometric mean keeps edges crisp.
+    # A pixel covers depth/f across and depth²/(f·h) along the ground: their geometric mean keeps edges sharp.
     footprint = depth / focal * math.sqrt(max(depth / height, 1.0))
     return max(math.log2(footprint / texel) - 0.4, 0.0)
 
@@ -42,9 +42,9 @@ def ground_radiance(
     maps: LightMaps,
     grain_of_asphalt: Tile,
 ) -> Color:
-    """Light from the ground at (px, py), m, to a camera that looks along the unit vector (dx, dy, dz); linear RGB.
+    """Return the radiance, linear RGB, of the ground at (px, py), m, seen along the unit vector (dx, dy, dz).
 
-    `level` and `grain_level` are those of the pyramids of the ground and of the stones in the asphalt.
+    `level` and `grain_level` are the levels of the pyramids of the ground and of the asphalt's grain.
     """
     albedo, grass, texel, below = sample_ground(ground, px, py, level)
     grain = 0.55 + 0.9 * sample_tile(grain_of_asphalt, px / 3.0, py / 3.0, grain_level)
@@ -63,7 +63,7 @@ def ground_radiance(
     green = albedo * (1.0 + 0.25 * grass) * (light.sun[1] * sun + light.sky[1] * sky)
     blue = albedo * (0.95 - 0.45 * grass) * (light.sun[2] * sun + light.sky[2] * sky)
     if wet > 0.0:
-        # Water mirrors what stands beyond: the sky, or the dark of a car where the sky is hidden.
+        # Water reflects the sky, or a dark car where the sky is occluded.
         mirror = 1.0 + dz
         mirror = (0.025 + 0.975 * mirror * mirror * mirror * mirror * mirror) * wet
         mirror *= min(1.0, 0.3 + 1.1 * wettable)

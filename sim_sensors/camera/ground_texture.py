@@ -1,4 +1,4 @@
-"""The ground seen from above: asphalt with patches, cracks, oil and worn paint, drawn once for a scene."""
+"""Texture of the ground: asphalt with patches, cracks, oil and worn paint, drawn once per scene."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ class GroundTexture(NamedTuple):
     """Albedo of the ground as an image pyramid.
 
     Attributes:
-        texels: (total, 3) uint8: the root of the grey albedo, how much of it is grass, how much water can stand
-            there, each 255 = 1; level after level, row-major, rows go with y.
+        texels: (total, 3) uint8: square root of the grey albedo, fraction of grass, and how much water can collect
+            there, each 255 = 1; level after level, row-major, rows along y.
         start: (n_levels,) int64, first texel of each level.
         shape: (n_levels, 2) int64, rows and columns of each level.
         per_m: (n_levels, 2) float64, texels per metre along y and x.
@@ -47,7 +47,7 @@ _TEXTURES: WeakKeyDictionary[Ground, GroundTexture] = WeakKeyDictionary()
 
 
 def ground_texture(ground: Ground) -> GroundTexture:
-    """The texture of a ground; made on first use and kept as long as the ground lives (about 1 s)."""
+    """Return the texture of a ground; made on first use (about 1 s) and kept as long as the ground exists."""
     if ground not in _TEXTURES:
         _TEXTURES[ground] = _draw(ground)
     return _TEXTURES[ground]
@@ -80,7 +80,7 @@ def _draw(ground: Ground) -> GroundTexture:
     _repair(asphalt, generator, texel)
     asphalt *= _stains(paved.shape, ground, corners, generator, texel)
     _crack(asphalt, generator, texel)
-    # Paint goes where tyres roll and where the stones stand out.
+    # Paint wears off under tyres and on protruding stones.
     wear = np.clip(0.8 - 0.28 * mottle - 0.2 * blotch - 0.14 * grain, 0.1, 0.95)
     cover = wear * (paint.astype(np.float32) / 255.0)
     grey = asphalt * (1.0 - cover) + (0.5 + 0.05 * blotch + 0.02 * grain) * cover
@@ -103,7 +103,7 @@ def _extent(ground: Ground) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 
 
 def _strip(x0: float, y0: float, x1: float, y1: float, width: float) -> NDArray[np.float64]:
-    """The four corners of a line of some width."""
+    """Return the four corners of a line with a width."""
     along = np.array([x1 - x0, y1 - y0])
     across = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9) * width / 2.0
     start, end = np.array([x0, y0]), np.array([x1, y1])
@@ -121,7 +121,7 @@ def _spread(
 
 
 def _repair(asphalt: NDArray[np.float32], generator: np.random.Generator, texel: float) -> None:
-    """Darker or lighter rectangles where the road was opened."""
+    """Draw darker or lighter rectangles: repaired road surface."""
     rows, columns = asphalt.shape
     for _ in range(int(asphalt.size * texel**2 / 250.0)):
         height, width = (generator.uniform(0.5, 3.5, 2) / texel).astype(int)
@@ -136,7 +136,7 @@ def _stains(
     generator: np.random.Generator,
     texel: float,
 ) -> NDArray[np.float32]:
-    """Oil and rust where engines stood, denser near markings; factor on the albedo."""
+    """Return a factor on the albedo: oil and rust stains, denser near markings."""
     stain = np.zeros(shape[:2], dtype=np.uint8)
     n_lines = len(ground.markings)
     area = shape[0] * shape[1] * texel**2
@@ -154,7 +154,7 @@ def _stains(
 
 
 def _crack(asphalt: NDArray[np.float32], generator: np.random.Generator, texel: float) -> None:
-    """Dark wandering lines."""
+    """Draw cracks: dark random walks."""
     rows, columns = asphalt.shape
     mask = np.zeros((rows, columns), dtype=np.uint8)
     for _ in range(int(rows * columns * texel**2 / 90.0)):
@@ -182,7 +182,7 @@ def _pyramid(image: NDArray[np.uint8], low: NDArray[np.float64], texel: float) -
 
 @compiled(**LEAF)
 def sample_ground(texture: GroundTexture, x: float, y: float, level: int) -> tuple[float, float, int, int]:
-    """The ground at (x, y), m, bilinear: grey albedo, share of grass; and its texel and the one below."""
+    """Sample the ground at (x, y), m, bilinearly: grey albedo, fraction of grass; and the texel and the one below."""
     level = min(max(level, 0), texture.shape.shape[0] - 1)
     columns = texture.shape[level, 1]
     # Beyond the drawn part it repeats, mirrored, so that no streaks run to the horizon.
@@ -203,14 +203,14 @@ def sample_ground(texture: GroundTexture, x: float, y: float, level: int) -> tup
 
 @compiled(**LEAF)
 def sample_water(texture: GroundTexture, i: int, j: int) -> float:
-    """How much water can stand between the texels i and j of `sample_ground`."""
+    """Return how much water can collect between the texels i and j of `sample_ground`."""
     t = texture.texels
     return float(float(t[i, 2]) + t[i + 1, 2] + t[j, 2] + t[j + 1, 2]) / 1020.0
 
 
 @compiled(**LEAF)
 def _mirrored(u: float, n: int) -> float:
-    """`u` folded back into [0, n - 1)."""
+    """Reflect `u` into [0, n - 1)."""
     span = n - 1.001
     if u < 0.0:
         u = -u

@@ -1,4 +1,4 @@
-"""From light to bytes: lens blur, vignetting, exposure, shot and read noise, tone curve."""
+"""Image sensor: lens blur, vignetting, exposure, shot and read noise, tone curve."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ _NOISE = 1 << 20  # numbers in the noise table
 
 @dataclass(frozen=True)
 class ImageSensor:
-    """How a camera turns radiance into bytes.
+    """Converts radiance to 8-bit images.
 
     Args:
-        mid_grey: mean of the exposed image (linear, 1 is white) that the automatic exposure aims at.
+        mid_grey: target mean of the automatic exposure (linear, 1 is white).
         least_gain, greatest_gain: limits of the automatic exposure.
         blur: px, standard deviation of the lens's point spread, at most 0.8.
         vignetting: fraction of the light lost in the image's corners.
-        shot_noise: deviation at white and gain 1; grows with the root of light and of gain.
-        read_noise: deviation in the dark at gain 1; grows with gain.
+        shot_noise: standard deviation at white and gain 1; proportional to the square root of light and of gain.
+        read_noise: standard deviation in the dark at gain 1; proportional to the gain.
 
     Raises:
         SensorError: a value that is negative, not finite or out of range.
@@ -62,10 +62,9 @@ class ImageSensor:
             )
 
     def gain(self, radiance: Float32Array) -> float:
-        """Automatic exposure of an (h, w, 3) image: the factor that brings its mean to mid grey.
+        """Return the automatic exposure of an (h, w, 3) image: the factor that brings its mean to mid grey.
 
-        Every eighth pixel's green is measured, and what is very bright counts no more than white: a low sun does not
-        turn the street black.
+        Every eighth pixel's green channel is measured, clipped at white: a low sun does not turn the street black.
         """
         sample = radiance[::8, ::8, 1].astype(np.float64)
         mean = float(np.minimum(sample, 3.0 * np.median(sample)).mean())
@@ -74,7 +73,7 @@ class ImageSensor:
     def expose(
         self, radiance: Float32Array, seed: int, gain: float, *, rain: float = 0.0
     ) -> NDArray[np.uint8]:
-        """Take the picture.
+        """Expose an image.
 
         Args:
             radiance: (h, w, 3) float32, linear RGB.
@@ -117,7 +116,7 @@ def _noise_table() -> Float32Array:
 
 @lru_cache(maxsize=1)
 def _tone_curve() -> NDArray[np.uint8]:
-    """8-bit codes over the square root of the light, so that the dark gets most of the steps."""
+    """Return 8-bit codes over the square root of the light, so that dark tones get most of the steps."""
     light = np.linspace(0.0, 1.0, _CURVE_STEPS) ** 2 * _BRIGHTEST
     over = np.maximum(light - _KNEE, 0.0)
     light = np.minimum(light, _KNEE) + (1.0 - _KNEE) * (1.0 - np.exp(-over / (1.0 - _KNEE)))
@@ -126,7 +125,7 @@ def _tone_curve() -> NDArray[np.uint8]:
 
 
 def _draw_rain(radiance: Float32Array, rain: float, generator: np.random.Generator) -> None:
-    """Faint near-vertical streaks, brighter than what is behind them."""
+    """Draw faint, nearly vertical streaks that are brighter than their background."""
     height, width, _ = radiance.shape
     count = int(rain * 500 * height * width / (640 * 480))
     column = generator.uniform(0, width, count)

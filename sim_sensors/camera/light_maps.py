@@ -1,4 +1,4 @@
-"""What keeps light away: a map of sun shadows and one of the dark under vehicles, round the camera."""
+"""Shadow maps around the camera: one of the sun, and one of the sky that vehicles hide from the ground."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ _KEPT = 4  # windows kept per scene
 
 
 class LightMaps(NamedTuple):
-    """Where the sun and the sky do not reach.
+    """Occlusion of sun and sky.
 
     Attributes:
-        shadow: (n, n) float32, height toward the sun of what stands nearest to it, m; 0 where nothing stands.
+        shadow: (n, n) float32, m, height towards the sun of the nearest occluder; 0 where there is none.
         to_shadow: (3, 4) float64, world point (x, y, z, 1) to column, row (texels) and that height.
-        contact: (m, m) uint8, how much of the sky vehicles hide from the ground, 255 = all.
+        contact: (m, m) uint8, fraction of the sky that vehicles hide from the ground, 255 = all.
         x, y: m, corner of the contact map.
         texels_per_m: of the contact map.
     """
@@ -52,7 +52,7 @@ _CACHE: WeakKeyDictionary[Instances, OrderedDict[_Key, LightMaps]] = WeakKeyDict
 
 
 def light_maps(pool: MeshPool, instances: Instances, weather: Weather, x: float, y: float) -> LightMaps:
-    """Maps of the surroundings of (x, y), m. Those of what stands still are kept while it lives."""
+    """Return the maps around (x, y), m. Maps of static instances are kept as long as the instances exist."""
     still = instances if instances.still is None else instances.still
     column, row = round(x / _STEP), round(y / _STEP)
     x, y = column * _STEP, row * _STEP
@@ -69,7 +69,7 @@ def light_maps(pool: MeshPool, instances: Instances, weather: Weather, x: float,
 
 
 def _near(pool: MeshPool, instances: Instances, x: float, y: float) -> NDArray[np.int32]:
-    """Which instances may throw a shadow into the window about (x, y)."""
+    """Return the instances that may cast a shadow into the window around (x, y)."""
     away = np.hypot(instances.pose[:, 0] - x, instances.pose[:, 1] - y)
     return np.flatnonzero(away < 0.75 * _WINDOW + pool.radius[instances.mesh]).astype(np.int32)
 
@@ -94,7 +94,7 @@ def _draw(pool: MeshPool, instances: Instances, weather: Weather, x: float, y: f
 def _with_moving(
     maps: LightMaps, pool: MeshPool, instances: Instances, moving: NDArray[np.int32], x: float, y: float
 ) -> LightMaps:
-    """The maps of what stands still, and over them what moves."""
+    """Add the moving instances to the maps of the static ones."""
     shadow = maps.shadow
     if len(shadow) == _SHADOW_TEXELS:
         shadow = np.maximum(shadow, _shadow_map(pool, instances, moving, maps.to_shadow))
@@ -103,7 +103,7 @@ def _with_moving(
 
 
 def _toward_the_sun(weather: Weather, x: float, y: float) -> FloatArray:
-    """World point (x, y, z, 1) to column and row of the shadow map about (x, y), and height toward the sun."""
+    """Return the matrix from a world point (x, y, z, 1) to column, row of the shadow map and height towards the sun."""
     sun = np.array(weather.sun_direction)
     across = np.cross([0.0, 0.0, 1.0], sun)
     across /= np.linalg.norm(across)
@@ -111,7 +111,7 @@ def _toward_the_sun(weather: Weather, x: float, y: float) -> FloatArray:
     n = _SHADOW_TEXELS
     to_shadow = np.zeros((3, 4))
     to_shadow[0, :3] = across * (n / _WINDOW)
-    # Seen from a low sun the window is flat: its texels may be finer that way.
+    # Seen from a low sun the window is foreshortened: its texels can be finer in that direction.
     to_shadow[1, :3] = up * (n / _WINDOW) / max(0.3, sun[2])
     to_shadow[2, :3] = sun
     center = np.array([x, y, 0.0])
@@ -122,7 +122,7 @@ def _toward_the_sun(weather: Weather, x: float, y: float) -> FloatArray:
 def _shadow_map(
     pool: MeshPool, instances: Instances, drawn: NDArray[np.int32], to_shadow: FloatArray
 ) -> Float32Array:
-    """The scene from the sun: the camera's own rasteriser, with height toward the sun for inverse depth."""
+    """Rasterize the scene from the sun, with height towards the sun in place of inverse depth."""
     n = _SHADOW_TEXELS
     triangles = _seen_from_the_sun(
         pool.vertices,
@@ -208,7 +208,7 @@ def _seen_from_the_sun(
 def _contact_map(
     pool: MeshPool, instances: Instances, near: NDArray[np.int32], x: float, y: float
 ) -> NDArray[np.uint8]:
-    """Footprints of the vehicles, blurred twice: the dark between the wheels and the soft rim about it."""
+    """Blur the footprints of the vehicles twice: the dark area between the wheels and its soft border."""
     image = np.zeros((_CONTACT_TEXELS, _CONTACT_TEXELS), dtype=np.uint8)
     boxes = bounding_boxes(pool)
     scale = _CONTACT_TEXELS / _WINDOW
@@ -231,7 +231,7 @@ _BOXES: WeakKeyDictionary[MeshPool, FloatArray] = WeakKeyDictionary()
 
 
 def bounding_boxes(pool: MeshPool) -> FloatArray:
-    """(n_meshes, 6) float64, m, each mesh's least x, y, z and greatest x, y, z in its own frame."""
+    """Return the bounding box of each mesh, (n_meshes, 6) float64, m: least and greatest x, y, z in its own frame."""
     if pool not in _BOXES:
         start = pool.vertex_start[:-1]
         low = np.minimum.reduceat(pool.vertices, start, axis=0)
@@ -242,7 +242,7 @@ def bounding_boxes(pool: MeshPool) -> FloatArray:
 
 @compiled(**LEAF)
 def sunlit(maps: LightMaps, x: float, y: float, z: float, bias: float) -> float:
-    """Fraction of the sun that reaches a point, 0 to 1; bilinear between four texels."""
+    """Return the fraction of the sun that reaches a point, 0 to 1; bilinear between four texels."""
     m = maps.to_shadow
     u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] - 0.5
     v = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] - 0.5
@@ -266,7 +266,7 @@ def sunlit(maps: LightMaps, x: float, y: float, z: float, bias: float) -> float:
 
 @compiled(**LEAF)
 def open_sky(maps: LightMaps, x: float, y: float) -> float:
-    """Fraction of the sky that the ground at (x, y) sees past the vehicles on it."""
+    """Return the fraction of the sky that is visible from the ground at (x, y) past the vehicles."""
     u = (x - maps.x) * maps.texels_per_m - 0.5
     v = (y - maps.y) * maps.texels_per_m - 0.5
     n = maps.contact.shape[0]

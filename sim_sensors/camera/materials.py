@@ -1,4 +1,4 @@
-"""What each material does with the light: paint that mirrors, leaves that waver, dirt, panes of glass."""
+"""Reflection models of the materials: car paint, foliage, dirt, glass."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ LINEAR = np.where(_CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) 
 
 
 class Materials(NamedTuple):
-    """What surfaces look like.
+    """Lookup tables of surface appearance.
 
     Attributes:
         grain, cloud: fine and soft noise on them.
@@ -83,7 +83,7 @@ def surface_radiance(
     maps: LightMaps,
     materials: Materials,
 ) -> Color:
-    """Light from a point of triangle `t` to a camera that looks along the unit vector (dx, dy, dz); linear RGB.
+    """Return the radiance, linear RGB, of a point of triangle `t` seen along the unit vector (dx, dy, dz).
 
     The point (px, py, pz), m, and the unit normal (nx, ny, nz) are in the world frame; a pixel spans `footprint`, m.
     """
@@ -92,7 +92,7 @@ def surface_radiance(
     cosine = -(nx * dx + ny * dy + nz * dz)
     inside = False
     if cosine < 0.0:
-        # Seen from behind: lining, not paint.
+        # Back faces show the interior lining, not the paint.
         nx, ny, nz, cosine = -nx, -ny, -nz, -cosine
         inside = material == _PAINT
     a_red = materials.linear[triangles.color[t, 0]]
@@ -135,7 +135,7 @@ def surface_radiance(
     if light.sun[0] > 0.0 and sun > 0.0:
         reaches = sunlit(maps, px + 0.04 * nx, py + 0.04 * ny, pz + 0.04 * nz, SHADOW_BIAS)
     sun = max(sun, 0.0) * reaches
-    # The sky above, the ground's reflection below; both fail under the sills and between the wheels.
+    # Sky light from above, bounced light from the ground below; both are weak under the sills and between the wheels.
     low = min(1.0, 0.3 + 0.75 * pz)
     upward = 0.5 + 0.5 * nz
     around = open_sky(maps, px + 0.6 * nx, py + 0.6 * ny)
@@ -148,7 +148,7 @@ def surface_radiance(
         grazing = 1.0 - min(cosine, 1.0)
         grazing *= grazing * grazing * grazing * grazing
         mirror += (1.0 - mirror) * grazing * (0.8 if material == _PAINT else 0.5)
-        # Pressed steel is never flat: what it mirrors wavers.
+        # Pressed steel is never flat: distort its reflections.
         waver = 0.03 * (blotch - 0.5)
         twice = 2.0 * cosine
         rx = dx + twice * nx + waver
@@ -189,7 +189,7 @@ def through_glass(
     light: Light,
     maps: LightMaps,
 ) -> Color:
-    """What is seen through panes, and what the nearest, at (px, py, pz), mirrors over it; linear RGB."""
+    """Return the radiance, linear RGB, through panes of glass plus the reflection of the nearest at (px, py, pz)."""
     tint = _GLASS_TINT
     for _ in range(1, min(n_panes, 4)):
         tint *= _GLASS_TINT

@@ -1,4 +1,4 @@
-"""Pinhole and stereo cameras: a scene, a pose, weather and a seed in; image, depth and instance ids out."""
+"""Pinhole and stereo cameras: render a scene from a pose, in a weather, to image, depth and instance ids."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ _AHEAD = 12.0  # m, before the camera: the middle of what is lit in detail
 
 
 class Drawable(Protocol):
-    """What a camera can look at.
+    """A scene that a camera can render.
 
-    The arrays inside are taken to be constant: shadows and textures made from them are kept as long as the
-    objects live. To change the scene make new `Instances`; the same pool and ground go on.
+    The arrays must not change: shadows and textures made from them are kept as long as the objects exist. To change
+    the scene make new `Instances`; pool and ground can be shared.
     """
 
     @property
@@ -39,7 +39,7 @@ class Drawable(Protocol):
 
     @property
     def instances(self) -> Instances:
-        """Where they stand."""
+        """Their poses."""
 
     @property
     def ground(self) -> Ground:
@@ -48,16 +48,16 @@ class Drawable(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """What a camera delivers, and the truth about it.
+    """An image and its ground truth.
 
     Attributes:
         image: (h, w, 3) uint8, RGB.
-        depth: (h, w) float32, m along the optical axis, of the first *opaque* surface at the pixel's centre: glass
-            is looked through, as stereo and lidar do. inf for the sky.
+        depth: (h, w) float32, m along the optical axis, of the first *opaque* surface at the pixel's centre: stereo and
+            lidar look through glass, too. inf for the sky.
         glass_depth: (h, w) float32, m along the optical axis, of the nearest pane before that surface; inf where
             there is none.
-        ids: (h, w) int32, `Instances.ids` of the first surface, a pane counted as one: 0 for scenery, ground and
-            sky. So a vehicle's pixels include its windows.
+        ids: (h, w) int32, `Instances.ids` of the first surface, glass included; 0 for scenery, ground and sky. So a
+            vehicle's pixels include its windows.
     """
 
     image: NDArray[np.uint8]
@@ -68,7 +68,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """A camera without distortion. Pixel (row, column) has its centre at (column + 0.5, row + 0.5).
+    """A pinhole camera without distortion. Pixel (row, column) has its centre at (column + 0.5, row + 0.5).
 
     Args:
         width, height: px.
@@ -77,7 +77,7 @@ class PinholeCamera:
         sensor: exposure, blur and noise.
         supersampling: 1, or 2 to draw four samples a pixel: smoother edges at four times the cost. Depth and ids
             are always taken at the pixel's centre.
-        coarse_beyond: m; farther things are drawn with coarse meshes where the pool has them.
+        coarse_beyond: m; farther objects are drawn with coarse meshes if the pool has them.
 
     Raises:
         SensorError: a size below 1, a focal length that is not positive, anything not finite.
@@ -111,7 +111,7 @@ class PinholeCamera:
     def from_field_of_view(
         cls, width: int = 640, height: int = 480, horizontal: float = 1.1
     ) -> PinholeCamera:
-        """Square pixels, principal point in the middle.
+        """Make a camera with square pixels and the principal point in the image centre.
 
         Args:
             width: px.
@@ -142,10 +142,9 @@ class PinholeCamera:
         *,
         gain: float | None = None,
     ) -> Frame:
-        """Take a picture. Equal arguments give equal bytes, on any number of threads.
+        """Render an image. Equal arguments give equal bytes, on any number of threads.
 
-        The first look at a ground draws its texture (about a second), the first call after installation also
-        compiles (both are kept).
+        The first image of a ground draws its texture (about a second); the first call after an installation compiles.
 
         Args:
             scene: pool, instances and ground.
@@ -159,15 +158,15 @@ class PinholeCamera:
         """
         weather = Weather() if weather is None else weather
         pose = checked_pose(scene, pose)
-        radiance, geometry = self._look(scene, pose, weather)
+        radiance, geometry = self._render_radiance(scene, pose, weather)
         chosen = self.sensor.gain(radiance) if gain is None else gain
         image = self.sensor.expose(radiance, seed, chosen, rain=weather.rain)
         return Frame(image, *geometry)
 
-    def _look(
+    def _render_radiance(
         self, scene: Drawable, pose: FloatArray, weather: Weather
     ) -> tuple[Float32Array, tuple[Float32Array, Float32Array, NDArray[np.int32]]]:
-        """Radiance, and depth, glass depth and ids."""
+        """Return radiance; and depth, glass depth and ids."""
         triangles, visibility = self.visibility(scene, pose)
         geometry = _geometry(visibility, triangles.instance, scene.instances.ids)
         texture = ground_texture(scene.ground)
@@ -184,10 +183,10 @@ class PinholeCamera:
         return _halved(radiance), geometry
 
     def visibility(self, scene: Drawable, pose: FloatArray) -> tuple[ScreenTriangles, Visibility]:
-        """Which triangle each pixel sees; the geometry alone, without light."""
+        """Return the visible triangle of each pixel: geometry without light."""
         size = (self.width, self.height)
         triangles = project(scene.pool, scene.instances, pose, self.intrinsics, size, self.coarse_beyond)
-        # The ground z = 0 is met where the ray's z component times depth makes up for the camera's height.
+        # The ray meets the ground z = 0 where its z component times the depth equals the camera's height.
         down = -pose[2, :3] / pose[2, 3]
         floor_x, floor_y = down[0] / self.fx, down[1] / self.fy
         floor = np.array([floor_x, floor_y, down[2] - floor_x * self.cx - floor_y * self.cy])
@@ -235,16 +234,16 @@ class StereoCamera:
     def render_stereo(
         self, scene: Drawable, pose: FloatArray, weather: Weather | None = None, seed: int = 0
     ) -> StereoFrame:
-        """Take both pictures at once, with one exposure; arguments and errors as of `PinholeCamera.render`.
+        """Render both images with one exposure; arguments and errors are those of `PinholeCamera.render`.
 
-        Textures, sky and shadows are made once for both. The two images' noise is independent.
+        Both share textures, sky and shadows; their noise is independent.
         """
         weather = Weather() if weather is None else weather
         sensor = self.camera.sensor
         frames = []
         gain = None
         for side, eye in enumerate((pose, self.right_pose(pose))):
-            radiance, geometry = self.camera._look(scene, checked_pose(scene, eye), weather)
+            radiance, geometry = self.camera._render_radiance(scene, checked_pose(scene, eye), weather)
             gain = sensor.gain(radiance) if gain is None else gain
             frames.append(Frame(sensor.expose(radiance, 2 * seed + side, gain, rain=weather.rain), *geometry))
         return StereoFrame(*frames)
@@ -281,7 +280,7 @@ def camera_pose(
 
 
 def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
-    """The pose as a contiguous (4, 4) float64 array.
+    """Return the pose as a contiguous (4, 4) float64 array.
 
     Raises:
         SensorError: of another shape, not finite, no rotation, not above the ground, or inside a vehicle.
@@ -340,7 +339,7 @@ def _geometry(
 
 @compiled
 def _halved(image: Float32Array) -> Float32Array:
-    """Mean of every 2×2 pixels of an (h, w, 3) image."""
+    """Average every 2×2 pixels of an (h, w, 3) image."""
     height, width, _ = image.shape
     out = np.empty((height // 2, width // 2, 3), dtype=np.float32)
     for y in range(height // 2):

@@ -30,7 +30,7 @@ _CLOSED[[Material.RUBBER, Material.FACADE, Material.BARK, Material.STONE, Materi
 
 
 class ScreenTriangles(NamedTuple):
-    """What is left of the scene's triangles on the screen.
+    """The visible triangles of a scene, projected into the image.
 
     Attributes:
         corners: (n, 6) float32, px: x, y of the three corners; pixel (row, column) has its centre at
@@ -63,7 +63,7 @@ def project(
 
     Args:
         pool: the meshes.
-        instances: where they stand.
+        instances: their poses.
         pose: (4, 4) camera to world, camera frame x right, y down, z forward.
         intrinsics: fx, fy, cx, cy, px.
         size: width, height, px.
@@ -123,7 +123,7 @@ def _visible_instances(
     intrinsics: tuple[float, float, float, float],
     size: tuple[int, int],
 ) -> IntArray:
-    """Instances whose bounding sphere reaches into the viewing pyramid."""
+    """Return the instances whose bounding sphere intersects the view frustum."""
     fx, fy, cx, cy = intrinsics
     center = (instances.pose[:, :3] - pose[:3, 3]) @ pose[:3, :3]
     reach = radius[instances.mesh].astype(np.float64)
@@ -166,7 +166,7 @@ def _project(
     polygon: FloatArray,
     out: ScreenTriangles,
 ) -> int:
-    """Fill `out`; how many. The arrays before it are room to work in."""
+    """Fill `out` and return the number of triangles. The arrays before it are work space."""
     count = 0
     for index in range(visible.shape[0]):
         q = visible[index]
@@ -251,7 +251,7 @@ def _clip(
     cy: float,
     polygon: FloatArray,
 ) -> int:
-    """Project the part of a triangle beyond the near plane into `polygon`, px; how many corners it has."""
+    """Project the part of a triangle beyond the near plane into `polygon`, px; return its number of corners."""
     if a[2] >= NEAR and b[2] >= NEAR and c[2] >= NEAR:
         polygon[0, 0] = fx * a[0] / a[2] + cx
         polygon[0, 1] = fy * a[1] / a[2] + cy
@@ -278,7 +278,7 @@ def _clip(
 
 @compiled(**LEAF)
 def _covers_pixels(polygon: FloatArray, corners: int, width: int, height: int) -> bool:
-    """Whether the bounding box of the polygon holds the centre of a pixel of the image."""
+    """Return whether the bounding box of the polygon contains the centre of a pixel of the image."""
     left = right = polygon[0, 0]
     top = bottom = polygon[0, 1]
     for i in range(1, corners):

@@ -1,7 +1,7 @@
-"""Which triangle each pixel sees: a z-buffer in horizontal bands.
+"""Rasterizer: a z-buffer in horizontal bands.
 
-Every band of rows is written by one thread alone and takes the triangles in the same order, so the result does
-not depend on the number of threads.
+Each band of rows is written by one thread, with the triangles in the same order, so the result does not depend on the
+number of threads.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _GLASS = int(Material.GLASS)
 
 
 class Visibility(NamedTuple):
-    """What the z-buffer found, (h, w) each.
+    """The contents of the z-buffer, (h, w) each.
 
     Attributes:
         inverse_depth: float32, 1/m along the optical axis, of the first opaque surface; 0 for the sky.
@@ -54,14 +54,14 @@ def rasterize(
     *,
     panes: bool = True,
 ) -> Visibility:
-    """Find the nearest opaque surface of every pixel and the glass before it.
+    """Find the nearest opaque surface of every pixel, and the glass in front of it.
 
     Args:
         triangles: as `project` gives them.
         size: width, height, px.
         floor: (3,) inverse depth of the ground, a·x + b·y + c at (x, y) px.
         minimum: 1/m; ground farther away than that is sky.
-        panes: whether to look for glass; without, its three arrays are (0, 0).
+        panes: whether to draw glass; if not, its three arrays are (0, 0).
     """
     width, height = size
     glazed = (height, width) if panes else (0, 0)
@@ -92,7 +92,7 @@ def rasterize(
 
 
 def interleaved(n: int) -> NDArray[np.int64]:
-    """The numbers 0 to n - 1 such that any long run of them is spread over the whole.
+    """Return a permutation of 0 to n - 1 in which every long run is spread over the whole range.
 
     Threads get runs of bands, and the top of an image (sky) is cheaper than its middle.
     """
@@ -104,7 +104,7 @@ def interleaved(n: int) -> NDArray[np.int64]:
 
 @compiled
 def _sort_into_bands(corners: Float32Array, n_bands: int, height: int) -> tuple[NDArray[np.int64], IntArray]:
-    """Which triangles touch which band, in their own order: members[start[b]:start[b + 1]]."""
+    """Return the triangles of each band, in their order: `members[start[b]:start[b + 1]]`."""
     n = corners.shape[0]
     first = np.empty(n, dtype=np.int32)
     last = np.empty(n, dtype=np.int32)
@@ -129,15 +129,15 @@ def _sort_into_bands(corners: Float32Array, n_bands: int, height: int) -> tuple[
 
 @compiled(**LEAF)
 def edge_slope(x0: float, y0: float, x1: float, y1: float) -> float:
-    """Change of x per row along an edge; 0 for a level one, which no row crosses."""
+    """Return the change of x per row along an edge; 0 for a horizontal edge, which no row crosses."""
     return (x1 - x0) / (y1 - y0) if y1 != y0 else 0.0
 
 
 @compiled(**LEAF)
 def sorted_by_row(corners: Float32Array) -> tuple[float, float, float, float, float, float]:
-    """The corners (x, y) of a triangle from top to bottom.
+    """Return the corners (x, y) of a triangle from top to bottom.
 
-    Neighbours that share an edge walk it from the same end, so no pixel between them is missed or drawn twice.
+    Neighbours traverse a shared edge from the same end, so no pixel between them is missed or drawn twice.
     """
     ax, ay, bx, by, cx, cy = (
         float(corners[0]), float(corners[1]), float(corners[2]),
@@ -184,7 +184,7 @@ def _rasterize(
                 pane_depth[y] = 0.0
                 pane[y] = -1
                 n_panes[y] = 0
-        # Glass comes second: it is drawn only where it stands before what is opaque.
+        # Glass comes second: it is drawn only in front of opaque surfaces.
         for is_glass in range(2 if pane.shape[0] > 0 else 1):
             for member in range(start[band], start[band + 1]):
                 t = members[member]

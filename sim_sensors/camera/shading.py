@@ -1,6 +1,6 @@
-"""The colour of every pixel: the ray of each meets the sky, the ground or a surface, through haze and glass.
+"""Deferred shading: the radiance of every pixel, from sky, ground or a surface, through haze and glass.
 
-Deferred: the rasteriser has found the surface, so each pixel is shaded once, and once more for a pane of glass.
+The rasterizer has found the surfaces, so each pixel is shaded once, and once more for a pane of glass.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ def shade(
     ground: GroundTexture,
     maps: LightMaps,
 ) -> Float32Array:
-    """Radiance of every pixel.
+    """Return the radiance of every pixel.
 
     Args:
         triangles: on the screen.
-        visibility: which of them each pixel sees.
+        visibility: the visible triangle of each pixel.
         pose: (4, 4) camera to world.
         intrinsics: fx, fy, cx, cy, px.
         weather: the light.
         ground: its texture.
-        maps: what keeps light away.
+        maps: shadows.
 
     Returns:
         (h, w, 3) float32, linear RGB, relative (see `Weather`).
@@ -88,7 +88,7 @@ def _shade(
     image: Float32Array,
 ) -> None:
     for task in prange(order.shape[0]):
-        # Put together here: a parallel loop takes tuples from outside, but none within a tuple.
+        # Assembled here: numba's parallel loops take tuples from outside, but no nested ones.
         materials = Materials(grain, cloud, response, linear)
         top = order[task] * BAND
         for y in range(top, min(image.shape[0], top + BAND)):

@@ -1,4 +1,4 @@
-"""The sky as a picture in which any direction can be looked up without trigonometry."""
+"""The sky as a paraboloid map, in which directions are looked up without trigonometry."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _BLURRED = 160
 
 @lru_cache(maxsize=8)
 def sky_domes(weather: Weather) -> tuple[Float32Array, Float32Array]:
-    """The upper half sphere, sharp for the background and blurred for reflections.
+    """Return the upper hemisphere, sharp for the background and blurred for reflections.
 
     Paraboloid maps: direction (x, y, z) with z ≥ 0 lies at ((x, y) / (1 + z) + 1) / 2 of the side. The skyline
     of far trees and roofs is in it.
@@ -52,7 +52,7 @@ def sky_domes(weather: Weather) -> tuple[Float32Array, Float32Array]:
 def _glow(
     weather: Weather, x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """How much brighter the air is near the sun."""
+    """Return the brightness of the sky around the sun."""
     sun = weather.sun_direction
     cosine = np.clip(x * sun[0] + y * sun[1] + z * sun[2], 0.0, 1.0)
     glow: NDArray[np.float64] = cosine**6 + 3.0 * cosine**60 + 12.0 * cosine**1500
@@ -90,7 +90,7 @@ def _with_skyline(
     y: NDArray[np.float64],
     z: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Far trees and roofs up to about 8° high, hazy."""
+    """Draw distant trees and roofs, up to about 8° high, in haze."""
     azimuth = np.mod(np.arctan2(y, x) / (2.0 * np.pi), 1.0)
     bins = 1024
     crowns = 0.05 + 0.022 * fractal_noise(bins, generator, 0.9)[0]
@@ -115,7 +115,7 @@ def _with_skyline(
 
 @compiled(**LEAF)
 def look_up(dome: Float32Array, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Bilinear radiance in the unit direction (x, y, z), z ≥ 0."""
+    """Return the bilinear radiance in the unit direction (x, y, z), z ≥ 0."""
     n = dome.shape[0]
     scale = 0.5 / (1.0 + z)
     u = (x * scale + 0.5) * n - 0.5

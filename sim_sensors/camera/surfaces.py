@@ -1,7 +1,7 @@
-"""Triangles from a few kinds of surface: bent grids, strips between curves, boxes, turned profiles, prisms.
+"""Triangle meshes from a few kinds of surface: curved grids, strips between curves, boxes, revolutions, prisms.
 
-Every triangle carries a *finish*, a small number; which material and colour that is, is looked up when the
-mesh is made. So one shape gives cars of many paints.
+Every triangle has a *finish*, a small number whose material and colour come from a palette when the mesh is made. So
+one shape gives cars of many paints.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Shape:
     finish: NDArray[np.uint8]
 
     def dyed(self, material: NDArray[np.uint8], color: NDArray[np.uint8]) -> Mesh:
-        """The mesh under a palette.
+        """Return the mesh with the materials and colours of a palette.
 
         Args:
             material: (n_finishes,) uint8.
@@ -66,12 +66,12 @@ class ShapeBuilder:
         self._smooth: list[bool] = []
 
     def grid(self, points: ArrayLike, finish: ArrayLike, *, flip: bool = False, smooth: bool = True) -> None:
-        """Add a bent sheet of quads.
+        """Add a curved grid of quads.
 
         Args:
             points: (a, b, 3) m. The outside is where ∂/∂a × ∂/∂b points.
             finish: () or (a - 1, b - 1) int.
-            flip: turns the outside to the other side.
+            flip: swaps inside and outside.
             smooth: rounds the sheet and its seams with other smooth sheets by common normals; facets otherwise.
         """
         corner = np.asarray(points, dtype=np.float64)
@@ -136,7 +136,7 @@ class ShapeBuilder:
     def turned(
         self, profile: ArrayLike, finish: ArrayLike, segments: int, *, smooth: bool = True, phase: float = 0.0
     ) -> None:
-        """Add a profile turned about the z axis.
+        """Add a surface of revolution about the z axis.
 
         Args:
             profile: (k, 2) radius and height, m; the outside lies to the right of its direction.
@@ -198,17 +198,17 @@ class ShapeBuilder:
         self._smooth.append(smooth)
 
     def build(self) -> Shape:
-        """Weld equal points, drop triangles of no area, and give every vertex its normal.
+        """Weld equal points, drop triangles without area, and compute the vertex normals.
 
-        A face's corner takes the mean normal, weighted by area, of the smooth faces about the point that make
-        less than the crease angle with it; faceted ones keep the face's own.
+        The corner of a smooth face gets the area-weighted mean normal of the smooth faces around the point that differ
+        by less than the crease angle; faceted faces keep their own normal.
         """
         counts = np.cumsum([0, *(len(p) for p in self._points)])
         points = np.concatenate(self._points)
         triangles = np.concatenate([t + start for t, start in zip(self._triangles, counts, strict=False)])
         finish = np.concatenate(self._finish)
         smooth = np.repeat(self._smooth, [len(t) for t in self._triangles])
-        spot = _spots(points)
+        spot = _point_numbers(points)
         corner = spot[triangles]
         doubled = np.cross(
             points[triangles[:, 1]] - points[triangles[:, 0]],
@@ -233,7 +233,7 @@ class ShapeBuilder:
 
 
 def _as_keys(rows: FloatArray) -> IntArray:
-    """One integer for each row of up to four small integers."""
+    """Return one integer for each row of up to four small integers."""
     columns = rows.astype(np.int64) + 4096
     keys = columns[:, 0]
     for column in columns[:, 1:].T:
@@ -241,8 +241,8 @@ def _as_keys(rows: FloatArray) -> IntArray:
     return np.asarray(keys)
 
 
-def _spots(points: FloatArray) -> IntArray:
-    """(n,) int64: points at the same place have the same number."""
+def _point_numbers(points: FloatArray) -> IntArray:
+    """Return (n,) int64 numbers that are equal for points at the same position."""
     cell = np.round(points / WELD_M).astype(np.int64)
     keys = (cell[:, 0] * 73856093) ^ (cell[:, 1] * 19349663 << 8) ^ (cell[:, 2] * 83492791 << 16)
     return np.asarray(np.unique(keys, return_inverse=True)[1])

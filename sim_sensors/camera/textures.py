@@ -1,4 +1,4 @@
-"""Noise that tiles, and image pyramids that compiled code samples with distance filtering."""
+"""Tileable noise, and image pyramids for compiled code."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
 
-# Everything that fastmath offers except the promise that no infinity occurs: the sky's depth is one.
+# All fastmath flags except the one that excludes infinities: the depth of the sky is infinite.
 FAST = {"reassoc", "nsz", "arcp", "contract", "afn"}
-# For functions that are called for every pixel or triangle and allocate nothing: numba's reference counts on
-# the arrays they are handed would cost ten times what they compute.
+# For functions that are called for every pixel or triangle and allocate nothing: numba's reference counting of their
+# array arguments would cost ten times the computation.
 LEAF = {"fastmath": FAST, "_nrt": False, "forceinline": True}
 
 
 class Tile(NamedTuple):
-    """A square grey texture that repeats, with its coarser levels.
+    """A square, tileable grey texture with its image pyramid.
 
     Attributes:
         levels: (total,) float32, 0 to 1, level after level, each row-major and half as wide as the last.
@@ -34,7 +34,7 @@ class Tile(NamedTuple):
 
 
 def fractal_noise(size: int, generator: np.random.Generator, slope: float) -> NDArray[np.float64]:
-    """Tileable noise whose amplitude falls as frequency^-slope; (size, size), mean 0, deviation 1."""
+    """Return tileable noise with amplitude ∝ frequency^-slope; (size, size), mean 0, standard deviation 1."""
     frequency = np.fft.fftfreq(size)
     radius = np.hypot(frequency[:, None], frequency[None, :])
     radius[0, 0] = 1.0
@@ -58,7 +58,7 @@ def make_tile(image: NDArray[np.float64]) -> Tile:
 
 @lru_cache(maxsize=1)
 def grain_tile() -> Tile:
-    """Stones in asphalt: white noise over a little fractal noise. The same in every scene."""
+    """Return the grain of asphalt: white noise over some fractal noise, the same in every scene."""
     generator = np.random.default_rng(41)
     image = 0.5 + 0.13 * fractal_noise(512, generator, 0.35) + 0.07 * fractal_noise(512, generator, 0.9)
     return make_tile(np.clip(image, 0.0, 1.0))
@@ -66,14 +66,14 @@ def grain_tile() -> Tile:
 
 @lru_cache(maxsize=1)
 def cloud_tile() -> Tile:
-    """Soft blotches: dirt, plaster, leaves, clouds. The same in every scene."""
+    """Return soft noise for dirt, plaster, leaves and clouds, the same in every scene."""
     image = 0.5 + 0.2 * fractal_noise(512, np.random.default_rng(42), 1.35)
     return make_tile(np.clip(image, 0.0, 1.0))
 
 
 @compiled(**LEAF)
 def sample_tile(tile: Tile, u: float, v: float, level: int) -> float:
-    """Bilinear value at (u, v), in periods of the tile, of one level of its pyramid."""
+    """Return the bilinear value at (u, v), in periods of the tile, of one level of its pyramid."""
     level = min(max(level, 0), tile.start.shape[0] - 1)
     n = tile.size >> level
     x = u * n - 0.5
@@ -94,7 +94,7 @@ def sample_tile(tile: Tile, u: float, v: float, level: int) -> float:
 
 @compiled(**LEAF)
 def hash_unit(x: int, y: int) -> float:
-    """A number in [0, 1) that looks random and is always the same for the same two integers."""
+    """Hash two integers to a number in [0, 1)."""
     h = (np.int64(x) * 374761393 + np.int64(y) * 668265263) & 0x7FFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0x7FFFFFFF
     return (h ^ (h >> 16)) / 2147483648.0
@@ -102,7 +102,7 @@ def hash_unit(x: int, y: int) -> float:
 
 @compiled(**LEAF)
 def pixel_level(texels: float) -> int:
-    """Level of a 512-texel tile whose texels are as large as a pixel that spans `texels` periods."""
+    """Return the level of a 512-texel tile whose texels are as large as a pixel that spans `texels` periods."""
     level = 0
     spans = texels * 512.0
     while spans > 1.4 and level < 7:

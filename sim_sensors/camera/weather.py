@@ -1,4 +1,4 @@
-"""The light of a day: sun, sky, haze and rain, by preset and seed."""
+"""Weather: sun, sky, haze and rain, by preset and seed."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Color = tuple[float, float, float]
 
 
 class _Drawn(NamedTuple):
-    """A number between two bounds, or a colour times such a number."""
+    """A random number between two bounds, or a colour times such a number."""
 
     low: float
     high: float
@@ -88,10 +88,10 @@ PRESETS = tuple(_PRESETS)
 
 @dataclass(frozen=True)
 class Weather:
-    """What lights a scene. Light is relative: a white wall under an open overcast sky has radiance 1.
+    """The light of a scene. Radiance is relative: a white wall under an open overcast sky has radiance 1.
 
     Args:
-        preset: the name it was drawn under.
+        preset: the name of the preset it was drawn from.
         sun_azimuth: rad, world frame, counter-clockwise from x, of the direction to the sun.
         sun_elevation: rad above the horizon.
         sun: radiance of a white surface that faces the sun, linear RGB; black when hidden.
@@ -147,7 +147,7 @@ class Weather:
 
     @classmethod
     def draw(cls, preset: str, seed: int) -> Weather:
-        """Weather of one preset, its parameters drawn by the seed.
+        """Draw the weather of a preset.
 
         Args:
             preset: one of `PRESETS`.

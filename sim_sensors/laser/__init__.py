@@ -1,1 +1,26 @@
-"""The 270° laser scanner."""
+"""Planar laser scanners."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sim_sensors.laser.footprints import ScanPlane
+    from sim_sensors.laser.scanner import LaserScanner
+
+_MODULES = {
+    "LaserScanner": "scanner",
+    "ScanPlane": "footprints",
+}
+
+__all__ = [
+    "LaserScanner",
+    "ScanPlane",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

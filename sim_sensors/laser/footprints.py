@@ -1,4 +1,4 @@
-"""What a horizontal scan plane meets: convex footprints and walls, sorted into cells so that a look is local."""
+"""Obstacles in a horizontal scan plane: convex footprints and walls, sorted into a grid of cells for fast queries."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STRAIGHT_RAD = 1e-9
 
 
 class Cells(NamedTuple):
-    """Obstacles as compiled code walks them, sixteen at a time; a wall is a polygon of two corners.
+    """Obstacles for compiled code, in blocks of sixteen; a wall is a polygon of two corners.
 
     Places `0:cell_start[-1]` are sorted by cell, row after row, so that neighbouring cells of a row are one run
     of places. The places after them hold what is too large for a cell or has left its own, and spares. Unused
@@ -58,12 +58,12 @@ class Cells(NamedTuple):
 
 
 class CellTable:
-    """Convex polygons of at most k corners, sorted into cells, of which single ones may change.
+    """Convex polygons of at most k corners, sorted into cells; single polygons can be replaced.
 
     Args:
         k: most corners of one.
         corners: (n, k_max, 2) float64, m, world frame, counter-clockwise.
-        n_corners: (n,) int64; those with none or with more than k are left out.
+        n_corners: (n,) int64; polygons with none or with more than k are omitted.
         labels: (n,) int64.
     """
 
@@ -95,7 +95,7 @@ class CellTable:
         self._write(np.arange(self._used), circle[order], corners[chosen], n_corners[chosen], labels[chosen])
 
     def copy(self) -> CellTable:
-        """A table of its own, whose changes leave this one as it is."""
+        """Return an independent copy."""
         twin = object.__new__(CellTable)
         twin._used, twin._place = self._used, self._place.copy()
         cells = self.cells
@@ -110,16 +110,16 @@ class CellTable:
         return twin
 
     def remove(self, index: int) -> None:
-        """Take a polygon away; nothing happens where there is none."""
+        """Remove a polygon, if there is one."""
         place = self._place[index]
         if place != NOWHERE:
             self.cells.x[place] = self.cells.y[place] = FAR
 
     def put(self, index: int, corners: Float64Array, label: int) -> bool:
-        """Let polygon `index` be another; False, and nothing done, if there is no place left and a new sort is due.
+        """Replace polygon `index`; return False, without a change, if no free place is left and a new sort is due.
 
         Args:
-            index: which.
+            index: of the polygon.
             corners: (3 to k, 2) float64, m, world frame, counter-clockwise.
             label: its label.
         """
@@ -160,7 +160,7 @@ class CellTable:
 
 
 class ScanPlane:
-    """Everything that a horizontal laser plane (knee height, 0.5 m) meets: footprints and walls.
+    """The obstacles in a horizontal laser plane (0.5 m above the ground): footprints and walls.
 
     Footprints are convex polygons (a post is a polygon of eight or more corners), walls are line segments of
     no thickness, seen from both sides. They may overlap. Preparing takes a sort over all of them; afterwards
@@ -210,12 +210,12 @@ class ScanPlane:
 
     @property
     def cells(self) -> tuple[Cells, Cells]:
-        """What compiled code walks: obstacles of up to four corners, and the others. To be read only."""
+        """The obstacles for compiled code: those of up to four corners, and the others. Read-only."""
         return self._quads.cells, self._others.cells
 
     @property
     def footprints(self) -> tuple[Float64Array, IntArray]:
-        """As kept: (n, k_max, 2) float64, m, world frame, counter-clockwise, zero-padded; and (n,) int64 corners."""
+        """Corners, (n, k_max, 2) float64, m, world frame, counter-clockwise, zero-padded; (n,) int64 counts."""
         return self._corners.copy(), self._n_corners.copy()
 
     @property
@@ -224,16 +224,16 @@ class ScanPlane:
         return self._wall.copy()
 
     def replace(self, index: int, corners: ArrayLike | None) -> None:
-        """Put another footprint in the place of one, or none; its id stays.
+        """Replace or clear a footprint; its id stays.
 
-        Takes microseconds, except that after every few dozen moves from one cell to another all are sorted again.
+        This takes microseconds, except that all are sorted again after every few dozen moves between cells.
 
         Args:
-            index: which footprint, 0 to n_footprints - 1.
+            index: of the footprint, 0 to n_footprints - 1.
             corners: (k, 2) float, m, world frame, 3 to k_max corners of either orientation; None to clear it.
 
         Raises:
-            SensorError: no such footprint, or corners that the class would refuse.
+            SensorError: no such footprint, or invalid corners.
         """
         if not 0 <= index < self.n_footprints:
             raise SensorError(f"index: wanted 0 to {self.n_footprints - 1}, got {index}")
@@ -251,7 +251,7 @@ class ScanPlane:
             self._sort()
 
     def with_footprint(self, index: int, corners: ArrayLike | None) -> ScanPlane:
-        """A copy in which one footprint is another; see `replace`."""
+        """Return a copy with one footprint replaced; see `replace`."""
         twin = object.__new__(ScanPlane)
         twin.__dict__.update(self.__dict__)
         twin._corners, twin._n_corners = self._corners.copy(), self._n_corners.copy()
@@ -271,7 +271,7 @@ class ScanPlane:
 
 
 def _short_pieces(walls: Float64Array) -> Float64Array:
-    """(n, 2, 2) float64: walls cut so that every piece fits into a cell."""
+    """Return walls cut into pieces that fit into a cell, (n, 2, 2) float64."""
     start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
     n = np.ceil(np.hypot(along[:, 0], along[:, 1]) / (2 * LARGEST_IN_A_CELL_M)).astype(np.int64)
     wall = np.repeat(np.arange(len(walls)), n)
@@ -281,7 +281,7 @@ def _short_pieces(walls: Float64Array) -> Float64Array:
 
 
 def _frame(circle: Float64Array) -> Float64Array:
-    """The frame of cells over all centres; see `Cells.frame`."""
+    """Return the frame of cells over all centres; see `Cells.frame`."""
     low, high = (circle[:, :2].min(0), circle[:, :2].max(0)) if len(circle) else (np.zeros(2), np.zeros(2))
     extent = high - low
     # Where little stands on much ground, larger cells keep their number in proportion to the obstacles.
@@ -291,7 +291,7 @@ def _frame(circle: Float64Array) -> Float64Array:
 
 
 def _cell_of(circle: Float64Array, frame: Float64Array) -> IntArray:
-    """(n,) int64: the cell of each centre, -1 outside all."""
+    """Return the cell of each centre, (n,) int64; -1 outside all cells."""
     x, y, size, rows, columns = frame[:5]
     column, row = np.floor((circle[:, 0] - x) / size), np.floor((circle[:, 1] - y) / size)
     inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
@@ -299,7 +299,7 @@ def _cell_of(circle: Float64Array, frame: Float64Array) -> IntArray:
 
 
 def _as_floats(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float64Array:
-    """`value` as finite float64 of a shape; None stands for any length.
+    """Return `value` as finite float64 of a shape; None stands for any length.
 
     Raises:
         SensorError: another shape, or a value that is not a finite number.
@@ -333,7 +333,7 @@ def _cross(a: Float64Array, b: Float64Array) -> Float64Array:
 
 
 def _enclosing_circles(corners: Float64Array, n_corners: IntArray) -> Float64Array:
-    """(n, 3) float64: x, y and radius of a circle around each polygon."""
+    """Return x, y and radius of a circle around each polygon, (n, 3) float64."""
     used = np.arange(corners.shape[1]) < n_corners[:, None]
     centre = (corners * used[..., None]).sum(1) / n_corners[:, None]
     reach = np.hypot(*np.moveaxis(corners - centre[:, None], -1, 0))
@@ -341,10 +341,10 @@ def _enclosing_circles(corners: Float64Array, n_corners: IntArray) -> Float64Arr
 
 
 def _normalised(name: str, corners: Float64Array, n_corners: IntArray) -> tuple[Float64Array, IntArray]:
-    """Footprints counter-clockwise, without corners on a straight edge.
+    """Return footprints counter-clockwise, without collinear corners.
 
     Args:
-        name: what the caller calls them.
+        name: for error messages.
         corners: (n, k_max, 2) float64, m.
         n_corners: (n,) int64.
 
@@ -352,7 +352,7 @@ def _normalised(name: str, corners: Float64Array, n_corners: IntArray) -> tuple[
         (n, k_max, 2) float64 and (n,) int64.
 
     Raises:
-        SensorError: a number of corners out of range, coinciding corners, no area, a concave or crossed outline.
+        SensorError: too few or too many corners, coinciding corners, no area, or a concave or self-crossing outline.
     """
     k_max = corners.shape[1]
     wrong = (n_corners < 3) & (n_corners != 0) | (n_corners > k_max)

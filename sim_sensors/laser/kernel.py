@@ -1,7 +1,7 @@
-"""The compiled part of the laser: each obstacle is drawn into the interval of beams that it covers.
+"""Compiled laser scanner: each obstacle is drawn into the interval of beams that it covers.
 
-A ray-caster asks every beam for the nearest of all segments. Here a convex footprint is turned into the interval
-of beams between its two silhouette corners and into the lines of its visible faces. The inverse range of a line
+A ray caster tests every beam against all segments. Here a convex footprint becomes the interval of beams between its
+two silhouette corners, and the lines of its visible faces. The inverse range of a line
 along a beam is linear in the beam's direction (u, v): 1/r = a·u + b·v. The face that a beam enters by is the one
 of least inverse range, and the obstacle that it meets first the one of greatest, so a beam costs two products a
 face and a comparison, and no division. A rectangle shows two faces at most. A wall is a polygon of two corners.
@@ -33,7 +33,7 @@ _FAST = {"contract", "reassoc", "arcp", "nsz"}
 
 
 class BeamTable(NamedTuple):
-    """The beams in the frame that looks along their middle, padded to whole blocks.
+    """The beams, in a frame along their middle direction, padded to whole blocks.
 
     Attributes:
         u, v: (n_padded,) float32, direction of each beam.
@@ -55,7 +55,7 @@ class BeamTable(NamedTuple):
 
 @compiled(inline="always")
 def _angle(x, y):  # type: ignore[no-untyped-def]
-    """Direction of (x, y) without a branch, rad; atan on [0, 1] by a least-maximum polynomial, error below 4e-8."""
+    """Return the direction of (x, y), rad, without branches; atan by a minimax polynomial, error below 4e-8."""
     f = np.float32
     a, b = abs(x), abs(y)
     q = min(a, b) / max(a, b)
@@ -78,11 +78,11 @@ def _prepare_block(  # type: ignore[no-untyped-def]
     k, block, corners, xs, ys, radius, label,
     x0, y0, cos, sin, excluded, per_radian, middle, max_range, shapes,
 ):  # fmt: skip
-    """Interval of beams, first and last visible face, and number of visible faces of sixteen obstacles.
+    """Compute the interval of beams, the first and last visible face, and their number, for sixteen obstacles.
 
     `shapes`, (7 · LANES,) float32: lowest beam, highest beam, a and b of the first face, a and b of the last,
-    faces. What is out of range or excluded gets an empty interval. Written without a branch, on flat arrays
-    and unsigned indices, so that the compiler makes vector code of it; `k` is a literal for the same reason.
+    faces. Obstacles out of range or excluded get an empty interval. Written without branches, on flat arrays
+    and unsigned indices, so that the compiler vectorizes it; `k` is a literal for the same reason.
     """
     f, zero = np.float32, np.float32(0)
     lanes = np.uint64(LANES)
@@ -177,7 +177,7 @@ def _draw_four_faces(lines, n, low, high, begin, end, u, v, number, inverse, row
 
 @compiled(error_model="numpy", fastmath=_FAST)
 def _draw_lines(lines, n, low, high, begin, end, label, u, v, number, inverse, ids, row, here):  # type: ignore[no-untyped-def]
-    """As `_draw_two_faces` for any number of faces, and with ids where somebody asks for them."""
+    """As `_draw_two_faces` for any number of faces, and with ids if they are wanted."""
     first, stop, start = np.uint64(begin), np.uint64(end), np.uint64(row)
     a, b = lines[0], lines[1]
     for i in range(first, stop):
@@ -201,11 +201,11 @@ def _draw_table(  # type: ignore[no-untyped-def]
     poses, first_pose, last_pose, heading, excluded, u, v, number, n_beams, per_radian, middle, max_range,
     shapes, lines, inverse, ids, here, covered,
 ):  # fmt: skip
-    """Draw what a table of cells holds within range of some poses.
+    """Draw the obstacles of a table of cells within range of several poses.
 
-    Scan s owns row s of `inverse` and, if it is not empty, of `ids`, (chunk · n_padded,). `covered[s]` becomes the
-    label of a footprint that the sensor is inside of. All poses of a chunk in one call, for a call counts the
-    references to its arrays, which takes as long as drawing a dozen obstacles.
+    Scan s has row s of `inverse` and, if it is not empty, of `ids`, (chunk · n_padded,). `covered[s]` becomes the
+    label of a footprint that contains the sensor. One call takes all poses of a chunk, because the reference counting
+    of its array arguments costs as much as drawing a dozen obstacles.
     """
     f = np.float32
     last_beam, half_turn, n_padded = f(n_beams - 1), f(math.pi) * per_radian, len(u)
@@ -289,7 +289,7 @@ def _draw_table(  # type: ignore[no-untyped-def]
 
 @compiled(error_model="numpy", fastmath=_FAST)
 def _add_noise(ranges, scan, max_range, table, offsets, sd, lost):  # type: ignore[no-untyped-def]
-    """Noise and drop-outs of one scan, both read in `table` from random offsets on."""
+    """Add noise and drop-outs to one scan, both read from `table` at random offsets."""
     f, n = np.float32, ranges.shape[1]
     for draw in range(offsets.shape[1]):
         noise, drop = np.uint64(offsets[scan, draw, 0]), np.uint64(offsets[scan, draw, 1])
@@ -303,7 +303,7 @@ def _add_noise(ranges, scan, max_range, table, offsets, sd, lost):  # type: igno
 
 @compiled(nogil=True, error_model="numpy", fastmath=_FAST)
 def scan_all(quads, others, poses, heading, exclude, beams, table, offsets, sd, lost, ranges, ids):  # type: ignore[no-untyped-def]
-    """Fill `ranges`, (b, n_beams) float32, and `ids`, the same or (0, n_beams) if nobody asks."""
+    """Fill `ranges`, (b, n_beams) float32, and `ids`, of the same shape or (0, n_beams) if they are not wanted."""
     f, n, n_padded, with_ids = np.float32, beams.n, len(beams.u), len(ids) > 0
     max_range, per_radian, middle = f(beams.max_range), f(beams.per_radian), f(beams.middle)
     u, v, number = beams.u, beams.v, beams.number

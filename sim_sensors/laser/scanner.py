@@ -1,4 +1,4 @@
-"""A laser scanner that looks over a `ScanPlane`: its beams, its noise, its scans."""
+"""Laser scanner: beams, noise, and scans of a `ScanPlane`."""
 
 from __future__ import annotations
 
@@ -100,13 +100,13 @@ class LaserScanner:
         *,
         exclude: int | None = None,
     ) -> Float32Array:
-        """One scan.
+        """Simulate one scan.
 
         Args:
-            plane: what stands there.
-            pose: (3,) x, y (m) and yaw (rad) of the sensor in the world frame.
+            plane: the obstacles.
+            pose: (3,) x, y in m and yaw in rad of the sensor, world frame.
             rng: draws noise and drop-outs; None for exact ranges.
-            exclude: id of footprints to look through, such as the vehicle that carries the sensor.
+            exclude: id of footprints to ignore, such as the vehicle that carries the sensor.
 
         Returns:
             (n_beams,) float32, m, `inf` for no return.
@@ -125,7 +125,7 @@ class LaserScanner:
         *,
         exclude: int | None = None,
     ) -> tuple[Float32Array, Int32Array]:
-        """One scan as `scan` makes it, and (n_beams,) int32: the id hit, `WALL` (-2), or `NO_RETURN` (-1)."""
+        """Simulate one scan; also return (n_beams,) int32: the id hit, `WALL` (-2), or `NO_RETURN` (-1)."""
         ranges, ids = self._measure(plane, _poses(pose, "pose", 1), rng, exclude, True)
         return ranges[0], ids[0]
 
@@ -137,13 +137,13 @@ class LaserScanner:
         *,
         exclude: ArrayLike | None = None,
     ) -> Float32Array:
-        """Many scans of one plane.
+        """Simulate many scans of one plane.
 
         Args:
-            plane: what stands there.
-            poses: (b, 3) x, y (m) and yaw (rad) of the sensor in the world frame.
+            plane: the obstacles.
+            poses: (b, 3) x, y in m and yaw in rad of the sensor, world frame.
             rng: draws noise and drop-outs; None for exact ranges.
-            exclude: an id for all, or (b,) int, one for each pose, -1 for none.
+            exclude: one id for all poses, or (b,) int, one for each; -1 for none.
 
         Returns:
             (b, n_beams) float32, m, `inf` for no return.
@@ -161,7 +161,7 @@ class LaserScanner:
         *,
         exclude: ArrayLike | None = None,
     ) -> tuple[Float32Array, Int32Array]:
-        """Scans as `scan_batch` makes them, and (b, n_beams) int32 ids as in `scan_with_ids`."""
+        """Simulate scans as `scan_batch` does; also return (b, n_beams) int32 ids as in `scan_with_ids`."""
         return self._measure(plane, _poses(poses, "poses", 2), rng, exclude, True)
 
     def _measure(
@@ -219,10 +219,10 @@ def _poses(value: ArrayLike, name: str, ndim: int) -> NDArray[np.float64]:
 
 @lru_cache(maxsize=1)
 def _noise_table() -> Float32Array:
-    """(NOISE_TABLE_SIZE + BEAMS_PER_DRAW,) float32: the standard normal's quantiles, shuffled once and for all.
+    """Return quantiles of the standard normal distribution in a fixed random order.
 
-    The table is a constant, as a ziggurat's is; what is random is where a scan reads in it. Every value stands for
-    the same probability, so that drop-outs, drawn by a threshold, have the probability that was asked for.
+    (NOISE_TABLE_SIZE + BEAMS_PER_DRAW,) float32. The table is constant, as in the ziggurat algorithm; scans read it
+    from random offsets. All values have the same probability, so drop-outs drawn by a threshold have the exact rate.
     """
     quantiles = ndtri((np.arange(NOISE_TABLE_SIZE) + 0.5) / NOISE_TABLE_SIZE)
     shuffled = np.random.default_rng(0).permutation(quantiles)

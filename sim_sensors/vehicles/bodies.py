@@ -23,7 +23,7 @@ IntArray = NDArray[np.int64]
 
 
 class Finish(IntEnum):
-    """What a triangle of a vehicle is made of."""
+    """Surface types of a vehicle's triangles."""
 
     BODY = 0
     BODY_DUSTY = 1

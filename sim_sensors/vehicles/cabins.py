@@ -1,4 +1,4 @@
-"""The glasshouse of a vehicle and what is seen through it: pillars, panes, roof, seats, dashboard."""
+"""The glasshouse of a vehicle and its interior: pillars, panes, roof, seats, dashboard."""
 
 from __future__ import annotations
 

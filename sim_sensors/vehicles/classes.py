@@ -1,6 +1,6 @@
-"""Which cars there are: bodies, market segments with their sizes, and paints.
+"""Vehicle classes: bodies, market segments with their sizes, and paints.
 
-Nobody defines the sizes of segments by law (the European Commission only names them, case COMP/M.1406). Lengths
+No law defines the sizes of segments (the European Commission only names them, case COMP/M.1406). Lengths
 follow what is commonly tabulated, cut to what is on the market:
 
 - A to F, *Euro Car Segment*, Wikipedia: A 2.7-3.7 m, B 3.7-4.2, C 4.2-4.6, D 4.6-4.8, E 4.8-5.0.
@@ -33,7 +33,7 @@ BODY_SHARE = (0.37, 0.11, 0.16, 0.24, 0.10, 0.02)
 
 
 class SizeClass(NamedTuple):
-    """A market segment under one body; lowest and highest of each measure, m."""
+    """A market segment of one body; least and greatest value of each dimension, m."""
 
     segment: str
     share: float
@@ -76,7 +76,7 @@ SIZE_CLASSES: dict[str, tuple[SizeClass, ...]] = {
 
 
 class Paint(NamedTuple):
-    """A colour of car paint, its share of the fleet, and how far cars of that name differ."""
+    """A car paint, its share of the fleet, and the variation of its colour."""
 
     name: str
     share: float
@@ -102,14 +102,14 @@ sold, so some of today's grey is still silver. Colours are sRGB, 0 to 255."""
 
 
 def draw_body(rng: np.random.Generator) -> str:
-    """A body by `BODY_SHARE`."""
+    """Draw a body by `BODY_SHARE`."""
     return BODIES[int(rng.choice(len(BODIES), p=BODY_SHARE))]
 
 
 def draw_size(body: str, rng: np.random.Generator) -> tuple[str, tuple[float, float, float]]:
-    """A segment of a body, and length, width and height in its limits.
+    """Draw a segment of a body, and length, width and height within its limits.
 
-    The three go together, as a longer car of a class tends to be the wider one, and lie around the middle.
+    The three are correlated, since longer cars of a class tend to be wider, and lie around the middle.
 
     Returns:
         The segment's name; length, width, height in m.
@@ -123,7 +123,7 @@ def draw_size(body: str, rng: np.random.Generator) -> tuple[str, tuple[float, fl
 
 
 def draw_paint(rng: np.random.Generator) -> tuple[int, int, int]:
-    """A paint's colour, sRGB, by the shares in `PAINTS`."""
+    """Draw a paint's colour, sRGB, by the shares in `PAINTS`."""
     paint = PAINTS[int(rng.choice(len(PAINTS), p=[p.share for p in PAINTS]))]
     drawn: NDArray[np.float64] = np.array(paint.color) + np.array(paint.spread) * rng.uniform(-1.0, 1.0)
     r, g, b = np.clip(np.round(drawn + rng.uniform(-3, 3, 3)), 0, 255).astype(int).tolist()

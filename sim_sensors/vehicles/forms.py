@@ -1,4 +1,4 @@
-"""The measures that make a body: where its lines run, drawn from what is usual for its kind."""
+"""The proportions of a vehicle body, drawn from distributions for its type."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Form:
 
     @property
     def arch_radius(self) -> float:
-        """Of the wheel arches, m."""
+        """Radius of the wheel arches, m."""
         return self.wheel_radius + ARCH_GAP
 
     @property
@@ -93,7 +93,7 @@ _USUAL: dict[str, tuple[float, ...]] = {
 
 
 def draw_form(body: str, segment: str, size: tuple[float, float, float], rng: np.random.Generator) -> Form:
-    """A body of a given size.
+    """Draw the proportions of a body of a given size.
 
     Args:
         body: one of `vehicle_classes.BODIES`.

@@ -1,4 +1,4 @@
-"""What is bolted to a vehicle's shell: wheels, lamps' reflectors, number plates, mirrors, handles, rails, cladding."""
+"""Attached parts of a vehicle: wheels, lamp reflectors, number plates, mirrors, handles, rails, cladding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Vehicle models made by parameters: a body, a size, a paint and a seed give a mesh, the same one every time."""
+"""Parametric vehicle models: a body, a size, a paint and a seed determine the mesh."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ _SHAPES_KEPT = 1024
 
 @dataclass(frozen=True)
 class VehicleModel:
-    """One kind of car: its shape, its paint and the trim that its seed gives it.
+    """A vehicle model: shape, paint and trim.
 
     Args:
         body: one of `vehicle_classes.BODIES`.
-        segment: of the market, as in `vehicle_classes.SIZE_CLASSES`; wheels and nose go by it.
+        segment: market segment, as in `vehicle_classes.SIZE_CLASSES`; it determines wheels and nose.
         size: length, width without mirrors, height, m.
         paint: sRGB, 0 to 255.
-        seed: 0 or more, of everything else.
+        seed: 0 or more, of all other details.
 
     Raises:
         SensorError: an unknown body, a size that no vehicle has, a paint or a seed out of range.
@@ -89,10 +89,10 @@ class VehicleModel:
 
     @classmethod
     def from_seed(cls, body: str | None, seed: int) -> VehicleModel:
-        """Draw a model: size in its class, paint and trim by how common they are.
+        """Draw a model: size, paint and trim by their frequency.
 
         Args:
-            body: one of `vehicle_classes.BODIES`; None draws that too, by `BODY_SHARE`.
+            body: one of `vehicle_classes.BODIES`; None draws it by `BODY_SHARE`.
             seed: 0 or more.
         """
         if body is not None and body not in BODIES:
@@ -106,7 +106,7 @@ class VehicleModel:
         return cls(chosen, segment, size, draw_paint(rng), int(seed))
 
     def painted(self, paint: tuple[int, int, int]) -> VehicleModel:
-        """The same car in another colour, sRGB; its shape is shared."""
+        """Return the same car in another colour, sRGB; its shape is shared."""
         return replace(self, paint=paint)
 
     @property
@@ -126,13 +126,13 @@ class VehicleModel:
 
     @cached_property
     def form(self) -> Form:
-        """The measures that the shape follows."""
+        """The proportions of the body."""
         return draw_form(self.body, self.segment, self.size, np.random.default_rng([self.seed, 2]))
 
     def mesh(self, level: int = DETAILED) -> Mesh:
-        """The car's triangles, vehicle frame.
+        """Return the mesh, vehicle frame.
 
-        Shapes are kept, so asking again, or for another paint, is cheap.
+        Shapes are cached, so the same model in another paint is cheap.
 
         Args:
             level: `DETAILED` (0), about 3,800 triangles, or `COARSE` (1), about 560.
@@ -143,7 +143,7 @@ class VehicleModel:
         return shape.dyed(*self._palette())
 
     def footprint(self) -> FloatArray:
-        """What a laser at knee height meets.
+        """Return the footprint 0.5 m above the ground.
 
         Returns:
             (k, 2) float64, m, vehicle frame: a convex polygon, counter-clockwise, at most `FOOTPRINT_CORNERS`
@@ -152,7 +152,7 @@ class VehicleModel:
         return _footprint(self.painted((0, 0, 0))).copy()
 
     def _palette(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Material and colour of every `Finish`."""
+        """Return material and colour of every `Finish`."""
         rng = np.random.default_rng([self.seed, 3])
         variety = self.form.variety
         paint = np.array(self.paint, dtype=np.float64)
@@ -222,7 +222,7 @@ def _skin(model: VehicleModel, coarse: bool) -> Skin:
 
 @lru_cache(maxsize=2 * _SHAPES_KEPT)
 def _shape(model: VehicleModel, level: int) -> Shape:
-    """The triangles of a model of any paint."""
+    """Return the triangles of a model without paint."""
     coarse = level == COARSE
     form, skin, build = model.form, _skin(model, coarse), ShapeBuilder()
     house = Glasshouse(skin)
@@ -266,7 +266,7 @@ def _footprint(model: VehicleModel) -> FloatArray:
 
 
 def _convex_hull(points: FloatArray) -> FloatArray:
-    """(k, 2) counter-clockwise, without corners on straight edges (Andrew's monotone chain)."""
+    """Return the convex hull, (k, 2), counter-clockwise, without collinear corners (Andrew's monotone chain)."""
     ordered = np.unique(np.round(points, 9), axis=0)
 
     def chain(row: list[list[float]]) -> list[list[float]]:

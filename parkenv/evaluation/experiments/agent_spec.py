@@ -7,7 +7,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator, ConfigDict, model_validator
 
 from parkenv.errors import InputError
-from parkenv.files.spec_file import Spec
+from parkenv.files.spec_file import OrText, Spec
 
 OptionValue = bool | int | float | str
 
@@ -25,6 +25,15 @@ class AgentSpec(Spec):
             if not isinstance(value, OptionValue) or value != value:
                 raise ValueError(f"{option} to be a number, true, false or text, not {value!r}")
         return self
+
+    @classmethod
+    def of(cls, text: str) -> AgentSpec:
+        """The agent that a word such as `mdp(failure_s=90)` names.
+
+        Raises:
+            InputError: brackets that do not match, or an option without a value.
+        """
+        return cls.parse(parse_agent(text), "--agent")
 
     @property
     def options(self) -> dict[str, Any]:
@@ -111,5 +120,5 @@ def _tables(value: object) -> object:
     return parse_agent(value) if isinstance(value, str) else value
 
 
-AgentItem = Annotated[AgentSpec, BeforeValidator(_tables, json_schema_input_type=str | AgentSpec)]
+AgentItem = Annotated[AgentSpec, BeforeValidator(_tables), OrText()]
 """An agent in a file: `"mdp"`, `"mdp(failure_s=90)"` or a table."""

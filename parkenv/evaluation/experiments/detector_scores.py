@@ -1,4 +1,4 @@
-"""A detector judged on labelled photographs."""
+"""Scores of a detector on labelled photographs."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from parkenv.perception.hog_detector import HogDetector
 
 _SMALLEST = {"single": 0.85, "multi": 0.65}
 _LARGEST = {"single": 1.2, "multi": 2.6}
-"""Sizes that are looked for, of UIUC's 100×40 box; the single-scale set has one."""
+"""Range of the searched sizes relative to UIUC's 100×40 box; the cars of the single-scale set have one size."""
 
 
 @dataclass(frozen=True, eq=False)
 class TestSetScore:
-    """Result on one test set: its row in `summary.json`, and the curve."""
+    """Result on one test set: its row in `summary.json`, and its curve."""
 
     row: dict[str, Any]
     curve: RecallPrecision
@@ -33,7 +33,7 @@ class TestSetScore:
 def score_on_uiuc(
     model: CarModel, folder: Path, *, on_image: Callable[[], None] = lambda: None
 ) -> list[TestSetScore]:
-    """Recall and precision on UIUC's test sets, as many as the folder holds.
+    """Measure recall and precision on the UIUC test sets in a folder.
 
     Args:
         model: a side model.
@@ -41,7 +41,7 @@ def score_on_uiuc(
         on_image: called after every image.
 
     Raises:
-        InputError: neither test set is there, or one is damaged.
+        InputError: no test set, or a damaged one.
     """
     sets = [name for name, (_, truth) in UIUC_TESTS.items() if (folder / truth).is_file()] or ["single"]
     return [score_on(model, read_uiuc_test(folder, name), name, on_image=on_image) for name in sets]
@@ -54,7 +54,7 @@ def score_on(
     *,
     on_image: Callable[[], None] = lambda: None,
 ) -> TestSetScore:
-    """Recall and precision on labelled images, by UIUC's rule."""
+    """Measure recall and precision on labelled images, by UIUC's matching rule."""
     height = UIUC_SIZE[1]
     detector = HogDetector(
         (model,), least_height=_SMALLEST[test_set] * height, most_height=_LARGEST[test_set] * height,
@@ -86,7 +86,7 @@ def score_on(
 
 
 def save_curves(scores: Sequence[TestSetScore], title: str, path: Path) -> None:
-    """Recall against one minus precision, as these sets' papers draw it."""
+    """Plot recall against 1 - precision, as the papers of these data sets do."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(5.4, 4.4))
         ax = figure.subplots()

@@ -88,12 +88,7 @@ class EpisodeRunner:
     """
 
     def __init__(
-        self,
-        scenario: Scenario,
-        name: str,
-        agent: Agent,
-        rig: str | None = None,
-        detector: str | None = None,
+        self, scenario: Scenario, name: str, agent: Agent, rig: str | None = None, detector: str | None = None
     ) -> None:
         self.scenario = scenario
         self.name = name
@@ -144,4 +139,4 @@ class EpisodeRunner:
     def _bound_s(self) -> float:
         state = self._state
         choice = best_slot(self.scenario, self._routes, state.world, state.path[0], state.arrival.time)
-        return min(choice.total_s, self.scenario.give_up_s)
+        return float(min(choice.total_s, self.scenario.give_up_s))

@@ -31,6 +31,7 @@ EPISODE_COLUMNS = (
     "drive_s",
     "failed_s",
     "walk_s",
+    "parking_cost_s",
     "gave_up_s",
     "bound_s",
     "driven_m",

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, mod
 from pydantic_core import PydanticCustomError
 
 from parkenv.evaluation.experiments.agent_spec import AgentItem, AgentSpec
-from parkenv.files.spec_file import Axis, FilePath, Several, Spec
+from parkenv.files.spec_file import Axis, FilePath, OrText, Several, Spec
 from parkenv.scenarios.spec import (
     SCENARIO_NAMES,
     Cost,
@@ -43,9 +43,7 @@ def _scenario_tables(value: object, info: ValidationInfo) -> object:
     return scenario_spec(value if str(value) in SCENARIO_NAMES else Path(folder) / value)
 
 
-ScenarioItem = Annotated[
-    ScenarioSpec, BeforeValidator(_scenario_tables, json_schema_input_type=str | ScenarioSpec)
-]
+ScenarioItem = Annotated[ScenarioSpec, BeforeValidator(_scenario_tables), OrText()]
 """A scenario in a file: a name, a file, or an inline table."""
 
 

@@ -50,6 +50,7 @@ MEANS = (
     "drive_s",
     "failed_s",
     "walk_s",
+    "parking_cost_s",
     "gave_up_s",
     "failed_parks",
     "replans",

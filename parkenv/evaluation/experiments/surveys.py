@@ -1,4 +1,4 @@
-"""Many sessions into a map file, and how good the sessions and the map are."""
+"""Surveys: many sessions into a map file, and the errors of sessions and map."""
 
 from __future__ import annotations
 
@@ -25,8 +25,11 @@ from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
 from parkenv.mapping.survey_score import DISTANCE_ENDS, METHODS
 from parkenv.scenarios.build import build
-from parkenv.world.occupancy import DAY_S, Arrival, ArrivalWindow
+from parkenv.world.occupancy import Arrival, ArrivalWindow, OccupancyModel
+from parkenv.world.occupancy_log import weekday_of
+from parkenv.world.recorded_occupancy import RecordedOccupancy
 from parkenv.world.scenario import Scenario
+from parkenv.world.week import DAY_S
 
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
@@ -42,11 +45,11 @@ SESSION_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class SurveyRun:
-    """A survey that is done.
+    """A completed survey.
 
     Attributes:
-        rows: a row a session, in order.
-        shown: the first session, with pictures; None if all were there already.
+        rows: one row per session, in order.
+        shown: the first session, with results for pictures; None if all sessions existed already.
     """
 
     rows: list[Row]
@@ -74,7 +77,7 @@ def survey_of(spec: SurveySpec) -> tuple[Scenario, SurveySettings]:
 
 
 def session_row(result: SessionResult) -> Row:
-    """What `sessions.csv` says of a session."""
+    """Return the row of a session in `sessions.csv`."""
     score = result.score
     return dict(
         zip(
@@ -93,7 +96,7 @@ def session_row(result: SessionResult) -> Row:
 
 
 def _error_columns(errors: FloatArray) -> tuple[float, ...]:
-    """`ERROR_COLUMNS`: medians but for the second."""
+    """Return the values of `ERROR_COLUMNS`: medians, except the second."""
     if not len(errors):
         return (float("nan"),) * len(ERROR_COLUMNS)
     middle = np.median(errors, axis=0)
@@ -111,16 +114,16 @@ def run_survey(
     pictures: int = 4,
     on_session: Callable[[Row], None] = lambda _: None,
 ) -> SurveyRun:
-    """Drive what the map file does not hold yet; each session is in it whole as soon as it is driven.
+    """Drive the sessions that the map file does not hold yet; each is written in one transaction when it ends.
 
     Args:
         scenario: the world.
         settings: how to drive.
-        sessions: how many.
-        map_file: made where it is not there. Beside it, `sessions.csv` keeps how good each session was.
-        workers: where they are driven; the result does not depend on it.
-        pictures: captures kept of the first session.
-        on_session: told of each session that is done.
+        sessions: number of sessions.
+        map_file: created if it does not exist. `sessions.csv` beside it holds the errors of each session.
+        workers: run the sessions; the result does not depend on them.
+        pictures: number of results kept of the first session.
+        on_session: called with the row of each completed session.
 
     Raises:
         InputError: fewer than one session, or a map file that cannot be used.
@@ -130,7 +133,7 @@ def run_survey(
     survey = Survey(scenario, settings)
     table = map_file.with_name("sessions.csv")
     with MapStore(map_file, scenario.lot) as store:
-        # A row is written before its session: one without is of a drive that was cut off, and is driven again.
+        # A row is written before its session: a row without a session is of an interrupted drive, which is repeated.
         rows = {r["key"]: r for r in _read_rows(table) if store.has(r["key"])}
         wanted = [survey.key_of(k) for k in range(sessions)]
         missing = [k for k, key in enumerate(wanted) if not store.has(key) or key not in rows]
@@ -148,7 +151,7 @@ def run_survey(
 
 
 def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_file: Path) -> Row:
-    """The row of `summary.json`."""
+    """Return the row of `summary.json`."""
     with MapStore(map_file, scenario.lot, create=False) as store:
         log = store.log()
         found = score_discovery(slots_found(store, len(log.time)), scenario.lot)
@@ -193,16 +196,15 @@ def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_
 
 
 def slots_found(store: MapStore, sessions: int) -> FoundSlots:
-    """Slots that the cars of all sessions in a map file show; nobody tells where any are.
+    """Discover slots from the cars of all sessions in a map file, without the lot's slots.
 
-    What passes or is taken for a car now and then adds up over sessions, so the more there are the more cars a slot
-    must have had.
+    Moving cars and false detections accumulate over sessions, so the least number of cars per slot grows with them.
     """
     return discover(store.cars(), least=max(3, sessions // 2))
 
 
 def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
-    """How often a parked car that stands clear in a frame is detected there, by weather and distance.
+    """Return how often a clearly visible parked car is detected in a frame, by weather and distance.
 
     Args:
         rows: of sessions.
@@ -235,24 +237,39 @@ def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
     return result
 
 
+def mean_occupancy(occupancy: OccupancyModel, window: ArrivalWindow) -> FloatArray:
+    """P(taken) of every slot in the middle of a window, (n_slots,): the truth that a map is compared with.
+
+    Of a process it is the marginal on the window's first day; of a recorded log, the fraction of its days on which
+    the slot was taken then.
+    """
+    middle = 0.5 * (window.start_s + window.end_s)
+    if isinstance(occupancy, RecordedOccupancy):
+        arrivals = [Arrival(weekday_of(day) * DAY_S + middle, day) for day in occupancy.days_in(window)]
+        slots = np.arange(occupancy.n_slots)
+        taken = [occupancy.world(np.uint64(0), arrival).occupied(slots, arrival.time) for arrival in arrivals]
+        return np.asarray(np.mean(taken, axis=0, dtype=np.float64))
+    return occupancy.forecast(Arrival(DAY_S * window.weekdays[0] + middle)).p_occupied
+
+
 def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: SessionLog) -> tuple[float, float]:
-    """How far the map's predictions are from the true probabilities, and how far counts alone would be.
+    """Return the mean absolute error of the map's predictions, and the error expected of raw counts.
 
     Args:
         scenario: whose occupancy is the truth.
-        windows: in which sessions began; the map is asked at the middle of each, on its first day.
+        windows: in which sessions began; the map predicts the middle of each, on its first day.
         log: the map's sessions.
 
     Returns:
-        Mean over slots and windows of |predicted - true|; and the sampling error that is to be expected of counts: the
-        same of the mean of as many independent draws as there are sessions in the window, at its very middle.
+        Mean over slots and windows of |predicted - true|; and the expected sampling error of raw counts: that of the
+        mean of as many independent draws, at the middle of the window, as there are sessions in the window.
     """
     errors, chances = [], []
     hour = log.time % DAY_S
     for window in windows:
         time = DAY_S * window.weekdays[0] + 0.5 * (window.start_s + window.end_s)
         draws = int(((hour >= window.start_s) & (hour <= window.end_s)).sum())
-        true = scenario.occupancy.forecast(Arrival(time)).p_occupied
+        true = mean_occupancy(scenario.occupancy, window)
         errors.append(np.abs(predict(log, time).p_occupied - true))
         # Mean absolute deviation of a binomial share, by its normal limit.
         chances.append(np.sqrt(2.0 / np.pi * true * (1.0 - true) / max(draws, 1)))
@@ -262,7 +279,7 @@ def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: Session
 def _driven(
     survey: Survey, numbers: Sequence[int], workers: Workers, pictures: int
 ) -> Iterator[SessionResult]:
-    """Sessions in order."""
+    """Yield the sessions in order."""
     if workers.in_process or len(numbers) < 2:
         for k in numbers:
             yield survey.drive(k, pictures=pictures if k == 0 else 0)
@@ -276,7 +293,7 @@ _KEPT: dict[str, Survey] = {}
 
 
 def _drive(scenario: Scenario, settings: SurveySettings, number: int, pictures: int) -> SessionResult:
-    """In a worker: the survey is made once, and kept for the next session."""
+    """Drive a session in a worker, which keeps the survey for the next session."""
     name = repr((scenario.name, settings))
     if name not in _KEPT:
         _KEPT.clear()
@@ -285,9 +302,9 @@ def _drive(scenario: Scenario, settings: SurveySettings, number: int, pictures: 
 
 
 def _mean(rows: Sequence[Row], column: str) -> float:
-    """The mean over the sessions that could tell; NaN where none could."""
-    told = [r[column] for r in rows if np.isfinite(r[column])]
-    return float(np.mean(told)) if told else math.nan
+    """Return the mean over the sessions with a finite value; NaN if there is none."""
+    finite = [r[column] for r in rows if np.isfinite(r[column])]
+    return float(np.mean(finite)) if finite else math.nan
 
 
 def _read_rows(path: Path) -> list[Row]:

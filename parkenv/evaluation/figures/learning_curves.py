@@ -99,7 +99,7 @@ def save_success_curves(
     As in `save_learning_curves`, one algorithm is drawn as the mean over seeds, several as medians.
 
     Args:
-        curves: of each algorithm, of each seed, the rows of its `curve.csv`; see `DriveTraining.examine`.
+        curves: of each algorithm, of each seed, the rows of its `curve.csv`; see `DriveTraining.evaluate`.
         kinds: of slots.
         planner: success rate of the planner in the same parkings, by kind; empty to draw none.
         title: of the figure.

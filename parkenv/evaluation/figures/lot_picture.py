@@ -43,11 +43,7 @@ SMALLEST_DISC = 6.0
 
 
 def draw_lot(
-    lot: ParkingLot,
-    ax: Axes,
-    *,
-    slot_color: ColorType | FloatArray | None = None,
-    show_graph: bool = False,
+    lot: ParkingLot, ax: Axes, *, slot_color: ColorType | FloatArray | None = None, show_graph: bool = False
 ) -> None:
     """Draw a lot from above, to scale, with a scale bar.
 

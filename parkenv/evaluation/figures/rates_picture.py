@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from parkenv.evaluation.figures.picture_files import save_picture
-from parkenv.world.occupancy import DAY_S, HOUR_S, OccupancyProcess
+from parkenv.world.occupancy import OccupancyProcess
+from parkenv.world.week import DAY_S, HOUR_S
 
 _DAYS = (("weekday", 0, "#0072b2"), ("weekend", 5, "#e69f00"))
 

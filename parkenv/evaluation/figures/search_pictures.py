@@ -19,7 +19,7 @@ from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.episodes import SearchTrace
 from parkenv.evaluation.figures.lot_picture import BELIEF_MAP, draw_discs, draw_lot, points_per_m
-from parkenv.evaluation.figures.picture_files import INK, STYLE, TIME_COLORS
+from parkenv.evaluation.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
 from parkenv.evaluation.figures.registry import ComparisonResults
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import KMH
@@ -58,9 +58,11 @@ def draw_search(trace: SearchTrace, ax: Axes) -> None:
 def _title(trace: SearchTrace, width: float) -> str:
     """Describe the search in lines that fit a width in inches at the current font size."""
     scenario, metrics = trace.scenario, trace.metrics
-    terms = [f"{metrics[key]:.0f} {name}" for key, (name, _) in TIME_COLORS.items()]
-    if not metrics["gave_up_s"]:
-        terms.pop()
+    terms = [
+        f"{metrics[key]:.0f} {name}"
+        for key, (name, _) in TIME_COLORS.items()
+        if key not in OPTIONAL_TIMES or metrics[key]
+    ]
     replans = metrics.get("replans", 0)
     planned = f"; {replans} replan{'s' if replans > 1 else ''}" if replans else ""
     lines = (

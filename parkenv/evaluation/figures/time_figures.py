@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import UNSEEN, against_occupancy
-from parkenv.evaluation.figures.picture_files import INK, STYLE, TIME_COLORS
+from parkenv.evaluation.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
 from parkenv.evaluation.figures.registry import ComparisonResults
 
 FloatArray = NDArray[np.float64]
@@ -125,7 +125,11 @@ def draw_time_split(rows: Sequence[Row]) -> Figure:
             lowest = (len(panels) - 1 - column) // columns
             axes[lowest, column].tick_params(labelbottom=True)
             axes[lowest, column].set_xlabel("mean total time, s; 95 % interval", color="#444444")
-        handles: list[Any] = [Patch(color=color, label=name) for name, color in TIME_COLORS.values()]
+        handles: list[Any] = [
+            Patch(color=color, label=name)
+            for key, (name, color) in TIME_COLORS.items()
+            if key not in OPTIONAL_TIMES or any(row[key] for row in rows)
+        ]
         handles.append(
             Line2D([], [], color=INK, linestyle=(0, (3, 2)), linewidth=1.2, label="clairvoyant lower bound")
         )

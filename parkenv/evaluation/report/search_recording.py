@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from parkenv.envs.search_state import SearchState
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
+from parkenv.evaluation.figures.picture_files import TIME_COLORS
 from parkenv.evaluation.report.lot_data import describe_lot
 from parkenv.evaluation.simulate import EpisodeResult, Observer, Step
 from parkenv.world.occupancy import World
@@ -175,7 +176,7 @@ class SearchRecorder(Observer):
             "parked": parked,
             "slot": self.state.vertex if parked else None,
             "truncated": result.truncated,
-            **{name: info[name] for name in ("drive_s", "failed_s", "walk_s", "gave_up_s", "total_s")},
+            **{name: info[name] for name in ("total_s", *TIME_COLORS)},
             "failed_parks": int(info["failed_parks"]),
             "replans": int(getattr(result.memory, "replans", 0)),
         }

@@ -101,7 +101,8 @@ class Track {
     if (k + 1 < search.t.length && search.failed[k + 1] > search.failed[k]) failed += now - search.t[k] / 100;
     const after = Math.max(0, seconds - this.end);
     const walk = Math.min(after, search.walk_s);
-    return { drive: now - failed, failed, walk, gave_up: Math.min(Math.max(0, after - search.walk_s), search.gave_up_s) };
+    const rest = after - walk;
+    return { drive: now - failed, failed, walk, parking_cost: Math.min(rest, search.parking_cost_s), gave_up: Math.min(rest, search.gave_up_s) };
   }
 
   status(seconds, k) {
@@ -240,7 +241,7 @@ class SearchReplay {
   layStrips(duration) {
     const rows = this.shown.flatMap(({ track }) => {
       const { search } = track;
-      const strip = make("div", { class: "strip", title: "drive, failed attempts, walk" });
+      const strip = make("div", { class: "strip", title: "drive, failed attempts, walk, parking cost or give-up penalty" });
       const part = (from, to, color) => {
         if (to > from) strip.append(make("span", { style: `left: ${(100 * from) / duration}%; width: ${(100 * (to - from)) / duration}%; background: var(${color})` }));
       };
@@ -254,7 +255,7 @@ class SearchReplay {
         }
       });
       part(track.end, track.end + search.walk_s, "--walk");
-      part(track.end + search.walk_s, search.total_s, "--gave-up");
+      part(track.end + search.walk_s, search.total_s, search.parked ? "--price" : "--gave-up");
       if (search.replans && search.t.length < 500) {
         search.plan.forEach((plan, k) => {
           if (plan !== null && k > 0 && plan.length) strip.append(make("span", { class: "replan", style: `left: ${search.t[k] / duration}%` }));
@@ -328,8 +329,8 @@ class SearchReplay {
       panel.dataset.vertex = search.vertex[k];
       panel.dataset.total = search.total_s;
       canvas.setAttribute("aria-label", `${search.agent} after ${seconds2(seconds)} s: ${statusText}`);
-      const words = [["drive", "--drive"], ["failed", "--failed"], ["walk", "--walk"], ["gave_up", "--gave-up"]]
-        .filter(([name]) => name !== "gave_up" || search.gave_up_s > 0)
+      const words = [["drive", "--drive"], ["failed", "--failed"], ["walk", "--walk"], ["parking_cost", "--price"], ["gave_up", "--gave-up"]]
+        .filter(([name]) => !["parking_cost", "gave_up"].includes(name) || search[`${name}_s`] > 0)
         .map(([name, color]) => make("span", {}, make("i", { style: `background: var(${color})` }), `${name.replace("_", " ")} `, make("b", {}, seconds2(parts[name]))));
       if (over && search.agrees !== null) {
         words.push(make("span", { class: search.agrees ? "check" : "check bad", title: "Whether the simulation reproduced the total time in episodes.csv" }, search.agrees ? "✓ as in episodes.csv" : `episodes.csv: ${seconds2(search.counted_s)} s`));

@@ -50,6 +50,7 @@ _KNOWN = {
         Column("drive_s", "drive", "s", help="Time driving, waits included"),
         Column("failed_s", "failed attempts", "s", help="Time of failed parking attempts"),
         Column("walk_s", "walk", "s"),
+        Column("parking_cost_s", "parking cost", "s", help="Cost of the slot, as time"),
         Column("gave_up_s", "give-up penalty", "s", help="Charged where the lot is full or the search was truncated"),
         Column("bound_s", "bound", "s", help="Clairvoyant lower bound: least time with full knowledge of the future"),
         Column("parked_fraction", "parked", share=True, digits=0),
@@ -98,7 +99,8 @@ _KNOWN = {
 }  # fmt: skip
 _ORDER = (
     "scenario", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh", "agent", "seed",
-    "total_s", "difference_s", "gap_to_exact", "regret_s", "drive_s", "failed_s", "walk_s", "gave_up_s",
+    "total_s", "difference_s", "gap_to_exact", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s",
+    "gave_up_s",
     "parked_fraction",
 )  # fmt: skip
 """First columns, in this order; others follow."""

@@ -1,7 +1,7 @@
 // Mean total time: a stacked bar per agent with the confidence interval of its mean, a panel per setting.
 
-const PARTS = [["drive_s", "drive", "--drive"], ["failed_s", "failed attempts", "--failed"], ["walk_s", "walk", "--walk"], ["gave_up_s", "give-up penalty", "--gave-up"]];
-/** Bars longer than this many times the shortest agent's are cut. */
+const PARTS = [["drive_s", "drive", "--drive"], ["failed_s", "failed attempts", "--failed"], ["walk_s", "walk", "--walk"], ["parking_cost_s", "parking cost", "--price"], ["gave_up_s", "give-up penalty", "--gave-up"]];
+/** Bars longer than this many times the shortest agent's of the panel may be cut off. */
 const CUT = 2.6;
 
 /** Return a round step that gives about `count` ticks. */
@@ -66,10 +66,11 @@ function showTimeChart(root, table) {
     groups.get(key).push(row);
   }
   if (groups.size > 12) return false;
-  const totals = rows.filter((row) => row.agent !== "oracle").map((row) => row.total_s[0]);
-  // A few agents far off must not squash the others.
-  const shortest = Math.min(...totals);
-  const shown = rows.map((row) => row.total_s[2] ?? row.total_s[0]).filter((seconds) => seconds <= CUT * shortest);
+  // A few agents far off must not squash the others of their panel.
+  const shown = [...groups.values()].flatMap((its) => {
+    const shortest = Math.min(...its.filter((row) => row.agent !== "oracle").map((row) => row.total_s[0]));
+    return its.map((row) => row.total_s[2] ?? row.total_s[0]).filter((seconds) => seconds <= CUT * shortest);
+  });
   const longest = Math.max(...rows.map((row) => row.total_s[2] ?? row.total_s[0]));
   const raw = Math.max(...shown) * 1.02;
   const step = tickStep(Math.min(longest, raw), 5);

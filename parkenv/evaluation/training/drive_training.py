@@ -170,15 +170,15 @@ def evaluate_parking(
     return batch.status, batch.time
 
 
-def parked_on(lots: Sequence[ParkingLot], seeds: Sequence[int], workers: Workers, driver: str) -> list[Row]:
+def parked_on(lots: Sequence[ParkingLot], seeds: Sequence[int], workers: Workers, agent: str) -> list[Row]:
     """Run parkings in `parkenv/Drive-v1`, in every kind of slot on some lots; return rows of `park_once`.
 
     Args:
         lots: to park on.
         seeds: of the tasks, the same for each kind and lot.
         workers: where tasks run.
-        driver: a name for `planners.driving.parking_agents.make_parking_agent`.
+        agent: a name for `planners.driving.parking_agents.make_parking_agent`.
     """
     cases = [ParkingCase(group.lot, (group.kind,)) for group in slot_groups(lots)]
     # Tables are by kind; nose-in or back-in is part of the task.
-    return [p.row | {"way": ""} for some in park_all(cases, seeds, workers, driver) for p in some]
+    return [p.row | {"way": ""} for some in park_all(cases, seeds, workers, agent) for p in some]

@@ -166,9 +166,7 @@ class DriveTrainingEnv(SharedVecEnv):
         self._start_all()
         return self.batch.observation()
 
-    def step_wait(
-        self,
-    ) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Step all drives. Where one ends, `info` has the keys of `Monitor`, `is_success` and `contact`."""
         batch = self.batch
         batch.drive(np.asarray(self.actions, dtype=np.float32))

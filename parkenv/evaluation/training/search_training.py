@@ -94,7 +94,7 @@ class SearchTraining(Training):
         """Metadata of the model file."""
         config = self.config
         settings = {"n_envs": config.n_envs, "policy": config.policy, **config.settings}
-        settings["imitated"] = None if self.demonstrations is None else self.demonstrations.agent
+        settings["clone"] = None if self.demonstrations is None else self.demonstrations.agent
         names = tuple(s.name for s in self.scenarios)
         return ModelCard(self.algorithm, names, self.k, OBSERVATION, seed, steps, settings, __version__)
 

@@ -12,23 +12,9 @@ from gymnasium.wrappers import TimeLimit
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.envs.perception import OnboardPerception
 from parkenv.envs.search import SearchEnv
-from parkenv.envs.search_step import (
-    DRIVEN_M,
-    FAILED_PARKS,
-    STEP_DRIVE,
-    STEP_FAILED,
-    STEP_WALK,
-    STEPS,
-    TIME,
-    drive_or_park,
-    learn,
-    look,
-    renew,
-    settle,
-    touched,
-)
 from parkenv.envs.sensor_sampler import Station
 from parkenv.errors import InputError
+from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
 from parkenv.evaluation.trips.executor import Leg, MotionExecutor, ParkingAttempt
 from parkenv.evaluation.trips.lot_driver import DrivingStyle, LotDriver
@@ -73,35 +59,32 @@ class DrivenSearchEnv(SearchEnv):
         self.executor.begin(state.key, state.world, state.vertex, state.time)
         return result
 
-    def _advance(self, action: int) -> None:
+    def _advance(self, action: int) -> tuple[Any, ...]:
         """Drive the action, and advance the world by the time that it took."""
-        state, search = self._state, self.search
-        numbers = search.numbers[0]
-        vertex, before = state.vertex, state.time
+        state, control = self._state, self._control
+        vertex, begin = state.vertex, state.time
         possible = self.scenario.action_masks[vertex, action] == 1
         if possible and action == PARK:
-            self._park(vertex, before)
+            self._park(vertex, begin)
         elif possible:
             seconds = self.executor.drive(vertex, action)
-            drive_or_park(search, 0, action)
-            numbers[STEP_DRIVE], numbers[TIME] = seconds, before + seconds
+            control.drive_or_park(action)
+            control.set_step_time(begin, drive_s=seconds)
         else:
             self.executor.wait(self.scenario.wait_s)
-            drive_or_park(search, 0, action)
+            control.drive_or_park(action)
         if not state.parked:
             self._observe(moved=possible and action != PARK)
             for slot in self._refused:
                 # It looks free, but this car does not fit into it.
-                learn(search, 0, touched(search, 0, slot), True, 1.0)
-        settle(search, 0)
-        renew(search, 0)
-        self._clock[:] = state.time, state.time - state.arrival.time
+                control.set_taken(slot)
+        return control.finish_step()
 
     def _observe(self, *, moved: bool) -> None:
         """Update the belief from the observations at the car's place and on its way there."""
         perception = self.perception
         if perception is None:
-            look(self.search, 0)
+            self._control.observe()
             return
         # After an attempt or a wait, the car observes once; captures within a manoeuvre are useless.
         track = self.executor.track if moved else self.executor.track[-1:]
@@ -110,25 +93,21 @@ class DrivenSearchEnv(SearchEnv):
             chosen = perception.sampler.select_stations(np.array([point.driven_m for point in track]))
             points = [track[i] for i in chosen.tolist()]
             stations = [Station(s.time, s.pose, self.executor.movers_at(s)) for s in points]
-        perception.update_belief(self.search, perception.sampler.sample(self._state, stations))
+        captures = perception.sampler.sample(self._state, stations)
+        perception.update_belief(self._control, self._state.vertex, captures)
 
-    def _park(self, slot: int, before: float) -> None:
-        search, state = self.search, self._state
-        numbers, counts = search.numbers[0], search.counts[0]
-        taken = bool(state.world.occupied(np.array([slot]), before)[0])
+    def _park(self, slot: int, begin: float) -> None:
+        taken = bool(self._state.world.occupied(np.array([slot]), begin)[0])
         outcome = self.executor.park(slot, taken)
         if taken or not outcome.reason:
-            drive_or_park(search, 0, PARK)
+            self._control.drive_or_park(PARK)
         else:
             self._refused.add(slot)
-            counts[FAILED_PARKS] += 1
-            counts[STEPS] += 1
-            numbers[STEP_WALK] = 0.0
+            self._control.fail_attempt()
         if not outcome.reason:
             self.manoeuvre = outcome
         lost = outcome.seconds if outcome.reason else 0.0
-        numbers[STEP_DRIVE], numbers[STEP_FAILED] = outcome.seconds - lost, lost
-        numbers[TIME] = before + outcome.seconds
+        self._control.set_step_time(begin, drive_s=outcome.seconds - lost, failed_s=lost)
 
 
 @dataclass(frozen=True)
@@ -138,11 +117,12 @@ class Trip:
     Attributes:
         seed: of the world.
         agent: name of the agent.
-        total_s: the sum of the next five.
+        total_s: the sum of the next six.
         lanes_s: driving on the lanes, waiting included.
         manoeuvre_s: from the decision to park until the car stood in the slot.
         failed_s: of failed attempts.
         walk_s: walk to the goal.
+        parking_cost_s: of the slot, as time.
         gave_up_s: give-up penalty.
         parked: whether the car was parked.
         slot: its name; empty where not parked.
@@ -164,6 +144,7 @@ class Trip:
     manoeuvre_s: float
     failed_s: float
     walk_s: float
+    parking_cost_s: float
     gave_up_s: float
     parked: bool
     slot: str
@@ -183,7 +164,7 @@ class DrivenSearch:
 
     Args:
         scenario: the scenario with its traffic.
-        agent: name of an agent, see `make_agent`.
+        agent: name of an agent, with its options in brackets: see `make_agent` and `AgentSpec`.
         vehicle: the car.
         style: of driving.
         rig: sensors that ride along and tell the car which slots are taken: laser, stereo, both_sides, or a
@@ -197,7 +178,7 @@ class DrivenSearch:
     Example:
         >>> import math
         >>> trip = DrivenSearch(make_scenario("mini")).run(seed=1)
-        >>> parts = trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.gave_up_s
+        >>> parts = trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.parking_cost_s + trip.gave_up_s
         >>> trip.parked, math.isclose(trip.total_s, parts)
         (True, True)
     """
@@ -215,7 +196,8 @@ class DrivenSearch:
         perception = None if rig is None else OnboardPerception(scenario, rig, weather, captures)
         self.scenario = scenario if perception is None else perception.scenario
         self.agent = agent
-        self._agent: Agent = make_agent(agent, self.scenario)
+        spec = AgentSpec.of(agent)
+        self._agent: Agent = make_agent(spec.name, self.scenario, **spec.options)
         self.driver = LotDriver(self.scenario, vehicle, style)
         self.env = DrivenSearchEnv(self.scenario, self.driver, perception)
         self._limited = adapt_to_agent(TimeLimit(self.env, STEP_LIMIT), self._agent)
@@ -242,21 +224,19 @@ class DrivenSearch:
         parked = env.manoeuvre
         manoeuvre_s = parked.seconds if parked else 0.0
         lanes_s = float(info["drive_s"]) - manoeuvre_s
-        failed_s, walk_s, gave_up_s = (float(info[name]) for name in ("failed_s", "walk_s", "gave_up_s"))
+        terms = {name: float(info[name]) for name in ("failed_s", "walk_s", "parking_cost_s", "gave_up_s")}
         log = driver.log
         return Trip(
             seed=int(seed),
             agent=self.agent,
-            total_s=lanes_s + manoeuvre_s + failed_s + walk_s + gave_up_s,
+            total_s=sum((lanes_s, manoeuvre_s, *terms.values())),
             lanes_s=lanes_s,
             manoeuvre_s=manoeuvre_s,
-            failed_s=failed_s,
-            walk_s=walk_s,
-            gave_up_s=gave_up_s,
+            **terms,
             parked=bool(info["parked"]),
             slot=parked.slot if parked else "",
             slot_kind=parked.kind if parked else "",
-            graph_m=float(env.search.numbers[0, DRIVEN_M]),
+            graph_m=env.state.driven_m,
             driven_m=log.driven_m,
             contacts=len(log.contacts),
             strays=log.strays,

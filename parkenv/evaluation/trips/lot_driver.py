@@ -65,7 +65,7 @@ _NEAR_M, _ALIGNED = 0.4, math.radians(10.0)
 _AROUND = math.radians(150.0)
 _STRAYED_M = 1.0
 _MOST_PLANS = 6
-_LOOK_STEP = 0.2
+_NOTICE_STEP = 0.2
 _LEAST_NOTICE = 0.8
 _WAITS_M = 7.0
 _BEND_M = 8.0
@@ -219,7 +219,7 @@ class LotDriver:
         self.doing = "searching"
         kind = ACROSS
         if not edge.across:
-            kind = self._take(edge)
+            kind = self._plan_edge(edge)
             self._refresh()
             while not self._arrived(edge, target) and self.time - began < _LONGEST_S:
                 if not self._keep_lane():
@@ -280,7 +280,7 @@ class LotDriver:
         self._placed = True
         self._clear_area()
 
-    def _take(self, edge: DrivenEdge) -> str:
+    def _plan_edge(self, edge: DrivenEdge) -> str:
         """Plan the path along an edge from the car's place; returns the edge's kind."""
         if self._line == edge.line and self._keeper is not None and not self._keeper.done:
             return ALONG
@@ -312,9 +312,9 @@ class LotDriver:
         self._keeper = LaneKeeper(self.vehicle, rounded(points, _BEND_M), self._on_lane)
 
     def _turn(self, before: int, edge: DrivenEdge, at: float) -> CarPath | None:
-        """From the line that the car is on to another that crosses it at station `at`; None where there is no way."""
+        """Plan the turn from the car's line to one that crosses it at station `at`; None if there is none."""
         here, line = self._lines.lines[before], self._lines.lines[edge.line]
-        # The line of the junction's middle, not of the other lane's side.
+        # Measured to the middle of the junction, not to the near side of the other lane.
         now = here.station_of(self.state[:2])
         leave = at - TURN_IN_M + _LEAD_M
         if now > leave:
@@ -334,7 +334,7 @@ class LotDriver:
         return joined(rounded(here.between(now, leave), _BEND_M), path)
 
     def _turn_onto(self, line: DrivenLine) -> str:
-        """Get onto a line from wherever the car is, and along it from there; the edge's kind."""
+        """Drive from the car's place onto a line, and continue along it; returns the edge's kind."""
         self._halt(self.style.braking)
         askew = 0.0
         for _ in range(_MOST_PLANS):
@@ -365,7 +365,7 @@ class LotDriver:
         there: Obstacles,
         reserves: Sequence[float],
     ) -> CarPath | None:
-        """The best way from a pose onto a line, as wide a turn as there is room for without going backward."""
+        """Plan the fastest path from a pose onto a line, with the widest turn possible without reversing."""
         best: tuple[float, CarPath] | None = None
         for reserve in reserves:
             settings = SearchSettings(
@@ -391,7 +391,7 @@ class LotDriver:
         return None if best is None else best[1]
 
     def _keep_lane(self) -> bool:
-        """A step along the way; whether there is more of it."""
+        """Drive one control step along the lane; returns False at its end."""
         assert self._keeper is not None
         pose, speed, steering = self.state[:3], float(self.state[SPEED]), float(self.state[STEERING])
         command = self._keeper.command(pose, speed, steering)
@@ -402,7 +402,7 @@ class LotDriver:
             assert self._line is not None
             self._turn_onto(self._lines.lines[self._line])
             return True
-        if not self._lets_go_first(self._keeper):
+        if not self._yields(self._keeper):
             self._step(*command)
         return True
 
@@ -418,7 +418,7 @@ class LotDriver:
         return bool(ahead >= (0.0 if slot else -TURN_IN_M))
 
     def _is_on(self, line: DrivenLine) -> bool:
-        """Whether the car drives along a line."""
+        """Return whether the car is aligned with a line."""
         pose = line.pose(line.station_of(self.state[:2]))
         return _away(pose, self.state[:3]) < _NEAR_M and _askew(pose, self.state[:3]) < _ALIGNED
 
@@ -427,7 +427,7 @@ class LotDriver:
     def _drive_in(
         self, targets: dict[str, FloatArray], there: Obstacles, inside: FloatArray | None
     ) -> tuple[str, str]:
-        """Drive to the target that is reached soonest; which that is, and why the slot was left, if it was."""
+        """Drive to the target that is reached first; returns its name, and the reason of a failure."""
         ways = list(targets)
         for _ in range(_MOST_PLANS):
             paths = {way: path for way in ways if (path := self._planned_to(targets[way], there)) is not None}
@@ -450,9 +450,9 @@ class LotDriver:
         return way, NO_WAY
 
     def _noticing(self, tracker: PathTracker, inside: FloatArray) -> Callable[[], bool]:
-        """Whether the car would run into an outline within `notice_m` on its way."""
+        """Return a function that tells whether the path meets an outline within `notice_m`."""
         body = shapely.Polygon(inside)
-        ahead = np.arange(0.0, self.style.notice_m + _LOOK_STEP, _LOOK_STEP)
+        ahead = np.arange(0.0, self.style.notice_m + _NOTICE_STEP, _NOTICE_STEP)
 
         def notices() -> bool:
             corners = self.vehicle.corners(tracker.poses_ahead(ahead))
@@ -461,12 +461,12 @@ class LotDriver:
         return notices
 
     def _planned_to(self, target: FloatArray, there: Obstacles) -> CarPath | None:
-        """A way to where the footprint's middle is to be."""
+        """Plan a path to a pose of the footprint's middle."""
         goal = self.vehicle.at_rear_axle(target)
         return plan_path(self.vehicle, there.corners, there.n_corners, self.state[:3], goal)
 
     def _follow(self, tracker: PathTracker, notices: Callable[[], bool] | None = None) -> bool:
-        """Follow a path to its end, or until the car has strayed and stands; False if it stopped as it noticed."""
+        """Follow a path to its end, or stop off the path; returns False where `notices` stopped the car."""
         while True:
             pose, speed, steering = self.state[:3], float(self.state[SPEED]), float(self.state[STEERING])
             command = tracker.command(pose, speed, steering)
@@ -480,11 +480,11 @@ class LotDriver:
             if abs(tracker.offset) > STRAYED_M or abs(tracker.askew) > STRAYED_RAD:
                 self._halt(self.style.braking, tracker)
                 return True
-            if not self._lets_go_first(tracker):
+            if not self._yields(tracker):
                 self._step(*command)
 
     def _back(self, slot: int) -> float:
-        """Drive back on the lane, in the direction of the slot or of before, whichever is sooner; `onward_m`."""
+        """Drive back onto the slot's lane or the previous one, whichever is faster; returns `onward_m`."""
         ways = [self._lines.at(slot)]
         if self._line is not None and self._line != ways[0][0]:
             line = self._lines.lines[self._line]
@@ -516,10 +516,10 @@ class LotDriver:
         own = self._lines.lines[index].station_of(self.vehicle.at_middle(self.state[:3])[:2])
         return own - station
 
-    # --- The car and what is around it
+    # --- The car and its surroundings
 
     def _rescue(self, line: DrivenLine) -> None:
-        """Put a car that is stuck back on a line."""
+        """Put a stuck car back onto a line."""
         self.log.rescues += 1
         self.time += RESCUE_S
         pose = line.pose(line.station_of(self.state[:2]))
@@ -527,12 +527,12 @@ class LotDriver:
         self._clear_area()
 
     def _clear_area(self) -> None:
-        """Have nobody stand where the car was put."""
+        """Hide road users that stand where the car was put."""
         if self.others is not None:
             self.others.clear_area(self.vehicle.corners(self.state[:3]))
 
-    def _lets_go_first(self, tracker: PathTracker) -> bool:
-        """Brake, or stand, for a step if somebody is in the way along a path; whether so."""
+    def _yields(self, tracker: PathTracker) -> bool:
+        """Brake or stand for a step if a road user is in the way along a path; returns whether it did."""
         if self.others is None:
             return False
         speed = abs(float(self.state[SPEED]))
@@ -551,13 +551,13 @@ class LotDriver:
         return True
 
     def _halt(self, braking: float, tracker: PathTracker | None = None) -> None:
-        """Brake until the car stands."""
+        """Brake to a standstill."""
         self._refresh()
         while self.state[SPEED] != 0.0:
             self._brake(braking, tracker)
 
     def _brake(self, braking: float, tracker: PathTracker | None = None) -> None:
-        """Brake for a step of the control, along the path that the car is on."""
+        """Brake for one control step along the current path."""
         speed, steering = float(self.state[SPEED]), float(self.state[STEERING])
         tracker = tracker or self._keeper
         wheels = steering / self.vehicle.max_steering
@@ -567,7 +567,7 @@ class LotDriver:
         self._step(-math.copysign(min(share, 1.0), speed) if speed else 0.0, wheels)
 
     def _step(self, acceleration: float, steering: float) -> None:
-        """Drive for a step of the control."""
+        """Drive one control step."""
         others = self.others
         if others is not None:
             others.advance(CONTROL_S, self.vehicle.corners(self.state[:3]))
@@ -590,11 +590,11 @@ class LotDriver:
             self._refresh()
 
     def _refresh(self) -> None:
-        """Bring what stands around up to date, unless that was done a moment ago and nearby."""
+        """Update the obstacles around the car."""
         self._enter(self._standing(self.state[:2]))
 
     def _standing(self, center: FloatArray, looks_free: int | None = None) -> Obstacles:
-        """What stands around a point, (2,) m, but for a car that is overlooked, and those that wait for this one."""
+        """Return the obstacles around a point, (2,) m, without waiting cars and a car in `looks_free`."""
         taken = set(self._around.taken(center, self.time))
         if self._knew is not None:
             new = np.array(sorted(taken - self._knew), dtype=np.int64)
@@ -604,7 +604,7 @@ class LotDriver:
         return self._around.at_time(center, self.time, sorted(taken - {looks_free}))
 
     def _enter(self, there: Obstacles) -> None:
-        """Drive among these."""
+        """Build the collision world of these obstacles."""
         if self.others is None:
             self._space = CollisionWorld(self.vehicle, there)
         else:
@@ -614,13 +614,13 @@ class LotDriver:
 
 
 def _with(there: Obstacles, outline: FloatArray) -> Obstacles:
-    """Obstacles, and a parked car."""
+    """Add a parked car to obstacles."""
     things = [(ObstacleKind(t), o) for t, o in zip(there.kind.tolist(), there.outlines(), strict=True)]
     return Obstacles.of([*things, (ObstacleKind.PARKED_CAR, outline)])
 
 
 def _seconds_of(path: CarPath) -> float:
-    """About how long it takes to drive a path in the way of manoeuvres."""
+    """Estimate the time of a manoeuvre along a path, s."""
     changes = path.direction_changes + (len(path.length) > 0 and path.length[0] < 0.0)
     return path.driven_m / _PACE + _CHANGE_S * changes
 
@@ -630,5 +630,5 @@ def _away(a: FloatArray, b: FloatArray) -> float:
 
 
 def _askew(a: FloatArray, b: FloatArray) -> float:
-    """Angle, rad, between two headings."""
+    """Return the angle between two headings, rad."""
     return abs(math.remainder(float(a[2] - b[2]), 2.0 * math.pi))

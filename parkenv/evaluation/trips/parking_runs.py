@@ -47,7 +47,7 @@ class ParkingCase:
     slack: float = 0.0
 
     def environment(self, render_mode: str | None = None) -> gym.Env[Any, Any]:
-        """`parkenv/Drive-v1` with the obstacle map."""
+        """Make `parkenv/Drive-v1` with the obstacle map."""
         return gym.make(
             "parkenv/Drive-v1",
             lot=self.lot,
@@ -119,7 +119,7 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
 
     Returns:
         A row with lot, seed, kind, way, slot, parked, reason (of a failure), time_s, driven_m, direction_changes,
-        wheel_rad (how far the wheels were turned in all), turned_rad (how far the heading was), position_error_m,
+        wheel_rad and turned_rad (total change of steering angle and heading), position_error_m,
         angle_error_deg; of a planner also plans, planning_s (all of them), path_m, expansions, margin_m.
     """
     recorder = _ParkingRecorder(every)
@@ -158,29 +158,29 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
 
 
 def park_all(
-    cases: Sequence[ParkingCase], seeds: Sequence[int], workers: Workers = HERE, driver: str = PLANNER
+    cases: Sequence[ParkingCase], seeds: Sequence[int], workers: Workers = HERE, agent: str = PLANNER
 ) -> Iterator[list[Parking]]:
-    """Every seed in every case by one driver, some at a time and in order.
+    """Run every seed of every case with one agent; yield the parkings in order.
 
-    What is measured in wall time differs from run to run; nothing else does, on any number of workers.
+    Only wall times differ from run to run, on any number of workers.
 
     Args:
-        cases: where is parked.
+        cases: the tasks.
         seeds: of the tasks.
-        workers: who runs it.
-        driver: a name for `planners.driving.parking_agents.make_parking_agent`.
+        workers: where they run.
+        agent: a name for `planners.driving.parking_agents.make_parking_agent`.
     """
     parts = [seeds[i : i + CHUNK] for i in range(0, len(seeds), CHUNK)]
-    yield from workers.in_order([partial(_park_some, case, part, driver) for case in cases for part in parts])
+    yield from workers.in_order([partial(_park_some, case, part, agent) for case in cases for part in parts])
 
 
-def _park_some(case: ParkingCase, seeds: Sequence[int], driver: str) -> list[Parking]:
-    env, agent = case.environment(), make_parking_agent(driver)
+def _park_some(case: ParkingCase, seeds: Sequence[int], name: str) -> list[Parking]:
+    env, agent = case.environment(), make_parking_agent(name)
     return [park_once(env, agent, seed) for seed in seeds]
 
 
 def parking_table(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each kind of slot and way of standing in it, and one for all: `kind` "all".
+    """Summarise parkings: a row for each kind of slot and way of parking, and one for all (`kind` "all").
 
     Returns:
         kind, way, episodes, parked, success and its 95 % interval (Wilson), contacts; median and p95 of planning_ms
@@ -194,7 +194,7 @@ def parking_table(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def write_parkings(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Write the rows of parkings as CSV, whole or not at all."""
+    """Write the rows of parkings as CSV, atomically."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     with atomic_write(path) as beside, beside.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")

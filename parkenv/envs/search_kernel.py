@@ -1,0 +1,536 @@
+"""The compiled search: what one action does to the car, to what it observes, and to its belief.
+
+`parkenv/Search-v1` and its batch are this code, so they agree to the bit. No step costs more in a larger lot: only
+slots that a search has had to do with, that were observed or asked about, get a column in its tables.
+
+Functions that take an address are called from Python; `Searches` holds the records there.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from parkenv.belief.slot_belief import bayes_update, decay_to_prior
+from parkenv.envs.search_records import (
+    BLOCK_BITS,
+    BLOCK_SIZE,
+    DECAY_RATE,
+    EXTERNAL_PRIOR,
+    FORECAST,
+    LOG_KIND,
+    N_ACTIONS,
+    NEVER_OBSERVED,
+    OBSERVED_AT,
+    P_OBSERVED,
+    PROCESS_KIND,
+    SENTINEL,
+    block_at,
+    scenario_at,
+    search_at,
+    slot_at,
+)
+from parkenv.world.keyed_random import (
+    ARRIVAL_STREAM,
+    ENTRY_STREAM,
+    SIGHTING_STREAM,
+    VIEW_STREAM,
+    episode_key,
+    keyed_uniform,
+)
+from parkenv.world.lot import PARK
+from parkenv.world.occupancy import BoolArray, FloatArray, IntArray
+from parkenv.world.occupancy_kernel import (
+    MAX_PROBABILITY,
+    MIN_PROBABILITY,
+    inlined,
+    keep_hourly_marginals,
+    kernel,
+    marginal_later,
+    process_at,
+    process_forecast,
+    process_state,
+    recorded_day_at,
+    recorded_forecast,
+    recorded_state,
+)
+from parkenv.world.pointers import float32s, float64s, int32s, int64s
+from parkenv.world.week import DAY_S, WEEK_HOURS, hour_of_week
+
+# ---- one search, from Python
+
+
+@kernel
+def begin_search(address: int) -> None:
+    """Begin the next episode; an external prior is still to be asked, and `init_prior` to be called."""
+    search = search_at(address, 0)
+    arrive(search)
+    if scenario_at(search.scenario, 0).prior_kind != EXTERNAL_PRIOR:
+        init_prior(search)
+    tell_time(search)
+
+
+@kernel
+def init_external_prior(address: int) -> None:
+    """Begin to believe the forecast in `Searches.external_prior`."""
+    init_prior(search_at(address, 0))
+
+
+# One function for each kind of sensor: whoever has one kind need not compile the other.
+
+
+@kernel
+def step_exact(address: int, action: int) -> tuple[Any, ...]:
+    """Take an action, one that there is, with an exact sensor; returns as `step_result`."""
+    search = search_at(address, 0)
+    drive_or_park(search, action)
+    if not search.parked:
+        observe_exact(search)
+    result: tuple[Any, ...] = complete_step(search)
+    return result
+
+
+@kernel
+def step_noisy(address: int, action: int) -> tuple[Any, ...]:
+    """Take an action, one that there is, with a noisy sensor; returns as `step_result`."""
+    search = search_at(address, 0)
+    drive_or_park(search, action)
+    if not search.parked:
+        observe_noisy(search)
+    result: tuple[Any, ...] = complete_step(search)
+    return result
+
+
+# ---- the parts of a step from Python, for environments that drive or observe in another way
+
+
+@kernel
+def act_in(address: int, action: int) -> None:
+    """Move the car along the graph, or try to park it; nothing is observed yet."""
+    drive_or_park(search_at(address, 0), action)
+
+
+@kernel
+def set_step_time(address: int, begin: float, drive_s: float, failed_s: float) -> None:
+    """Replace the time that a step which began at `begin` took for driving and for failed attempts."""
+    search = search_at(address, 0)
+    search.time = begin + (drive_s + failed_s)
+    search.step_drive_s, search.step_failed_s = drive_s, failed_s
+
+
+@kernel
+def fail_attempt_in(address: int) -> None:
+    """Count a failed attempt to park in a slot that is free; its time is set by `set_step_time`."""
+    search = search_at(address, 0)
+    search.failed_parks += 1
+    search.n_steps += 1
+    search.step_walk_s = search.step_parking_cost_s = 0.0
+
+
+@kernel
+def observe_in(address: int) -> None:
+    """Observe the slots in view, as the scenario's sensor model has it."""
+    observe(search_at(address, 0))
+
+
+@kernel
+def apply_observations_in(
+    address: int, slots: IntArray, taken: BoolArray, hit_rate: FloatArray, false_alarm_rate: FloatArray
+) -> None:
+    """Update the belief from observations made elsewhere, (k,) each, instead of `observe_in`."""
+    search = search_at(address, 0)
+    mark_passed(search)
+    for i in range(slots.size):
+        apply_observation(search, column_of(search, slots[i]), taken[i], hit_rate[i], false_alarm_rate[i])
+
+
+@kernel
+def set_taken_in(address: int, slot: int) -> None:
+    """Believe that a slot is taken, for certain."""
+    search = search_at(address, 0)
+    set_belief(search, column_of(search, slot), True, 1.0)
+
+
+@kernel
+def finish_step_in(address: int) -> tuple[Any, ...]:
+    """Add the step to the episode and update the full belief; returns as `step_result`."""
+    result: tuple[Any, ...] = complete_step(search_at(address, 0))
+    return result
+
+
+@kernel
+def read_belief(
+    address: int, p_occupied: FloatArray, p_observed: FloatArray, observed_at: FloatArray
+) -> None:
+    """Write the belief in observed slots over arrays that hold the forecast, (n_slots,) each."""
+    search = search_at(address, 0)
+    for column in range(1, search.n_columns + 1):
+        record, i = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
+        p_occupied[record.slot] = belief_now(search, column)
+        if record.observed:
+            block = block_at(search.blocks, column >> BLOCK_BITS)
+            p_observed[record.slot] = block.p_observed[i]
+            observed_at[record.slot] = block.observed_at[i] - search.arrival
+
+
+# ---- an episode
+
+
+@inlined
+def complete_step(search: Any) -> tuple[Any, ...]:
+    """Add the step to the episode and update what is observed of it; returns as `step_result`."""
+    finish_step(search)
+    refresh_belief(search)
+    tell_time(search)
+    result: tuple[Any, ...] = step_result(search)
+    return result
+
+
+@inlined
+def step_result(search: Any) -> tuple[Any, ...]:
+    """Return the reward and its terms, what the episode so far has cost, how it stands, and where the car is.
+
+    A tuple in the order of the code below: taken all at once, numbers cost less than read one by one.
+    """
+    drive, failed, walk = search.step_drive_s, search.step_failed_s, search.step_walk_s
+    parking, gave_up = search.step_parking_cost_s, search.step_gave_up_s
+    total_s = search.drive_s + search.failed_s + search.walk_s + search.parking_cost_s + search.gave_up_s
+    return (
+        -(drive + failed + walk + parking + gave_up), -drive, -failed, -walk, -parking, -gave_up,
+        search.drive_s, search.failed_s, search.walk_s, search.parking_cost_s, search.gave_up_s, total_s,
+        search.driven_m, search.walked_m,
+        search.failed_parks, search.slots_passed, search.parked, search.over, search.vertex,
+    )  # fmt: skip
+
+
+@kernel
+def arrive(search: Any) -> None:
+    """Begin a search in the world of its seed and episode; nothing has been observed."""
+    scenario = scenario_at(search.scenario, 0)
+    key = episode_key(search.seed_state, search.episode)
+    day = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * scenario.n_weekdays)
+    midnight = int64s(scenario.weekdays)[day] * DAY_S
+    second_of_window = keyed_uniform(key, ARRIVAL_STREAM, 0, 1) * (
+        scenario.window_end - scenario.window_start
+    )
+    arrival = midnight + (scenario.window_start + second_of_window)
+    entry = int(keyed_uniform(key, ENTRY_STREAM, 0, 0) * scenario.n_entries)
+    _, hour, second = hour_of_week(arrival)
+    clear_slots(search)
+    search.key, search.day, search.hour, search.second_of_hour = key, day, hour, second
+    search.arrival, search.time, search.second_of_day = arrival, arrival, arrival - midnight
+    search.vertex = search.previous_vertex = int64s(scenario.entries)[entry]
+    search.parked = search.over = False
+    search.drive_s = search.failed_s = search.walk_s = search.parking_cost_s = search.gave_up_s = 0.0
+    search.step_drive_s = search.step_failed_s = search.step_walk_s = 0.0
+    search.step_parking_cost_s = search.step_gave_up_s = 0.0
+    search.driven_m = search.walked_m = search.n_observed_free = search.n_expected_free = 0.0
+    search.failed_parks = search.slots_passed = search.n_steps = search.n_observed = search.n_known_taken = 0
+    search.remembered_slot = -1
+
+
+@kernel
+def clear_slots(search: Any) -> None:
+    """Take all slots out of their columns."""
+    columns = int32s(search.columns)
+    for column in range(1, search.n_columns + 1):
+        columns[slot_at(search.slots, column).slot] = SENTINEL
+        # Whole blocks are computed; what stays in an empty column must give a number.
+        block_at(search.blocks, column >> BLOCK_BITS).decay_rate[column & (BLOCK_SIZE - 1)] = 0.0
+    search.n_columns = 0
+
+
+@inlined
+def take_step(search: Any, action: int) -> None:
+    """Do all that an action does, whatever the sensor; what it cost is in the fields `step_*`."""
+    drive_or_park(search, action)
+    if not search.parked:
+        observe(search)
+    finish_step(search)
+
+
+@inlined
+def tell_time(search: Any) -> None:
+    """Write the observed time: s since Monday 00:00, and since the search began."""
+    search.clock[0], search.clock[1] = search.time, search.time - search.arrival
+
+
+@kernel
+def drive_or_park(search: Any, action: int) -> None:
+    """Move the car, or try to park it."""
+    scenario, vertex = scenario_at(search.scenario, 0), search.vertex
+    edge = vertex * N_ACTIONS + action
+    drive_s, failed_s, walk_s, parking_cost_s = float64s(scenario.seconds)[edge], 0.0, 0.0, 0.0
+    search.driven_m += float64s(scenario.metres)[edge]
+    target = int64s(scenario.targets)[edge]
+    if target != vertex:
+        search.previous_vertex, search.vertex = vertex, target
+    elif action == PARK and vertex < scenario.n_slots:
+        column = column_of(search, vertex)
+        taken = is_taken(search, column, search.time)
+        if taken:
+            search.failed_parks += 1
+            set_belief(search, column, taken, 1.0)
+            failed_s = scenario.failure_s
+        else:
+            search.parked = True
+            walk_s = float64s(scenario.walk_s)[vertex]
+            parking_cost_s = float64s(scenario.parking_cost_s)[vertex]
+            search.walked_m = float64s(scenario.walk_m)[vertex]
+    search.time += drive_s + failed_s
+    search.step_drive_s, search.step_failed_s = drive_s, failed_s
+    search.step_walk_s, search.step_parking_cost_s = walk_s, parking_cost_s
+    search.n_steps += 1
+
+
+@inlined
+def finish_step(search: Any) -> None:
+    """Give up a lot that is proven full, and add the step to the episode."""
+    scenario = scenario_at(search.scenario, 0)
+    full = search.n_known_taken == scenario.n_slots
+    search.step_gave_up_s = scenario.give_up_s if full else 0.0
+    search.over = full or search.parked
+    search.drive_s += search.step_drive_s
+    search.failed_s += search.step_failed_s
+    search.walk_s += search.step_walk_s
+    search.parking_cost_s += search.step_parking_cost_s
+    search.gave_up_s += search.step_gave_up_s
+
+
+# ---- what is observed
+
+
+@inlined
+def observe(search: Any) -> None:
+    """Observe the slots in view of the car, as the scenario's sensor model has it."""
+    if scenario_at(search.scenario, 0).exact_sensor:
+        observe_exact(search)
+    else:
+        observe_noisy(search)
+
+
+@inlined
+def observe_exact(search: Any) -> None:
+    """Observe the true states of the slots in view.
+
+    A slot whose state surely has not changed needs no more than a new time of the observation.
+    """
+    scenario, time = scenario_at(search.scenario, 0), search.time
+    viewed, columns = int64s(scenario.viewed), int32s(search.columns)
+    observed_at, since_arrival = float32s(search.belief), time - search.arrival
+    first = OBSERVED_AT * search.width
+    starts = int64s(scenario.view_starts)
+    for i in range(starts[search.vertex], starts[search.vertex + 1]):
+        slot = viewed[i]
+        column = np.int64(columns[slot])
+        if time >= slot_at(search.slots, column).valid_until:
+            column = observe_changed(search, slot)
+        block_at(search.blocks, column >> BLOCK_BITS).observed_at[column & (BLOCK_SIZE - 1)] = time
+        if search.belief != 0:
+            observed_at[first + slot] = since_arrival
+    mark_passed(search)
+
+
+@kernel
+def observe_changed(search: Any, slot: int) -> int:
+    """Observe the true state of a slot that may have changed; return its column."""
+    column: int = column_of(search, slot)
+    taken = is_taken(search, column, search.time)
+    set_belief(search, column, taken, 1.0 if taken else 0.0)
+    return column
+
+
+@kernel
+def observe_noisy(search: Any) -> None:
+    """Observe some of the slots in view, and some of them wrongly."""
+    scenario, key, time = scenario_at(search.scenario, 0), search.key, search.time
+    viewed, starts = int64s(scenario.viewed), int64s(scenario.view_starts)
+    seen_rate, hit_rate = float64s(scenario.seen_rate), float64s(scenario.hit_rate)
+    false_alarm_rate = float64s(scenario.false_alarm_rate)
+    mark_passed(search)
+    # By the millisecond: two observations of a slot at one time make the same error.
+    millisecond = int(time * 1000.0)
+    for i in range(starts[search.vertex], starts[search.vertex + 1]):
+        slot = viewed[i]
+        # What hides a slot goes on hiding it: one random number a search, which a better view may beat.
+        if keyed_uniform(key, VIEW_STREAM, slot, 0) >= seen_rate[i]:
+            continue
+        column = column_of(search, slot)
+        rate = hit_rate[i] if is_taken(search, column, time) else false_alarm_rate[i]
+        taken = keyed_uniform(key, SIGHTING_STREAM, slot, millisecond) < rate
+        apply_observation(search, column, taken, hit_rate[i], false_alarm_rate[i])
+
+
+@inlined
+def apply_observation(
+    search: Any, column: int, taken: bool, hit_rate: float, false_alarm_rate: float
+) -> None:
+    """Update the belief in a slot from one observation (Bayes' rule)."""
+    p = bayes_update(belief_now(search, column), taken, hit_rate, false_alarm_rate)
+    set_belief(search, column, taken, p)
+
+
+@kernel
+def mark_passed(search: Any) -> None:
+    """Count the slot that the car stops at, the first time."""
+    if search.vertex < scenario_at(search.scenario, 0).n_slots:
+        record = slot_at(search.slots, column_of(search, search.vertex))
+        if not record.passed:
+            record.passed = True
+            search.slots_passed += 1
+
+
+# ---- the belief
+
+
+@kernel
+def set_belief(search: Any, column: int, observed_taken: bool, p: float) -> None:
+    """Set the belief in a slot to `p`, after an observation now."""
+    record, i = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
+    block = block_at(search.blocks, column >> BLOCK_BITS)
+    if not record.observed:
+        record.observed = True
+        search.n_observed += 1
+        search.n_observed_free += 0.0 if observed_taken else 1.0
+        search.n_expected_free += 1.0 - block.prior[i]
+    search.n_known_taken += int(observed_taken) - int(record.observed_taken)
+    record.observed_taken = observed_taken
+    block.p_observed[i], block.observed_at[i] = p, search.time
+    if search.belief != 0:
+        belief, width = float32s(search.belief), search.width
+        belief[P_OBSERVED * width + record.slot] = p
+        belief[OBSERVED_AT * width + record.slot] = search.time - search.arrival
+
+
+@inlined
+def belief_now(search: Any, column: int) -> float:
+    """Return the belief in the slot of a column, now."""
+    block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
+    elapsed = search.time - block.observed_at[i]
+    return float(decay_to_prior(block.prior[i], block.decay_rate[i], block.p_observed[i], elapsed))
+
+
+@kernel
+def refresh_belief(search: Any) -> None:
+    """Write the belief now into `p_occupied`; only slots with a column can have changed."""
+    decay_belief(search)
+    p_occupied, end = float32s(search.p_occupied), search.n_columns + 1
+    for first in range(0, end, BLOCK_SIZE):
+        block = block_at(search.blocks, first >> BLOCK_BITS)
+        # A loop of fixed length, which is unrolled.
+        for i in range(BLOCK_SIZE):
+            if SENTINEL < first + i < end:
+                p_occupied[slot_at(search.slots, first + i).slot] = block.p_occupied[i]
+
+
+@kernel
+def decay_belief(search: Any) -> None:
+    """Compute the belief in all slots with a column, now."""
+    time = search.time
+    for number in range((search.n_columns + BLOCK_SIZE) >> BLOCK_BITS):
+        block = block_at(search.blocks, number)
+        # A loop of a length that is known beforehand, so that it becomes vector code.
+        for i in range(BLOCK_SIZE):
+            block.p_occupied[i] = decay_to_prior(
+                block.prior[i], block.decay_rate[i], block.p_observed[i], time - block.observed_at[i]
+            )
+
+
+@inlined
+def column_of(search: Any, slot: int) -> Any:
+    """Return the column of a slot, a new one if it has none."""
+    column = np.int64(int32s(search.columns)[slot])
+    if column == SENTINEL:
+        column = add_column(search, slot)
+    return column
+
+
+@kernel
+def add_column(search: Any, slot: int) -> int:
+    """Give a slot a column, and write into it what is forecast of the slot."""
+    column = search.n_columns + 1
+    search.n_columns = column
+    int32s(search.columns)[slot] = column
+    record = slot_at(search.slots, column)
+    record.slot, record.sojourn, record.valid_until = slot, 0, 0.0
+    record.observed = record.observed_taken = record.passed = False
+    block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
+    prior, rate = forecast_of(search, slot)
+    block.prior[i] = block.p_observed[i] = block.p_occupied[i] = prior
+    block.decay_rate[i], block.observed_at[i] = rate, search.arrival
+    return int(column)
+
+
+# ---- the truth and the forecast
+
+
+@inlined
+def is_taken(search: Any, column: int, time: float) -> bool:
+    """Return the truth about the slot of a column, at a time not before that of earlier questions, s."""
+    record = slot_at(search.slots, column)
+    if time >= record.valid_until:
+        find_state(search, record, time)
+    return bool(record.occupied)
+
+
+@kernel
+def find_state(search: Any, record: Any, time: float) -> None:
+    """Compute whether a slot is taken at a time for which that is not known yet."""
+    scenario, slot = scenario_at(search.scenario, 0), np.int64(record.slot)
+    if scenario.world_kind == LOG_KIND:
+        recorded_state(recorded_day_at(scenario.world, search.day), slot, record, time)
+    else:
+        process_state(
+            process_at(scenario.world, 0), search.key, search.arrival, search.hour, search.second_of_hour,
+            slot, record, time,
+        )  # fmt: skip
+
+
+@kernel
+def forecast_of(search: Any, slot: int) -> tuple[float, float]:
+    """Return P(taken) that the car foresees for a slot, and its decay rate, 1/s."""
+    scenario = scenario_at(search.scenario, 0)
+    if scenario.prior_kind == EXTERNAL_PRIOR:
+        external = float64s(search.external_prior)
+        return external[slot], external[search.width + slot]
+    if scenario.prior_kind == LOG_KIND:
+        day = recorded_day_at(scenario.prior, search.day)
+        p, rate = recorded_forecast(day, slot, search.second_of_day), day.decay_rate
+    else:
+        p, rate = process_forecast(process_at(scenario.prior, 0), search.hour, search.second_of_hour, slot)
+    return min(max(p, MIN_PROBABILITY), MAX_PROBABILITY), rate
+
+
+@kernel
+def init_prior(search: Any) -> None:
+    """Write the forecast of every slot into the full belief; none has been observed."""
+    scenario, width = scenario_at(search.scenario, 0), search.width
+    belief, p_occupied, n = float32s(search.belief), float32s(search.p_occupied), scenario.n_slots
+    if scenario.prior_kind == PROCESS_KIND:
+        _init_process_prior(search)
+    else:
+        for slot in range(n):
+            belief[FORECAST * width + slot], belief[DECAY_RATE * width + slot] = forecast_of(search, slot)
+    for slot in range(n):
+        p_occupied[slot] = belief[P_OBSERVED * width + slot] = belief[FORECAST * width + slot]
+        belief[OBSERVED_AT * width + slot] = NEVER_OBSERVED
+
+
+@kernel
+def _init_process_prior(search: Any) -> None:
+    """Write `forecast_of` all slots, with the marginals at the full hour computed before, by vector instructions."""
+    scenario, width, hour, second = (
+        scenario_at(search.scenario, 0), search.width, search.hour, search.second_of_hour,
+    )  # fmt: skip
+    process, n = process_at(scenario.prior, 0), scenario.n_slots
+    keep_hourly_marginals(process, hour)
+    factors, profiles = float64s(process.factors), float64s(process.profiles)
+    start, belief = float64s(process.hourly_marginals), float32s(search.belief)
+    arriving, leaving = profiles[hour], profiles[WEEK_HOURS + hour]
+    for slot in range(n):
+        arrival = factors[slot] * arriving
+        rate = arrival + factors[n + slot] * leaving
+        p = marginal_later(start[hour * n + slot], arrival, rate, second)
+        belief[FORECAST * width + slot] = min(max(p, MIN_PROBABILITY), MAX_PROBABILITY)
+        belief[DECAY_RATE * width + slot] = rate

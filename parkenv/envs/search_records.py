@@ -1,0 +1,345 @@
+"""Scenarios and searches as records with named fields, for the compiled search."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from parkenv.errors import InputError
+from parkenv.world.lot import MOVES, PARK
+from parkenv.world.occupancy import IntArray, OccupancyModel, OccupancyProcess, PriorModel
+from parkenv.world.occupancy_kernel import CURSOR_FIELDS, PROCESS, RECORDED_DAY
+from parkenv.world.occupancy_log import weekday_of
+from parkenv.world.pointers import ADDRESS, address_of, record_at
+from parkenv.world.recorded_occupancy import RecordedOccupancy
+from parkenv.world.scenario import Scenario
+
+N_ACTIONS = PARK + 1
+PROCESS_KIND, LOG_KIND, EXTERNAL_PRIOR = range(3)
+"""Kinds of world and prior: a generating process; a replayed log; a forecast asked of Python at every arrival."""
+
+SCENARIO = np.dtype(
+    [
+        ("n_slots", np.int64),
+        ("exact_sensor", np.bool_),
+        ("failure_s", np.float64),
+        ("give_up_s", np.float64),
+        # When and where cars arrive: seconds of the day; (n_weekdays,) int64; (n_entries,) int64 vertices.
+        ("window_start", np.float64),
+        ("window_end", np.float64),
+        ("n_weekdays", np.int64),
+        ("weekdays", ADDRESS),
+        ("n_entries", np.int64),
+        ("entries", ADDRESS),
+        # What actions lead to, (n_vertices, 5) each: int64 vertices; float64 s; float64 m. Every action leads
+        # somewhere: one that the graph does not have, and parking, to where the car is.
+        ("targets", ADDRESS),
+        ("seconds", ADDRESS),
+        ("metres", ADDRESS),
+        # (n_vertices, 5) uint8, which actions the graph has.
+        ("action_masks", ADDRESS),
+        # (n_slots,) float64 of each slot: walk to the goal, s and m; cost of parking there, s.
+        ("walk_s", ADDRESS),
+        ("walk_m", ADDRESS),
+        ("parking_cost_s", ADDRESS),
+        # Slots in view of vertex v are viewed[view_starts[v]] to viewed[view_starts[v + 1]], excluded; int64 both.
+        ("view_starts", ADDRESS),
+        ("viewed", ADDRESS),
+        # Of each of `viewed`, float64: P(in sight), P(observed taken | taken), P(observed taken | free).
+        ("seen_rate", ADDRESS),
+        ("hit_rate", ADDRESS),
+        ("false_alarm_rate", ADDRESS),
+        # Of PROCESS_KIND: a PROCESS record. Of LOG_KIND: RECORDED_DAY records, one for each of `weekdays`.
+        ("world_kind", np.int64),
+        ("world", ADDRESS),
+        ("prior_kind", np.int64),
+        ("prior", ADDRESS),
+    ],
+    align=True,
+)
+"""What does not change while cars search in a scenario. Fields with addresses say to what arrays."""
+
+N_REGIONS = 4
+
+_PROGRESS = [
+    # Sums over the episode, s and m.
+    ("drive_s", np.float64),
+    ("failed_s", np.float64),
+    ("walk_s", np.float64),
+    ("parking_cost_s", np.float64),
+    ("gave_up_s", np.float64),
+    ("driven_m", np.float64),
+    ("walked_m", np.float64),
+    ("failed_parks", np.int64),
+    ("slots_passed", np.int64),
+    ("n_steps", np.int64),
+    # What the last step cost, s.
+    ("step_drive_s", np.float64),
+    ("step_failed_s", np.float64),
+    ("step_walk_s", np.float64),
+    ("step_parking_cost_s", np.float64),
+    ("step_gave_up_s", np.float64),
+    # Where things stand. Times are s since Monday 00:00.
+    ("vertex", np.int64),
+    ("previous_vertex", np.int64),
+    ("time", np.float64),
+    ("parked", np.bool_),
+    ("over", np.bool_),
+    # The world: index of the weekday or recorded day among the scenario's; hour of the week of the arrival, second of
+    # that hour and of that day.
+    ("key", np.uint64),
+    ("day", np.int64),
+    ("arrival", np.float64),
+    ("hour", np.int64),
+    ("second_of_hour", np.float64),
+    ("second_of_day", np.float64),
+    # What was observed: slots with a column in the tables; slots observed; of those, how many were free at first, and
+    # were expected to be; how many were taken when last observed.
+    ("n_columns", np.int64),
+    ("n_observed", np.int64),
+    ("n_observed_free", np.float64),
+    ("n_expected_free", np.float64),
+    ("n_known_taken", np.int64),
+    # For the local observation: forecast share of free slots in quarters of the lot; the best slot observed free,
+    # or -1.
+    ("free_by_region", np.float64, (N_REGIONS,)),
+    ("remembered_slot", np.int64),
+]
+_EPISODES = [("episode", np.int64), ("seed_state", np.uint64), ("clock", np.float32, (2,))]
+
+PROGRESS_FIELDS = tuple(str(entry[0]) for entry in _PROGRESS + _EPISODES)
+"""Fields of a SEARCH record that a search changes."""
+
+SEARCH = np.dtype(
+    [
+        *_PROGRESS,
+        # Number of the episode, and the mixed seed: together they give `key`.
+        *_EPISODES[:2],
+        # Time since Monday 00:00, and since the search began, as observed.
+        _EPISODES[2],
+        # What belongs to the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns;
+        # (2, width) float64 forecast and decay rate of an external prior, or 0.
+        ("scenario", ADDRESS),
+        ("blocks", ADDRESS),
+        ("slots", ADDRESS),
+        ("columns", ADDRESS),
+        ("external_prior", ADDRESS),
+        # Slots of the largest lot; (width,) float32 belief now, and (4, width) float32, the observation's `belief`, or
+        # 0 where these are not kept.
+        ("width", np.int64),
+        ("p_occupied", ADDRESS),
+        ("belief", ADDRESS),
+    ],
+    align=True,
+)
+"""A search under way."""
+
+SENTINEL = 0
+"""Column of all slots that have none of their own: nothing was observed there."""
+
+SLOT = np.dtype(
+    [
+        ("slot", np.int32),
+        *CURSOR_FIELDS,
+        ("observed", np.bool_),
+        ("observed_taken", np.bool_),
+        ("passed", np.bool_),
+    ],
+    align=True,
+)
+"""A slot with a column: its truth as in CURSOR; if it was observed, and taken at last; if the car stopped there."""
+
+BLOCK_BITS = 3
+BLOCK_SIZE = 1 << BLOCK_BITS
+BLOCK = np.dtype(
+    [
+        (name, np.float64, (BLOCK_SIZE,))
+        for name in ("prior", "decay_rate", "p_observed", "observed_at", "p_occupied")
+    ],
+    align=True,
+)
+"""The belief in 8 slots: forecast; decay rate, 1/s; after the last observation; its time, s; now.
+
+In blocks, the belief in 8 slots is updated by a few vector instructions, and what a search uses lies close together.
+"""
+
+FORECAST, DECAY_RATE, P_OBSERVED, OBSERVED_AT = range(4)
+"""The parts of the observation's `belief`."""
+NEVER_OBSERVED = -1.0
+"""`observed_at` of a slot that was not observed in this search."""
+
+scenario_at, search_at = record_at(SCENARIO), record_at(SEARCH)
+slot_at, block_at = record_at(SLOT), record_at(BLOCK)
+
+
+class ScenarioRecords:
+    """Scenarios as records, and the arrays that these point to.
+
+    Attributes:
+        records: (n,) of the dtype SCENARIO.
+
+    Raises:
+        InputError: an occupancy that is neither a process nor a log.
+    """
+
+    def __init__(self, scenarios: Sequence[Scenario]) -> None:
+        self._kept: list[Any] = []
+        self.records = np.zeros(len(scenarios), SCENARIO)
+        for record, scenario in zip(self.records, scenarios, strict=True):
+            self._write_search(record, scenario)
+            self._write_occupancy(record, scenario)
+
+    def _keep(self, values: ArrayLike, dtype: Any = np.float64) -> int:
+        array = np.ascontiguousarray(values, dtype)
+        self._kept.append(array)
+        return address_of(array, dtype)
+
+    def _write_search(self, record: np.void, scenario: Scenario) -> None:
+        lot, masks = scenario.lot, scenario.action_masks
+        targets = np.repeat(np.arange(lot.n_vertices)[:, None], N_ACTIONS, axis=1)
+        seconds = np.full(targets.shape, scenario.wait_s)
+        metres = np.zeros(targets.shape)
+        moves = masks[:, : len(MOVES)] == 1
+        targets[:, :PARK][moves] = lot.neighbors[moves]
+        seconds[:, :PARK][moves] = scenario.move_s[moves]
+        metres[:, :PARK][moves] = lot.edge_length[moves]
+        seconds[: lot.n_slots, PARK] = 0.0
+        entries = lot.entry_vertices if scenario.entry is None else lot.entry_vertices[[scenario.entry]]
+        starts, viewed = scenario.slots_in_view
+        rates = scenario.sensor_rates
+        numbers = {
+            "n_slots": lot.n_slots,
+            "exact_sensor": scenario.sensor_model.perfect,
+            "failure_s": scenario.failure_s,
+            "give_up_s": scenario.give_up_s,
+            "window_start": scenario.arrival.start_s,
+            "window_end": scenario.arrival.end_s,
+            "n_entries": len(entries),
+            "entries": self._keep(entries, np.int64),
+            "targets": self._keep(targets, np.int64),
+            "seconds": self._keep(seconds),
+            "metres": self._keep(metres),
+            "action_masks": self._keep(masks, np.uint8),
+            "walk_s": self._keep(scenario.walk_s),
+            "walk_m": self._keep(lot.walk_m(scenario.goal)),
+            "parking_cost_s": self._keep(scenario.parking_cost_s),
+            "view_starts": self._keep(starts, np.int64),
+            "viewed": self._keep(viewed, np.int64),
+            "seen_rate": self._keep(rates.seen),
+            "hit_rate": self._keep(rates.hit),
+            "false_alarm_rate": self._keep(rates.false_alarm),
+        }
+        for name, value in numbers.items():
+            record[name] = value
+
+    def _write_occupancy(self, record: np.void, scenario: Scenario) -> None:
+        occupancy, prior = scenario.occupancy, scenario.prior
+        if isinstance(occupancy, RecordedOccupancy):
+            weekdays = [weekday_of(day) for day in occupancy.days_in(scenario.arrival)]
+        else:
+            weekdays = list(scenario.arrival.weekdays)
+        record["weekdays"], record["n_weekdays"] = self._keep(weekdays, np.int64), len(weekdays)
+        record["world_kind"], record["world"] = self._kind_and_address(occupancy, scenario)
+        if record["world_kind"] == EXTERNAL_PRIOR:
+            raise InputError(
+                f"occupancy is a {type(occupancy).__name__}, want an OccupancyProcess or a RecordedOccupancy"
+            )
+        if prior is None or prior is occupancy:
+            record["prior_kind"], record["prior"] = record["world_kind"], record["world"]
+        elif isinstance(prior, OccupancyProcess):
+            record["prior_kind"], record["prior"] = self._kind_and_address(prior, scenario)
+        else:
+            record["prior_kind"] = EXTERNAL_PRIOR
+
+    def _kind_and_address(self, model: OccupancyModel | PriorModel, scenario: Scenario) -> tuple[int, int]:
+        if isinstance(model, OccupancyProcess):
+            self._kept.append(model)
+            return PROCESS_KIND, address_of(model.record, PROCESS)
+        if isinstance(model, RecordedOccupancy):
+            self._kept += [model, days := model.day_records(model.days_in(scenario.arrival))]
+            return LOG_KIND, address_of(days, RECORDED_DAY)
+        return EXTERNAL_PRIOR, 0
+
+
+class Searches:
+    """Searches under way, one or many, as records, and the arrays that these point to.
+
+    Args:
+        scenarios: what they are in.
+        scenario_of: (n,) index into `scenarios` for each search.
+        full_belief: whether to keep `p_occupied` and `belief` up to date.
+
+    Attributes:
+        records: (n,) of the dtype SEARCH.
+        slots: (n, m + 1) of the dtype SLOT, a column for each slot that a search has had to do with, in order; the
+            first is the sentinel's. m is the number of slots of the largest lot.
+        external_prior: (n, 2, m) float64, forecast and decay rate of priors that only Python can compute; else
+            (0, 2, 0).
+        p_occupied: (n, m) float32, belief in every slot now; (0, 0) if not kept.
+        belief: (n, 4, m) float32: forecast, decay rate, belief after the last observation, time of it; (0, 4, 0) if
+            not kept.
+    """
+
+    def __init__(self, scenarios: ScenarioRecords, scenario_of: IntArray, full_belief: bool) -> None:
+        n, m = len(scenario_of), int(scenarios.records["n_slots"].max())
+        external = bool((scenarios.records["prior_kind"] == EXTERNAL_PRIOR).any())
+        self.scenarios = scenarios
+        self.records = np.zeros(n, SEARCH)
+        self.slots = np.zeros((n, m + 1), SLOT)
+        self._blocks = np.zeros((n, (m + BLOCK_SIZE) >> BLOCK_BITS), BLOCK)
+        # Zeros, which are the sentinel's: memory that nobody writes to is not even taken from the system.
+        self._columns = np.zeros((n, m), np.int32)
+        self.external_prior = np.zeros((n, 2, m) if external else (0, 2, 0))
+        # Past the last slot of a smaller lot: taken, constant, never observed.
+        self.p_occupied = np.ones((n, m) if full_belief else (0, 0), np.float32)
+        self.belief = np.zeros((n, 4, m) if full_belief else (0, 4, 0), np.float32)
+        self.belief[:, [FORECAST, P_OBSERVED]] = 1.0
+        self.belief[:, OBSERVED_AT] = NEVER_OBSERVED
+        self.records["width"] = m
+        self.records["scenario"] = address_of(scenarios.records, SCENARIO) + scenario_of * SCENARIO.itemsize
+        for name, array in self._arrays().items():
+            first = address_of(array, array.dtype)
+            self.records[name] = first + np.arange(n) * array.strides[0] if len(array) else 0
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays with a row for each search, by the fields of SEARCH that hold the addresses of the rows."""
+        return {
+            "slots": self.slots,
+            "blocks": self._blocks,
+            "columns": self._columns,
+            "external_prior": self.external_prior,
+            "p_occupied": self.p_occupied,
+            "belief": self.belief,
+        }
+
+    @property
+    def address(self) -> int:
+        """Address of the records, for compiled code; valid while this object lives."""
+        return address_of(self.records, SEARCH)
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory of the searches, without the scenarios' tables, which they share."""
+        return sum(array.nbytes for array in (self.records, *self._arrays().values()))
+
+    def save(self) -> tuple[NDArray[Any], ...]:
+        """Return copies of all that a search changes."""
+        return (self.records.copy(), *(array.copy() for array in self._arrays().values()))
+
+    def restore(self, saved: tuple[NDArray[Any], ...]) -> None:
+        """Continue from what `save` of searches in the same scenarios returned.
+
+        Raises:
+            InputError: another number of slots.
+        """
+        records, *arrays = saved
+        width = int(records["width"][0])
+        if width != self.records["width"][0]:
+            raise InputError(f"state is of a lot with {width} slots, this one has {self.records['width'][0]}")
+        for name in PROGRESS_FIELDS:
+            self.records[name] = records[name]
+        for mine, array in zip(self._arrays().values(), arrays, strict=True):
+            mine[...] = array

@@ -1,0 +1,105 @@
+"""What a lot file contains: its valid features, and the errors of the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from parkenv.lots.generators import Slots, bay_row
+from parkenv.world.drive_graph import GraphError, build_drive_graph, linestrings
+from parkenv.world.lot import Lane, mouth_points
+
+FloatArray = NDArray[np.float64]
+
+KINDS = {
+    "slot": ("Polygon",),
+    "lane": ("LineString",),
+    "entry": ("Point",),
+    "goal": ("Point",),
+    "wall": ("LineString", "Polygon"),
+}
+"""The kinds of features, and the geometry types allowed for each."""
+
+
+@dataclass(frozen=True)
+class LotProblem:
+    """An error or warning about a lot file; `feature` is the 0-based index in the FeatureCollection."""
+
+    severity: Literal["error", "warning"]
+    feature: int | None
+    message: str
+
+    def __str__(self) -> str:
+        where = "" if self.feature is None else f"feature {self.feature}: "
+        return f"{self.severity}: {where}{self.message}"
+
+
+@dataclass
+class LotContents:
+    """The valid features of a file; `numbers[kind]` are their feature numbers, `errors` the faults of the others."""
+
+    name: str
+    slot_ids: list[str] = field(default_factory=list)
+    slots: Slots = field(default_factory=lambda: bay_row((0.0, 0.0), 0.0, 0))
+    lanes: list[Lane] = field(default_factory=list)
+    entries: list[FloatArray] = field(default_factory=list)
+    goals: list[FloatArray] = field(default_factory=list)
+    walls: list[FloatArray] = field(default_factory=list)
+    numbers: dict[str, list[int]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
+    errors: list[LotProblem] = field(default_factory=list)
+
+    def columns(self) -> dict[str, Any]:
+        """The keyword arguments that `ParkingLot` takes."""
+        return {
+            "name": self.name,
+            "slot_ids": tuple(self.slot_ids),
+            **self.slots.columns(),
+            "lanes": tuple(self.lanes),
+            "entries": np.array(self.entries),
+            "goals": np.array(self.goals),
+            "walls": tuple(self.walls),
+        }
+
+    def error(self, feature: int | None, message: str) -> None:
+        """Record an error of a feature, or of the file as a whole."""
+        self.errors.append(LotProblem("error", feature, message))
+
+
+def graph_errors(contents: LotContents) -> list[LotProblem]:
+    """Errors of the drive graph: slots and entries that no lane serves, junctions of too many lanes."""
+    lanes = [(lane.points, lane.oneway) for lane in contents.lanes]
+    if not lanes:
+        return []
+    slots = contents.slots
+    mouth_xy = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+    left = {"slot": np.arange(len(slots)), "entry": np.arange(len(contents.entries))}
+    entries = np.array(contents.entries).reshape(-1, 2)
+    errors = []
+    while True:
+        # Faulty features are left out and the rest is tried again, so that all faults are found.
+        try:
+            build_drive_graph(lanes, mouth_xy[left["slot"]], entries[left["entry"]])
+        except GraphError as error:
+            kind = error.problems[0].kind
+            for problem in error.problems:
+                if kind == "junction":
+                    distance = shapely.distance(
+                        linestrings([points for points, _ in lanes]), shapely.Point(problem.xy)
+                    )
+                    feature = contents.numbers["lane"][int(np.argmin(distance))]
+                    message = f"lane: the junction {problem.message}"
+                else:
+                    index = left[kind][problem.index]
+                    feature = contents.numbers[kind][index]
+                    name = f"slot {contents.slot_ids[index]!r:.40}" if kind == "slot" else kind
+                    message = f"{name} {problem.message}"
+                errors.append(LotProblem("error", feature, message))
+            if kind == "junction":
+                return errors
+            left[kind] = np.delete(left[kind], [problem.index for problem in error.problems])
+        else:
+            return errors

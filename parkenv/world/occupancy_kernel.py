@@ -1,0 +1,306 @@
+"""Whether a slot is taken at a time, compiled: the one place where the hidden truth is computed.
+
+There are two kinds of worlds. In a process, every slot is a two-state Markov chain whose random numbers are a pure
+function of (key, slot, sojourn), so a state can be computed for any slot at any time in any order. A recorded day is
+read off a log. The worlds of `parkenv.world`, the search environment and its batch all call these functions.
+
+A *sojourn* is a stretch of time in which the state of a slot does not change.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from parkenv.world.decay import decay_factor
+from parkenv.world.keyed_random import OCCUPANCY_STREAM, keyed_exponential, keyed_uniform
+from parkenv.world.pointers import ADDRESS, float64s, int64s, record_at, uint8s
+from parkenv.world.week import DAY_HOURS, DAY_S, HOUR_S, WEEK_HOURS, WEEK_S, hour_of_week
+from sim_sensors.compilation import compiled
+
+# No forecast is certain: a planner must be able to recover from a wrong one.
+MIN_PROBABILITY = 0.001
+MAX_PROBABILITY = 0.999
+
+PRIOR_DAYS = 1.0
+"""Weight, in days, of the lot's mean in a slot's forecast from a log."""
+
+_NEVER_WEEKS = 1e9
+_FORGOTTEN = 1e-17
+# The lower bound of a sojourn's end is taken this much earlier than computed, for rounding.
+_SAFE = 1.0 - 1e-6
+_MOMENT_S = 1e-6
+
+# Without numba's reference counting, which would take most of a step's time: no kernel allocates anything.
+kernel = compiled(error_model="numpy", _nrt=False)
+inlined = compiled(error_model="numpy", _nrt=False, forceinline=True)
+
+PROCESS = np.dtype(
+    [
+        ("n_slots", np.int64),
+        ("factors", ADDRESS),
+        ("profiles", ADDRESS),
+        ("hazards", ADDRESS),
+        ("hourly_marginals", ADDRESS),
+    ],
+    align=True,
+)
+"""An `OccupancyProcess`: addresses of its arrays. Rows of the first three are the states that are left.
+
+factors (2, n_slots); profiles (2, 168), 1/s; hazards (2, 169), the profiles summed up from Monday 00:00, at full hours;
+hourly_marginals (168, n_slots), P(taken) at full hours, computed when first needed; 0 before. All float64.
+"""
+
+RECORDED_DAY = np.dtype(
+    [
+        ("midnight", np.float64),
+        ("decay_rate", np.float64),
+        ("n_records", np.float64),
+        ("log_slot", ADDRESS),
+        ("record", ADDRESS),
+        ("share", ADDRESS),
+        ("lot_share", ADDRESS),
+        ("n_days", ADDRESS),
+        ("first", ADDRESS),
+        ("from_s", ADDRESS),
+        ("occupied", ADDRESS),
+    ],
+    align=True,
+)
+"""A day of a log that is replayed on a lot: fields of `MappedLog` and `OccupancyLog`, and midnight, s since Monday."""
+
+CURSOR_FIELDS = [
+    ("sojourn", np.int32),
+    ("since", np.float64),
+    ("valid_until", np.float64),
+    ("occupied", np.bool_),
+    ("end_known", np.bool_),
+]
+CURSOR = np.dtype(CURSOR_FIELDS, align=True)
+"""What has been computed of one slot's truth.
+
+sojourn: number of the sojourn, from 1; 0 before anything was computed. since: its begin, s. valid_until: s, the state
+surely lasts until then, and ends exactly then if end_known. Other records with these fields serve as well.
+"""
+
+process_at, recorded_day_at, cursor_at = record_at(PROCESS), record_at(RECORDED_DAY), record_at(CURSOR)
+
+
+@kernel
+def process_state(
+    process: Any,
+    key: np.uint64,
+    arrival: float,
+    hour: int,
+    second: float,
+    slot: int,
+    cursor: Any,
+    time: float,
+) -> bool:
+    """Return whether a slot of a process is taken, and move its cursor to the sojourn that holds `time`.
+
+    Args:
+        process: a PROCESS record.
+        key: of the world.
+        arrival: when the world begins, s since Monday 00:00.
+        hour: of the week, of the arrival.
+        second: of that hour.
+        slot: index of the slot.
+        cursor: its cursor, changed in place.
+        time: s, not before the cursor's sojourn began.
+    """
+    if cursor.sojourn == 0:
+        _enter_first_sojourn(process, key, arrival, hour, second, slot, cursor)
+    while time >= cursor.valid_until:
+        if cursor.end_known:
+            cursor.since = cursor.valid_until
+            cursor.occupied = not cursor.occupied
+            cursor.sojourn += 1
+            cursor.end_known = False
+        find_sojourn_end(process, key, slot, cursor)
+    return bool(cursor.occupied)
+
+
+@kernel
+def _enter_first_sojourn(
+    process: Any, key: np.uint64, arrival: float, hour: int, second: float, slot: int, cursor: Any
+) -> None:
+    """Draw the state at the arrival from the marginal, and bound its end from below."""
+    p, _ = process_forecast(process, hour, second, slot)
+    occupied = keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < p
+    cursor.sojourn, cursor.since, cursor.occupied, cursor.end_known = 1, arrival, occupied, False
+    # The sojourn ends when its hazard reaches -log(u), which is more than 1 - u; until the hour ends the rate is
+    # constant. Mostly this bound is late enough, and spares us the exact end.
+    state = 1 if occupied else 0
+    factor = float64s(process.factors)[state * process.n_slots + slot]
+    rate = factor * float64s(process.profiles)[state * WEEK_HOURS + hour]
+    lasts = HOUR_S - second
+    hazard = (1.0 - keyed_uniform(key, OCCUPANCY_STREAM, slot, 1)) * _SAFE
+    if hazard < rate * lasts:
+        lasts = hazard / rate
+    cursor.valid_until = arrival + lasts - _MOMENT_S
+
+
+@kernel
+def find_sojourn_end(process: Any, key: np.uint64, slot: int, cursor: Any) -> None:
+    """Compute exactly when the cursor's sojourn ends, unless that is known."""
+    if cursor.end_known:
+        return
+    state = 1 if cursor.occupied else 0
+    factor = float64s(process.factors)[state * process.n_slots + slot]
+    profile = process.profiles + state * WEEK_HOURS * 8
+    hazards = process.hazards + state * (WEEK_HOURS + 1) * 8
+    end = np.inf
+    if factor * float64s(hazards)[WEEK_HOURS] > 0.0:
+        hazard = keyed_exponential(key, OCCUPANCY_STREAM, slot, np.int64(cursor.sojourn)) / factor
+        end = _time_after(profile, hazards, cursor.since, hazard)
+    cursor.valid_until, cursor.end_known = end, True
+
+
+@kernel
+def _time_after(profile: int, hazards: int, since: float, hazard: float) -> float:
+    """Return when the hazard of a slot of factor 1, gathered from `since` on, reaches `hazard`.
+
+    Args:
+        profile: address of (168,) rates, 1/s.
+        hazards: address of (169,) sums; the last must be above 0.
+        since: s.
+        hazard: no unit.
+    """
+    rates, sums = float64s(profile), float64s(hazards)
+    week, hour, second = hour_of_week(since)
+    target = sums[hour] + rates[hour] * second + hazard
+    more_weeks = np.floor(target / sums[WEEK_HOURS])
+    if not more_weeks < _NEVER_WEEKS:
+        return np.inf
+    rest = target - more_weeks * sums[WEEK_HOURS]
+    # sums[hour] < rest <= sums[hour + 1], hence a positive rate, but for rounding at the ends.
+    hour = min(max(_count_below(hazards, 0, WEEK_HOURS + 1, rest, False) - 1, 0), WEEK_HOURS - 1)
+    second = min((rest - sums[hour]) / rates[hour], HOUR_S) if rates[hour] > 0.0 else 0.0
+    end: float = max((week + more_weeks) * WEEK_S + hour * HOUR_S + second, since)
+    return end
+
+
+@kernel
+def _count_below(address: int, begin: int, end: int, value: float, equal_too: bool) -> int:
+    """Return how many of the ascending float64 from `begin` to `end` are below `value`, or equal to it as well."""
+    # Bisection by hand: numpy's, in compiled code, takes half a second to compile.
+    values, low, high = float64s(address), begin, end
+    while low < high:
+        middle = (low + high) >> 1
+        if values[middle] < value or (equal_too and values[middle] == value):
+            low = middle + 1
+        else:
+            high = middle
+    return low - begin
+
+
+@inlined
+def process_forecast(process: Any, hour: int, second: float, slot: int) -> tuple[float, float]:
+    """Return P(taken) of a slot at a second of an hour of the week, and its decay rate there, 1/s."""
+    n = process.n_slots
+    factors, profiles = float64s(process.factors), float64s(process.profiles)
+    start = float64s(process.hourly_marginals)[hour * n + slot]
+    if start == 0.0:
+        start = _marginal_at_hour(process, hour, slot)
+    arrival = factors[slot] * profiles[hour]
+    rate = arrival + factors[n + slot] * profiles[WEEK_HOURS + hour]
+    return marginal_later(start, arrival, rate, second), rate
+
+
+@inlined
+def marginal_later(start: float, arrival: float, rate: float, second: float) -> float:
+    """Return P(taken) `second` s after it was `start`; rates of arrival, and of arrival plus departure, constant."""
+    equilibrium = arrival / rate if rate > 0.0 else 0.0
+    return float(equilibrium + (start - equilibrium) * decay_factor(rate * second))
+
+
+@kernel
+def _marginal_at_hour(process: Any, now: int, slot: int) -> float:
+    """Compute and keep P(taken) when hour `now` of the week begins.
+
+    It is the periodic regime of p' = λ(t)(1-p) - μ(t)p. The affine map over the week that ends at `now` is gathered
+    backwards, latest hour first, so it stops as soon as the past is forgotten. A slot that never changes has no
+    regime; it gets 0.5.
+    """
+    n = process.n_slots
+    factors, profiles = float64s(process.factors), float64s(process.profiles)
+    p, gain, gathered, forgotten = 0.0, 1.0, 0.0, False
+    for back in range(1, WEEK_HOURS + 1):
+        hour = (now - back) % WEEK_HOURS
+        arrival = factors[slot] * profiles[hour]
+        rate = arrival + factors[n + slot] * profiles[WEEK_HOURS + hour]
+        if rate > 0.0:
+            moved = -math.expm1(-rate * HOUR_S)
+            p += gain * (arrival / rate) * moved
+            gain *= 1.0 - moved
+            gathered += rate * HOUR_S
+            if gain < _FORGOTTEN:
+                forgotten = True
+                break
+    if not forgotten:
+        p = p / -math.expm1(-gathered) if gathered > 0.0 else 0.5
+    float64s(process.hourly_marginals)[now * n + slot] = p
+    return p
+
+
+@kernel
+def keep_hourly_marginals(process: Any, hour: int) -> None:
+    """Compute P(taken) of all slots at the beginning of an hour of the week, where that is not known yet."""
+    n = process.n_slots
+    start = float64s(process.hourly_marginals)
+    missing = 0
+    for slot in range(n):
+        missing += start[hour * n + slot] == 0.0
+    if missing > 0:
+        for slot in range(n):
+            if start[hour * n + slot] == 0.0:
+                _marginal_at_hour(process, hour, slot)
+
+
+@inlined
+def recorded_look(day: Any, slot: int, second: float) -> int:
+    """Return the index of the look of the log that tells the state of a slot at a second of a recorded day."""
+    record = int64s(day.record)[slot]
+    begin, end = int64s(day.first)[record], int64s(day.first)[record + 1]
+    look: int = begin + _count_below(day.from_s, begin, end, second, True) - 1
+    return look
+
+
+@kernel
+def recorded_state(day: Any, slot: int, cursor: Any, time: float) -> bool:
+    """Return whether a slot of a recorded day is taken, and move its cursor.
+
+    Args:
+        day: a RECORDED_DAY record.
+        slot: index of the lot's slot.
+        cursor: changed in place; its sojourn is not counted.
+        time: s since Monday 00:00.
+    """
+    look = recorded_look(day, slot, time - day.midnight)
+    record = int64s(day.record)[slot]
+    last = look + 1 >= int64s(day.first)[record + 1]
+    cursor.occupied = uint8s(day.occupied)[look] != 0
+    cursor.valid_until = np.inf if last else float64s(day.from_s)[look + 1] + day.midnight - _MOMENT_S
+    return bool(cursor.occupied)
+
+
+@kernel
+def recorded_forecast(day: Any, slot: int, second: float) -> float:
+    """Return P(taken) of a slot at a second of a recorded day, from the hour around it on the other days.
+
+    The mean of the days that the world does not replay is shrunk by a Beta prior worth `PRIOR_DAYS` to the mean of all
+    slots of the log.
+    """
+    share, lot_share = float64s(day.share), float64s(day.lot_share)
+    log_slot = int64s(day.log_slot)[slot]
+    low, high = max(second - HOUR_S / 2, 0.0), min(second + HOUR_S / 2, DAY_S)
+    taken = in_all = 0.0
+    for hour in range(int(low // HOUR_S), min(int(high // HOUR_S), DAY_HOURS - 1) + 1):
+        weight = (min((hour + 1) * HOUR_S, high) - max(hour * HOUR_S, low)) / (high - low)
+        taken += weight * share[log_slot * DAY_HOURS + hour]
+        in_all += weight * lot_share[hour]
+    p = (taken + PRIOR_DAYS * in_all / day.n_records) / (int64s(day.n_days)[log_slot] + PRIOR_DAYS)
+    return float(min(max(p, MIN_PROBABILITY), MAX_PROBABILITY))
