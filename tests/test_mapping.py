@@ -296,7 +296,7 @@ def test_a_session_is_written_once(mini, tmp_path):
 _WRITER = """
 import sys, numpy as np
 from pathlib import Path
-from parkenv import ParkingLot
+from parkenv.lots import packaged_lot
 from parkenv.mapping.store import MapStore, Session
 lot = packaged_lot("mini")
 with MapStore(Path(sys.argv[1]), lot) as store:

@@ -1,14 +1,16 @@
 """A price on slots counts like the walk, for the solvers, the planners, the bound and the heuristics."""
 
+import json
 from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import parkenv as command
 from small_lots import features
 
 from parkenv import OccupancyProcess, ParkingLot, Scenario
-from parkenv.lots import packaged_lot
+from parkenv.lots import packaged_lot, write_lot
 from planners import ParkingMDP, label_setting, make_agent, policy_iteration, value_iteration
 from planners.agent import ClairvoyantAgent
 from planners.bounds.oracle import best_slot
@@ -28,19 +30,22 @@ def empty_lot(lot):
     return Scenario(name="empty", lot=lot, occupancy=occupancy, prior=prior)
 
 
-def parked_at(agent, scenario):
-    """The slot in which a search ends."""
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
-    observation, _ = env.reset(seed=0)
+def search(agent, env, seed=0):
+    """The slot in which a search ends, and its total time."""
+    observation, _ = env.reset(seed=seed)
     state = env.unwrapped.state
     if isinstance(agent, ClairvoyantAgent):
         agent.prepare(state.world, state.time)
     memory, over = None, False
     while not over:
         action, memory = agent.predict(observation, memory)
-        observation, _, over, _, _ = env.step(action)
+        observation, _, over, _, info = env.step(action)
     assert state.parked
-    return state.vertex
+    return state.vertex, info["total_s"]
+
+
+def parked_at(agent, scenario):
+    return search(agent, gym.make("parkenv/Search-v1", scenario=scenario))[0]
 
 
 @pytest.mark.parametrize(
@@ -97,3 +102,21 @@ def test_the_bound_counts_prices():
         total_s = np.array(free_at) - state.time + scenario.walk_s + scenario.lot.slot_parking_cost_s
         best = best_slot(scenario, routes, state.world, state.vertex, state.time)
         assert best.total_s == pytest.approx(total_s.min())
+        # The oracle waits in whole steps.
+        _, reached_s = search(make_agent("oracle", scenario), env, seed)
+        assert best.total_s - 1e-6 <= reached_s <= best.total_s + 2 * scenario.wait_s
+
+
+def test_a_comparison_shows_what_parking_cost(tmp_path):
+    lot = packaged_lot("mini")
+    write_lot(priced(lot, np.where(np.arange(lot.n_slots) % 2 == 0, 30.0, 5.0)), tmp_path / "dear.geojson")
+    done = command(
+        "compare", "--lot", tmp_path / "dear.geojson", "--agents", "mdp,greedy-goal", "--episodes", 5,
+        "--occupancy-levels", "none", "--no-figures", "--out", tmp_path / "run",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "parking" in done.stdout
+    for row in json.loads((tmp_path / "run" / "summary.json").read_text())["rows"]:
+        assert 4.0 < row["parking_cost_s"] <= 30.0
+        parts = sum(row[name] for name in ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s"))
+        assert row["total_s"] == pytest.approx(parts)

@@ -342,7 +342,7 @@ def test_park_writes_its_table_and_pictures(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--lot", "nowhere"], "nowhere: no such file"),
+        (["--lot", "nowhere"], "--lot is 'nowhere', want a packaged lot"),
         (["--kind", "diagonal"], "--kind has 'diagonal', want some of perpendicular, oblique, parallel"),
         (["--way", "up"], "--way has 'up', want some of nose-in, back-in"),
         (["--lot", "mini", "--kind", "parallel"], "'mini' has no slot of the kinds parallel"),

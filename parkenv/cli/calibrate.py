@@ -17,7 +17,12 @@ from parkenv.errors import InputError
 from parkenv.scenarios.build import build
 
 AgentOption = Annotated[
-    str, typer.Option("--agent", metavar="NAME", help="Who decides where to drive and park.")
+    str,
+    typer.Option(
+        "--agent",
+        metavar="NAME",
+        help="The agent that searches, with options in brackets: mdp(failure_s=90).",
+    ),
 ]
 NoticeOption = Annotated[
     float,
@@ -69,6 +74,7 @@ def calibrate(
 
     * `parkenv compare --calibrated results/calibrate/calibrated.json`
     """
+    from parkenv.evaluation.experiments.agent_spec import AgentSpec
     from parkenv.evaluation.experiments.experiment import agent_fingerprints, fingerprints, flat_tables
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.trips.calibration import (
@@ -94,7 +100,7 @@ def calibrate(
         "scenarios": {its.name: flat_tables(spec.model_dump(mode="json"))},
         "files": fingerprints(spec.files()), "agent": agent, "style": dataclasses.asdict(style),
         "rig": rig,
-        "traffic": dataclasses.asdict(its.traffic), "agent files": agent_fingerprints([agent]),
+        "traffic": dataclasses.asdict(its.traffic), "agent files": agent_fingerprints([AgentSpec.of(agent).name]),
     }  # fmt: skip
     folder = TripFolder(out, settings, resume=resume)
     console = make_console()

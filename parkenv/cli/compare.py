@@ -286,7 +286,7 @@ _DETAILS: tuple[Column, ...] = (
     ("drive", lambda r: _seconds(r["drive_s"])),
     ("failed", lambda r: _seconds(r["failed_s"])),
     ("walk", lambda r: _seconds(r["walk_s"])),
-    ("price", lambda r: _seconds(r["parking_cost_s"])),
+    ("parking", lambda r: _seconds(r["parking_cost_s"])),
     ("gave up", lambda r: _seconds(r["gave_up_s"])),
     ("parked", lambda r: f"{r['parked_fraction']:.0%}"),
     ("replans", lambda r: f"{r['replans']:.1f}"),
@@ -316,7 +316,7 @@ def result_tables(rows: list[Row], width: int) -> list[Table]:
             f"{max(r['episodes'] for r in its_rows)} searches"
         )
         costs = any(row["parking_cost_s"] for row in its_rows)
-        details = tuple(column for column in _DETAILS if costs or column[0] != "price")
+        details = tuple(column for column in _DETAILS if costs or column[0] != "parking")
         for columns in [results + details] if width >= WIDE else [results, details]:
             headings = ("agent", *(heading for heading, _ in columns))
             table = make_table(title if columns is not details else None, headings)

@@ -32,12 +32,15 @@ def park(
             "`parkenv train --env drive`.",
         ),
     ] = "planner",
-    lot: Annotated[
-        str,
+    scenario: Annotated[
+        str | None,
         typer.Option(
-            "--lot", help="Packaged lots (campus, jam, street, mini) or lot files, separated by commas."
+            "--scenario",
+            metavar="NAME|FILE[,...]",
+            help="Scenarios in whose lots the car parks: packaged ones, or scenario files.  [default: campus,street]",
         ),
-    ] = "campus,street",
+    ] = None,
+    lot: args.LotOption = None,
     kind: Annotated[
         str,
         typer.Option(
@@ -48,16 +51,18 @@ def park(
         str, typer.Option("--way", help="Orientation in the slot: nose-in, back-in; or both.")
     ] = "both",
     episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Episodes per lot.")] = 100,
-    occupancy: Annotated[
+    occupancy_level: Annotated[
         float,
-        typer.Option("--occupancy", min=0.0, max=1.0, help="Fraction of the other slots that are occupied."),
+        typer.Option(
+            "--occupancy-level", min=0.0, max=1.0, help="Fraction of the other slots that are occupied."
+        ),
     ] = 0.85,
     slack: Annotated[
         float,
         typer.Option("--slack", min=0.0, help="Distance around the slot kept clear of parked cars, m."),
     ] = 0.0,
     seed: args.SeedOption = 0,
-    jobs: args.JobsOption = 1,
+    jobs: args.JobsOption = 0,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Output folder for pictures, episodes.csv and summary.json.")
     ] = Path("results/park"),
@@ -68,7 +73,7 @@ def park(
     failures, if any; with several agents, into one folder per agent.
 
     Examples:
-    * `parkenv park --episodes 250 --lot campus,street,jam --jobs 2`
+    * `parkenv park --episodes 250 --scenario campus,street,jam`
 
     * `parkenv park --agents planner,sac:results/drive-sac/seed_0/model.zip`
 
@@ -77,14 +82,14 @@ def park(
     from parkenv.driving.parking_task import KINDS, WAYS
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, parking_table, write_parkings
-    from parkenv.lots import load_lot
+    from parkenv.scenarios.build import build
     from planners.driving.parking_agents import make_parking_agent
 
     kinds = None if kind == "all" else _chosen("--kind", kind, KINDS)
     ways = WAYS if way == "both" else _chosen("--way", way, WAYS)
     cases = []
-    for name in args.words("--lot", lot):
-        case = ParkingCase(load_lot(name), kinds, ways, occupancy, slack)
+    for spec in args.scenario_specs(scenario, lot=lot, default="campus,street"):
+        case = ParkingCase(build(spec).lot, kinds, ways, occupancy_level, slack)
         case.environment().close()  # validates the options before the first episode
         cases.append(case)
     labels = _labels(args.words("--agents", agents))

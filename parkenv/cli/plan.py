@@ -24,7 +24,13 @@ def plan(
     arrival: args.ArrivalOption = None,
     days: args.DaysOption = None,
     view_range: args.ViewRangeOption = None,
-    agent: Annotated[str, typer.Option("--agent", help="A planning agent: mdp or mdp-static.")] = "mdp",
+    agent: Annotated[
+        str,
+        typer.Option(
+            "--agent",
+            help="A planning agent, mdp or mdp-static, with options in brackets: mdp(failure_s=90).",
+        ),
+    ] = "mdp",
     failure_cost: args.FailureCostOption = None,
     v_walk_kmh: args.WalkOption = None,
     v_drive_kmh: args.DriveOption = None,
@@ -45,6 +51,7 @@ def plan(
     """
     import numpy as np
 
+    from parkenv.evaluation.experiments.agent_spec import AgentSpec
     from parkenv.evaluation.experiments.compare import Case, settings_of
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.experiments.spec import Grid
@@ -69,7 +76,8 @@ def plan(
             )
         )
     )  # fmt: skip
-    if not isinstance(make_agent(agent, base), StaticAgent):
+    named = AgentSpec.of(agent)
+    if not isinstance(make_agent(named.name, base, **named.options), StaticAgent):
         raise InputError(f"--agent {agent!r} makes no plan; known: mdp, mdp-static")
     make_folder(out)
 
@@ -89,9 +97,9 @@ def plan(
     rows, traces = [], []
     with console.status("Planning"):
         for setting in settings_of(base, grid.failure_s, grid.v_walk_kmh, grid.v_drive_kmh):
-            case = Case(setting, agent)
+            case = Case(setting, named.name, options=named.options)
             trace = case.trace(seed)
-            planner = make_agent(agent, setting)
+            planner = make_agent(named.name, setting, **named.options)
             assert isinstance(planner, StaticAgent)
             expected = planner.expected_time(trace.forecast)[trace.path[0]]
             slots = [

@@ -1,4 +1,4 @@
-"""What lies around the car, as a vector of the same length on every lot: for policies that go from lot to lot.
+"""The car's surroundings as a vector of the same length on every lot, for policies that transfer between lots.
 
 The vector has 46 + 8k numbers from 0 to 1. A time of s seconds is written as s / (s + 60), so that a minute is a half
 and what is far away or missing comes near, or to, 1. A chance of p is written as p. "Ahead" of a move are those k slots
@@ -8,14 +8,14 @@ nearest by drive to which the shortest drive from here begins with that move.
 |---|---|
 | 0 | whether there is a slot here |
 | 1 | chance that it is free; 0 where there is none |
-| 2 | walk from it to the goal; 1 where there is none |
+| 2 | walk from it to the goal, and its parking cost; 1 where there is none |
 | 3 | time since the search began |
-| 4 | how many slots have been seen, n / (n + 20) |
-| 5 | share of them that looked free when first seen |
-| 6 | share of them that was forecast to be free |
+| 4 | number of slots observed, n / (n + 20) |
+| 5 | share of them that were free when first observed |
+| 6 | share of them that were forecast to be free |
 | 7-10 | forecast share of free slots among the quarters of the lot by walk, nearest to the goal first |
-| 11 | chance that the remembered slot is free: of those seen free the one with the shortest drive and walk; 0 if none |
-| 12 | walk from it; 1 if there is none |
+| 11 | chance that the remembered slot is free: the one observed free with the shortest drive and walk; 0 if none |
+| 12 | walk from it and its parking cost; 1 if there is none |
 | 13 | drive to it as the crow flies; 1 if there is none |
 | 14 + 8a | for the moves a up, down, left, right: whether the graph has it |
 | 15 + 8a | its drive; 1 if there is none, as all times below |
@@ -23,12 +23,12 @@ nearest by drive to which the shortest drive from here begins with that move.
 | 17 + 8a | whether it leads back to where the car came from |
 | 18 + 8a | chance that at least one of the slots ahead is free |
 | 19 + 8a | expected drive and walk by way of the best free slot ahead; a minute more than the worst where none is |
-| 20 + 8a | share of the slots ahead that have been seen |
+| 20 + 8a | share of the slots ahead that were observed |
 | 21 + 8a | drive from there to the remembered slot as the crow flies |
 | 46 + 8i | for the k slots nearest by drive, nearest first: chance that it is free; 0 if there is none |
-| 47 + 8i | whether it has been seen |
+| 47 + 8i | whether it was observed |
 | 48 + 8i | drive to it; 1 if there is none |
-| 49 + 8i | walk from it; 1 if there is none |
+| 49 + 8i | walk from it and its parking cost; 1 if there is none |
 | 50 + 8i to 53 + 8i | whether the drive to it begins with up, down, left, right |
 """
 
@@ -112,7 +112,7 @@ class Surroundings(NamedTuple):
 
         Args:
             problems: with the lots.
-            k: slots that are told of, and that lie ahead of a move.
+            k: number of slots that are described, nearby and ahead of each move.
 
         Raises:
             InputError: k is not a whole number of at least 1.

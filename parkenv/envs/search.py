@@ -1,4 +1,4 @@
-"""`parkenv/Search-v1`: decide at every stop where to drive, or to park."""
+"""`parkenv/Search-v1`: decide at every vertex where to drive, or to park."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from parkenv.envs.search_control import SearchControl
-from parkenv.envs.search_kernel import begin_search, init_external_prior, step_search
+from parkenv.envs.search_kernel import begin_search, init_external_prior, step_exact, step_noisy
 from parkenv.envs.search_records import NEVER_OBSERVED, ScenarioRecords, Searches
 from parkenv.envs.search_state import SearchState
 from parkenv.errors import InputError
@@ -53,9 +53,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     """Find a free slot and walk from it to the goal, in as little time as possible.
 
     ## Description
-    A car comes into a parking lot. It knows the lot and how often each slot tends to be taken, sees the
-    slots near it as it drives past them, and decides at every stop where to go on, or to try to park
-    there. Slots fill and empty while it drives. After Bogoslavskyi's thesis (Freiburg 2014), §3.4.
+    A car searches a parking lot for a free slot. It knows the lot and an occupancy forecast for each slot, observes
+    the slots near it as it drives past them, and decides at every vertex of the drive graph where to drive, or to try
+    to park there. Slots fill and empty meanwhile. After Bogoslavskyi's thesis (Freiburg 2014), §3.4.
 
     ## Action space
     `Discrete(5)`
@@ -63,16 +63,16 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     | Num | Action | Effect |
     |-----|--------|--------|
     | 0-3 | up, down, left, right | drive along that edge of the graph; where there is none, wait `wait_s` |
-    | 4 | park | park and walk to the goal if the slot here is free; lose `failure_s` if it is taken |
+    | 4 | park | park and walk to the goal if the slot here is free; a failed attempt, `failure_s`, if it is taken |
 
-    Where there is no slot, parking is waiting, too.
+    Where there is no slot, parking means waiting, too.
 
     ## Observation space
     A `Dict`:
 
     | Key | Space | Meaning |
     |-----|-------|---------|
-    | `vertex` | `Discrete(n_vertices)` | where the car is; vertex i < n_slots lies before slot i |
+    | `vertex` | `Discrete(n_vertices)` | where the car is; vertex i < n_slots is the stop position of slot i |
     | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
     | `p_occupied` | `Box(0, 1, (n_slots,), float32)` | belief that each slot is taken, now |
     | `belief` | `Box((4 * n_slots,), float32)` | what `p_occupied` is computed from, four parts as below |
@@ -92,24 +92,25 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     `p_occupied = forecast + (p_observed - forecast) * exp(-decay_rate * (time[1] - observed_at))`.
 
     ## Rewards
-    Minus the seconds that the step took; parking adds minus the seconds of the walk, so the return is
-    minus the total time to the goal. `info["reward_terms"]` holds the terms `drive` (moving or waiting),
-    `failed` (tries at taken slots), `walk` and `gave_up`; they add up to the reward.
+    Minus the seconds that the step took. Parking adds minus the seconds of the walk and the parking cost of the slot
+    (`ParkingLot.slot_parking_cost_s`, 0 by default), so the return is minus the total time to the goal.
+    `info["reward_terms"]` holds the terms `drive` (moving or waiting), `failed` (failed attempts), `walk`, `parking`
+    (the slot's cost) and `gave_up`; they add up to the reward.
 
     ## Starting state
-    At the scenario's entry, at a time drawn from its arrival window. The first observation is the forecast
-    alone; slots are seen from the first step on, from wherever a step ends.
-    With `reset(seed=s)` arrival, entry and every slot's comings and goings are the same whatever the agent
-    does; later `reset()` calls go through further worlds of the same seed.
+    At the scenario's entry, at a time drawn from its arrival window. The first observation holds the forecast alone;
+    slots are observed from the first step on, from the vertex where a step ends.
+    `reset(seed=s)` fixes arrival, entry and the state of every slot at every time, whatever the agent does; later
+    `reset()` calls go through further worlds of the same seed.
 
     ## Episode end
-    - Terminated: parked; or the lot is *proven full*, that is every slot has been seen in this search and
-      looked taken at its last look. Then the driver goes elsewhere, which costs `give_up_s`.
+    - Terminated: parked; or the lot is *proven full*: every slot was observed in this search, and taken when last
+      observed. Then the driver parks elsewhere, for the give-up penalty `give_up_s`.
     - Truncated: after the step limit of the spec, 2000 (`max_episode_steps` of `gymnasium.make`).
 
-    At the end `info` holds drive_s, failed_s, walk_s, gave_up_s, total_s, driven_m, walked_m, failed_parks,
-    slots_passed (slots whose vertex was driven to) and parked. A wrapper's time limit is not part of
-    `get_state`: it goes on counting.
+    `info` holds the episode's metrics so far: drive_s, failed_s, walk_s, parking_cost_s, gave_up_s, total_s, driven_m,
+    walked_m, failed_parks, slots_passed (slots whose vertex the car stopped at) and parked. A wrapper's time limit is
+    not part of `get_state`: it keeps counting.
 
     ## Keys
     For `gymnasium.utils.play.play(env, wait_on_player=True, noop=4)` (needs the extra `human`): w, s, a, d drive up,
@@ -155,6 +156,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self.action_space = spaces.Discrete(len(ACTIONS))
         self.observation_space = search_space(lot.n_slots, lot.n_vertices)
         self._masks = list(self.scenario.action_masks)
+        self._step = step_exact if self.scenario.sensor_model.perfect else step_noisy
         self._vertices = list(np.arange(lot.n_vertices))
         self._renderer: SearchRenderer | None = None
         self._make_search()
@@ -166,7 +168,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self._address = self.searches.address
         self._state = SearchState(self.scenario, self.searches)
         self._control = SearchControl(self.searches)
-        # Methods that copy what is observed: looking them up takes as long as copying a little.
+        # Bound methods that copy what is observed: looking them up takes a tenth of a step.
         self._copy_time = self.searches.records["clock"][0].copy
         self._copy_p_occupied = self.searches.p_occupied[0].copy
         self._copy_belief = self.searches.belief[0].reshape(-1).copy
@@ -277,7 +279,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     def _advance(self, action: int) -> tuple[Any, ...]:
         """Act, observe, and return what `parkenv.envs.search_kernel.step_result` does."""
-        result: tuple[Any, ...] = step_search(self._address, action)
+        result: tuple[Any, ...] = self._step(self._address, action)
         return result
 
     def action_masks(self) -> NDArray[np.bool_]:
@@ -335,14 +337,16 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
     """What is observed in a lot of some size; see `SearchEnv`."""
     # Of forecast, decay_rate, p_observed, observed_at.
-    low, high = [0.0, 0.0, 0.0, NEVER_OBSERVED], [1.0, MAX_DECAY_RATE, 1.0, LATEST]
-    bounds = (np.repeat(np.array(row, np.float32), n_slots) for row in (low, high))
+    low, high = (
+        np.repeat(np.array(bounds, np.float32), n_slots)
+        for bounds in ([0.0, 0.0, 0.0, NEVER_OBSERVED], [1.0, MAX_DECAY_RATE, 1.0, LATEST])
+    )
     return spaces.Dict(
         {
             "vertex": spaces.Discrete(n_vertices),
             "time": spaces.Box(0.0, LATEST, (2,), np.float32),
             "p_occupied": spaces.Box(0.0, 1.0, (n_slots,), np.float32),
-            "belief": spaces.Box(*bounds, dtype=np.float32),
+            "belief": spaces.Box(low, high, dtype=np.float32),
             "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
         }
     )

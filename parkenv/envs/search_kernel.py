@@ -77,14 +77,29 @@ def init_external_prior(address: int) -> None:
     init_prior(search_at(address, 0))
 
 
+# One function for each kind of sensor: whoever has one kind need not compile the other.
+
+
 @kernel
-def step_search(address: int, action: int) -> tuple[Any, ...]:
-    """Take an action, one that there is, and update the full belief; returns as `step_result`."""
+def step_exact(address: int, action: int) -> tuple[Any, ...]:
+    """Take an action, one that there is, with an exact sensor; returns as `step_result`."""
     search = search_at(address, 0)
-    take_step(search, action)
-    refresh_belief(search)
-    tell_time(search)
-    return step_result(search)
+    drive_or_park(search, action)
+    if not search.parked:
+        observe_exact(search)
+    result: tuple[Any, ...] = complete_step(search)
+    return result
+
+
+@kernel
+def step_noisy(address: int, action: int) -> tuple[Any, ...]:
+    """Take an action, one that there is, with a noisy sensor; returns as `step_result`."""
+    search = search_at(address, 0)
+    drive_or_park(search, action)
+    if not search.parked:
+        observe_noisy(search)
+    result: tuple[Any, ...] = complete_step(search)
+    return result
 
 
 # ---- the parts of a step from Python, for environments that drive or observe in another way
@@ -140,11 +155,8 @@ def set_taken_in(address: int, slot: int) -> None:
 @kernel
 def finish_step_in(address: int) -> tuple[Any, ...]:
     """Add the step to the episode and update the full belief; returns as `step_result`."""
-    search = search_at(address, 0)
-    finish_step(search)
-    refresh_belief(search)
-    tell_time(search)
-    return step_result(search)
+    result: tuple[Any, ...] = complete_step(search_at(address, 0))
+    return result
 
 
 @kernel
@@ -163,6 +175,16 @@ def read_belief(
 
 
 # ---- an episode
+
+
+@inlined
+def complete_step(search: Any) -> tuple[Any, ...]:
+    """Add the step to the episode and update what is observed of it; returns as `step_result`."""
+    finish_step(search)
+    refresh_belief(search)
+    tell_time(search)
+    result: tuple[Any, ...] = step_result(search)
+    return result
 
 
 @inlined
@@ -221,7 +243,7 @@ def clear_slots(search: Any) -> None:
 
 @inlined
 def take_step(search: Any, action: int) -> None:
-    """Do everything that an action does; what it cost is in the fields `step_*`."""
+    """Do all that an action does, whatever the sensor; what it cost is in the fields `step_*`."""
     drive_or_park(search, action)
     if not search.parked:
         observe(search)
@@ -313,7 +335,7 @@ def observe_exact(search: Any) -> None:
 @kernel
 def observe_changed(search: Any, slot: int) -> int:
     """Observe the true state of a slot that may have changed; return its column."""
-    column = column_of(search, slot)
+    column: int = column_of(search, slot)
     taken = is_taken(search, column, search.time)
     set_belief(search, column, taken, 1.0 if taken else 0.0)
     return column
@@ -416,10 +438,12 @@ def decay_belief(search: Any) -> None:
 
 
 @inlined
-def column_of(search: Any, slot: int) -> int:
+def column_of(search: Any, slot: int) -> Any:
     """Return the column of a slot, a new one if it has none."""
     column = np.int64(int32s(search.columns)[slot])
-    return add_column(search, slot) if column == SENTINEL else column
+    if column == SENTINEL:
+        column = add_column(search, slot)
+    return column
 
 
 @kernel

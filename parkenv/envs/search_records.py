@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from parkenv.errors import InputError
 from parkenv.world.lot import MOVES, PARK
 from parkenv.world.occupancy import IntArray, OccupancyModel, OccupancyProcess, PriorModel
-from parkenv.world.occupancy_kernel import CURSOR, PROCESS, RECORDED_DAY
+from parkenv.world.occupancy_kernel import CURSOR_FIELDS, PROCESS, RECORDED_DAY
 from parkenv.world.occupancy_log import weekday_of
 from parkenv.world.pointers import ADDRESS, address_of, record_at
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -143,7 +143,7 @@ SENTINEL = 0
 SLOT = np.dtype(
     [
         ("slot", np.int32),
-        *((name, CURSOR.fields[name][0]) for name in CURSOR.names or ()),
+        *CURSOR_FIELDS,
         ("observed", np.bool_),
         ("observed_taken", np.bool_),
         ("passed", np.bool_),

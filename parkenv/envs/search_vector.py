@@ -1,4 +1,4 @@
-"""Many searches at once, compiled: the `vector_entry_point` of `parkenv/Search-v1`."""
+"""A compiled batch of searches: the `vector_entry_point` of `parkenv/Search-v1`."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def step_local(
 
 @kernel
 def first_wrong(actions: IntArray) -> int:
-    """The first action's index that is none, or -1."""
+    """Return the index of the first number that is no action, or -1."""
     for e in range(len(actions)):
         if not 0 <= actions[e] < N_ACTIONS:
             return e
@@ -200,20 +200,20 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     ## Episode end
     As in `parkenv/Search-v1`; truncated after `max_episode_steps`. What then happens is `autoreset_mode`: NEXT_STEP,
-    whatever is done in the next step begins a new search, for a reward of 0; SAME_STEP, a new search begins at once,
-    and the last observations and infos are `info["final_obs"]` and `info["final_info"]`; DISABLED, those to begin anew
-    are named in `reset(options={"reset_mask": ...})`. Where a search ends, `info` has its metrics, as the single
-    environment's, with `_drive_s` and so on saying which searches they are of.
+    the next step ignores the action and begins a new search, with a reward of 0; SAME_STEP, a new search begins at
+    once, and the last observations and infos are `info["final_obs"]` and `info["final_info"]`; DISABLED, the searches
+    to reset are named in `reset(options={"reset_mask": ...})`. Where a search ends, `info` has its metrics, as the
+    single environment's; `_drive_s` and so on say which searches they are of.
 
     ## Arguments
-    - `num_envs`: how many.
+    - `num_envs`: number of environments.
     - `scenario`: a `Scenario` or the name of a packaged one; or a sequence of such, of which search i gets the one at
       i modulo their number.
     - `observation`: full, occupancy or local.
-    - `k`: how many slots `local` tells of.
+    - `k`: number of slots that `local` describes.
     - `max_episode_steps`: 2000 from `make_vec`.
     - `autoreset_mode`: NEXT_STEP, SAME_STEP or DISABLED of `gymnasium.vector.AutoresetMode`, or its value.
-    - `copy`: False hands out arrays that the next step overwrites, and saves their copying.
+    - `copy`: False returns arrays that the next step overwrites, which saves their copying.
     - further keywords replace fields of the scenarios, e.g. `failure_s=90.0`.
 
     ```python
@@ -310,7 +310,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     @property
     def bytes_each(self) -> float:
-        """Memory of one search, bytes, in a lot of whose slots all have been looked at; the tables are shared."""
+        """Memory of one search, bytes, once all slots of its lot were observed; the scenarios' tables are shared."""
         own = (a for name, a in self._seen.items() if name not in ("p_occupied", "belief"))
         return (self._searches.n_bytes + sum(a.nbytes for a in (*own, *self._steps))) / self.num_envs
 
@@ -320,11 +320,12 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         """Start a search in every environment, or in those of `options["reset_mask"]`, (n_envs,) bool.
 
         Args:
-            seed: the first one's, counted up from there; or one for each, None to go on; or None to go on.
+            seed: of the first environment, the next ones counting up from it; or a sequence with one for each, where
+                None continues with the next world of the environment's seed; or None, which does so for all.
             options: nothing but `reset_mask`.
 
         Raises:
-            InputError: another option, or as many seeds as there are no environments.
+            InputError: an unknown option, or a number of seeds that is not the number of environments.
         """
         which = self._chosen(options)
         if seed is None or isinstance(seed, (int, np.integer)):
@@ -396,7 +397,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return self._observations(), *results, info
 
     def _step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
-        """Begin the searches that are fresh, leave the idle ones alone, step the others."""
+        """Begin the searches that are fresh, skip the idle ones, step the others."""
         seen, steps = self._seen, self._steps
         if self._surroundings is None:
             step_full(

@@ -1,6 +1,6 @@
 """Random numbers that are a pure function of (key, stream, slot, index).
 
-Nothing is stored between draws, so a world does not depend on who looks, at which slot, or in which order.
+Nothing is stored between draws, so a world does not depend on which slots are observed, or in which order.
 The mixing function is the finaliser of SplitMix64 (Steele, Lea, Flood, "Fast splittable pseudorandom number
 generators", OOPSLA 2014), applied once for each of stream, slot and index.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from parkenv.errors import InputError
 from sim_sensors.compilation import compiled
 
-# What the numbers are for; two purposes must not share a stream.
+# One stream for each purpose, so that their numbers are independent.
 ARRIVAL_STREAM = 0
 OCCUPANCY_STREAM = 1
 ENTRY_STREAM = 2
@@ -74,14 +74,14 @@ def _absorbed(state: np.uint64, word: np.uint64) -> np.uint64:
 
 @compiled
 def episode_key(seed_state: np.uint64, episode: int) -> np.uint64:
-    """Key of a world, from `seed_state` and an episode number below 2**64 (compiled; for batches too)."""
+    """Return the key of a world, from `seed_state` and an episode number below 2**64."""
     # The number of words goes in first, so that no two (seed, episode) pairs spell the same words.
     key: np.uint64 = _absorbed(_absorbed(seed_state, np.uint64(1)), np.uint64(episode))
     return key
 
 
 def seed_state(seed: int) -> np.uint64:
-    """What is mixed of a seed, a non-negative integer of any size, before the episode number."""
+    """Return the state after mixing a seed, a non-negative integer of any size, before the episode number."""
     return _with_words(np.uint64(0), "seed", seed)
 
 

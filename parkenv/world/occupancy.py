@@ -1,4 +1,4 @@
-"""Which slots are taken when: the contracts of a world, and a process that generates worlds.
+"""Which slots are taken when: the protocols of worlds and forecasts, and a process that generates worlds.
 
 Times are seconds since Monday 00:00 of the scenario's week; rates are 1/s.
 """
@@ -115,11 +115,11 @@ class Arrival:
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """What is known of a lot before anything has been seen.
+    """What is known of a lot before anything was observed.
 
     Args:
         p_occupied: (n,) float64, probability at the arrival.
-        decay_rate: (n,) float64, 1/s, arrival rate plus departure rate: how fast a sighting goes stale.
+        decay_rate: (n,) float64, 1/s, arrival rate plus departure rate: how fast an observation loses its value.
     """
 
     p_occupied: FloatArray
@@ -140,18 +140,18 @@ class World(Protocol):
 
 
 class PriorModel(Protocol):
-    """Says what can be known beforehand."""
+    """Forecasts occupancy."""
 
     @property
     def n_slots(self) -> int:
         """Number of slots."""
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """What is known at the arrival; it never peeks at the world."""
+        """Return what is known at the arrival; it does not depend on the world."""
 
 
 class OccupancyModel(PriorModel, Protocol):
-    """Draws arrivals and worlds, and says what can be known beforehand."""
+    """Draws arrivals and worlds, and forecasts occupancy."""
 
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
         """The arrival of the episode with this key."""
@@ -304,14 +304,14 @@ class OccupancyProcess:
         return OccupancyProcess, tuple(getattr(self, name) for name in _FIELDS)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "OccupancyProcess":
-        return self  # immutable: copies of a world share it
+        return self  # immutable: copies share it
 
     @classmethod
     def from_demand(cls, attraction: ArrayLike, demand: ArrayLike, mean_stay_s: float = 2 * HOUR_S) -> Self:
         """Process whose equilibrium occupancy has the logit `attraction[s] + demand[h]`.
 
         Args:
-            attraction: (n,) float64, logit, how much a slot is liked.
+            attraction: (n,) float64, logit, popularity of each slot.
             demand: (168,) float64, logit, by hour of the week.
             mean_stay_s: s, mean time that a car stays, the same for all slots and hours.
         """
@@ -401,7 +401,7 @@ class OccupancyProcess:
         return scaled(brentq(excess, low, high, xtol=1e-10))
 
     def marginal(self, time: float) -> FloatArray:
-        """(n,) float64: P(occupied) at `time`, when nothing has been seen."""
+        """(n,) float64: P(occupied) at `time`, before anything was observed."""
         _, hour, second = hour_of_week(float(time))
         marginals = np.empty(self.n_slots)
         _marginals(self.address, hour, second, marginals)

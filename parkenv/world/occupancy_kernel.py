@@ -71,14 +71,14 @@ RECORDED_DAY = np.dtype(
 )
 """A day of a log that is replayed on a lot: fields of `MappedLog` and `OccupancyLog`, and midnight, s since Monday."""
 
-_CURSOR_FIELDS = [
+CURSOR_FIELDS = [
     ("sojourn", np.int32),
     ("since", np.float64),
     ("valid_until", np.float64),
     ("occupied", np.bool_),
     ("end_known", np.bool_),
 ]
-CURSOR = np.dtype(_CURSOR_FIELDS, align=True)
+CURSOR = np.dtype(CURSOR_FIELDS, align=True)
 """What has been computed of one slot's truth.
 
 sojourn: number of the sojourn, from 1; 0 before anything was computed. since: its begin, s. valid_until: s, the state

@@ -10,7 +10,6 @@ from typing import Any
 
 import numba
 import numpy as np
-from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
@@ -33,7 +32,7 @@ def address_of(array: NDArray[Any], dtype: Any) -> int:
 
 
 def _elements(item: Any) -> Any:
-    @intrinsic  # type: ignore[untyped-decorator]
+    @intrinsic
     def elements(_: Any, address: Any) -> Any:  # noqa: ARG001 - numba passes it
         def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
             return builder.inttoptr(values[0], context.get_value_type(signature.return_type))
@@ -53,10 +52,10 @@ def record_at(dtype: Any) -> Any:
     dtype = np.dtype(dtype)
     record = numba.from_dtype(dtype)
 
-    @intrinsic  # type: ignore[untyped-decorator]
+    @intrinsic
     def at(_: Any, address: Any, index: Any) -> Any:  # noqa: ARG001 - numba passes them
         def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-            offset = builder.mul(values[1], ir.Constant(ir.IntType(64), dtype.itemsize))
+            offset = builder.mul(values[1], context.get_constant(types.int64, dtype.itemsize))
             start = builder.add(values[0], offset)
             return builder.inttoptr(start, context.get_value_type(signature.return_type))
 

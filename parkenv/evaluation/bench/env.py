@@ -56,6 +56,9 @@ def env_rows(
             scenario, batch, "full", False
         ),
         f"batch of {batch}, {scenario.lot.n_slots} slots, full belief": _ours(scenario, batch, "full", True),
+        f"batch of {batch}, {scenario.lot.n_slots} slots, p_occupied alone": _ours(
+            scenario, batch, "occupancy", True
+        ),
         f"batch of {batch}, {scenario.lot.n_slots} slots, local k={NEAREST}": _ours(
             scenario, batch, "local", True
         ),

@@ -26,6 +26,15 @@ class AgentSpec(Spec):
                 raise ValueError(f"{option} to be a number, true, false or text, not {value!r}")
         return self
 
+    @classmethod
+    def of(cls, text: str) -> AgentSpec:
+        """The agent that a word such as `mdp(failure_s=90)` names.
+
+        Raises:
+            InputError: brackets that do not match, or an option without a value.
+        """
+        return cls.parse(parse_agent(text), "--agent")
+
     @property
     def options(self) -> dict[str, Any]:
         """The options by name."""

@@ -14,6 +14,7 @@ from parkenv.envs.perception import OnboardPerception
 from parkenv.envs.search import SearchEnv
 from parkenv.envs.sensor_sampler import Station
 from parkenv.errors import InputError
+from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
 from parkenv.evaluation.trips.executor import Leg, MotionExecutor, ParkingAttempt
 from parkenv.evaluation.trips.lot_driver import DrivingStyle, LotDriver
@@ -163,7 +164,7 @@ class DrivenSearch:
 
     Args:
         scenario: the scenario with its traffic.
-        agent: name of an agent, see `make_agent`.
+        agent: name of an agent, with its options in brackets: see `make_agent` and `AgentSpec`.
         vehicle: the car.
         style: of driving.
         rig: sensors that ride along and tell the car which slots are taken: laser, stereo, both_sides, or a
@@ -195,7 +196,8 @@ class DrivenSearch:
         perception = None if rig is None else OnboardPerception(scenario, rig, weather, captures)
         self.scenario = scenario if perception is None else perception.scenario
         self.agent = agent
-        self._agent: Agent = make_agent(agent, self.scenario)
+        spec = AgentSpec.of(agent)
+        self._agent: Agent = make_agent(spec.name, self.scenario, **spec.options)
         self.driver = LotDriver(self.scenario, vehicle, style)
         self.env = DrivenSearchEnv(self.scenario, self.driver, perception)
         self._limited = adapt_to_agent(TimeLimit(self.env, STEP_LIMIT), self._agent)
