@@ -48,10 +48,9 @@ class TargetAgent(SearchAgent[GreedyState]):
         """Keep the target while it is a candidate, else choose another; park on arrival."""
         vertex = int(observation["vertex"])
         previous = memory.target
-        if previous < 0 or belief.state[previous] == OBSERVED_TAKEN or self.drops_target(belief, previous):
-            # An observation that has decayed to the forecast says nothing any more: the slot is a candidate again.
-            decayed = (belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast)
-            candidates = ~belief.observed_taken | decayed
+        taken = previous >= 0 and belief.state[previous] == OBSERVED_TAKEN and not _decayed(belief)[previous]
+        if previous < 0 or taken or self.drops_target(belief, previous):
+            candidates = ~belief.observed_taken | _decayed(belief)
             memory.target = self.choose(candidates, belief.observed_free, vertex, previous)
             if memory.target < 0:
                 # Every slot was observed taken: the one observed longest ago is likeliest to be free by now.
@@ -100,6 +99,11 @@ class TargetAgent(SearchAgent[GreedyState]):
         """Return whether to choose another target although this one was not observed taken."""
         del belief, target
         return False
+
+
+def _decayed(belief: SlotBelief) -> NDArray[np.bool_]:
+    """Return the slots, (n_slots,), whose observation has decayed to the forecast and says nothing any more."""
+    return np.asarray((belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast))
 
 
 class GreedyGoalAgent(TargetAgent):

@@ -14,7 +14,7 @@ from parkenv.world.scenario import SearchProblem
 from planners.belief.planning_graph import VIEW, PlanningGraph
 from planners.road_table import RoadTable
 from planners.thesis.heap import pop, push
-from planners.thesis.label_setting import StoppingGraph, settle
+from planners.thesis.label_setting import StoppingGraph, set_labels
 from planners.thesis.mdp import ParkingMDP
 from sim_sensors.compilation import compiled
 
@@ -186,7 +186,7 @@ class Neighborhoods:
         """Return h of every vertex, (n_vertices,) s up to a constant, where all slots but some are free."""
         p_free = self._free.copy()
         p_free[taken] = 0.0
-        return settle(self._graph, p_free).cost
+        return set_labels(self._graph, p_free).cost
 
     def _expand(self, entry: int, least_s: FloatArray) -> Neighborhood:
         lot = self._problem.lot

@@ -5,7 +5,7 @@ import numpy as np
 from parkenv.evaluation.bench.planning import drive, forecast_process, planning_rows, transitions
 from parkenv.lots import grid_lot
 from planners.thesis.label_repair import repair
-from planners.thesis.label_setting import StoppingGraph, settle
+from planners.thesis.label_setting import StoppingGraph, set_labels
 
 
 def test_rows_have_the_keys_of_every_bench_and_stand_beside_the_thesis():
@@ -33,7 +33,7 @@ def test_the_measured_drive_ends_and_sees_each_slot_once():
     mdp = forecast_process(lot, 0)
     graph = StoppingGraph.of(mdp)
     for seed in range(5):
-        labels = settle(graph, mdp.p_free.copy())
+        labels = set_labels(graph, mdp.p_free.copy())
         seen = []
         for slot, p_free in drive(graph, labels, lot.n_slots, np.random.default_rng(seed)):
             seen.append(int(slot[0]))

@@ -594,9 +594,9 @@ def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algo
 
 @pytest.mark.slow
 def test_a_short_training_learns_to_park_from_nearby(tmp_path, monkeypatch):
-    """In a minute of training it masters two levels: it parks in 60 of the last 100 drives of each."""
+    """In half a minute of training it masters two levels: it parks in 60 of the last 100 drives of each."""
     monkeypatch.setitem(DRIVE_CONFIGS, "ppo", FULL_SIZE["ppo"])
-    curve = train_one(training_of("ppo", 800_000, 400_000), 0, tmp_path).curve
+    curve = train_one(training_of("ppo", 400_000, 400_000), 0, tmp_path).curve
     assert curve[-1]["perpendicular_level"] >= 2.0
     near = slot_groups((MINI,))[0].tasks(slack=1.0, distance=(1.0, 6.0), starts="way-out")
     tasks = [PreparedTask(near.draw(7_000 + k)) for k in range(60)]

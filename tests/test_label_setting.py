@@ -14,7 +14,7 @@ from parkenv.scenarios.spec import SCENARIO_NAMES
 from parkenv.world.lot import PARK
 from planners import ParkingMDP, label_setting, make_agent, policy_iteration, value_iteration
 from planners.thesis.label_repair import repair
-from planners.thesis.label_setting import TIE_S, StoppingGraph, best_moves, settle
+from planners.thesis.label_setting import TIE_S, StoppingGraph, best_moves, set_labels
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -152,7 +152,7 @@ def test_where_circling_beats_every_stop_policy_iteration_takes_over():
     neighbors = np.full((n, 4), -1)
     neighbors[:, 0] = (np.arange(n) + 1) % n
     mdp = ParkingMDP(neighbors, np.ones((n, 4)), np.zeros(n), np.zeros(n), 90.0, wait_s=50.0, gamma=0.99)
-    assert not settle(StoppingGraph.of(mdp), mdp.p_free).settled
+    assert not set_labels(StoppingGraph.of(mdp), mdp.p_free).settled
     solution = label_setting(mdp)
     np.testing.assert_allclose(solution.values, -100.0)
     assert (solution.policy == 0).all()
@@ -198,11 +198,11 @@ def test_a_mended_plan_equals_a_fresh_one_on_any_graph(seed, gamma):
 
 def check_mending(mdp, n_slots, rng):
     graph = StoppingGraph.of(mdp)
-    labels = settle(graph, mdp.p_free.copy())
+    labels = set_labels(graph, mdp.p_free.copy())
     for _ in range(12):
         changed = rng.choice(n_slots, int(rng.integers(0, min(n_slots, 6) + 1)), replace=False)
         repair(graph, labels, changed, rng.choice([0.0, 1.0, *rng.random(3)], len(changed)))
-        fresh = settle(graph, labels.p_free.copy())
+        fresh = set_labels(graph, labels.p_free.copy())
         assert labels.settled == fresh.settled
         if fresh.settled:
             expect_same_values(labels.cost, fresh.cost)
@@ -219,7 +219,7 @@ def city():
 
 def test_mending_touches_what_the_change_reaches_and_no_more(city):
     graph, p_free = city
-    labels = settle(graph, p_free.copy())
+    labels = set_labels(graph, p_free.copy())
     passed = np.flatnonzero(labels.move[:3000] != PARK)[:200]
     touched = [repair(graph, labels, passed[i : i + 1], np.zeros(1)) for i in range(200)]
     assert touched == [0] * 200, "a slot that nobody was to park in, found taken, changes no plan"
@@ -235,16 +235,16 @@ def test_mending_touches_what_the_change_reaches_and_no_more(city):
 
 def test_changes_everywhere_are_planned_afresh(city):
     graph, p_free = city
-    labels = settle(graph, p_free.copy())
+    labels = set_labels(graph, p_free.copy())
     changed = np.random.default_rng(1).permutation(3000)[:1500]
     assert repair(graph, labels, changed, np.full(1500, 0.5)) == -1
-    np.testing.assert_array_equal(labels.cost, settle(graph, labels.p_free).cost)
+    np.testing.assert_array_equal(labels.cost, set_labels(graph, labels.p_free).cost)
     # So is the loss of the one slot that all the lot was heading for.
     only = np.zeros(len(p_free))
     only[1234] = 1.0
-    labels = settle(graph, only)
+    labels = set_labels(graph, only)
     assert repair(graph, labels, np.array([1234]), np.zeros(1)) == -1
-    np.testing.assert_array_equal(labels.cost, settle(graph, labels.p_free).cost)
+    np.testing.assert_array_equal(labels.cost, set_labels(graph, labels.p_free).cost)
 
 
 # --- the agents ------------------------------------------------------------------------------------

@@ -30,19 +30,22 @@ def empty_lot(lot):
     return Scenario(name="empty", lot=lot, occupancy=occupancy, prior=prior)
 
 
-def parked_at(agent, scenario):
-    """The slot in which a search ends."""
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
-    observation, _ = env.reset(seed=0)
+def search(agent, env, seed=0):
+    """The slot in which a search ends, and its total time."""
+    observation, _ = env.reset(seed=seed)
     state = env.unwrapped.state
     if isinstance(agent, ClairvoyantAgent):
         agent.prepare(state.world, state.time)
     memory, over = None, False
     while not over:
         action, memory = agent.predict(observation, memory)
-        observation, _, over, _, _ = env.step(action)
+        observation, _, over, _, info = env.step(action)
     assert state.parked
-    return state.vertex
+    return state.vertex, info["total_s"]
+
+
+def parked_at(agent, scenario):
+    return search(agent, gym.make("parkenv/Search-v1", scenario=scenario))[0]
 
 
 @pytest.mark.parametrize(
@@ -99,6 +102,9 @@ def test_the_bound_counts_prices():
         total_s = np.array(free_at) - state.time + scenario.walk_s + scenario.lot.slot_parking_cost_s
         best = best_slot(scenario, routes, state.world, state.vertex, state.time)
         assert best.total_s == pytest.approx(total_s.min())
+        # The oracle waits in whole steps.
+        _, reached_s = search(make_agent("oracle", scenario), env, seed)
+        assert best.total_s - 1e-6 <= reached_s <= best.total_s + 2 * scenario.wait_s
 
 
 def test_a_comparison_shows_what_parking_cost(tmp_path):

@@ -40,7 +40,7 @@ def with_backdrop(grey: Image, far: NDArray[np.bool_], rng: np.random.Generator)
 
 
 def random_texture(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
-    """(h, w) float32 of mean 0 and deviation 1: grain, bars or neither, with boxes over it or not."""
+    """Return random texture, (h, w) float32, mean 0, deviation 1: grain, bars or neither, perhaps with boxes."""
     texture = np.zeros(shape, dtype=np.float32)
     kind = rng.choice(["grain", "bars", "boxes"], p=[0.6, 0.2, 0.2])
     if kind == "grain":
@@ -54,7 +54,7 @@ def random_texture(shape: tuple[int, ...], rng: np.random.Generator) -> Float32A
 
 
 def _grain(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
-    """Noise of several sizes, stretched: leaves, stone, plaster."""
+    """Return noise of several scales, stretched: leaves, stone, plaster."""
     height, width = shape
     grain = np.zeros(shape, dtype=np.float32)
     for size in _OCTAVES:
@@ -66,7 +66,7 @@ def _grain(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
 
 
 def _bars(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
-    """Stripes, grids, bricks at any angle, upright ones above all."""
+    """Return stripes, grids and bricks at any angle, mostly upright."""
     height, width = shape
     x, y = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     angle = float(rng.choice([0.0, math.pi / 2, rng.uniform(0.0, math.pi)]))
@@ -83,7 +83,7 @@ def _bars(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
 
 
 def _draw_boxes(texture: Float32Array, rng: np.random.Generator) -> None:
-    """Signs, windows, doors: rectangles of any shade, most of them upright."""
+    """Draw signs, windows, doors: rectangles of any shade, mostly upright."""
     height, width = texture.shape
     for _ in range(int(rng.integers(4, 40))):
         center = float(rng.uniform(0, width)), float(rng.uniform(0, height))

@@ -73,7 +73,7 @@ class Detector(Protocol):
     """Finds cars in camera images.
 
     A detector of your own is a class with this one method and a constructor without arguments. It is named
-    `MODULE:CLASS` wherever a detector is asked for: `parkenv survey --detector my_detectors:Mine`,
+    `MODULE:CLASS` wherever a detector is named: `parkenv survey --detector my_detectors:Mine`,
     `gym.make("parkenv/SearchPerception-v1", detector="my_detectors:Mine")`.
 
     The method must not depend on earlier calls: images of several cameras, and of several episodes, come in any order.

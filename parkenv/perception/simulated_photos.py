@@ -57,10 +57,10 @@ class SimulatedPhoto:
 
 
 def simulated_photos(n_scenes: int, seed: int = 0) -> Iterator[SimulatedPhoto]:
-    """Pictures of random streets in random light, twenty of each, every fifth without a car.
+    """Render images of random streets in random light, twenty of each, every fifth without cars.
 
-    Cars stand along the street, across it or aslant; half of the pictures are taken with long lenses, the others as
-    rigs see. Texture lies over what is behind the cars, and every picture goes through random exposure, blur and noise.
+    Cars are parked along the street, perpendicular or at an angle; half of the images have a long focal length, the
+    others are those of a rig. The background gets random texture, and every image random exposure, blur and noise.
 
     Args:
         n_scenes: how many streets.
@@ -174,7 +174,7 @@ def _as_rigs_see(street: Street, rng: np.random.Generator) -> tuple[PinholeCamer
 def _crops(
     grey: Image, boxes: VehicleBoxes, clear: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[list[Image], list[Image]]:
-    """Sides and ends of the clear cars that are whole in the picture and seen straight."""
+    """Return crops of sides and ends of unoccluded cars that are completely in the image and seen straight on."""
     crops: dict[View, list[Image]] = {View.SIDE: [], View.END: []}
     height, width = grey.shape
     for i in np.flatnonzero(clear).tolist():
@@ -193,7 +193,7 @@ def _crops(
 
 
 def _patch(grey: Image, region: FloatArray, size: tuple[int, int], rng: np.random.Generator) -> Image:
-    """The region at a resolution as photographs have it: coarse ones are drawn out, fine ones stay at most double."""
+    """Cut out a region at the resolution of photographs: enlarge small ones, reduce large ones to double."""
     edge = int(max(region[2] - region[0], region[3] - region[1])) + 2
     wider = cv2.copyMakeBorder(grey, edge, edge, edge, edge, cv2.BORDER_REPLICATE)
     left, top, right, bottom = np.round(region + edge).astype(int)

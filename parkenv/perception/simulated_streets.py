@@ -43,7 +43,7 @@ class Street:
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Street:
-        """One or two rows with walls, houses, trees, posts and people around them."""
+        """Draw one or two rows of cars with walls, houses, trees, posts and pedestrians around them."""
         kind = str(rng.choice(_KINDS, p=[0.52, 0.40, 0.08]))
         poses, models = _row(rng, kind, 0.0, _REACH)
         first, back = len(poses), 0.5 * _DEPTH[kind]
@@ -57,11 +57,11 @@ class Street:
         return cls(kind, np.array(poses), first, front, Fleet(tuple(models), around))
 
     def scene(self, there: NDArray[np.bool_], turned: NDArray[np.bool_]) -> Scene:
-        """The street with some of its cars.
+        """Return the street with some of its cars.
 
         Args:
-            there: (n,) which of them stand there.
-            turned: (n,) which of them head the other way.
+            there: (n,) bool, cars that are present.
+            turned: (n,) bool, cars that head the other way.
         """
         chosen = np.flatnonzero(there)
         pose = self.pose[chosen].copy()
@@ -72,7 +72,7 @@ class Street:
 def _row(
     rng: np.random.Generator, kind: str, y: float, reach: float
 ) -> tuple[list[list[float]], list[VehicleModel]]:
-    """Poses and models of cars side by side, or nose to tail, from -reach to reach."""
+    """Return poses and models of cars side by side, or one behind the other, from -reach to reach."""
     turn = {"along": 0.0, "across": 0.5 * math.pi, "aslant": rng.uniform(0.9, 1.3) * rng.choice([-1.0, 1.0])}[
         kind
     ]

@@ -27,17 +27,17 @@ _NO_CARS = np.empty((0, 4))
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """How a model is trained.
+    """Parameters of the training.
 
     Args:
         penalty: of the support vector machine (its C).
-        rounds: how often hard negatives are mined, each time from another part of the images.
-        jitter: how many shifted and scaled copies of each positive are added.
-        shift: of a copy, as a share of the window, at most.
-        resize: of a copy, as a share, at most.
-        misaligned: how many crops beside the car are taken from each positive as negatives.
-        per_image: hard negatives taken from one image in a round, at most.
-        positives_weight: how much more a positive counts than a negative.
+        rounds: rounds of hard-negative mining, each on another part of the images.
+        jitter: number of shifted and scaled copies of each positive.
+        shift: largest shift of a copy, as a fraction of the window.
+        resize: largest change of a copy's size, as a fraction.
+        misaligned: number of misaligned crops of each positive that become negatives.
+        per_image: largest number of hard negatives from one image per round.
+        positives_weight: weight of a positive relative to a negative.
         seed: of the jitter and the solver.
     """
 
@@ -78,24 +78,24 @@ def train(
 ) -> CarModel:
     """Train a model; equal arguments give equal weights, bit for bit, on one machine.
 
-    All crops are mirrored, and positives jittered; windows that hold half a car are negatives from the start. Then the
-    model scans the negative images, and what it takes for cars joins the negatives, round after round (Dalal and
-    Triggs 2005). Scores are calibrated to probabilities on cross-validated ones (Platt 1999).
+    All crops are mirrored, and positives are jittered; windows with half a car are negatives from the start. Then the
+    model scans the negative images, and its false positives join the negatives, round after round (Dalal and Triggs
+    2005). Scores are calibrated to probabilities on cross-validated ones (Platt 1999).
 
     Args:
-        positives: grey crops, uint8, in which the car lies alike; stretched into the window.
-        negatives: grey images of any size without a car in them.
-        photos: pictures with all their cars labelled; what the model sees beside the cars is mined, too.
-        descriptor: the side view's 128×64 where None.
-        region_aspect: width over height of the crops; the first one's where None.
-        car: where the car lies in the crops, as shares.
+        positives: aligned grey crops of cars, uint8; resized to the window.
+        negatives: grey images of any size without cars.
+        photos: images with all their cars labelled; false positives beside the cars are mined, too.
+        descriptor: None: 128×64, for side views.
+        region_aspect: width over height of the crops; None: that of the first one.
+        car: left, top, right, bottom of the car in the crops, as fractions.
         end_on: whether the crops show fronts and rears rather than sides.
-        settings: the defaults where None.
-        trained_on: a line for people.
-        progress: called with a line for each stage.
+        settings: None: the defaults.
+        trained_on: one line that describes the training data.
+        progress: called with one line for each stage.
 
     Raises:
-        InputError: fewer than 20 positives, or no negative.
+        InputError: fewer than 20 positives, or no negatives.
     """
     if len(positives) < _LEAST or not negatives:
         raise InputError(
@@ -129,7 +129,7 @@ def train(
         images = [*(LabelledImage("", n, _NO_CARS) for n in negatives), *photos]
         hard = mined(model, images[round_number :: settings.rounds], settings.per_image)
         if not len(hard):
-            progress(f"round {round_number}: nothing is taken for a car wrongly any more")
+            progress(f"round {round_number}: no false positives are left")
             break
         no = np.concatenate([no, hard])
     progress("calibrating scores")
@@ -137,9 +137,9 @@ def train(
 
 
 def mined(model: CarModel, images: Sequence[LabelledImage], per_image: int) -> Float32Array:
-    """(n, size) descriptors of windows that the model takes for cars where none is, the worst of each image.
+    """Mine hard negatives: descriptors, (n, size), of the false positives with the highest scores in each image.
 
-    A window that overlaps a labelled car by more than `CAR_OVERLAP` is left alone.
+    Windows that overlap a labelled car by more than `CAR_OVERLAP` are skipped.
     """
     window = model.descriptor
     size = (window.width, window.height)
@@ -160,7 +160,7 @@ def mined(model: CarModel, images: Sequence[LabelledImage], per_image: int) -> F
 
 
 def _overlap_any(boxes: Float32Array, cars: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which boxes overlap any of the cars by more than `CAR_OVERLAP`, intersection over union."""
+    """Return which boxes overlap any of the cars by more than `CAR_OVERLAP`, intersection over union."""
     hit = np.zeros(len(boxes), dtype=np.bool_)
     area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
     for car in cars:
@@ -195,10 +195,10 @@ def _svm(yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> tup
 
 
 def _calibration(yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> tuple[float, float]:
-    """Slope and offset of the probability, from scores of samples that the model was not trained on."""
+    """Return slope and offset of the probability, from scores of held-out samples."""
     from sklearn.linear_model import LogisticRegression
 
-    # Copies of one car lie at a fixed distance from it; blocks keep most of them together.
+    # Copies of one car are at a fixed distance from it; blocks keep most of them together.
     scores, labels = [], []
     for fold in range(_FOLDS):
         in_yes, in_no = (np.arange(len(x)) * _FOLDS // len(x) == fold for x in (yes, no))
@@ -207,7 +207,7 @@ def _calibration(yes: Float32Array, no: Float32Array, settings: TrainingSettings
             scores.append(x @ weights + bias)
             labels.append(np.full(len(x), label))
     fit = LogisticRegression(C=1e3).fit(np.concatenate(scores)[:, None], np.concatenate(labels))
-    # Its last digits depend on how many threads summed up; nobody needs them, and equal training makes equal files.
+    # Its last digits depend on the number of threads; rounded, equal training makes equal files.
     return round(float(fit.coef_[0, 0]), 6), round(float(fit.intercept_[0]), 6)
 
 
@@ -218,12 +218,12 @@ def _how(image: Image, size: tuple[int, int]) -> int:
 def _cut(
     image: Image, left_top: tuple[float, float], right_bottom: tuple[float, float], size: tuple[int, int]
 ) -> Image:
-    """A part of an image, px, brought to a size; what lies outside is as the border."""
+    """Cut out a part of an image, px, and resize it; the border is replicated outside."""
     (left, top), (right, bottom) = left_top, right_bottom
     scale_x, scale_y = (right - left) / size[0], (bottom - top) / size[1]
     moved = np.array([[scale_x, 0.0, left + 0.5 * scale_x - 0.5], [0.0, scale_y, top + 0.5 * scale_y - 0.5]])
     if scale_x > 1.0 and scale_y > 1.0:
-        # Smaller than it was: average first, or fine texture turns into gradients of its own.
+        # When shrinking, average first: fine texture would alias to false gradients.
         image = np.asarray(
             cv2.resize(image, None, fx=1.0 / scale_x, fy=1.0 / scale_y, interpolation=cv2.INTER_AREA)
         )
@@ -233,7 +233,7 @@ def _cut(
 
 
 def _moved(crop: Image, size: tuple[int, int], rng: np.random.Generator, settings: TrainingSettings) -> Image:
-    """A copy, a little shifted and scaled."""
+    """Return a slightly shifted and scaled copy."""
     height, width = crop.shape
     dx, dy = rng.uniform(-settings.shift, settings.shift, 2)
     grow = rng.uniform(-settings.resize, settings.resize) / 2.0
@@ -246,7 +246,7 @@ def _moved(crop: Image, size: tuple[int, int], rng: np.random.Generator, setting
 
 
 def _beside(crop: Image, size: tuple[int, int], rng: np.random.Generator) -> Image:
-    """A window that holds part of the car, or the car too large or too small: no place to say that a car is here."""
+    """Return a window with part of the car, or with the car too large or too small: a negative."""
     height, width = crop.shape
     kind = rng.integers(3)
     if kind == 0:

@@ -123,7 +123,7 @@ class ChangingSolution:
         )
         if sweeps >= _MOST_SWEEPS:
             raise InputError(
-                "Bellman's equation did not settle: want rates that let a car leave within hours"
+                "Bellman's equation did not converge: want rates that let a car leave within hours"
             )
 
     def expected_s(self, vertex: int, codes: IntArray | None = None) -> float:

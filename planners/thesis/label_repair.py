@@ -17,9 +17,9 @@ from planners.thesis.label_setting import (
     FloatArray,
     Labels,
     StoppingGraph,
-    settle_again,
     spread,
     stop_cost,
+    update_labels,
 )
 from sim_sensors.compilation import compiled
 
@@ -34,7 +34,7 @@ def repair(graph: StoppingGraph, labels: Labels, vertices: NDArray[np.int64], p_
 
     Args:
         graph: that the plan was made with.
-        labels: the plan; `labels.settled` tells afterwards whether it is exact, as after `settle`.
+        labels: the plan; `labels.settled` tells afterwards whether it is exact, as after `set_labels`.
         vertices: (k,) int64, the slots whose probability changed.
         p_free: (k,) float64, their new probabilities.
 
@@ -47,7 +47,7 @@ def repair(graph: StoppingGraph, labels: Labels, vertices: NDArray[np.int64], p_
     if labels.settled and len(vertices) <= reach:
         touched = _repair(graph, vertices, labels.p_free, labels.cost, labels.move, reach)
     if touched < 0:
-        settle_again(graph, labels)
+        update_labels(graph, labels)
     return touched
 
 

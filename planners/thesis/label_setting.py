@@ -127,14 +127,14 @@ def label_setting(mdp: ParkingMDP) -> Solution:
     breaks ties as `best_move` says. `iterations` is 1, or those of policy iteration where it had to take over.
     """
     graph = StoppingGraph.of(mdp)
-    labels = settle(graph, mdp.p_free)
+    labels = set_labels(graph, mdp.p_free)
     iterations = 1
     if not labels.settled:
         labels, iterations = by_policy_iteration(mdp, labels)
     return Solution(-labels.cost, best_moves(graph, labels.p_free, labels.cost), iterations)
 
 
-def settle(graph: StoppingGraph, p_free: FloatArray) -> Labels:
+def set_labels(graph: StoppingGraph, p_free: FloatArray) -> Labels:
     """Plan by one pass of label setting.
 
     Args:
@@ -146,16 +146,16 @@ def settle(graph: StoppingGraph, p_free: FloatArray) -> Labels:
     """
     n = len(p_free)
     labels = Labels(np.empty(n), np.empty(n, dtype=np.int8), p_free, settled=False)
-    settle_again(graph, labels)
+    update_labels(graph, labels)
     return labels
 
 
-def settle_again(graph: StoppingGraph, labels: Labels) -> None:
+def update_labels(graph: StoppingGraph, labels: Labels) -> None:
     """Update a plan to its present probabilities by one pass of label setting, in place."""
     width = float(graph.in_s.min()) if len(graph.in_s) else 1.0
     labels.settled = bool(
-        _settle_by_buckets(graph, labels.p_free, width, labels.cost, labels.move)
-        or _settle_by_heap(graph, labels.p_free, labels.cost, labels.move)
+        _set_by_buckets(graph, labels.p_free, width, labels.cost, labels.move)
+        or _set_by_heap(graph, labels.p_free, labels.cost, labels.move)
     )
 
 
@@ -250,7 +250,7 @@ def _is_source(graph: StoppingGraph, cost: FloatArray, u: int) -> bool:
 
 
 @compiled(error_model="numpy")
-def _settle_by_buckets(
+def _set_by_buckets(
     graph: StoppingGraph, p_free: FloatArray, width: float, cost: FloatArray, move: NDArray[np.int8]
 ) -> bool:
     """Fill `cost` and `move`; bucket b holds the vertices to spread whose labels lie in [b, b + 1) times `width`.
@@ -341,9 +341,7 @@ def _settle_by_buckets(
 
 
 @compiled(error_model="numpy")
-def _settle_by_heap(
-    graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, move: NDArray[np.int8]
-) -> bool:
+def _set_by_heap(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, move: NDArray[np.int8]) -> bool:
     """Do the same with a heap, for climbs so small that buckets would be too many, or too wide."""
     n = len(cost)
     for u in range(n):

@@ -73,4 +73,4 @@ def policy_iteration(
         if not better.any():
             return Solution(values, policy, iteration)
         policy = np.where(better, q.argmax(axis=1), policy)
-    raise RuntimeError(f"policy iteration did not settle within {max_iterations} iterations")
+    raise RuntimeError(f"policy iteration did not converge within {max_iterations} iterations")

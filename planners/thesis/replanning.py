@@ -20,7 +20,7 @@ from planners.thesis.label_setting import (
     best_move,
     best_moves,
     by_policy_iteration,
-    settle,
+    set_labels,
     with_p_free,
 )
 from planners.thesis.mdp import ParkingMDP
@@ -114,7 +114,7 @@ class StaticAgent(SearchAgent[Plan]):
         if self.solver == "policy_iteration":
             labels, _ = by_policy_iteration(with_p_free(self._mdp, p_free))
         else:
-            labels = self._settled(settle(self._graph, p_free))
+            labels = self._solved(set_labels(self._graph, p_free))
         self._check_discount(labels, float(labels.cost.max()))
         return labels
 
@@ -145,7 +145,7 @@ class StaticAgent(SearchAgent[Plan]):
             action = best_move(self._graph, labels.p_free, labels.cost, vertex)
         return PlanPreview(tuple(path))
 
-    def _settled(self, labels: Labels) -> Labels:
+    def _solved(self, labels: Labels) -> Labels:
         """Return the plan; by policy iteration where label setting did not terminate, since circling pays."""
         if labels.settled:
             return labels
@@ -179,7 +179,7 @@ class ReplanningAgent(StaticAgent):
                 labels, _ = by_policy_iteration(with_p_free(self._mdp, labels.p_free), labels)
             else:
                 repair(self._graph, labels, slots, p_free)
-                labels = self._settled(labels)
+                labels = self._solved(labels)
             memory.labels = labels
             memory.replans += 1
             self._check_discount(labels, float(labels.cost[observation["vertex"]]))

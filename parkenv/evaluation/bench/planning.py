@@ -29,7 +29,7 @@ from planners.thesis.label_setting import (
     StoppingGraph,
     best_move,
     by_policy_iteration,
-    settle,
+    set_labels,
     with_p_free,
 )
 from planners.thesis.mdp import ParkingMDP
@@ -84,8 +84,8 @@ def solving_rows(sizes: list[int], seed: int, seconds: float) -> list[BenchRow]:
     for n_slots in sizes:
         mdp = forecast_process(city_lot(n_slots, seed), seed)
         graph, n = StoppingGraph.of(mdp), mdp.n_states
-        labels = settle(graph, mdp.p_free)
-        ours = seconds_each(lambda _, g=graph, p=mdp.p_free: settle(g, p), seconds)  # type: ignore[misc]
+        labels = set_labels(graph, mdp.p_free)
+        ours = seconds_each(lambda _, g=graph, p=mdp.p_free: set_labels(g, p), seconds)  # type: ignore[misc]
         vertices.append(n)
         own.append(ours)
         theirs = {}
@@ -111,17 +111,17 @@ def repair_rows(lot: ParkingLot, seed: int, seconds: float) -> list[BenchRow]:
     """Measure replanning after each observed slot; peers plan from scratch, or by policy iteration."""
     mdp = forecast_process(lot, seed)
     graph = StoppingGraph.of(mdp)
-    repair(graph, settle(graph, mdp.p_free.copy()), np.array([0]), np.ones(1))
+    repair(graph, set_labels(graph, mdp.p_free.copy()), np.array([0]), np.ones(1))
     times = []
     end = time.perf_counter() + max(seconds, 0.1)
     rng = np.random.default_rng(seed)
     while time.perf_counter() < end:
-        labels = settle(graph, mdp.p_free.copy())
+        labels = set_labels(graph, mdp.p_free.copy())
         for slot, p_free in drive(graph, labels, lot.n_slots, rng):
             start = time.perf_counter()
             repair(graph, labels, slot, p_free)
             times.append(time.perf_counter() - start)
-    fresh = 1e6 * seconds_each(lambda _: settle(graph, mdp.p_free), seconds)
+    fresh = 1e6 * seconds_each(lambda _: set_labels(graph, mdp.p_free), seconds)
     known, _ = by_policy_iteration(mdp)
     seen = mdp.p_free.copy()
     seen[: lot.n_slots // 20] = 0.0
