@@ -22,9 +22,10 @@ from pathlib import Path
 from typing import Any, overload
 
 import numba
-from numba.core import event, types
+from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache, _CacheLocator
 from numba.core.serialize import dumps
+from numba.core.types.misc import unliteral
 from platformdirs import user_cache_path
 
 _PACKAGES = ("sim_sensors", "parkenv", "planners")
@@ -85,8 +86,8 @@ def _ignore_literals(dispatcher: Any) -> None:
     template_of = dispatcher.get_call_template
 
     def get_call_template(args: Any, kws: Any) -> Any:
-        values = {name: types.unliteral(kind) for name, kind in dict(kws).items()}
-        return template_of(tuple(types.unliteral(kind) for kind in args), values)
+        values = {name: unliteral(kind) for name, kind in dict(kws).items()}
+        return template_of(tuple(unliteral(kind) for kind in args), values)
 
     dispatcher.get_call_template = get_call_template
 
