@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from parkenv.errors import InputError
 from parkenv.world.keyed_random import keyed_exponential, keyed_uniform, world_key
 from parkenv.world.occupancy import Arrival, ArrivalWindow, OccupancyProcess
+from parkenv.world.pointers import address_of
 from parkenv.world.week import HOUR_S, WEEK_S
 
 NINE = Arrival(9 * HOUR_S)
@@ -371,3 +372,11 @@ def test_a_process_is_laid_on_another_lot_fullest_nearest():
     assert laid.n_slots == 6
     assert (np.diff(fullness[np.argsort(walk)]) <= 1e-12).all()
     np.testing.assert_allclose(np.unique(fullness), np.unique(process.marginal(0.0)))
+
+
+def test_addresses_of_arrays_of_another_type_are_refused():
+    """Compiled code would misread them."""
+    assert address_of(np.zeros(3), np.float64) > 0
+    for wrong in (np.zeros(3, np.float32), np.zeros((3, 2))[:, 0]):
+        with pytest.raises(TypeError, match=r"wanted .*float64"):
+            address_of(wrong, np.float64)

@@ -83,7 +83,19 @@ def test_the_command_line_takes_it(tmp_path):
     from command_line import parkenv
 
     out = tmp_path / "s"
-    words = ("survey", "--scenario", "mini", "-n", "1", "--every", "5", "--jobs", "1", "--out", str(out))
+    words = (
+        "survey",
+        "--scenario",
+        "mini",
+        "--sessions",
+        "1",
+        "--every",
+        "5",
+        "--jobs",
+        "1",
+        "--out",
+        str(out),
+    )
     assert parkenv(*words, "--detector", OWN).returncode == 0
     (row,) = json.loads((out / "summary.json").read_text())["rows"]
     assert row["detector"] == OWN

@@ -1,4 +1,4 @@
-"""How slots are seen: rates by distance and side, files of them, and what is counted of the real stack."""
+"""Sensor models: rates by distance and side, files of them, and counts of the perception pipeline's observations."""
 
 import json
 
@@ -151,5 +151,5 @@ def mean_total_s(name, agent, rig):
 
 @pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
 def test_agents_that_plan_on_what_they_see_refuse_to_search_blindly(name):
-    with pytest.raises(InputError, match="slots are seen"):
+    with pytest.raises(InputError, match="plans on observations from the lane"):
         make_agent(name, make_scenario("mini", sensor_model=SensorModel.blind()))
