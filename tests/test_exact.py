@@ -162,7 +162,7 @@ def test_a_certain_lot_is_a_shortest_way():
     certain[4] = 0.0
     from planners.routes import DriveRoutes
 
-    way = DriveRoutes(problem).seconds_from(entry)[4] + problem.walk_s[4]
+    way = DriveRoutes(problem).seconds_from(entry)[4] + problem.arrival_cost_s[4]
     assert ExactSolution(problem, certain, entry).expected_s == pytest.approx(way)
     assert expected_time(make_agent("exact", problem), problem, certain, entry) == pytest.approx(way)
 

@@ -364,7 +364,7 @@ def test_a_slot_that_is_not_there_is_an_index_error(slot):
         busy_process().world(KEY, NINE).occupied([slot], NINE.time)
 
 
-def test_a_process_is_laid_on_another_lot_fullest_nearest():
+def test_a_process_is_mapped_to_another_lot_fullest_nearest():
     process = OccupancyProcess.from_demand(np.array([-1.0, 2.0, 0.5]), np.zeros(168))
     walk = np.array([90.0, 10.0, 50.0, 70.0, 20.0, 30.0])
     laid = process.mapped_to_lot(walk)

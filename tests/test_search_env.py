@@ -296,7 +296,7 @@ def test_old_ids_are_not_registered():
             gym.make(f"parkenv/{name}-v0")
 
 
-def test_only_slots_in_view_are_learnt_of():
+def test_only_slots_in_view_are_observed():
     """The belief of a slot that was never in view stays at its forecast, whatever stands there."""
     scenario = make_scenario("campus", sensor_model=SensorModel(view_range=6.0))
     env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
@@ -326,11 +326,11 @@ def test_a_sighting_is_bayes_rule_and_relaxes_exponentially():
 
 
 @given(x=st.floats(0.0, 600.0))
-def test_fading_is_the_exponential(x):
+def test_decay_is_the_exponential(x):
     assert decay_factor(x) == pytest.approx(np.exp(-x), rel=1e-14)
 
 
-def test_the_belief_in_a_slot_left_behind_grows_old():
+def test_the_belief_in_a_slot_left_behind_decays():
     lot = grid_lot(1, 12)
     process = OccupancyProcess.from_demand(np.zeros(12), np.zeros(168), 600.0)
     scenario = Scenario(name="a", lot=lot, occupancy=process, sensor_model=SensorModel(view_range=0.0))

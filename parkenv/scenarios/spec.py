@@ -298,7 +298,7 @@ class ScenarioSpec(Spec):
     sensor_model: Annotated[SensorModelSpec, BeforeValidator(_sensor_tables), OrText()] = SensorModelSpec(
         name="perfect"
     )
-    rig: RigName = Field("laser", description="The sensors of the car, where they are simulated.")
+    rig: RigName = Field("laser", description="The sensors of the car in surveys and sensor-model fits.")
     traffic: TrafficSpec | None = Field(
         None, description="Other road users; none if absent, some in surveys."
     )
