@@ -87,8 +87,8 @@ class SearchAgent(ABC, Generic[Memory]):
 
         Args:
             observation: from `parkenv/Search-v1`.
-            belief: what it says about the slots.
-            memory: of this episode; may be changed in place.
+            belief: its belief about the slots.
+            memory: memory of this episode; may be changed in place.
         """
 
     def predict(

@@ -46,7 +46,7 @@ STOP = np.dtype(
     [
         ("vertex", np.int64),
         ("time", np.float64),
-        ("first", np.int64),  # index of its first observation; those up to the next stop's are its own
+        ("first", np.int64),  # index of its first observation; the last precedes the next stop's first
         ("ahead_s", np.float64),  # scratch: least time to the goal after any later observation
     ]
 )
