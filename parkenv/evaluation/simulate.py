@@ -135,7 +135,7 @@ def charge_truncation(metrics: MutableMapping[str, Any], scenario: Scenario, tru
 
 
 def adapt_to_agent(env: gym.Env[Any, Any], agent: Agent) -> gym.Env[Any, Any]:
-    """Wrap the environment to return the agent's observation: trained models (with `local_k`) use `LocalObservation`."""
+    """Give the environment the agent's observation: trained models (with `local_k`) use `LocalObservation`."""
     k = getattr(agent, "local_k", None)
     return env if k is None else LocalObservation(env, k)
 

@@ -157,7 +157,7 @@ _HINDSIGHT = DriveTrainingConfig(
 )
 
 # A contact must cost more than standing still forever, which costs 0.4 s / (1 - gamma) with sparse rewards and about
-# twice that with dense ones. If it costs much less (60 s), an untrained policy ends episodes with a contact. If it costs
+# twice that with dense ones. If it costs much less (60 s), untrained policies end episodes with a contact. If it costs
 # much more (100 s), learning the narrow path into a parallel slot takes two to three times as long.
 DRIVE_CONFIGS: dict[str, DriveTrainingConfig] = {
     "ppo": DriveTrainingConfig(

@@ -27,7 +27,7 @@ from parkenv.files.atomic_write import atomic_write
 from planners.learned import ModelCard, algorithm_class
 
 TRAINING_SEEDS = 10_000_000
-"""World seeds of training seed s start at (s + 1) times this, far from the seeds of evaluations and benchmark suites."""
+"""World seeds of training seed s start at (s + 1) times this, far from those of evaluations and benchmark suites."""
 MODEL, CHECKPOINT, REPLAY, CURVE = "model.zip", "checkpoint.zip", "replay.pkl", "curve.csv"
 
 Row = dict[str, Any]

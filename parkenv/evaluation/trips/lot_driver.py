@@ -229,7 +229,7 @@ class LotDriver:
         return leg.seconds
 
     def park(self, slot: int, taken: bool) -> ParkingAttempt:
-        """Stop, plan a manoeuvre into a slot and drive it; if the slot is taken or too narrow, drive back onto the lane.
+        """Stop, plan a manoeuvre into a slot and drive it; if it is taken or too narrow, return to the lane.
 
         Args:
             slot: index of the slot.
@@ -427,7 +427,7 @@ class LotDriver:
     def _drive_in(
         self, targets: dict[str, FloatArray], there: Obstacles, inside: FloatArray | None
     ) -> tuple[str, str]:
-        """Drive to the target that is reached first; returns its name, and the reason of a failure."""
+        """Drive to the target with the fastest path; return its name, and the reason of a failure."""
         ways = list(targets)
         for _ in range(_MOST_PLANS):
             paths = {way: path for way in ways if (path := self._planned_to(targets[way], there)) is not None}
