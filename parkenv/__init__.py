@@ -1,6 +1,6 @@
-"""Search for a free parking space: Gymnasium environments, and the stack and planners to beat.
+"""Search for a free parking space: Gymnasium environments, a perception stack, and planners as baselines.
 
-Importing this package registers the environments; everything heavy is loaded when it is first used.
+Importing this package registers the environments; heavy modules are loaded on first use.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ for _name, _entry_point, _vector_entry_point in (
             entry_point=_entry_point,
             vector_entry_point=_vector_entry_point,
             max_episode_steps=2000,
-            # They themselves refuse to step or to render what has not begun.
+            # The environments themselves check that `reset` comes first.
             order_enforce=False,
         )
 if "parkenv/Drive-v1" not in registry:

@@ -1,6 +1,6 @@
 """Planners and heuristic baselines: from the belief about a lot's slots to an action.
 
-They know the lot and the belief, never the hidden occupancy; the oracle alone is shown that.
+They know the lot and the belief. Only the oracle knows the hidden occupancy.
 """
 
 from planners.agent import AGENT_NAMES, Agent, SearchAgent, make_agent

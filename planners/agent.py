@@ -1,4 +1,4 @@
-"""The agents' interface, and agents by name."""
+"""The interface of agents, and a factory that makes agents by name."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Memory = TypeVar("Memory")
 
 
 class Agent(Protocol):
-    """Interface of everything that decides: planners, heuristic baselines and stable-baselines3's models alike."""
+    """Interface of planners, heuristic baselines and stable-baselines3 models."""
 
     def predict(
         self,
@@ -34,16 +34,16 @@ class Agent(Protocol):
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, Any]:
-        """Choose an action for an observation; pass the returned state to the next call."""
+        """Return an action for an observation, and the state to pass to the next call."""
         ...
 
 
 @runtime_checkable
 class ClairvoyantAgent(Protocol):
-    """An agent that is shown the hidden occupancy of each episode; of those in this package the oracle alone."""
+    """An agent that knows the hidden occupancy of each episode. The oracle is the only one in this package."""
 
     def prepare(self, world: World, time: float) -> None:
-        """Receive the world of the episode about to begin, and its starting time, s since Monday 00:00."""
+        """Receive the world of the next episode and its start time, s since Monday 00:00."""
         ...
 
 
@@ -52,7 +52,7 @@ class PlanPreview:
     """Where an agent intends to drive, for replays and pictures.
 
     Attributes:
-        path: vertices ahead, in order, without the present one; empty where the agent has no plan to show.
+        path: vertices ahead, in order, without the current one; empty if the agent has no plan.
     """
 
     path: tuple[int, ...] = ()
@@ -61,15 +61,15 @@ class PlanPreview:
 class SearchAgent(ABC, Generic[Memory]):
     """Base class of the agents for `parkenv/Search-v1`.
 
-    A subclass decides on one observation at a time, by the belief about the slots that the observation states; this
-    class handles batches. An agent object holds what it knows of the problem and does not change; what it remembers of
-    an episode is in `state`, so one object may serve many episodes at once.
+    A subclass decides on one observation at a time, from the belief that the observation contains; this class handles
+    batches. An agent object does not change: the memory of an episode is in `state`, so one object can serve many
+    episodes at once.
     """
 
     name: ClassVar[str]
 
     def __init__(self, problem: SearchProblem) -> None:
-        # An agent that is given a whole scenario keeps the public part only.
+        # From a whole scenario, keep the public part only.
         self.problem = problem.public() if isinstance(problem, Scenario) else problem
 
     @abstractmethod
@@ -78,7 +78,7 @@ class SearchAgent(ABC, Generic[Memory]):
 
         Args:
             observation: from `parkenv/Search-v1`.
-            belief: what it says about the slots.
+            belief: its belief about the slots.
         """
 
     @abstractmethod
@@ -87,8 +87,8 @@ class SearchAgent(ABC, Generic[Memory]):
 
         Args:
             observation: from `parkenv/Search-v1`.
-            belief: what it says about the slots.
-            memory: of this episode; may be changed in place.
+            belief: its belief about the slots.
+            memory: memory of this episode; may be changed in place.
         """
 
     def predict(
@@ -103,9 +103,9 @@ class SearchAgent(ABC, Generic[Memory]):
         Args:
             observation: from `parkenv/Search-v1` or a vector of them.
             state: what the last call returned; None at the start.
-            episode_start: for each environment, whether its episode has just begun. With None, it has
-                where there is no state.
-            deterministic: accepted for the interface; these agents make no distinction.
+            episode_start: for each environment, whether its episode has just begun. With None, episodes begin where
+                `state` is None.
+            deterministic: part of the interface; ignored by these agents.
 
         Returns:
             The action, () or (n_envs,) int64, and the state to pass to the next call.
@@ -133,18 +133,18 @@ class SearchAgent(ABC, Generic[Memory]):
         return np.asarray(self.decide(observation, belief, memory), dtype=np.int64), memory
 
     def plan_preview(self, observation: Observation, action: int, memory: Memory) -> PlanPreview:
-        """Return where the agent intends to drive, right after `predict` chose `action`; changes nothing.
+        """Return where the agent intends to drive, right after `predict` chose `action`, without side effects.
 
         Args:
-            observation: that it decided on.
-            action: what it chose.
+            observation: the last argument of `predict`.
+            action: the action that it chose.
             memory: the state that `predict` returned.
         """
         del observation, action, memory
         return PlanPreview()
 
 
-# Modules are imported when an agent is made: heuristics need no sparse solver, and only models need torch.
+# Modules are imported when an agent is made: heuristics need no sparse solver, and only trained models need torch.
 _AGENTS: dict[str, tuple[str, str]] = {
     "mdp": ("planners.thesis.replanning", "ReplanningAgent"),
     "mdp-static": ("planners.thesis.replanning", "StaticAgent"),
@@ -165,14 +165,14 @@ AGENT_NAMES = tuple(name for name in _AGENTS if name not in SMALL_LOTS_ONLY)
 
 
 def require_observations(name: str, problem: SearchProblem) -> None:
-    """Refuse problems in which slots are never observed from the lane.
+    """Raise an error if slots can never be observed from the lane.
 
     Args:
-        name: of the agent.
-        problem: with its sensor model.
+        name: name of the agent, for the message.
+        problem: a problem with its sensor model.
 
     Raises:
-        InputError: no slot is ever observed.
+        InputError: no slot can be observed.
     """
     if not problem.sensor_rates.seen.any():
         raise InputError(
@@ -185,10 +185,10 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
 
     Args:
         name: one of `AGENT_NAMES` or `SMALL_LOTS_ONLY`; `ALGORITHM:FILE` for a model of `parkenv train`, such as
-            `ppo:models/ppo.zip`; or `MODULE:CLASS` for an agent of your own, such as `my_agents:Patient`: a class whose
-            first argument is the problem. The module may be in the working directory.
+            `ppo:models/ppo.zip`; or `MODULE:CLASS` for your own agent, such as `my_agents:Patient`: a class whose first
+            argument is the problem. The module may be in the working directory.
         scenario: the scenario; its hidden occupancy is not passed to the agent.
-        options: of the agent, such as `failure_s=5.0` of "mdp".
+        options: options of the agent, such as `failure_s=5.0` for "mdp".
 
     Raises:
         InputError: an unknown name or option; the message lists the known ones.
@@ -222,10 +222,10 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
 
 
 def agent_file(name: str) -> Path | None:
-    """Return the file that an agent comes from: a trained model, or the module of an agent of the user's.
+    """Return the file that defines an agent: a trained model, or the module of a user's agent.
 
     Args:
-        name: as `make_agent` takes it; `make_agent` was called with it before.
+        name: the name, already passed to `make_agent` once.
 
     Returns:
         None for the agents that come with the package.

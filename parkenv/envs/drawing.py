@@ -51,7 +51,7 @@ def draw_dashes(image: Image, start: FloatArray, end: FloatArray, color: Color) 
 
 
 def write_text(image: Image, text: str, at: tuple[int, int], color: Color, size: int, weight: int) -> int:
-    """Write text from a point of the baseline; returns its right end, px."""
+    """Write text from a point on the baseline; returns its right end, px."""
     (right, _), _ = cv2.putText(image, text, at, color, FONT, size, weight)
     return int(right)
 

@@ -52,7 +52,7 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     """Drive a car into a parking slot and stop there without a collision.
 
     ## Description
-    A car stands on the lane before a free slot, between parked cars that stand not quite straight. The car is a
+    A car starts on the lane in front of a free slot between slightly misaligned parked cars. Its motion model is a
     kinematic bicycle with limited speeds and rates (`parkenv.driving.vehicle`), integrated in steps of 0.05 s; pymunk
     detects collisions. An action is applied for 0.1 s.
 
@@ -64,12 +64,12 @@ class DriveEnv(gym.Env[dict[str, Any], NDArray[np.float32]]):
     | 0 | acceleration, fraction of the limit | backward | forward |
     | 1 | steering angle of the wheels, fraction of the limit | right | left |
 
-    Acceleration against the motion brakes: the limit is that of the brakes, and within a step the car comes to rest at
-    most.
+    Acceleration against the direction of motion brakes: the limit is then the braking limit, and the car at most
+    comes to rest within a step.
 
     ## Observation Space
-    A `Dict` with the keys of Gymnasium-Robotics' goal environments. Positions are in the slot's frame: origin in its
-    middle, x along its yaw, so that a car parked nose-in has yaw 0.
+    A `Dict` with the keys of Gymnasium-Robotics' goal environments. Positions are in the slot's frame: the origin is
+    its centre and x points along its yaw, so a car parked nose-in has yaw 0.
 
     | Key | Space | Content |
     |-----|-------|---------|
@@ -87,7 +87,7 @@ length and width over the car's |
 
     | Num | Content | Unit | Bounds |
     |-----|---------|------|--------|
-    | 0, 1 | x, y of the footprint's middle | m | ±60 |
+    | 0, 1 | x, y of the footprint's centre | m | ±60 |
     | 2, 3 | cosine and sine of the yaw | | ±1 |
     | 4 | speed, negative backward | m/s | ± the car's limit |
     | 5 | steering angle, positive to the left | rad | ± the car's limit |
@@ -95,8 +95,8 @@ length and width over the car's |
     | 7, 8 | half the excess of the slot's length and width over the car's | m | ±60 |
     | 9-11 | kind of the slot, one-hot: perpendicular, oblique, parallel | | ±1 |
 
-    The laser is in the middle of the footprint, low enough to detect kerbs. Rows of the obstacle map are sorted by
-    distance; outlines of fewer corners are padded with their last corner, unused rows with 1000 m.
+    The laser is at the centre of the footprint, low enough to detect kerbs. Rows of the obstacle map are sorted by
+    distance. Outlines with fewer corners are padded with their last corner, unused rows with 1000 m.
 
     ## Rewards
     - `sparse`: -0.1 per step, its duration in seconds; 0 for the step that parks.
@@ -107,16 +107,16 @@ length and width over the car's |
     with the contact from `info["contact"]`.
 
     ## Starting State
-    The car stands on the lane, `distance` before the slot, up to 0.2 m beside the driving line and up to 4° askew, with
-    straight wheels. `reset(seed=s)` determines all of it; later `reset()` calls draw further tasks of the seed.
-    Option of `reset`: `start`, x, y (m) and yaw (rad) of the rear axle in the lot's frame.
+    The car is on the lane, `distance` before the slot, up to 0.2 m off the driving line and up to 4° off its
+    direction, with straight wheels. `reset(seed=s)` determines all of it; later `reset()` calls draw further tasks of
+    the seed. Option of `reset`: `start`, x, y (m) and yaw (rad) of the rear axle in the lot's frame.
 
     ## Episode End
     Terminated:
 
-    1. parked (`info["is_success"]`): the footprint is inside the slot, its middle at most 0.25 m from the slot's, the
+    1. parked (`info["is_success"]`): the footprint is inside the slot, its centre at most 0.25 m from the slot's, the
        yaw within 5°, and the speed at most 0.05 m/s;
-    2. a contact, of which `info["contact"]` names the obstacle;
+    2. a contact; `info["contact"]` names the obstacle;
     3. the car left the area of 27 m around the slot along the lot's axes (`contact` is "left the area").
 
     Truncated after 600 steps, one minute.
@@ -133,7 +133,7 @@ length and width over the car's |
     - `laser`: True for the thesis's scanner (1081 beams over 270°), or a `LaserScanner`.
     - `obstacle_map`: whether the observation has `cars` and `lines`.
     - `traffic`: e.g. `Traffic(cars=4, pedestrians=6)` adds moving cars and pedestrians. They wait for the car, but do
-      not evade a car that drives into them.
+      not swerve if it drives into them.
     - `render_mode`: `rgb_array` (480, 640, 3), or `human` (needs the extra `human`).
 
     ```python
@@ -154,7 +154,7 @@ length and width over the car's |
     accelerate forward and backward, a and d steer left and right; combinations are possible.
 
     ## Version History
-    - v1: the id rises with the other environments'.
+    - v1: same version number as the other environments.
     - v0: first version.
     """
 
@@ -325,8 +325,8 @@ length and width over the car's |
 
         Args:
             achieved_goal: (7,) or (n, 7).
-            desired_goal: likewise.
-            info: of the step, or a sequence of n; a missing `contact` means none.
+            desired_goal: same shape.
+            info: the step's `info`, or a sequence of n; a missing `contact` means none.
 
         Returns:
             A float, or (n,) float32.
@@ -378,7 +378,7 @@ length and width over the car's |
             self._renderer = None
 
     def _enter(self, state: DriveState) -> None:
-        """Set up the collision world and the constant parts of the observation of an episode."""
+        """Set up the collision world and the constant parts of the observation."""
         task = state.task
         movers: list[tuple[ObstacleKind, FloatArray]] = []
         if self._n_movers:

@@ -1,4 +1,4 @@
-"""Goals of `parkenv/Drive-v1`: when a car counts as parked, and how far it is from that."""
+"""Goals of `parkenv/Drive-v1`: goal errors, and when a car counts as parked."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 
 POSITION_TOLERANCE = 0.25
-"""Greatest distance, m, of a parked car's middle from the wanted position."""
+"""Largest distance, m, of a parked car's centre from the goal."""
 ANGLE_TOLERANCE = math.radians(5.0)
-"""Greatest angle, rad, between a parked car's yaw and the wanted one."""
+"""Largest angle, rad, between a parked car's yaw and the goal's."""
 STANDING = 0.05
-"""Speed, m/s, up to which a car stands."""
+"""Speed, m/s, up to which a car counts as standing."""
 
 
 def goal_errors(

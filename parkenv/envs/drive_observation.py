@@ -19,7 +19,7 @@ from sim_sensors.laser.scanner import LaserScanner
 FloatArray = NDArray[np.float64]
 
 FAR = 1000.0
-"""Coordinate, m, slot frame, of the unused rows of the obstacle map."""
+"""Coordinate, m, slot frame, that fills unused rows of the obstacle map."""
 MOST_CARS, MOST_LINES = 160, 320
 """Rows of the obstacle map."""
 CORNERS = 24
@@ -34,7 +34,7 @@ def drive_observation_space(
     """The observation space of `DriveEnv`.
 
     Args:
-        vehicle: sets the bounds of speed, steering and acceleration.
+        vehicle: defines the bounds of speed, steering and acceleration.
         laser: adds `scan`.
         n_movers: number of moving road users, rows of `movers`.
         obstacle_map: whether to add `cars`, `lines` and, with traffic, `movers`.
@@ -86,7 +86,7 @@ def scan_plane(task: ParkingTask, movers: int = 0) -> ScanPlane:
     """The scene of a laser low on the car: parked cars as footprints, kerbs and walls as walls.
 
     Args:
-        task: with the obstacles.
+        task: defines the obstacles.
         movers: number of rows reserved after the cars for moving outlines.
     """
     cars = task.obstacles.only(ObstacleKind.PARKED_CAR)

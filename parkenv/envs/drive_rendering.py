@@ -68,7 +68,7 @@ _BODY = 0.5 * np.stack([np.sign(f) * np.abs(f) ** 0.3 for f in (np.cos(_ANGLE), 
 
 
 class DriveRenderer:
-    """Renderer of the manoeuvres on one lot, to scale.
+    """Renderer of parking manoeuvres on one lot, to scale.
 
     Args:
         lot: the lot.
@@ -85,8 +85,8 @@ class DriveRenderer:
         """Render the current state, (480, 640, 3) uint8 RGB.
 
         Args:
-            state: of an environment on the renderer's lot.
-            outlines: (k, 2) m, in their own frames, of the moving road users, if there are any.
+            state: state of an environment on the renderer's lot.
+            outlines: outlines of the moving road users, (k, 2) m each, in their own frames.
         """
         task = state.task
         if task is not self._task:
@@ -99,7 +99,7 @@ class DriveRenderer:
         inside = self._view(middle)
         center = (0.0, 0.0)
         if not ((inside > 30.0) & (inside < np.array([WIDTH, HEIGHT - HUD]) - 30.0)).all():
-            # The window moves in steps and depends on the car's place alone: equal states, equal frames.
+            # The window moves in steps and depends only on the car's position: equal states give equal frames.
             stride = np.array([WIDTH, HEIGHT - HUD]) / self._view.scale / 2
             along = (middle - task.slot[:2]) @ self._view.turn
             center = tuple((np.round(along / stride) * stride).tolist())
@@ -143,7 +143,7 @@ def draw_car(
         view: maps metres to pixels.
         vehicle: the car.
         state: (6,) as in `parkenv.driving.vehicle`.
-        color: of its body.
+        color: colour of its body.
     """
     middle = vehicle.at_middle(state[:3])
     size = np.array([vehicle.length, vehicle.width])
@@ -159,7 +159,7 @@ def draw_car(
 
 
 def _draw_trail(image: Image, view: MapView, state: DriveState) -> None:
-    """Draw the path of the car's middle, and its outline at the start and at changes of direction."""
+    """Draw the path of the car's centre, and its outline at the start and at changes of direction."""
     vehicle, poses = state.task.vehicle, np.array(state.trail)
     color = mixed_color(ASPHALT, CAR, 0.75)
     step = np.diff(poses[:, :2], axis=0)
@@ -174,7 +174,7 @@ def _draw_trail(image: Image, view: MapView, state: DriveState) -> None:
 
 
 def _ground(lot: ParkingLot, outline: LotOutline, task: ParkingTask, view: MapView) -> Image:
-    """Draw all that does not move at `SUPERSAMPLING` times the resolution, and average it down."""
+    """Draw everything static at `SUPERSAMPLING` times the resolution, and average it down."""
     fine = MapView(view.turn, view.scale * SUPERSAMPLING, view.shift * SUPERSAMPLING)
     shape = ((HEIGHT - HUD) * SUPERSAMPLING, WIDTH * SUPERSAMPLING)
     image = np.full((*shape, 3), GROUND, dtype=np.uint8)
@@ -208,7 +208,7 @@ def _ground(lot: ParkingLot, outline: LotOutline, task: ParkingTask, view: MapVi
 
 
 def _draw_parked(image: Image, view: MapView, outline: FloatArray) -> None:
-    """Draw a parked car from its footprint: longer than wide, its windows alike at both ends."""
+    """Draw a parked car from its footprint, with equal windows at both ends."""
     cv2.fillConvexPoly(image, fixed_point(view(outline)), PARKED_CAR, cv2.LINE_8, SUBPIXEL_BITS)
     box = shapely.get_coordinates(shapely.minimum_rotated_rectangle(shapely.Polygon(outline)))
     side = np.diff(box[:3], axis=0)

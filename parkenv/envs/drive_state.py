@@ -19,18 +19,18 @@ class DriveState:
     """Everything that changes during an episode.
 
     Args:
-        key: of the world.
+        key: key of the world.
         task: the parking task; never changes.
         vehicle: (6,) state of the car, see `parkenv.driving.vehicle`.
-        rng: of the laser's noise.
-        time: since the start, s.
+        rng: random generator of the laser's noise.
+        time: time since the start, s.
         driven_m: distance driven, m.
-        direction: of the last motion, 1 forward, -1 backward, 0 before the first.
+        direction: direction of the last motion: 1 forward, -1 backward, 0 before the first.
         direction_changes: number of changes between forward and backward.
         contact: name of the obstacle touched, empty without one.
         parked: whether the car has parked.
         over: whether the episode has ended.
-        clocks: (n,) s, of the moving road users.
+        clocks: (n,) s, time of each moving road user.
         movers: (n, 3) x, y in m and yaw in rad, poses of the moving road users.
         trail: x, y in m and yaw in rad of the rear axle after each step.
     """

@@ -1,34 +1,34 @@
 """The car's surroundings as a vector of the same length on every lot, for policies that transfer between lots.
 
-The vector has 46 + 8k numbers from 0 to 1. A time of s seconds is written as s / (s + 60), so that a minute is a half
-and what is far away or missing comes near, or to, 1. A chance of p is written as p. "Ahead" of a move are those k slots
-nearest by drive to which the shortest drive from here begins with that move.
+The vector has 46 + 8k numbers from 0 to 1. A time of s seconds is encoded as s / (s + 60): a minute becomes 0.5, and
+distant or missing slots come close to, or equal, 1. Probabilities are not transformed. The slots "ahead" of a move are
+the k nearest slots, by drive time, whose shortest path from here starts with that move.
 
 | Index | Meaning |
 |---|---|
 | 0 | whether there is a slot here |
-| 1 | chance that it is free; 0 where there is none |
-| 2 | walk from it to the goal, and its parking cost; 1 where there is none |
+| 1 | P(free) of it; 0 if there is none |
+| 2 | walk from it to the goal plus its parking cost; 1 if there is none |
 | 3 | time since the search began |
 | 4 | number of slots observed, n / (n + 20) |
-| 5 | share of them that were free when first observed |
-| 6 | share of them that were forecast to be free |
-| 7-10 | forecast share of free slots among the quarters of the lot by walk, nearest to the goal first |
-| 11 | chance that the remembered slot is free: the one observed free with the shortest drive and walk; 0 if none |
-| 12 | walk from it and its parking cost; 1 if there is none |
-| 13 | drive to it as the crow flies; 1 if there is none |
-| 14 + 8a | for the moves a up, down, left, right: whether the graph has it |
-| 15 + 8a | its drive; 1 if there is none, as all times below |
-| 16 + 8a | it, and from there on the shortest drive and walk by way of any slot, were all free |
-| 17 + 8a | whether it leads back to where the car came from |
-| 18 + 8a | chance that at least one of the slots ahead is free |
-| 19 + 8a | expected drive and walk by way of the best free slot ahead; a minute more than the worst where none is |
-| 20 + 8a | share of the slots ahead that were observed |
-| 21 + 8a | drive from there to the remembered slot as the crow flies |
-| 46 + 8i | for the k slots nearest by drive, nearest first: chance that it is free; 0 if there is none |
+| 5 | fraction of them that were free when first observed |
+| 6 | fraction of them that were forecast to be free |
+| 7-10 | forecast fraction of free slots in each quarter of the lot by walk, nearest to the goal first |
+| 11 | P(free) of the remembered slot: the one observed free with the shortest drive and walk; 0 if none |
+| 12 | walk from it plus its parking cost; 1 if there is none |
+| 13 | straight-line drive to it; 1 if there is none |
+| 14 + 8a | for each move a (up, down, left, right): whether the graph has it |
+| 15 + 8a | drive time of the move; 1 if there is no such move, as for all times below |
+| 16 + 8a | the move, then the shortest drive and walk via any slot, if all were free |
+| 17 + 8a | whether the move leads back to the previous vertex |
+| 18 + 8a | P(at least one of the slots ahead is free) |
+| 19 + 8a | expected drive and walk via the best free slot ahead; if none is free, a minute more than the worst |
+| 20 + 8a | fraction of the slots ahead that were observed |
+| 21 + 8a | straight-line drive from the end of the move to the remembered slot |
+| 46 + 8i | for each of the k slots nearest by drive, nearest first: P(free); 0 if there is none |
 | 47 + 8i | whether it was observed |
 | 48 + 8i | drive to it; 1 if there is none |
-| 49 + 8i | walk from it and its parking cost; 1 if there is none |
+| 49 + 8i | walk from it plus its parking cost; 1 if there is none |
 | 50 + 8i to 53 + 8i | whether the drive to it begins with up, down, left, right |
 """
 
@@ -76,21 +76,21 @@ _NOWHERE = -1
 
 
 class Surroundings(NamedTuple):
-    """What is near each vertex of one lot or several; rows are vertices, lot after lot.
+    """The surroundings of every vertex of one or several lots; rows are vertices, lot after lot.
 
     Attributes:
-        first: (n_lots,) int64, each lot's first row.
-        fixed: (n, 46 + 8k) float32, the observation but for what changes.
-        starts: (n + 1,) int32, where each row's slots begin.
-        slots: int32, those that are near or ahead, each once.
-        near: (n, k) int32, which of its slots are nearest; -1 past the last.
-        ahead: (n, 4, k) int32, which lie ahead of each move, least drive and walk first; -1 past the last.
-        total_s: (n, 4, k) s, that drive and walk.
-        crow_s: (n, 2) s, coordinates over speed.
-        samples: (n_lots, 4, 4) int32, slots of each quarter of the lot by walk.
-        first_view: (n_lots,) int64, where each lot begins in `view_s`.
-        view_s: s, for each of the slots in view of each vertex the drive to it as the crow flies, and the walk.
-        columns: int32, where the columns of a row's slots are noted while a search is observed.
+        first: (n_lots,) int64, first row of each lot.
+        fixed: (n, 46 + 8k) float32, the constant part of the observation.
+        starts: (n + 1,) int32, start of each row's slots in `slots`.
+        slots: int32, the near or ahead slots of each row, without repeats.
+        near: (n, k) int32, indices of the nearest ones into the row's slots; -1 past the last.
+        ahead: (n, 4, k) int32, indices of those ahead of each move, least drive plus walk first; -1 past the last.
+        total_s: (n, 4, k) s, drive plus walk via each slot of `ahead`.
+        crow_s: (n, 2) s, coordinates divided by the driving speed.
+        samples: (n_lots, 4, 4) int32, sample slots from each quarter of the lot by walk.
+        first_view: (n_lots,) int64, start of each lot in `view_s`.
+        view_s: s, straight-line drive plus walk for each slot in view of each vertex.
+        columns: int32, scratch space for the columns of a row's slots.
     """
 
     first: NDArray[np.int64]
@@ -108,11 +108,11 @@ class Surroundings(NamedTuple):
 
     @classmethod
     def of(cls, problems: Sequence[SearchProblem], k: int) -> Surroundings:
-        """Find out what is near where.
+        """Compute the surroundings of all vertices.
 
         Args:
-            problems: with the lots.
-            k: number of slots that are described, nearby and ahead of each move.
+            problems: define the lots.
+            k: number of slots described, both nearby and ahead of each move.
 
         Raises:
             InputError: k is not a whole number of at least 1.
@@ -144,7 +144,7 @@ class Surroundings(NamedTuple):
 
 
 def local_space(k: int) -> spaces.Dict:
-    """What is observed: `local`, (46 + 8k,) float32, and `action_mask`, (5,) int8."""
+    """The observation space: `local`, (46 + 8k,) float32, and `action_mask`, (5,) int8."""
     return spaces.Dict(
         {
             "local": spaces.Box(0.0, 1.0, (FIRST_NEAR + PER_NEAR * k,), np.float32),
@@ -156,11 +156,11 @@ def local_space(k: int) -> spaces.Dict:
 class LocalObservation(
     gym.ObservationWrapper[dict[str, Any], np.int64, dict[str, Any]], gym.utils.RecordConstructorArgs
 ):
-    """`parkenv/Search-v1` observed as `local` and `action_mask`; see the module for what `local` says.
+    """Observe `parkenv/Search-v1` as `local` and `action_mask`; the module describes `local`.
 
     Args:
-        env: `parkenv/Search-v1`, or one that observes what it does.
-        k: how many slots it tells of.
+        env: `parkenv/Search-v1`, or an environment with the same observations.
+        k: number of slots described.
 
     Raises:
         TypeError: another environment.
@@ -184,7 +184,7 @@ class LocalObservation(
         self.observation_space = local_space(k)
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """What lies around the car now."""
+        """Return the local observation."""
         local = np.empty(self._surroundings.fixed.shape[1], dtype=np.float32)
         assert isinstance(self.env.unwrapped, SearchEnv)
         observe_one(self.env.unwrapped.searches.address, self._surroundings, local)
@@ -193,13 +193,13 @@ class LocalObservation(
 
 @kernel
 def observe_one(address: int, around: Surroundings, local: NDArray[np.float32]) -> None:
-    """`observe_surroundings` of the only search there is."""
+    """Call `observe_surroundings` for a single search."""
     observe_surroundings(search_at(address, 0), around, 0, local)
 
 
 @kernel
 def observe_surroundings(search: Any, around: Surroundings, lot: int, local: NDArray[np.float32]) -> None:
-    """Write what lies around the car, in a lot of `around`; to be called after each reset and each step."""
+    """Write the local observation; must be called after each reset and each step."""
     if search.n_steps == 0:
         _forecast_regions(search, around, lot)
     _remember(search, around, lot)
@@ -260,13 +260,13 @@ def observe_surroundings(search: Any, around: Surroundings, lot: int, local: NDA
 
 @inlined
 def _p_occupied(search: Any, column: int) -> float:
-    """The belief in the slot of a column, as `decay_belief` left it."""
+    """P(taken) of the slot of a column, as `decay_belief` last computed it."""
     return float(block_at(search.blocks, column >> BLOCK_BITS).p_occupied[column & (BLOCK_SIZE - 1)])
 
 
 @inlined
 def _arrival_cost_s(scenario: Any, slot: int) -> float:
-    """Walk from a slot to the goal, and cost of parking there, s."""
+    """Walk from a slot to the goal plus its parking cost, s."""
     return float(float64s(scenario.walk_s)[slot] + float64s(scenario.parking_cost_s)[slot])
 
 
@@ -289,7 +289,7 @@ def _squashed(seconds: float) -> float:
 
 @inlined
 def _crow_s(around: Surroundings, one: int, other: int) -> float:
-    """Drive between two vertices, s, as the crow flies."""
+    """Straight-line drive between two vertices, s."""
     dx = around.crow_s[one, 0] - around.crow_s[other, 0]
     dy = around.crow_s[one, 1] - around.crow_s[other, 1]
     return math.sqrt(dx * dx + dy * dy)
@@ -297,7 +297,7 @@ def _crow_s(around: Surroundings, one: int, other: int) -> float:
 
 @kernel
 def _forecast_regions(search: Any, around: Surroundings, lot: int) -> None:
-    """Compute the forecast of a few slots of each quarter of the lot."""
+    """Average the forecast of a few slots in each quarter of the lot."""
     for region in range(N_REGIONS):
         free = 0.0
         for i in range(SAMPLES):
@@ -307,7 +307,7 @@ def _forecast_regions(search: Any, around: Surroundings, lot: int) -> None:
 
 @kernel
 def _remember(search: Any, around: Surroundings, lot: int) -> None:
-    """Remember the best slot that was observed free, and drop it when it is observed taken."""
+    """Remember the best slot observed free, and drop it when it is observed taken."""
     scenario, columns = scenario_at(search.scenario, 0), int32s(search.columns)
     first, first_view, vertex = around.first[lot], around.first_view[lot], search.vertex
     best, least = search.remembered_slot, np.inf
@@ -332,7 +332,7 @@ def _remember(search: Any, around: Surroundings, lot: int) -> None:
 
 
 def _view_s(problem: SearchProblem) -> FloatArray:
-    """Drive as the crow flies and walk to each slot in view of each vertex, row by row, s."""
+    """Straight-line drive plus walk for each slot in view of each vertex, row by row, s."""
     starts, slots = problem.slots_in_view
     viewer = np.repeat(np.arange(problem.lot.n_vertices), np.diff(starts))
     away = problem.lot.vertex_xy[slots] - problem.lot.vertex_xy[viewer]
@@ -341,7 +341,7 @@ def _view_s(problem: SearchProblem) -> FloatArray:
 
 
 def _around(problem: SearchProblem, k: int) -> tuple[NDArray[Any], ...]:
-    """Of one lot: how many slots each row has, and the arrays of `Surroundings` without `first` and `starts`."""
+    """For one lot: the number of slots of each row, and the arrays of `Surroundings` except `first` and `starts`."""
     lot = problem.lot
     n = lot.n_vertices
     neighbors, move_s, walk_s = lot.neighbors, problem.move_s, problem.arrival_cost_s
@@ -391,7 +391,7 @@ def _nearest(
     ahead = np.full((n, N_MOVES, k), _NOWHERE, np.int32)
     ahead_s = np.full((n, N_MOVES, k), np.inf)
     settled = np.full(n, _NOWHERE, np.int32)
-    # A move that is no shortest way to anything would have the whole lot searched for slots ahead of it.
+    # A move that starts no shortest path has no slots ahead: bound the search for them.
     patience = 64 + 8 * k * N_MOVES
     for v in range(n):
         heap: list[tuple[float, int, int]] = [(0.0, v, _NOWHERE)]
@@ -426,7 +426,7 @@ def _nearest(
 def _without_repeats(
     near: NDArray[np.int32], ahead: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """How many different slots each row names, these, and what is named as indices into them."""
+    """Number of distinct slots of each row, these slots, and the rows as indices into them."""
     n, k = near.shape
     wanted = np.concatenate((near, ahead.reshape(n, N_MOVES * k)), axis=1)
     index = np.full(wanted.shape, _NOWHERE, np.int32)
@@ -450,7 +450,7 @@ def _without_repeats(
 
 @compiled
 def _best_totals(neighbors: NDArray[np.int32], move_s: FloatArray, walk_s: FloatArray) -> FloatArray:
-    """Least drive and walk from each vertex by way of any slot, (n,) s; inf where none can be reached."""
+    """Least drive plus walk from each vertex via any slot, (n,) s; inf if no slot is reachable."""
     best = np.full(len(neighbors), np.inf)
     best[: len(walk_s)] = walk_s
     better = True

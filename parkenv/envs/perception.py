@@ -24,7 +24,7 @@ from sim_sensors.rig import SensorRig
 
 
 class OnboardPerception:
-    """Sensors and perception pipeline of a searching car, and the belief update from what they observe.
+    """Sensors and perception pipeline of a searching car, and the belief update from its observations.
 
     Args:
         scenario: the world. If its sensor model is perfect, the fitted model of the rig replaces it, because the belief
@@ -36,7 +36,7 @@ class OnboardPerception:
         scenario: the scenario with the sensor model of the belief update.
         sampler: the simulated sensors.
         pipeline: detection, ranging and slot filter.
-        results: what the pipeline made of the captures of the last step, oldest first.
+        results: pipeline results for the captures of the last step, oldest first.
         observation: the slots observed in the last step, and their observed states.
 
     Raises:
@@ -72,13 +72,13 @@ class OnboardPerception:
         """Run the pipeline on the captures of a step, and update the belief with the observed slots.
 
         Args:
-            control: of a search in this scenario.
-            vertex: where the car is.
-            captures: measured on the way there, oldest first.
+            control: step control of a search in this scenario.
+            vertex: current vertex of the car.
+            captures: captures on the way there, oldest first.
         """
         self.results, observed = self.pipeline.observe(captures)
         rows = slice(self._view_starts[vertex], self._view_starts[vertex + 1])
-        # The sensor model has rates for the slots within its range only.
+        # The sensor model has rates only for slots within its range.
         in_range, rates = self._view_slots[rows], self._rates.of(rows)
         rated, used = np.isin(in_range, observed.slots), np.isin(observed.slots, in_range)
         self.observation = SlotObservation(observed.slots[used], observed.taken[used])
@@ -89,11 +89,11 @@ class SearchPerceptionEnv(SearchEnv):
     """`parkenv/Search-v1` with the real perception pipeline in the loop: the belief comes from simulated sensors.
 
     ## Description
-    World, decisions and rewards are those of `parkenv/Search-v1`, and equal seeds give equal worlds. But slots are not
-    observed by a sensor model. During every step the car's camera and laser measure (as in
+    World, decisions and rewards are those of `parkenv/Search-v1`, and equal seeds give equal worlds. But a perception
+    pipeline replaces the sensor model: at every step the car's camera and laser measure (as in
     `parkenv/SearchSensors-v1`), cars are detected and located, beams are traced into the slots, and the observed states
-    of the slots update the belief. So the belief has the errors of a real detector, and the observed slots depend on
-    occlusion, not on distance alone.
+    of the slots update the belief. So the belief has the errors of a real detector, and occlusion as well as distance
+    decides which slots are observed.
 
     ## Action space
     `Discrete(5)`, as in `parkenv/Search-v1`:
@@ -190,7 +190,7 @@ class SearchPerceptionEnv(SearchEnv):
         return super().step(action)
 
     def _advance(self, action: int) -> tuple[Any, ...]:
-        """Act, measure on the way, and update the belief from the measurements."""
+        """Apply the action, measure on the way, and update the belief from the measurements."""
         control, state = self._control, self._state
         control.drive_or_park(action)
         state.extend_path()

@@ -43,11 +43,11 @@ KEY_WIDTH = 172
 MARGIN = 8
 """Margin, px, around the lot."""
 SMALLEST_SLOT = 4.0
-"""Slot width, px, below which a frame shows a window that moves with the car instead of the whole lot."""
+"""Slot width, px, below which a frame shows a window around the car instead of the whole lot."""
 WINDOW_SLOT = 9.0
 """Width, px, of a slot in such a window."""
 LARGEST_SCALE = 22.0
-"""px/m; a few slots need not fill the frame."""
+"""Largest scale, px/m, so that a small lot does not fill the frame."""
 SUPERSAMPLING = 4
 
 BELIEF_ANCHORS: tuple[Color, ...] = (
@@ -76,9 +76,9 @@ _EDGE = 3.0  # m, around the lot's features
 _PALENESS = 0.62
 
 TEXT_WIDTH, TEXT_ROWS = 78, 17
-"""Cells of the text map: with the lines above and below it fits a terminal of 80 by 24."""
+"""Rows of the text map: with the lines above and below, it fits an 80 × 24 terminal."""
 TEXT_CELL_LEAST, TEXT_CELL = 1.25, 3.5
-"""Least and largest width, m, of a cell; larger lots show a window around the car, so that slots stay apart."""
+"""Smallest and largest width, m, of a cell; larger lots show a window around the car, so slots stay apart."""
 
 
 def _belief_scale() -> Image:
@@ -129,9 +129,9 @@ class MapView:
 
     @classmethod
     def fit(cls, xy: FloatArray, size: tuple[float, float], largest_scale: float = np.inf) -> Self:
-        """Show all points, (k, 2) m, centred in a picture of this width and height, px.
+        """Fit all points, (k, 2) m, centred, into an image of this width and height, px.
 
-        North is up, or to the right where that makes the lot more than 20 % larger.
+        North is up, or to the right if that makes the lot more than 20 % larger.
         """
         low, high = xy.min(axis=0), xy.max(axis=0)
         extent = np.maximum(high - low, 1e-6)
@@ -143,7 +143,7 @@ class MapView:
     def around(
         cls, center: FloatArray, size: tuple[float, float], scale: float, *, turned: bool = False
     ) -> Self:
-        """Show the surroundings of a point, (2,) m, which is the picture's centre."""
+        """Centre the image on a point, (2,) m."""
         turn = np.array([[0.0, 1.0], [1.0, 0.0]] if turned else [[1.0, 0.0], [0.0, -1.0]])
         return cls(turn, scale, np.array(size) / 2 - center @ turn * scale)
 
@@ -155,17 +155,17 @@ class MapView:
 
 @dataclass(frozen=True, eq=False)
 class StillLayer:
-    """What stays the same from frame to frame, and the pixels of the slots.
+    """The static background of the frames, and the pixels of the slots.
 
     Attributes:
-        view: of the frame.
-        image: (HEIGHT, WIDTH, 3) uint8, the picture without slots.
-        slots: (m,) int64, the slots in the picture.
-        pixel: (k,) int64, index of each pixel that shows a slot, in the flattened picture.
-        slot: (k,) int64, which of `slots` it shows.
-        cover: (k,) float32, share of the pixel that is slot; the rest is paint.
-        car: (k, 3) float32, colour of a parked car there, times
-        car_cover: (k,) float32, the share of the pixel that it takes.
+        view: map view of the frame.
+        image: (HEIGHT, WIDTH, 3) uint8, the image without slots.
+        slots: (m,) int64, the slots in the image.
+        pixel: (k,) int64, index of each pixel that shows a slot, in the flattened image.
+        slot: (k,) int64, index into `slots` of the slot it shows.
+        cover: (k,) float32, fraction of the pixel covered by the slot; the rest is paint.
+        car: (k, 3) float32, colour of a parked car there, multiplied by `car_cover`.
+        car_cover: (k,) float32, fraction of the pixel covered by the car.
     """
 
     view: MapView
@@ -199,14 +199,14 @@ def _paint_slots(
 
 
 class SearchRenderer:
-    """Draws the searches of one scenario.
+    """Renderer of the searches in one scenario.
 
-    Asphalt, slots and cars are drawn once with high resolution; a frame then only mixes colours, so its
-    cost does not grow with the number of slots. Of a lot whose slots would be less than `SMALLEST_SLOT` px
-    wide, a window around the car is shown, which moves in steps of half its size.
+    Asphalt, slots and cars are drawn once at high resolution; a frame then only mixes colours, so its cost does not
+    grow with the number of slots. If slots would be less than `SMALLEST_SLOT` px wide, the frame shows a window around
+    the car, which moves in steps of half its size.
 
     Args:
-        scenario: where the searches take place.
+        scenario: the scenario.
 
     Attributes:
         outline: the lot's shapes.
@@ -231,11 +231,11 @@ class SearchRenderer:
     def frame(self, state: SearchState, occupied: NDArray[np.bool_]) -> Image:
         """Render the current state, (480, 640, 3) uint8 RGB.
 
-        A slot's colour is the belief, pale until the slot has been observed; parked cars are the true
-        occupancy, so frames are for spectators, not for agents.
+        A slot's colour shows the belief, pale until the slot has been observed. Parked cars show the true occupancy,
+        so frames are for spectators, not for agents.
 
         Args:
-            state: of an environment with the renderer's scenario.
+            state: state of an environment with the renderer's scenario.
             occupied: (n_slots,) bool, the true occupancy.
         """
         ground = self.still_layer(state)
@@ -278,7 +278,7 @@ class SearchRenderer:
         return "\n".join(line[:TEXT_WIDTH] for line in lines)
 
     def still_layer(self, state: SearchState) -> StillLayer:
-        """Return the layer of the lot's part that a frame shows."""
+        """Return the static layer for the part of the lot that a frame shows."""
         if self._whole is not None:
             if self._still is None:
                 self._still = draw_still_layer(self.scenario.lot, self.outline, self._whole)
@@ -286,8 +286,8 @@ class SearchRenderer:
         return self._window(self.scenario.lot.vertex_xy[state.vertex], WINDOW_SLOT, 2)
 
     def _window(self, place: FloatArray, slot_px: float, parts: int) -> StillLayer:
-        """Return the layer around a place, (2,) m, with slots of `slot_px` width; it moves by 1/`parts` of its size."""
-        # The window depends on the place alone: equal states, equal frames.
+        """Return the layer around a position, (2,) m, with slots `slot_px` wide; it moves by 1/`parts` of its size."""
+        # The window depends only on the position: equal states give equal frames.
         scale = slot_px / self._slot_width
         stride = np.array(self._size) / scale / parts
         column, row = np.round(place / stride).astype(int)
@@ -328,7 +328,7 @@ class SearchRenderer:
             here = (column >= 0) & (column < TEXT_WIDTH) & (row >= 0) & (row < TEXT_ROWS)
             rows[row[here], column[here]] = glyphs[here]
 
-        # Where slots share a cell, the one most likely free is written last.
+        # If slots share a cell, the one most likely to be free is written last.
         order = np.argsort(-belief.p_occupied, kind="stable")
         likely = np.searchsorted([1 / 3, 2 / 3], belief.p_occupied)
         glyphs = np.where(belief.observed, np.array(list("oo#"))[likely], np.array(list(".:%"))[likely])
@@ -433,7 +433,7 @@ def _corners(lot: ParkingLot) -> FloatArray:
 
 
 def _way_in(lot: ParkingLot, vertex: int) -> FloatArray:
-    """Return the unit vector, (2,), of the edge out of a vertex that leads most toward the slots."""
+    """Return the unit vector, (2,), of the edge out of a vertex that points most directly toward the slots."""
     ahead = lot.vertex_xy[lot.neighbors[vertex][lot.neighbors[vertex] >= 0]] - lot.vertex_xy[vertex]
     if not len(ahead):
         return np.array([1.0, 0.0])
@@ -455,11 +455,11 @@ def draw_outline(
 
     Args:
         image: (h, w, 3) uint8, drawn upon.
-        view: of the image, which has `SUPERSAMPLING` times the resolution of the frame.
-        outline: of the lot.
-        center: (2,) m, of the part to draw.
-        reach: m, how far from there along both axes it has to be complete.
-        apron: m, of asphalt beyond the kerbs.
+        view: map view of the image, which has `SUPERSAMPLING` times the resolution of the frame.
+        outline: outline of the lot.
+        center: (2,) m, centre of the part to draw.
+        reach: m, half the size of that part along both axes.
+        apron: m, width of the asphalt beyond the kerbs.
     """
     for building in outline.buildings:
         cv2.fillPoly(image, [fixed_point(view(building))], BUILDING, cv2.LINE_8, SUBPIXEL_BITS)
@@ -472,7 +472,7 @@ def draw_outline(
 
 
 def draw_still_layer(lot: ParkingLot, outline: LotOutline, view: MapView) -> StillLayer:
-    """Draw all that does not move, at `SUPERSAMPLING` times the resolution, and average it down."""
+    """Draw everything static at `SUPERSAMPLING` times the resolution, and average it down."""
     fine = MapView(view.turn, view.scale * SUPERSAMPLING, view.shift * SUPERSAMPLING)
     shape = ((HEIGHT - HUD) * SUPERSAMPLING, WIDTH * SUPERSAMPLING)
     at = view(lot.slot_xy)
@@ -484,7 +484,7 @@ def draw_still_layer(lot: ParkingLot, outline: LotOutline, view: MapView) -> Sti
     length, width = lot.slot_length[slots, None, None], lot.slot_width[slots, None, None]
 
     def placed(part: FloatArray, long: FloatArray, wide: FloatArray) -> NDArray[np.int32]:
-        """Place a part of unit size, (k, 2), in every slot; (m, k, 2) fixed-point pixels."""
+        """Place a unit-size shape, (k, 2), in every slot; returns (m, k, 2) fixed-point pixels."""
         xy = lot.slot_xy[slots, None] + part[:, :1] * long * along + part[:, 1:] * wide * left
         return fixed_point(fine(xy))
 

@@ -1,4 +1,4 @@
-"""`parkenv/Search-v1`: decide at every vertex where to drive, or to park."""
+"""`parkenv/Search-v1`: search a parking lot for a free slot."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from parkenv.envs.rendering import SearchRenderer
 
 LATEST = 1e8
-"""Bound, s, of the observed times: Gymnasium wants one, and three years are more than any search takes."""
+"""Bound, s, of the observed times: Gymnasium requires one, and no search takes three years."""
 MAX_DECAY_RATE = 1e6
 """Bound, 1/s, of `decay_rate`."""
 _REBUILT = (
@@ -43,7 +43,7 @@ REWARD_TERMS = ("drive", "failed", "walk", "parking", "gave_up")
 
 
 class SavedSearch(NamedTuple):
-    """What `SearchEnv.get_state` returns: copies of all that changes, and the vertices passed so far."""
+    """Saved state from `SearchEnv.get_state`: copies of everything that changes, and the path so far."""
 
     arrays: tuple[NDArray[Any], ...]
     path: list[int]
@@ -53,64 +53,64 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     """Find a free slot and walk from it to the goal, in as little time as possible.
 
     ## Description
-    A car searches a parking lot for a free slot. It knows the lot and an occupancy forecast for each slot, observes
-    the slots near it as it drives past them, and decides at every vertex of the drive graph where to drive, or to try
-    to park there. Slots fill and empty meanwhile. After Bogoslavskyi's thesis (Freiburg 2014), §3.4.
+    A car searches a parking lot for a free slot. The agent knows the lot and an occupancy forecast for each slot, and
+    observes nearby slots while driving past. At every vertex of the drive graph it chooses a move or attempts to park.
+    Meanwhile slots fill and empty. After Bogoslavskyi's thesis (Freiburg 2014), §3.4.
 
     ## Action space
     `Discrete(5)`
 
     | Num | Action | Effect |
     |-----|--------|--------|
-    | 0-3 | up, down, left, right | drive along that edge of the graph; where there is none, wait `wait_s` |
-    | 4 | park | park and walk to the goal if the slot here is free; a failed attempt, `failure_s`, if it is taken |
+    | 0-3 | up, down, left, right | drive along that edge of the graph; wait `wait_s` if there is none |
+    | 4 | park | park and walk to the goal if the slot here is free; lose `failure_s` (failed attempt) if it is taken |
 
-    Where there is no slot, parking means waiting, too.
+    At a vertex without a slot, `park` waits `wait_s`, too.
 
     ## Observation space
     A `Dict`:
 
     | Key | Space | Meaning |
     |-----|-------|---------|
-    | `vertex` | `Discrete(n_vertices)` | where the car is; vertex i < n_slots is the stop position of slot i |
+    | `vertex` | `Discrete(n_vertices)` | position of the car; vertex i < n_slots is the stop position of slot i |
     | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
-    | `p_occupied` | `Box(0, 1, (n_slots,), float32)` | belief that each slot is taken, now |
-    | `belief` | `Box((4 * n_slots,), float32)` | what `p_occupied` is computed from, four parts as below |
-    | `action_mask` | `Box(0, 1, (5,), int8)` | which actions the graph has here |
+    | `p_occupied` | `Box(0, 1, (n_slots,), float32)` | current P(taken) of each slot |
+    | `belief` | `Box((4 * n_slots,), float32)` | the belief state behind `p_occupied`, four parts as below |
+    | `action_mask` | `Box(0, 1, (5,), int8)` | the actions that the graph has here |
 
-    The parts of `belief`, n_slots numbers each, to be unpacked as
+    `belief` has four parts of n_slots numbers each; unpack them with
     `forecast, decay_rate, p_observed, observed_at = observation["belief"].reshape(4, -1)`:
 
     | Part | Name | Bounds | Meaning |
     |------|------|--------|---------|
-    | 0 | `forecast` | 0, 1 | P(taken) foreseen at the arrival; constant in an episode |
-    | 1 | `decay_rate` | 0, 1e6 | 1/s, decay to the forecast; constant in an episode |
+    | 0 | `forecast` | 0, 1 | P(taken) forecast for the arrival; constant in an episode |
+    | 1 | `decay_rate` | 0, 1e6 | 1/s, rate of decay to the forecast; constant in an episode |
     | 2 | `p_observed` | 0, 1 | P(taken) right after the last observation of the slot; the forecast before the first |
-    | 3 | `observed_at` | -1, 1e8 | s since the search began, of that observation; -1 before the first |
+    | 3 | `observed_at` | -1, 1e8 | time of that observation, s since the search began; -1 before the first |
 
     An observation updates the belief in a slot by Bayes' rule; then the belief decays to the forecast:
     `p_occupied = forecast + (p_observed - forecast) * exp(-decay_rate * (time[1] - observed_at))`.
 
     ## Rewards
-    Minus the seconds that the step took. Parking adds minus the seconds of the walk and the parking cost of the slot
+    Minus the duration of the step, s. Parking also subtracts the walk to the goal and the slot's parking cost
     (`ParkingLot.slot_parking_cost_s`, 0 by default), so the return is minus the total time to the goal.
     `info["reward_terms"]` holds the terms `drive` (moving or waiting), `failed` (failed attempts), `walk`, `parking`
     (the slot's cost) and `gave_up`; they add up to the reward.
 
     ## Starting state
-    At the scenario's entry, at a time drawn from its arrival window. The first observation holds the forecast alone;
-    slots are observed from the first step on, from the vertex where a step ends.
+    The car is at the scenario's entry, at a time drawn from its arrival window. The first observation holds only the
+    forecast; from then on the car observes slots from the vertex where each step ends.
     `reset(seed=s)` fixes arrival, entry and the state of every slot at every time, whatever the agent does; later
     `reset()` calls go through further worlds of the same seed.
 
     ## Episode end
     - Terminated: parked; or the lot is *proven full*: every slot was observed in this search, and taken when last
-      observed. Then the driver parks elsewhere, for the give-up penalty `give_up_s`.
+      observed. Then the search ends with the give-up penalty `give_up_s`, the time to park elsewhere.
     - Truncated: after the step limit of the spec, 2000 (`max_episode_steps` of `gymnasium.make`).
 
     `info` holds the episode's metrics so far: drive_s, failed_s, walk_s, parking_cost_s, gave_up_s, total_s, driven_m,
-    walked_m, failed_parks, slots_passed (slots whose vertex the car stopped at) and parked. A wrapper's time limit is
-    not part of `get_state`: it keeps counting.
+    walked_m, failed_parks, slots_passed (slots whose vertex the car stopped at) and parked. The step count of a
+    time-limit wrapper is not part of `get_state`.
 
     ## Keys
     For `gymnasium.utils.play.play(env, wait_on_player=True, noop=4)` (needs the extra `human`): w, s, a, d drive up,
@@ -119,7 +119,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     ## Arguments
     - `scenario`: a `Scenario`, or the name of a packaged one: campus, jam, street, mini.
     - `render_mode`: `rgb_array` (480, 640, 3), `human` (needs the extra `human`), or `ansi`.
-    - further keywords replace fields of the scenario, e.g. `failure_s=90.0`; unknown ones are refused.
+    - further keywords replace fields of the scenario, e.g. `failure_s=90.0`; unknown ones raise an error.
 
     ```python
     >>> import gymnasium as gym
@@ -168,7 +168,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self._address = self.searches.address
         self._state = SearchState(self.scenario, self.searches)
         self._control = SearchControl(self.searches)
-        # Bound methods that copy what is observed: looking them up takes a tenth of a step.
+        # Bound methods that copy the observation: looking them up takes a tenth of a step.
         self._copy_time = self.searches.records["clock"][0].copy
         self._copy_p_occupied = self.searches.p_occupied[0].copy
         self._copy_belief = self.searches.belief[0].reshape(-1).copy
@@ -177,7 +177,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     @property
     def state(self) -> SearchState:
-        """The episode under way, hidden truth included. Not for agents.
+        """The current episode, including the hidden occupancy; not for agents.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
@@ -187,11 +187,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return self._state
 
     def get_state(self) -> SavedSearch:
-        """A copy of the episode, which `set_state` brings back."""
+        """A copy of the episode's state, for `set_state`."""
         return SavedSearch(self.searches.save(), list(self.state.path))
 
     def set_state(self, state: SavedSearch) -> None:
-        """Continue from a state that `get_state` of an environment with the same scenario returned."""
+        """Continue from a state returned by `get_state` of an environment with the same scenario."""
         self.searches.restore(state.arrays)
         self._state.path = list(state.path)
         self._begun, self._over = True, self._state.over
@@ -210,7 +210,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start a search; see the class for what a seed fixes. There are no options."""
+        """Start an episode; see the class for seeds. There are no options."""
         super().reset(seed=seed)
         if options:
             raise InputError(f"reset takes no options, got {', '.join(options)}")
@@ -234,7 +234,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return self._observation(self._state), {}
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drive along an edge, or try to park; see the class."""
+        """Drive along an edge, or attempt to park; see the class."""
         if self._over:
             raise gym.error.ResetNeeded("the search has not begun, or is over: call reset()")
         try:
@@ -252,7 +252,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if vertex != state.path[-1]:
             state.path.append(vertex)
         self._over = over
-        # A time limit ends the episode from outside, so the metrics are there at every step.
+        # A wrapper's time limit may end the episode at any step, so every step has the metrics.
         info = {
             "reward_terms": {
                 "drive": drive,
@@ -278,17 +278,17 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return self._observation(state), reward, over, False, info
 
     def _advance(self, action: int) -> tuple[Any, ...]:
-        """Act, observe, and return what `parkenv.envs.search_kernel.step_result` does."""
+        """Act, observe, and return the result of `parkenv.envs.search_kernel.step_result`."""
         result: tuple[Any, ...] = self._step(self._address, action)
         return result
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """(5,) bool, which actions the graph has here; the name that sb3-contrib looks for."""
+        """Return the actions that the graph has here, (5,) bool; sb3-contrib expects this name."""
         mask: NDArray[np.bool_] = self._masks[self.state.vertex].astype(np.bool_)
         return mask
 
     def render(self) -> Any:
-        """A frame, a text, or the window brought up to date, as `render_mode` says."""
+        """Return a frame or text, or update the window, depending on `render_mode`."""
         if self.render_mode is None:
             gym.logger.warn(
                 'render() does nothing without a render_mode, e.g. gym.make(..., render_mode="rgb_array")'
@@ -308,7 +308,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return frame
 
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
-        """The lot from above."""
+        """Return the lot from above."""
         assert self._renderer is not None
         everything = np.arange(self.scenario.lot.n_slots)
         return self._renderer.frame(state, state.world.occupied(everything, state.time))
@@ -318,7 +318,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return {(ord(key),): action for action, key in enumerate("wsad ")}
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window, if open."""
         if self._renderer is not None:
             self._renderer.window.close()
             self._renderer = None
@@ -335,8 +335,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
 
 def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
-    """What is observed in a lot of some size; see `SearchEnv`."""
-    # Of forecast, decay_rate, p_observed, observed_at.
+    """The observation space for a lot of the given size; see `SearchEnv`."""
+    # Bounds of forecast, decay_rate, p_observed, observed_at.
     low, high = (
         np.repeat(np.array(bounds, np.float32), n_slots)
         for bounds in ([0.0, 0.0, 0.0, NEVER_OBSERVED], [1.0, MAX_DECAY_RATE, 1.0, LATEST])
@@ -353,7 +353,7 @@ def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
 
 
 def _action_number(action: Any) -> int:
-    """The element of an array of one, as models return it."""
+    """Convert an action, or an array of one as models return it, to a number."""
     number = np.asarray(action)
     if number.size != 1 or not np.issubdtype(number.dtype, np.integer):
         raise _wrong_action(action)

@@ -1,4 +1,4 @@
-"""The parts of a search's step, for environments that drive or observe in another way."""
+"""The parts of a search step, for environments that drive or observe differently."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from parkenv.envs.search_records import Searches
 
 
 class SearchControl:
-    """Takes a step of the only search of `searches` apart: act, observe, finish.
+    """Splits a step of the single search of `searches` into act, observe and finish.
 
-    A step is `drive_or_park`, or `fail_attempt`; then, unless the car is parked, `observe` or `apply_observations`;
+    A step is `drive_or_park` or `fail_attempt`; then, unless the car is parked, `observe` or `apply_observations`;
     then `finish_step`.
     """
 
@@ -30,19 +30,19 @@ class SearchControl:
         self._searches = searches
 
     def drive_or_park(self, action: int) -> None:
-        """Move the car along the graph, or try to park it, at the graph's times and the scenario's costs."""
+        """Move along the graph or attempt to park, with the graph's times and the scenario's costs."""
         act_in(self._searches.address, action)
 
     def fail_attempt(self) -> None:
-        """Fail to park in a slot that is free, because the car did not get in."""
+        """Count a failed attempt at a free slot that the car could not enter."""
         fail_attempt_in(self._searches.address)
 
     def set_step_time(self, begin: float, drive_s: float = 0.0, failed_s: float = 0.0) -> None:
-        """Replace the time, s, that this step, which began at `begin`, took for driving and for a failed attempt."""
+        """Set the times, s, for driving and for a failed attempt, of the step that began at `begin`."""
         set_step_time(self._searches.address, begin, drive_s, failed_s)
 
     def observe(self) -> None:
-        """Observe the slots in view, as the scenario's sensor model has it."""
+        """Observe the slots in view with the scenario's sensor model."""
         observe_in(self._searches.address)
 
     def apply_observations(
@@ -52,15 +52,15 @@ class SearchControl:
         hit_rate: NDArray[np.float64],
         false_alarm_rate: NDArray[np.float64],
     ) -> None:
-        """Update the belief from observations of slots, (k,) each: what they showed, and the sensor's rates."""
+        """Update the belief from observations of slots, (k,) each: observed states and error rates."""
         columns = (np.ascontiguousarray(a) for a in (slots, taken, hit_rate, false_alarm_rate))
         apply_observations_in(self._searches.address, *columns)
 
     def set_taken(self, slot: int) -> None:
-        """Believe that a slot is taken, for certain, as of now."""
+        """Set the belief that a slot is taken to certainty, as of now."""
         set_taken_in(self._searches.address, slot)
 
     def finish_step(self) -> tuple[Any, ...]:
-        """Add the step to the episode, and return what `parkenv.envs.search_kernel.step_result` does."""
+        """Add the step to the episode, and return the result of `parkenv.envs.search_kernel.step_result`."""
         result: tuple[Any, ...] = finish_step_in(self._searches.address)
         return result

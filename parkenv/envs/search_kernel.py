@@ -1,9 +1,9 @@
-"""The compiled search: what one action does to the car, to what it observes, and to its belief.
+"""The compiled search: the effect of an action on the car, its observations and its belief.
 
-`parkenv/Search-v1` and its batch are this code, so they agree to the bit. No step costs more in a larger lot: only
-slots that a search has had to do with, that were observed or asked about, get a column in its tables.
+`parkenv/Search-v1` and its batch both run this code, so they agree to the bit. The cost of a step does not grow with
+the lot: only slots that a search has observed or queried get a column in its tables.
 
-Functions that take an address are called from Python; `Searches` holds the records there.
+Functions that take an address are called from Python; it is the address of a record of `Searches`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ from parkenv.world.week import DAY_S, WEEK_HOURS, hour_of_week
 
 @kernel
 def begin_search(address: int) -> None:
-    """Begin the next episode; an external prior is still to be asked, and `init_prior` to be called."""
+    """Begin the next episode; an external prior must then be queried and `init_prior` called."""
     search = search_at(address, 0)
     arrive(search)
     if scenario_at(search.scenario, 0).prior_kind != EXTERNAL_PRIOR:
@@ -73,16 +73,16 @@ def begin_search(address: int) -> None:
 
 @kernel
 def init_external_prior(address: int) -> None:
-    """Begin to believe the forecast in `Searches.external_prior`."""
+    """Initialise the belief with the forecast in `Searches.external_prior`."""
     init_prior(search_at(address, 0))
 
 
-# One function for each kind of sensor: whoever has one kind need not compile the other.
+# One function for each kind of sensor, so that only the kind in use is compiled.
 
 
 @kernel
 def step_exact(address: int, action: int) -> tuple[Any, ...]:
-    """Take an action, one that there is, with an exact sensor; returns as `step_result`."""
+    """Take a valid action with an exact sensor; returns as `step_result`."""
     search = search_at(address, 0)
     drive_or_park(search, action)
     if not search.parked:
@@ -93,7 +93,7 @@ def step_exact(address: int, action: int) -> tuple[Any, ...]:
 
 @kernel
 def step_noisy(address: int, action: int) -> tuple[Any, ...]:
-    """Take an action, one that there is, with a noisy sensor; returns as `step_result`."""
+    """Take a valid action with a noisy sensor; returns as `step_result`."""
     search = search_at(address, 0)
     drive_or_park(search, action)
     if not search.parked:
@@ -102,18 +102,18 @@ def step_noisy(address: int, action: int) -> tuple[Any, ...]:
     return result
 
 
-# ---- the parts of a step from Python, for environments that drive or observe in another way
+# ---- the parts of a step from Python, for environments that drive or observe differently
 
 
 @kernel
 def act_in(address: int, action: int) -> None:
-    """Move the car along the graph, or try to park it; nothing is observed yet."""
+    """Move along the graph or attempt to park, without observing yet."""
     drive_or_park(search_at(address, 0), action)
 
 
 @kernel
 def set_step_time(address: int, begin: float, drive_s: float, failed_s: float) -> None:
-    """Replace the time that a step which began at `begin` took for driving and for failed attempts."""
+    """Set the times, s, for driving and for failed attempts, of the step that began at `begin`."""
     search = search_at(address, 0)
     search.time = begin + (drive_s + failed_s)
     search.step_drive_s, search.step_failed_s = drive_s, failed_s
@@ -121,7 +121,7 @@ def set_step_time(address: int, begin: float, drive_s: float, failed_s: float) -
 
 @kernel
 def fail_attempt_in(address: int) -> None:
-    """Count a failed attempt to park in a slot that is free; its time is set by `set_step_time`."""
+    """Count a failed attempt at a free slot; `set_step_time` sets its time."""
     search = search_at(address, 0)
     search.failed_parks += 1
     search.n_steps += 1
@@ -130,7 +130,7 @@ def fail_attempt_in(address: int) -> None:
 
 @kernel
 def observe_in(address: int) -> None:
-    """Observe the slots in view, as the scenario's sensor model has it."""
+    """Observe the slots in view with the scenario's sensor model."""
     observe(search_at(address, 0))
 
 
@@ -138,7 +138,7 @@ def observe_in(address: int) -> None:
 def apply_observations_in(
     address: int, slots: IntArray, taken: BoolArray, hit_rate: FloatArray, false_alarm_rate: FloatArray
 ) -> None:
-    """Update the belief from observations made elsewhere, (k,) each, instead of `observe_in`."""
+    """Update the belief from external observations, (k,) each, instead of `observe_in`."""
     search = search_at(address, 0)
     mark_passed(search)
     for i in range(slots.size):
@@ -147,7 +147,7 @@ def apply_observations_in(
 
 @kernel
 def set_taken_in(address: int, slot: int) -> None:
-    """Believe that a slot is taken, for certain."""
+    """Set the belief that a slot is taken to certainty."""
     search = search_at(address, 0)
     set_belief(search, column_of(search, slot), True, 1.0)
 
@@ -163,7 +163,7 @@ def finish_step_in(address: int) -> tuple[Any, ...]:
 def read_belief(
     address: int, p_occupied: FloatArray, p_observed: FloatArray, observed_at: FloatArray
 ) -> None:
-    """Write the belief in observed slots over arrays that hold the forecast, (n_slots,) each."""
+    """Overwrite arrays that hold the forecast, (n_slots,) each, with the belief in observed slots."""
     search = search_at(address, 0)
     for column in range(1, search.n_columns + 1):
         record, i = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
@@ -179,7 +179,7 @@ def read_belief(
 
 @inlined
 def complete_step(search: Any) -> tuple[Any, ...]:
-    """Add the step to the episode and update what is observed of it; returns as `step_result`."""
+    """Add the step to the episode and update the observed time; returns as `step_result`."""
     finish_step(search)
     refresh_belief(search)
     tell_time(search)
@@ -189,9 +189,9 @@ def complete_step(search: Any) -> tuple[Any, ...]:
 
 @inlined
 def step_result(search: Any) -> tuple[Any, ...]:
-    """Return the reward and its terms, what the episode so far has cost, how it stands, and where the car is.
+    """Return the reward and its terms, the metrics of the episode so far, its status, and the car's vertex.
 
-    A tuple in the order of the code below: taken all at once, numbers cost less than read one by one.
+    Reading all numbers at once, as a tuple in the order below, is faster than reading them one by one.
     """
     drive, failed, walk = search.step_drive_s, search.step_failed_s, search.step_walk_s
     parking, gave_up = search.step_parking_cost_s, search.step_gave_up_s
@@ -206,7 +206,7 @@ def step_result(search: Any) -> tuple[Any, ...]:
 
 @kernel
 def arrive(search: Any) -> None:
-    """Begin a search in the world of its seed and episode; nothing has been observed."""
+    """Begin a search in the world of its seed and episode, without observations."""
     scenario = scenario_at(search.scenario, 0)
     key = episode_key(search.seed_state, search.episode)
     day = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * scenario.n_weekdays)
@@ -232,18 +232,18 @@ def arrive(search: Any) -> None:
 
 @kernel
 def clear_slots(search: Any) -> None:
-    """Take all slots out of their columns."""
+    """Remove all slots from their columns."""
     columns = int32s(search.columns)
     for column in range(1, search.n_columns + 1):
         columns[slot_at(search.slots, column).slot] = SENTINEL
-        # Whole blocks are computed; what stays in an empty column must give a number.
+        # Whole blocks are computed, so empty columns must hold finite numbers.
         block_at(search.blocks, column >> BLOCK_BITS).decay_rate[column & (BLOCK_SIZE - 1)] = 0.0
     search.n_columns = 0
 
 
 @inlined
 def take_step(search: Any, action: int) -> None:
-    """Do all that an action does, whatever the sensor; what it cost is in the fields `step_*`."""
+    """Do everything in a step that does not depend on the sensor; its costs go to the fields `step_*`."""
     drive_or_park(search, action)
     if not search.parked:
         observe(search)
@@ -258,7 +258,7 @@ def tell_time(search: Any) -> None:
 
 @kernel
 def drive_or_park(search: Any, action: int) -> None:
-    """Move the car, or try to park it."""
+    """Move the car, or attempt to park."""
     scenario, vertex = scenario_at(search.scenario, 0), search.vertex
     edge = vertex * N_ACTIONS + action
     drive_s, failed_s, walk_s, parking_cost_s = float64s(scenario.seconds)[edge], 0.0, 0.0, 0.0
@@ -286,7 +286,7 @@ def drive_or_park(search: Any, action: int) -> None:
 
 @inlined
 def finish_step(search: Any) -> None:
-    """Give up a lot that is proven full, and add the step to the episode."""
+    """Add the step to the episode; give up if the lot is proven full."""
     scenario = scenario_at(search.scenario, 0)
     full = search.n_known_taken == scenario.n_slots
     search.step_gave_up_s = scenario.give_up_s if full else 0.0
@@ -303,7 +303,7 @@ def finish_step(search: Any) -> None:
 
 @inlined
 def observe(search: Any) -> None:
-    """Observe the slots in view of the car, as the scenario's sensor model has it."""
+    """Observe the slots in view with the scenario's sensor model."""
     if scenario_at(search.scenario, 0).exact_sensor:
         observe_exact(search)
     else:
@@ -314,7 +314,7 @@ def observe(search: Any) -> None:
 def observe_exact(search: Any) -> None:
     """Observe the true states of the slots in view.
 
-    A slot whose state surely has not changed needs no more than a new time of the observation.
+    If a slot's state cannot have changed, only the time of its observation is updated.
     """
     scenario, time = scenario_at(search.scenario, 0), search.time
     viewed, columns = int64s(scenario.viewed), int32s(search.columns)
@@ -334,7 +334,7 @@ def observe_exact(search: Any) -> None:
 
 @kernel
 def observe_changed(search: Any, slot: int) -> int:
-    """Observe the true state of a slot that may have changed; return its column."""
+    """Observe the true state of a slot that may have changed; returns its column."""
     column: int = column_of(search, slot)
     taken = is_taken(search, column, search.time)
     set_belief(search, column, taken, 1.0 if taken else 0.0)
@@ -343,17 +343,17 @@ def observe_changed(search: Any, slot: int) -> int:
 
 @kernel
 def observe_noisy(search: Any) -> None:
-    """Observe some of the slots in view, and some of them wrongly."""
+    """Observe the slots in view with misses and errors."""
     scenario, key, time = scenario_at(search.scenario, 0), search.key, search.time
     viewed, starts = int64s(scenario.viewed), int64s(scenario.view_starts)
     seen_rate, hit_rate = float64s(scenario.seen_rate), float64s(scenario.hit_rate)
     false_alarm_rate = float64s(scenario.false_alarm_rate)
     mark_passed(search)
-    # By the millisecond: two observations of a slot at one time make the same error.
+    # Keyed by the millisecond: two observations of a slot at the same time have the same error.
     millisecond = int(time * 1000.0)
     for i in range(starts[search.vertex], starts[search.vertex + 1]):
         slot = viewed[i]
-        # What hides a slot goes on hiding it: one random number a search, which a better view may beat.
+        # Occlusions persist: one random number per slot and search; only a higher rate of seeing can overcome it.
         if keyed_uniform(key, VIEW_STREAM, slot, 0) >= seen_rate[i]:
             continue
         column = column_of(search, slot)
@@ -373,7 +373,7 @@ def apply_observation(
 
 @kernel
 def mark_passed(search: Any) -> None:
-    """Count the slot that the car stops at, the first time."""
+    """Count the slot that the car stops at, once per search."""
     if search.vertex < scenario_at(search.scenario, 0).n_slots:
         record = slot_at(search.slots, column_of(search, search.vertex))
         if not record.passed:
@@ -386,7 +386,7 @@ def mark_passed(search: Any) -> None:
 
 @kernel
 def set_belief(search: Any, column: int, observed_taken: bool, p: float) -> None:
-    """Set the belief in a slot to `p`, after an observation now."""
+    """Set P(taken) of a slot to `p` after an observation at the current time."""
     record, i = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
     block = block_at(search.blocks, column >> BLOCK_BITS)
     if not record.observed:
@@ -405,7 +405,7 @@ def set_belief(search: Any, column: int, observed_taken: bool, p: float) -> None
 
 @inlined
 def belief_now(search: Any, column: int) -> float:
-    """Return the belief in the slot of a column, now."""
+    """Return the current belief in the slot of a column."""
     block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
     elapsed = search.time - block.observed_at[i]
     return float(decay_to_prior(block.prior[i], block.decay_rate[i], block.p_observed[i], elapsed))
@@ -413,12 +413,12 @@ def belief_now(search: Any, column: int) -> float:
 
 @kernel
 def refresh_belief(search: Any) -> None:
-    """Write the belief now into `p_occupied`; only slots with a column can have changed."""
+    """Write the current belief into `p_occupied`; only slots with a column can have changed."""
     decay_belief(search)
     p_occupied, end = float32s(search.p_occupied), search.n_columns + 1
     for first in range(0, end, BLOCK_SIZE):
         block = block_at(search.blocks, first >> BLOCK_BITS)
-        # A loop of fixed length, which is unrolled.
+        # Fixed length, so that the loop is unrolled.
         for i in range(BLOCK_SIZE):
             if SENTINEL < first + i < end:
                 p_occupied[slot_at(search.slots, first + i).slot] = block.p_occupied[i]
@@ -426,11 +426,11 @@ def refresh_belief(search: Any) -> None:
 
 @kernel
 def decay_belief(search: Any) -> None:
-    """Compute the belief in all slots with a column, now."""
+    """Compute the current belief in all slots with a column."""
     time = search.time
     for number in range((search.n_columns + BLOCK_SIZE) >> BLOCK_BITS):
         block = block_at(search.blocks, number)
-        # A loop of a length that is known beforehand, so that it becomes vector code.
+        # Fixed length, so that the loop is vectorised.
         for i in range(BLOCK_SIZE):
             block.p_occupied[i] = decay_to_prior(
                 block.prior[i], block.decay_rate[i], block.p_observed[i], time - block.observed_at[i]
@@ -448,7 +448,7 @@ def column_of(search: Any, slot: int) -> Any:
 
 @kernel
 def add_column(search: Any, slot: int) -> int:
-    """Give a slot a column, and write into it what is forecast of the slot."""
+    """Give a slot a column, and write its forecast there."""
     column = search.n_columns + 1
     search.n_columns = column
     int32s(search.columns)[slot] = column
@@ -467,7 +467,7 @@ def add_column(search: Any, slot: int) -> int:
 
 @inlined
 def is_taken(search: Any, column: int, time: float) -> bool:
-    """Return the truth about the slot of a column, at a time not before that of earlier questions, s."""
+    """Return whether the slot of a column is taken at a time, s; times must not decrease between calls."""
     record = slot_at(search.slots, column)
     if time >= record.valid_until:
         find_state(search, record, time)
@@ -476,7 +476,7 @@ def is_taken(search: Any, column: int, time: float) -> bool:
 
 @kernel
 def find_state(search: Any, record: Any, time: float) -> None:
-    """Compute whether a slot is taken at a time for which that is not known yet."""
+    """Compute whether a slot is taken at a time beyond the known part of its sojourn."""
     scenario, slot = scenario_at(search.scenario, 0), np.int64(record.slot)
     if scenario.world_kind == LOG_KIND:
         recorded_state(recorded_day_at(scenario.world, search.day), slot, record, time)
@@ -489,7 +489,7 @@ def find_state(search: Any, record: Any, time: float) -> None:
 
 @kernel
 def forecast_of(search: Any, slot: int) -> tuple[float, float]:
-    """Return P(taken) that the car foresees for a slot, and its decay rate, 1/s."""
+    """Return the forecast P(taken) of a slot, and its decay rate, 1/s."""
     scenario = scenario_at(search.scenario, 0)
     if scenario.prior_kind == EXTERNAL_PRIOR:
         external = float64s(search.external_prior)
@@ -504,7 +504,7 @@ def forecast_of(search: Any, slot: int) -> tuple[float, float]:
 
 @kernel
 def init_prior(search: Any) -> None:
-    """Write the forecast of every slot into the full belief; none has been observed."""
+    """Initialise the full belief with the forecast of every slot."""
     scenario, width = scenario_at(search.scenario, 0), search.width
     belief, p_occupied, n = float32s(search.belief), float32s(search.p_occupied), scenario.n_slots
     if scenario.prior_kind == PROCESS_KIND:
@@ -519,7 +519,7 @@ def init_prior(search: Any) -> None:
 
 @kernel
 def _init_process_prior(search: Any) -> None:
-    """Write `forecast_of` all slots, with the marginals at the full hour computed before, by vector instructions."""
+    """Write the forecast of all slots, vectorised, from marginals precomputed at the full hour."""
     scenario, width, hour, second = (
         scenario_at(search.scenario, 0), search.width, search.hour, search.second_of_hour,
     )  # fmt: skip

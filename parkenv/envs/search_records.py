@@ -19,7 +19,7 @@ from parkenv.world.scenario import Scenario
 
 N_ACTIONS = PARK + 1
 PROCESS_KIND, LOG_KIND, EXTERNAL_PRIOR = range(3)
-"""Kinds of world and prior: a generating process; a replayed log; a forecast asked of Python at every arrival."""
+"""Kinds of world and prior: a generating process; a replayed log; a forecast computed in Python at every arrival."""
 
 SCENARIO = np.dtype(
     [
@@ -27,32 +27,32 @@ SCENARIO = np.dtype(
         ("exact_sensor", np.bool_),
         ("failure_s", np.float64),
         ("give_up_s", np.float64),
-        # When and where cars arrive: seconds of the day; (n_weekdays,) int64; (n_entries,) int64 vertices.
+        # Arrival window and entries: seconds of the day; (n_weekdays,) int64; (n_entries,) int64 vertices.
         ("window_start", np.float64),
         ("window_end", np.float64),
         ("n_weekdays", np.int64),
         ("weekdays", ADDRESS),
         ("n_entries", np.int64),
         ("entries", ADDRESS),
-        # What actions lead to, (n_vertices, 5) each: int64 vertices; float64 s; float64 m. Every action leads
-        # somewhere: one that the graph does not have, and parking, to where the car is.
+        # Results of actions, (n_vertices, 5) each: int64 vertices; float64 s; float64 m. Parking, and actions that the
+        # graph does not have, lead back to the same vertex.
         ("targets", ADDRESS),
         ("seconds", ADDRESS),
         ("metres", ADDRESS),
-        # (n_vertices, 5) uint8, which actions the graph has.
+        # (n_vertices, 5) uint8, mask of the actions that the graph has.
         ("action_masks", ADDRESS),
-        # (n_slots,) float64 of each slot: walk to the goal, s and m; cost of parking there, s.
+        # (n_slots,) float64: walk to the goal, s and m; parking cost, s.
         ("walk_s", ADDRESS),
         ("walk_m", ADDRESS),
         ("parking_cost_s", ADDRESS),
         # Slots in view of vertex v are viewed[view_starts[v]] to viewed[view_starts[v + 1]], excluded; int64 both.
         ("view_starts", ADDRESS),
         ("viewed", ADDRESS),
-        # Of each of `viewed`, float64: P(in sight), P(observed taken | taken), P(observed taken | free).
+        # For each of `viewed`, float64: P(in sight), P(observed taken | taken), P(observed taken | free).
         ("seen_rate", ADDRESS),
         ("hit_rate", ADDRESS),
         ("false_alarm_rate", ADDRESS),
-        # Of PROCESS_KIND: a PROCESS record. Of LOG_KIND: RECORDED_DAY records, one for each of `weekdays`.
+        # For PROCESS_KIND, a PROCESS record; for LOG_KIND, RECORDED_DAY records, one for each of `weekdays`.
         ("world_kind", np.int64),
         ("world", ADDRESS),
         ("prior_kind", np.int64),
@@ -60,7 +60,7 @@ SCENARIO = np.dtype(
     ],
     align=True,
 )
-"""What does not change while cars search in a scenario. Fields with addresses say to what arrays."""
+"""The constant part of the searches in a scenario; the comments describe the arrays at the addresses."""
 
 N_REGIONS = 4
 
@@ -76,13 +76,13 @@ _PROGRESS = [
     ("failed_parks", np.int64),
     ("slots_passed", np.int64),
     ("n_steps", np.int64),
-    # What the last step cost, s.
+    # Costs of the last step, s.
     ("step_drive_s", np.float64),
     ("step_failed_s", np.float64),
     ("step_walk_s", np.float64),
     ("step_parking_cost_s", np.float64),
     ("step_gave_up_s", np.float64),
-    # Where things stand. Times are s since Monday 00:00.
+    # Current status; times in s since Monday 00:00.
     ("vertex", np.int64),
     ("previous_vertex", np.int64),
     ("time", np.float64),
@@ -96,15 +96,15 @@ _PROGRESS = [
     ("hour", np.int64),
     ("second_of_hour", np.float64),
     ("second_of_day", np.float64),
-    # What was observed: slots with a column in the tables; slots observed; of those, how many were free at first, and
-    # were expected to be; how many were taken when last observed.
+    # Counts: slots with a column in the tables; slots observed; of those, free when first observed, expected to be
+    # free, and taken when last observed.
     ("n_columns", np.int64),
     ("n_observed", np.int64),
     ("n_observed_free", np.float64),
     ("n_expected_free", np.float64),
     ("n_known_taken", np.int64),
-    # For the local observation: forecast share of free slots in quarters of the lot; the best slot observed free,
-    # or -1.
+    # For the local observation: forecast fraction of free slots in each quarter of the lot; the best slot observed
+    # free, or -1.
     ("free_by_region", np.float64, (N_REGIONS,)),
     ("remembered_slot", np.int64),
 ]
@@ -120,25 +120,25 @@ SEARCH = np.dtype(
         *_EPISODES[:2],
         # Time since Monday 00:00, and since the search began, as observed.
         _EPISODES[2],
-        # What belongs to the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns;
-        # (2, width) float64 forecast and decay rate of an external prior, or 0.
+        # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
+        # float64 forecast and decay rate of an external prior, or 0.
         ("scenario", ADDRESS),
         ("blocks", ADDRESS),
         ("slots", ADDRESS),
         ("columns", ADDRESS),
         ("external_prior", ADDRESS),
-        # Slots of the largest lot; (width,) float32 belief now, and (4, width) float32, the observation's `belief`, or
-        # 0 where these are not kept.
+        # Number of slots of the largest lot; (width,) float32 current belief and (4, width) float32 `belief` of the
+        # observation, or 0 if these are not kept.
         ("width", np.int64),
         ("p_occupied", ADDRESS),
         ("belief", ADDRESS),
     ],
     align=True,
 )
-"""A search under way."""
+"""A running search."""
 
 SENTINEL = 0
-"""Column of all slots that have none of their own: nothing was observed there."""
+"""Column shared by all slots without their own: they were not observed."""
 
 SLOT = np.dtype(
     [
@@ -150,7 +150,7 @@ SLOT = np.dtype(
     ],
     align=True,
 )
-"""A slot with a column: its truth as in CURSOR; if it was observed, and taken at last; if the car stopped there."""
+"""A slot with a column: true state as in CURSOR; whether it was observed, was last observed taken, was passed."""
 
 BLOCK_BITS = 3
 BLOCK_SIZE = 1 << BLOCK_BITS
@@ -161,22 +161,22 @@ BLOCK = np.dtype(
     ],
     align=True,
 )
-"""The belief in 8 slots: forecast; decay rate, 1/s; after the last observation; its time, s; now.
+"""The belief in 8 slots: forecast; decay rate, 1/s; P(taken) after the last observation; its time, s; current P(taken).
 
-In blocks, the belief in 8 slots is updated by a few vector instructions, and what a search uses lies close together.
+A few vector instructions update a block, and the data of a search stay close together in memory.
 """
 
 FORECAST, DECAY_RATE, P_OBSERVED, OBSERVED_AT = range(4)
 """The parts of the observation's `belief`."""
 NEVER_OBSERVED = -1.0
-"""`observed_at` of a slot that was not observed in this search."""
+"""`observed_at` of a slot not observed in this search."""
 
 scenario_at, search_at = record_at(SCENARIO), record_at(SEARCH)
 slot_at, block_at = record_at(SLOT), record_at(BLOCK)
 
 
 class ScenarioRecords:
-    """Scenarios as records, and the arrays that these point to.
+    """Scenarios as records, and the arrays that the records point to.
 
     Attributes:
         records: (n,) of the dtype SCENARIO.
@@ -265,21 +265,21 @@ class ScenarioRecords:
 
 
 class Searches:
-    """Searches under way, one or many, as records, and the arrays that these point to.
+    """One or more running searches as records, and the arrays that the records point to.
 
     Args:
-        scenarios: what they are in.
+        scenarios: scenarios of the searches.
         scenario_of: (n,) index into `scenarios` for each search.
         full_belief: whether to keep `p_occupied` and `belief` up to date.
 
     Attributes:
         records: (n,) of the dtype SEARCH.
-        slots: (n, m + 1) of the dtype SLOT, a column for each slot that a search has had to do with, in order; the
-            first is the sentinel's. m is the number of slots of the largest lot.
+        slots: (n, m + 1) of the dtype SLOT, a column for each slot that a search has observed or queried, in order of
+            first use; the first column is the sentinel. m is the number of slots of the largest lot.
         external_prior: (n, 2, m) float64, forecast and decay rate of priors that only Python can compute; else
             (0, 2, 0).
-        p_occupied: (n, m) float32, belief in every slot now; (0, 0) if not kept.
-        belief: (n, 4, m) float32: forecast, decay rate, belief after the last observation, time of it; (0, 4, 0) if
+        p_occupied: (n, m) float32, current belief in every slot; (0, 0) if not kept.
+        belief: (n, 4, m) float32: forecast, decay rate, belief after the last observation, and its time; (0, 4, 0) if
             not kept.
     """
 
@@ -290,10 +290,10 @@ class Searches:
         self.records = np.zeros(n, SEARCH)
         self.slots = np.zeros((n, m + 1), SLOT)
         self._blocks = np.zeros((n, (m + BLOCK_SIZE) >> BLOCK_BITS), BLOCK)
-        # Zeros, which are the sentinel's: memory that nobody writes to is not even taken from the system.
+        # Zeros stand for the sentinel; the system allocates no memory for pages that are never written.
         self._columns = np.zeros((n, m), np.int32)
         self.external_prior = np.zeros((n, 2, m) if external else (0, 2, 0))
-        # Past the last slot of a smaller lot: taken, constant, never observed.
+        # Padding past the last slot of a smaller lot: taken, constant, never observed.
         self.p_occupied = np.ones((n, m) if full_belief else (0, 0), np.float32)
         self.belief = np.zeros((n, 4, m) if full_belief else (0, 4, 0), np.float32)
         self.belief[:, [FORECAST, P_OBSERVED]] = 1.0
@@ -305,7 +305,7 @@ class Searches:
             self.records[name] = first + np.arange(n) * array.strides[0] if len(array) else 0
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays with a row for each search, by the fields of SEARCH that hold the addresses of the rows."""
+        """The arrays with a row for each search, keyed by the SEARCH field that holds the row's address."""
         return {
             "slots": self.slots,
             "blocks": self._blocks,
@@ -322,18 +322,18 @@ class Searches:
 
     @property
     def n_bytes(self) -> int:
-        """Memory of the searches, without the scenarios' tables, which they share."""
+        """Memory of the searches, bytes, without the shared tables of the scenarios."""
         return sum(array.nbytes for array in (self.records, *self._arrays().values()))
 
     def save(self) -> tuple[NDArray[Any], ...]:
-        """Return copies of all that a search changes."""
+        """Return copies of everything that a search changes."""
         return (self.records.copy(), *(array.copy() for array in self._arrays().values()))
 
     def restore(self, saved: tuple[NDArray[Any], ...]) -> None:
-        """Continue from what `save` of searches in the same scenarios returned.
+        """Restore a copy returned by `save` of searches in the same scenarios.
 
         Raises:
-            InputError: another number of slots.
+            InputError: the number of slots differs.
         """
         records, *arrays = saved
         width = int(records["width"][0])

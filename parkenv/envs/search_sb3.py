@@ -24,19 +24,19 @@ METRICS = (
 class SearchVecEnv(SharedVecEnv):
     """`ParkSearchVectorEnv` for stable-baselines3 and sb3-contrib.
 
-    Where a search ends, its `info` has `terminal_observation`, `TimeLimit.truncated`, `episode` (return in seconds, and
-    length, as `Monitor` has them) and the metrics of `parkenv/Search-v1`. sb3-contrib finds `action_masks`.
+    When a search ends, its `info` has `terminal_observation`, `TimeLimit.truncated`, `episode` (return in seconds and
+    length, as from `Monitor`) and the metrics of `parkenv/Search-v1`. `action_masks` is available to sb3-contrib.
 
     Args:
         num_envs: number of searches.
-        scenario: one, by name or as object, or several, which take turns.
-        reward_scale: factor of the rewards in seconds; returns of about one are easiest to learn.
+        scenario: a scenario or its name, or a sequence of them, assigned to the searches in rotation.
+        reward_scale: factor of the rewards in seconds; returns near one are easiest to learn.
         k: number of slots in the `local` observation.
-        observation: local; or full, for a single lot.
+        observation: `local`, or for a single lot `full`.
         max_episode_steps: steps after which a search is truncated.
 
     Raises:
-        InputError: an argument out of its range, by name.
+        InputError: an argument out of its range; the message names it.
 
     Examples:
         >>> venv = SearchVecEnv(4, "mini")
@@ -112,7 +112,7 @@ class SearchVecEnv(SharedVecEnv):
         """Return a row of `action_masks` per search, which sb3-contrib calls.
 
         Raises:
-            NotImplementedError: another method.
+            NotImplementedError: for any other method.
         """
         if method_name != "action_masks" or method_args or method_kwargs:
             raise NotImplementedError(f"searches of a batch have no method {method_name} of their own")

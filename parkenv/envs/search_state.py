@@ -1,4 +1,4 @@
-"""The hidden state of a search, as oracles, pictures and recordings read it."""
+"""The full state of a search, for oracle policies, rendering and recording."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from parkenv.world.scenario import Scenario
 
 
 class SearchState:
-    """The episode under way, hidden truth included; it changes with the environment.
+    """The current episode, including the hidden occupancy; a live view of the environment.
 
     Attributes:
-        path: vertices that the car has stopped at, in order.
+        path: vertices where the car has stopped, in order.
     """
 
     def __init__(self, scenario: Scenario, searches: Searches) -> None:
@@ -26,7 +26,7 @@ class SearchState:
         self._world: tuple[np.uint64, World] | None = None
 
     def extend_path(self) -> None:
-        """Add the car's vertex to the path, if it has moved."""
+        """Add the car's vertex to the path if the car has moved."""
         if self.path[-1] != self.vertex:
             self.path.append(self.vertex)
 
@@ -42,14 +42,14 @@ class SearchState:
 
     @property
     def world(self) -> World:
-        """The truth; questions to it change nothing."""
+        """The true occupancy; queries do not change it."""
         if self._world is None or self._world[0] != self.key:
             self._world = self.key, self._scenario.occupancy.world(self.key, self.arrival)
         return self._world[1]
 
     @property
     def belief(self) -> SlotBelief:
-        """The belief about the slots now, a copy, in float64."""
+        """A float64 copy of the current belief about the slots."""
         forecast = self._scenario.forecast(self.arrival)
         belief = SlotBelief.of_forecast(forecast.p_occupied, forecast.decay_rate)
         belief.time = self.time - self.arrival.time
@@ -58,22 +58,22 @@ class SearchState:
 
     @property
     def vertex(self) -> int:
-        """Where the car is."""
+        """Current vertex of the car."""
         return int(self._record["vertex"])
 
     @property
     def time(self) -> float:
-        """Now, s since Monday 00:00."""
+        """Current time, s since Monday 00:00."""
         return float(self._record["time"])
 
     @property
     def walk_s(self) -> float:
-        """The walk to the goal, s; 0 before the car is parked."""
+        """Walk to the goal, s; 0 before the car is parked."""
         return float(self._record["walk_s"])
 
     @property
     def gave_up_s(self) -> float:
-        """The give-up penalty, s; 0 while the search goes on."""
+        """Give-up penalty, s; 0 unless the search gave up."""
         return float(self._record["gave_up_s"])
 
     @property
@@ -83,7 +83,7 @@ class SearchState:
 
     @property
     def failed_parks(self) -> int:
-        """Attempts to park that failed."""
+        """Number of failed parking attempts."""
         return int(self._record["failed_parks"])
 
     @property
@@ -98,7 +98,7 @@ class SearchState:
 
 
 def arrival_of(scenario: Scenario, record: np.void) -> Arrival:
-    """Return when the search of a SEARCH record began."""
+    """Return the arrival of the search in a SEARCH record."""
     time = float(record["arrival"])
     if isinstance(scenario.occupancy, RecordedOccupancy):
         return Arrival(time, scenario.occupancy.days_in(scenario.arrival)[int(record["day"])])

@@ -38,18 +38,18 @@ TIME_METRICS = (
     "walked_m",
 )
 COUNT_METRICS = ("failed_parks", "slots_passed")
-# Gymnasium's names of the arrays that say which searches a metric is of.
+# Gymnasium's names of the masks that say which searches have a metric.
 _WHICH = tuple(f"_{name}" for name in ("reward_terms", "parked", *TIME_METRICS, *COUNT_METRICS))
 _WHICH_TERMS = tuple(f"_{name}" for name in REWARD_TERMS)
 
 
 class Steps(NamedTuple):
-    """What a step gave, besides observations.
+    """The results of a step, besides observations.
 
     Attributes:
         rewards: (n,) float64.
         terminated, truncated: (n,) bool.
-        terms: (5, n) float64, the reward's, where a search has ended; left over elsewhere, as all that follows.
+        terms: (5, n) float64, reward terms of the searches that have ended; like all below, stale for the others.
         times: (8, n) float64, `TIME_METRICS`.
         tallies: (2, n) int64, `COUNT_METRICS`.
         parked: (n,) bool.
@@ -65,7 +65,7 @@ class Steps(NamedTuple):
 
     @classmethod
     def of(cls, n: int) -> Self:
-        """Of n searches that have not begun."""
+        """Return the initial results for n searches."""
         flags = [np.zeros(n, dtype=np.bool_) for _ in range(3)]
         tallies = np.zeros((len(COUNT_METRICS), n), dtype=np.int64)
         times = np.zeros((len(TIME_METRICS), n))
@@ -96,7 +96,7 @@ def step_full(
     time: NDArray[np.float32],
     mask: NDArray[np.int8],
 ) -> None:
-    """Step all searches but the idle and the fresh ones, and observe."""
+    """Step all searches except idle and fresh ones, and observe."""
     for e in range(len(actions)):
         if idle[e]:
             continue
@@ -124,7 +124,7 @@ def step_local(
     local: NDArray[np.float32],
     mask: NDArray[np.int8],
 ) -> None:
-    """As `step_full`, observing the cars' surroundings."""
+    """As `step_full`, with the local observation."""
     for e in range(len(actions)):
         if idle[e]:
             continue
@@ -137,7 +137,7 @@ def step_local(
 
 @kernel
 def first_wrong(actions: IntArray) -> int:
-    """Return the index of the first number that is no action, or -1."""
+    """Return the index of the first invalid action, or -1."""
     for e in range(len(actions)):
         if not 0 <= actions[e] < N_ACTIONS:
             return e
@@ -146,7 +146,7 @@ def first_wrong(actions: IntArray) -> int:
 
 @kernel
 def _report(search: Any, e: int, fresh: bool, limit: int, steps: Steps, mask: NDArray[np.int8]) -> None:
-    """Reward, ends, metrics where it ends, and what can be done next."""
+    """Write a search's reward, end of episode, final metrics and action mask."""
     masks = uint8s(scenario_at(search.scenario, 0).action_masks)
     for action in range(N_ACTIONS):
         mask[e, action] = masks[search.vertex * N_ACTIONS + action]
@@ -172,48 +172,50 @@ def _report(search: Any, e: int, fresh: bool, limit: int, steps: Steps, mask: ND
 
 
 class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]]):
-    """`parkenv/Search-v1` many times over, in one compiled step.
+    """A batch of `parkenv/Search-v1` environments in one compiled step.
 
     ## Description
-    World, decisions, rewards, ends and observations are those of `parkenv/Search-v1`: search i of a batch that was
-    reset with `seed=s` is the single environment that was reset with `seed=s + i`, bit for bit, through all the
-    episodes that follow.
+    World, decisions, rewards, ends and observations are those of `parkenv/Search-v1`: search i of a batch reset with
+    `seed=s` equals the single environment reset with `seed=s + i`, bit for bit, in this and all later episodes.
 
     ## Action space
     `MultiDiscrete([5, ...])`: up, down, left, right, park.
 
     ## Observation space
-    With `observation="full"` the `Dict` of `parkenv/Search-v1`, with a row for each search. Where lots differ in size,
-    slots past a lot's last one are taken (1) and never observed, and `belief` has four parts of the largest lot's size.
-
-    With `observation="occupancy"` the same without `belief`, which saves its copying.
-
-    With `observation="local"` a `Dict` of `local` and `action_mask`; see `parkenv.envs.local_observation`. It has the
-    same size on every lot, and costs the same.
+    - `observation="full"`: the `Dict` of `parkenv/Search-v1`, with a row for each search. If lots differ in size,
+      smaller lots are padded with slots that are taken (1) and never observed; the four parts of `belief` have the
+      largest lot's size.
+    - `observation="occupancy"`: the same without `belief`, which saves copying it.
+    - `observation="local"`: a `Dict` of `local` and `action_mask`; see `parkenv.envs.local_observation`. Its size and
+      cost are the same on every lot.
 
     ## Rewards
     As in `parkenv/Search-v1`, float64. `reward_terms` holds the last step's terms.
 
     ## Starting state
-    As in `parkenv/Search-v1`. `reset(seed=s)` gives search i the seed s + i; a sequence gives each its own. Without a
-    seed every search goes on to the next world of its seed.
+    As in `parkenv/Search-v1`. `reset(seed=s)` gives search i the seed s + i; a sequence gives one seed to each.
+    Without a seed, every search continues with the next world of its seed.
 
     ## Episode end
-    As in `parkenv/Search-v1`; truncated after `max_episode_steps`. What then happens is `autoreset_mode`: NEXT_STEP,
-    the next step ignores the action and begins a new search, with a reward of 0; SAME_STEP, a new search begins at
-    once, and the last observations and infos are `info["final_obs"]` and `info["final_info"]`; DISABLED, the searches
-    to reset are named in `reset(options={"reset_mask": ...})`. Where a search ends, `info` has its metrics, as the
-    single environment's; `_drive_s` and so on say which searches they are of.
+    As in `parkenv/Search-v1`; truncated after `max_episode_steps`. `autoreset_mode` then applies:
+
+    - NEXT_STEP: the next step ignores the action and begins a new search, with reward 0;
+    - SAME_STEP: a new search begins at once; `info["final_obs"]` and `info["final_info"]` hold the last observations
+      and infos;
+    - DISABLED: the caller resets searches with `reset(options={"reset_mask": ...})`.
+
+    When a search ends, `info` has its metrics, as in the single environment; the masks `_drive_s` and so on say which
+    searches have ended.
 
     ## Arguments
     - `num_envs`: number of environments.
-    - `scenario`: a `Scenario` or the name of a packaged one; or a sequence of such, of which search i gets the one at
-      i modulo their number.
+    - `scenario`: a `Scenario` or the name of a packaged one; or a sequence of them, assigned to the searches in
+      rotation.
     - `observation`: full, occupancy or local.
     - `k`: number of slots that `local` describes.
     - `max_episode_steps`: 2000 from `make_vec`.
     - `autoreset_mode`: NEXT_STEP, SAME_STEP or DISABLED of `gymnasium.vector.AutoresetMode`, or its value.
-    - `copy`: False returns arrays that the next step overwrites, which saves their copying.
+    - `copy`: False returns arrays that the next step overwrites, which saves copying them.
     - further keywords replace fields of the scenarios, e.g. `failure_s=90.0`.
 
     ```python
@@ -230,7 +232,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     ```
 
     Raises:
-        InputError: an argument out of its range, by name.
+        InputError: an argument out of its range; the message names it.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium declares it so
@@ -310,7 +312,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     @property
     def bytes_each(self) -> float:
-        """Memory of one search, bytes, once all slots of its lot were observed; the scenarios' tables are shared."""
+        """Memory of one search, bytes, after observing every slot; without the shared tables of the scenarios."""
         own = (a for name, a in self._seen.items() if name not in ("p_occupied", "belief"))
         return (self._searches.n_bytes + sum(a.nbytes for a in (*own, *self._steps))) / self.num_envs
 
@@ -320,12 +322,12 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         """Start a search in every environment, or in those of `options["reset_mask"]`, (n_envs,) bool.
 
         Args:
-            seed: of the first environment, the next ones counting up from it; or a sequence with one for each, where
-                None continues with the next world of the environment's seed; or None, which does so for all.
-            options: nothing but `reset_mask`.
+            seed: seed of the first environment, counting up for the others; or a sequence of one per environment, where
+                None continues with the next world of the environment's seed; or None to continue all of them.
+            options: only `reset_mask`.
 
         Raises:
-            InputError: an unknown option, or a number of seeds that is not the number of environments.
+            InputError: an unknown option, or a number of seeds that differs from the number of environments.
         """
         which = self._chosen(options)
         if seed is None or isinstance(seed, (int, np.integer)):
@@ -338,7 +340,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         if isinstance(seed, (int, np.integer)):
             seeds = [int(seed) + i for i in range(self.num_envs)]
         elif not self._begun and None in seeds:
-            # Nobody ever gave these a seed. Where `np_random` was set by hand, its own is not known.
+            # These never got a seed. If `np_random` was set by hand, its seed is unknown.
             _ = self.np_random
             known = self.np_random_seed
             first = int(self.np_random.integers(1 << 62)) if known is None or known < 0 else known
@@ -397,7 +399,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return self._observations(), *results, info
 
     def _step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
-        """Begin the searches that are fresh, skip the idle ones, step the others."""
+        """Begin fresh searches, skip idle ones, step the others."""
         seen, steps = self._seen, self._steps
         if self._surroundings is None:
             step_full(
@@ -411,7 +413,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             )  # fmt: skip
 
     def _arrive(self, which: BoolArray) -> None:
-        """Put some of the cars at the entries of their next worlds."""
+        """Put the selected cars at the entries of their next worlds."""
         searches = self._searches
         arrive_all(searches.address, which)
         if not len(searches.external_prior):
@@ -432,7 +434,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return final
 
     def _metrics(self, done: BoolArray) -> dict[str, Any]:
-        """What `SearchEnv`'s info says, and which searches it is of."""
+        """Return the `info` of `SearchEnv`, with masks of the searches that have ended."""
         steps = self._steps
         terms, times, tallies, parked = steps.terms, steps.times, steps.tallies, steps.parked
         if self._copy:
@@ -444,7 +446,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return metrics | dict.fromkeys(_WHICH, done)
 
     def _chosen(self, options: dict[str, Any] | None) -> BoolArray:
-        """Which environments to reset."""
+        """Return the mask of environments to reset."""
         rest = dict(options or {})
         mask = np.asarray(rest.pop("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
         if rest:

@@ -1,4 +1,4 @@
-"""Simulated sensor measurements of a searching car between two decisions."""
+"""Simulated sensor measurements between two decisions of a search."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ class Station(NamedTuple):
 
 
 class SensorSampler:
-    """Samples the simulated sensors of a searching car, along each edge that it drives.
+    """Samples the simulated sensors of the searching car along each edge it drives.
 
-    A car at a vertex is headed along the lane; between two vertices it is headed along the edge. Measurements depend on
-    world, pose and time alone, not on the agent or on earlier measurements.
+    At a vertex the car is headed along the lane, between two vertices along the edge. Measurements depend only on
+    world, pose and time, not on the agent or on earlier measurements.
 
     Args:
-        scenario: the world, with its traffic.
+        scenario: defines world and traffic.
         rig: laser, stereo, both_sides, or any `SensorRig`.
         weather: one of `sim_sensors.camera.weather.PRESETS`; None draws one for each world.
         captures: largest number of captures on an edge.
@@ -96,8 +96,8 @@ class SensorSampler:
         """Measure at the given stations.
 
         Args:
-            state: of the search, for its world.
-            stations: oldest first.
+            state: state of the search, which defines the world.
+            stations: poses and times, oldest first.
 
         Returns:
             One capture for each station.
@@ -114,7 +114,9 @@ class SensorSampler:
         return captures
 
     def select_stations(self, driven: FloatArray) -> NDArray[np.int64]:
-        """Select evenly spaced points of a driven path: at least `every` m apart, at most `captures`, and the last one.
+        """Select evenly spaced points of a driven path, including the last.
+
+        They are at least `every` m apart, and at most `captures`.
 
         Args:
             driven: (k,) m, distance driven up to each candidate point, ascending; k at least 1.

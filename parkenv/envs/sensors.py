@@ -26,12 +26,12 @@ class SearchSensorsEnv(SearchEnv):
     """`parkenv/Search-v1` with raw sensor data instead of a belief: images, laser scans and poses.
 
     ## Description
-    World, decisions and rewards are those of `parkenv/Search-v1`, and equal seeds give equal worlds. The agent brings
+    World, decisions and rewards are those of `parkenv/Search-v1`, and equal seeds give equal worlds. The agent needs
     its own perception. Simulated sensors measure up to `captures` times on every edge, at equal distances, the last
-    time at its end. The vehicle stands on its vertex and is headed along the lane; between two vertices it is headed
-    along the edge. One capture is made at the start, and one after waiting or a failed attempt.
+    time at its end. At a vertex the vehicle is headed along the lane, between two vertices along the edge. There is
+    one capture at the start, and one after waiting or a failed attempt.
 
-    The forecast of the slots is not observed; it is in the first observation of `parkenv/Search-v1` with the same seed.
+    Observations do not contain the forecast; the first observation of `parkenv/Search-v1` with the same seed has it.
 
     ## Action space
     `Discrete(5)`, as in `parkenv/Search-v1`:
@@ -88,7 +88,7 @@ class SearchSensorsEnv(SearchEnv):
     ```
 
     ## Version history
-    - v1: the id rises with `parkenv/Search-v1`.
+    - v1: same version number as `parkenv/Search-v1`.
     - v0: first version.
     """
 
@@ -170,7 +170,7 @@ def with_camera_images(
 ) -> NDArray[np.uint8]:
     """Append the newest image of every camera of the rig to the right of a frame, (h, w, 3).
 
-    Without a capture the images are black: every frame of a video must have the same width.
+    Without a capture the images are black, so that all frames of a video have the same width.
     """
     pictures = []
     if newest is not None:

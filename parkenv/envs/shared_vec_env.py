@@ -1,4 +1,4 @@
-"""The base of batched environments for stable-baselines3, whose attributes belong to the whole batch."""
+"""Base class of batched environments for stable-baselines3."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices
 class SharedVecEnv(VecEnv):  # type: ignore[misc]
     """A batch of environments as stable-baselines3's `VecEnv`.
 
-    Attributes and methods are those of the batch, the same for every environment. Returns and lengths of episodes are
-    reported in `info` as by `Monitor`, so that no wrapper is needed.
+    Attributes and methods belong to the whole batch. `info` reports returns and lengths of episodes as `Monitor` does,
+    so no wrapper is needed.
 
     Attributes:
-        actions: of the next `step_wait`.
+        actions: actions for the next `step_wait`.
     """
 
     actions: NDArray[Any]
@@ -35,7 +35,7 @@ class SharedVecEnv(VecEnv):  # type: ignore[misc]
         self._returns[:], self._lengths[:] = 0.0, 0
 
     def _count(self, rewards: NDArray[np.floating]) -> None:
-        """Add a step's rewards, (n_envs,), to the episodes."""
+        """Add a step's rewards, (n_envs,), to the episode returns."""
         self._returns += rewards
         self._lengths += 1
 
@@ -48,9 +48,9 @@ class SharedVecEnv(VecEnv):  # type: ignore[misc]
         """Return the step's `info` of all environments, and start counting new episodes where one has ended.
 
         Args:
-            done: (n_envs,), where an episode has ended.
-            truncated: (n_envs,), where a step limit ended it.
-            final: returns the last observation and further entries of `info` of an ended episode, by environment.
+            done: (n_envs,), whether the episode has ended.
+            truncated: (n_envs,), whether a step limit ended it.
+            final: function of an environment's index; returns the last observation and further entries of `info`.
         """
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for i in np.flatnonzero(done).tolist():
@@ -69,7 +69,7 @@ class SharedVecEnv(VecEnv):  # type: ignore[misc]
         self.actions = np.asarray(actions)
 
     def close(self) -> None:
-        """Release nothing."""
+        """Do nothing: there are no resources to release."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the batch for each environment; the render mode is None."""
@@ -77,7 +77,7 @@ class SharedVecEnv(VecEnv):  # type: ignore[misc]
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Refuse: environments of a batch have no attributes of their own.
+        """Raise an error: environments of a batch have no attributes of their own.
 
         Raises:
             NotImplementedError: always.
@@ -92,7 +92,7 @@ class SharedVecEnv(VecEnv):  # type: ignore[misc]
         return [value for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type[Any], indices: VecEnvIndices = None) -> list[bool]:
-        """Return True for `Monitor`, whose job the batch does itself."""
+        """Return True for `Monitor`: the batch has its function built in."""
         from stable_baselines3.common.monitor import Monitor
 
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]

@@ -11,10 +11,10 @@ from parkenv.errors import InputError
 
 
 class Window:
-    """Shows frames; it opens with the first.
+    """A window that opens with the first frame.
 
     Args:
-        title: of the window.
+        title: title of the window.
     """
 
     def __init__(self, title: str) -> None:
@@ -23,7 +23,7 @@ class Window:
         self._ticker: Any = None
 
     def show(self, frame: NDArray[np.uint8], fps: float) -> None:
-        """Show a frame, (h, w, 3), at most `fps` of them a second.
+        """Show a frame, (h, w, 3), at most `fps` frames per second.
 
         Raises:
             InputError: pygame is not installed.
@@ -40,13 +40,13 @@ class Window:
             self._ticker = pygame.time.Clock()
             pygame.display.set_caption(self._title)
         self._screen.blit(pygame.surfarray.make_surface(frame.swapaxes(0, 1)), (0, 0))
-        # Unanswered events make a desktop call the window frozen.
+        # If events are not handled, the desktop reports the window as not responding.
         pygame.event.pump()
         pygame.display.flip()
         self._ticker.tick(fps)
 
     def close(self) -> None:
-        """Close it, if it is open."""
+        """Close the window, if open."""
         if self._screen is not None:
             import pygame
 

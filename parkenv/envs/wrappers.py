@@ -10,10 +10,10 @@ from parkenv.envs.search import SearchEnv
 
 
 class ThesisReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):
-    """The thesis's own reward: parking pays r_max - r_s, not minus the walk (eq. 3.23-3.25).
+    """The thesis's reward: parking pays r_max - r_s instead of minus the walk (eq. 3.23-3.25).
 
-    It differs from the environment's by the constant r_max, the walk from the farthest slot, paid on
-    success. `info["reward_terms"]` gains the term `r_max`, so that the terms still add up.
+    Success pays an additional constant r_max, the walk from the farthest slot. `info["reward_terms"]` gains the term
+    `r_max`, so that the terms still add up.
 
     Examples:
         >>> import gymnasium as gym
@@ -29,7 +29,7 @@ class ThesisReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
         self.r_max = float(env.unwrapped.scenario.walk_s.max())
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
-        """Step, and pay r_max for parking."""
+        """Step, and add r_max for parking."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         bonus = self.r_max if info["parked"] else 0.0
         info["reward_terms"] = {**info["reward_terms"], "r_max": bonus}

@@ -1,1 +1,1 @@
-"""Agents compared: episodes, statistics, result folders and pictures."""
+"""Evaluation of agents: episodes, statistics, result folders and figures."""

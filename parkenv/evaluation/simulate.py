@@ -15,21 +15,21 @@ from planners.agent import Agent, ClairvoyantAgent
 from sim_sensors.compilation import seconds_spent
 
 STEP_LIMIT = 2000
-"""Decisions after which environments that are not made by `gymnasium.make` truncate, as `parkenv/Search-v1` does."""
+"""Step limit of environments that are not made by `gymnasium.make`, the same as that of `parkenv/Search-v1`."""
 
 
 class Step(NamedTuple):
     """One decision and its outcome.
 
     Attributes:
-        observation: what the agent decided on.
-        action: what it decided.
+        observation: observation before the decision.
+        action: action chosen by the agent.
         memory: the agent's state after the decision; it may change with the next decision.
-        reward: of the environment's step.
-        next_observation: what the environment returned.
-        terminated: whether the episode ended by itself.
-        truncated: whether the step limit ended it.
-        info: of the environment's step.
+        reward: reward of the step.
+        next_observation: observation after the step.
+        terminated: whether the episode reached a terminal state.
+        truncated: whether the step limit ended the episode.
+        info: `info` of the step.
     """
 
     observation: Any
@@ -47,10 +47,10 @@ class EpisodeResult:
     """The outcome of one episode.
 
     Attributes:
-        seed: of the world.
-        info: the last step's `info`. A truncated search is charged the give-up penalty, see `charge_truncation`.
+        seed: seed of the world.
+        info: `info` of the last step. A truncated search is charged the give-up penalty, see `charge_truncation`.
         truncated: whether the step limit ended the episode.
-        decision_s: wall time of each decision, s, without compiling and loading compiled code.
+        decision_s: wall time of each decision, s, excluding compiling and loading of compiled code.
         memory: the agent's state at the end.
     """
 
@@ -70,7 +70,7 @@ class Observer:
     """Hooks into an episode; subclasses override what they need."""
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Called after the environment's reset, before the first decision."""
+        """Called after the reset, before the first decision."""
 
     def on_step(self, step: Step) -> None:
         """Called after each step of the environment."""
@@ -86,8 +86,8 @@ def simulate(
 
     Args:
         env: the environment, with a step limit if the agent may never finish; see `adapt_to_agent`.
-        agent: decides; the oracle is shown the world first.
-        seed: of the world.
+        agent: the agent; an oracle gets the hidden occupancy first.
+        seed: seed of the world.
         observers: called in this order at each hook.
     """
     observation, _ = env.reset(seed=seed)
@@ -101,7 +101,7 @@ def simulate(
     while not (terminated or truncated):
         start, compiling = time.perf_counter(), seconds_spent()
         action, memory = agent.predict(observation, memory)
-        # The first decision of a process may compile, which says nothing about the agent.
+        # The first decision of a process may include compilation, which is not counted.
         decision_s.append(time.perf_counter() - start - (seconds_spent() - compiling))
         decided_on = observation
         observation, reward, terminated, truncated, info = env.step(action)
@@ -120,13 +120,13 @@ def simulate(
 
 
 def charge_truncation(metrics: MutableMapping[str, Any], scenario: Scenario, truncated: Any = 1.0) -> None:
-    """Charge truncated searches the give-up penalty, like those that end in a full lot.
+    """Charge truncated searches the give-up penalty, like searches that give up in a full lot.
 
-    Otherwise an agent that never parks would look cheap.
+    Otherwise an agent that never parks would seem cheap.
 
     Args:
-        metrics: of a search, or arrays with an element per search; `gave_up_s` and `total_s` rise.
-        scenario: has the penalty `give_up_s`.
+        metrics: metrics of a search, or arrays with one element per search; `gave_up_s` and `total_s` are increased.
+        scenario: the scenario, with the penalty `give_up_s`.
         truncated: which searches were truncated, as a number or a bool array.
     """
     penalty = truncated * scenario.give_up_s
@@ -135,13 +135,13 @@ def charge_truncation(metrics: MutableMapping[str, Any], scenario: Scenario, tru
 
 
 def adapt_to_agent(env: gym.Env[Any, Any], agent: Agent) -> gym.Env[Any, Any]:
-    """Return the environment with the observation that the agent needs: trained models have `local_k`."""
+    """Give the environment the agent's observation: trained models (with `local_k`) use `LocalObservation`."""
     k = getattr(agent, "local_k", None)
     return env if k is None else LocalObservation(env, k)
 
 
 def _prepare(agent: Agent, env: gym.Env[Any, Any]) -> None:
-    """Show the hidden occupancy to agents that are defined by knowing it."""
+    """Pass the hidden occupancy to agents that know it by definition, such as the oracle."""
     if isinstance(agent, ClairvoyantAgent):
         state = env.unwrapped.state  # type: ignore[attr-defined]
         agent.prepare(state.world, state.time)

@@ -1,1 +1,1 @@
-"""Planning in belief space: the path of the least expected total time."""
+"""Planning in belief space: the path with the least expected total time."""

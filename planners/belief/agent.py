@@ -1,4 +1,4 @@
-"""`belief`: a planner in belief space, for a search in which slots are revealed on the way and change."""
+"""`belief`: a planner in belief space, for slots that change and are observed while driving."""
 
 from __future__ import annotations
 
@@ -52,20 +52,20 @@ class BeliefSearch:
     """Memory of an episode.
 
     Attributes:
-        near: the part of the lot that is planned for. The arrays below are of its slots, by its numbers.
-        n_unobserved: slots of it that were unobserved when it was chosen.
-        day: belief about how far the day differs from the forecast.
+        near: the part of the lot that is planned for. The arrays below cover its slots, in its numbering.
+        n_unobserved: number of its slots that were unobserved when it was chosen.
+        day: belief about how much the day differs from the forecast.
         state: (n_slots,) int8, `SlotBelief.state` at the last decision.
-        missed_rate: (n_slots,) float64, the greatest detection rate of a view from which a slot was not detected.
-        time: s since the search began, of the last decision.
-        news_at: s, when a slot of the part was last observed for the first time, or the part was chosen.
-        targets: (DEPTH,) int64, what the path of the last decision goes past first.
-        path: room for one.
-        entry: the vertex that the car drives to before it plans, or -1.
-        n_targets: how many targets there are.
-        failure_s: s, the failure cost of the thesis's planner on that path.
-        promise_s: s, what that path was expected to leave by now, unless something was observed since; else inf.
-        replans: how often the path ahead has changed.
+        missed_rate: (n_slots,) float64, the highest detection rate among the views from which a slot was not detected.
+        time: s since the search began, at the last decision.
+        news_at: s, the last time at which an unobserved slot of the part was observed, or the part was chosen.
+        targets: (DEPTH,) int64, the vertices that the path of the last decision passes first.
+        path: buffer for one path.
+        entry: vertex to drive to before planning, or -1.
+        n_targets: number of targets.
+        failure_s: s, failure cost of the thesis's planner on that path.
+        promise_s: s, time that was expected to remain on that path by now; inf if something has been observed since.
+        replans: number of times that the path ahead has changed.
         expected_s: s, expected time of the search from here.
     """
 
@@ -90,42 +90,43 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
     """`belief`: follows the path with the least expected time under optimal stopping.
 
     **Model.** A slot is free with the forecast probability, unless the day differs from its forecast in one of several
-    ways, about which the slots observed so far are evidence (`ForecastErrorModel`). A slot is revealed when it comes in
+    ways; the slots observed so far are evidence for these (`ForecastErrorModel`). A slot is revealed when it comes into
     view; then its state decays as a two-state Markov chain, so a free slot may be gone on arrival and a taken one may
-    come free.
+    become free.
 
-    **Search.** At each decision candidate paths are rolled out (`rollout_path`): as the thesis's planner would drive if
-    everything that it observes were taken, at several failure costs, and past up to three vertices inserted before.
-    Each is evaluated by optimal stopping with recall (`evaluate_path`), so everything on the way counts, and so does
-    that taken slots are evidence for a full day. The best path's first step is taken, and its targets are where the
-    next decision starts. At its end, a part of a path is driven again and again, or what it found so far is
-    extrapolated where enough slots are unobserved; and where one more observation may prove the lot full, it may be
-    better not to make it.
+    **Search.** Each decision rolls out candidate paths (`rollout_path`): they follow the thesis's planner as if every
+    slot that it observes were taken, at several failure costs, and pass up to three inserted vertices first. Each path
+    is evaluated by optimal stopping with recall (`evaluate_path`), which counts every slot on the way, and counts taken
+    slots as evidence for a full day. The agent takes the first step of the best path; the next decision starts from its
+    targets. The time beyond the end of a path is that of driving a part of it repeatedly, or is extrapolated from the
+    path if enough slots are unobserved. Where one more observation may prove the lot full, it can be better to avoid
+    it.
 
-    **Why it beats the thesis's planner.** That one values the one slot it drives to and needs a failure cost to stand
-    for all else, which is off by a factor where the forecast is wrong; and it makes the observation that proves a lot
-    full where it had better wait for a car to leave. This one has no cost to tune; on small lots it stays within a
-    thousandth of the exact optimum on average where slots last, and within 2 % where they change (tests).
+    **Why it beats the thesis's planner.** The thesis's planner values one slot, the one it drives to, and needs a
+    failure cost for everything else; the right cost changes by a factor when the forecast is wrong. It also makes the
+    observation that proves a lot full when it would be better to wait for a car to leave. This planner has no cost to
+    tune. On small lots its mean time is within 0.1 % of the exact optimum where slots do not change, and within 2 %
+    where they do (tests).
 
-    **Where it does not.** Where the forecast is right, the thesis's planner with its failure cost tuned to the forecast
-    is as near to the best path as this one. Allowing for forecast errors costs a little on such days; where an event
-    has filled a lot against the forecast, drivers who take the first free slot still do better. One path at a time is
-    evaluated, so it is not foreseen that the car leaves the path for another one after an observation. Estimates differ
-    by where the car is, so that it could turn round between two paths for ever: until it observes something, it keeps
-    to its path unless another is better than what that one had promised. Where a sensor misses slots, a slot that was
-    in view and not detected is looked for only from where it is likelier than not to be detected; one that is not
-    detected from its own vertex either is attempted.
+    **Where it does not.** If the forecast is right, the thesis's planner with a failure cost tuned to the forecast is
+    as close to the best path as this one. Allowing for forecast errors costs a little time on such days. If an event
+    has filled a lot against the forecast, drivers who take the first free slot still do better. Each path is evaluated
+    on its own, without the option to change to another path after an observation. Estimates depend on the position of
+    the car, so it could alternate between two paths for ever; until it observes something new, it therefore keeps its
+    path unless another one is better than the time that this path was expected to take. If a sensor misses slots, a
+    slot that was in view and not detected is observed again only from vertices where a detection is more likely than
+    not. A slot that is not detected from its own vertex either is attempted.
 
     Args:
         problem: lot, goal, speeds and costs.
-        budget_ms: about how long a decision may take, ms. It is counted in work, not by the clock, so
-            that the same observations give the same actions on every machine.
-        trust_forecast: whether to assume that the forecast is right on every day.
-        most_vertices: a lot with more is planned for in part (`Neighborhoods`).
-        forecast_error: how a day may differ from its forecast, where that is not trusted.
+        budget_ms: approximate time of a decision, ms. It limits the amount of work, not the wall time, so the same
+            observations give the same actions on every machine.
+        trust_forecast: whether to assume that the forecast is always right.
+        most_vertices: a larger lot is planned for in part (`Neighborhoods`).
+        forecast_error: how a day may differ from its forecast, if that is not trusted.
 
     Raises:
-        InputError: a budget that is not positive, a bad `most_vertices`, or a problem in which nothing is observed.
+        InputError: the budget is not positive, `most_vertices` is out of range, or no slot can be observed.
     """
 
     name: ClassVar[str] = "belief"
@@ -147,7 +148,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         )
         self._worth_passing_s = 0.0 if trust_forecast else WORTH_PASSING_S
         self._budget = Budget(np.array(FAILURE_COSTS), int(budget_ms * WORK_PER_MS), DEPTH)
-        # With a sensor that never errs nobody attempts a taken slot.
+        # With a perfect sensor no taken slot is attempted.
         self._failure_s = 0.0 if self.problem.sensor_model.perfect else self.problem.failure_s
         self._neighborhoods = Neighborhoods(self.problem, most_vertices)
         self._routes = DriveRoutes(self.problem)
@@ -176,7 +177,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         )
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
-        """Update on the observation, search for the best path, and take its first step or park."""
+        """Update the memory, search for the best path, and take its first step or park."""
         vertex = int(observation["vertex"])
         known = self._update(belief, vertex, memory)
         if memory.entry not in (-1, vertex):
@@ -184,7 +185,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         if memory.entry == vertex:
             memory.entry, memory.news_at = -1, memory.time
         here = memory.near.index(vertex)
-        # Half of the slots that were unobserved have been observed, or none for long: search another part.
+        # Search another part if half of the unobserved slots have been observed, or none for a long time.
         half = 2 * _n_unobserved(memory.state) < memory.n_unobserved
         spent = not memory.near.whole and (half or memory.time - memory.news_at > STALE_S)
         action = None if here < 0 or spent else self._follow_best_path(vertex, here, known, memory)
@@ -196,7 +197,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         return self._wait(vertex) if action is None else action
 
     def _update(self, belief: SlotBelief, vertex: int, memory: BeliefSearch) -> SlotBelief:
-        """Update the memory by what was observed; return the belief about the slots of its part."""
+        """Update the memory from the observation; return the belief about the slots of its part."""
         near = memory.near
         known = belief.take(near.slots)
         state = known.state
@@ -208,7 +209,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             memory.promise_s = math.inf
         memory.state = state
         here = near.index(vertex)
-        # There are no observations at the moment of arrival.
+        # Nothing is observed at the moment of arrival.
         if here >= 0 and belief.time > memory.time:
             views = near.in_view(here)
             missed = np.where(state[views["slot"]] == UNOBSERVED, views["rate"], 0.0)
@@ -249,14 +250,14 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         return near.table.move_to(here, choice.next_vertex)
 
     def _change_part(self, belief: SlotBelief, vertex: int, memory: BeliefSearch) -> SlotBelief:
-        """Plan for the part of the lot around the car from now on, and keep what is known about it."""
+        """Change the planned part of the lot to the one around the car; keep what is known about it."""
         old = memory.near
         near = self._neighborhoods.around(vertex, np.flatnonzero(belief.observed_taken))
         new = self._search_of(near, belief)
         _, ours, theirs = np.intersect1d(old.slots, near.slots, assume_unique=True, return_indices=True)
         new.missed_rate[theirs] = memory.missed_rate[ours]
         new.failure_s, new.replans = memory.failure_s, memory.replans
-        # The caller keeps `memory`: it becomes the new one in place.
+        # Update in place: the caller keeps `memory`.
         vars(memory).update(vars(new))
         memory.entry = -1 if near.entry == vertex else near.entry
         known = self._update(belief, vertex, memory)
@@ -264,9 +265,9 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         return known
 
     def plan_preview(self, observation: Observation, action: int, memory: BeliefSearch) -> PlanPreview:
-        """Return the path that the agent would drive if everything that it comes to observe were taken."""
+        """Return the path that the agent would drive if it observed only taken slots."""
         belief = SlotBelief.of_observation(observation)
-        # The lot does not change; what is remembered does.
+        # The lot does not change, so it need not be copied.
         imagined = copy.deepcopy(memory, {id(memory.near): memory.near})
         problem, vertex, path = self.problem, int(observation["vertex"]), list[int]()
         starts, slots = problem.slots_in_view
@@ -285,7 +286,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         return PlanPreview(tuple(path))
 
     def _wait(self, vertex: int) -> int:
-        """Return a move that the graph does not have; where it has all four, the shortest."""
+        """Return a move without an edge, which waits; the shortest move if all four have edges."""
         missing = np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)
         return int(missing[0]) if len(missing) else int(self.problem.move_s[vertex].argmin())
 
@@ -294,11 +295,11 @@ def _snapshot(here: int, known: SlotBelief, memory: BeliefSearch) -> BeliefSnaps
     """Return the belief about the slots of a part as the path search uses it."""
     weights, p_free_if = memory.day.mixture()
     n, state = len(memory.state), memory.state
-    # Cars leave as often as on the forecast day; a fuller day takes free slots faster.
+    # Cars leave as often as forecast; on a fuller day free slots are taken faster.
     usual = np.maximum(weights @ p_free_if, 1e-6)
     rate = known.decay_rate * (1.0 - known.forecast) / usual
     p_free = np.where(state == UNOBSERVED, usual, 1.0 - known.p_occupied)
-    # An observation decays to the forecast; on a fuller day a free slot has a lower chance to have lasted.
+    # An observation decays to the forecast; on a fuller day a slot is less likely to be still free.
     age = np.where(known.observed, known.age, 0.0)
     lasted = usual + (1.0 - usual) * np.exp(-rate * age)
     p_free = np.where(state == OBSERVED_FREE, np.minimum(p_free, lasted), p_free)

@@ -1,4 +1,4 @@
-"""The search for the path of the least expected time, compiled."""
+"""Compiled search for the path with the least expected time."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class PathChoice(NamedTuple):
 
     Attributes:
         onward_s: s, expected time of the path.
-        then_s: s, expected time left after its first step of a car that goes on, if that step is a drive to where
-            nothing is observed; else inf.
-        at_hand_s: s, expected time of driving to the best slot known now.
+        then_s: s, expected time left after its first step if the car goes on and that step leads to a vertex where
+            nothing new is observed; else inf.
+        at_hand_s: s, expected time of driving to the best slot that is known now.
         slot: that slot, or -1.
-        next_vertex: the vertex that comes next on the path, `ATTEMPT` or `NOWHERE`.
-        n_targets: targets of the path before the thesis's planner takes over.
+        next_vertex: the next vertex on the path, `ATTEMPT` or `NOWHERE`.
+        n_targets: number of targets before the path follows the thesis's planner.
         failure_s: s, failure cost of that planner on it.
-        work: steps of the evaluation made to insert targets, at most one candidate's more than the budget.
+        work: evaluation steps spent on inserting targets; exceeds the budget by one candidate at most.
     """
 
     onward_s: float
@@ -52,12 +52,12 @@ class PathChoice(NamedTuple):
 
 
 class Budget(NamedTuple):
-    """How far to search.
+    """Limits of a search for a path.
 
     Attributes:
-        failure_costs: (k,) float64, s, failure costs with which the thesis's planner rolls out paths.
-        work: steps of the evaluation at most; it bounds the time of a decision.
-        depth: targets of a path at most.
+        failure_costs: (k,) float64, s, failure costs at which paths of the thesis's planner are rolled out.
+        work: maximum number of evaluation steps; it bounds the time of a decision.
+        depth: maximum number of targets of a path.
     """
 
     failure_costs: FloatArray
@@ -77,22 +77,23 @@ def best_path(
     belief: BeliefSnapshot,
     path: PathBuffer,
 ) -> PathChoice:
-    """Search for the path of the least expected time, starting from that of the last decision.
+    """Search for the path with the least expected time, starting from the path of the last decision.
 
-    Candidates are the paths of the thesis's planner at several failure costs, then those past one more target, which
-    may be any vertex, inserted at any place. Ties go to what was found first.
+    Candidates are the paths of the thesis's planner at several failure costs, then the best path with one more target,
+    which may be any vertex, inserted at any position. Of equal candidates the first is kept.
 
     Args:
         vertex: where the car is.
-        targets: (depth,) int64, of the last decision's path; those of the chosen one on return.
-        n_targets: how many.
+        targets: (depth,) int64, targets of the last decision's path; on return, those of the chosen path.
+        n_targets: number of targets of the last decision's path.
         failure_s: s, failure cost of the last decision's path.
-        promise_s: expected s left on that path, where nothing was observed since, to keep to it unless another is
-            better: estimates differ by where the car is, and it could turn round for ever. Else inf.
-        budget: how far to search.
+        promise_s: s, time expected to remain on that path, or inf if something was observed since. The path is kept
+            unless another is better than this: estimates depend on the position of the car, so it could turn round for
+            ever.
+        budget: limits of the search.
         graph: the lot.
         belief: the belief.
-        path: room for one path.
+        path: buffer for one path.
     """
     options, n_options, fallback_s = _options_at_hand(vertex, budget, graph, belief, path)
     at_hand_s, slot = np.inf, -1
@@ -125,7 +126,7 @@ def best_path(
     if best == np.inf:
         return PathChoice(best, best, at_hand_s, slot, NOWHERE, 0, base, 0)
 
-    # Vertices nearby matter for the step to be taken now, and come first where the budget is small.
+    # Nearest vertices first: with a small budget they matter most for the next step.
     nearest_first = np.argsort(graph.drive_s[vertex])
     on_route = np.empty((depth, len(graph.drive_s)), np.bool_)
     for _ in range(depth):
@@ -176,9 +177,9 @@ def _options_at_hand(
     belief: BeliefSnapshot,
     path: PathBuffer,
 ) -> tuple[IntArray, int, FloatArray]:
-    """Return the best slots known to be free, how many, and what the search takes on where each slot is gone, s.
+    """Return the best slots known to be free, their number, and the remaining time if each slot is gone, s.
 
-    Where a slot is gone on arrival, the search goes on as if no slot were known to be free, or to another of the slots.
+    If a slot is gone on arrival, the search continues as if no slot were known to be free, or goes to another slot.
     """
     n = len(belief.slots)
     options, n_options = np.empty(MOST_OPTIONS, np.int64), 0
@@ -219,7 +220,7 @@ def _options_at_hand(
 
 @compiled(error_model="numpy")
 def _first_step(onward_s: float, path: PathBuffer) -> tuple[int, float]:
-    """Return `next_vertex` and `then_s` of a path; `onward_s` as it would be if nothing were observed."""
+    """Return `next_vertex` and `then_s` of a path, given `onward_s` for the case that nothing is observed."""
     stops = path.stops
     if stops[1].time == 0.0 and stops[2].first > 0:
         return ATTEMPT, np.inf  # only an attempt takes no time
@@ -231,7 +232,7 @@ def _first_step(onward_s: float, path: PathBuffer) -> tuple[int, float]:
 
 @compiled(error_model="numpy")
 def _shows_news(vertex: int, graph: PlanningGraph, belief: BeliefSnapshot) -> bool:
-    """Return whether a slot in view of a vertex was not observed yet, or may have come free."""
+    """Return whether any slot in view of a vertex is unobserved or may have become free."""
     for i in range(graph.view_starts[vertex], graph.view_starts[vertex + 1]):
         view = graph.views[i]
         if is_hidden(view.slot, view.rate, belief):
@@ -252,7 +253,7 @@ def _mark_route(
     graph: PlanningGraph,
     path: PathBuffer,
 ) -> None:
-    """Mark vertices that a path reaches by a shortest route from its start or last target: no use to insert them."""
+    """Mark vertices on a shortest route from the path's start or last target: inserting them changes nothing."""
     on_route[:] = False
     passed, since, origin = 0, 0.0, vertex
     for k in range(n_stops):

@@ -1,11 +1,11 @@
 """Evaluation of a path for a car that may stop at any free slot it has observed: optimal stopping with recall.
 
-A path says where to observe next while everything observed is taken. At every stop of it the car knows what it has
-passed, and either settles for the best free slot so far, which may mean driving back, or goes on. The value follows
-exactly by going through the path backwards; the state is which slot is the best so far, or none.
+A path says where to observe next while all observed slots are taken. At every stop the car knows the slots that it has
+passed, and either takes the best free slot so far, which may mean driving back, or goes on. Backward induction along
+the path gives the exact value; the state is the best slot so far, or none.
 
-A car that comes too late to a slot goes on searching, for a time that is estimated once a decision, or tries the next
-of the slots that it knows to be free.
+If a slot is gone on arrival, the car continues the search, for a time that is estimated once per decision, or drives to
+the next slot that it knows to be free.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ def expected_cost_to_slot(
     graph: PlanningGraph,
     belief: BeliefSnapshot,
 ) -> float:
-    """Return the expected time, s, of driving to a slot that was observed some time ago.
+    """Return the expected time, s, of driving to a slot observed `age` seconds ago.
 
     Args:
-        vertex: where from.
-        slot: where to.
+        vertex: where the drive starts.
+        slot: where it ends.
         p_free: P(free) when it was observed.
-        age: s since then.
-        fallback_s: s that the search takes on if it is taken.
+        age: s since that observation.
+        fallback_s: s, remaining time of the search if the slot is taken.
         graph: the lot.
         belief: the belief.
     """
@@ -69,26 +69,26 @@ def evaluate_path(
     belief: BeliefSnapshot,
     path: PathBuffer,
 ) -> tuple[float, float]:
-    """Return the least expected time, s, of following a path and stopping at will.
+    """Return the least expected time, s, of following a path with the option to stop at any time.
 
-    What an observation says about the day depends on what it leads to. Where the car would park if the slot were free,
-    going on means that it was taken; where the car drives past in any case, the observation may have been either, and
-    on average says nothing. So the path is evaluated twice: without any such evidence, which shows where the car would
-    park, and with the evidence of the observations there.
+    What an observation says about the day depends on the decision that follows. If the car would park in the slot were
+    it free, then going on means that it was taken. If the car drives past in either case, the observation is no
+    evidence on average. So the path is evaluated twice: without evidence, to find where the car would park, and then
+    with the evidence of the observations there.
 
     Args:
-        n_stops: of the path.
-        left_s: s, expected at its end if nothing was found.
+        n_stops: number of stops of the path.
+        left_s: s, expected time after its end if nothing was found.
         options: slots that are known to be free now.
-        n_options: how many.
-        fallback_s: (n_slots,) float64, s that the search takes on where each slot is gone on arrival.
+        n_options: number of such slots.
+        fallback_s: (n_slots,) float64, s, remaining time of the search if the slot is gone on arrival.
         graph: the lot.
         belief: the belief.
         path: the path.
 
     Returns:
-        The value of driving on to its second stop, and that of not stopping there either, counted from there; inf
-        where it has none.
+        The value, s, of driving on to the second stop, and the value from there of not parking there either; inf where
+        there is none.
     """
     if n_stops < 2:
         return np.inf, np.inf
@@ -103,7 +103,7 @@ def evaluate_path(
 
 @compiled(error_model="numpy")
 def _set_first_observations(n_stops: int, belief: BeliefSnapshot, path: PathBuffer) -> None:
-    """Set P(free) of the first observations along a path, each given that the car did not park before."""
+    """Set P(free) of the first observations along a path, given that the car has not parked before."""
     weights = copy_weights(belief, path)
     for j in range(path.stops[n_stops].first):
         observation = path.observations[j]
@@ -124,10 +124,10 @@ def _stop_optimally(
     belief: BeliefSnapshot,
     path: PathBuffer,
 ) -> tuple[float, float]:
-    """Evaluate a path on which P(free) of all observations is known."""
+    """Evaluate a path, given P(free) of all its observations."""
     stops, observations = path.stops, path.observations
-    # A bound on what any later observation can bring. A slot that is better than that is taken at once; others are kept
-    # in mind for a while, in which they grow no better.
+    # Lower bound on the time after any later observation. A slot that is better than the bound is taken at once. Others
+    # are remembered for some stops; their value cannot improve in the meantime.
     ahead = np.inf
     for k in range(n_stops - 1, 0, -1):
         stops[k].ahead_s = ahead
@@ -144,7 +144,7 @@ def _stop_optimally(
             )
     nothing, onward, then_s = left_s, 0.0, left_s
     for k in range(n_stops - 1, 0, -1):
-        # `value` of the observations and `nothing` hold what follows at the next stop, and `onward` is the drive there.
+        # `value` of the observations and `nothing` hold the values at the next stop; `onward` is the drive there.
         vertex, first, last = stops[k].vertex, stops[k].first, stops[k + 1].first
         oldest = stops[max(k - KEPT_IN_MIND, 1)].first
         stop_s = np.inf
@@ -164,12 +164,12 @@ def _stop_optimally(
             back_s = expected_cost_to_slot(vertex, slot, 1.0, age, fallback_s[slot], graph, belief)
             observation.expected_s = min(stop_s, back_s)
             later = onward + (nothing if observation.kept_until == k else observation.value)
-            # The stop at which the slot is observed comes last, and decides.
+            # The stop at which the slot is observed is processed last and decides.
             observation.parks = observation.expected_s <= max(stops[k].ahead_s, later)
             observation.value = observation.expected_s if observation.parks else later
         then_s = onward + nothing
         nothing = min(stop_s, then_s)
-        # Now back to before the observations at this stop: the best slot that they show replaces a worse one.
+        # Value before the observations at this stop: the best slot that they show replaces a worse one.
         _sort_observations(first, last, path)
         for j in range(oldest, first):
             if observations[j].kept_until < k:
@@ -197,7 +197,7 @@ def _sort_observations(first: int, last: int, path: PathBuffer) -> None:
     for i in range(first + 1, last):
         j = i
         while j > first and observations[j].expected_s < observations[j - 1].expected_s:
-            # Records are views: they are exchanged field by field. (Times at one stop are equal.)
+            # Records are views, so swap them field by field. (Times at one stop are equal.)
             a, b = observations[j - 1], observations[j]
             a.slot, b.slot = b.slot, a.slot
             a.p_free, b.p_free = b.p_free, a.p_free

@@ -1,7 +1,7 @@
-"""Rollout of a path: where the car would observe next while everything that it observes is taken.
+"""Rollout of a path: where the car would observe next while all slots that it observes are taken.
 
-What is left at the end of a path is the time of driving a part of it again and again until a slot has come free, or of
-standing and waiting for one. In a lot that is almost full most of the time goes into this as slots change.
+The time that remains at the end of a path is that of driving a part of it repeatedly until a slot becomes free, or of
+standing and waiting for one. In an almost full lot this is most of the total time.
 """
 
 from __future__ import annotations
@@ -40,25 +40,25 @@ def rollout_path(
     belief: BeliefSnapshot,
     path: PathBuffer,
 ) -> tuple[int, float]:
-    """Roll out a path: past the targets, then as the thesis's planner drives while everything observed is taken.
+    """Roll out a path: past the targets, then along the thesis's plan while all observed slots are taken.
 
-    It may come back to slots that it observed taken, once they are likely enough to have come free.
+    It may return to slots observed taken once they are likely enough to be free again.
 
     Args:
         vertex: where the car is.
         targets: vertices to pass first, in order.
-        n_targets: how many.
+        n_targets: number of targets.
         failure_s: s, failure cost of the thesis's planner.
         graph: the lot.
         belief: the belief.
-        path: filled.
+        path: output buffer.
 
     Returns:
-        The number of stops, and the time, s, that is left at its end if nothing was found.
+        The number of stops, and the expected time, s, after its end if nothing was found.
     """
     stops, observations, marks = path.stops, path.observations, path.marks
     n = len(belief.slots)
-    # In a part of a lot there is always one more slot that was not observed.
+    # A part of a lot can never be proven full: count one more unobserved slot.
     n_unproven = 0 if graph.whole else 1
     n_unobserved = 0 if graph.whole else n
     for s in range(n):
@@ -93,7 +93,7 @@ def rollout_path(
             vertex = following
         k += 1
         stops[k].vertex, stops[k].time = vertex, time
-        # What the car observes from here, and, where that shows nothing of the target, what an attempt shows.
+        # Observations from here, and the result of an attempt if they do not show the target.
         n_views = graph.view_starts[vertex + 1] - graph.view_starts[vertex]
         for i in range(n_views + 1):
             if n_observations == len(observations):
@@ -126,14 +126,14 @@ def rollout_path(
             )
             marks[s].observed_at = time
             n_observations += 1
-            # Until it is observed, the target stays the best choice: all else only grows worse.
+            # The target stays the best choice until it is observed: the others only get worse.
             choose = choose or s == target
             if attempts:
-                # The path goes on only if the attempt failed.
+                # The path continues only if the attempt failed.
                 time += graph.failure_s
         stops[k + 1].first = n_observations
         if n_unproven == 0:
-            # The last observation proves the lot full if it shows no free slot. It may be better not to make it.
+            # The last observation proves the lot full if it shows no free slot; it may be better to avoid it.
             p_none, cost_s = 1.0, np.inf
             for j in range(stops[k].first, n_observations):
                 p_none *= 1.0 - observations[j].p_free
@@ -146,7 +146,7 @@ def rollout_path(
                 stops[1].vertex, stops[1].time, stops[2].first = stops[0].vertex, graph.wait_s, 0
                 return 2, spared_s
             return k, spared_s
-    # A half of the path is representative of what follows if as many slots are left that were not observed.
+    # Half of the path is representative of what follows if at least as many slots are still unobserved.
     left_s = np.inf
     if n_unobserved >= n_observations - stops[k // 2].first:
         left_s = _extrapolate(k, n_observations, graph, path)
@@ -157,7 +157,7 @@ def rollout_path(
 def _is_settled(
     target: int, vertex: int, time: float, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> bool:
-    """Return whether a target cannot be reached from a vertex, or nothing is left to do there."""
+    """Return whether a target is unreachable from a vertex or has nothing left to observe or attempt."""
     if target != vertex:
         return bool(graph.next_vertex[vertex, target] < 0)
     return not _is_attempt_due(vertex, time, graph, belief, path)
@@ -167,7 +167,7 @@ def _is_settled(
 def is_worth_an_attempt(
     vertex: int, time: float, observed_at: float, graph: PlanningGraph, belief: BeliefSnapshot
 ) -> bool:
-    """Return whether to attempt to park at a vertex, some time from now; `observed_at` as in `MARK`."""
+    """Return whether to attempt to park at a vertex at a given time from now; `observed_at` as in `MARK`."""
     if not needs_attempt(vertex, graph, belief):
         return False
     if belief.slots[vertex].state == UNOBSERVED and observed_at < 0.0:
@@ -179,7 +179,7 @@ def is_worth_an_attempt(
 def _is_attempt_due(
     vertex: int, time: float, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> bool:
-    """Return whether to attempt to park at a vertex that a path has come to."""
+    """Return whether to attempt to park at a vertex that a path has reached."""
     if vertex >= len(path.marks):
         return False
     return bool(is_worth_an_attempt(vertex, time, path.marks[vertex].observed_at, graph, belief))
@@ -189,7 +189,7 @@ def _is_attempt_due(
 def _repeat_path(
     last: int, n_observations: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> float:
-    """Return the expected time, s, from a stop on if a part of the path is driven again and again."""
+    """Return the expected time, s, from a stop on if a part of the path is driven repeatedly."""
     best, leaving, cost_s = np.inf, 0.0, 0.0
     vertex = path.stops[last].vertex
     for i in range(graph.view_starts[vertex], graph.view_starts[vertex + 1]):
@@ -201,7 +201,7 @@ def _repeat_path(
             leaving += leaves
             cost_s += leaves * graph.cost_s[s]
     if leaving > 0.0:
-        # Or the car stands and waits for a slot in view.
+        # Alternatively the car stands and waits for a slot in view.
         best = (1.0 + cost_s) / leaving
     for quarter in range(4):
         best = min(best, _repeat_part(quarter * last // 4, last, n_observations, graph, belief, path))
@@ -212,10 +212,10 @@ def _repeat_path(
 def _repeat_part(
     first: int, last: int, n_observations: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> float:
-    """Return the expected time, s, of driving a part of a path again and again until a slot on it has come free.
+    """Return the expected time, s, of driving a part of a path repeatedly until a slot on it becomes free.
 
-    All its slots were just observed taken. Each observation finds the slot free with the probability that the time
-    since the one before gives, so that many observations of few slots do not count for more than they are worth.
+    All its slots were just observed taken. The probability that an observation finds its slot free follows from the
+    time since the previous observation of that slot, so frequent observations of few slots are not overrated.
     """
     stops, observations, marks = path.stops, path.observations, path.marks
     start, end = stops[first].vertex, stops[last].vertex
@@ -246,7 +246,7 @@ def _repeat_part(
 
 @compiled(error_model="numpy")
 def _extrapolate(last: int, n_observations: int, graph: PlanningGraph, path: PathBuffer) -> float:
-    """Return the expected time, s, of going on to unobserved slots that are as good as those of the second half."""
+    """Return the expected time, s, of going on to unobserved slots like those on the second half of the path."""
     stops, observations = path.stops, path.observations
     first = last // 2
     found, cost_s = 0.0, 0.0
@@ -258,7 +258,7 @@ def _extrapolate(last: int, n_observations: int, graph: PlanningGraph, path: Pat
 
 @compiled(error_model="numpy")
 def _p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnapshot) -> float:
-    """Return P(free) some time from now of a slot observed taken, really or along the path; 0 if too low."""
+    """Return P(free) at a given time of a slot observed taken, in fact or along the path; 0 if too low."""
     at = belief.slots[slot]
     if observed_at >= 0.0:
         if time - observed_at < OBSERVE_AGAIN_S:
@@ -278,9 +278,9 @@ def _next_target(
     belief: BeliefSnapshot,
     path: PathBuffer,
 ) -> tuple[int, float]:
-    """Return the slot that the thesis's planner would drive to at some time of a path, and its expected time, s.
+    """Return the slot that the thesis's planner would drive to at a given time of a path, and its expected time, s.
 
-    With γ = 1 its plan is to drive to one slot and to attempt until it is free: drive + cost + failure_s·(1 - p)/p.
+    With γ = 1 its plan is to drive to one slot and to attempt it until it is free: drive + cost + failure_s·(1 - p)/p.
     """
     best, chosen = np.inf, -1
     drive_s = graph.drive_s[vertex]
@@ -305,12 +305,12 @@ def _next_target(
 
 @compiled(error_model="numpy")
 def p_free_when_first_observed(weights: FloatArray, p_free_if: FloatArray, taken_follows: bool) -> float:
-    """Return P(free) of a slot at its first observation, given the hypotheses.
+    """Return P(free) of a slot at its first observation, averaged over the hypotheses.
 
     Args:
-        weights: (k,) of the hypotheses; updated to those after a taken slot where `taken_follows`.
+        weights: (k,) weights of the hypotheses; with `taken_follows`, updated for a taken slot.
         p_free_if: (k,) P(free) under each.
-        taken_follows: whether the path goes on only if the slot is taken.
+        taken_follows: whether the path continues only if the slot is taken.
     """
     free, taken = 0.0, 0.0
     for h in range(len(weights)):
@@ -326,7 +326,7 @@ def p_free_when_first_observed(weights: FloatArray, p_free_if: FloatArray, taken
 def _p_nothing_found(
     vertex: int, value_s: float, n_observations: int, graph: PlanningGraph, path: PathBuffer
 ) -> float:
-    """Return P(no slot observed along the path is free and as good as the value of driving on)."""
+    """Return P(no slot observed along the path is free and at least as good as driving on)."""
     p_none = 1.0
     for j in range(n_observations):
         s = path.observations[j].slot

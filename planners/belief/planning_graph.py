@@ -1,8 +1,8 @@
-"""Data of the path search, for compiled code: the drive graph, the belief about its slots, and room for one path.
+"""Data of the path search for compiled code: the drive graph, the belief about its slots, and a path buffer.
 
-All times are seconds. "Now" is the time of the decision; times along a path count from now. P(free) of a slot decays
-as that of a two-state Markov chain, p(t) = p∞ + (p(0) - p∞)·exp(-rt): a free slot may be taken while the car drives to
-it, and a taken one may come free.
+All times are in seconds. "Now" is the time of the decision; times along a path count from now. P(free) of a slot
+follows a two-state Markov chain, p(t) = p∞ + (p(0) - p∞)·exp(-rt): a free slot may be taken while the car drives to it,
+and a taken one may become free.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ VIEW = np.dtype([("slot", np.int64), ("rate", np.float64)])
 SLOT = np.dtype(
     [
         ("p_free", np.float64),  # now
-        ("p_free_usual", np.float64),  # the value to which it decays,
-        ("decay_rate", np.float64),  # 1/s, at this rate
-        ("odds", np.float64),  # P(taken)/P(free) about when the car could be there; inf where hopeless
+        ("p_free_usual", np.float64),  # the value to which it decays
+        ("decay_rate", np.float64),  # 1/s, rate of that decay
+        ("odds", np.float64),  # P(taken)/P(free) at about the earliest arrival of the car; inf where hopeless
         ("least_odds", np.float64),  # the value to which those decay
-        ("missed_rate", np.float64),  # greatest detection rate of a view from which it was not detected
+        ("missed_rate", np.float64),  # highest detection rate among the views from which it was not detected
         ("state", np.int64),  # `SlotBelief.state`
     ]
 )
@@ -46,8 +46,8 @@ STOP = np.dtype(
     [
         ("vertex", np.int64),
         ("time", np.float64),
-        ("first", np.int64),  # number of its first observation; its last one precedes that of the next stop
-        ("ahead_s", np.float64),  # scratch: least time that any later observation leaves to the goal
+        ("first", np.int64),  # index of its first observation; the last precedes the next stop's first
+        ("ahead_s", np.float64),  # scratch: least time to the goal after any later observation
     ]
 )
 """A stop of a path."""
@@ -55,12 +55,12 @@ STOP = np.dtype(
 OBSERVATION = np.dtype(
     [
         ("slot", np.int64),
-        ("p_free", np.float64),  # given that the search has come so far
+        ("p_free", np.float64),  # given that the search has reached this stop
         ("time", np.float64),
         ("expected_s", np.float64),  # scratch: expected time of driving to the slot
         ("value", np.float64),  # scratch: value of what follows
-        ("kept_until", np.int64),  # scratch: the last stop at which the slot is kept in mind
-        ("is_first", np.bool_),  # whether the slot was not observed before, really or along the path
+        ("kept_until", np.int64),  # scratch: the last stop at which the slot is remembered
+        ("is_first", np.bool_),  # whether the slot was not observed before, in fact or along the path
         ("parks", np.bool_),  # whether the car parks in the slot if it is free
     ]
 )
@@ -71,19 +71,19 @@ MARK = np.dtype([("observed_at", np.float64), ("scratch", np.float64)])
 
 
 class PlanningGraph(NamedTuple):
-    """What stays the same during a search.
+    """The part of the planning problem that does not change during a search.
 
     Attributes:
         drive_s: (n_vertices, n_vertices) float64, s, drive times.
         next_vertex: (n_vertices, n_vertices) int16, the next vertex of a shortest route.
         view_starts: (n_vertices + 1,) int64, rows of `views`.
-        views: `VIEW` records, what is in view of each vertex.
+        views: `VIEW` records, the slots in view of each vertex.
         own_rate: (n_slots,) float64, P(the slot is detected from its own vertex).
-        cost_s: (n_slots,) float64, s, what parking there costs on arrival (`SearchProblem.arrival_cost_s`).
+        cost_s: (n_slots,) float64, s, arrival cost (`SearchProblem.arrival_cost_s`).
         wait_s: s, time of an observation without moving.
         give_up_s: s, cost of giving up a lot that is proven full.
-        failure_s: s, expected cost of finding a slot taken on arrival; 0 where that is observed before the attempt.
-        whole: whether these are all slots of the lot, so that it can be proven full.
+        failure_s: s, expected cost of finding a slot taken on arrival; 0 if that is observed before the attempt.
+        whole: whether these are all slots of the lot; only then can it be proven full.
     """
 
     drive_s: FloatArray
@@ -99,7 +99,7 @@ class PlanningGraph(NamedTuple):
 
 
 class BeliefSnapshot(NamedTuple):
-    """What is believed of the slots at one decision.
+    """The belief about the slots at one decision.
 
     Attributes:
         slots: (n_slots,) `SLOT` records.
@@ -113,11 +113,11 @@ class BeliefSnapshot(NamedTuple):
 
 
 class PathBuffer(NamedTuple):
-    """Room for one path, used again and again.
+    """Buffer for one path, reused by all rollouts.
 
     Attributes:
-        stops: `STOP` records, one more than stops.
-        observations: `OBSERVATION` records, the observations in order.
+        stops: `STOP` records, one more than there are stops.
+        observations: `OBSERVATION` records in order.
         marks: (n_slots,) `MARK` records.
         weights: float64, scratch: probabilities of the hypotheses along the path.
     """
@@ -129,7 +129,7 @@ class PathBuffer(NamedTuple):
 
 
 def path_buffer(n_slots: int, n_vertices: int) -> PathBuffer:
-    """Make room for a path on a lot of that size."""
+    """Allocate the buffer for a path on a lot of a given size."""
     most_stops = min(4 * n_vertices + 16, MOST_STOPS)
     most_observations = n_slots + min(n_slots + 64, MOST_STOPS)
     return PathBuffer(
@@ -151,7 +151,7 @@ def copy_weights(belief: BeliefSnapshot, path: PathBuffer) -> FloatArray:
 
 @compiled(error_model="numpy")
 def decayed_part(rate: float, seconds: float) -> float:
-    """Return 1 - exp(-rate · seconds), fast where it is small."""
+    """Return 1 - exp(-rate · seconds), with a fast approximation for small values."""
     x = rate * seconds
     if x < 1e-3:
         return x
@@ -160,31 +160,32 @@ def decayed_part(rate: float, seconds: float) -> float:
 
 @compiled(error_model="numpy")
 def detects_missed(rate: float, missed_rate: float) -> bool:
-    """Return whether a view is likelier than not to detect a slot that another one has missed.
+    """Return whether a view is more likely than not to detect a slot that another view has missed.
 
-    What hides a slot goes on hiding it: a view detects all that one with a lower rate does (`SensorBand`).
+    Whatever hides a slot keeps hiding it: a view detects every slot that a view with a lower rate detects
+    (`SensorBand`).
 
     Args:
-        rate: P(the slot is detected), of the view.
-        missed_rate: the same of the best view from which it was not detected; 0 if there was none.
+        rate: P(the view detects the slot).
+        missed_rate: the highest such rate among the views that missed it; 0 if there were none.
     """
     return rate > missed_rate and rate - missed_rate >= 0.5 * (1.0 - missed_rate)
 
 
 @compiled(error_model="numpy")
 def is_hidden(slot: int, rate: float, belief: BeliefSnapshot) -> bool:
-    """Return whether a view with some detection rate is expected not to show a slot."""
+    """Return whether a slot is expected to stay hidden in a view with the given detection rate."""
     if belief.slots[slot].state == UNOBSERVED:
         return not detects_missed(rate, belief.slots[slot].missed_rate)
-    # Known from a better view, or from an attempt.
+    # The slot's state is known from a better view or from an attempt.
     return bool(rate <= belief.slots[slot].missed_rate)
 
 
 @compiled(error_model="numpy")
 def needs_attempt(vertex: int, graph: PlanningGraph, belief: BeliefSnapshot) -> bool:
-    """Return whether only a parking attempt shows if the slot at a vertex is free.
+    """Return whether only a parking attempt can show if the slot at a vertex is free.
 
-    That is so where it is not known to be free and is not detected from its own vertex either.
+    That is the case if it is not known to be free and is not expected to be detected from its own vertex.
     """
     if vertex >= len(belief.slots) or belief.slots[vertex].state == OBSERVED_FREE:
         return False

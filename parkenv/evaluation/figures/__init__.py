@@ -1,1 +1,1 @@
-"""The pictures that commands and reports write."""
+"""Figures for commands and reports."""

@@ -1,4 +1,4 @@
-"""A figure to check a lot import with: what was read from a file, and what is missing."""
+"""Figure for checking a lot import: what was read from the file, and what is missing."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ AREA, AREA_EDGE = "#d9d3e3", "#8d7ca8"
 ROAD = "#333a42"
 TIE = "#9aa0a6"
 ARROW_EVERY = 15.0
-"""m, between two arrows on a one-way lane."""
+"""Distance between arrows on a one-way lane, m."""
 
 
 def save_import_picture(draft: LotDraft, path: str | Path) -> None:
-    """Draw a draft, complete or not, into a PNG.
+    """Draw a draft, complete or not, to a PNG file.
 
-    Slots are coloured by their source, each with a line from its mouth to the lane that serves it; one-way
-    lanes carry arrows; what is missing is listed below.
+    Slots are coloured by their source, each with a line from its open side to its lane. One-way lanes have arrows.
+    Missing parts are listed below the drawing.
 
     Raises:
         InputError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Learning curves: scores against decisions made in training, with planners for comparison."""
+"""Learning curves: scores against training decisions, with planners for comparison."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from parkenv.evaluation.figures.picture_files import INK, STYLE, save_picture
 from parkenv.evaluation.figures.time_figures import spread
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
-"""Of trainings, as many as are distinguishable."""
+"""Colours of trainings: as many as are easy to tell apart."""
 OFF_SCALE = 2.0
-"""Times above this multiple of the least one are off the figure."""
-_APART = 0.045  # of the axis, least distance of two labels
+"""Times above this multiple of the lowest are cut off."""
+_APART = 0.045  # least distance of two labels, fraction of the axis
 
 Curves = Sequence[Sequence[Mapping[str, Any]]]
 
@@ -35,11 +35,11 @@ def across_seeds(curves: Curves, measure: str = "total_s") -> list[dict[str, flo
     """Return the mean over seeds with its 95 % interval, and the median, at evaluations that all seeds have.
 
     Args:
-        curves: of each seed, the rows of its `curve.csv`.
-        measure: which column.
+        curves: rows of `curve.csv` of each seed.
+        measure: the column.
 
     Returns:
-        Rows of steps, `measure` and its `columns_of`.
+        Rows with steps, `measure` and its `columns_of`.
     """
     low_name, high_name, median_name = columns_of(measure)
     rows = []
@@ -56,14 +56,15 @@ def save_learning_curves(
 ) -> None:
     """Draw each algorithm's total time, and planners as horizontal lines.
 
-    One algorithm is drawn as the mean over seeds with its interval; several, whose intervals would hide each other, as
-    medians, which a single search driven in circles does not distort. Single seeds are thin lines.
+    A single algorithm is drawn as the mean over seeds with its interval. Several are drawn as medians: their intervals
+    would hide each other, and medians are robust against single searches that drive in circles. Single seeds are thin
+    lines.
 
     Args:
-        curves: of each algorithm, of each seed, the rows of its `curve.csv`.
+        curves: rows of `curve.csv` by algorithm and seed.
         planners: mean total time, s, of each planner in the same worlds.
-        title: of the figure.
-        path: of the PNG.
+        title: title of the figure.
+        path: the PNG file to write.
     """
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.2, 4.2 if len(curves) == 1 else 4.8), layout="constrained")
@@ -73,7 +74,7 @@ def save_learning_curves(
             drawn = _draw(axes, name, its, "total_s", color, alone=len(curves) == 1)
             highest = max(highest, *drawn[len(drawn) // 10 :])
         low = min(*planners.values(), *(r["total_s"] for its in curves.values() for c in its for r in c))
-        # An untrained policy drives in circles; the end of the curves has to be readable.
+        # An untrained policy drives in circles, so cut off high values to keep the end of the curves readable.
         high = min(max([highest, *planners.values()]), OFF_SCALE * low)
         margin = 0.06 * (high - low) or 1.0
         axes.set_ylim(low - margin, high + margin)
@@ -94,16 +95,16 @@ def save_learning_curves(
 def save_success_curves(
     curves: Mapping[str, Curves], kinds: Sequence[str], planner: Mapping[str, float], title: str, path: Path
 ) -> None:
-    """Draw each algorithm's success rate, a panel per kind of slot, with the planner's.
+    """Draw the success rates of algorithms and of the planner, one panel per kind of slot.
 
-    As in `save_learning_curves`, one algorithm is drawn as the mean over seeds, several as medians.
+    As in `save_learning_curves`, a single algorithm is drawn as the mean over seeds, several as medians.
 
     Args:
-        curves: of each algorithm, of each seed, the rows of its `curve.csv`; see `DriveTraining.evaluate`.
-        kinds: of slots.
-        planner: success rate of the planner in the same parkings, by kind; empty to draw none.
-        title: of the figure.
-        path: of the PNG.
+        curves: rows of `curve.csv` by algorithm and seed; see `DriveTraining.evaluate`.
+        kinds: kinds of slots.
+        planner: success rate of the planner in the same tasks, by kind; empty to draw none.
+        title: title of the figure.
+        path: the PNG file to write.
     """
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(2.4 + 2.8 * len(kinds), 3.4), layout="constrained")
@@ -130,7 +131,7 @@ def save_success_curves(
 
 
 def _draw(axes: Axes, name: str, curves: Curves, measure: str, color: str, *, alone: bool) -> Sequence[float]:
-    """Draw the mean over seeds with its interval, or the median, and thin single seeds; returns the line."""
+    """Draw the mean over seeds with its interval, or the median, and single seeds as thin lines; return the line."""
     rows = across_seeds(curves, measure)
     low, high, median = columns_of(measure)
     steps, line = [row["steps"] for row in rows], [row[measure if alone else median] for row in rows]
@@ -149,7 +150,7 @@ def _draw(axes: Axes, name: str, curves: Curves, measure: str, color: str, *, al
 
 
 def _mark(axes: Axes, value: float, words: str, height: float) -> None:
-    """A horizontal line, with words beside the axes at a height, a share of theirs."""
+    """Draw a horizontal line, with a label beside the axes at a height given as a fraction of theirs."""
     axes.axhline(value, color=INK, lw=0.8, ls=(0, (4, 3)), zorder=1)
     axes.annotate(
         words, (1.0, height), xycoords="axes fraction", xytext=(5, 0),

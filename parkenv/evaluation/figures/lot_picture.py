@@ -35,11 +35,11 @@ GOAL = "#ffc53a"
 GRAPH = "#ffd98a"
 INK = "#333333"
 BELIEF_MAP = LinearSegmentedColormap.from_list("belief", [[c / 255 for c in rgb] for rgb in BELIEF_ANCHORS])
-"""From free to taken."""
+"""Colours of beliefs, from free to taken."""
 COST_MAP = "viridis"
-"""Of parking costs."""
+"""Colour map of parking costs."""
 SMALLEST_DISC = 6.0
-"""Points."""
+"""Smallest diameter of a disc, points."""
 
 
 def draw_lot(
@@ -47,13 +47,12 @@ def draw_lot(
 ) -> None:
     """Draw a lot from above, to scale, with a scale bar.
 
-    The z-order of all is below 2 except for entries and goals (5), so that what is plotted later
-    lies between.
+    Everything has a z-order below 2 except entries and goals (5), so that later plots lie in between.
 
     Args:
         lot: the lot.
-        ax: where to draw; its limits and aspect are set, its ticks and frame are removed.
-        slot_color: fill of the slots: one colour, or (n_slots, 3 or 4) RGB(A) in 0..1; not filled if None.
+        ax: axes to draw in; sets their limits and aspect, and removes ticks and frame.
+        slot_color: fill of the slots: one colour, or (n_slots, 3 or 4) RGB(A) in 0..1; no fill if None.
         show_graph: also draw the drive graph, an arrow for every move.
     """
     x0, y0, x1, y1 = lot.bounds()
@@ -63,7 +62,7 @@ def draw_lot(
     ax.set_aspect("equal")
     ax.set_facecolor(GROUND)
     ax.spines[:].set_visible(False)
-    # Paint has a width on the ground, within what is visible.
+    # Road markings are drawn to scale, but not too thin to see.
     scale = points_per_m(ax)
     paint_width = float(np.clip(0.12 * scale, 0.2, 1.2))
 
@@ -84,16 +83,16 @@ def draw_lot(
 
 
 def draw_discs(lot: ParkingLot, ax: Axes, outer: FloatArray, inner: FloatArray) -> None:
-    """Draw two discs at each slot, as T Fig. 4.7: an outer one for a prediction, an inner one for the truth.
+    """Draw two discs at each slot, as in T Fig. 4.7: an outer one for the prediction, an inner one for the truth.
 
     Args:
-        lot: drawn in `ax` already.
-        ax: where to draw.
-        outer: (n_slots,) probabilities that the slot is taken; their colours are those of `BELIEF_MAP`.
+        lot: a lot that is already drawn in `ax`.
+        ax: axes to draw in.
+        outer: (n_slots,) probabilities that the slot is taken, coloured by `BELIEF_MAP`.
         inner: (n_slots, 3 or 4) RGB(A) in 0..1.
     """
     scale = points_per_m(ax)
-    # As wide as the slot, or larger if that is too small to see and neighbours leave room.
+    # As wide as the slot, or larger if that is too small to see and the distance to neighbours allows it.
     nearest = np.asarray(cKDTree(lot.slot_xy).query(lot.slot_xy, k=2)[0])[:, 1]
     size = np.minimum(lot.slot_width, lot.slot_length)
     size = np.maximum(size, np.minimum(nearest, SMALLEST_DISC / scale))
@@ -114,19 +113,19 @@ def draw_discs(lot: ParkingLot, ax: Axes, outer: FloatArray, inner: FloatArray) 
 
 
 def points_per_m(ax: Axes) -> float:
-    """Return the size of a metre in axes with an equal aspect, points."""
+    """Return the size of a metre, points, in axes with an equal aspect ratio."""
     box = ax.get_window_extent()
     across, down = np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())
     return float(min(box.width / across, box.height / down)) / ax.figure.dpi * 72
 
 
 def save_lot_picture(lot: ParkingLot, path: str | Path, *, show_graph: bool = False) -> None:
-    """Draw a lot into a file, whose suffix names the format (`.png`, `.pdf`, `.svg`).
+    """Draw a lot to a file in the format of its suffix (`.png`, `.pdf`, `.svg`).
 
     Slots with a parking cost are filled with its colour, and a colour bar gives the scale.
 
     Raises:
-        InputError: the format is not known, or the file cannot be written.
+        InputError: the format is unknown, or the file cannot be written.
     """
     path = Path(path)
     x0, y0, x1, y1 = lot.bounds()
@@ -167,7 +166,7 @@ def _patch(polygons: Sequence[Rings], **style: object) -> PathPatch:
 
 
 def _draw_lane_marks(outline: LotOutline, ax: Axes, paint_width: float) -> None:
-    """A dashed line in the middle of two-way lanes, arrows on one-way lanes."""
+    """Draw a dashed line in the middle of two-way lanes and arrows on one-way lanes."""
     ax.add_collection(
         LineCollection(
             list(outline.centre_lines), colors=PAINT, alpha=0.45, linewidths=paint_width, linestyles=(0, (5, 6)),
@@ -214,7 +213,7 @@ def _draw_graph(lot: ParkingLot, ax: Axes, points_per_m: float) -> None:
 
 
 def _draw_entries_and_goals(outline: LotOutline, ax: Axes, points_per_m: float) -> None:
-    """Draw an arrow into the lot at each entry, a star on each goal."""
+    """Draw an arrow into the lot at each entry and a star at each goal."""
     for x, y, yaw in outline.entries:
         reach = 32.0 / points_per_m
         ax.add_patch(
@@ -244,7 +243,7 @@ def _draw_entries_and_goals(outline: LotOutline, ax: Axes, points_per_m: float) 
 
 
 def _draw_scale_bar(ax: Axes, x: float, y: float, width: float) -> None:
-    """A bar of a round length, about a sixth of the lot's width, with its lower left corner at (x, y)."""
+    """Draw a scale bar of a round length, about a sixth of the lot's width, with its lower left corner at (x, y)."""
     power = 10.0 ** np.floor(np.log10(width / 6))
     length = power * max(step for step in (1, 2, 5) if step * power <= width / 6)
     thickness = 0.005 * width

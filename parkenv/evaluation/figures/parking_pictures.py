@@ -1,4 +1,4 @@
-"""Figures of driven parkings, from above."""
+"""Figures of parking manoeuvres from above."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ Image = NDArray[np.uint8]
 
 COLUMNS = 2
 GAP = 6
-"""px between pictures."""
+"""Space between pictures, px."""
 _SIZE = (480, 640, 3)
 
 
 def save_parkings(ends: Sequence[tuple[ParkingLot, DriveState]], path: Path) -> None:
-    """Write a PNG of the final states and driven paths of parkings, two in a row.
+    """Write a PNG of the final states and driven paths of parking episodes, two per row.
 
     Args:
-        ends: lot and final state of each.
+        ends: lot and final state of each episode.
         path: the file to write.
     """
     pictures = [DriveRenderer(lot).frame(state) for lot, state in ends]

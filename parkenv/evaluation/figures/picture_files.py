@@ -1,4 +1,4 @@
-"""The style of all figures, and writing them into files."""
+"""Style of all figures, and functions that save them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ TIME_COLORS = {
 }
 """Names and colours of the parts of the total time."""
 OPTIONAL_TIMES = ("parking_cost_s", "gave_up_s")
-"""Parts that are mentioned only where they are not 0."""
+"""Parts that are shown only if they are not 0."""
 
 
 def save_picture(figure: Figure, path: str | Path) -> None:
@@ -59,14 +59,14 @@ def save_picture(figure: Figure, path: str | Path) -> None:
 def save_film(
     frames: Sequence[NDArray[np.uint8]], path: str | Path, *, fps: float, colors: int | None = None
 ) -> None:
-    """Write an endless GIF, whole or not at all.
+    """Write a looping GIF atomically.
 
     Args:
-        frames: (h, w, 3) RGB each.
-        path: of the file.
-        fps: frames a second.
-        colors: of one palette for all frames, the rare ones among them: for drawings. Where None, each frame has a
-            palette of its own: for photographs.
+        frames: RGB images, (h, w, 3).
+        path: the file to write.
+        fps: frames per second.
+        colors: size of one palette for all frames, which keeps rare colours (for drawings). If None, each frame has
+            its own palette (for photographs).
 
     Raises:
         InputError: the file cannot be written.

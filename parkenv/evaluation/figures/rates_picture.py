@@ -15,12 +15,12 @@ _DAYS = (("weekday", 0, "#0072b2"), ("weekend", 5, "#e69f00"))
 
 
 def save_rates(process: OccupancyProcess, path: Path, *, title: str = "") -> None:
-    """Draw mean occupancy with the spread over slots, and the profiles of both rates, for each day class.
+    """Draw the mean occupancy with its spread over slots, and the profiles of both rates, for each day class.
 
     Args:
         process: the process; Monday represents weekdays, Saturday the weekend.
         path: the PNG to write.
-        title: of the figure.
+        title: title of the figure.
     """
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     full, rates = figure.subplots(1, 2)

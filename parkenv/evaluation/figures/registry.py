@@ -1,4 +1,4 @@
-"""The figures of a comparison: which there are, and drawing them all.
+"""Registry of the figures of a comparison.
 
 To add one, write a function that takes `ComparisonResults` and yields (suffix, figure) pairs, and add a line to
 `FIGURES`. `parkenv compare` draws it into `NAME_SUFFIX.png`, and the report shows it under its caption.
@@ -22,16 +22,16 @@ Row = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class ComparisonResults:
-    """What figures of a comparison are drawn from.
+    """Results from which the figures of a comparison are drawn.
 
     Attributes:
-        cases: each with the seeds of its episodes.
+        cases: cases, each with the seeds of its episodes.
         episodes: finished episodes, rows of `episodes.csv` by `Case.key`.
-        rows: of the table, one per case with finished episodes.
-        occupancy_rows: the same of lots that were made fuller and emptier.
-        flat_forecasts: scenarios whose forecast is the same for every slot: the scenario that each varies, and that
-            probability.
-        seed: of the episode that pictures of single searches show.
+        rows: rows of the table, one per case with finished episodes.
+        occupancy_rows: the same at the occupancy levels.
+        flat_forecasts: scenarios with the same forecast for every slot: the scenario that each is a variant of, and
+            the probability.
+        seed: seed of the episode shown in pictures of single searches.
     """
 
     cases: Sequence[tuple[Case, Sequence[int]]]
@@ -43,7 +43,7 @@ class ComparisonResults:
 
     @property
     def scenarios(self) -> list[str]:
-        """Names, in order, without variants with flat forecasts, and without those of a failure-cost sweep."""
+        """Names, in order, without the variants of flat forecasts and of failure-cost sweeps."""
         names = dict.fromkeys(row["scenario"] for row in self.rows)
         sweep = {name for name in names if f"{name}{UNSEEN}" in names}
         return [n for n in names if n.removesuffix(UNSEEN) not in sweep and n not in self.flat_forecasts]
@@ -55,11 +55,11 @@ class ComparisonResults:
         return [name for name in names if f"{name}{UNSEEN}" in names]
 
     def rows_of(self, scenario: str) -> list[Row]:
-        """The table's rows of a scenario."""
+        """Return the table's rows of a scenario."""
         return [row for row in self.rows if row["scenario"] == scenario]
 
     def episodes_of(self, case: Case, seeds: Sequence[int]) -> list[Row]:
-        """The finished episodes of a case."""
+        """Return the finished episodes of a case."""
         return [self.episodes[key] for seed in seeds if (key := case.key(seed)) in self.episodes]
 
 
@@ -68,9 +68,9 @@ class ComparisonFigure:
     """One kind of figure.
 
     Attributes:
-        name: what its files' names begin with.
-        caption: of the figure in reports.
-        function: `MODULE:FUNCTION`, imported when it is drawn.
+        name: prefix of the file names.
+        caption: caption in reports.
+        function: `MODULE:FUNCTION`, imported when the figure is drawn.
     """
 
     name: str
@@ -78,7 +78,7 @@ class ComparisonFigure:
     function: str
 
     def draw(self, results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
-        """Yield its figures, each with the rest of its file's name; none where it does not apply."""
+        """Yield (file name suffix, figure) pairs; none if the figure does not apply."""
         module, _, function = self.function.partition(":")
         draw: Callable[[ComparisonResults], Iterator[tuple[str, Figure]]] = getattr(
             import_module(module), function
@@ -109,19 +109,19 @@ FIGURES = (
     ),
     ComparisonFigure("searches", "Searches in one world", f"{_HERE}.search_pictures:searches"),
 )
-"""In the order in which reports show them."""
+"""All figures, in the order of reports."""
 
 
 def draw_figures(results: ComparisonResults, folder: Path, names: Sequence[str] | None = None) -> list[Path]:
-    """Draw the figures of a comparison into PNG files.
+    """Draw the figures of a comparison to PNG files.
 
     Args:
-        results: of the comparison.
-        folder: where to.
-        names: of the kinds to draw; all where None.
+        results: results of the comparison.
+        folder: output folder.
+        names: names of the figures to draw; all if None.
 
     Returns:
-        The files.
+        The files written.
 
     Raises:
         InputError: a file cannot be written.

@@ -1,4 +1,4 @@
-"""Pictures of single searches, as T Fig. 4.7 to 4.12."""
+"""Pictures of single searches, as in T Fig. 4.7 to 4.12."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ PATH, WALK = "#ffd000", "#1852ba"
 PICTURED = ("greedy-goal", "first-free", "oracle")
 """Agents whose paths are drawn beside the first agent's."""
 POLICY_SCALE = 2.2
-"""Points per metre from which arrows at every vertex are legible."""
+"""Least scale, points per metre, at which arrows at every vertex are legible."""
 
 
 def draw_search(trace: SearchTrace, ax: Axes) -> None:
     """Draw one search as in T Fig. 4.9 to 4.12.
 
-    At each slot an inner disc shows the true occupancy and an outer ring the forecast; then the path from 1 to 2,
-    the walk, and, where there is room, the first plan's action at each vertex (T Fig. 4.8). Give the axes
-    their final size before: line widths and arrows follow from the scale.
+    At each slot, an inner disc shows the true occupancy and an outer ring the forecast. The path (from 1 to 2) and the
+    walk follow and, if there is room, the first plan's action at each vertex (T Fig. 4.8). Set the final size of the
+    axes first: line widths and arrows depend on the scale.
 
     Args:
         trace: the search.
-        ax: where to draw; its limits, aspect and title are set.
+        ax: axes to draw in; sets their limits, aspect and title.
     """
     lot = trace.scenario.lot
     draw_lot(lot, ax)
@@ -56,7 +56,7 @@ def draw_search(trace: SearchTrace, ax: Axes) -> None:
 
 
 def _title(trace: SearchTrace, width: float) -> str:
-    """Describe the search in lines that fit a width in inches at the current font size."""
+    """Describe the search, with lines broken to a width in inches at the current font size."""
     scenario, metrics = trace.scenario, trace.metrics
     terms = [
         f"{metrics[key]:.0f} {name}"
@@ -102,7 +102,7 @@ def _draw_path(trace: SearchTrace, ax: Axes, scale: float) -> None:
     length = np.hypot(step[:, 0], step[:, 1])
     if length.any():
         driven = np.r_[0.0, np.cumsum(length)]
-        # A mark every inch of road, but not hundreds on a long search.
+        # About one mark per inch of path, but not hundreds on a long search.
         n = int(np.clip(driven[-1] * scale / 60.0, 1, 18))
         at = (np.arange(n) + 0.5) / n * driven[-1]
         leg = np.clip(np.searchsorted(driven, at, side="right") - 1, 0, len(length) - 1)
@@ -172,13 +172,13 @@ def _draw_policy(trace: SearchTrace, ax: Axes, scale: float) -> None:
 
 
 def _placed(shape: FloatArray, at: FloatArray, ahead: FloatArray) -> list[FloatArray]:
-    """Place a shape, (k, 2) m with its nose to +x, at each point, turned ahead."""
+    """Place a shape, (k, 2) m with its nose towards +x, at each point, rotated to its heading."""
     turn = np.stack([ahead, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)], axis=1)
     return list(at[:, None] + shape @ turn)
 
 
 def searches(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
-    """Yield `draw_searches` of each scenario and setting: the first agent and some others in the same world."""
+    """Yield `draw_searches` for each scenario and setting: the first agent and some others in the same world."""
     settings: dict[str, list[Case]] = {}
     for case, _ in results.cases:
         if case.scenario.name in results.scenarios:
@@ -193,10 +193,10 @@ def searches(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
 
 
 def draw_searches(traces: Sequence[SearchTrace]) -> Figure:
-    """Draw searches side by side: agents, or settings, in the same world.
+    """Draw searches of several agents or settings in the same world side by side.
 
     Args:
-        traces: at least one.
+        traces: at least one search.
 
     Raises:
         InputError: there are no traces.
@@ -210,7 +210,7 @@ def draw_searches(traces: Sequence[SearchTrace]) -> Figure:
     )
     columns = 1 if len(traces) == 1 or (len(traces) == 2 and aspect < 0.6) else 2
     lines = -(-len(traces) // columns)
-    # All in inches; line widths follow from the size of the axes, so they are placed here for good.
+    # All sizes in inches. Line widths depend on the size of the axes, so the axes get their final place here.
     width = 9.6 if columns == 1 else 7.0
     height = min(width * aspect, 8.0)
     width = height / aspect

@@ -24,10 +24,10 @@ Image = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
 
 NEAREST, FARTHEST = 2.0, 30.0
-"""Depths, m, between which the colour scale runs."""
+"""Limits of the depth colour scale, m."""
 BOX_COLORS = {View.SIDE: (255, 208, 0), View.END: (86, 180, 233), View.OBLIQUE: (230, 159, 0)}
 SEEN = 0.05
-"""Visible fraction from which a vehicle's box is drawn."""
+"""Least visible fraction of a vehicle for its box to be drawn."""
 
 
 def with_boxes(image: Image, boxes: VehicleBoxes) -> Image:
@@ -45,7 +45,7 @@ def with_boxes(image: Image, boxes: VehicleBoxes) -> Image:
 
 
 def draw_scan(ax: Axes, lot: ParkingLot, capture: Capture, rig: SensorRig) -> None:
-    """Draw the lot from above with the vehicle and the ends of its beams."""
+    """Draw the lot from above with the vehicle and the end points of its beams."""
     draw_lot(lot, ax)
     x, y, yaw = capture.pose
     for name, laser, mount in rig.lasers:
@@ -67,11 +67,11 @@ def save_sensor_preview(
 
     Args:
         lot: the lot.
-        rig: with at least a camera, a stereo camera and a laser.
-        capture: by that rig.
-        boxes: of the first camera's frame.
-        title: of the figure.
-        path: the PNG to write.
+        rig: a rig with at least a camera, a stereo camera and a laser.
+        capture: a capture of this rig.
+        boxes: boxes in the first camera's frame.
+        title: title of the figure.
+        path: the PNG file to write.
     """
     frame = capture.images[rig.cameras[0][0]]
     name, stereo, _ = rig.stereo_cameras[0]

@@ -45,8 +45,8 @@ def draw_detections(
 
     Args:
         image: the image.
-        found: its detections.
-        placed: rows of those that were ranged; others are drawn thin and grey. All where None.
+        found: detections in the image.
+        placed: indices of the ranged detections, others are drawn thin and grey; all if None.
     """
     drawn = image.copy()
     for i, (box, p, end) in enumerate(zip(found.boxes, found.probability, found.end_on, strict=True)):
@@ -127,7 +127,7 @@ def save_graph(lot: ParkingLot, predicted: Prediction, result: SessionResult, pa
 
 
 def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, path: Path) -> None:
-    """Draw the slots discovered from the cars of all sessions over the true ones."""
+    """Draw the slots discovered from the cars of all sessions over the true slots."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(11.0, _height(lot, 11.0, 1)), layout="constrained")
         ax = figure.subplots()
@@ -152,7 +152,7 @@ def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Pa
         for i, weather in enumerate(dict.fromkeys(row["weather"] for row in rows)):
             its = [row for row in rows if row["weather"] == weather]
             color = WEATHER_COLORS.get(weather, UNKNOWN)
-            # Side by side, so that the intervals do not hide each other.
+            # Offset the points, so that the intervals do not hide each other.
             x = np.array([np.mean(row["distance_m"]) for row in its]) + 0.09 * (i - 2)
             rate = np.array([row["rate"] for row in its])
             low, high = np.array([row["rate_ci95"] for row in its]).T
@@ -172,7 +172,7 @@ def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Pa
 
 
 def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, title: str, path: Path) -> None:
-    """Draw the map's prediction of every slot (T Fig. 4.6), and the true probabilities where they are known."""
+    """Draw the map's prediction for every slot (T Fig. 4.6), and the true probabilities if known."""
     with mpl.rc_context(STYLE):
         panels = [("predicted", predicted.p_occupied)] + (
             [("true probability", true)] if true is not None else []
@@ -181,7 +181,7 @@ def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, ti
         figure = Figure(figsize=(11.0, _height(lot, 11.0, len(panels))))
         axes = np.atleast_1d(figure.subplots(len(panels), 1))
         for ax, (name, values) in zip(axes, panels, strict=True):
-            # cividis reads the same with any colour vision.
+            # cividis looks the same with any colour vision.
             draw_lot(lot, ax, slot_color=mpl.colormaps["cividis"](values))
             ax.set_title(f"{title}: {name}")
             bar = figure.colorbar(
@@ -193,7 +193,7 @@ def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, ti
 
 
 def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:
-    """Draw the slot filter's states, with a bright edge around wrong ones."""
+    """Draw the slot filter's states, with a bright outline around wrong ones."""
     states, wrong = result.states, (result.states.occupied != result.truth) & result.states.in_view
     color = np.array([to_rgb(TAKEN if o else FREE) for o in states.occupied])
     color[~states.in_view] = to_rgb(UNKNOWN)

@@ -1,4 +1,4 @@
-"""The cumulative distribution of the total time: how often each agent needs at most so many seconds."""
+"""Cumulative distribution of the total time of each agent."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ Totals = Mapping[str, FloatArray]
 
 BOUND = "clairvoyant lower bound"
 OFF_SCALE = 2.5
-"""The time axis ends at this many times the median, so that rare long searches do not squash the rest."""
+"""The time axis ends at this multiple of the median, so that rare long searches do not compress the rest."""
 _DASHED = ("oracle", BOUND)
 
 
 def time_distributions(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
     """Yield a figure for each setting of costs and speeds, with a panel per scenario.
 
-    The clairvoyant lower bound is added where the oracle is not among the agents.
+    The clairvoyant lower bound is added if the oracle is not among the agents.
     """
     settings: dict[tuple[float, float, float], dict[str, dict[str, FloatArray]]] = {}
     for case, seeds in results.cases:
@@ -100,7 +100,7 @@ def _draw_panel(ax: Axes, totals: Totals) -> None:
     end = min(high, OFF_SCALE * float(np.median(everything)))
     margin = 0.04 * (end - low) or 1.0
     limit = end + margin
-    # The first agent lies on top of the others.
+    # Draw the first agent on top of the others.
     for order, name in enumerate(reversed(list(totals))):
         times = np.sort(totals[name])
         share = 100.0 * np.arange(1, len(times) + 1) / len(times)
@@ -109,7 +109,7 @@ def _draw_panel(ax: Axes, totals: Totals) -> None:
             x, y, where="post", color=_color(name), linestyle=_dashes(name) or "-", linewidth=1.7,
             zorder=2 + 0.01 * order,
         )  # fmt: skip
-        # A mean beyond the axis is a triangle at its end.
+        # Show a mean beyond the axis as a triangle at its end.
         mean = float(times.mean())
         at = min(mean, limit)
         height = 100.0 * float(np.searchsorted(times, at, side="right")) / len(times)

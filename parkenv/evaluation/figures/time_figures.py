@@ -1,4 +1,4 @@
-"""Figures of mean total times: by their parts, and against occupancy, failure cost and forecast."""
+"""Figures of mean total times: split into parts, and against occupancy, failure cost and forecast."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ AGENT_COLORS = {
 """Each agent has one colour in all figures, distinguishable with any colour vision (Okabe-Ito and Tol)."""
 OTHER_AGENT = "#5c4a3d"
 OCCUPANCY_BINS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001)
-"""Ends of the bins in which episodes are averaged where no lots were made fuller and emptier."""
+"""Bin edges for averaging episodes if the run has no occupancy levels."""
 OFF_SCALE = 3.0
-"""Totals above this many times the median are cut off, so that they do not squash the rest."""
+"""Totals above this multiple of the median are cut off, so that they do not compress the rest."""
 
 
 def time_splits(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
@@ -51,7 +51,7 @@ def time_splits(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
 
 
 def times_against_occupancy(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
-    """Yield `draw_time_against_occupancy` of each scenario, at the first of the speeds."""
+    """Yield `draw_time_against_occupancy` of each scenario, at the first speeds."""
     for name in results.scenarios:
         rows = [
             {**row, "occupancy": row["occupancy_level"]}
@@ -79,7 +79,7 @@ def times_against_failure_cost(results: ComparisonResults) -> Iterator[tuple[str
 
 
 def times_against_map(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
-    """Yield `draw_time_against_map` of each scenario with flat forecasts, at the first of the costs and speeds."""
+    """Yield `draw_time_against_map` of each scenario with flat forecasts, at the first cost and speeds."""
     forecasts = results.flat_forecasts
     if not forecasts:
         return
@@ -96,7 +96,7 @@ def draw_time_split(rows: Sequence[Row]) -> Figure:
     """Draw mean total times: a panel per setting, a bar per agent, split into drive, failed attempts and walk.
 
     Args:
-        rows: of one scenario, as `parkenv compare` writes them into `summary.json`.
+        rows: rows of one scenario, as `parkenv compare` writes them to `summary.json`.
 
     Raises:
         InputError: there are no rows.
@@ -184,7 +184,7 @@ def _draw_split(ax: Axes, rows: Sequence[Row], limit: float) -> None:
 
 
 def _draw_break(ax: Axes, y: float, limit: float) -> None:
-    """Mark a bar that is cut off by two slanted lines near its end."""
+    """Mark a truncated bar with two slanted lines near its end."""
     slant = np.array([[-0.008, 0.46], [0.008, -0.46]])
     for at in (0.925, 0.95):
         xy = np.array([at, y]) + slant
@@ -195,7 +195,7 @@ def draw_time_against_occupancy(rows: Sequence[Row]) -> Figure:
     """Draw the total time against occupancy: a panel per failure cost, a line per agent.
 
     Args:
-        rows: with occupancy (0..1), agent, failure_cost_s, total_s, total_s_ci95.
+        rows: rows with occupancy (0..1), agent, failure_cost_s, total_s, total_s_ci95.
 
     Raises:
         InputError: there are no rows.
@@ -225,7 +225,7 @@ def draw_time_against_failure_cost(seen: Sequence[Row], unseen: Sequence[Row]) -
     """Draw the total time against the failure cost, with and without observations of slots before an attempt.
 
     Args:
-        seen: rows with failure_cost_s, agent, total_s, total_s_ci95, of one scenario.
+        seen: rows of one scenario with failure_cost_s, agent, total_s, total_s_ci95.
         unseen: the same without observations from the lane.
 
     Raises:
@@ -239,7 +239,7 @@ def draw_time_against_failure_cost(seen: Sequence[Row], unseen: Sequence[Row]) -
         for ax, (title, rows) in zip(figure.subplots(1, 2), panels, strict=True):
             _draw_lines(ax, rows, _limit(rows), lambda row: float(row["failure_cost_s"]))
             last = max(row["failure_cost_s"] for row in rows)
-            # A cost of 0 has its place, too.
+            # A symmetric log scale includes a cost of 0.
             ax.set_xscale("symlog", linthresh=1.0, linscale=0.4)
             ticks = [tick for tick in (0, 1, 2, 5, 10, 20, 50, 100) if tick <= last]
             ax.set(xlim=(0.0, 1.08 * last), xticks=ticks, xticklabels=[str(tick) for tick in ticks])
@@ -255,8 +255,8 @@ def draw_time_against_map(rows: Sequence[Row], own: Sequence[Row], forecast: Map
     """Draw the total time against a forecast that is the same for every slot.
 
     Args:
-        rows: with scenario, agent, total_s, total_s_ci95, of one world with several flat forecasts.
-        own: of the same world with its own forecast: dashed.
+        rows: rows with scenario, agent, total_s, total_s_ci95, of one world with several flat forecasts.
+        own: rows of the same world with its own forecast, drawn dashed.
         forecast: P(taken) of each flat forecast, by scenario.
 
     Raises:
@@ -279,7 +279,7 @@ def draw_time_against_map(rows: Sequence[Row], own: Sequence[Row], forecast: Map
 
 
 def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Row], float]) -> None:
-    """Draw a line per agent; `along` gives a row's place on the x axis."""
+    """Draw a line per agent; `along` returns a row's x value."""
     ends = []
     places = [along(row) for row in rows]
     for agent in dict.fromkeys(row["agent"] for row in rows):
@@ -289,7 +289,7 @@ def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Ro
         total = np.array([row["total_s"] for row in own])
         low, high = np.array([_interval(row) for row in own]).T
         dashes = (0, (4, 2)) if agent == "oracle" else "-"
-        # The band of a line that is off the scale would only cover the others.
+        # The interval of a line beyond the limit would only cover the others.
         ax.fill_between(x, low, high, where=total <= limit, color=color, alpha=0.15, linewidth=0)
         ax.plot(x, total, color=color, linestyle=dashes, linewidth=1.8, marker="o", markersize=3.5)
         ends.append((total[-1], x[-1], agent, color))
@@ -315,7 +315,7 @@ def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Ro
 
 
 def spread(places: Sequence[float], gap: float) -> FloatArray:
-    """Move ascending places apart to at least `gap`, as little as possible, none above 1 if they fit."""
+    """Move ascending positions at least `gap` apart, as little as possible, and not above 1 if they fit."""
     spread = np.array(places, dtype=np.float64)
     for i in range(1, len(spread)):
         spread[i] = max(spread[i], spread[i - 1] + gap)
@@ -326,14 +326,14 @@ def spread(places: Sequence[float], gap: float) -> FloatArray:
 
 
 def _limit(rows: Sequence[Row]) -> float:
-    """Return the end of the axis of total times: beyond all totals within `OFF_SCALE` medians."""
+    """Return the upper limit of the total-time axis: above all totals within `OFF_SCALE` medians."""
     total = np.array([row["total_s"] for row in rows])
     near = total[total <= OFF_SCALE * np.median(total)]
     return float(1.12 * near.max()) or 1.0
 
 
 def _interval(row: Row) -> tuple[float, float]:
-    """Return the confidence interval of the total; the mean twice where there is none."""
+    """Return the confidence interval of the total; the mean twice if there is none."""
     low, high = (row["total_s"] if end is None or end != end else end for end in row["total_s_ci95"])
     return low, high
 
@@ -344,7 +344,7 @@ def _require_rows(rows: Sequence[Row]) -> None:
 
 
 def _name(figure: Figure, rows: Sequence[Row]) -> None:
-    """Title a figure with the scenario if all rows have the same."""
+    """Title a figure with the scenario if all rows share it."""
     names = {row.get("scenario") for row in rows} - {None}
     episodes = {row.get("episodes") for row in rows} - {None}
     if len(names) == 1:

@@ -1,4 +1,4 @@
-"""A film of a whole trip from above: the surroundings of the car, with the whole lot in a corner."""
+"""Animation of a whole trip from above: the car's surroundings, with the whole lot in an inset."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from parkenv.world.scenario import Scenario
 FloatArray = NDArray[np.float64]
 
 SPEEDUP = 5
-"""How much faster than real time a film runs."""
+"""Playback speed relative to real time."""
 FPS = 10
 LAST_S = 2.0
-"""s for which the last frame stays."""
+"""Duration of the last frame, s."""
 COLORS = 96
-"""Colours of a film: enough for drawings, with small files."""
+"""Number of colours of an animation: enough for drawings, and small files."""
 
 _SLOT_PX = 26.0  # a slot's width in the picture near the car
 _INSET = 0.34
@@ -48,8 +48,8 @@ class TripRenderer(SearchRenderer):
     """Draws a search with the car at its driven pose.
 
     Args:
-        scenario: where it takes place.
-        driver: drives the car.
+        scenario: the scenario.
+        driver: the driver of the car.
         near: whether to show the car's surroundings instead of the whole lot.
     """
 
@@ -61,7 +61,7 @@ class TripRenderer(SearchRenderer):
             self._whole = None
 
     def rows(self) -> tuple[int, int]:
-        """Return the first and last row, px, of the lot in a frame of the whole lot."""
+        """Return the first and last pixel row of the lot in a frame of the whole lot."""
         assert self._whole is not None
         west, south, east, north = self.scenario.lot.bounds()
         corners = self._whole(np.array([[west, south], [east, north], [west, north], [east, south]]))
@@ -72,7 +72,7 @@ class TripRenderer(SearchRenderer):
         return self._driver.vehicle.at_middle(self._driver.state[:3])
 
     def still_layer(self, state: SearchState) -> StillLayer:
-        """Return the layer of the lot's part near the car, or of the whole lot."""
+        """Return the layer of the part of the lot near the car, or of the whole lot."""
         if not self._near:
             return super().still_layer(state)
         return self._window(self._middle()[:2], _SLOT_PX, 3)
@@ -116,7 +116,7 @@ class TripRenderer(SearchRenderer):
 
 
 def film_trip(search: DrivenSearch, seed: int) -> tuple[Trip, list[Image]]:
-    """Drive a trip and render it: frames of (480, 640, 3) uint8, `FPS` per second of film."""
+    """Drive a trip and render it: frames of (480, 640, 3) uint8, at `FPS` frames per second."""
     driver, env = search.driver, search.env
     near = TripRenderer(search.scenario, driver, near=True)
     far = TripRenderer(search.scenario, driver, near=False)
@@ -149,7 +149,7 @@ def film_trip(search: DrivenSearch, seed: int) -> tuple[Trip, list[Image]]:
 
 
 def _inset(near: Image, far: Image, low: int, high: int) -> Image:
-    """Return a frame with rows `low` to `high` of the whole lot's frame small in its corner."""
+    """Return the near frame with rows `low` to `high` of the whole lot's frame as a small inset."""
     width, height = round(_INSET * WIDTH), round(_INSET * (high - low))
     small = cv2.resize(far[low:high], (width, height), interpolation=cv2.INTER_AREA)
     image = near.copy()

@@ -1,1 +1,1 @@
-"""One self-contained HTML page on the results of a command, with its searches and drives to watch again."""
+"""A self-contained HTML page on the results of a command, with replays of its searches and drives."""

@@ -19,10 +19,10 @@ from parkenv.perception.pipeline import CameraView, PerceptionResult
 from sim_sensors.rig import poses_along
 
 PICTURE_WIDTH = 480
-"""px, of recorded camera frames."""
+"""Width of recorded camera frames, px."""
 JPEG_QUALITY = 68
 SCAN_REACH = 16.0
-"""m; longer beams are left out."""
+"""Maximum length of recorded beams, m."""
 LEVELS = 15
 """Shades of the occupancy grid."""
 
@@ -30,12 +30,12 @@ Recording = dict[str, Any]
 
 
 def record_drive(survey: Survey, number: int, most_frames: int) -> Recording:
-    """Drive a session again and record it.
+    """Repeat a session of a survey, and record it.
 
     Args:
         survey: the survey.
-        number: of the session.
-        most_frames: captures to keep, at equal distances, always with the last one.
+        number: number of the session.
+        most_frames: maximum number of captures to keep, evenly spaced, the last one included.
     """
     captures = len(poses_along(survey.route.path, survey.settings.every))
     step = max(1, math.ceil(captures / most_frames))
@@ -107,7 +107,7 @@ def _frame(frame: SurveyFrame, first_time: float) -> Recording:
 
 
 def _boxes(view: CameraView) -> list[list[float]]:
-    """List left, top, right, bottom as fractions of the image; probability; is an end; is ranged."""
+    """List, per box: left, top, right, bottom as fractions of the image; probability; is a front or rear; is ranged."""
     height, width = view.image.shape[:2]
     found = view.detections
     made = []
@@ -120,7 +120,7 @@ def _boxes(view: CameraView) -> list[list[float]]:
 
 
 def _scan(result: PerceptionResult) -> list[int]:
-    """List the ends of beams, decimetres from the car, x and y alternating."""
+    """List the end points of beams relative to the car, in decimetres, x and y alternating."""
     x, y, _ = result.vehicle
     points = [
         scan.points(np.flatnonzero(np.nan_to_num(scan.distance, nan=np.inf) < SCAN_REACH))[::2]
@@ -132,7 +132,7 @@ def _scan(result: PerceptionResult) -> list[int]:
 
 
 def _changes(before: NDArray[np.int64], now: NDArray[np.int64]) -> list[int]:
-    """List alternating slot and value of those that have changed."""
+    """List the changed entries, slot and new value alternating."""
     changed = np.flatnonzero(before != now)
     pairs: list[int] = np.stack([changed, now[changed]], axis=1).ravel().tolist()
     return pairs
@@ -147,7 +147,7 @@ def _jpeg(image: NDArray[np.uint8]) -> str:
 
 
 def _grid_png(grid: OccupancyGrid) -> str:
-    """Encode the grid, north up, at half its resolution: 0 where unobserved, then from free to taken."""
+    """Encode the grid as a PNG, north up, at half resolution: 0 for unobserved, then from free to taken."""
     rows, columns = (2 * (n // 2) for n in grid.log_odds.shape)
     blocks = (rows // 2, 2, columns // 2, 2)
     p = grid.probability[:rows, :columns].reshape(blocks).max(axis=(1, 3))
@@ -161,7 +161,7 @@ def _grid_png(grid: OccupancyGrid) -> str:
 
 
 def _palette() -> list[int]:
-    """Transparent, then from pale blue to dark violet."""
+    """Build the palette: transparent, then from pale blue to dark violet."""
     share = np.linspace(0.0, 1.0, LEVELS)[:, None]
     colors = np.array([[150, 190, 215]]) * (1 - share) + np.array([[112, 48, 170]]) * share
     return [0, 0, 0, *np.round(colors).astype(int).ravel().tolist()]

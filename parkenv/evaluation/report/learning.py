@@ -1,4 +1,4 @@
-"""Learning curves of `parkenv train` as the page draws them."""
+"""Learning curves of `parkenv train` in a report page."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def learning_of(run: RunFolder) -> list[dict[str, Any]]:
     """Build the panels of learning curves: total time of searches, or success by kind of slot.
 
     Args:
-        run: any run; only trainings have curves.
+        run: a run of any kind; only trainings have curves.
     """
     curve, lines = run.summary.get("curve"), run.summary.get("evaluated")
     if run.kind != "train" or not curve or not isinstance(lines, Mapping):
@@ -47,9 +47,9 @@ def _panel(
     *,
     share: bool,
 ) -> dict[str, Any]:
-    """Build a panel: points of the mean are decisions, mean, and the ends of its 95 % interval (None for one seed).
+    """Build a panel; a point of the mean is decisions, mean, and the ends of its 95 % interval (None for one seed).
 
-    Other trainings show their median, which a single search driven in circles does not distort.
+    Other trainings show their median, which is robust against single searches that drive in circles.
     """
     low, high, median = columns_of(column)
     return {

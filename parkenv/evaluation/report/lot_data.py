@@ -1,4 +1,4 @@
-"""A lot's shapes as the page's data hold them."""
+"""Shapes of a lot in the data of a report page."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from parkenv.world.lot import ParkingLot
 
 
 def describe_lot(lot: ParkingLot) -> dict[str, Any]:
-    """Return the lot that the page draws, `lot` in `report.schema.json`: m, rounded to centimetres."""
+    """Return the `lot` of `report.schema.json`: lengths in m, rounded to centimetres."""
     outline = LotOutline.of(lot)
     return {
         "name": lot.name,

@@ -1,4 +1,4 @@
-"""The report page: data, figures, style and program in one self-contained HTML file."""
+"""The report page: data, figures, style sheet and scripts in one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SCRIPTS = (
     "numbers.js", "tables.js", "time_chart.js", "learning_chart.js", "lot_view.js", "player.js", "search_replay.js",
     "drive_replay.js", "page.js",
 )  # fmt: skip
-"""Parts of the program, in order of dependence."""
+"""Scripts of the page, in order of dependence."""
 MOST_WIDTH = 1800
 """px; wider figures are scaled down."""
 LOSSLESS = 150_000
@@ -54,13 +54,13 @@ def page_data(
     drives: Sequence[Mapping[str, Any]] = (),
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Build the data of a page, all but the figures; see `report.schema.json`.
+    """Build the data of a page, without the figures; see `report.schema.json`.
 
     Args:
         run: the run.
         encounters: from `search_recording.record`.
         drives: from `drive_recording.record_drive`.
-        notes: for the reader, such as why there is no replay.
+        notes: notes for the reader, such as why there is no replay.
     """
     lots: list[Any] = []
 
@@ -94,9 +94,9 @@ def write_page(run: RunFolder, data: Mapping[str, Any], path: Path) -> None:
     """Write the page atomically.
 
     Args:
-        run: has the figures.
-        data: from `page_data`.
-        path: of the HTML file.
+        run: the run, with its figures.
+        data: data from `page_data`.
+        path: the HTML file to write.
 
     Raises:
         InputError: the file cannot be written.
@@ -141,7 +141,7 @@ def _figure(path: Path) -> str:
 
 
 def _webp(picture: PillowImage.Image) -> str:
-    """Compress without loss where that is small, as for charts."""
+    """Encode as WebP: lossless if the result is small (charts), else lossy."""
     content = io.BytesIO()
     picture.save(content, "WEBP", lossless=True)
     if content.tell() > LOSSLESS:

@@ -24,9 +24,9 @@ class RunFolder:
 
     Attributes:
         path: the folder.
-        summary: its `summary.json`.
-        figures: the PNG files in it, by name.
-        kind: of run: compare, survey, demo, train, ...; the command's name where it left no specification.
+        summary: content of `summary.json`.
+        figures: the PNG files in the folder, by name.
+        kind: compare, survey, demo, train, ...; the command's name if the folder holds no specification.
     """
 
     path: Path
@@ -36,10 +36,11 @@ class RunFolder:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read it.
+        """Read a run folder.
 
         Raises:
-            InputError: no folder, no finished run in it, one of another version, or a torn summary.
+            InputError: there is no folder or no finished run in it, the run is of another version, or the summary is
+                damaged.
         """
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; want one that a command with --out wrote")
@@ -74,14 +75,14 @@ class RunFolder:
 
     @property
     def arguments(self) -> list[str]:
-        """What the command was called with."""
+        """Arguments of the command."""
         return [str(word) for word in self.summary["command"][2:]]
 
     def totals(self) -> dict[tuple[Any, ...], float]:
-        """Total time, s, of every search in `episodes.csv`, by `results.episode_key`; empty where there is none.
+        """Read the total time, s, of every search in `episodes.csv`, by `results.episode_key`; empty without the file.
 
         Raises:
-            InputError: the file is not what this version writes.
+            InputError: this version does not write such a file.
         """
         file = self.path / "episodes.csv"
         if not file.exists():
@@ -97,7 +98,7 @@ class RunFolder:
                 raise InputError(f"{file}: a line of it cannot be read ({error})") from error
 
     def table(self, name: str) -> list[Row]:
-        """The rows of a CSV file in the folder, numbers as numbers; none where it is not there."""
+        """Read the rows of a CSV file in the folder, with numbers converted; empty without the file."""
         file = self.path / name
         if not file.exists():
             return []

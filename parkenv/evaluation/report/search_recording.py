@@ -20,11 +20,11 @@ from parkenv.world.occupancy import World
 from planners.agent import Agent, make_agent
 
 MOST_SLOTS = 20_000
-"""Lots with more slots have no replay: the page would not load."""
+"""Lots with more slots are not replayed: the page would not load."""
 STEADY_S = 600.0
-"""s up to which the true occupancy is recorded every second; later only at decisions."""
+"""Time, s, up to which the true occupancy is recorded every second; later it is recorded only at decisions."""
 FULL = 255
-"""The recorded value of a belief of 1."""
+"""Recorded value of a belief of 1."""
 AGREES_S = 1e-6
 
 Recording = dict[str, Any]
@@ -32,11 +32,11 @@ Recording = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Encounter:
-    """Agents in the same world.
+    """Several agents in the same world.
 
     Attributes:
-        cases: one per agent, of one setting.
-        seed: of the world.
+        cases: one case per agent, all in one setting.
+        seed: seed of the world.
     """
 
     cases: tuple[Case, ...]
@@ -44,11 +44,11 @@ class Encounter:
 
 
 def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[Encounter]:
-    """Choose the first searches of each setting in turn, up to a number; at least one world.
+    """Choose the first searches of each setting in turn, up to a total number; at least one world.
 
     Args:
-        cases: each with the seeds of its searches.
-        episodes: how many searches to choose.
+        cases: cases, each with the seeds of its searches.
+        episodes: number of searches to choose.
     """
     settings: dict[tuple[Any, ...], list[tuple[Case, Sequence[int]]]] = {}
     for case, seeds in cases:
@@ -67,12 +67,12 @@ def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[E
 
 
 def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Recording:
-    """Run every agent of an encounter through its world again.
+    """Repeat the searches of all agents of an encounter, and record them.
 
     Args:
         encounter: the agents and their world.
-        counted: total time, s, of each search in the comparison, by `Case.key`; searches that are missing there are
-            not compared.
+        counted: total time, s, of each search in the original run, by `Case.key`; the totals of missing searches are
+            not checked.
     """
     searches, moments = [], {0.0}
     state: SearchState | None = None
@@ -110,7 +110,7 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
 
 
 def _truth(world: World, n_slots: int, start: float, moments: Sequence[float]) -> Recording:
-    """Record the occupancy at the arrival, and its changes: [centiseconds, slot, ...]."""
+    """Record the occupancy at the arrival and its changes: [centiseconds, slot, ...]."""
     everything = np.arange(n_slots)
     taken = world.occupied(everything, start)
     first, changes = taken, []
@@ -126,12 +126,12 @@ class SearchRecorder(Observer):
     """Records a search for the report: times in centiseconds since the arrival, beliefs in steps of 1/255.
 
     Args:
-        name: of the agent.
-        agent: whose plans are recorded, if it has `plan_preview`.
+        name: name of the agent.
+        agent: the agent; its plans are recorded if it has `plan_preview`.
 
     Attributes:
-        state: of the environment, hidden occupancy included.
-        recording: of the finished search.
+        state: state of the environment, including the hidden occupancy.
+        recording: recording of the finished search.
     """
 
     state: SearchState
@@ -156,11 +156,11 @@ class SearchRecorder(Observer):
         self._record_state(failed_s=0.0)
 
     def on_step(self, step: Step) -> None:
-        """Record the decision, the plan behind it, and the state after it."""
+        """Record the decision, the plan that led to it, and the next state."""
         plan: list[int] = []
         if self._preview_of is not None:
             plan = list(self._preview_of(step.observation, int(step.action), step.memory).path)
-        # Most plans are what is left of the last one.
+        # Most plans are the remainder of the previous one; those are stored as None.
         self._rows["plan"].append(None if plan == self._plan[1:] else plan)
         self._rows["action"].append(int(step.action))
         self._plan = plan if self.state.vertex != self._vertex else [-1, *plan]

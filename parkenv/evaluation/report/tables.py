@@ -14,12 +14,12 @@ class Column(NamedTuple):
     """Format of a column.
 
     Attributes:
-        key: in the summary.
+        key: key in the summary.
         label: heading.
-        unit: of the numbers; empty for none.
-        digits: after the point.
-        share: whether it is a fraction, to be written as a percentage.
-        signed: whether a plus is written.
+        unit: unit of the numbers; empty for none.
+        digits: number of decimals.
+        share: whether the value is a fraction, shown as a percentage.
+        signed: whether positive values get a plus sign.
         help: explanation.
     """
 
@@ -103,13 +103,13 @@ _ORDER = (
     "gave_up_s",
     "parked_fraction",
 )  # fmt: skip
-"""First columns, in this order; others follow."""
+"""The first columns, in this order."""
 _TABLES_OF_THEIR_OWN = ("by_weather",)
 _UNITS = (("_kmh", "km/h"), ("_ms", "ms"), ("_s", "s"), ("_m", "m"), ("_deg", "°"), ("_rad", "rad"))
 
 
 def column_of(key: str) -> Column:
-    """Return the format of a column; unknown ones are labelled by their key.
+    """Return the format of a column; unknown columns are labelled by their key.
 
     Examples:
         >>> column_of("total_s").label, column_of("brake_distance_m")[:3]
@@ -126,14 +126,14 @@ def column_of(key: str) -> Column:
 def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False) -> dict[str, Any]:
     """Build a table of the page's data.
 
-    Intervals (`NAME_ci95`) join the column of their value. Columns that are equal in all rows go to `same`, which is
-    printed above the table.
+    Intervals (`NAME_ci95`) are merged into the column of their value. Columns that are equal in all rows go to `same`,
+    which is printed above the table.
 
     Args:
-        name: identifies it in the page.
-        title: above it.
-        rows: with about the same keys.
-        facts: whether it is one row, shown from top to bottom.
+        name: identifier of the table in the page.
+        title: title above the table.
+        rows: rows with mostly the same keys.
+        facts: whether to show a single row from top to bottom.
     """
     flat = [_flat(row) for row in rows]
     keys = list(dict.fromkeys(key for row in flat for key in row))
@@ -142,7 +142,7 @@ def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False)
     same = []
     if len(rows) > 1:
         same = [k for k in keys if len({repr(v) for v in values[k]}) == 1]
-        # Compared values stay even if they are equal.
+        # Compared values stay in the table even if they are equal.
         same = [
             k for k in same if values[k][0] is None or k in _ORDER[:6] or k in ("episodes", "rig", "slots")
         ]
@@ -162,7 +162,7 @@ def _described(key: str) -> dict[str, Any]:
 
 
 def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Cell]:
-    """Flatten nested keys and join intervals; lists of rows are left out, as they have their own tables."""
+    """Flatten nested keys and merge intervals; skip lists of rows, which have their own tables."""
     made: dict[str, Cell] = {}
     for key, value in row.items():
         name = prefix + key
@@ -185,8 +185,8 @@ def tables_of(kind: str, summary: Mapping[str, Any], sessions: Sequence[Row]) ->
 
     Args:
         kind: name of the command.
-        summary: its summary.
-        sessions: of a survey, the rows of `sessions.csv`.
+        summary: summary of the command.
+        sessions: rows of `sessions.csv`, for a survey.
     """
     rows = summary["rows"]
     surveyed = rows[0] if kind == "survey" and rows else summary.get("survey")

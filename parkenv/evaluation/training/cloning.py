@@ -1,4 +1,4 @@
-"""Behaviour cloning: a planner's demonstrations, and fitting a policy to them before reinforcement learning."""
+"""Behaviour cloning: collect a planner's demonstrations, and fit a policy to them before reinforcement learning."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from parkenv.world.scenario import Scenario
 from planners.agent import ClairvoyantAgent, make_agent
 
 UPDATES = 3000
-"""Steps of the optimizer, enough for a policy that seldom deviates from the demonstrations."""
+"""Number of optimizer steps: enough for a policy that seldom deviates from the demonstrations."""
 CLONEABLE = ("ppo", "maskable-ppo")
 """Algorithms whose policies can be cloned from demonstrations."""
 BATCH = 512
@@ -28,10 +28,10 @@ LEARNING_RATE = 1e-3
 
 
 def require_cloneable(algorithm: str, agent: str, scenario: Scenario) -> None:
-    """Check that an algorithm can clone an agent, before demonstrations are collected.
+    """Check that an algorithm supports behaviour cloning of an agent, before demonstrations are collected.
 
     Raises:
-        InputError: an algorithm without behaviour cloning, an unknown agent, or the oracle.
+        InputError: the algorithm does not support cloning, or the agent is unknown or the oracle.
     """
     if algorithm not in CLONEABLE:
         raise InputError(f"{algorithm} has no behaviour cloning; take {' or '.join(CLONEABLE)}")
@@ -43,10 +43,10 @@ def require_cloneable(algorithm: str, agent: str, scenario: Scenario) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Demonstrations:
-    """Decisions of an agent, to clone.
+    """Recorded decisions of an agent, for behaviour cloning.
 
     Args:
-        agent: its name.
+        agent: name of the agent.
         local: (n, 46 + 8k) float32, observations of `LocalObservation`.
         masks: (n, 5) int8, action masks.
         actions: (n,) int64, the agent's actions.
@@ -64,7 +64,7 @@ class Demonstrations:
         """Simulate an agent, one search per seed; truncated searches are left out.
 
         Raises:
-            InputError: it finished none.
+            InputError: all searches were truncated.
         """
         planner = make_agent(agent, scenario)
         env = gym.make("parkenv/Search-v1", scenario=scenario, max_episode_steps=MAX_STEPS)
@@ -82,7 +82,7 @@ class Demonstrations:
 
 
 class _DecisionRecorder(Observer):
-    """Keeps (local observation, action mask, action, reward) of each decision of the searches that end by themselves.
+    """Record (local observation, action mask, action, reward) of each decision, for searches that are not truncated.
 
     Args:
         local: computes the local observation from the environment's state.
@@ -99,7 +99,7 @@ class _DecisionRecorder(Observer):
         self._now = self._local.observation(observation)["local"]
 
     def on_step(self, step: Step) -> None:
-        """Keep the decision."""
+        """Record the decision."""
         mask = step.observation["action_mask"]
         self._decisions.append((self._now, mask, int(step.action), step.reward))
         self._now = self._local.observation(step.next_observation)["local"]
@@ -113,13 +113,13 @@ class _DecisionRecorder(Observer):
 def clone(
     model: OnPolicyAlgorithm, demonstrations: Demonstrations, seed: int, updates: int = UPDATES
 ) -> None:
-    """Fit a model's policy to demonstrations, and its values to the remaining time of the searches.
+    """Fit a model's policy to the demonstrations, and its value function to the remaining search time.
 
     Args:
-        model: fresh, of ppo or maskable-ppo.
+        model: an untrained ppo or maskable-ppo model.
         demonstrations: decisions to clone.
-        seed: of the mini-batches.
-        updates: steps of the optimizer.
+        seed: seed of the mini-batches.
+        updates: number of optimizer steps.
     """
     import torch
 

@@ -1,4 +1,4 @@
-"""Training configs: for each algorithm the settings that performed well."""
+"""Training configs: settings of each algorithm that performed well."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from parkenv.errors import InputError
 REWARD_SCALE = 0.01
 """Scales returns of about -100 s to about -1."""
 MAX_STEPS = 500
-"""Step limit of training episodes: a search that takes longer drives in circles."""
+"""Step limit of training episodes: longer searches only drive in circles."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ SEARCH_CONFIGS: dict[str, TrainingConfig] = {
             "batch_size": 512,
             "train_freq": 1,
             "gradient_steps": 2,
-            # Closer to 1, the value of driving in circles for ever dominates what is to be learned.
+            # With gamma closer to 1, the value of endless circling dominates the learning signal.
             "gamma": 0.995,
             "target_update_interval": 2_000,
             "exploration_fraction": 0.3,
@@ -71,20 +71,20 @@ SEARCH_CONFIGS: dict[str, TrainingConfig] = {
         0.05,
     ),
 }
-"""Config of each algorithm for searching."""
+"""Config of each algorithm for search."""
 
 
 WAY_IN = "way-in"
-"""Starts on the planned path into the slot."""
+"""Start on the planned path into the slot."""
 
 
 @dataclass(frozen=True)
 class CurriculumLevel:
-    """Difficulty of the tasks of a level; see `parkenv.driving.parking_task.ParkingTasks`.
+    """Difficulty of the tasks at one level; see `parkenv.driving.parking_task.ParkingTasks`.
 
     Args:
-        starts: `way-out` or `lane`, or `way-in`: on the planned path from the lane into the slot.
-        distance: least and greatest, m; for `way-in` the remaining length of the path.
+        starts: `way-out`, `lane`, or `way-in` (on the planned path from the lane into the slot).
+        distance: minimum and maximum, m; for `way-in`, of the remaining path length.
         slack: free space around the slot, m.
     """
 
@@ -107,8 +107,8 @@ CURRICULUM = (
 )
 """Levels from a start just outside the slot to the full task of `parkenv/Drive-v1`.
 
-A random drive out of a parallel slot ends inside it, so these starts teach to correct the pose in the slot; the part
-between slot and lane is learned along the planned path, from its end backwards.
+A random drive out of a parallel slot ends while still inside it, so `way-out` starts teach pose correction in the slot.
+The part between slot and lane is learned along the planned path, backwards from its end.
 """
 
 
@@ -156,9 +156,9 @@ _HINDSIGHT = DriveTrainingConfig(
     steps=300_000,
 )
 
-# A contact must cost more than standing still for ever, which is 0.4 s / (1 - gamma) in sparse rewards and about twice
-# that in dense ones: with much less (60 s), an untrained policy ends episodes by a contact. With much more (100 s), the
-# narrow path into a parallel slot is learned two or three times as slowly.
+# A contact must cost more than standing still forever, which costs 0.4 s / (1 - gamma) with sparse rewards and about
+# twice that with dense ones. If it costs much less (60 s), untrained policies end episodes with a contact. If it costs
+# much more (100 s), learning the narrow path into a parallel slot takes two to three times as long.
 DRIVE_CONFIGS: dict[str, DriveTrainingConfig] = {
     "ppo": DriveTrainingConfig(
         256,
@@ -170,7 +170,7 @@ DRIVE_CONFIGS: dict[str, DriveTrainingConfig] = {
             "n_epochs": 6,
             "gamma": 0.99,
             "gae_lambda": 0.95,
-            # Exploration narrows more slowly than without.
+            # An entropy bonus slows the decay of exploration.
             "ent_coef": 0.004,
             "policy_kwargs": {"net_arch": [128, 128], "log_std_init": -0.5},
         },
@@ -192,12 +192,12 @@ def config_of(algorithm: str, configs: Mapping[str, AnyConfig], task: str) -> An
     """Look up the config of an algorithm.
 
     Args:
-        algorithm: its name.
-        configs: of the task.
+        algorithm: name of the algorithm.
+        configs: configs of the task.
         task: search or drive.
 
     Raises:
-        InputError: the algorithm has none.
+        InputError: the algorithm has no config for this task.
     """
     if algorithm not in configs:
         raise InputError(f"ALGORITHM is {algorithm!r}, want one of {', '.join(configs)} for {task}")

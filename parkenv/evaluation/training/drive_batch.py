@@ -1,8 +1,7 @@
 """Many drives of `parkenv/Drive-v1` at once, compiled: the training environment's engine.
 
 Car, limits, tasks, goals and rewards are those of the environment. A contact is an outline that crosses the car's,
-not a collision in pymunk, so that grazing contacts may be judged differently. Trained models are tested in the
-environment itself.
+not a collision in pymunk, so grazing contacts may differ. Trained models are tested in the environment itself.
 """
 
 from __future__ import annotations
@@ -46,11 +45,11 @@ class DriveBatch:
         vehicle: the car of all tasks; None for the default.
 
     Attributes:
-        state: (n, 6) float64 of the vehicles; x, y and yaw in each slot's frame.
-        time: (n,) float64, s since the start.
+        state: (n, 6) float64, vehicle states; x, y and yaw in each slot's frame.
+        time: (n,) float64, time since the start, s.
         status: (n,) int64, `RUNNING`, `PARKED`, `CONTACT` or `LEFT_AREA`.
         approach: (n,) float64, s: 0.1 s × (distance / 10 m + angle / π), summed over the last decision (dense reward).
-        took: (n,) float64, s: duration of the last decision, without the step that parked.
+        took: (n,) float64, duration of the last decision, s, excluding the step that parked.
     """
 
     def __init__(self, n: int, vehicle: VehicleParameters | None = None) -> None:
@@ -117,11 +116,7 @@ class DriveBatch:
 
 
 class PreparedTask:
-    """A task in the slot's frame, ready for a batch.
-
-    Args:
-        task: the task.
-    """
+    """A task in the slot's frame, ready for a batch."""
 
     def __init__(self, task: ParkingTask) -> None:
         self.kind, self.slot_yaw = task.kind, float(task.slot[2])
@@ -227,7 +222,7 @@ def _touches(
     half: FloatArray,
     middle: float,
 ) -> bool:
-    """Whether an edge meets the car's outline."""
+    """Return whether an edge intersects the car's outline."""
     c, s = math.cos(state[YAW]), math.sin(state[YAW])
     x, y = state[0] + middle * c, state[1] + middle * s
     own = math.hypot(half[0], half[1])
@@ -245,9 +240,9 @@ def _touches(
 
 @compiled(error_model="numpy")
 def _crosses(px: float, py: float, qx: float, qy: float, half: FloatArray) -> bool:
-    """Whether an edge from p to q, m, car frame about its middle, meets the box of `half`."""
+    """Return whether the edge from p to q, m, in the car-centred frame, intersects the box of half-size `half`."""
     if max(px, qx) < -half[0] or min(px, qx) > half[0] or max(py, qy) < -half[1] or min(py, qy) > half[1]:
         return False
-    # All corners of the box on one side of the edge's line: they do not meet.
+    # If all corners of the box lie on one side of the edge's line, they do not intersect.
     ex, ey = qx - px, qy - py
     return bool(abs(ex * py - ey * px) <= abs(ex) * half[1] + abs(ey) * half[0])

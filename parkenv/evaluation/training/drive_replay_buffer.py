@@ -14,8 +14,8 @@ from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 class TerminalGoalReplayBuffer(HerReplayBuffer):  # type: ignore[misc]
     """stable-baselines3's hindsight experience replay with terminal goals.
 
-    In the base class a relabelled episode continues after its goal. A drive ends there, because the car has parked;
-    and most relabelled goals cannot be held, as the car passes through them at speed.
+    In the base class, a relabelled episode continues after its goal. A drive ends there because the car has parked.
+    Moreover, most relabelled goals cannot be held: the car passes through them at speed.
     """
 
     def _get_virtual_samples(

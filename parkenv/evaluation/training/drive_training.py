@@ -41,11 +41,11 @@ class DriveTraining(Training):
         algorithm: one of `DRIVE_CONFIGS`.
         steps: decisions in total.
         evaluate_every: decisions between evaluations.
-        lots: to train on; each kind of slot on them is used equally often.
+        lots: lots to train on; every kind of slot on them is used equally often.
         evaluation_seeds: seeds of the held-out tasks, the same for each kind and lot.
 
     Raises:
-        InputError: an unknown algorithm, a number out of its range, or a lot without a slot that the car fits into.
+        InputError: an unknown algorithm, a number out of range, or a lot without a slot that the car fits into.
     """
 
     lots: tuple[ParkingLot, ...]
@@ -84,11 +84,11 @@ class DriveTraining(Training):
         return env
 
     def evaluate(self, model: Any, env: VecEnv) -> Row:
-        """Park in the held-out tasks.
+        """Evaluate a model on the held-out tasks.
 
         Returns:
-            Per kind: success rate with 95 % interval (Wilson), fraction of contacts (leaving the area included), mean
-            time of successes, s (NaN for none), and level of the curriculum. `success` and `time_s` are means over
+            Per kind: success rate with 95 % interval (Wilson), fraction of contacts (including leaving the area), mean
+            time of successes, s (NaN for none), and curriculum level. `success` and `time_s` are means over
             the kinds.
         """
         row: Row = {}
@@ -110,12 +110,12 @@ class DriveTraining(Training):
         return {"success": success, "time_s": time_s, **row}
 
     def score(self, row: Row) -> tuple[float, ...]:
-        """Success rate, then speed."""
+        """Return the success rate, then minus the mean time to break ties."""
         return (row["success"], -row["time_s"] if row["time_s"] == row["time_s"] else -np.inf)
 
     def settings(self) -> dict[str, Any]:
-        """Arguments of the constructor, with goal features and, for sparse rewards, hindsight experience replay."""
-        # Imported here because they need torch, which a training that is only described does not.
+        """Return the constructor's arguments: goal features and, for sparse rewards, hindsight experience replay."""
+        # Imported here because they need torch, which is not needed to describe a training.
         import torch
 
         from parkenv.evaluation.training.drive_replay_buffer import TerminalGoalReplayBuffer
@@ -128,19 +128,19 @@ class DriveTraining(Training):
         }
         if self.config.reward == "sparse":
             settings["replay_buffer_class"] = TerminalGoalReplayBuffer
-            # `copy_info_dict`: a contact remains one in relabelled transitions.
+            # `copy_info_dict` keeps contacts in relabelled transitions.
             settings["replay_buffer_kwargs"] = settings["replay_buffer_kwargs"] | {"copy_info_dict": True}
         return settings
 
     def model_card(self, seed: int, steps: int) -> ModelCard:
-        """Metadata of the model file."""
+        """Return the metadata of the model file."""
         settings = dataclasses.asdict(self.config)
         names = tuple(lot.name for lot in self.lots)
         return ModelCard(self.algorithm, names, 0, INTERFACE, seed, steps, settings, __version__, "drive")
 
     @cached_property
     def _tasks(self) -> dict[str, list[PreparedTask]]:
-        """The held-out tasks by kind, as the environment draws them with `evaluation_seeds`."""
+        """Return the held-out tasks by kind, as the environment draws them with `evaluation_seeds`."""
         tasks: dict[str, list[PreparedTask]] = {kind: [] for kind in self.kinds}
         for group in self.groups:
             drawn = group.tasks()
@@ -153,10 +153,10 @@ class DriveTraining(Training):
 def evaluate_parking(
     model: Any, tasks: Sequence[PreparedTask]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Run one drive per task; return final `DriveBatch.status`, (n,) int64, and duration, (n,) s.
+    """Run one drive per task; return its final `DriveBatch.status`, (n,) int64, and duration, (n,) s.
 
     Args:
-        model: of stable-baselines3 or sb3-contrib, over the observation of `DriveBatch`.
+        model: a stable-baselines3 or sb3-contrib model of the observation of `DriveBatch`.
         tasks: one drive each.
     """
     batch = DriveBatch(len(tasks))
@@ -171,14 +171,14 @@ def evaluate_parking(
 
 
 def parked_on(lots: Sequence[ParkingLot], seeds: Sequence[int], workers: Workers, agent: str) -> list[Row]:
-    """Run parkings in `parkenv/Drive-v1`, in every kind of slot on some lots; return rows of `park_once`.
+    """Park in `parkenv/Drive-v1` in every kind of slot on some lots; return rows of `park_once`.
 
     Args:
-        lots: to park on.
-        seeds: of the tasks, the same for each kind and lot.
-        workers: where tasks run.
+        lots: lots to park on.
+        seeds: seeds of the tasks, the same for each kind and lot.
+        workers: where the tasks run.
         agent: a name for `planners.driving.parking_agents.make_parking_agent`.
     """
     cases = [ParkingCase(group.lot, (group.kind,)) for group in slot_groups(lots)]
-    # Tables are by kind; nose-in or back-in is part of the task.
+    # Tables are by kind only; each task fixes nose-in or back-in.
     return [p.row | {"way": ""} for some in park_all(cases, seeds, workers, agent) for p in some]

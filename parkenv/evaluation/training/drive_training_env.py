@@ -27,19 +27,19 @@ FloatArray = NDArray[np.float64]
 Observations = dict[str, NDArray[np.float32]]
 
 DECISION_S = ACTION_REPEAT * CONTROL_S
-"""s, from one decision to the next."""
+"""Time between decisions, s."""
 MOST_DECISIONS = 80
 """Step limit of a drive: half a minute, enough for a trained agent from any start."""
 STOOD = 5
-"""A drive is cut off after so many consecutive decisions at a standstill: an untrained agent would not move again."""
+"""Truncate a drive after this many consecutive decisions at a standstill: an untrained agent would not move again."""
 TRIED = 100
-"""Number of the latest drives at a level that decide whether it is mastered."""
+"""Number of most recent drives at a level that decide whether it is mastered."""
 MASTERED = 0.7
-"""Fraction of them that must have parked."""
+"""Fraction of these drives that must end parked."""
 SHARES = (0.5, 0.25, 0.25)
-"""Probability that a drive is of the current level, of a random level up to it, and of the last level."""
+"""Probabilities that a drive uses the current level, a random level up to it, or the last level."""
 TIMES_DRIVEN = 20
-"""Mean number of drives per drawn task: drawing a task takes as long as driving it a few times."""
+"""Mean number of drives per drawn task: drawing a task takes as long as a few drives."""
 KEPT = 128
 """Number of cached tasks per kind, lot and level."""
 
@@ -61,10 +61,10 @@ class SlotGroup:
 
 
 def slot_groups(lots: Sequence[ParkingLot]) -> tuple[SlotGroup, ...]:
-    """The groups of slots on some lots that the car fits into, sorted by kind.
+    """Group the slots that the car fits into by lot and kind, sorted by kind.
 
     Raises:
-        InputError: a lot has none.
+        InputError: a lot has no such slot.
     """
     vehicle = VehicleParameters()
     groups = []
@@ -76,7 +76,7 @@ def slot_groups(lots: Sequence[ParkingLot]) -> tuple[SlotGroup, ...]:
 
 
 class CurriculumTask(NamedTuple):
-    """A task and the poses at which a drive may start.
+    """A task and its possible start poses.
 
     Attributes:
         task: in the slot's frame.
@@ -89,7 +89,7 @@ class CurriculumTask(NamedTuple):
 
 
 def planned_path(task: ParkingTask) -> FloatArray:
-    """The `path` of a curriculum task; the start alone where the planner finds no path."""
+    """Return the `path` of a curriculum task; only the start if the planner finds no path."""
     around, target = task.obstacles, task.vehicle.at_rear_axle(task.target)
     path = plan_path(task.vehicle, around.corners, around.n_corners, task.start[:3], target)
     way = task.start[None, :3].copy() if path is None else path.sampled(_STEP_M)[0][::-1].copy()
@@ -101,19 +101,20 @@ def planned_path(task: ParkingTask) -> FloatArray:
 class DriveTrainingEnv(SharedVecEnv):
     """A batch of drives with the decisions of `planners.driving.policy_interface` and a curriculum.
 
-    Each kind of slot has its own level, and starts at the first. A level is mastered when the fraction `MASTERED` of
-    its last `TRIED` drives parked. `SHARES` of the drives are at the level, at easier ones, and at the last one, which
-    is the task of `parkenv/Drive-v1` itself. The more levels a kind has left, the more often it is drawn.
-    A drive is truncated after `MOST_DECISIONS`, or after `STOOD` consecutive decisions at a standstill.
+    Each kind of slot has its own level, which starts at the first. A level is mastered when a fraction `MASTERED` of
+    its last `TRIED` drives ended parked. `SHARES` gives the fractions of drives at the current level, at a random level
+    up to it, and at the last level, which is the task of `parkenv/Drive-v1` itself. Kinds with more levels left are
+    drawn more often. A drive is truncated after `MOST_DECISIONS`, or after `STOOD` consecutive decisions at a
+    standstill.
 
-    With the `sparse` reward, a decision costs 0.4 s unless it ends in the slot, so that `compute_reward` follows from
-    goals and contact alone. With the `dense` reward it costs the environment's reward.
+    With the `sparse` reward, a decision costs 0.4 s unless it ends in the slot, so `compute_reward` needs only goals
+    and contacts. The `dense` reward is that of the environment.
 
     Args:
         num_envs: number of drives.
         groups: slots to park in.
         config: rewards and curriculum.
-        levels: level of each kind at the start.
+        levels: initial level of each kind.
 
     Raises:
         InputError: no groups, or an unknown level.
@@ -160,14 +161,14 @@ class DriveTrainingEnv(SharedVecEnv):
         return [seed] * self.num_envs
 
     def reset(self) -> Observations:
-        """Start a new episode in every drive; levels are kept."""
+        """Start a new episode in every drive; keep the levels."""
         for i in range(self.num_envs):
             self._start_episode(i)
         self._start_all()
         return self.batch.observation()
 
     def step_wait(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Step all drives. Where one ends, `info` has the keys of `Monitor`, `is_success` and `contact`."""
+        """Step all drives. At the end of a drive, `info` has the keys of `Monitor`, `is_success` and `contact`."""
         batch = self.batch
         batch.drive(np.asarray(self.actions, dtype=np.float32))
         observations = batch.observation()
@@ -197,12 +198,12 @@ class DriveTrainingEnv(SharedVecEnv):
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
     ) -> NDArray[np.float32]:
-        """Sparse rewards, (n,) float32, of decisions that led to goals.
+        """Compute the sparse rewards, (n,) float32, of decisions.
 
         Args:
-            achieved_goal: (n, 7) float32, after the decision.
+            achieved_goal: (n, 7) float32, goal reached by the decision.
             desired_goal: (n, 7) float32.
-            info: of each decision; a missing `contact` means none.
+            info: `info` of each decision; without `contact` there was none.
         """
         achieved, desired = (np.asarray(g, dtype=np.float32) for g in (achieved_goal, desired_goal))
         _, _, parked = goal_errors(achieved, desired, self.batch.view.half)

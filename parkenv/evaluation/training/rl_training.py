@@ -27,7 +27,7 @@ from parkenv.files.atomic_write import atomic_write
 from planners.learned import ModelCard, algorithm_class
 
 TRAINING_SEEDS = 10_000_000
-"""World seeds of training seed s start at (s + 1) times this: far from those of evaluations and benchmark suites."""
+"""World seeds of training seed s start at (s + 1) times this, far from those of evaluations and benchmark suites."""
 MODEL, CHECKPOINT, REPLAY, CURVE = "model.zip", "checkpoint.zip", "replay.pkl", "curve.csv"
 
 Row = dict[str, Any]
@@ -35,7 +35,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class Training(ABC):
-    """A training: what is trained, for how long, and how it is evaluated.
+    """Base class of trainings: what is trained, for how long, and how it is evaluated.
 
     Args:
         algorithm: name of an algorithm with a training config.
@@ -43,7 +43,7 @@ class Training(ABC):
         evaluate_every: decisions between evaluations.
 
     Raises:
-        InputError: an unknown algorithm, or a number out of its range.
+        InputError: an unknown algorithm, or a number out of range.
     """
 
     algorithm: str
@@ -62,7 +62,7 @@ class Training(ABC):
         """Training config of the algorithm.
 
         Raises:
-            InputError: the algorithm has none for this task.
+            InputError: the algorithm has no config for this task.
         """
 
     @property
@@ -80,38 +80,38 @@ class Training(ABC):
         """Make the training environment.
 
         Args:
-            seed: of its worlds.
-            curve: evaluations so far; none at the start.
+            seed: seed of the worlds.
+            curve: evaluations so far; empty at the start.
         """
 
     @abstractmethod
     def evaluate(self, model: Any, env: VecEnv) -> Row:
-        """Evaluate a model in the held-out worlds, the same every time; return the `metrics`."""
+        """Evaluate a model in the held-out worlds, which never change; return the `metrics`."""
 
     @abstractmethod
     def score(self, row: Row) -> tuple[float, ...]:
-        """Score of an evaluation, for comparing checkpoints; higher is better."""
+        """Return the score of an evaluation, for comparing checkpoints; higher is better."""
 
     @abstractmethod
     def model_card(self, seed: int, steps: int) -> ModelCard:
-        """Metadata of the model file."""
+        """Return the metadata of the model file."""
 
     def settings(self) -> dict[str, Any]:
-        """Arguments of the algorithm's constructor, without the learning rate."""
+        """Return the arguments of the algorithm's constructor, without the learning rate."""
         return {name: value for name, value in self.config.settings.items() if name != "learning_rate"}
 
     def prepare(self, model: Any, seed: int) -> None:
-        """Prepare a new model before it learns; subclasses may pretrain it."""
+        """Prepare a new model before training; subclasses may pretrain it."""
         del model, seed
 
     def train(self, seed: int, folder: Path, *, tensorboard: bool = False) -> list[Row]:
-        """Train with one seed; resume from the folder's checkpoint where there is one.
+        """Train with one seed; resume from the folder's checkpoint if there is one.
 
         `model.zip` is the checkpoint with the best evaluation, `curve.csv` lists all evaluations.
 
         Args:
-            seed: of the network and of the worlds.
-            folder: created if missing.
+            seed: seed of the network and of the worlds.
+            folder: output folder, created if missing.
             tensorboard: whether to write a log for TensorBoard.
 
         Returns:
@@ -125,12 +125,12 @@ class Training(ABC):
         if curve and checkpoint.exists():
             done = ModelCard.of_file(checkpoint).steps
             curve = [row for row in curve if row["steps"] <= done]
-            # Other worlds than those at the start.
+            # Do not repeat the worlds from the start of the training.
             env = self.make_env(first + done, curve)
             model = kind.load(checkpoint, env=env, device="cpu", tensorboard_log=log)
             if (folder / REPLAY).exists():
                 with warnings.catch_warnings():
-                    # Unfinished drives end at the interruption; hindsight replay warns of that.
+                    # Unfinished drives end at the interruption, and hindsight replay warns about it.
                     warnings.filterwarnings("ignore", message="The last trajectory", category=UserWarning)
                     model.load_replay_buffer(folder / REPLAY)
             elif hasattr(model, "learning_starts"):
@@ -161,7 +161,7 @@ class Training(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Trained:
-    """Result of a training, as bytes, so that it can be sent from another machine.
+    """Result of a training, as bytes, so that a worker on another machine can return it.
 
     Attributes:
         curve: rows of `curve.csv`.
@@ -180,7 +180,7 @@ class Trained:
 
 
 def train_one(training: Training, seed: int, folder: Path, tensorboard: bool = False) -> Trained:
-    """Train with one seed on one thread, so that one training per core can run in parallel."""
+    """Train with one seed on a single thread, so that one training per core can run in parallel."""
     import torch
 
     torch.set_num_threads(1)
@@ -189,7 +189,7 @@ def train_one(training: Training, seed: int, folder: Path, tensorboard: bool = F
 
 
 class _Evaluator(BaseCallback):  # type: ignore[misc]
-    """Callback that evaluates the model as it learns, and saves it."""
+    """Callback that evaluates and saves the model during training."""
 
     def __init__(self, training: Training, seed: int, folder: Path, env: VecEnv, curve: list[Row]) -> None:
         super().__init__()
@@ -199,7 +199,7 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
         self._due = self._due_after(curve[-1]["steps"] if curve else 0)
 
     def _due_after(self, steps: int) -> int:
-        """Step of the next evaluation; a function of `steps` alone, so that an interruption changes nothing."""
+        """Return the step of the next evaluation; it depends on `steps` alone, so an interruption changes nothing."""
         return self.subject.evaluate_every * (1 + steps // self.subject.evaluate_every)
 
     def _on_training_start(self) -> None:
@@ -220,7 +220,7 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
             self.logger.record(f"evaluation/{name}", value)
 
     def evaluate(self, model: Any, steps: int) -> Row:
-        """Evaluate; write the curve, a checkpoint, and the model if it is the best so far; return the metrics."""
+        """Evaluate, write the curve and a checkpoint, keep the model if it is the best so far; return the metrics."""
         subject = self.subject
         scores = subject.evaluate(model, self.env)
         row = {"steps": steps, **scores, "wall_s": time.monotonic() - self._start}
@@ -256,7 +256,7 @@ def write_curve(path: Path, curve: Sequence[Mapping[str, Any]]) -> None:
 
 
 def read_curve(path: Path) -> list[Row]:
-    """Read evaluations from CSV; none without a file.
+    """Read evaluations from CSV; return an empty list if there is no file.
 
     Raises:
         InputError: a value is not a number.

@@ -1,4 +1,4 @@
-"""Training for `parkenv/Search-v1`: total time counts."""
+"""Training for `parkenv/Search-v1`: the score is the mean total time."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ class SearchTraining(Training):
         algorithm: one of `SEARCH_CONFIGS`.
         steps: decisions in total.
         evaluate_every: decisions between evaluations.
-        scenarios: to train on, in rotation.
-        evaluation_seeds: seeds of the held-out worlds, of the first scenario.
+        scenarios: scenarios to train on, in rotation.
+        evaluation_seeds: seeds of the held-out worlds in the first scenario.
         k: number of slots in the observation.
-        demonstrations: for behaviour cloning before training; None for none.
+        demonstrations: demonstrations to clone before training; None for no cloning.
 
     Raises:
-        InputError: an unknown algorithm, one without behaviour cloning, or a number out of its range.
+        InputError: an unknown algorithm, one that does not support behaviour cloning, or a number out of range.
     """
 
     scenarios: tuple[Scenario, ...]
@@ -67,7 +67,7 @@ class SearchTraining(Training):
         return ("total_s", "low_s", "high_s", "parked_fraction")
 
     def make_env(self, seed: int, curve: Sequence[Row]) -> VecEnv:
-        """Make a batch of searches in all scenarios."""
+        """Make a batch of search environments over all scenarios."""
         del curve
         env = SearchVecEnv(
             self.config.n_envs, self.scenarios, REWARD_SCALE, self.k, max_episode_steps=MAX_STEPS
@@ -82,16 +82,16 @@ class SearchTraining(Training):
         return dict(zip(self.metrics, (*mean_interval(times), float(parked.mean())), strict=True))
 
     def score(self, row: Row) -> tuple[float, ...]:
-        """Minus the mean total time."""
+        """Return minus the mean total time."""
         return (-row["total_s"],)
 
     def prepare(self, model: Any, seed: int) -> None:
-        """Clone the demonstrations, if there are any."""
+        """Clone the demonstrations, if any."""
         if self.demonstrations is not None:
             clone(model, self.demonstrations, seed)
 
     def model_card(self, seed: int, steps: int) -> ModelCard:
-        """Metadata of the model file."""
+        """Return the metadata of the model file."""
         config = self.config
         settings = {"n_envs": config.n_envs, "policy": config.policy, **config.settings}
         settings["clone"] = None if self.demonstrations is None else self.demonstrations.agent
@@ -100,7 +100,7 @@ class SearchTraining(Training):
 
 
 def search_times(agent: LearnedAgent, scenario: Scenario, seeds: Sequence[int]) -> Row:
-    """Total times of a model, as columns of `parkenv compare`."""
+    """Run a model, and return its total times as columns of `parkenv compare`."""
     times, parked = episode_times(agent.model, scenario, seeds, agent.local_k)
     mean, low, high = mean_interval(times)
     return {
@@ -114,13 +114,13 @@ def search_times(agent: LearnedAgent, scenario: Scenario, seeds: Sequence[int]) 
 def episode_times(
     model: Any, scenario: Scenario, seeds: Sequence[int], k: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Total times of a model's episodes, (n,) s, and whether it parked, (n,) bool.
+    """Run episodes; return their total times, (n,) s, and whether the car parked, (n,) bool.
 
     An episode that has not ended after `MAX_STEPS` decisions is charged `give_up_s`, as in `parkenv compare`.
 
     Args:
-        model: of stable-baselines3 or sb3-contrib, over the `local` observation.
-        scenario: to search in.
+        model: a stable-baselines3 or sb3-contrib model of the `local` observation.
+        scenario: scenario to search in.
         seeds: one episode each.
         k: number of slots in the observation.
     """

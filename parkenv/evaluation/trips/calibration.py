@@ -1,7 +1,7 @@
-"""Calibrate the search environment from driven trips: speed on the lanes, manoeuvre time, time of a failed attempt.
+"""Calibrate the search environment from driven trips: lane speed, manoeuvre time and cost of a failed attempt.
 
 The drive graph charges an edge's length at `v_drive`, nothing for the manoeuvre into a slot, and `failure_s` for a
-failed attempt. Here these values are measured in driven trips.
+failed attempt. This module measures these values in driven trips.
 """
 
 from __future__ import annotations
@@ -47,19 +47,19 @@ _FORMAT = JsonFormat("parkenv-calibration", 1, "a calibration of `parkenv calibr
 
 @dataclass(frozen=True)
 class Calibration:
-    """Values measured in a scenario, which may replace its assumed ones.
+    """Values measured in a scenario, which may replace the assumed ones.
 
     Args:
-        scenario: its name.
-        v_drive: m/s, m of the drive graph over the time on the lanes.
-        failure_s: s, time of an attempt at a taken slot, less the time of the onward way that it has covered already.
-        manoeuvre_s: s, from the decision to park until the car stands in the slot. The drive graph charges nothing for
-            it, so it adds to the total time of every agent that parks.
+        scenario: name of the scenario.
+        v_drive: m/s, distance on the drive graph divided by the time on the lanes.
+        failure_s: s, time of an attempt at a taken slot, less the time for the part of the onward route that it covers.
+        manoeuvre_s: s, from the decision to park until the car stands in the slot. The drive graph does not charge it,
+            so it adds to the total time of every agent that parks.
         trips: number of trips.
-        speed_limit: m/s, on the lanes.
+        speed_limit: speed limit on the lanes, m/s.
 
     Raises:
-        InputError: a value out of its range, by name.
+        InputError: a value is out of range; the message names it.
     """
 
     scenario: str
@@ -82,15 +82,15 @@ class Calibration:
         return scenario.replace(v_drive=self.v_drive, failure_s=self.failure_s)
 
     def to_file(self, path: Path) -> None:
-        """Write it as JSON, atomically."""
+        """Write the calibration as JSON, atomically."""
         _FORMAT.write(path, dataclasses.asdict(self))
 
     @classmethod
     def from_file(cls, path: Path) -> Self:
-        """Read a file of `to_file`.
+        """Read a file written by `to_file`.
 
         Raises:
-            InputError: the file cannot be read, or is not a calibration.
+            InputError: the file cannot be read or is not a calibration.
         """
         content = _FORMAT.read(path)
         names = [f.name for f in dataclasses.fields(cls)]
@@ -106,7 +106,7 @@ class TripPlan:
     Args:
         scenario: the scenario.
         agent: name of the agent.
-        style: of driving.
+        style: driving style.
         rig: name of the sensor rig; None for the scenario's sensor model.
     """
 
@@ -116,14 +116,14 @@ class TripPlan:
     rig: str | None = None
 
     def run(self, slots: str, seeds: Sequence[int]) -> list[Row]:
-        """Drive trips; returns `trip_row` of each."""
+        """Drive the trips; return the `trip_row` of each."""
         scenario, rig = (self.scenario, self.rig) if slots == OBSERVED else (unseen(self.scenario), None)
         search = DrivenSearch(scenario, self.agent, style=self.style, rig=rig)
         return [trip_row(search.run(seed), slots) for seed in seeds]
 
 
 def trip_row(trip: Trip, slots: str) -> Row:
-    """Return a trip as JSON data; `slots` tells whether slots were observed from the lane."""
+    """Return a trip as JSON data; `slots` is `OBSERVED` or `UNOBSERVED`."""
     row = dataclasses.asdict(trip)
     return {
         "slots": slots,
@@ -134,11 +134,11 @@ def trip_row(trip: Trip, slots: str) -> Row:
 
 
 class TripFolder:
-    """The file of trips, to which every finished trip adds a line.
+    """The file of trips, with one line per finished trip.
 
     Args:
-        path: the folder; it exists.
-        settings: all that affects the outcome of a trip.
+        path: an existing folder.
+        settings: everything that affects the outcome of a trip.
         resume: continue an earlier run.
 
     Attributes:
@@ -185,9 +185,9 @@ def drive_trips(
     workers: Workers = HERE,
     on_progress: Callable[[int], None] = lambda _: None,
 ) -> list[Row]:
-    """Drive the missing trips, each seed with and without observations of slots; returns all rows in order.
+    """Drive the missing trips, each seed with and without slot observations; return all rows in order.
 
-    An agent that observes slots hardly ever attempts a taken one; trips without observations provide failed attempts.
+    Agents that observe slots hardly ever attempt a taken one; trips without observations provide failed attempts.
     """
     tasks = [
         partial(plan.run, slots, block)
@@ -212,13 +212,13 @@ def samples(rows: Sequence[Row], speed: float) -> dict[str, FloatArray]:
     """Collect the samples of each measured quantity.
 
     Args:
-        rows: of trips.
-        speed: m/s on the lanes, which turns the onward way of a failed attempt into time.
+        rows: rows of trips.
+        speed: speed on the lanes, m/s; converts the onward distance of a failed attempt into time.
 
     Returns:
-        `speed_kmh` on the lanes, of each trip with observations; `manoeuvre_s`, also by kind of slot, of those;
-        `failed_s`, also by kind of slot: time of a failed attempt until the car is back on the lane; `lost_s`: the
-        same, less the onward way; `s_per_m` by kind of edge.
+        From trips with observations: `speed_kmh` on the lanes, and `manoeuvre_s`, also by kind of slot.
+        `failed_s`, also by kind of slot: time of a failed attempt until the car is back on the lane. `lost_s`: the
+        same, less the time of the onward distance. `s_per_m` by kind of edge.
     """
     observed = [row for row in rows if row["slots"] == OBSERVED]
     attempts = [ParkingAttempt(*t) for row in rows for t in row["attempts"]]
@@ -255,13 +255,13 @@ def summary_of(values: FloatArray) -> Row:
 
 
 def calibrate(rows: Sequence[Row], scenario: Scenario, speed_limit: float) -> tuple[Calibration, list[Row]]:
-    """Compute the calibration, and a row for each distribution.
+    """Compute the calibration and one row per distribution.
 
     The speed is the total distance of trips with observations over their total time, so that drive times on the graph
     are right on average.
 
     Raises:
-        InputError: no trip parked, or no attempt failed.
+        InputError: no trip ended parked, or no attempt failed.
     """
     observed = [row for row in rows if row["slots"] == OBSERVED]
     metres = np.array([row["graph_m"] for row in observed])

@@ -1,4 +1,4 @@
-"""Whole trips: an agent decides on the drive graph, and a simulated car drives, from the entry into the slot."""
+"""Whole trips: an agent decides on the drive graph, and a simulated car drives from the entry into the slot."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from sim_sensors.rig import SensorRig
 
 
 class DrivenSearchEnv(SearchEnv):
-    """`parkenv/Search-v1` with continuous driving: edges, waits and attempts take the time that a simulated car needs.
+    """`parkenv/Search-v1` with continuous driving: edges, waits and attempts take as long as a simulated car needs.
 
-    World, observations and decisions are those of `parkenv/Search-v1`. An attempt also fails where the car does not get
-    into a free slot, which then counts as taken. The time of the manoeuvre into the slot counts as driven.
+    World, observations and decisions are those of `parkenv/Search-v1`. An attempt also fails if the car does not fit
+    into a free slot, which then counts as taken. The manoeuvre into the slot counts as driving time.
 
     Args:
         scenario: the scenario.
-        executor: carries out the decisions.
-        perception: sensors on the car, whose scenario this is: the belief is updated from what they measure on the
-            driven path, as in `parkenv/SearchPerception-v1`. None: slots are observed from the vertices, with the
-            scenario's sensor model.
+        executor: executes the decisions.
+        perception: simulated sensors on the car, made for this scenario: the belief is updated from their measurements
+            along the driven path, as in `parkenv/SearchPerception-v1`. If None, slots are observed from the vertices
+            with the scenario's sensor model.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class DrivenSearchEnv(SearchEnv):
         return result
 
     def _advance(self, action: int) -> tuple[Any, ...]:
-        """Drive the action, and advance the world by the time that it took."""
+        """Execute the action, and advance the world by the time it took."""
         state, control = self._state, self._control
         vertex, begin = state.vertex, state.time
         possible = self.scenario.action_masks[vertex, action] == 1
@@ -76,12 +76,12 @@ class DrivenSearchEnv(SearchEnv):
         if not state.parked:
             self._observe(moved=possible and action != PARK)
             for slot in self._refused:
-                # It looks free, but this car does not fit into it.
+                # The slot looks free, but this car does not fit.
                 control.set_taken(slot)
         return control.finish_step()
 
     def _observe(self, *, moved: bool) -> None:
-        """Update the belief from the observations at the car's place and on its way there."""
+        """Update the belief from the observations along the driven path and at its end."""
         perception = self.perception
         if perception is None:
             self._control.observe()
@@ -115,26 +115,26 @@ class Trip:
     """One trip from the entry to the goal.
 
     Attributes:
-        seed: of the world.
+        seed: seed of the world.
         agent: name of the agent.
-        total_s: the sum of the next six.
+        total_s: sum of the next six.
         lanes_s: driving on the lanes, waiting included.
         manoeuvre_s: from the decision to park until the car stood in the slot.
-        failed_s: of failed attempts.
+        failed_s: failed attempts.
         walk_s: walk to the goal.
-        parking_cost_s: of the slot, as time.
+        parking_cost_s: parking cost of the slot, as time.
         gave_up_s: give-up penalty.
         parked: whether the car was parked.
-        slot: its name; empty where not parked.
-        slot_kind: its orientation to the lane.
-        graph_m: m, length of the driven edges in the graph.
-        driven_m: m driven, forward and backward.
+        slot: name of the slot; empty if not parked.
+        slot_kind: orientation of the slot to the lane.
+        graph_m: length of the driven edges in the graph, m.
+        driven_m: distance driven, forward and backward, m.
         contacts: number of collisions.
-        strays: how often it left its path.
-        rescues: how often it was stuck and was put back on the lane.
-        waited_s: s, braking and standing for other road users.
+        strays: how often the car left its path.
+        rescues: how often the car was stuck and was put back on the lane.
+        waited_s: time spent braking and standing for other road users, s.
         legs: the driven edges, in order.
-        attempts: in order.
+        attempts: the parking attempts, in order.
     """
 
     seed: int
@@ -164,16 +164,17 @@ class DrivenSearch:
 
     Args:
         scenario: the scenario with its traffic.
-        agent: name of an agent, with its options in brackets: see `make_agent` and `AgentSpec`.
+        agent: name of an agent, with its options in brackets; see `make_agent` and `AgentSpec`.
         vehicle: the car.
-        style: of driving.
-        rig: sensors that ride along and tell the car which slots are taken: laser, stereo, both_sides, or a
-            `sim_sensors.rig.SensorRig`; None where the scenario's sighting model stands for them.
-        weather: as of `parkenv/SearchPerception-v1`.
-        captures: most captures per edge.
+        style: driving style.
+        rig: simulated sensors that observe the slots: laser, stereo, both_sides, or a `sim_sensors.rig.SensorRig`;
+            None to use the scenario's sensor model.
+        weather: as in `parkenv/SearchPerception-v1`.
+        captures: maximum number of captures per edge.
 
     Raises:
-        InputError: an unknown agent, rig or weather, a speed above the car's, or a lot without a slot for the car.
+        InputError: an unknown agent, rig or weather, a speed above the car's maximum, or a lot without a slot that
+            fits the car.
 
     Example:
         >>> import math
@@ -205,15 +206,15 @@ class DrivenSearch:
     def run(
         self, seed: int, observers: Sequence[Observer] = (), on_control: Callable[[], None] = lambda: None
     ) -> Trip:
-        """Drive the trip in the world of a seed.
+        """Drive one trip in the world of a seed.
 
         Args:
-            seed: 0 or more.
-            observers: of the decisions.
+            seed: seed of the world, at least 0.
+            observers: observers of the decisions.
             on_control: called after every 0.1 s of driving; `driver` and `env` hold the current state.
 
         Raises:
-            InputError: a seed that is not a whole number of at least 0.
+            InputError: the seed is not an integer of at least 0.
         """
         if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
             raise InputError(f"seed is {seed!r}, want a whole number of at least 0")

@@ -1,4 +1,4 @@
-"""The interface of what carries out the decisions of a driven search."""
+"""Interface between a search on the drive graph and the car that executes its decisions."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ FloatArray = NDArray[np.float64]
 
 ALONG, TURN, ROUND, ACROSS = "along", "turn", "round", "across"
 EDGE_KINDS = (ALONG, TURN, ROUND, ACROSS)
-"""Kinds of edges by how they are driven: straight on; with a turn into another lane; with a turn-around; across a
-two-way lane, where the car turns round only when it drives on, not to park."""
+"""Kinds of edges: straight on; with a turn into another lane; with a U-turn; across a two-way lane, where the car turns
+round only if it drives on afterwards, not if it parks."""
 TAKEN, NO_ROOM, NO_WAY = "taken", "too narrow", "no way in"
 """Reasons of failed attempts."""
 
@@ -34,13 +34,13 @@ class ParkingAttempt(NamedTuple):
     """An attempt to park.
 
     Attributes:
-        slot: its name.
-        kind: how it lies to its lane.
-        way: nose-in or back-in; empty where no path was found, and for parallel slots.
+        slot: name of the slot.
+        kind: orientation of the slot to its lane.
+        way: nose-in or back-in; empty for parallel slots and if no path was found.
         seconds: from the decision until the car stands in the slot, or is back on the lane.
-        reason: of the failure; empty where the car is parked.
-        onward_m: m, how far beyond the slot's vertex the car is on the lane after a failed attempt: that much of the
-            next edges is driven already.
+        reason: reason of the failure; empty if the car parked.
+        onward_m: distance of the car on the lane beyond the slot's vertex after a failed attempt, m; this part of the
+            next edges is already driven.
     """
 
     slot: str
@@ -52,13 +52,13 @@ class ParkingAttempt(NamedTuple):
 
 
 class TrackPoint(NamedTuple):
-    """Where the car and all road users were at a time.
+    """Positions of the car and all road users at one time.
 
     Attributes:
         time: s since Monday 00:00.
-        driven_m: m driven so far.
+        driven_m: distance driven so far, m.
         pose: (3,) x, y in m, yaw in rad, of the middle of the car's footprint.
-        clocks: (n,) s, of the moving road users, see `RoadUsers`.
+        clocks: (n,) s, clocks of the moving road users, see `RoadUsers`.
     """
 
     time: float
@@ -68,26 +68,25 @@ class TrackPoint(NamedTuple):
 
 
 class MotionExecutor(Protocol):
-    """Carries out decisions on the drive graph, and reports how long they took.
+    """Executes decisions on the drive graph and returns how long they took.
 
     Attributes:
-        track: where the car has been since the last decision, every 0.1 s; empty where no time passed, or without a
-            car.
+        track: positions of the car since the last decision, every 0.1 s; empty if no time passed or there is no car.
     """
 
     track: list[TrackPoint]
 
     def begin(self, key: np.uint64, world: World, vertex: int, time: float) -> None:
-        """Start at a vertex at a time, s, in the world of a key."""
+        """Start at a vertex, at a time in s, in the world with this key."""
 
     def drive(self, source: int, column: int) -> float:
-        """Drive along an edge; returns s."""
+        """Drive along an edge; return the time taken, s."""
 
     def park(self, slot: int, taken: bool) -> ParkingAttempt:
-        """Try to park; a taken slot looks free until the car notices."""
+        """Attempt to park; a taken slot looks free until the car notices that it is taken."""
 
     def wait(self, seconds: float) -> float:
-        """Stand still; returns s."""
+        """Stand still; return the time taken, s."""
 
     def movers_at(self, point: TrackPoint) -> Movers | None:
-        """Return the road users at the time of a track point; None without traffic."""
+        """Return the road users at a track point's time; None without traffic."""

@@ -1,4 +1,4 @@
-"""Drive a car through a lot: along the lanes, into slots, and back out of those that turn out taken."""
+"""Drive a car through a lot: along the lanes, into slots, and back out of slots that turn out to be taken."""
 
 from __future__ import annotations
 
@@ -48,19 +48,19 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 RESCUE_S = 60.0
-"""s until a stuck car is back on the lane."""
+"""Time until a stuck car is back on the lane, s."""
 PATIENCE_S = 3.0
-"""s for which the car and another waiting road user stand until the other gives way."""
+"""Time for which the car and a waiting road user both stand until the other gives way, s."""
 TURN_IN_M = 9.0
-"""m, from the rear axle to the middle of a junction at which the turn begins."""
+"""Distance from the rear axle to the middle of a junction at which the turn begins, m."""
 
 _LEAD_M = 1.5
 _LANE = SearchSettings(change_m=8.0, attempts=((0.25, 0.5), (0.15, 0.5), (0.08, 0.5), (0.03, 0.25)))
-_WIDE = (0.6, 0.3, 0.06)  # margins, by which turns are wider than necessary where there is room
-_ONTO = (4.0, 6.5, 9.0, 12.0)  # m after a junction, where a turn into the lane may end
-_BACK = (0.0, 3.0, 6.0, 9.0)  # m after a slot, or after where the car turns round
-_CHANGE_S = 3.0  # s, about what a change of direction takes
-_PACE = 1.5  # m/s, about how fast one drives between them
+_WIDE = (0.6, 0.3, 0.06)  # margins by which turns are widened if there is room
+_ONTO = (4.0, 6.5, 9.0, 12.0)  # m after a junction at which a turn into the lane may end
+_BACK = (0.0, 3.0, 6.0, 9.0)  # m after a slot or the place where the car turns round
+_CHANGE_S = 3.0  # s, approximate time of a change of direction
+_PACE = 1.5  # m/s, approximate speed between changes of direction
 _NEAR_M, _ALIGNED = 0.4, math.radians(10.0)
 _AROUND = math.radians(150.0)
 _STRAYED_M = 1.0
@@ -79,13 +79,13 @@ class DrivingStyle:
     """Parameters of driving.
 
     Args:
-        speed: m/s, highest on the lanes; None for the scenario's `v_drive`.
-        acceleration: m/s², and deceleration before turns.
-        braking: m/s², before parking.
-        notice_m: m along its path, the distance at which the car notices at the latest that a slot is taken.
+        speed: maximum on the lanes, m/s; None for the scenario's `v_drive`.
+        acceleration: acceleration, and deceleration before turns, m/s².
+        braking: deceleration before parking, m/s².
+        notice_m: distance along the path, m, at which the car notices at the latest that a slot is taken.
 
     Raises:
-        InputError: a value that is not a finite number above 0, or a notice distance too short to stop.
+        InputError: a value is not a finite number above 0, or the notice distance is too short to stop.
 
     Example:
         >>> DrivingStyle(notice_m=0.1)
@@ -120,11 +120,11 @@ class DriveLog:
     Attributes:
         legs: driven edges.
         attempts: parking attempts.
-        driven_m: m, forward and backward.
+        driven_m: distance driven, forward and backward, m.
         contacts: kinds of obstacles touched, one per collision.
         strays: how often the car left its path and planned another.
-        rescues: how often there was none, and the car was put back on the lane.
-        waited_s: s, braking and standing for other road users.
+        rescues: how often no path was found and the car was put back on the lane.
+        waited_s: time spent braking and standing for other road users, s.
     """
 
     legs: list[Leg] = field(default_factory=list)
@@ -137,26 +137,26 @@ class DriveLog:
 
 
 class LotDriver:
-    """Drives a kinematic bicycle among pymunk bodies, by lane keeping and planned manoeuvres.
+    """Drives a kinematic bicycle model among pymunk bodies, by lane keeping and planned manoeuvres.
 
-    Paths along lanes are straights and arcs; paths between lanes are planned among kerbs, walls and slots as if all
-    slots were filled, so they can be driven at any time. Parking, turning round and leaving a slot are planned among
-    the cars that are parked there. Cars that arrive during a manoeuvre wait until it is over.
+    Paths along lanes are straights and arcs. Paths between lanes are planned as if all slots were taken, so they can be
+    driven at any time. Parking, turning round and leaving a slot are planned among the cars that are parked there. Cars
+    that arrive during a manoeuvre wait until it is over.
 
-    The scenario's traffic moves meanwhile. The car brakes for road users in its way now or soon, and they for it; where
-    both have stood for `PATIENCE_S`, the others give way, see `RoadUsers`.
+    The scenario's traffic moves meanwhile. The car brakes for road users that are in its way now or soon, and they
+    brake for the car; if both have stood for `PATIENCE_S`, the others give way, see `RoadUsers`.
 
     Args:
-        scenario: with lot, parked cars and traffic.
+        scenario: the scenario, with lot, parked cars and traffic.
         vehicle: the car.
-        style: of driving.
+        style: driving style.
 
     Attributes:
-        log: of the drive since `begin`.
-        state: (6,) of the vehicle, see `parkenv.driving.vehicle`.
-        time: now, s.
+        log: record of the drive since `begin`.
+        state: (6,) state of the vehicle, see `parkenv.driving.vehicle`.
+        time: current time, s.
         doing: current activity, for displays.
-        track: the car's places since the last decision, every 0.1 s.
+        track: positions of the car since the last decision, every 0.1 s.
         others: moving road users; None without traffic.
         on_control: called after every control step, 0.1 s.
     """
@@ -189,7 +189,7 @@ class LotDriver:
         self.time = 0.0
 
     def begin(self, key: np.uint64, world: World, vertex: int, time: float) -> None:
-        """Start at a vertex at a time, s, in the world of a key; at full speed."""
+        """Start at a vertex at full speed, at a time in s, in the world with this key."""
         self._around.begin(key, world)
         self.log = DriveLog()
         self.track = []
@@ -209,7 +209,7 @@ class LotDriver:
         self._enter(self._standing(self.scenario.lot.vertex_xy[vertex]))
 
     def drive(self, source: int, column: int) -> float:
-        """Drive along an edge of the graph to its end; returns s."""
+        """Drive along an edge of the graph to its end; return the time taken, s."""
         lot = self.scenario.lot
         target, length = int(lot.neighbors[source, column]), float(lot.edge_length[source, column])
         edge = self._lines.edge(source, target, length)
@@ -229,11 +229,11 @@ class LotDriver:
         return leg.seconds
 
     def park(self, slot: int, taken: bool) -> ParkingAttempt:
-        """Stop, plan a manoeuvre into a slot and drive it; if it is taken or too narrow, drive back onto the lane.
+        """Stop, plan a manoeuvre into a slot and drive it; if it is taken or too narrow, return to the lane.
 
         Args:
-            slot: its index.
-            taken: whether a car is parked in it, which this car notices when it is about to drive in.
+            slot: index of the slot.
+            taken: whether a car is parked in the slot; this car notices it when it is about to drive in.
         """
         lot, vehicle, began = self.scenario.lot, self.vehicle, self.time
         self.track = []
@@ -259,7 +259,7 @@ class LotDriver:
         return result
 
     def wait(self, seconds: float) -> float:
-        """Brake, and stand for some time; returns s."""
+        """Brake, and stand for some time; return the time taken, s."""
         until, self.track = self.time + seconds, []
         self._refresh()
         while self.time < until - 1e-9:
@@ -281,7 +281,7 @@ class LotDriver:
         self._clear_area()
 
     def _plan_edge(self, edge: DrivenEdge) -> str:
-        """Plan the path along an edge from the car's place; returns the edge's kind."""
+        """Plan the path along an edge from the car's pose; return the edge's kind."""
         if self._line == edge.line and self._keeper is not None and not self._keeper.done:
             return ALONG
         line = self._lines.lines[edge.line]
@@ -312,7 +312,7 @@ class LotDriver:
         self._keeper = LaneKeeper(self.vehicle, rounded(points, _BEND_M), self._on_lane)
 
     def _turn(self, before: int, edge: DrivenEdge, at: float) -> CarPath | None:
-        """Plan the turn from the car's line to one that crosses it at station `at`; None if there is none."""
+        """Plan the turn from the car's line to one that crosses it at station `at`; return None if there is none."""
         here, line = self._lines.lines[before], self._lines.lines[edge.line]
         # Measured to the middle of the junction, not to the near side of the other lane.
         now = here.station_of(self.state[:2])
@@ -334,7 +334,7 @@ class LotDriver:
         return joined(rounded(here.between(now, leave), _BEND_M), path)
 
     def _turn_onto(self, line: DrivenLine) -> str:
-        """Drive from the car's place onto a line, and continue along it; returns the edge's kind."""
+        """Drive from the car's pose onto a line, and continue along it; return the edge's kind."""
         self._halt(self.style.braking)
         askew = 0.0
         for _ in range(_MOST_PLANS):
@@ -391,7 +391,7 @@ class LotDriver:
         return None if best is None else best[1]
 
     def _keep_lane(self) -> bool:
-        """Drive one control step along the lane; returns False at its end."""
+        """Drive one control step along the lane; return False at its end."""
         assert self._keeper is not None
         pose, speed, steering = self.state[:3], float(self.state[SPEED]), float(self.state[STEERING])
         command = self._keeper.command(pose, speed, steering)
@@ -427,7 +427,7 @@ class LotDriver:
     def _drive_in(
         self, targets: dict[str, FloatArray], there: Obstacles, inside: FloatArray | None
     ) -> tuple[str, str]:
-        """Drive to the target that is reached first; returns its name, and the reason of a failure."""
+        """Drive to the target with the fastest path; return its name, and the reason of a failure."""
         ways = list(targets)
         for _ in range(_MOST_PLANS):
             paths = {way: path for way in ways if (path := self._planned_to(targets[way], there)) is not None}
@@ -450,7 +450,7 @@ class LotDriver:
         return way, NO_WAY
 
     def _noticing(self, tracker: PathTracker, inside: FloatArray) -> Callable[[], bool]:
-        """Return a function that tells whether the path meets an outline within `notice_m`."""
+        """Return a function that checks whether the path meets an outline within `notice_m`."""
         body = shapely.Polygon(inside)
         ahead = np.arange(0.0, self.style.notice_m + _NOTICE_STEP, _NOTICE_STEP)
 
@@ -461,12 +461,12 @@ class LotDriver:
         return notices
 
     def _planned_to(self, target: FloatArray, there: Obstacles) -> CarPath | None:
-        """Plan a path to a pose of the footprint's middle."""
+        """Plan a path to a pose of the footprint's centre."""
         goal = self.vehicle.at_rear_axle(target)
         return plan_path(self.vehicle, there.corners, there.n_corners, self.state[:3], goal)
 
     def _follow(self, tracker: PathTracker, notices: Callable[[], bool] | None = None) -> bool:
-        """Follow a path to its end, or stop off the path; returns False where `notices` stopped the car."""
+        """Follow a path to its end, or stop if the car leaves it; return False if `notices` stopped the car."""
         while True:
             pose, speed, steering = self.state[:3], float(self.state[SPEED]), float(self.state[STEERING])
             command = tracker.command(pose, speed, steering)
@@ -484,7 +484,7 @@ class LotDriver:
                 self._step(*command)
 
     def _back(self, slot: int) -> float:
-        """Drive back onto the slot's lane or the previous one, whichever is faster; returns `onward_m`."""
+        """Drive back onto the slot's lane or the previous one, whichever is faster; return `onward_m`."""
         ways = [self._lines.at(slot)]
         if self._line is not None and self._line != ways[0][0]:
             line = self._lines.lines[self._line]
@@ -527,12 +527,12 @@ class LotDriver:
         self._clear_area()
 
     def _clear_area(self) -> None:
-        """Hide road users that stand where the car was put."""
+        """Hide road users that stand where the car was placed."""
         if self.others is not None:
             self.others.clear_area(self.vehicle.corners(self.state[:3]))
 
     def _yields(self, tracker: PathTracker) -> bool:
-        """Brake or stand for a step if a road user is in the way along a path; returns whether it did."""
+        """Brake or stand for one step if a road user blocks the path; return whether the car did."""
         if self.others is None:
             return False
         speed = abs(float(self.state[SPEED]))
@@ -567,7 +567,7 @@ class LotDriver:
         self._step(-math.copysign(min(share, 1.0), speed) if speed else 0.0, wheels)
 
     def _step(self, acceleration: float, steering: float) -> None:
-        """Drive one control step."""
+        """Advance the car by one control step."""
         others = self.others
         if others is not None:
             others.advance(CONTROL_S, self.vehicle.corners(self.state[:3]))
@@ -594,7 +594,7 @@ class LotDriver:
         self._enter(self._standing(self.state[:2]))
 
     def _standing(self, center: FloatArray, looks_free: int | None = None) -> Obstacles:
-        """Return the obstacles around a point, (2,) m, without waiting cars and a car in `looks_free`."""
+        """Return the obstacles around a point, (2,) m, without waiting cars and any car in slot `looks_free`."""
         taken = set(self._around.taken(center, self.time))
         if self._knew is not None:
             new = np.array(sorted(taken - self._knew), dtype=np.int64)

@@ -34,7 +34,7 @@ class ParkingCase:
 
     Args:
         lot: the lot.
-        kinds: kinds of slots; None for all that the lot has.
+        kinds: kinds of slots; None for all kinds on the lot.
         ways: orientations in perpendicular and oblique slots.
         occupancy: fraction of the other slots that are occupied.
         slack: distance around the slot kept clear of parked cars, m.
@@ -66,7 +66,7 @@ class Parking:
     """Result of one parking episode.
 
     Attributes:
-        row: its metrics.
+        row: metrics of the episode.
         state: final state of the episode, with the driven trail.
         frames: rendered frames, if requested.
     """
@@ -114,13 +114,13 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
     Args:
         env: `parkenv/Drive-v1`; with `render_mode="rgb_array"` for pictures.
         agent: the parking agent.
-        seed: of the task.
+        seed: seed of the task.
         every: steps between frames; 0 for none.
 
     Returns:
         A row with lot, seed, kind, way, slot, parked, reason (of a failure), time_s, driven_m, direction_changes,
         wheel_rad and turned_rad (total change of steering angle and heading), position_error_m,
-        angle_error_deg; of a planner also plans, planning_s (all of them), path_m, expansions, margin_m.
+        angle_error_deg; for a planner also plans, planning_s (all plans), path_m, expansions, margin_m.
     """
     recorder = _ParkingRecorder(every)
     result = simulate(env, agent, seed, (recorder,))
@@ -162,12 +162,12 @@ def park_all(
 ) -> Iterator[list[Parking]]:
     """Run every seed of every case with one agent; yield the parkings in order.
 
-    Only wall times differ from run to run, on any number of workers.
+    Results do not depend on the number of workers; only wall times differ from run to run.
 
     Args:
         cases: the tasks.
-        seeds: of the tasks.
-        workers: where they run.
+        seeds: seeds of the tasks.
+        workers: where the episodes run.
         agent: a name for `planners.driving.parking_agents.make_parking_agent`.
     """
     parts = [seeds[i : i + CHUNK] for i in range(0, len(seeds), CHUNK)]
@@ -180,7 +180,7 @@ def _park_some(case: ParkingCase, seeds: Sequence[int], name: str) -> list[Parki
 
 
 def parking_table(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Summarise parkings: a row for each kind of slot and way of parking, and one for all (`kind` "all").
+    """Summarise parkings: one row per kind of slot and way of parking, and one for all (`kind` "all").
 
     Returns:
         kind, way, episodes, parked, success and its 95 % interval (Wilson), contacts; median and p95 of planning_ms
@@ -194,7 +194,7 @@ def parking_table(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def write_parkings(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Write the rows of parkings as CSV, atomically."""
+    """Write rows of parkings as CSV, atomically."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
     with atomic_write(path) as beside, beside.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")

@@ -36,9 +36,9 @@ FloatArray = NDArray[np.float64]
 TIMELINE = "drive"
 """Seconds since the first drive began."""
 PAUSE_S = 5.0
-"""Between two drives."""
+"""Pause between two drives, s."""
 GRID_EVERY = 10
-"""Captures between two images of the grid, which is large and changes little."""
+"""Record the grid at every this many captures only: it is large and changes little."""
 JPEG_QUALITY = 80
 UNOBSERVED_GREY = 40
 SIDE, END, UNRANGED = (255, 208, 0), (86, 180, 233), (150, 150, 150)
@@ -68,7 +68,7 @@ class SensorLog:
         self._draw_rig()
 
     def begin(self) -> None:
-        """Begin another drive, after the ones recorded so far."""
+        """Begin another drive after those recorded so far."""
         self._begun = 0.0 if not self._n_captures else self._time + PAUSE_S
         self._path = []
 
@@ -76,8 +76,8 @@ class SensorLog:
         """Record the estimated pose of the car, its measurements, and the detected cars.
 
         Args:
-            time: s since the drive began.
-            result: of the perception pipeline.
+            time: time since the drive began, s.
+            result: result of the perception pipeline.
         """
         import rerun as rr
 
@@ -122,7 +122,7 @@ class SensorLog:
         self._n_captures += 1
 
     def slots(self, p_occupied: FloatArray, known: NDArray[np.bool_] | None = None) -> None:
-        """Record P(taken) of every slot, (n_slots,); grey where not `known`."""
+        """Record P(taken) of every slot, (n_slots,); slots that are not `known` are grey."""
         import rerun as rr
 
         colors = (255.0 * colormaps["cividis"](p_occupied)).astype(np.uint8)
@@ -200,7 +200,7 @@ def require_viewer() -> None:
     """Check that the Rerun SDK is installed.
 
     Raises:
-        InputError: it is not.
+        InputError: the SDK is missing.
     """
     if find_spec("rerun") is None:
         raise InputError("a recording needs the Rerun SDK; install it with: pip install 'parkenv[viewer]'")
@@ -208,7 +208,7 @@ def require_viewer() -> None:
 
 @contextmanager
 def sensor_log(path: str | Path, lot: ParkingLot, rig: SensorRig) -> Iterator[SensorLog]:
-    """Open a log that becomes the file `path`, an .rrd, at the end of the block.
+    """Open a log that is written to `path` (.rrd) at the end of the block.
 
     Raises:
         InputError: the extra `viewer` is not installed, or the file cannot be written.
@@ -250,8 +250,8 @@ def record_session(survey: Survey, number: int, log: SensorLog) -> None:
 
     Args:
         survey: the survey.
-        number: of the session.
-        log: of the survey's lot and rig.
+        number: number of the session.
+        log: a log for the survey's lot and rig.
     """
     log.begin()
     begun: list[float] = []
@@ -268,11 +268,11 @@ def record_session(survey: Survey, number: int, log: SensorLog) -> None:
 
 
 class _SearchLogger(Observer):
-    """Records what the sensors of a search captured, and the belief, after every decision.
+    """Record the sensor captures of a search and the belief after every decision.
 
     Args:
-        log: where to.
-        perception: of the environment.
+        log: the log to write to.
+        perception: the environment's perception.
     """
 
     def __init__(self, log: SensorLog, perception: OnboardPerception) -> None:
@@ -295,13 +295,13 @@ class _SearchLogger(Observer):
 
 
 def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: SensorLog) -> None:
-    """Search once with simulated sensors, and record it.
+    """Run one search with simulated sensors, and record it.
 
     Args:
         env: the environment.
-        agent: made for its scenario.
-        seed: of the world.
-        log: of the environment's lot and rig.
+        agent: an agent made for its scenario.
+        seed: seed of the world.
+        log: a log for the environment's lot and rig.
     """
     simulate(TimeLimit(env, STEP_LIMIT), agent, seed, (_SearchLogger(log, env.perception),))
 
@@ -310,12 +310,12 @@ def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
     """Drive a trip with sensors, and record it.
 
     Args:
-        search: with a rig.
-        seed: of the world.
-        log: of the lot and rig of `search`.
+        search: a search with a rig.
+        seed: seed of the world.
+        log: a log for the lot and rig of `search`.
 
     Raises:
-        InputError: a search without a rig.
+        InputError: the search has no rig.
     """
     perception = search.env.perception
     if perception is None:
