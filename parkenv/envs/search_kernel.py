@@ -179,7 +179,7 @@ def read_belief(
 
 @inlined
 def complete_step(search: Any) -> tuple[Any, ...]:
-    """Add the step to the episode and update the observed time; returns as `step_result`."""
+    """Add the step to the episode, update belief and observed time; returns as `step_result`."""
     finish_step(search)
     refresh_belief(search)
     tell_time(search)

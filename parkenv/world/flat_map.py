@@ -1,4 +1,4 @@
-"""A forecast that is wrong on purpose: the same probability for every slot."""
+"""A deliberately wrong forecast: the same probability for every slot."""
 
 from __future__ import annotations
 

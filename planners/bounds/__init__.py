@@ -1,1 +1,1 @@
-"""Bounds on what any agent can reach: the clairvoyant oracle, exact solutions of small lots."""
+"""Bounds on the performance of any agent: the clairvoyant oracle, and exact solutions for small lots."""

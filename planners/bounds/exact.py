@@ -1,18 +1,19 @@
 """The exact optimum of a parking search over belief states, on small lots.
 
-The model is that of a search in which nothing changes: each slot is free with a known probability, independently,
-and stays as it is; a slot is revealed as soon as it is in view. The belief state is then the set of slots observed and
-the set of those that were free, and the optimum follows by dynamic programming over
+In this model slots do not change: each is free with a known probability, independently of the others, and is revealed
+as soon as it is in view. The belief state is then the set of observed slots and the subset of these that are free.
+Dynamic programming finds the optimum over the states
 
-    (where the car is, observed, observed free).
+    (vertex of the car, observed, observed free).
 
-Three facts keep the state space small, without loss (w is the arrival cost of a slot, D the drive between two):
+Three facts keep the state space small without loss of optimality (w is the arrival cost of a slot, D the drive time
+between two slots):
 
-- Driving through vertices that show nothing new decides nothing: the car chooses among the *frontier*, the
-  vertices that show something new and that it can reach through vertices that do not.
-- A slot f' observed free can be left out where another one f is as good from there: w_f + D(f', f) <= w_f'.
-- The search is over where the best slot observed free, by a route that shows nothing new, costs no more than any other
-  slot could.
+- Vertices that show nothing new need no decision: the car chooses among the *frontier*, the vertices that show
+something new and are reachable through vertices that do not.
+- A slot f' observed free can be left out if another free slot f is at least as good from there: w_f + D(f', f) <= w_f'.
+- The search ends when the best slot observed free, reached by a route that shows nothing new, costs no more than any
+other slot possibly could.
 """
 
 from __future__ import annotations
@@ -46,33 +47,33 @@ _CHUNK = 20_000
 
 @dataclass(frozen=True, eq=False)
 class _LotMasks:
-    """A small lot as the dynamic program needs it; sets of slots are the bits of integers."""
+    """Data of a small lot for the dynamic program; sets of slots are bit masks."""
 
-    shows: IntArray  # (n_vertices,) what is in view of each vertex
+    shows: IntArray  # (n_vertices,) the slots in view of each vertex
     neighbors: NDArray[np.int32]
     move_s: FloatArray
     seconds: FloatArray  # (n_vertices, n_vertices)
     cost_s: FloatArray  # (n_slots,) arrival cost
-    dominated_by: IntArray  # (n_slots,) the slots that are as good as each one
+    dominated_by: IntArray  # (n_slots,) the slots that are at least as good as each one
     p_free: FloatArray
     give_up_s: float
-    stay_s: FloatArray  # (n_vertices,) the wait that shows what is in view of the first vertex
+    stay_s: FloatArray  # (n_vertices,) time of a wait that shows the view of the start vertex
 
 
 class ExactSolution:
-    """The optimum from one belief state on.
+    """The optimal search from one belief state.
 
     Args:
         problem: lot, goal, speeds, costs and view range; the sensor must not err.
-        p_occupied: (n_slots,) probability that each slot is taken; only those of unobserved slots matter.
+        p_occupied: (n_slots,) probability that each slot is taken; used for unobserved slots only.
         vertex: where the car is.
-        seen: (n_slots,) bool, slots that were observed; none where None.
-        free: (n_slots,) bool, those of them that are free.
-        most_states: how many belief states may be kept.
+        seen: (n_slots,) bool, slots that were observed; None: no slot.
+        free: (n_slots,) bool, slots that were observed free.
+        most_states: maximum number of belief states.
 
     Attributes:
         expected_s: s, the least expected time from here to the goal.
-        n_states: belief states that were kept.
+        n_states: number of belief states.
 
     Raises:
         InputError: more than `MOST_SLOTS` slots or `most_states` states, or a sensor that errs.
@@ -116,12 +117,12 @@ class ExactSolution:
         return self  # immutable: copies of a plan share it
 
     def decide(self, seen: int, vertex: int, free: int) -> tuple[float, int] | None:
-        """Return the expected time, s, and the next vertex to observe from (-1: park); None for a state never reached.
+        """Return the expected time, s, and the next vertex to observe from (-1: park); None for an unreachable state.
 
         Args:
-            seen: slots observed, as bits.
-            vertex: where the car decides: where it began, or a vertex that showed something new.
-            free: slots observed free, as bits.
+            seen: slots observed, as a bit mask.
+            vertex: the start vertex, or a vertex that showed something new.
+            free: slots observed free, as a bit mask.
         """
         free = _without_dominated(free, self._masks.dominated_by)
         level = _popcount(seen)
@@ -133,7 +134,7 @@ class ExactSolution:
         return float(self._values[at]), int(self._choices[at])
 
     def _enumerate(self, root: int, most_states: int) -> None:
-        """Find all states that can follow from the first one, by how many slots were observed."""
+        """Find all states that can follow from the first one, in the order of the number of observed slots."""
         n = self._n
         masks = self._masks
         pending: list[list[IntArray]] = [[] for _ in range(n + 1)]
@@ -180,7 +181,7 @@ class ExactSolution:
 
 
 def require_small(problem: SearchProblem) -> None:
-    """Refuse problems that the exact planner cannot solve.
+    """Raise an error if the exact planner cannot solve the problem.
 
     Raises:
         InputError: too many slots or vertices, or a sensor that errs.
@@ -196,7 +197,7 @@ def require_small(problem: SearchProblem) -> None:
 
 
 def bits_of(slots: NDArray[np.bool_]) -> int:
-    """Return a set of slots, (n_slots,) bool, as the bits of a number."""
+    """Return a set of slots, (n_slots,) bool, as a bit mask."""
     return int(sum(1 << int(s) for s in np.flatnonzero(slots)))
 
 
@@ -210,7 +211,7 @@ def _lot_masks(problem: SearchProblem, p_occupied: FloatArray, table: RoadTable)
     gain = cost[:, None] - (cost[None, :] + from_slot)
     as_good = (gain > 1e-9) | ((np.abs(gain) <= 1e-9) & (np.arange(n)[None, :] < np.arange(n)[:, None]))
     np.fill_diagonal(as_good, val=False)
-    # Of two that are as good as each other the lower number stays; else each would remove the other.
+    # Of two equally good slots keep the one with the lower number; else each would remove the other.
     dominated_by = np.array([bits_of(row) for row in as_good], dtype=np.int64)
     missing = (lot.neighbors < 0).any(axis=1)
     return _LotMasks(
@@ -264,7 +265,7 @@ def _popcounts(bits: IntArray) -> IntArray:
 
 @compiled
 def _without_dominated(free: int, dominated_by: IntArray) -> int:
-    """Keep only those slots observed free that no other one is as good as."""
+    """Keep the slots observed free that no other free slot dominates."""
     kept = free
     for s in range(len(dominated_by)):
         if (free >> s) & 1 and dominated_by[s] & free:
@@ -284,10 +285,10 @@ def _drive_within_known(
     came_from: IntArray,
     done: NDArray[np.uint8],
 ) -> None:
-    """Find drive times, s, through vertices that show nothing new, to those and to the frontier.
+    """Compute drive times, s, through vertices that show nothing new, to these vertices and to the frontier.
 
-    Where the car starts at a vertex that it has not observed from yet, the time to that vertex is that of the
-    shortest way to end a step there: a wait, or a round trip.
+    If the car has not observed from its start vertex yet, the time to that vertex is that of the shortest step that
+    ends there: a wait or a round trip.
     """
     reach[:] = np.inf
     came_from[:] = -1
@@ -348,7 +349,7 @@ def _successors(
     dominated_by: IntArray,
     stay_s: FloatArray,
 ) -> IntArray:
-    """List the states that one more observation can lead to, repeats included."""
+    """List the states after one more observation, with duplicates."""
     n_vertices = len(shows)
     reach, came_from = np.empty(n_vertices), np.empty(n_vertices, np.int64)
     done = np.empty(n_vertices, np.uint8)
@@ -402,7 +403,7 @@ def _back_up(
     p_free: FloatArray,
     give_up_s: float,
 ) -> None:
-    """Apply Bellman's equation to the states with `level` slots observed, those with more being solved."""
+    """Apply Bellman's equation to the states with `level` observed slots; states with more are already solved."""
     n_vertices = len(shows)
     reach, came_from = np.empty(n_vertices), np.empty(n_vertices, np.int64)
     done = np.empty(n_vertices, np.uint8)
@@ -425,7 +426,7 @@ def _back_up(
         elif best > min(least, _best_known(free, seconds[vertex], cost_s)):
             limit = best
             if best == np.inf:
-                # Slots that no route leads to leave the lot unproven; the step limit then charges the same.
+                # With unreachable slots the lot is never proven full; the step limit then costs the same.
                 best = give_up_s
             for v in range(n_vertices):
                 new = shows[v] & ~seen
@@ -450,7 +451,7 @@ def _back_up(
                     if revealed == 0:
                         break
                     revealed = (revealed - 1) & new
-                # A forced observation counts even where it may end in giving up.
+                # A forced observation counts even if it may end in giving up.
                 if expected < best or (choice == _SEARCH_ENDS and limit == np.inf):
                     best, choice = expected, v
         values[i] = best
@@ -462,10 +463,10 @@ class ExactState:
     """Memory of the exact agent.
 
     Attributes:
-        forecast: (n_slots,) float, P(taken) before anything was observed.
-        solution: the optimum from the state that it was last solved for.
-        seen: slots observed, as bits.
-        free: slots that were free when last observed, as bits.
+        forecast: (n_slots,) float, P(taken) before the first observation.
+        solution: the most recent solution.
+        seen: slots observed, as a bit mask.
+        free: slots that were free when last observed, as a bit mask.
         target: the next vertex to observe from; -1 to park at a slot observed free; -2 before a decision.
     """
 
@@ -479,14 +480,15 @@ class ExactState:
 class ExactAgent(SearchAgent[ExactState]):
     """`exact`: follows the optimum over belief states; for lots of up to about 20 slots.
 
-    It assumes that slots do not change. Where a slot observed free turns out taken it solves again from there.
+    It assumes that slots do not change. If a slot observed free turns out to be taken, it solves the problem again from
+    there.
 
     Args:
         problem: lot, goal, speeds and costs.
-        most_states: how many belief states may be kept.
+        most_states: maximum number of belief states.
 
     Raises:
-        InputError: too large a lot, or a sensor that errs.
+        InputError: the lot is too large, or the sensor errs.
     """
 
     name: ClassVar[str] = "exact"
@@ -503,7 +505,7 @@ class ExactAgent(SearchAgent[ExactState]):
         return ExactState(forecast, self._solution(forecast, int(observation["vertex"]), 0, 0))
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: ExactState) -> int:
-        """Drive to where the next observation is made, or to the slot chosen, and park there."""
+        """Drive to the next vertex to observe from, or to the chosen slot, and park there."""
         vertex = int(observation["vertex"])
         seen, free = bits_of(belief.observed), bits_of(belief.observed_free)
         if (seen, free) != (memory.seen, memory.free) or memory.target == -2 or vertex == memory.target:
@@ -561,6 +563,6 @@ class ExactAgent(SearchAgent[ExactState]):
         return self.table.move_to(vertex, step)
 
     def _wait(self, vertex: int) -> int:
-        """Return a move that the graph does not have; where it has all four, one that it has."""
+        """Return a move without an edge, which waits; any move if all four have edges."""
         missing = np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)
         return int(missing[0]) if len(missing) else int(len(MOVES) - 1)

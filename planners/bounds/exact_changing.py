@@ -1,12 +1,12 @@
-"""The optimum of a parking search over belief states where slots fill and empty, on very small lots.
+"""The exact optimum of a parking search over belief states, for very small lots whose slots fill and empty.
 
 The belief about a slot follows from its last observation and the time since then: p(t) = p∞ + (p(0) - p∞)·exp(-rt).
 On a grid of times the belief states are
 
-    (where the car is, and for each slot: never observed, or free or taken so many steps ago),
+    (vertex of the car, and for each slot: never observed, or observed free or taken k steps ago),
 
-and the least expected time from each solves Bellman's equation, which value iteration finds. Costs are exact; the time
-since an observation is rounded to whole steps, and ages of `memory_steps` and more are not distinguished.
+and value iteration solves Bellman's equation for the least expected time from each. Costs are exact; the time since an
+observation is rounded to whole steps, and ages of `memory_steps` and more are not distinguished.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ _WAIT = 4
 
 
 class ChangingSolution:
-    """The optimum from every belief state.
+    """The optimal search from every belief state.
 
     Args:
         problem: lot, goal, speeds and costs; the sensor must not err.
-        p_occupied: (n_slots,) probability that each slot is taken, which does not change.
+        p_occupied: (n_slots,) constant probability that each slot is taken.
         rate: (n_slots,) 1/s, arrival rate plus departure rate.
-        step_s: s, of the grid of times; a move or a wait takes its time, rounded to at least one step.
-        memory_steps: how many ages are distinguished.
+        step_s: s, step of the time grid; times of moves and waits are rounded to at least one step.
+        memory_steps: number of ages that are distinguished.
 
     Attributes:
         values: (n_vertices, n_codes) float64, s, the least expected time; inf for states that cannot occur.
-        belief_error: bound on the error of P(free) of slots whose age is not distinguished any more.
-        rounding_error: greatest relative error of the time of a move.
+        belief_error: bound on the error of P(free) for slots whose age is no longer distinguished.
+        rounding_error: largest relative error of the time of a move.
 
     Raises:
-        InputError: a sensor that errs, a value out of its range, or too many states.
+        InputError: a sensor that errs, a value out of range, or too many states.
 
     Example:
         Where cars leave more often, the same slots, equally often taken, are found sooner.
@@ -96,7 +96,7 @@ class ChangingSolution:
         ages = np.arange(memory_steps) * step_s
         usual = 1.0 - p[:, None]
         decayed = np.exp(-r[:, None] * ages)
-        # P(free) by code: never observed, free so many steps ago, taken so many steps ago.
+        # P(free) by code: never observed; free k steps ago; taken k steps ago.
         self._free = np.concatenate([usual, usual + (1.0 - usual) * decayed, usual * (1.0 - decayed)], axis=1)
         moves = np.concatenate([lot.neighbors, np.arange(lot.n_vertices)[:, None]], axis=1).astype(np.int64)
         waits = (lot.neighbors < 0).any(axis=1)
@@ -127,7 +127,7 @@ class ChangingSolution:
             )
 
     def expected_s(self, vertex: int, codes: IntArray | None = None) -> float:
-        """Return the least expected time, s, from a vertex in a belief state of `code`; nothing observed where None."""
+        """Return the least expected time, s, from a vertex in a belief state (see `code`); None: nothing observed."""
         return float(self.values[vertex, self._index(codes)])
 
     def decide(self, vertex: int, codes: IntArray) -> int:
@@ -136,7 +136,7 @@ class ChangingSolution:
         return {_WAIT: 5, 5: PARK}.get(choice, choice)
 
     def code(self, belief: SlotBelief) -> IntArray:
-        """Return the codes, (n_slots,), of what is known of each slot."""
+        """Return the codes, (n_slots,), of the belief about each slot."""
         age = np.minimum(np.rint(belief.age / self.step_s), self.memory_steps - 1).astype(np.int64)
         return np.where(belief.observed, 1 + age + np.where(belief.observed_free, 0, self.memory_steps), 0)
 
@@ -160,7 +160,7 @@ def _iterate(
     give_up_s: float,
     memory_steps: int,
 ) -> int:
-    """Solve in place by sweeps over the states that can occur; return how many sweeps it took."""
+    """Solve in place by sweeps over the states that can occur; return the number of sweeps."""
     n_vertices, n_states = values.shape
     n = len(free)
     n_codes = 2 * memory_steps + 1
@@ -244,7 +244,7 @@ class ChangingAgent(SearchAgent[None]):
         self.solution = solution
 
     def begin(self, observation: Observation, belief: SlotBelief) -> None:
-        """Nothing has to be remembered: the belief is the state."""
+        """Return no memory: the belief is the state."""
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: None) -> int:
         """Choose the optimal action for the belief."""

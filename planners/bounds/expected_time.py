@@ -1,4 +1,4 @@
-"""The exact expected time of an agent's search: every observation that can occur, weighted by its probability."""
+"""The exact expected time of an agent's search, over all possible observations."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ MOST_STEPS = 2000
 def expected_time(agent: Agent, problem: SearchProblem, p_occupied: ArrayLike, vertex: int) -> float:
     """Return the mean total time, s, of an agent's search where slots do not change and the forecast is right.
 
-    The rules are those of `parkenv/Search-v1` in a world in which each slot is taken with its probability,
-    independently of the others, and nothing changes. The agent decides in every history of observations that can
-    occur, so this is for lots of about a dozen slots.
+    The rules are those of `parkenv/Search-v1`. Each slot is taken with its forecast probability, independently of the
+    others, and does not change. Every possible history of observations is enumerated, so lots can have about a dozen
+    slots.
 
     Args:
-        agent: one whose memory can be copied.
+        agent: an agent whose memory can be copied.
         problem: lot, goal, speeds, costs and view range; the sensor must not err.
         p_occupied: (n_slots,) the forecast.
         vertex: where the search begins.
 
     Raises:
-        InputError: a sensor that errs, or a forecast that is not one.
+        InputError: a sensor that errs, or an invalid forecast.
 
     Examples:
         >>> from parkenv.lots import packaged_lot
@@ -56,14 +56,14 @@ def expected_time(agent: Agent, problem: SearchProblem, p_occupied: ArrayLike, v
 
 
 class _Histories:
-    """The tree of what an agent can observe."""
+    """The tree of all histories of observations."""
 
     def __init__(self, agent: Agent, problem: SearchProblem) -> None:
         self.agent, self.problem = agent, problem
         self.masks = problem.action_masks
 
     def mean(self, vertex: int, belief: SlotBelief, steps: int, memory: Any) -> float:
-        """Return the expected time, s, from here; `belief` has its time, and `memory` is this history's own."""
+        """Return the expected time, s, from here; `belief` contains the time, and `memory` belongs to this history."""
         problem, begun = self.problem, belief.time
         while True:
             if steps >= MOST_STEPS:
@@ -88,7 +88,7 @@ class _Histories:
                 return belief.time - begun + self._observe(vertex, belief, steps, memory)
 
     def _observe(self, vertex: int, belief: SlotBelief, steps: int, memory: Any) -> float:
-        """Return the expected time, s, from the moment at which the car observes from a vertex."""
+        """Return the expected time, s, from the moment of an observation at a vertex."""
         in_view = self._in_view(vertex)
         new = in_view[~belief.observed[in_view]]
         total = 0.0

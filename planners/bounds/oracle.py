@@ -1,4 +1,4 @@
-"""The clairvoyant lower bound: an agent that knows every slot's future, and the least total time of an episode."""
+"""The clairvoyant lower bound: the least total time of an episode, and an agent that knows every slot's future."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class BestSlot:
     """The best slot of an episode.
 
     Attributes:
-        slot: its index; -1 if none ever comes free.
+        slot: its index; -1 if no slot ever becomes free.
         wait_s: s between the earliest possible arrival and parking.
         total_s: s, drive, wait and arrival cost; inf if there is none.
     """
@@ -43,17 +43,17 @@ def best_slot(
     """Find the slot that minimises drive, wait and arrival cost.
 
     Occupancy does not depend on the car, so arriving as early as possible and waiting is never worse than arriving
-    later: with waits of any length (`wait_s` 0) the minimum over slots bounds every search that ends in a slot. An
-    agent that does not park pays `give_up_s`, so no agent's total is below the smaller of the two. With `wait_s`
-    above 0 waits come in such steps, as in the environment, and a slot that is free for less than a step in between
-    is missed.
+    later. With waits of any length (`wait_s` 0) the minimum over slots is therefore a lower bound for every search that
+    ends in a slot. An agent that does not park pays `give_up_s`, so the total of any agent is at least the smaller of
+    the two. With `wait_s` above 0 the car waits in steps of that length, as in the environment, and misses a slot that
+    is free only between two steps.
 
     Args:
         problem: lot, goal, speeds and costs.
-        routes: drives on that lot.
+        routes: shortest drives on that lot.
         world: the hidden occupancy of the episode.
         vertex: where the car is.
-        time: s since Monday 00:00, now.
+        time: current time, s since Monday 00:00.
         wait_s: s, the length of one wait; 0 for any length.
     """
     arrival = time + routes.seconds_from(vertex)[: problem.lot.n_slots]
@@ -61,7 +61,7 @@ def best_slot(
     earliest = arrival - time + cost_s
     best = BestSlot(-1, 0.0, np.inf)
     for slot in np.argsort(earliest):
-        # In this order, later slots cannot win even without a wait.
+        # Slots are in the order of earliest arrival: later ones cannot win even without a wait.
         if not earliest[slot] < best.total_s:
             break
         latest = time + best.total_s - cost_s[slot]
@@ -72,7 +72,7 @@ def best_slot(
 
 
 def _first_free(world: World, slot: int, arrival: float, wait_s: float, latest: float) -> float:
-    """Return the time, s, at which a car that arrives then, or whole waits later, can park; inf if after `latest`."""
+    """Return the first time, s, at `arrival` or whole waits later, when the slot is free; inf if after `latest`."""
     slots = np.array([slot])
     moment = arrival
     while moment < latest:
@@ -88,9 +88,9 @@ class OracleState:
     """Memory of the oracle.
 
     Attributes:
-        slot: its target; -1 where it proves the lot full, or where no slot ever comes free.
-        waits: how many waits to make before it drives there.
-        unobserved: (n_slots,) bool, slots still to be observed to prove the lot full; None where it parks.
+        slot: the target; -1 if it proves the lot full, or if no slot ever becomes free.
+        waits: number of waits before it drives there.
+        unobserved: (n_slots,) bool, slots still to be observed to prove the lot full; None if it parks.
     """
 
     slot: int
@@ -101,10 +101,10 @@ class OracleState:
 class OracleAgent(SearchAgent[OracleState]):
     """`oracle`: drives to the slot with the least total time and arrives when it is free.
 
-    It is shown the world by `prepare` before each episode; no other agent sees hidden state. Where no slot comes free
-    for so long that giving up is cheaper, it proves the lot full by a tour from each slot to the nearest one not yet
-    observed. It waits in steps of `wait_s`, as every agent must, and its tour need not be the shortest, so its total
-    may exceed the bound that `best_slot` gives.
+    It receives the world in `prepare` before each episode; no other agent has access to hidden state. If giving up is
+    cheaper than waiting for any slot, it proves the lot full by a nearest-neighbour tour of the unobserved slots. Like
+    every agent it waits in steps of `wait_s`, and its tour may not be the shortest, so its total can exceed the bound
+    from `best_slot`.
     """
 
     name: ClassVar[str] = "oracle"
@@ -116,11 +116,11 @@ class OracleAgent(SearchAgent[OracleState]):
         self._time = 0.0
 
     def prepare(self, world: World, time: float) -> None:
-        """Receive the world of the episode about to begin, and its starting time, s since Monday 00:00."""
+        """Receive the world of the next episode and its start time, s since Monday 00:00."""
         self._world, self._time = world, time
 
     def begin(self, observation: Observation, belief: SlotBelief) -> OracleState:
-        """Choose the slot, or to prove the lot full."""
+        """Choose a slot, or decide to prove the lot full."""
         del belief
         if self._world is None:
             raise RuntimeError("the oracle was not shown the world: call prepare(world, time) after reset()")
@@ -135,7 +135,7 @@ class OracleAgent(SearchAgent[OracleState]):
         return OracleState(best.slot, waits + self._extra_waits(vertex, best.slot, waits) if waits else 0)
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: OracleState) -> int:
-        """Wait, drive to the slot, and park when it is free; or drive on along the tour."""
+        """Wait, drive to the slot and park when it is free; or continue the tour."""
         assert self._world is not None
         vertex, now = int(observation["vertex"]), self._time + belief.time
         missing = np.flatnonzero(observation["action_mask"][: len(MOVES)] == 0)
@@ -145,7 +145,7 @@ class OracleAgent(SearchAgent[OracleState]):
             target, seconds = self._nearest_unobserved(vertex, memory.unobserved)
             if math.isfinite(seconds):
                 return self.routes.move_toward(vertex, target)
-            # All was observed, and the lot is still not proven full: a slot that no route leads to is free.
+            # All reachable slots were observed, but the lot is not proven full: an unreachable slot is free.
             best = best_slot(self.problem, self.routes, self._world, vertex, now, self.problem.wait_s)
             vars(memory).update(vars(self._bound_for(best, vertex)))
         if memory.slot < 0:
@@ -163,10 +163,10 @@ class OracleAgent(SearchAgent[OracleState]):
         return PlanPreview(self.routes.path(int(observation["vertex"]), memory.slot))
 
     def _extra_waits(self, vertex: int, slot: int, waits: int) -> int:
-        """Return how many waits to add so that it never observes the whole lot taken, which would end the search.
+        """Return the number of extra waits so that it never observes the whole lot taken, which would end the search.
 
-        It waits before it drives, so observations on the way matter only where the route shows every slot: then the
-        target must be free when it comes in view, not just on arrival.
+        It waits before it drives, so observations on the way matter only if the route shows every slot: then the target
+        must be free when it comes into view, not just on arrival.
         """
         assert self._world is not None
         shown = np.zeros(self.problem.lot.n_slots, dtype=np.bool_)
@@ -194,12 +194,12 @@ class OracleAgent(SearchAgent[OracleState]):
         return slots[starts[vertex] : starts[vertex + 1]]
 
     def _nearest_unobserved(self, vertex: int, unobserved: NDArray[np.bool_]) -> tuple[int, float]:
-        """Return the next slot of the tour and the drive to it, s; -1 and inf where none is reachable."""
+        """Return the next slot of the tour and the drive time to it, s; -1 and inf if none is reachable."""
         slots, seconds = self.routes.nearest(vertex, unobserved)
         return int(slots[0]) if len(slots) else -1, seconds
 
     def _tour_s(self, vertex: int, at_most: float) -> float:
-        """Return the time, s, to observe every slot; inf where it is over `at_most` or a slot is not reachable."""
+        """Return the time, s, to observe every slot; inf if it exceeds `at_most` or a slot is unreachable."""
         unobserved = np.ones(self.problem.lot.n_slots, dtype=np.bool_)
         unobserved[self._in_view(vertex)] = False
         total = 0.0
@@ -208,7 +208,7 @@ class OracleAgent(SearchAgent[OracleState]):
             total += seconds
             if not total < at_most:
                 return np.inf
-            # Slots observed on the way there are not counted: an upper bound is good enough.
+            # Slots observed on the way are ignored: an upper bound is enough.
             vertex = target
             unobserved[self._in_view(vertex)] = False
         return total

@@ -21,7 +21,7 @@ DISCS = 4
 """Number of discs in a row that cover the footprint."""
 
 _SAMPLE_M = 0.5 * CELL_M
-# A distance in the field differs from the true one by half a cell's diagonal at either end and half a sample.
+# Error of a distance in the field: half a cell's diagonal at either end and half a sample.
 _UNSURE = math.sqrt(2.0) * CELL_M + 0.5 * _SAMPLE_M
 
 
@@ -29,13 +29,13 @@ class Clearance(NamedTuple):
     """Obstacles and distance field for compiled collision checks.
 
     Attributes:
-        corners: (n, k_max, 2) float64, m: convex outlines, counter-clockwise or not; lines have two corners.
+        corners: (n, k_max, 2) float64, m: convex outlines in either orientation; lines have two corners.
         n_corners: (n,) int64.
-        circle: (n, 3) float64, m: x, y and radius of a circle round each outline.
+        circle: (n, 3) float64, m: centre x, y and radius of a circle around each outline.
         field: (rows, columns) float32, m: approximate distance of each cell to the nearest outline.
-        low: (2,) float64, m: the corner of the field's first cell.
+        low: (2,) float64, m: lower corner of the field's first cell.
         half: (2,) float64, m: half the car's length and width.
-        middle: from the rear axle to the footprint's middle, m.
+        middle: m, distance from the rear axle to the footprint's middle.
     """
 
     corners: FloatArray
@@ -84,7 +84,7 @@ def clearance(
 
 @compiled(error_model="numpy")
 def _draw(outlines: FloatArray, n_corners: IntArray, low: FloatArray, taken: NDArray[np.bool_]) -> None:
-    """Mark the cells that outlines run through, and those inside of them."""
+    """Mark the cells on the outlines and inside them."""
     rows, columns = taken.shape
     for i in range(len(outlines)):
         k = n_corners[i]
@@ -99,7 +99,7 @@ def _draw(outlines: FloatArray, n_corners: IntArray, low: FloatArray, taken: NDA
                     taken[row, column] = True
         if k < 3:
             continue
-        # Between the leftmost and the rightmost marked cell of a row all belong to a convex outline.
+        # The outline is convex, so all cells between the leftmost and the rightmost marked one of a row belong to it.
         bottom, top = outlines[i, :k, 1].min(), outlines[i, :k, 1].max()
         left, right = outlines[i, :k, 0].min(), outlines[i, :k, 0].max()
         first = max(math.floor((bottom - low[1]) / CELL_M), 0)
@@ -126,7 +126,7 @@ def _draw(outlines: FloatArray, n_corners: IntArray, low: FloatArray, taken: NDA
 
 @compiled(error_model="numpy")
 def stands_free(space: Clearance, x: float, y: float, yaw: float, margin: float) -> bool:
-    """Whether the car, with its rear axle at a pose and `margin` m wider on all sides, overlaps nothing."""
+    """Return whether the car, grown by `margin` m on all sides, is free of obstacles with its rear axle at a pose."""
     rows, columns = space.field.shape
     half_length, half_width = space.half[0] + margin, space.half[1] + margin
     cosine, sine = math.cos(yaw), math.sin(yaw)
@@ -171,7 +171,7 @@ def _overlap(
     half_length: float,
     half_width: float,
 ) -> bool:
-    """Whether a rectangle and convex outline i overlap: no line along a side of either parts them."""
+    """Return whether a rectangle and convex outline i overlap (separating axis test)."""
     low_x = low_y = math.inf
     high_x = high_y = -math.inf
     for j in range(k):
@@ -185,7 +185,7 @@ def _overlap(
         ax, ay = corners[i, j, 0], corners[i, j, 1]
         bx, by = corners[i, (j + 1) % k, 0], corners[i, (j + 1) % k, 1]
         nx, ny = by - ay, ax - bx
-        # The rectangle's shadow on the normal, round its middle.
+        # Half the length of the rectangle's projection onto the normal.
         shadow = half_length * abs(nx * cosine + ny * sine) + half_width * abs(ny * cosine - nx * sine)
         at = nx * (mx - ax) + ny * (my - ay)
         low = high = 0.0
@@ -199,7 +199,7 @@ def _overlap(
 
 @compiled(error_model="numpy")
 def room_at(space: Clearance, x: float, y: float, yaw: float, most: float) -> float:
-    """The greatest margin, m, up to `most`, with which the car stands free at a pose; below 0 if with none."""
+    """Return the largest margin, m, up to `most`, with which the car is collision-free at a pose; below 0 if none."""
     if not stands_free(space, x, y, yaw, 0.0):
         return -1.0
     low, high = 0.0, most

@@ -1,4 +1,4 @@
-"""Distances to a point over a grid, for a disc among obstacles: the search's estimate without the car's kinematics."""
+"""Grid distances to a point for a disc among obstacles: the search's heuristic that ignores the car's kinematics."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ GRID_CELLS = 2
 
 @compiled(error_model="numpy")
 def grid_distances(space: Clearance, x: float, y: float, least: float) -> FloatArray:
-    """Shortest distances, m, to a point for a disc of radius `least`, per grid cell; infinity where unreachable."""
+    """Return the shortest distances, m, of all cells to a point, for a disc of radius `least`; inf if unreachable."""
     step = CELL_M * GRID_CELLS
     rows, columns = space.field.shape[0] // GRID_CELLS, space.field.shape[1] // GRID_CELLS
     left = np.full((rows, columns), math.inf)
@@ -40,7 +40,7 @@ def grid_distances(space: Clearance, x: float, y: float, least: float) -> FloatA
                 r, c = row + dr, column + dc
                 if r < 0 or c < 0 or r >= rows or c >= columns or (dr == 0 and dc == 0):
                     continue
-                # Tolerate half a grid cell and the field's own error: the estimate must not be too long.
+                # Allow for half a grid cell and the field's error, so that distances are not overestimated.
                 if space.field[r * GRID_CELLS, c * GRID_CELLS] + 0.35 < least:
                     continue
                 further = key + step * math.sqrt(float(dr * dr + dc * dc))

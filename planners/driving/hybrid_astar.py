@@ -1,9 +1,9 @@
-"""Plan a path between two poses among obstacles: hybrid A* with Reeds-Shepp shots.
+"""Hybrid A* with Reeds-Shepp shots: plan a path between two poses among obstacles.
 
 After Dolgov, Thrun, Montemerlo and Diebel, "Path planning for autonomous vehicles in unknown semi-structured
-environments", International Journal of Robotics Research 29 (2010). The search runs from the slot outward: few moves
-are possible there, so it leaves the slot soon, and a shot over the open lane completes it. A kinematic path can be
-driven in both directions, so the result is reversed.
+environments", International Journal of Robotics Research 29 (2010). The search starts at the slot: few moves are
+possible there, so it leaves the slot after few expansions, and a shot over the open lane completes the path. A
+kinematic path can be driven in both directions, so the result is reversed.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class SearchSettings:
     Args:
         change_m: cost of a change of direction, m.
         steer_m: cost of turning the wheel from straight to its stop, m, at each change of curvature.
-        reserve: fraction by which planned turning circles are wider than the least, which leaves room to correct.
+        reserve: fraction by which planned turning circles exceed the smallest one, which leaves room for corrections.
         attempts: pairs, tried in order, of the clearance to obstacles, m (less where start or target are closer), and
-            the length of a move of the search, m. Cells are half as wide as a move is long.
+            the length of a search move, m. Cells are half as wide as a move is long.
         greed: weight of the heuristic, at least 1.
-        most_expansions: expanded nodes after which an attempt fails.
-        patience: after the first path, the search continues for this fraction of the nodes expanded so far.
+        most_expansions: number of expanded nodes after which an attempt fails.
+        patience: after the first path, the search expands this fraction of the nodes expanded so far.
 
     Raises:
         InputError: a value out of its range.
@@ -178,8 +178,8 @@ def _search(
     cell, yaw_cells = 0.5 * move, round(36.0 / move)
     rows = int(space.field.shape[0] * CELL_M / cell) + 1
     columns = int(space.field.shape[1] * CELL_M / cell) + 1
-    # The best node per cell and direction of arrival. Short moves serve to leave a tight slot, sideways by millimetres
-    # each: cells are small there, or each move would end in the cell where it started.
+    # Best node per cell and direction of arrival. In a tight slot short moves shift the car sideways by millimetres, so
+    # cells are small there; else each move would end in the cell where it started.
     n_wide = rows * columns * yaw_cells
     narrow = int(2.0 * _NARROW_M / _NARROW_CELL_M) if move < _SHORT_MOVE_M else 0
     node_of = np.full((n_wide + narrow * narrow * _NARROW_YAW_CELLS, 2), -1, np.int32)

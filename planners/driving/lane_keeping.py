@@ -22,8 +22,8 @@ class LaneKeeper(PathTracker):
     Args:
         vehicle: the car.
         path: the path.
-        settings: of the tracking.
-        aside: greatest lateral acceleration, m/s²; the car slows down in turns accordingly.
+        settings: settings of the tracking.
+        aside: maximum lateral acceleration, m/s²; the car slows down in turns accordingly.
     """
 
     def __init__(
@@ -50,7 +50,7 @@ def rounded(points: FloatArray, radius: float) -> CarPath:
 
     Args:
         points: (k, 2) m, two or more, in the order driven.
-        radius: of the arcs, m, less where legs are short: an arc takes at most half of each adjacent leg.
+        radius: radius of the arcs, m; smaller where legs are short: an arc uses at most half of each adjacent leg.
     """
     step = np.diff(points, axis=0)
     leg = np.hypot(step[:, 0], step[:, 1])

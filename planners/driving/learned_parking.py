@@ -1,4 +1,4 @@
-"""Parking agent with a model of `parkenv train --env drive`, for `parkenv/Drive-v1`."""
+"""Parking agent for `parkenv/Drive-v1` with a model trained by `parkenv train --env drive`."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class LearnedParkingMemory:
     Attributes:
         outlines: the obstacles.
         action: (2,) float32, the current decision.
-        left: number of steps for which it still holds.
+        left: number of steps for which the action still holds.
     """
 
     outlines: Outlines
@@ -45,16 +45,17 @@ class LearnedParkingAgent:
     """A trained model as a parking agent, on any lot.
 
     Args:
-        algorithm: that trained the model.
+        algorithm: the algorithm of the model.
         path: the model file.
         vehicle: the car; by default the one used in training.
 
     Raises:
-        InputError: a file that is not a model, or of another algorithm, task or observation.
+        InputError: the file is not a model, or is one of another algorithm, task or observation.
 
     Attributes:
         card: metadata of the model file.
-        model: of stable-baselines3 or sb3-contrib, over the observation of `planners.driving.policy_interface`.
+        model: a model of stable-baselines3 or sb3-contrib; its observation is that of
+            `planners.driving.policy_interface`.
     """
 
     def __init__(
@@ -76,7 +77,8 @@ class LearnedParkingAgent:
         Args:
             observation: from `parkenv/Drive-v1` with `obstacle_map=True`, or a vector of them.
             state: returned by the previous call; None at the start.
-            episode_start: per environment, whether its episode has just started; None: where there is no state.
+            episode_start: for each environment, whether its episode has just begun. With None, episodes begin where
+                `state` is None.
             deterministic: whether to use the mode of the policy instead of a sample.
 
         Returns:
@@ -125,7 +127,7 @@ class LearnedParkingAgent:
         return actions, memories
 
     def _seen(self, own: NDArray[np.float32], outlines: Outlines) -> NDArray[np.float32]:
-        """The model's observation without the goals; `own` is the environment's `observation`."""
+        """Return the model's observation without the goals; `own` is the environment's `observation`."""
         values = own.astype(np.float64)
         state = np.zeros(STATE_SIZE)
         state[[SPEED, STEERING, ACCELERATION]] = values[4:7]

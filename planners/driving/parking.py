@@ -1,4 +1,4 @@
-"""The planning parking agent: plan a path through the obstacle map, track it, and replan after deviations."""
+"""The planning parking agent: it plans a path among the obstacles, tracks it, and replans after deviations."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PATIENCE_S = 3.0
 """Time of waiting for a standing road user, s, after which a path around it is planned."""
 
 _CONTROL_S = 0.1
-_NOWHERE = 999.0  # m; unused rows of the obstacle map lie beyond
+_NOWHERE = 999.0  # m; unused rows of the obstacle map are farther away
 _STANDS = 0.01
 
 
@@ -39,12 +39,12 @@ class ParkingMemory:
     """State of the agent within an episode.
 
     Attributes:
-        tracker: of the current path; None without one.
+        tracker: tracker of the current path, if any.
         paths: all planned paths, in the slot's frame.
-        planning_s: wall time of each planning, s.
+        planning_s: wall time of each planning call, s.
         stuck: whether no path was found.
-        others: (n, 2) m, positions of the moving road users one step ago.
-        waited_s: time for which the car has been waiting for road users, s.
+        others: (n, 2) m, positions of the moving road users at the previous step.
+        waited_s: s, time that the car has waited for road users.
     """
 
     tracker: PathTracker | None = None
@@ -56,7 +56,7 @@ class ParkingMemory:
 
 
 class ParkingAgent:
-    """Park in `parkenv/Drive-v1`: hybrid A*, Reeds-Shepp shots, and a tracking controller.
+    """Parks in `parkenv/Drive-v1` with hybrid A*, Reeds-Shepp shots and a tracking controller.
 
     The agent knows the car and the observation: the poses of car and slot and, with `obstacle_map=True`, the outlines
     of parked cars, kerbs and walls, and of moving road users, for which it waits.
@@ -91,7 +91,8 @@ class ParkingAgent:
         Args:
             observation: from `parkenv/Drive-v1` with `obstacle_map=True`, or a vector of them.
             state: returned by the previous call; None at the start.
-            episode_start: per environment, whether its episode has just started; None: where there is no state.
+            episode_start: for each environment, whether its episode has just begun. With None, episodes begin where
+                `state` is None.
             deterministic: part of the interface; this agent is always deterministic.
 
         Returns:
@@ -121,11 +122,11 @@ class ParkingAgent:
         return actions, memories
 
     def plan(self, observation: Observation, *, around_others: bool = False) -> CarPath | None:
-        """Plan a path from the current pose to the wanted one, in the slot's frame; None if there is none.
+        """Plan a path from the current pose to the desired one, in the slot's frame; return None if none was found.
 
         Args:
-            observation: with the obstacle map.
-            around_others: whether moving road users, where they are now, are obstacles too.
+            observation: an observation with the obstacle map.
+            around_others: whether moving road users count as obstacles at their current positions.
         """
         cars = observation["cars"]
         if around_others:
@@ -168,14 +169,14 @@ class ParkingAgent:
 
     def _stop(self, speed: float, steering: float) -> NDArray[np.float32]:
         """Brake and keep the steering angle."""
-        # Brake only as hard as stops the car within the step.
+        # Brake no harder than needed to stop within the step.
         pedal = min(abs(speed) / (self.vehicle.max_braking * _CONTROL_S), 1.0)
         return np.array(
             [-math.copysign(pedal, speed), steering / self.vehicle.max_steering], dtype=np.float32
         )
 
     def _waits(self, observation: Observation, memory: ParkingMemory, speed: float) -> bool:
-        """Whether a road user at constant velocity would come too close to the car on its path."""
+        """Return whether a road user, at constant velocity, would come too close to the car on its path."""
         outlines = np.asarray(observation["movers"], dtype=np.float64)
         at = outlines.mean(axis=1)
         before, memory.others = memory.others, at
@@ -187,16 +188,16 @@ class ParkingAgent:
 
 
 def _pose(goal: NDArray[np.float32]) -> FloatArray:
-    """Pose, (3,) x, y in m and yaw in rad, of a goal."""
+    """Return the pose, (3,) x, y in m and yaw in rad, of a goal."""
     return np.array([float(goal[0]), float(goal[1]), math.atan2(float(goal[3]), float(goal[2]))])
 
 
 def _obstacles(cars: NDArray[np.float32], lines: NDArray[np.float32]) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Outlines of the obstacle map, (n, k, 2) m, and their numbers of valid corners, (n,)."""
+    """Return the outlines in the obstacle map, (n, k, 2) m, and their numbers of valid corners, (n,)."""
     cars = cars[cars[:, 0, 0] < _NOWHERE]
     lines = lines[lines[:, 0, 0] < _NOWHERE]
     outlines = np.concatenate([cars, np.repeat(lines, [1, cars.shape[1] - 1], axis=1)]).astype(np.float64)
     count = np.full(len(outlines), 2, dtype=np.int64)
-    # Outlines of fewer corners are padded with their last.
+    # Outlines with fewer corners repeat the last one.
     count[: len(cars)] = 1 + (np.abs(np.diff(cars, axis=1)) > 0.0).any(axis=2).sum(axis=1)
     return outlines, count

@@ -16,13 +16,14 @@ def make_parking_agent(name: str, vehicle: VehicleParameters | None = None) -> A
     """Make a parking agent.
 
     Args:
-        name: `planner`; or `ALGORITHM:FILE` for a model of `parkenv train --env drive`, such as `sac:models/sac.zip`.
+        name: `planner`, or `ALGORITHM:FILE` for a model trained by `parkenv train --env drive`, such as
+            `sac:models/sac.zip`.
         vehicle: the car.
 
     Raises:
-        InputError: an unknown name, or a file that is not such a model.
+        InputError: the name is unknown, or the file is not such a model.
     """
-    # Imported by name: the planner needs no torch.
+    # Import only what is needed: the planner needs no torch.
     algorithm, colon, file = name.partition(":")
     if colon:
         agent: Any = import_module("planners.driving.learned_parking").LearnedParkingAgent(

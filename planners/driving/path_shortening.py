@@ -1,4 +1,4 @@
-"""Shorten a path: replace parts of it by free Reeds-Shepp words, and merge equal arcs."""
+"""Path shortening: replace parts of a path by collision-free Reeds-Shepp words, and merge equal arcs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def shorten_path(
     change_m: float,
     steer_m: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Replace parts of a path by free Reeds-Shepp words wherever that lowers its cost."""
+    """Replace parts of a path by collision-free Reeds-Shepp words where that lowers its cost."""
     pieces, turns = np.zeros((MOST_WORDS, PIECES)), np.zeros((MOST_WORDS, PIECES), np.int64)
     counts, costs = np.zeros(MOST_WORDS, np.int64), np.empty(MOST_WORDS)
     for _ in range(3):

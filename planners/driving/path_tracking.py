@@ -1,8 +1,8 @@
 """Path tracking: steering and speed along a path, forward and backward.
 
-The steering is feedback about the rear axle (Samson 1992; Paden et al., "A survey of motion planning and control
-techniques for self-driving urban vehicles", 2016, §V): like Stanley's rule it corrects the heading error and the
-offset from the path; unlike it, it is stable in reverse, where feedback about the front axle diverges.
+Steering is feedback control of the rear axle (Samson 1992; Paden et al., "A survey of motion planning and control
+techniques for self-driving urban vehicles", 2016, §V): like the Stanley controller it corrects the heading error and
+the lateral offset, but it is also stable in reverse, where feedback control of the front axle diverges.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ class TrackingSettings:
     """Speeds and gains of path tracking.
 
     Args:
-        speed, reverse_speed: greatest speeds, m/s.
+        speed, reverse_speed: maximum speeds, m/s.
         acceleration: acceleration and deceleration, m/s².
         firmness: gain, 1/m; an offset from the path decays over about 2/firmness metres.
-        blend_m: distance over which the steering changes from one arc's to the next one's, m.
+        blend_m: distance over which the steering changes between two arcs, m.
         control_s: control period, s.
 
     Raises:
@@ -53,29 +53,29 @@ class TrackingSettings:
                 raise InputError(f"tracking {name} is {value!r}, want above 0")
 
 
-_CRAWL = 0.1  # m/s, the least commanded speed before the end
+_CRAWL = 0.1  # m/s, lowest commanded speed before the end of the path
 _ARRIVED = 0.01  # m
 _BRAKE_FROM = 0.85  # of the acceleration
 _LAG = 0.8  # steps
 _CLOSE = 0.06  # m
 _AIMED = 0.02  # rad, of the wheels, before the car sets off
 _STANDS = 0.01  # m/s
-_RATE_SHARE = 0.8  # of the steering rate that a path may ask for; the rest corrects
+_RATE_SHARE = 0.8  # share of the steering rate available to the path; the rest is for corrections
 _REACTION_S = 0.2
 
 
 class PathTracker:
-    """Track one path, with the progress made so far.
+    """Tracks one path and its progress along it.
 
     Args:
         vehicle: the car.
         path: the path.
-        settings: of the tracking.
+        settings: settings of the tracking.
 
     Attributes:
         done: whether the car has reached the end of the path.
-        offset: last lateral offset from the path, m, positive to the left.
-        askew: last heading error, rad.
+        offset: latest lateral offset from the path, m, positive to the left.
+        askew: latest heading error, rad.
     """
 
     def __init__(
@@ -92,12 +92,12 @@ class PathTracker:
         self.askew = 0.0
 
     def command(self, pose: FloatArray, speed: float, steering: float) -> tuple[float, float]:
-        """Acceleration and steering, -1 to 1 each as `parkenv.driving.vehicle.advance` takes them.
+        """Return the acceleration and steering commands, -1 to 1 each, for `parkenv.driving.vehicle.advance`.
 
         Args:
             pose: (3,) x, y in m and yaw in rad of the rear axle.
-            speed: m/s, below 0 backward.
-            steering: rad, of the wheels.
+            speed: m/s, negative backward.
+            steering: rad, angle of the wheels.
         """
         while True:
             segment = self._segments[self._segment]
@@ -106,7 +106,7 @@ class PathTracker:
             self._at = first + int(np.hypot(near[:, 0] - pose[0], near[:, 1] - pose[1]).argmin())
             x, y, yaw = segment.poses[self._at].tolist()
             along = math.cos(yaw) * (float(pose[0]) - x) + math.sin(yaw) * (float(pose[1]) - y)
-            # On to the path's point abeam of the car: between two samples the path is as good as an arc.
+            # Move to the closest point of the path: between two samples the path is approximately an arc.
             x, y, yaw = move_along(x, y, yaw, float(segment.curvature[self._at]), along)
             dx, dy = float(pose[0]) - x, float(pose[1]) - y
             station = float(segment.station[self._at]) + segment.direction * along
@@ -122,7 +122,7 @@ class PathTracker:
             self._at, self._set_off = 0, False
 
     def poses_ahead(self, distances: FloatArray) -> FloatArray:
-        """Poses, (n, 3), on the path, distances, (n,) m, on from where the car last was; to the next stop at most."""
+        """Return the poses, (n, 3), on the path at `distances`, (n,) m, ahead of the car; at most to the next stop."""
         segment = self._segments[self._segment]
         station = np.minimum(segment.station[self._at] + distances, segment.station[-1])
         at = np.searchsorted(segment.station, station - 1e-9)
@@ -133,7 +133,7 @@ class PathTracker:
     ) -> tuple[float, float]:
         settings, vehicle = self._settings, self._vehicle
         reach = abs(speed) * settings.control_s
-        # A command is carried out, on the mean, half a step late, and the wheels take as long again to come there.
+        # A command takes effect half a step late on average, and the wheels take another half step to get there.
         bend = float(np.interp(station + 1.5 * reach, segment.station, segment.curvature))
         if not self._set_off:
             wheels = math.atan(bend * vehicle.wheelbase)
@@ -145,7 +145,7 @@ class PathTracker:
         turn = self._turn(math.atan(bend * vehicle.wheelbase))
         if left < _ARRIVED:
             return self._pedal(0.0, speed), turn
-        # Brake so as to stop at the end of the segment; braking takes most of a step to build up.
+        # Brake to stop at the end of the segment; braking takes most of a step to build up.
         braking = 0.5 * speed * speed / max(left - _LAG * reach, 1e-3)
         if speed * segment.direction > 0.0 and braking > _BRAKE_FROM * settings.acceleration:
             return -segment.direction * min(braking / vehicle.max_braking, 1.0), turn
@@ -156,7 +156,7 @@ class PathTracker:
         return min(max(wheels / self._vehicle.max_steering, -1.0), 1.0)
 
     def _pedal(self, goal: float, speed: float) -> float:
-        """The share of the acceleration's limit that leads to a speed within the reaction time."""
+        """Return the fraction of the maximum acceleration that reaches a speed within the reaction time."""
         most = 1.5 * self._settings.acceleration
         needed = min(max((goal - speed) / _REACTION_S, -most), most)
         limit = self._vehicle.max_braking if needed * speed < 0.0 else self._vehicle.max_acceleration
@@ -168,17 +168,17 @@ class _Segment:
     """A sampled path between two changes of direction."""
 
     direction: float  # 1 forward, -1 backward
-    station: FloatArray  # (n,) m from its start
+    station: FloatArray  # (n,) m, distance from its start
     poses: FloatArray  # (n, 3)
     curvature: FloatArray  # (n,) 1/m
-    pace: FloatArray  # (n,) m/s, at most
+    pace: FloatArray  # (n,) m/s, speed limit
 
 
 def _segments(vehicle: VehicleParameters, path: CarPath, settings: TrackingSettings) -> list[_Segment]:
-    """Split a path at changes of direction, and smooth it for a finite steering rate.
+    """Split a path at changes of direction, and smooth its curvature for a finite steering rate.
 
-    Between two arcs the curvature changes linearly about their joint. Each arc turns the car as far as before, so the
-    deviation from the path is a few millimetres. Each segment starts on the planned path.
+    Between two arcs the curvature changes linearly around their joint. The heading change of each arc stays the same,
+    so the deviation from the path is a few millimetres. Each segment starts on the planned path.
     """
     kept = np.abs(path.length) > 1e-9
     length, curvature = path.length[kept], path.curvature[kept]
@@ -192,7 +192,7 @@ def _segments(vehicle: VehicleParameters, path: CarPath, settings: TrackingSetti
         knots = np.r_[0.0, np.stack([ends[1:-1] - ramp, ends[1:-1] + ramp], axis=1).ravel(), ends[-1]]
         bends = np.repeat(curvature[arcs], 2)
         station = np.linspace(0.0, ends[-1], max(2, math.ceil(ends[-1] / SAMPLE_M) + 1))
-        # Knots are samples, too: between them the curvature is linear, and the turn its mean.
+        # Include the knots as samples: the curvature is linear between them, so its mean gives the exact turn.
         station = np.unique(np.r_[station, knots])
         bend = np.interp(station, knots, bends)
         poses = [start]
@@ -213,7 +213,7 @@ def _segments(vehicle: VehicleParameters, path: CarPath, settings: TrackingSetti
 def _pace(
     station: FloatArray, wheels: FloatArray, fastest: float, rate: float, acceleration: float
 ) -> FloatArray:
-    """Greatest speeds, (n,) m/s, for a steering rate of `rate`, rad/s, from which the car can stop at the end."""
+    """Return speed limits, (n,) m/s, for a steering rate of `rate`, rad/s, that let the car stop at the end."""
     n = len(station)
     pace = np.empty(n)
     for i in range(n):

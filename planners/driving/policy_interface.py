@@ -1,7 +1,7 @@
 """Observation and action of learned parking agents, on top of `parkenv/Drive-v1`.
 
-The policy observes the free distance in every direction, from the car's outline to the nearest obstacle, and decides
-speed and steering for the next 0.4 s. Its own pose and the wanted one are in the goals.
+The policy observes the free distance in every direction, from the car's outline to the nearest obstacle, and commands
+speed and steering for the next 0.4 s. The current and the desired pose are in the goals.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ OBSERVATION_SIZE = 8 + BEAMS
 """Length of the observation vector."""
 
 _CONTROL_S = 0.1
-_NOWHERE = 999.0  # m; unused rows of the obstacle map lie beyond
+_NOWHERE = 999.0  # m; unused rows of the obstacle map are farther away
 _CIRCLE = 2.0 * math.pi / BEAMS
 
 
@@ -47,7 +47,7 @@ class Outlines(NamedTuple):
     Attributes:
         edges: (n_edges, 4) float64, m: x, y of both ends; edges of one obstacle are consecutive.
         first: (n + 1,) int64: index of the first edge of each obstacle.
-        circle: (n, 3) float64, m: x, y and radius of a circle round each obstacle.
+        circle: (n, 3) float64, m: centre x, y and radius of a circle around each obstacle.
     """
 
     edges: FloatArray
@@ -56,11 +56,11 @@ class Outlines(NamedTuple):
 
     @classmethod
     def of_map(cls, cars: Float32Array, lines: Float32Array) -> Outlines:
-        """Convert `cars`, (n, 24, 2) m, and `lines`, (m, 2, 2) m, of an observation with the obstacle map."""
+        """Convert `cars`, (n, 24, 2) m, and `lines`, (m, 2, 2) m, from an observation with the obstacle map."""
         cars = cars[cars[:, 0, 0] < _NOWHERE].astype(np.float64)
         lines = lines[lines[:, 0, 0] < _NOWHERE].astype(np.float64)
         around = np.concatenate([cars, np.roll(cars, -1, axis=1)], axis=2)
-        # Outlines of fewer corners are padded with their last.
+        # Outlines with fewer corners repeat the last one.
         long = (np.abs(around[..., :2] - around[..., 2:]) > 0.0).any(axis=2)
         edges = np.concatenate([around[long], lines.reshape(-1, 4)])
         count = np.concatenate([long.sum(axis=1), np.ones(len(lines), dtype=np.int64)])
@@ -102,18 +102,18 @@ class PolicyInterface:
 
     @cached_property
     def pedals(self) -> FloatArray:
-        """Parameters of `pedal_command`, (4,): the greatest braking and acceleration, m/s², and `SPEEDS`."""
+        """Parameters of `pedal_command`, (4,): maximum braking and acceleration, m/s², and `SPEEDS`."""
         return np.array([self.vehicle.max_braking, self.vehicle.max_acceleration, *SPEEDS])
 
 
 @compiled(error_model="numpy")
 def pedal_command(action: Float32Array, speed: float, pedals: FloatArray) -> float:
-    """The acceleration command, -1 to 1, that reaches the commanded speed.
+    """Return the acceleration command, -1 to 1, that reaches the commanded speed.
 
     Args:
-        action: (2,) speed as a fraction of the greatest, and steering, both -1 to 1.
-        speed: the car's, m/s.
-        pedals: of a `PolicyInterface`.
+        action: (2,) speed as a fraction of the maximum, and steering, both -1 to 1.
+        speed: speed of the car, m/s.
+        pedals: `PolicyInterface.pedals`.
     """
     target = min(max(float(action[0]), -1.0), 1.0)
     size = (abs(target) - STAND) / (1.0 - STAND)
@@ -135,18 +135,18 @@ def encode_observation(
 
     Args:
         middle: (2,) x, y of the footprint's middle, m, slot frame.
-        state: (6,) of the vehicle, with the yaw in the slot frame.
+        state: (6,) state of the vehicle, with the yaw in the slot frame.
         outlines: see `Outlines`.
-        body: of a `PolicyInterface`.
+        body: `PolicyInterface.body`.
         about: (5,) half the differences of length and width of slot and car, m, and the slot's kind, one-hot.
-        seen: (`OBSERVATION_SIZE`,) float32, output: speed, steering angle and acceleration, scaled to about one;
-            `about`; and for each beam 1 / (1 + free distance in m), so that 1 is a contact.
+        seen: (`OBSERVATION_SIZE`,) float32, output: speed, steering angle and acceleration, each scaled to about one;
+            `about`; and for each beam 1 / (1 + free distance in m), which is 1 at contact.
     """
     seen[0], seen[1], seen[2] = state[SPEED] / 2.0, state[STEERING] / 0.6, state[ACCELERATION] / 3.0
     for k in range(5):
         seen[3 + k] = about[k]
     edges, first, circle = outlines
-    # Edges are compared by inverse distance, 1/m, which needs no special case for beams parallel to an edge.
+    # Compare edges by inverse distance, 1/m: beams parallel to an edge then need no special case.
     near = np.full(BEAMS, 1.0 / (FARTHEST_M + 3.0))
     ahead, aside = np.empty(BEAMS), np.empty(BEAMS)
     for b in range(BEAMS):
@@ -163,7 +163,7 @@ def encode_observation(
             if abs(twice) < 1e-12:
                 continue
             for b in range(BEAMS):
-                # The ray meets the edge where the edge's ends lie on either side of the ray.
+                # The ray crosses the edge if the edge's ends lie on opposite sides of the ray.
                 left, right = ahead[b] * qy - aside[b] * qx, aside[b] * px - ahead[b] * py
                 if left * twice >= 0.0 and right * twice >= 0.0:
                     near[b] = max(near[b], (left + right) / twice)
