@@ -14,7 +14,6 @@ from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.compare import (
-    UNSEEN,
     Case,
     at_occupancy,
     check_worlds,
@@ -34,6 +33,7 @@ from parkenv.scenarios.spec import ScenarioSpec, SensorModelSpec
 from parkenv.world.flat_map import FlatMap
 from parkenv.world.occupancy import OccupancyProcess
 from parkenv.world.scenario import Scenario
+from parkenv.world.sensor_model import SensorModel
 from planners.agent import agent_file, make_agent
 
 NEEDS_OBSERVATIONS = ("belief", "mdp-tuned", "exact")
@@ -64,13 +64,16 @@ class Experiment:
                 "blind searches have no observations, and all agents plan on observations: "
                 f"{', '.join(agent.label for agent in self.spec.agents)}; add one that does not, such as mdp"
             )
-        if (measured := self.calibration) is not None:
-            names = [scenario.name for scenario in self.scenarios]
-            if names != [measured.scenario]:
-                raise InputError(
-                    f"{self.spec.grid.calibrated} was measured on {measured.scenario!r}, here are {', '.join(names)}; "
-                    "compare that scenario alone, neither blind nor with wrong maps"
-                )
+        names = [scenario.name for scenario in self.scenarios]
+        if repeated := [name for name in names if names.count(name) > 1]:
+            raise InputError(
+                f"two scenarios are called {repeated[0]!r}, want different names; rename one of them"
+            )
+        if (measured := self.calibration) is not None and names != [measured.scenario]:
+            raise InputError(
+                f"{self.spec.grid.calibrated} was measured on {measured.scenario!r}, here are {', '.join(names)}; "
+                "compare that scenario alone, neither blind nor with wrong maps"
+            )
 
     @cached_property
     def _own(self) -> list[Scenario]:
@@ -114,7 +117,7 @@ class Experiment:
             for scenario in self.scenarios
             for setting in self._settings(scenario)
             for agent in self.spec.agents
-            if not scenario.name.endswith(UNSEEN) or _works_blind(agent)
+            if scenario.sensor_model != SensorModel.blind() or _works_blind(agent)
         ]
 
     @cached_property
@@ -127,7 +130,7 @@ class Experiment:
             for level in self.spec.grid.occupancy_levels
             for setting in self._grid(at_occupancy(scenario, level), first_speeds=True)
             for agent in self.spec.agents
-            if not scenario.name.endswith(UNSEEN) or _works_blind(agent)
+            if scenario.sensor_model != SensorModel.blind() or _works_blind(agent)
         ]
 
     def _case(self, scenario: Scenario, agent: AgentSpec, level: float | None = None) -> Case:
