@@ -45,7 +45,7 @@ class ComparisonResults:
     def scenarios(self) -> list[str]:
         """Names, in order, without the variants of flat forecasts and of failure-cost sweeps."""
         names = dict.fromkeys(row["scenario"] for row in self.rows)
-        sweep = {name.removesuffix(UNSEEN) for name in names if name.endswith(UNSEEN)}
+        sweep = {name for name in names if f"{name}{UNSEEN}" in names}
         return [n for n in names if n.removesuffix(UNSEEN) not in sweep and n not in self.flat_forecasts]
 
     @property
