@@ -98,7 +98,7 @@ class SearchProblem:
 
     @cached_property
     def slots_in_view(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Slots in view, `slots` and `starts`: for vertex v `slots[starts[v]:starts[v + 1]]`, ascending."""
+        """Slots in view, as (starts, slots): for vertex v `slots[starts[v]:starts[v + 1]]`, ascending."""
         tree = cKDTree(self.lot.vertex_xy)
         # A slot's own vertex counts even at a range of 0.
         pairs = tree.query_pairs(self.sensor_model.view_range, output_type="ndarray")
