@@ -160,7 +160,10 @@ def trip(
     scenario: args.ScenarioOption = None,
     agent: AgentOption = "mdp",
     blind: Annotated[
-        bool, typer.Option("--unseen", help="Let no slot be seen before a try, so that tries fail.")
+        bool,
+        typer.Option(
+            "--blind", help="Observe no slot before an attempt to park there, so that attempts fail."
+        ),
     ] = False,
     notice_m: NoticeOption = 2.0,
     rig: args.RigOption = None,
@@ -173,13 +176,13 @@ def trip(
     """Drive one trip from the entry into a slot, and film it from above at five times real speed.
 
     Examples:
-    * `parkenv trip --scenario campus --seed 7 --unseen --out trip.gif`
+    * `parkenv trip --scenario campus --seed 7 --blind --out trip.gif`
 
     * `parkenv trip --scenario campus --rig laser --rerun trip.rrd`
 
     * `parkenv trip --scenario campus --cars 6 --pedestrians 8`
     """
-    from parkenv.evaluation.experiments.compare import unseen
+    from parkenv.evaluation.experiments.compare import blind_scenario
     from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.figures.picture_files import save_film
     from parkenv.evaluation.figures.trip_pictures import COLORS, FPS, film_trip
@@ -190,9 +193,7 @@ def trip(
     if out.suffix.lower() != ".gif":
         raise InputError(f"--out is {out}, want a file that ends in .gif")
     if blind and rig is not None:
-        raise InputError(
-            "--unseen and --rig: without observations no sensors are needed; name one of the two"
-        )
+        raise InputError("--blind and --rig: without observations no sensors are needed; name one of the two")
     if rerun is not None:
         if rig is None:
             raise InputError("--rerun records what sensors measure: add --rig laser")
@@ -200,7 +201,7 @@ def trip(
     spec = args.one_scenario(args.scenario_specs(scenario, cars=cars, pedestrians=pedestrians))
     its = build(spec)
     style = DrivingStyle(notice_m=notice_m)
-    search = DrivenSearch(unseen(its) if blind else its, agent, style=style, rig=args.rig_of(rig))
+    search = DrivenSearch(blind_scenario(its) if blind else its, agent, style=style, rig=args.rig_of(rig))
     make_folder(out.parent)
     console = make_console()
     with console.status("Driving and drawing"):

@@ -43,6 +43,7 @@ def fit(
     from parkenv.evaluation.figures.rates_picture import save_rates
     from parkenv.world.occupancy_fit import fit_process
     from parkenv.world.occupancy_log import OccupancyLog
+    from parkenv.world.week import DAY_S, HOUR_S
 
     make_folder(out)
     console = make_console()
@@ -63,7 +64,7 @@ def fit(
     )
     for name, day in (("weekday", 0), ("weekend", 5)):
         for hour in range(7, 19):
-            occupied = float(np.mean(process.marginal(86400.0 * day + 3600.0 * hour)))
+            occupied = float(np.mean(process.marginal(day * DAY_S + hour * HOUR_S)))
             rates = mean_rate("arrival", day, hour), mean_rate("departure", day, hour)
             rows.append(
                 {
