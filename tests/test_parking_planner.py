@@ -284,7 +284,20 @@ def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
     no_room = SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0)
     monkeypatch.setattr(parking_runs, "make_parking_agent", lambda name: ParkingAgent(search=no_room))
     out = tmp_path / "park"
-    options = ["--lot", "mini", "--way", "back-in", "--episodes", "2", "--slack", "0", "--out", str(out)]
+    options = [
+        "--lot",
+        "mini",
+        "--way",
+        "back-in",
+        "--episodes",
+        "2",
+        "--slack",
+        "0",
+        "--jobs",
+        "1",
+        "--out",
+        str(out),
+    ]
     result = CliRunner().invoke(app, ["park", "--seed", "3", *options])
     assert result.exit_code == 0, result.output
     assert "failed: mini, seed 3" in result.output

@@ -21,7 +21,7 @@ needs_data = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def scenario():
     lot = read_lot(MAP)
-    return make_scenario(lot, RecordedOccupancy(OccupancyLog.read(LOG), lot.walk_m()))
+    return make_scenario(lot, occupancy=RecordedOccupancy(OccupancyLog.read(LOG), lot.walk_m()))
 
 
 def totals(scenario, agent, episodes):

@@ -251,7 +251,7 @@ def without_network(path):
     [
         (torn, "maskable-ppo", "no model file, or a damaged one"),
         (with_card("{"), "maskable-ppo", "no model file, or a damaged one"),
-        (with_card("[]"), "maskable-ppo", "holds a list, want what it was trained for"),
+        (with_card("[]"), "maskable-ppo", "holds a list, want a model card"),
         (without_network, "maskable-ppo", "its network cannot be read"),
         (without_card, "maskable-ppo", "parkenv.json is missing"),
         (of_another_layout, "maskable-ppo", "observes 'local-0', this version of parkenv gives 'local-1'"),
@@ -271,7 +271,7 @@ def test_observations_of_another_kind_are_refused(trained):
     agent = LearnedAgent(SCENARIO, "maskable-ppo", trained / "model.zip")
     env = gym.make("parkenv/Search-v1", scenario=SCENARIO)
     plain, _ = env.reset(seed=0)
-    with pytest.raises(InputError, match=r"observes what .*LocalObservation says, got vertex, time"):
+    with pytest.raises(InputError, match=r"wants observations of .*LocalObservation, got vertex, time"):
         agent.predict(plain)
     with pytest.raises(InputError, match="observes 86 numbers, got 102 for its k = 5"):
         agent.predict(LocalObservation(env, k=7).reset(seed=0)[0])
