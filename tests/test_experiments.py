@@ -127,12 +127,12 @@ def test_python_runs_the_same_object(tmp_path):
 
 
 def test_a_scenario_may_be_called_like_a_blind_one_but_no_two_alike():
-    named = {"name": "x-unseen", "lot": "mini"}
+    named = {"name": "x-blind", "lot": "mini"}
     spec = ExperimentSpec.parse({"agents": ["belief"], "scenarios": [named], "episodes": 2}, "test")
-    assert [case.scenario.name for case, _ in Experiment(spec).cases] == ["x-unseen"]
+    assert [case.scenario.name for case, _ in Experiment(spec).cases] == ["x-blind"]
     plain = {"name": "x", "lot": "mini"}
     both = {"agents": ["mdp"], "scenarios": [plain, named], "grid": {"blind": True}, "episodes": 2}
-    with pytest.raises(InputError, match="two scenarios are called 'x-unseen'"):
+    with pytest.raises(InputError, match="two scenarios are called 'x-blind'"):
         Experiment(ExperimentSpec.parse(both, "test"))
 
 

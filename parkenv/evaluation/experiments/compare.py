@@ -22,9 +22,10 @@ from parkenv.world.keyed_random import world_key
 from parkenv.world.occupancy import ArrivalWindow, OccupancyProcess
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
+from parkenv.world.week import DAY_S
 from planners.agent import make_agent
 
-UNSEEN = "-unseen"
+BLIND = "-blind"
 """Suffix of the names of scenarios whose slots are not observed before an attempt."""
 BLOCK = 10
 """Episodes per task: a crash loses few of them, and the overhead of starting a task stays small."""
@@ -116,9 +117,9 @@ def settings_of(
     ]
 
 
-def unseen(scenario: Scenario) -> Scenario:
+def blind_scenario(scenario: Scenario) -> Scenario:
     """Return a renamed scenario in which slots are not observed before a parking attempt."""
-    return scenario.replace(name=f"{scenario.name}{UNSEEN}", sensor_model=SensorModel.blind())
+    return scenario.replace(name=f"{scenario.name}{BLIND}", sensor_model=SensorModel.blind())
 
 
 def at_occupancy(scenario: Scenario, level: float) -> Scenario:
@@ -138,7 +139,7 @@ def at_occupancy(scenario: Scenario, level: float) -> Scenario:
             return None
         if not isinstance(model, OccupancyProcess):
             raise InputError(f"scenario {scenario.name!r}: a recorded world cannot be made {level:.0%} full")
-        return model.at_mean_occupancy(level, day * 86400.0 + middle)
+        return model.at_mean_occupancy(level, day * DAY_S + middle)
 
     return scenario.replace(
         arrival=moment, occupancy=adjusted(scenario.occupancy), prior=adjusted(scenario.prior)

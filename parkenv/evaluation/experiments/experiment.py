@@ -16,11 +16,11 @@ from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.compare import (
     Case,
     at_occupancy,
+    blind_scenario,
     check_worlds,
     run_cases,
     settings_of,
     table,
-    unseen,
 )
 from parkenv.evaluation.experiments.results import ResultFolder, Row
 from parkenv.evaluation.experiments.spec import SPEC_FILE, ExperimentSpec
@@ -56,7 +56,7 @@ class Experiment:
     spec: ExperimentSpec
 
     def __post_init__(self) -> None:
-        for scenario in self._own:
+        for scenario in self._base_scenarios:
             for agent in self.spec.agents:
                 make_agent(agent.name, scenario, **agent.options)
         if self.spec.grid.blind and not any(_works_blind(agent) for agent in self.spec.agents):
@@ -76,15 +76,15 @@ class Experiment:
             )
 
     @cached_property
-    def _own(self) -> list[Scenario]:
+    def _base_scenarios(self) -> list[Scenario]:
         return [build(_seen_through(spec, self.spec.rig)) for spec in self.spec.scenarios]
 
     @cached_property
-    def maps(self) -> dict[str, tuple[Scenario, float]]:
+    def wrong_map_scenarios(self) -> dict[str, tuple[Scenario, float]]:
         """Scenarios with flat maps, and the constant probability of each map, by name."""
         made = {}
         for p_occupied in self.spec.grid.map_says:
-            for scenario in self._own:
+            for scenario in self._base_scenarios:
                 name = f"{scenario.name}{MAP_SAYS}{p_occupied:g}"
                 wrong = FlatMap(p_occupied, scenario.prior or scenario.occupancy)
                 made[name] = (scenario.replace(name=name, prior=wrong), p_occupied)
@@ -93,9 +93,11 @@ class Experiment:
     @cached_property
     def scenarios(self) -> list[Scenario]:
         """All scenarios, with their own costs and speeds."""
-        made = self._own + [flat for flat, _ in self.maps.values()]
+        made = self._base_scenarios + [flat for flat, _ in self.wrong_map_scenarios.values()]
         return (
-            [s for scenario in made for s in (scenario, unseen(scenario))] if self.spec.grid.blind else made
+            [s for scenario in made for s in (scenario, blind_scenario(scenario))]
+            if self.spec.grid.blind
+            else made
         )
 
     @cached_property
@@ -126,9 +128,10 @@ class Experiment:
         return [
             (self._case(setting, agent, level), self.seeds[: max(1, self.spec.episodes // 3)])
             for scenario in self.scenarios
-            if isinstance(scenario.occupancy, OccupancyProcess) and scenario.name not in self.maps
+            if isinstance(scenario.occupancy, OccupancyProcess)
+            and scenario.name not in self.wrong_map_scenarios
             for level in self.spec.grid.occupancy_levels
-            for setting in self._grid(at_occupancy(scenario, level), first_speeds=True)
+            for setting in self._grid_settings(at_occupancy(scenario, level), first_speeds=True)
             for agent in self.spec.agents
             if scenario.sensor_model != SensorModel.blind() or _works_blind(agent)
         ]
@@ -137,19 +140,19 @@ class Experiment:
         return Case(scenario, agent.name, level, self.spec.rig, agent.options)
 
     def _settings(self, scenario: Scenario) -> list[Scenario]:
-        settings = self._grid(scenario)
+        settings = self._grid_settings(scenario)
         if (measured := self.calibration) is not None:
             settings += settings_of(measured.applied(scenario), v_walk_kmh=self.spec.grid.v_walk_kmh)
         return settings
 
-    def _grid(self, scenario: Scenario, first_speeds: bool = False) -> list[Scenario]:
+    def _grid_settings(self, scenario: Scenario, first_speeds: bool = False) -> list[Scenario]:
         grid = self.spec.grid
         walk, drive = grid.v_walk_kmh, grid.v_drive_kmh
         if first_speeds:
             walk, drive = walk and walk[:1], drive and drive[:1]
         return settings_of(scenario, grid.failure_s, walk, drive)
 
-    def settings(self) -> Row:
+    def fingerprint(self) -> Row:
         """Return everything that affects the outcome of an episode; a resumed run must have the same settings."""
         return {
             "version": __version__,
@@ -226,7 +229,10 @@ class ExperimentResult:
 
     def figure_data(self) -> ComparisonResults:
         """Return the data for the figures of a comparison."""
-        flat = {name: (name.partition(MAP_SAYS)[0], p) for name, (_, p) in self.experiment.maps.items()}
+        flat = {
+            name: (name.partition(MAP_SAYS)[0], p)
+            for name, (_, p) in self.experiment.wrong_map_scenarios.items()
+        }
         return ComparisonResults(
             self.experiment.cases,
             self.folder.episodes,
@@ -280,7 +286,7 @@ def run_experiment(
         check_worlds(scenario, experiment.seeds)
     cases = experiment.cases + experiment.occupancy_cases
     with workers:
-        folder = ResultFolder(out, experiment.settings(), resume=resume, overwrite=overwrite)
+        folder = ResultFolder(out, experiment.fingerprint(), resume=resume, overwrite=overwrite)
         remove_figures(out)
         spec.write(out / SPEC_FILE)
         on_start(sum(len(seeds) for _, seeds in cases))
