@@ -80,9 +80,7 @@ def fit_box(
     size = np.full(2, CAR_WIDTH)
     size[along] = CAR_LENGTH
     size = np.maximum(size, extent)
-    anchor = np.zeros(
-        2
-    )  # -1: the low side is a true side of the car, 1: the high side, 0: undecided
+    anchor = np.zeros(2)  # -1: the low side is a true side of the car, 1: the high side, 0: undecided
     for i in (0, 1):
         anchor[i] = -1.0 if seen_from[i] < low[i] else 1.0 if seen_from[i] > high[i] else 0.0
         # Whether the low or the high side is only where the view ends.
