@@ -1,4 +1,4 @@
-"""`parkenv compare` and its neighbours from the outside: results, resuming, faults."""
+"""`parkenv compare` and related commands: results, resuming, errors."""
 
 import csv
 import dataclasses

@@ -1,4 +1,4 @@
-"""Experiment files: what they run, how a run folder is gone on with, and how bad files are refused."""
+"""Experiment files: what they run, how a run folder is resumed, and errors of invalid files."""
 
 import json
 import re
@@ -71,7 +71,7 @@ def test_a_file_is_run_and_its_folder_says_what_was_run(tmp_path, sweep):
     kept = ExperimentSpec.read(out / SPEC_FILE)
     assert kept == ExperimentSpec.read(sweep)
 
-    # The folder alone is enough to go on, and to add to it.
+    # The folder alone is enough to resume the run and to extend it.
     (out / "summary.json").unlink()
     episodes = (out / "episodes.csv").read_text()
     (out / "episodes.csv").write_text("\n".join(episodes.splitlines()[:20]) + "\n")
@@ -81,7 +81,7 @@ def test_a_file_is_run_and_its_folder_says_what_was_run(tmp_path, sweep):
     assert {row["episodes"] for row in summary_of(out)["rows"]} == {5}
     assert ExperimentSpec.read(out / SPEC_FILE) == kept.changed(episodes=5, jobs=0)
 
-    # A file of the experiment that has changed is noticed.
+    # A changed file of the experiment is detected.
     (tmp_path / "own.toml").write_text('lot = "mini"\ncosts = { give_up_s = 70 }\n')
     again = parkenv("run", sweep, "--out", out, "--resume")
     assert again.returncode == 2

@@ -1,4 +1,4 @@
-"""The report in a real browser: it loads without a complaint, plays, steps, sorts, and shows the summary's numbers."""
+"""The report in a real browser: it loads without errors, plays, steps, sorts, and shows the summary's numbers."""
 
 import json
 import shutil

@@ -1,4 +1,4 @@
-"""Learning agents: the batch for stable-baselines3, trainings that can be stopped, models that say what they are."""
+"""Learning agents: the batch for stable-baselines3, interruptible trainings, model metadata."""
 
 import dataclasses
 import json
@@ -176,7 +176,7 @@ def test_a_kill_between_the_last_checkpoint_and_its_examination_loses_neither(tm
 
 
 class Waits:
-    """Goes nowhere."""
+    """Never moves."""
 
     def predict(self, observation, state=None):
         return int(np.flatnonzero(observation["action_mask"] == 0)[0]), state
@@ -317,7 +317,7 @@ def test_every_algorithm_trains_a_model_that_searches(algorithm, tmp_path, monke
     assert row["episodes"] == 4
 
 
-# One that learns from its last decisions, and one that keeps what it did for long.
+# One on-policy algorithm, and one with a replay buffer.
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["maskable-ppo", "dqn"])
 def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp_path, algorithm):

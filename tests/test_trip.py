@@ -1,4 +1,4 @@
-"""The whole trip: lines along lanes, lane keeping, tries that fail, and what many trips say of speeds and costs."""
+"""The whole trip: lines along lanes, lane keeping, failed attempts, and calibration of speeds and costs."""
 
 import dataclasses
 import json
@@ -200,7 +200,7 @@ def test_a_lane_keeper_stays_near_its_path_at_any_speed_and_slows_down_in_turns(
 
 @pytest.mark.parametrize("name", ["mini", "campus"])
 def test_with_the_graphs_times_a_trip_is_the_search_itself(name):
-    """Replace what was driven by what the graph says, and every decision and second is that of Search-v1."""
+    """With the graph's times instead of driven ones, every decision and time equals that of Search-v1."""
     scenario = blind_scenario(make_scenario(name))
     agent = make_agent("mdp", scenario)
     plain, driven = SearchEnv(scenario), DrivenSearchEnv(scenario, GraphExecutor(scenario))

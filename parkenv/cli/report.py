@@ -186,7 +186,7 @@ def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
 
 
 def _trained(run: RunFolder) -> Cases:
-    """Return the best model and the best planners in the test scenarios; none if no search was trained."""
+    """Return the best model and the best planners in the test scenarios; none for driving, or without a test."""
     from parkenv.evaluation.experiments.compare import Case
     from parkenv.evaluation.experiments.spec import SPEC_FILE, TrainingSpec
 
