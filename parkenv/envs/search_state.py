@@ -88,7 +88,7 @@ class SearchState:
 
     @property
     def parked(self) -> bool:
-        """Whether the car is parked."""
+        """Whether the car has parked."""
         return bool(self._record["parked"])
 
     @property

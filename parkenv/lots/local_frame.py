@@ -1,4 +1,4 @@
-"""Local metric frames: metres east and north of a point on the globe."""
+"""Local metric frames: metres east and north of a geographic point."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class LocalFrame:
         lat: latitude of the centre, degrees.
 
     Raises:
-        InputError: coordinates that are not on the globe.
+        InputError: an invalid longitude or latitude.
 
     Examples:
         >>> frame = LocalFrame(lon=7.85, lat=48.0)

@@ -109,7 +109,7 @@ class CarModel:
         """Load a packaged model by name, or a model from a file.
 
         Raises:
-            InputError: no such model or file, or a file of another kind or version.
+            InputError: an unknown model, a missing file, or a file with another format or version.
         """
         if str(name) in PACKAGED_MODELS:
             source = resources.files("parkenv.perception") / "models" / f"{name}.npz"

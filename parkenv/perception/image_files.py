@@ -47,7 +47,7 @@ def images_in(folder: Path) -> list[Path]:
     """Return the image files in a folder and its subfolders, in natural order of their names.
 
     Raises:
-        InputError: no such folder, or one without images.
+        InputError: the folder does not exist or contains no images.
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")

@@ -83,7 +83,7 @@ def _make_slot_lot(lot: ParkingLot, seed: int) -> SlotLot:
 class LotScenes:
     """Scenes of one world over time.
 
-    Parked cars and traffic depend on the world alone. Consecutive scenes are updated incrementally.
+    Parked cars and traffic depend only on the world. Consecutive scenes are updated incrementally.
 
     Args:
         slots: `slot_lot` of the scenario's lot.

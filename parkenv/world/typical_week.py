@@ -1,4 +1,4 @@
-"""A typical working week on any lot: full by day, empty by night, and fuller near the goal."""
+"""Occupancy of a typical working week on any lot: full by day, empty at night, fuller near the goal."""
 
 from __future__ import annotations
 
