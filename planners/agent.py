@@ -98,11 +98,11 @@ class SearchAgent(ABC, Generic[Memory]):
         episode_start: NDArray[np.bool_] | Sequence[bool] | None = None,
         deterministic: bool = True,
     ) -> tuple[NDArray[np.int64], Sequence[Memory] | Memory]:
-        """Choose actions by stable-baselines3's interface, for one observation or a batch with a leading axis.
+        """Choose actions for one observation or a batch with a leading axis (stable-baselines3's interface).
 
         Args:
             observation: from `parkenv/Search-v1` or a vector of them.
-            state: what the last call returned; None at the start.
+            state: returned by the previous call; None at the start.
             episode_start: for each environment, whether its episode has just begun. With None, episodes begin where
                 `state` is None.
             deterministic: part of the interface; ignored by these agents.

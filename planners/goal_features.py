@@ -14,8 +14,8 @@ N_FEATURES = 17
 class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
     """Appends the goal in the car's frame and the car in the goal's frame to the observation.
 
-    Nothing here is learned. The features depend only on the difference between achieved and desired goal, so that a
-    policy generalises over places, and hindsight goals look like slots.
+    Nothing here is learned. The features depend only on the difference between achieved and desired goal, so a policy
+    generalises over positions, and hindsight goals look like slots.
 
     Args:
         observation_space: a `Dict` of observation, achieved_goal and desired_goal.
@@ -32,10 +32,10 @@ class GoalFeatures(BaseFeaturesExtractor):  # type: ignore[misc]
         away, cosine, sine = own[:, :2] - goal[:, :2], own[:, 2:4], goal[:, 2:4]
         ahead, aside = _rotate(away, sine)  # in the goal's frame
         before, beside = _rotate(-away, cosine)  # in the car's
-        along, across = _rotate(cosine, sine)  # the car's heading against the goal's
+        along, across = _rotate(cosine, sine)  # the car's heading relative to the goal's
         speed, wanted = own[:, 4], goal[:, 4]
         distance = torch.hypot(ahead, aside)
-        # Near the goal decimetres matter, far from it metres.
+        # Decimetres matter near the goal, metres far from it.
         fine = torch.stack(
             [
                 ahead,

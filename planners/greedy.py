@@ -1,7 +1,7 @@
-"""Heuristic baselines: how people search. They use what they observe, and no forecast.
+"""Heuristic baselines: how people search, from their observations and without a forecast.
 
-A slot is a candidate unless it was observed taken not long ago. Heuristics that look at the goal rank slots by what
-parking costs there on arrival (`SearchProblem.arrival_cost_s`): the walk, and the price where slots have one.
+A slot is a candidate unless it was recently observed taken. Heuristics that consider the goal rank slots by arrival
+cost (`SearchProblem.arrival_cost_s`): the walk, and the price where slots have one.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ class GreedyState:
     """Memory of a heuristic.
 
     Attributes:
-        target: the slot that it drives to, or -1.
+        target: the slot to drive to, or -1.
     """
 
     target: int = -1
 
 
 class TargetAgent(SearchAgent[GreedyState]):
-    """Drives to one slot after the other, parks where its target is free, and drops it once it is observed taken."""
+    """Drives to one slot after another, parks if the target is free, and drops it once it is observed taken."""
 
     def __init__(self, problem: SearchProblem) -> None:
         super().__init__(problem)
@@ -45,7 +45,7 @@ class TargetAgent(SearchAgent[GreedyState]):
         return GreedyState()
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: GreedyState) -> int:
-        """Keep the target while it is a candidate, else choose another; park on arrival."""
+        """Keep the target while it is a candidate, else choose another one; park on arrival."""
         vertex = int(observation["vertex"])
         previous = memory.target
         taken = previous >= 0 and belief.state[previous] == OBSERVED_TAKEN and not _decayed(belief)[previous]
@@ -53,7 +53,7 @@ class TargetAgent(SearchAgent[GreedyState]):
             candidates = ~belief.observed_taken | _decayed(belief)
             memory.target = self.choose(candidates, belief.observed_free, vertex, previous)
             if memory.target < 0:
-                # Every slot was observed taken: the one observed longest ago is likeliest to be free by now.
+                # Every slot was observed taken: the one observed longest ago is the most likely to be free.
                 p_occupied = np.where(self.reachable(vertex), belief.p_occupied, np.inf)
                 memory.target = int(p_occupied.argmin())
         if memory.target == vertex:
@@ -73,21 +73,21 @@ class TargetAgent(SearchAgent[GreedyState]):
         vertex: int,
         previous: int,
     ) -> int:
-        """Return the slot to drive to, or -1 where no candidate is reachable.
+        """Return the slot to drive to, or -1 if no candidate is reachable.
 
         Args:
-            candidates: (n_slots,) bool, not observed taken.
-            observed_free: (n_slots,) bool.
+            candidates: (n_slots,) bool, slots not recently observed taken.
+            observed_free: (n_slots,) bool, slots that were observed free.
             vertex: where the car is.
-            previous: the slot that it was driving to, or -1 at the start.
+            previous: the previous target, or -1 at the start.
         """
 
     def reachable(self, vertex: int) -> NDArray[np.bool_]:
-        """Return which slots, (n_slots,), a route leads to."""
+        """Return the slots, (n_slots,) bool, that are reachable from a vertex."""
         return np.asarray(np.isfinite(self.routes.seconds_from(vertex)[: self.problem.lot.n_slots]))
 
     def cheapest(self, candidates: NDArray[np.bool_], vertex: int) -> NDArray[np.bool_]:
-        """Return the reachable candidates, (n_slots,) bool, with the least arrival cost; none if none is reachable."""
+        """Return the reachable candidates, (n_slots,) bool, with the lowest arrival cost; all False if none."""
         cost_s = np.where(candidates, self.problem.arrival_cost_s, np.inf)
         best = np.asarray(candidates & (cost_s == cost_s.min()))
         if not len(self.routes.nearest(vertex, best)[0]):
@@ -96,20 +96,20 @@ class TargetAgent(SearchAgent[GreedyState]):
         return best
 
     def drops_target(self, belief: SlotBelief, target: int) -> bool:
-        """Return whether to choose another target although this one was not observed taken."""
+        """Return whether to choose another target even though this one was not observed taken."""
         del belief, target
         return False
 
 
 def _decayed(belief: SlotBelief) -> NDArray[np.bool_]:
-    """Return the slots, (n_slots,), whose observation has decayed to the forecast and says nothing any more."""
+    """Return the slots, (n_slots,) bool, whose last observation has decayed to the forecast."""
     return np.asarray((belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast))
 
 
 class GreedyGoalAgent(TargetAgent):
     """`greedy-goal`: drives to the candidate nearest to the goal, then to the next one.
 
-    Nearest means the least arrival cost: where slots have a price, a cheaper one may come before a nearer one.
+    Nearest means the lowest arrival cost: where slots have a price, a cheaper one may come before a nearer one.
     """
 
     name: ClassVar[str] = "greedy-goal"
@@ -121,7 +121,7 @@ class GreedyGoalAgent(TargetAgent):
         vertex: int,
         previous: int,
     ) -> int:
-        """Return the least arrival cost; among equals the shortest drive."""
+        """Return the slot with the lowest arrival cost; among equals the one with the shortest drive."""
         del observed_free, previous
         slots, _ = self.routes.nearest(vertex, self.cheapest(candidates, vertex))
         return int(slots[0]) if len(slots) else -1
@@ -139,22 +139,22 @@ class GreedyDriveAgent(TargetAgent):
         vertex: int,
         previous: int,
     ) -> int:
-        """Return the shortest drive; among equals the least arrival cost."""
+        """Return the slot with the shortest drive; among equals the one with the lowest arrival cost."""
         del observed_free, previous
         slots, _ = self.routes.nearest(vertex, candidates)
         return int(slots[self.problem.arrival_cost_s[slots].argmin()]) if len(slots) else -1
 
 
 class FirstFreeAgent(TargetAgent):
-    """`first-free`: drives toward the goal and takes the first free slot that is near enough.
+    """`first-free`: drives towards the goal and takes the first free slot that is near enough.
 
-    Where it has found nothing by the time it reaches the slot nearest to the goal, it goes on to the nearest slot not
-    observed yet, and so on, and takes whatever is free.
+    If it has found none when it reaches the slot nearest to the goal, it drives on to the nearest unobserved slot, and
+    so on, and takes any free slot.
 
     Args:
         problem: lot, goal, speeds and costs.
-        within_m: greatest distance from the goal, m, at which a free slot is good enough; the lot's median where
-            None. A slot's price counts as the metres that one walks in as many seconds.
+        within_m: maximum distance from the goal, m, at which a free slot is good enough; None: the lot's median. A
+            slot's price counts as the distance that one walks in as many seconds.
     """
 
     name: ClassVar[str] = "first-free"
@@ -175,7 +175,7 @@ class FirstFreeAgent(TargetAgent):
         vertex: int,
         previous: int,
     ) -> int:
-        """Return a slot observed free that is near enough; at first the one at the goal; then the nearest candidate."""
+        """Return a near enough slot observed free; else first the slot at the goal, then the nearest candidate."""
         good = candidates & observed_free & self._near
         if good.any():
             slots, _ = self.routes.nearest(vertex, good)
@@ -187,16 +187,16 @@ class FirstFreeAgent(TargetAgent):
         return int(slots[0]) if len(slots) else -1
 
     def drops_target(self, belief: SlotBelief, target: int) -> bool:
-        """Return whether a slot that is near enough was observed free while driving to another one."""
+        """Return whether a near enough slot was observed free while driving to another one."""
         return belief.state[target] != OBSERVED_FREE and bool((belief.observed_free & self._near).any())
 
 
 class RandomAgent(SearchAgent[np.random.Generator]):
-    """`random`: any action that the graph has here, all equally likely.
+    """`random`: chooses any available action, all with equal probability.
 
     Args:
         problem: lot, goal, speeds and costs.
-        seed: fixes the episode together with the moment of arrival.
+        seed: determines the actions together with the time of arrival.
     """
 
     name: ClassVar[str] = "random"
@@ -206,7 +206,7 @@ class RandomAgent(SearchAgent[np.random.Generator]):
         self.seed = seed
 
     def begin(self, observation: Observation, belief: SlotBelief) -> np.random.Generator:
-        """Return a generator that depends on the seed and the moment of arrival alone."""
+        """Return a generator that depends only on the seed and the time of arrival."""
         del belief
         moment = int(np.float32(observation["time"][0]).view(np.uint32))
         return np.random.default_rng([self.seed, moment, int(observation["vertex"])])

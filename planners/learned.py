@@ -1,7 +1,7 @@
-"""Trained models as agents, and their files.
+"""Trained models as agents, and their model files.
 
-A model file is stable-baselines3's archive with one more member, `parkenv.json`, the model card: what the model was
-trained on, with which settings, and what it observes.
+A model file is a stable-baselines3 archive with an added member `parkenv.json`, the model card: on what and with which
+settings the model was trained, and what it observes.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ class ModelCard:
 
     Args:
         algorithm: one of `ALGORITHMS`.
-        scenarios: names of those it was trained on; of lots, if it drives.
-        k: slots in its observation; 0, if it drives.
+        scenarios: names of the training scenarios; for driving, of the lots.
+        k: number of slots in the observation; 0 for driving.
         observation: version of the observation's layout.
-        seed: of the training.
+        seed: seed of the training.
         steps: environment steps of the training.
-        settings: of the algorithm, from its training config.
-        parkenv: version of the package that it was trained with.
+        settings: settings of the algorithm, from its training config.
+        parkenv: version of this package at training time.
         task: one of `TASKS`.
     """
 
@@ -70,7 +70,7 @@ class ModelCard:
         """Read the card of a model file.
 
         Raises:
-            InputError: no such file, a damaged one, one without a card, or of another version.
+            InputError: the file is missing or damaged, has no card, or has a card of another version.
         """
         try:
             with zipfile.ZipFile(path) as archive:
@@ -98,10 +98,10 @@ class ModelCard:
 
 
 def algorithm_class(name: str) -> Any:
-    """Return stable-baselines3's class of an algorithm.
+    """Return the stable-baselines3 class of an algorithm.
 
     Raises:
-        InputError: an unknown name, or the extra `rl` is not installed.
+        InputError: the name is unknown, or the extra `rl` is not installed.
     """
     if name not in ALGORITHMS:
         raise InputError(f"unknown algorithm {name!r}; known: {', '.join(ALGORITHMS)}")
@@ -118,13 +118,13 @@ def load_model(
     """Load a model and its card.
 
     Args:
-        algorithm: that it was trained with.
+        algorithm: algorithm that it was trained with.
         path: the model file.
         task: one of `TASKS`.
-        observation: version of the layout that the environment observes.
+        observation: version of the environment's observation layout.
 
     Raises:
-        InputError: a file that is no model, of another algorithm, another task or another observation.
+        InputError: the file is not a model, or is one of another algorithm, task or observation.
     """
     card = ModelCard.of_file(path)
     if card.algorithm != algorithm:
@@ -143,24 +143,24 @@ def load_model(
     kind = algorithm_class(algorithm)
     try:
         return card, kind.load(Path(path), device="cpu", custom_objects=unneeded)
-    except Exception as error:  # torch raises many kinds for damaged files
+    except Exception as error:  # torch raises many types for damaged files
         raise InputError(f"{path}: its network cannot be read ({type(error).__name__}: {error})") from error
 
 
 class LearnedAgent:
-    """A trained model as an agent for any lot; it observes `parkenv.envs.local_observation`.
+    """A trained model as an agent for any lot, on observations of `parkenv.envs.local_observation`.
 
     Args:
         problem: lot, goal, speeds and costs.
-        algorithm: that it was trained with.
+        algorithm: algorithm that it was trained with.
         path: the model file.
 
     Raises:
-        InputError: a file that is no model, of another algorithm, another task or another observation.
+        InputError: the file is not a model, or is one of another algorithm, task or observation.
 
     Attributes:
         card: metadata of the file.
-        local_k: slots that the observation must have.
+        local_k: number of slots in the observation.
     """
 
     def __init__(
@@ -178,10 +178,10 @@ class LearnedAgent:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, Any]:
-        """Choose an action by stable-baselines3's interface, for observations of `LocalObservation`.
+        """Choose an action for an observation of `LocalObservation` (stable-baselines3's interface).
 
         Raises:
-            InputError: another observation, or a mask that allows no action.
+            InputError: the observation has another layout, or its mask allows no action.
         """
         if "local" not in observation:
             raise InputError(

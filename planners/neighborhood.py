@@ -1,4 +1,4 @@
-"""Subgraphs of large lots: the part of the drive graph that a search can be about, with all drives in it."""
+"""Subgraphs of large lots: the part of the drive graph that matters for a search, with all shortest drives in it."""
 
 from __future__ import annotations
 
@@ -29,18 +29,18 @@ _KEPT = 4
 
 @dataclass(frozen=True, eq=False)
 class Neighborhood:
-    """A subgraph of a lot, with vertex numbers of its own, and all drives within it.
+    """A subgraph of a lot with its own vertex numbers, and all shortest drives within it.
 
     Attributes:
-        vertices: (k,) int64, the vertices' numbers in the lot, ascending, so that slots come first here, too.
-        n_slots: how many of them are slots.
+        vertices: (k,) int64, numbers of its vertices in the lot, ascending, so slots come first here, too.
+        n_slots: number of slots among them.
         whole: whether it is the whole lot.
-        entry: the vertex of the lot from which it was expanded, and through which the car enters it.
-        table: the drives.
+        entry: the vertex of the lot from which it was expanded and where the car enters it.
+        table: shortest drives.
         view_starts: (k + 1,) int64, rows of `views`.
         views: `VIEW` records, slots of the subgraph in view of each vertex.
         own_rate: (n_slots,) float64, P(each slot is detected from its own vertex).
-        cost_s: (n_slots,) float64, s, what parking costs on arrival.
+        cost_s: (n_slots,) float64, s, arrival cost.
     """
 
     vertices: IntArray
@@ -69,7 +69,7 @@ class Neighborhood:
             slots, rates = seen[seen >= 0], rates[row][seen >= 0]
         views = np.empty(len(slots), VIEW)
         views["slot"], views["rate"] = slots, rates
-        # Copies: numba compiles a function once more for arrays that are read-only, as those of the whole lot are.
+        # Copies: the lot's arrays are read-only, for which numba would compile every function again.
         neighbors, starts = neighbors.copy(), starts.copy()
         table, own_rate = RoadTable.over(neighbors, problem.move_s[vertices]), np.zeros(n_slots)
         own = slots == np.repeat(np.arange(len(vertices)), np.diff(starts))
@@ -83,19 +83,19 @@ class Neighborhood:
         return self.vertices[: self.n_slots]
 
     def index(self, vertex: int) -> int:
-        """Return the number here of a vertex of the lot, or -1."""
+        """Return the number in this subgraph of a vertex of the lot, or -1."""
         i = int(np.searchsorted(self.vertices, vertex))
         return i if i < len(self.vertices) and self.vertices[i] == vertex else -1
 
     def in_view(self, vertex: int) -> NDArray[Any]:
-        """Return the `VIEW` records of a vertex, numbered as here."""
+        """Return the `VIEW` records of a vertex, both numbered as in this subgraph."""
         return self.views[self.view_starts[vertex] : self.view_starts[vertex + 1]]
 
     def planning_graph(self, problem: SearchProblem, failure_s: float) -> PlanningGraph:
         """Return the data of a path search.
 
         Args:
-            problem: that this is a part of.
+            problem: the problem on the whole lot.
             failure_s: s, cost of finding a slot taken on arrival.
         """
         return PlanningGraph(
@@ -113,21 +113,21 @@ class Neighborhood:
 
 
 class Neighborhoods:
-    """Finds the subgraph of a lot that matters to a search.
+    """Finds the subgraph of a lot that matters for a search.
 
-    A vertex cannot do better than g = drive to it + h, where h is the least drive and arrival cost from there if every
-    slot were free. Vertices are added in the order of g; from any of them on the rest can be left out: no plan that is
-    expected to take less than the next one's g goes there first. The shortest routes from the start to the vertices
-    added are among them. Near the goal the expansion starts where the car is. While the car is farther from the goal
-    than a quarter of the vertices that there is room for, it starts where a shortest route first comes that near: the
-    subgraph's entry.
+    A lower bound on any plan via a vertex is g = drive time to it + h, where h is the least drive time plus arrival
+    cost from there if all slots were free. Vertices are added in the order of g. The rest can be left out at any point:
+    no plan that is expected to take less than the next g goes there first. The subgraph contains the shortest routes
+    from its start to all its vertices. Near the goal the expansion starts at the car. If the car is farther from the
+    goal than a quarter of `most_vertices` reaches, the expansion starts where a shortest route first comes that near:
+    the subgraph's entry.
 
     Args:
-        problem: the lot, goal and speeds.
-        most_vertices: lots of up to so many vertices are one neighbourhood.
+        problem: lot, goal and speeds.
+        most_vertices: maximum size of a subgraph; lots up to this size are one neighbourhood.
 
     Raises:
-        InputError: too few vertices, or too many for a table.
+        InputError: `most_vertices` is too small, or too large for a table.
     """
 
     def __init__(self, problem: SearchProblem, most_vertices: int = MOST_VERTICES) -> None:
@@ -148,7 +148,7 @@ class Neighborhoods:
         self._far_s = float(np.partition(self._least_s, most_vertices // 4)[most_vertices // 4])
 
     def toward(self, vertex: int) -> Neighborhood:
-        """Return where a search that begins at a vertex will take place. The last few are kept."""
+        """Return the subgraph for a search that begins at a vertex. The last few are cached."""
         if self._whole is not None:
             return self._whole
         if vertex not in self._kept:
@@ -160,9 +160,9 @@ class Neighborhoods:
         return self._kept[vertex]
 
     def around(self, vertex: int, taken: IntArray) -> Neighborhood:
-        """Return where a search goes on from a vertex when some slots, (k,), were observed taken.
+        """Return the subgraph for continuing a search at a vertex after some slots, (k,), were observed taken.
 
-        It is expanded from there; where that reaches no other slot, from the best of them.
+        It is expanded from the vertex, or, if that reaches no other slot, from the best other slot.
         """
         if self._whole is not None:
             return self._whole
@@ -173,7 +173,7 @@ class Neighborhoods:
         return near
 
     def _descend(self, vertex: int, least_s: FloatArray, enough_s: float) -> int:
-        """Return where a shortest route to the best slot is first within some time of it, or its end."""
+        """Return the first vertex on a shortest route to the best slot that is within a given time of it."""
         while enough_s < least_s[vertex] < np.inf:
             onward = self._problem.lot.neighbors[vertex]
             through = np.where(onward >= 0, self._problem.move_s[vertex] + least_s[onward], np.inf)
@@ -183,7 +183,7 @@ class Neighborhoods:
         return vertex
 
     def _least(self, taken: IntArray) -> FloatArray:
-        """Return h of every vertex, (n_vertices,) s up to a constant, where all slots but some are free."""
+        """Return h of every vertex, (n_vertices,) s up to a constant, if all slots except `taken` are free."""
         p_free = self._free.copy()
         p_free[taken] = 0.0
         return set_labels(self._graph, p_free).cost
@@ -195,7 +195,7 @@ class Neighborhoods:
 
 
 def _renumber(vertices: IntArray, numbers: NDArray[np.integer]) -> IntArray:
-    """Return the positions of vertices of the lot among `vertices`; -1 where one is not there."""
+    """Return the positions in `vertices` of some vertices of the lot; -1 if absent."""
     place = np.minimum(np.searchsorted(vertices, numbers), len(vertices) - 1)
     return np.where(vertices[place] == numbers, place, -1).astype(np.int64)
 
@@ -204,7 +204,7 @@ def _renumber(vertices: IntArray, numbers: NDArray[np.integer]) -> IntArray:
 def _first_by_bound(
     start: int, least_s: FloatArray, neighbors: NDArray[np.int32], move_s: FloatArray, most: int
 ) -> NDArray[np.int32]:
-    """Return up to `most` vertices in the order of the drive to them plus `least_s`, their bound: A* search."""
+    """Return up to `most` vertices in the order of drive time plus the bound `least_s` (A* search)."""
     seconds = np.full(len(neighbors), np.inf)
     settled = np.zeros(len(neighbors), np.bool_)
     room = neighbors.shape[1] * most + 1

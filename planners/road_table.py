@@ -1,4 +1,4 @@
-"""All shortest drives of a lot or of a part of it: times between all vertices, and the routes."""
+"""All shortest drives of a lot or a part of it: times and routes between all vertices."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ class RoadTable:
 
     @classmethod
     def over(cls, neighbors: NDArray[np.int32], move_s: FloatArray) -> Self:
-        """Make the table of a graph: (n_vertices, 4) neighbours, -1 for none, and drive times, s."""
+        """Make the table of a graph from (n_vertices, 4) neighbours, -1 for none, and drive times, s."""
         n = len(neighbors)
         source, move = np.nonzero(neighbors >= 0)
         target, drive = neighbors[source, move], move_s[source, move]
-        # Parallel edges would be added up by the matrix: keep the quickest.
+        # The matrix would add up parallel edges: keep the fastest.
         order = np.lexsort((drive, target, source))
         source, target, drive = source[order], target[order], drive[order]
         first = np.r_[True, (np.diff(source) != 0) | (np.diff(target) != 0)][: len(source)]

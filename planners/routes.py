@@ -1,4 +1,4 @@
-"""Shortest drives over the drive graph, searched only as far as needed."""
+"""Shortest drives in the drive graph, searched only as far as needed."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class DriveRoutes:
     """
 
     def __init__(self, problem: SearchProblem) -> None:
-        # Copies: numba compiles a function once more for arrays that are read-only.
+        # Copies: numba would compile every function again for read-only arrays.
         self._neighbors, self._move_s = problem.lot.neighbors.copy(), problem.move_s.copy()
         n_moves = len(MOVES)
         self._out_start = np.arange(0, n_moves * len(self._neighbors) + 1, n_moves, dtype=np.int32)
@@ -38,19 +38,19 @@ class DriveRoutes:
         self._moves: OrderedDict[int, dict[int, int]] = OrderedDict()
 
     def seconds_from(self, vertex: int) -> FloatArray:
-        """Return the drive time, (n_vertices,) s, from a vertex to every other; inf where no route leads."""
+        """Return the drive time, (n_vertices,) s, from a vertex to every other; inf where unreachable."""
         nowhere = np.zeros(0, dtype=np.bool_)
         return self._outward(vertex, nowhere)[0]
 
     def nearest(self, vertex: int, slots: NDArray[np.bool_]) -> tuple[NDArray[np.int64], float]:
-        """Return those of some slots that are nearest by drive.
+        """Return the slots of a set with the shortest drive.
 
         Args:
             vertex: where the car is.
             slots: (n_slots,) bool, to choose from.
 
         Returns:
-            (k,) int64, ascending, the nearest slots, and their drive time, s; none and inf where no route leads to any.
+            (k,) int64, ascending, the nearest slots, and their drive time, s; none and inf if none is reachable.
         """
         seconds, reached = self._outward(vertex, slots)
         if reached == _NONE:
@@ -75,13 +75,13 @@ class DriveRoutes:
         return moves[vertex]
 
     def path(self, vertex: int, target: int) -> tuple[int, ...]:
-        """Return the vertices of a shortest route without the first; none where there is no target (-1) or no route."""
+        """Return the vertices of a shortest route without the first; empty without a target (-1) or a route."""
         if target < 0 or not np.isfinite(self.seconds_from(vertex)[target]):
             return ()
         return tuple(v for _, v in self.hops(vertex, target))
 
     def hops(self, vertex: int, target: int) -> Iterator[tuple[int, int]]:
-        """Yield the moves of a shortest route and the vertices that they lead to; nothing where the car is there.
+        """Yield the moves of a shortest route and the vertices that they lead to; nothing if the car is already there.
 
         Raises:
             InputError: no route leads to the target.
@@ -92,13 +92,13 @@ class DriveRoutes:
             yield move, vertex
 
     def _outward(self, vertex: int, ends: NDArray[np.bool_]) -> tuple[FloatArray, int]:
-        """Return drive times, exact up to the nearest of `ends` and upper bounds beyond, and that one's vertex."""
+        """Return drive times, exact up to the nearest of `ends` and upper bounds beyond, and that nearest vertex."""
         seconds = np.full(len(self._neighbors), np.inf)
         reached = _search(self._out_start, self._out_target, self._out_s, vertex, ends, seconds)
         return seconds, int(reached)
 
     def _moves_along(self, vertex: int, target: int) -> dict[int, int]:
-        """Return the moves of a shortest route by the vertex that each is made at; none where there is no route."""
+        """Return the moves of a shortest route, keyed by the vertex at which each is made; empty without a route."""
         seconds = np.full(len(self._neighbors), np.inf)
         end = np.zeros(vertex + 1, dtype=np.bool_)
         end[vertex] = True
@@ -122,15 +122,16 @@ def _search(
     ends: NDArray[np.bool_],
     seconds: FloatArray,
 ) -> int:
-    """Dijkstra's algorithm until the first of `ends`, (k,) bool of the first k vertices, is settled.
+    """Run Dijkstra's algorithm until the first of `ends`, (k,) bool of the first k vertices, is settled.
 
     Args:
         start: (n + 1,) int32, the edges of v are rows `start[v]` to `start[v + 1]` of the next two.
-        leads_to: (m,) int32, the vertex at an edge's other end; -1 is no edge.
-        edge_s: (m,) s.
-        origin: the first vertex.
+        leads_to: (m,) int32, the vertex at an edge's other end; -1 for no edge.
+        edge_s: (m,) s, drive time of each edge.
+        origin: the start vertex.
         ends: vertices at which the search may stop.
-        seconds: (n,) s, all inf; filled with drive times, exact up to where it stopped and upper bounds beyond.
+        seconds: (n,) s, all inf; output: drive times, exact up to the vertex where the search stopped, upper bounds
+            beyond.
 
     Returns:
         One of the nearest of `ends`, or -1.

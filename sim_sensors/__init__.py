@@ -1,6 +1,6 @@
 """Simulated sensors of a car: cameras, stereo cameras and laser scanners in scenes of parametric vehicles.
 
-The package knows geometry and light, and nothing of parking. Each name is loaded when it is first used: importing
+The package contains geometry and light, but nothing about parking. Each name is loaded on first use: importing
 `sim_sensors.laser` does not load the cameras.
 """
 

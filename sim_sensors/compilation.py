@@ -1,8 +1,8 @@
-"""Compile functions with numba, and keep the machine code until any source it was made from changes.
+"""Compile functions with numba, and cache the machine code until any of its sources changes.
 
-Numba's own cache checks the file of the compiled function alone: after an edit of a function that it calls, or of a
-constant that it reads, in another file, callers would go on running the old code. Here the key is the content of the
-function's module and of every module that it imports, directly or not. Libraries count by numba's version alone.
+Numba's own cache checks only the file of the compiled function: after a change in another file, to a function that it
+calls or a constant that it reads, callers would keep running the old code. Here the key is the content of the
+function's module and of every module that it imports, directly or indirectly. Of libraries only numba's version counts.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _LOGGER = logging.getLogger("parkenv")
 
 
 def cache_folder() -> Path:
-    """Return the folder that holds compiled code: `NUMBA_CACHE_DIR`, else one in the user's cache folder."""
+    """Return the folder of compiled code: `NUMBA_CACHE_DIR`, else one in the user's cache folder."""
     configured = numba.config.CACHE_DIR
     return Path(configured) if configured else user_cache_path("parkenv", appauthor=False) / "compiled"
 
@@ -47,11 +47,11 @@ def compiled(function: Callable[..., Any], /) -> Any: ...
 @overload
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]: ...
 def compiled(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
-    """Decorate a function to be compiled when it is first called, once for all processes and sessions.
+    """Compile the decorated function on its first call, once for all processes and sessions.
 
     Args:
-        function: the function, where the decorator has no options.
-        options: those of `numba.njit` but `cache`.
+        function: the function, if the decorator has no options.
+        options: options of `numba.njit`, except `cache`.
 
     Examples:
         >>> @compiled(error_model="numpy")
@@ -73,15 +73,15 @@ def _compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
     try:
         dispatcher._cache = _SourceKeyedCache(function, options)
     except (OSError, RuntimeError):
-        dispatcher._cache = NullCache()  # the function stands in no file that can be read
+        dispatcher._cache = NullCache()  # the function's source file is not readable
     return dispatcher
 
 
 def _ignore_literals(dispatcher: Any) -> None:
     """Let compiled callers share one version of a function for `f(0)` and `f(n)`.
 
-    Numba types a constant, and a variable whose first value is one, as a type of its own, and would compile the
-    function, and all that it calls, once more for it.
+    Numba gives a constant, or a variable whose first value is one, its own type, and would compile the function and all
+    its callees again for it.
     """
     template_of = dispatcher.get_call_template
 
@@ -93,7 +93,7 @@ def _ignore_literals(dispatcher: Any) -> None:
 
 
 class _Clock:
-    """Seconds that this process has spent on compiling and on loading compiled code."""
+    """Measures the seconds that this process has spent on compiling and loading compiled code."""
 
     def __init__(self) -> None:
         self.total_s = 0.0
@@ -134,16 +134,16 @@ event.register("numba:compile", _CompileListener())
 
 
 def seconds_spent() -> float:
-    """Return the seconds that this process has spent so far on compiling and on loading compiled code.
+    """Return the seconds that this process has spent so far on compiling and loading compiled code.
 
-    Subtract the difference of two calls from a measured time to leave compilation out of it.
+    Subtract the difference between two calls from a measured time to exclude compilation.
     """
     return _CLOCK.total_s
 
 
 @functools.cache
 def _announce() -> None:
-    """Say once in a process that functions are being compiled, since the first call of many takes seconds."""
+    """Report once per process that functions are being compiled, since first calls can take seconds."""
     _LOGGER.warning(
         "compiling functions for this machine, which takes some seconds the first time; kept in %s",
         cache_folder(),
@@ -152,7 +152,7 @@ def _announce() -> None:
 
 @functools.cache
 def _warn_of_unwritable_cache(reason: str) -> None:
-    """Say once in a process that the next one will compile again."""
+    """Warn once per process that the next process will compile again."""
     _LOGGER.warning(
         "compiled functions cannot be kept in %s (%s): every process compiles them again; set NUMBA_CACHE_DIR to a "
         "folder that can be written",
@@ -162,7 +162,7 @@ def _warn_of_unwritable_cache(reason: str) -> None:
 
 
 class _SourceKeyedLocator(_CacheLocator):  # type: ignore[misc]
-    """Names the folder of a module's compiled code after the content of all the sources it is made from."""
+    """Names the folder of a module's compiled code after the content of all its sources."""
 
     def __init__(self, py_func: Any, py_file: str) -> None:
         self._py_file = py_file
@@ -180,7 +180,7 @@ class _SourceKeyedLocator(_CacheLocator):  # type: ignore[misc]
         return self._folder.name
 
     def get_disambiguator(self) -> str:
-        # Two functions of one module may have the same name, one after the other.
+        # A module may define two functions of the same name, one after the other.
         return _short_hash(self._name)
 
     def ensure_cache_path(self) -> None:
@@ -194,7 +194,7 @@ class _SourceKeyedImpl(CompileResultCacheImpl):  # type: ignore[misc]
 
 
 class _CodeFiles:
-    """One file for each signature, replaced as a whole: processes that compile at the same time cannot mix theirs."""
+    """One file per signature, replaced atomically, so processes can compile at the same time."""
 
     def __init__(self, folder: str, name: str) -> None:
         self._folder, self._name = Path(folder), name
@@ -247,7 +247,7 @@ class _SourceKeyedCache(FunctionCache):  # type: ignore[misc]
 
 
 def _delete_old_versions(folder: Path) -> None:
-    """Delete code of earlier versions of the module that nothing has been added to for a month."""
+    """Delete code of earlier versions of the module that has not changed for a month."""
     oldest = time.time() - _KEPT_DAYS * 86_400
     for other in folder.parent.glob(f"{folder.name.rpartition('-')[0]}-*"):
         try:
@@ -262,14 +262,14 @@ def _short_hash(text: str) -> str:
 
 
 def source_key(file: str | os.PathLike[str]) -> str:
-    """Return the key of code compiled from a file: a hash of numba's version, the file, and all that it imports.
+    """Return the key of code compiled from a file: a hash of numba's version, the file, and everything that it imports.
 
-    Sources count as they were when this process first asked for them, which is when it imported them.
+    Sources are read once per process, when they are imported.
     """
     path = Path(file).resolve()
     status = path.stat()
     if _STATUS.setdefault(path, (status.st_mtime_ns, status.st_size)) != (status.st_mtime_ns, status.st_size):
-        # The module was edited and is imported again, as in a notebook.
+        # The module was edited and imported again, as in a notebook.
         _STATUS.clear()
         _content.cache_clear()
         _imported_files.cache_clear()
@@ -290,7 +290,7 @@ def _closure_key(file: Path) -> str:
 
 
 def _closure(file: Path) -> set[Path]:
-    """Return the file and all files that it imports, directly or not, but those of libraries."""
+    """Return the file and all files that it imports, directly or indirectly, except those of libraries."""
     found = {file}
     waiting = [file]
     while waiting:
@@ -313,7 +313,7 @@ _NAME = re.compile(rb"[\w.]+")
 
 @functools.cache
 def _content(file: Path) -> tuple[bytes, tuple[str, ...]]:
-    """Return the hash of a file, and the names of modules that it may import, relative ones with their dots."""
+    """Return the hash of a file, and the names of modules that it may import, relative ones with leading dots."""
     content = file.read_bytes()
     modules = set()
     for source, names, plain in _IMPORT.findall(content.replace(b"\\\n", b" ")):
@@ -330,8 +330,8 @@ def _content(file: Path) -> tuple[bytes, tuple[str, ...]]:
 def _module_files(module: str, importer: Path) -> tuple[Path, ...]:
     """Return the file of a module that compiled code may depend on; none for modules of libraries.
 
-    Libraries carry their version in their metadata; their sources do not change under us. Those of a user's own
-    modules, and ours, do.
+    Sources of installed libraries change only with their version; those of this package and of the user's own modules
+    may change at any time.
     """
     name = module.lstrip(".")
     if module != name:

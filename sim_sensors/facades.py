@@ -12,7 +12,7 @@ from sim_sensors.compilation import compiled
 def facade(
     along: float, z: float, nz: float, footprint: float, lit_windows: float, grain: Tile
 ) -> tuple[float, float, float]:
-    """Return the factor on the wall's albedo, the light of a window and the reflection, for storeys of windows."""
+    """Return the factor on the wall's albedo, the light from a window, and the reflectance, for storeys of windows."""
     courses = sample_tile(grain, along * 0.4, z * 2.5, pixel_level(footprint))
     wall = 0.7 + 0.55 * courses
     if abs(nz) > 0.5:
@@ -29,7 +29,7 @@ def facade(
         return 1.5, 0.0, 0.0
     chance = hash_unit(column, storey)
     glow = 0.13 * (0.5 + chance / max(lit_windows, 0.01)) if chance < lit_windows else 0.0
-    # Some have blinds part of the way down.
+    # Some windows have half-closed blinds.
     blind = hash_unit(storey + 17, column + 91)
     if blind < 0.45 and v > 0.8 - 0.5 * blind:
         return 0.9, 0.4 * glow, 0.04

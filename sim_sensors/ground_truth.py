@@ -31,14 +31,15 @@ class View(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class VehicleBoxes:
-    """Every vehicle that would be visible without occlusion, nearest first.
+    """The vehicles that would be visible without occlusion, nearest first.
 
     Attributes:
         ids: (n,) int32, as in the instances.
-        box: (n, 4) int32, px: left, top, right, bottom (right and bottom exclusive) of the whole vehicle as far
-            as the image reaches, hidden parts included.
-        visible_box: (n, 4) int32, the same of the pixels that are seen; zeros where none is.
-        visible_fraction: (n,) float64, pixels seen over pixels that it would have alone, both within the image.
+        box: (n, 4) int32, px: left, top, right, bottom (right and bottom exclusive) of the whole vehicle within the
+            image, hidden parts included.
+        visible_box: (n, 4) int32, the box of its visible pixels; zeros if there are none.
+        visible_fraction: (n,) float64, visible pixels divided by the pixels that it would have alone, both within the
+            image.
         view: (n,) int8, a `View` each.
         distance: (n,) float64, m, from the camera to the vehicle's origin, in the ground plane.
     """
@@ -54,13 +55,13 @@ class VehicleBoxes:
 def vehicle_boxes(camera: PinholeCamera, scene: Drawable, pose: FloatArray, frame: Frame) -> VehicleBoxes:
     """Return the boxes of the vehicles (instances with an id above 0) in a frame of the camera.
 
-    Each vehicle is rasterized again without depth test, in one image that stores the last vehicle at each pixel.
+    Each vehicle is rasterized again without depth test, into one image that stores the last vehicle at each pixel.
 
     Args:
         camera: the camera of the frame.
         scene: the scene of the frame.
         pose: (4, 4) camera to world.
-        frame: its instance ids are counted.
+        frame: the frame with the instance ids.
     """
     pose = checked_pose(scene, pose)
     size = (camera.width, camera.height)
@@ -96,7 +97,7 @@ def _views(offset: FloatArray, yaw: FloatArray) -> NDArray[np.int8]:
 def _extents_alone(
     corners: NDArray[np.float32], instance: IntArray, n: int, width: int, height: int
 ) -> tuple[NDArray[np.int64], IntArray]:
-    """Return the pixel count and box of each instance without the others; its triangles are consecutive."""
+    """Return the pixel count and box of each instance without the others; triangles of an instance are consecutive."""
     last = np.full((height, width), -1, dtype=np.int32)
     count = np.zeros(n, dtype=np.int64)
     box = _empty_boxes(n, width, height)

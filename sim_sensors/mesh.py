@@ -12,16 +12,16 @@ Float32Array = NDArray[np.float32]
 
 
 class Material(IntEnum):
-    """Materials, which the camera shades differently."""
+    """Materials, each with its own shading."""
 
     PAINT = 0  # clear-coated, glossy
-    GLASS = 1  # seen through, with reflections
+    GLASS = 1  # transparent, with reflections
     TRIM = 2  # dark plastic
     RUBBER = 3
     RIM = 4
     LAMP = 5
     PLATE = 6
-    INTERIOR = 7  # seats, dashboard, seen through glass
+    INTERIOR = 7  # seats and dashboard behind glass
     CHROME = 8
     FACADE = 9
     FOLIAGE = 10
@@ -36,7 +36,7 @@ class Mesh:
     """Triangles of one object in its own frame: x forward, y left, z up from the ground, m.
 
     Attributes:
-        vertices: (v, 3) float32, m. Creases have a vertex for either side.
+        vertices: (v, 3) float32, m. Vertices at creases are duplicated, one for each side.
         normals: (v, 3) float32, unit, outward.
         triangles: (t, 3) int32, counter-clockwise seen from outside.
         material: (t,) uint8, a `Material` each.
@@ -55,12 +55,12 @@ class MeshPool:
     """Many meshes in shared arrays, for compiled code.
 
     Attributes:
-        vertices, normals, triangles, material, color: as in `Mesh`, one mesh after the other; the indices
-            in `triangles` count within their own mesh.
+        vertices, normals, triangles, material, color: as in `Mesh`, one mesh after the other; indices in `triangles`
+            count from the start of their mesh.
         vertex_start: (n_meshes + 1,) int64; mesh m has vertices `vertex_start[m]:vertex_start[m + 1]`.
         triangle_start: (n_meshes + 1,) int64, the same for triangles.
-        radius: (n_meshes,) float32, m, of the sphere round the mesh's origin that holds it, for culling.
-        coarse: (n_meshes,) int32, the mesh drawn in its place when it is far away; None: always itself.
+        radius: (n_meshes,) float32, m, radius of a sphere around the mesh's origin that contains it, for culling.
+        coarse: (n_meshes,) int32, the mesh drawn instead when it is far away; None: always itself.
     """
 
     vertices: Float32Array
@@ -81,9 +81,9 @@ class Instances:
     Attributes:
         mesh: (n,) int32, index into the pool.
         pose: (n, 4) float64, x, y, z in m and yaw in rad, world frame.
-        ids: (n,) int32, what the camera writes into its instance image: 0 for scenery, above for vehicles.
-        still: the static ones, which come first, if others move: shadows of static instances are kept for as
-            long as this object lives. None: nothing moves.
+        ids: (n,) int32, value in the camera's instance image: 0 for scenery, above 0 for vehicles.
+        still: the static instances, which come first, if others move; their shadows are cached as long as this object
+            exists. None: nothing moves.
     """
 
     mesh: NDArray[np.int32]
@@ -99,7 +99,7 @@ class Ground:
     Attributes:
         paved: polygons, (k, 2) float64 m each, of asphalt; grass or gravel elsewhere.
         markings: (n, 5) float64: x, y of both ends of a painted line and its width, m.
-        seed: of the texture: stains, patches, worn paint.
+        seed: seed of the texture: stains, patches, worn paint.
     """
 
     paved: tuple[NDArray[np.float64], ...]

@@ -32,7 +32,7 @@ class Movers:
         walker_look: (p,) int, 0 to `LOOKS` - 1: appearance.
 
     Raises:
-        SensorError: a wrong shape, a value that is not finite, an index below 0 or no such person.
+        SensorError: a shape is wrong, a value is not finite, or an index is out of range.
     """
 
     vehicle_pose: FloatArray = field(default_factory=lambda: np.empty((0, 3)))

@@ -26,7 +26,7 @@ WIDE = PinholeCamera.from_field_of_view(horizontal=math.pi / 2)
 
 
 class Sensed(Drawable, Protocol):
-    """A scene that a rig can measure: geometry for cameras, and a plane for laser scanners."""
+    """A scene that a rig can measure: geometry for cameras, and a scan plane for lasers."""
 
     @property
     def scan_plane(self) -> ScanPlane:
@@ -47,7 +47,7 @@ class Mount:
         pitch: rad, positive upwards.
 
     Raises:
-        SensorError: a number that is not finite, or a sensor on or below the ground.
+        SensorError: a number is not finite, or the sensor is on or below the ground.
     """
 
     x: float = 0.0
@@ -64,7 +64,7 @@ class Mount:
             raise SensorError(f"mount z is {self.z} m, want above the ground")
 
     def in_world(self, vehicle: FloatArray) -> tuple[float, float, float]:
-        """Return x, y in m and yaw in rad in the world frame, for a vehicle at (3,) x, y, yaw."""
+        """Return the sensor's x, y in m and yaw in rad in the world frame, for a vehicle at (3,) x, y, yaw."""
         x, y, yaw = vehicle
         cosine, sine = math.cos(yaw), math.sin(yaw)
         return x + cosine * self.x - sine * self.y, y + sine * self.x + cosine * self.y, yaw + self.yaw
@@ -77,13 +77,13 @@ class Mount:
 
 @dataclass(frozen=True)
 class Capture:
-    """What a rig measured at one pose.
+    """Measurements of a rig at one pose.
 
     Attributes:
         pose: (3,) float64, x, y in m and yaw in rad of the vehicle, world frame.
-        images: by the camera's name; a frame also holds the true depth and instance ids.
-        pairs: by the stereo camera's name.
-        scans: by the laser's name, (n_beams,) float32, m, `inf` for no return.
+        images: frame of each camera by name; a frame also contains the true depth and instance ids.
+        pairs: frames of each stereo camera by name.
+        scans: ranges of each laser by name, (n_beams,) float32, m, `inf` for no return.
     """
 
     pose: FloatArray
@@ -102,7 +102,7 @@ class SensorRig:
         lasers: the same for laser scanners; angle 0 is the mount's forward direction.
 
     Raises:
-        SensorError: no sensor at all, or a name that is used twice.
+        SensorError: there is no sensor, or a name is used twice.
 
     Examples:
         >>> rig = SensorRig.thesis()
@@ -124,7 +124,7 @@ class SensorRig:
 
     @classmethod
     def named(cls, name: str) -> SensorRig:
-        """Return one of the rigs in `RIG_NAMES`: `laser` is `thesis()`, the others are the methods of their name.
+        """Return one of the rigs in `RIG_NAMES`: `laser` is `thesis()`; the others are methods of the same name.
 
         Raises:
             SensorError: an unknown name.
@@ -171,12 +171,12 @@ class SensorRig:
         Args:
             scene: the surroundings, without the vehicle that carries the rig.
             pose: (3,) x, y in m and yaw in rad of the vehicle, world frame.
-            weather: None: a sunny day.
-            seed: of the noise of all sensors.
-            noise: whether the laser's ranges have noise; images always have.
+            weather: the light; None: a sunny day.
+            seed: seed of the noise of all sensors.
+            noise: whether laser ranges have noise; images always do.
 
         Raises:
-            SensorError: a pose that is not three finite numbers; what the sensors raise.
+            SensorError: the pose is not three finite numbers, or a sensor raised an error.
         """
         vehicle = np.asarray(pose, dtype=np.float64)
         if vehicle.shape != (3,) or not np.isfinite(vehicle).all():
@@ -206,17 +206,17 @@ class SensorRig:
 
 
 def poses_along(path: ArrayLike, every: float) -> FloatArray:
-    """Return vehicle poses at equal distances along a polyline, headed along it, both ends included.
+    """Return vehicle poses at equal distances along a polyline, including both ends, with headings along it.
 
     Args:
         path: (k, 2) m, at least two different points.
-        every: m between poses; the last step may be shorter.
+        every: m, distance between poses; the last step may be shorter.
 
     Returns:
         (n, 3) float64, x, y, yaw.
 
     Raises:
-        SensorError: a path of the wrong shape, not finite or without length, or a distance that is not positive.
+        SensorError: the path has the wrong shape, is not finite or has no length, or the distance is not positive.
     """
     points = np.asarray(path, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2 or not np.isfinite(points).all():

@@ -31,13 +31,14 @@ class OverlapWarning(UserWarning):
 
 
 class Footprints(NamedTuple):
-    """The obstacles in a horizontal plane 0.5 m above the ground, as `footprints.ScanPlane` takes them.
+    """The obstacles in a horizontal plane 0.5 m above the ground, for `footprints.ScanPlane`.
 
     Attributes:
         corners: (n, k, 2) float64, m, world frame, counter-clockwise: a row for every vehicle place, then the posts,
-            trunks and people of the surroundings, then what moves.
-        n_corners: (n,) int64, how many corners are used; 0 for an empty place.
-        ids: (n,) int64, as in `Instances.ids`: place + 1 for a vehicle, more for one that moves, 0 for all else.
+            trunks and people of the surroundings, then moving objects.
+        n_corners: (n,) int64, number of corners used; 0 for an empty place.
+        ids: (n,) int64, as in `Instances.ids`: place + 1 for a vehicle, larger for a moving vehicle, 0 for everything
+            else.
         walls: (m, 2, 2) float64, m, world frame: ends of line segments.
     """
 
@@ -71,7 +72,7 @@ class Fleet:
 
     @cached_property
     def _scenery(self) -> tuple[list[Mesh], list[int]]:
-        """Distinct meshes of the surroundings, and the index of each object's mesh."""
+        """Return the distinct meshes of the surroundings, and the index of each object's mesh."""
         meshes: list[Mesh] = []
         place: dict[int, int] = {}
         index = []
@@ -117,7 +118,7 @@ class Fleet:
 
     @cached_property
     def outlines(self) -> tuple[FloatArray, IntArray]:
-        """(n_models, k, 2) float64 footprints, vehicle frame, and (n_models,) int64 how many corners they have."""
+        """(n_models, k, 2) float64 footprints, vehicle frame, and (n_models,) int64 their numbers of corners."""
         return _padded([m.footprint() for m in self.models])
 
     @cached_property
@@ -132,16 +133,16 @@ class Fleet:
 class Scene:
     """Vehicles in numbered places, and their surroundings. World frame, SI units.
 
-    A place may be empty, so the ids of the other vehicles stay when a vehicle leaves. Make a scene with `from_arrays`,
-    or from parking slots with `slot_scenes.scene_of_slots`.
+    A place may be empty, so the ids of other vehicles do not change when a vehicle leaves. Make a scene with
+    `from_arrays`, or from parking slots with `slot_scenes.scene_of_slots`.
 
     Args:
         vehicle_pose: (n, 3) float64: x, y in m, yaw in rad, of each place.
-        vehicle_model: (n,) int64, index into `fleet.models`, `NO_VEHICLE` where the place is empty.
+        vehicle_model: (n,) int64, index into `fleet.models`; `NO_VEHICLE` for an empty place.
         fleet: the meshes.
 
     Raises:
-        SensorError: a wrong shape, a pose that is not finite, a model that the fleet does not have.
+        SensorError: a shape is wrong, a pose is not finite, or the fleet does not have a model.
 
     Warns:
         OverlapWarning: two vehicles' rectangles overlap.
@@ -192,17 +193,17 @@ class Scene:
         paints: Sequence[tuple[int, int, int] | None] | None = None,
         surroundings: Surroundings | None = None,
     ) -> Scene:
-        """Make a scene of given vehicles.
+        """Make a scene from arrays of vehicles.
 
         Args:
             poses: (n, 3): x, y in m, yaw in rad.
-            seeds: (n,) int, of each vehicle's model.
+            seeds: (n,) int, seed of each vehicle's model.
             bodies: (n,) names from `vehicle_classes.BODIES`; None for a body drawn by the seed.
             paints: (n,) sRGB triples; None for a paint drawn by the seed.
             surroundings: None for an open plain.
 
         Raises:
-            SensorError: as the class, and for lengths that differ.
+            SensorError: as for the class, or the lengths differ.
         """
         pose = floats("poses", poses, 3)
         seed = np.asarray(seeds)
@@ -241,7 +242,7 @@ class Scene:
 
     @property
     def pool(self) -> MeshPool:
-        """The meshes; the same object for all scenes made from one by changing vehicles."""
+        """The meshes; the same object for all scenes that were derived from one by changing vehicles."""
         return self.fleet.pool
 
     @property
@@ -251,7 +252,7 @@ class Scene:
 
     @cached_property
     def instances(self) -> Instances:
-        """The poses of all meshes, detailed; `pool.coarse` maps them to coarse ones."""
+        """The poses of all meshes, in their detailed version; `pool.coarse` maps these to coarse ones."""
         still, movers = self.still_instances, self.movers
         if movers is None:
             return still
@@ -317,7 +318,7 @@ class Scene:
 
     @cached_property
     def scan_plane(self) -> ScanPlane:
-        """`footprints` for the laser scanner; the ids are those of `instances`."""
+        """The footprints for the laser scanner; ids are those of `instances`."""
         corners, n_corners, ids, walls = self.footprints()
         return ScanPlane(corners, n_corners, walls, ids)
 
@@ -335,18 +336,18 @@ class Scene:
     def with_vehicle(
         self, i: int, *, pose: ArrayLike | None = None, model: VehicleModel | None = None
     ) -> Scene:
-        """Return a scene with another vehicle in place i, or the same one at another pose; all else is shared.
+        """Return a scene with another vehicle in place i, or the same one at another pose; everything else is shared.
 
         Args:
             i: the place.
             pose: (3,): x, y in m, yaw in rad; None: unchanged.
-            model: None: unchanged. A model that the fleet lacks is added to a copy of its meshes.
+            model: None: unchanged. A model that is not in the fleet is added to a copy of its meshes.
 
         Raises:
-            SensorError: no such place, a pose that is not finite, or no model for an empty place.
+            SensorError: the place does not exist, the pose is not finite, or an empty place gets no model.
 
         Warns:
-            OverlapWarning: it overlaps another vehicle.
+            OverlapWarning: the vehicle overlaps another one.
         """
         self._check_place(i)
         fleet, number = self.fleet, int(self.vehicle_model[i])
@@ -359,18 +360,18 @@ class Scene:
         return self._changed(i, self.vehicle_pose[i] if pose is None else pose, number, fleet)
 
     def without_vehicle(self, i: int) -> Scene:
-        """Return a scene in which place i is empty; all else is shared."""
+        """Return a scene in which place i is empty; everything else is shared."""
         self._check_place(i)
         return self._changed(i, self.vehicle_pose[i], NO_VEHICLE, self.fleet)
 
     def with_movers(self, movers: Movers | None) -> Scene:
-        """Return the scene with moving vehicles and pedestrians; all else is shared.
+        """Return the scene with moving vehicles and pedestrians; everything else is shared.
 
         Args:
-            movers: None: no moving objects. The k-th vehicle has the id `n_vehicles` + 1 + k, people have 0.
+            movers: moving objects, or None. The k-th vehicle has the id `n_vehicles` + 1 + k; people have 0.
 
         Raises:
-            SensorError: a model that the fleet does not have.
+            SensorError: the fleet does not have a model.
         """
         if movers is not None and movers.vehicle_model.max(initial=0) >= len(self.fleet.models):
             raise SensorError(

@@ -24,8 +24,8 @@ KERB_M = (0.14, 0.12)
 
 _STOREY = 3.0
 _BAY = 2.7
-_REVEAL = 0.14  # m, from the wall to the window
-_STEP = 0.76  # m, at a walking pace
+_REVEAL = 0.14  # m, depth of the window in the wall
+_STEP = 0.76  # m, length of a walking step
 
 
 class _Part(IntEnum):
@@ -89,7 +89,7 @@ def building_mesh(outline: ArrayLike, height: float, seed: int) -> Mesh:
     Args:
         outline: (k, 2) m, a simple polygon, counter-clockwise.
         height: m, at least 2.4.
-        seed: of colours and of which bays have doors.
+        seed: seed of colours and doors.
 
     Returns:
         The mesh in the outline's frame; it has no interior and no roof.
@@ -120,14 +120,14 @@ def building_mesh(outline: ArrayLike, height: float, seed: int) -> Mesh:
 
 
 class _Facade(NamedTuple):
-    """One side of a building, with its outside to the right of its direction."""
+    """One side of a building; its outside is on the right of its direction."""
 
     start: FloatArray
     along: FloatArray
     length: float
 
     def place(self, u: FloatArray, z: FloatArray, depth: FloatArray) -> FloatArray:
-        """Return points at u along the wall, z up and `depth` outwards, m."""
+        """Return the points at u along the wall, height z and `depth` outwards, m."""
         out = np.array([self.along[1], -self.along[0]])
         base = self.start + u[..., None] * self.along + depth[..., None] * out
         return np.concatenate([base, z[..., None]], axis=-1)
@@ -135,7 +135,7 @@ class _Facade(NamedTuple):
     def add_slab(
         self, build: ShapeBuilder, box: tuple[float, float, float, float], depth: float, part: _Part
     ) -> None:
-        """A flat panel from u, u, z, z; if it stands out, with its upper and lower side."""
+        """Add a flat panel; `box` is u, u, z, z. If it protrudes, add its upper and lower side."""
         u0, u1, z0, z1 = box
         u = np.array([u0, u1, u1, u0])
         build.fan(self.place(u, np.array([z0, z0, z1, z1]), np.full(4, depth)), part)
@@ -155,7 +155,7 @@ def _add_facade(
     centers = (np.arange(bays) + 0.5) * pitch
     wide, low, high = 0.27 * pitch, 0.32 * tall, 0.84 * tall
     sills = np.arange(storeys) * tall + 0.3
-    # Every window edge twice: once on the wall, once at the bottom of the reveal.
+    # Every window edge appears twice: on the wall and at the bottom of the reveal.
     sides = np.repeat(np.sort(np.concatenate([centers - wide, centers + wide])), 2)
     levels = np.repeat(np.sort(np.concatenate([sills + low, sills + high])), 2)
     u, u_deep = np.array([0.0, *sides, length]), np.zeros(len(sides) + 2, dtype=bool)
@@ -214,7 +214,7 @@ def _within(p: FloatArray, a: FloatArray, b: FloatArray, c: FloatArray) -> bool:
 
 
 def wall_mesh(start: ArrayLike, end: ArrayLike, height: float, thickness: float, seed: int) -> Mesh:
-    """A free-standing wall with a coping, its middle line from start to end, (2,) m each."""
+    """Make a free-standing wall with a coping; its centre line runs from start to end, (2,) m each."""
     a, b = np.asarray(start, dtype=np.float64), np.asarray(end, dtype=np.float64)
     tone = np.array([150.0, 142.0, 130.0]) + np.random.default_rng([seed, 12]).uniform(-20, 20)
     build = ShapeBuilder()
@@ -224,7 +224,7 @@ def wall_mesh(start: ArrayLike, end: ArrayLike, height: float, thickness: float,
 
 
 def kerb_mesh(line: ArrayLike) -> Mesh:
-    """Kerb stones along a polyline, (k, 2) m."""
+    """Make kerb stones along a polyline, (k, 2) m."""
     point = np.asarray(line, dtype=np.float64)
     build = ShapeBuilder()
     for a, b in itertools.pairwise(point):
@@ -245,7 +245,7 @@ def _add_bar(
 
 
 def tree_mesh(height: float, seed: int) -> Mesh:
-    """A broad-leaved tree about the z axis, its height in m."""
+    """Make a broad-leaved tree on the z axis; height in m."""
     rng = np.random.default_rng([seed, 13])
     build = ShapeBuilder()
     scale = height / 7.0
@@ -274,7 +274,7 @@ def _add_ball(
     rng: np.random.Generator | None = None,
     rough: float = 0.0,
 ) -> None:
-    """An ellipsoid of 8 × 5 facets, its surface roughened."""
+    """Add an ellipsoid of 8 × 5 facets with an optional rough surface."""
     across, up = np.linspace(0, 2 * np.pi, 9), np.linspace(-np.pi / 2, np.pi / 2, 6)
     reach = np.ones((9, 6))
     if rng is not None:
@@ -294,7 +294,7 @@ def _add_ball(
 
 
 def lamp_post_mesh(height: float = 5.5) -> Mesh:
-    """A lamp post at the origin, its lantern out along x; height in m."""
+    """Make a lamp post at the origin with its arm along x; height in m."""
     build = ShapeBuilder()
     foot, neck = LAMP_POST_M, 0.55 * LAMP_POST_M
     build.turned(
@@ -311,11 +311,11 @@ GAITS = 8
 
 
 def pedestrian_mesh(phase: float, seed: int) -> Mesh:
-    """Make a walking pedestrian at the origin, headed along x.
+    """Make a walking pedestrian at the origin, facing along x.
 
     Args:
-        phase: of the stride, in turns; 0 and 0.5 are the widest steps.
-        seed: of height and clothes.
+        phase: phase of the stride, in turns; the step is widest at 0 and 0.5.
+        seed: seed of height and clothes.
     """
     rng = np.random.default_rng([seed, 14])
     scale = rng.uniform(1.58, 1.88) / 1.75
@@ -368,7 +368,7 @@ def pedestrian_mesh(phase: float, seed: int) -> Mesh:
 def _add_limb(
     build: ShapeBuilder, a: FloatArray, b: FloatArray, radius: tuple[float, float], part: _Part
 ) -> None:
-    """A tapered rod of seven sides from a to b, closed at both ends."""
+    """Add a tapered rod with seven sides from a to b, closed at both ends."""
     axis = (b - a) / np.linalg.norm(b - a)
     side = np.cross(axis, [0.0, 1.0, 0.0])
     side /= np.linalg.norm(side)
@@ -391,7 +391,7 @@ def pedestrian_footprint(phase: float) -> FloatArray:
 
 
 def round_footprint(radius: float) -> FloatArray:
-    """(8, 2) float64, m: a post as an octagon of the same area, counter-clockwise."""
+    """Return an octagon with the area of a round post, (8, 2) float64, m, counter-clockwise."""
     turn = np.arange(8) * np.pi / 4
     corner = radius * np.sqrt(np.pi / (2 * np.sqrt(2)))
     return np.asarray(corner * np.column_stack([np.cos(turn), np.sin(turn)]))

@@ -32,17 +32,17 @@ NOSE_GAP_M = 0.05
 class ParkingManners:
     """Distribution of parking poses.
 
-    The offsets of a car are normal with these standard deviations, clipped at three of them and so that the car's
-    rectangle stays within its slot; a car that is too long extends out of the open end. A model is used only in slots
-    that it fits.
+    The offsets of a car are normally distributed with these standard deviations. They are clipped at three standard
+    deviations and such that the car's rectangle stays within its slot; a car that is too long extends out of the open
+    end. A model is used only in slots that it fits.
 
     Args:
         lateral_m: standard deviation across the slot, m.
         along_m: standard deviation along the slot, m.
         yaw_rad: standard deviation of the heading, rad.
-        nose_out: fraction of cars that are backed in, against the slot's yaw; none in kerbside slots.
-        door_room_m: how much wider than a car its slot must be, except kerbside slots.
-        overhang_m: how much longer than its slot a car may be; in a kerbside slot it must be as much shorter.
+        nose_out: fraction of cars that parked in reverse, opposite to the slot's yaw; none in kerbside slots.
+        door_room_m: m by which a slot must be wider than its car, except kerbside slots.
+        overhang_m: m by which a car may be longer than its slot; in a kerbside slot it must be shorter by this.
     """
 
     lateral_m: float = 0.12
@@ -63,29 +63,29 @@ class ParkingManners:
 
 @lru_cache(maxsize=4)
 def vehicle_library(n_models: int = LIBRARY_MODELS) -> tuple[VehicleModel, ...]:
-    """Return the vehicle models of seeds 0 to n - 1, with bodies, sizes and paints by their frequency."""
+    """Return the vehicle models of seeds 0 to n - 1, with bodies, sizes and paints drawn by frequency."""
     return tuple(VehicleModel.from_seed(None, seed) for seed in range(n_models))
 
 
 @dataclass(frozen=True, eq=False)
 class SlotLot:
-    """Parking slots, and the car of every arrival at each of them.
+    """Parking slots, and the car of each arrival.
 
-    The model and pose of a car depend on (seed, slot, arrival) alone, not on other slots or the order of arrivals.
+    The model and pose of a car depend only on (seed, slot, arrival), not on other slots or the order of arrivals.
 
     Args:
         slot_xy: (n, 2) m, centres.
-        slot_yaw: (n,) rad, heading of a car that stands nose-in.
+        slot_yaw: (n,) rad, heading of a car that is parked nose-in.
         slot_length: (n,) or () m, along the yaw.
         slot_width: (n,) or () m.
         kerbside: (n,) or () bool, slots that lie along the lane.
-        surroundings: ground and scenery; None: asphalt under and around the slots, and their painted lines.
+        surroundings: ground and scenery; None: asphalt under and around the slots, and painted lines.
         manners: distribution of parking poses.
         n_models: number of vehicle models.
         seed: 0 or more.
 
     Raises:
-        SensorError: a wrong shape or value, or a slot that no model fits.
+        SensorError: a shape or value is wrong, or no model fits a slot.
     """
 
     slot_xy: ArrayLike
@@ -137,10 +137,10 @@ class SlotLot:
 
     @cached_property
     def fitting(self) -> list[IntArray]:
-        """For each slot, the models that fit it."""
+        """The models that fit each slot."""
         size = np.array([m.size for m in vehicle_library(self.n_models)])
         spare = np.where(self._column("kerbside"), -self.manners.overhang_m, self.manners.overhang_m)
-        # Kerbside, doors open over the pavement and the street.
+        # In kerbside slots doors open over the pavement and the street.
         room = np.where(self._column("kerbside"), KERB_ROOM_M, self.manners.door_room_m)
         length, width = self._column("slot_length") + spare, self._column("slot_width") - room
         known: dict[tuple[float, float], IntArray] = {}
@@ -211,7 +211,7 @@ class SlotLot:
 
 
 def slot_surroundings(lot: SlotLot, lanes: Sequence[ArrayLike] = (), **more: object) -> Surroundings:
-    """Return asphalt under slots and lanes, and painted lines: both sides of slots, and the ends of kerbside ones.
+    """Return asphalt under slots and lanes, and painted lines at both sides of slots and at the ends of kerbside ones.
 
     Args:
         lot: the slots.
@@ -265,19 +265,19 @@ def scene_of_slots(
 
     Args:
         slot_xy: (n, 2) m, centres.
-        slot_yaw: (n,) rad, heading of a car that stands nose-in.
+        slot_yaw: (n,) rad, heading of a car that is parked nose-in.
         slot_length: (n,) or () m, along the yaw.
         slot_width: (n,) or () m.
         occupied: (n,) bool.
         kerbside: (n,) or () bool, slots that lie along the lane.
         arrivals: (n,) or () int, 0 or more: index of the arrival in each slot.
-        lanes: polylines, (k, 2) m, that are paved.
+        lanes: polylines, (k, 2) m, which are paved.
         seed: 0 or more.
-        manners: how cars stand.
+        manners: distribution of parking poses.
         surroundings: fields of `Surroundings`: walls, buildings, trees and so on.
 
     Raises:
-        SensorError: as `SlotLot` and `Surroundings`.
+        SensorError: as for `SlotLot` and `Surroundings`.
 
     Examples:
         >>> scene = scene_of_slots([[0, 0], [2.5, 0]], [1.57, 1.57], 5.0, 2.5, np.array([True, False]))

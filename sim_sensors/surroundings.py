@@ -1,4 +1,4 @@
-"""The static surroundings of a scene, from plain arrays: ground and scenery."""
+"""The static surroundings of a scene, from plain arrays: the ground and scenery."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from sim_sensors.scenery import (
 FloatArray = NDArray[np.float64]
 
 TREE_KINDS = 8
-LOW_WALL_M = 0.5  # the laser passes over what is lower
+LOW_WALL_M = 0.5  # the laser passes over lower walls
 WALL_THICKNESS_M = 0.24
 
 
@@ -45,7 +45,7 @@ def floats(name: str, value: ArrayLike, columns: int) -> FloatArray:
     """Return `value` as a finite, read-only (n, columns) float64 array; an empty one may have any shape.
 
     Raises:
-        SensorError: another shape, or a value that is not finite.
+        SensorError: the shape differs, or a value is not finite.
     """
     try:
         array = np.array(value, dtype=np.float64)
@@ -76,10 +76,11 @@ class Surroundings:
         trees: (n, 3) m: x, y, height.
         lamp_posts: (n, 3): x, y in m, yaw of the arm in rad.
         pedestrians: (n, 4): x, y in m, yaw in rad, phase of the stride in turns.
-        seed: 0 or more, of textures, trees, clothes, windows.
+        seed: 0 or more, seed of textures, trees, clothes and windows.
 
     Raises:
-        SensorError: a wrong shape, a value that is not finite, a height or width not above zero, a wall of no length.
+        SensorError: a shape is wrong, a value is not finite, a height or width is not above zero, or a wall has no
+        length.
     """
 
     paved: Sequence[ArrayLike] = ()
@@ -143,7 +144,7 @@ class Surroundings:
 
     @cached_property
     def standing(self) -> tuple[Standing, ...]:
-        """All static objects; equal ones share their mesh."""
+        """All static objects; equal objects share a mesh."""
         things: list[Standing] = []
         for i, (outline, height) in enumerate(
             zip(self._outlines, self._table("building_heights"), strict=True)
@@ -152,7 +153,7 @@ class Surroundings:
             mesh = building_mesh(outline - center, float(height), self.seed + i)
             things.append(Standing(mesh, (center[0], center[1], 0.0)))
         for i, (x0, y0, x1, y1, height) in enumerate(self._table("walls").tolist()):
-            # Corners of walls overlap; were they of one height, their tops would flicker.
+            # Walls overlap at corners; with equal heights their tops would flicker.
             mesh = wall_mesh(
                 [0, 0], [x1 - x0, y1 - y0], height + 0.002 * (i % 4), WALL_THICKNESS_M, self.seed
             )

@@ -1,4 +1,4 @@
-"""The command line as tests call it: in this process, or in one of its own where it is to be killed."""
+"""Run the command line for tests: in this process, or in a separate one that can be killed."""
 
 import contextlib
 import io
@@ -10,7 +10,7 @@ from unittest import mock
 from parkenv.cli import main
 
 PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
-"""The command in a process of its own."""
+"""The command in a separate process."""
 
 
 def parkenv(*arguments, cwd=None):

@@ -1,4 +1,4 @@
-"""Tasks for tests of workers; a module of its own, so that workers of other processes can import it."""
+"""Tasks for tests of workers, in a separate module that worker processes can import."""
 
 import os
 import signal

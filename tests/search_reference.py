@@ -47,7 +47,7 @@ def process_taken(process, key, arrival, slot, time):
 
 
 def recorded_taken(occupancy, arrival, slot, time):
-    """Whether a slot of a replayed log is taken: the last look before, or the first of the day."""
+    """Whether a slot of a replayed log is taken: the last observation before, or the first of the day."""
     log, mapped = occupancy.log, occupancy.mapped_log(arrival.day)
     looks = slice(*log.first[mapped.record[slot] : mapped.record[slot] + 2])
     before = np.flatnonzero(log.from_s[looks] <= time - weekday_of(arrival.day) * 86_400.0)
@@ -90,7 +90,7 @@ class ReferenceSearch:
         return self.forecast + (self.p_observed - self.forecast) * np.exp(-self.decay_rate * age)
 
     def set_belief(self, slot, taken, p):
-        """Note an observation of a slot, made now."""
+        """Record an observation of a slot, made now."""
         self.observed_taken[slot], self.p_observed[slot] = taken, p
         self.observed_at[slot] = self.time - self.arrival.time
 
@@ -127,7 +127,7 @@ class ReferenceSearch:
         return {name: -cost for name, cost in terms.items()}
 
     def observe(self):
-        """Observe the slots in view: those near enough, in sight, and some of them wrongly."""
+        """Observe the slots that are near enough and visible, some of them wrongly."""
         starts, slots = self.scenario.slots_in_view
         rows = range(starts[self.vertex], starts[self.vertex + 1])
         rates = self.scenario.sensor_rates

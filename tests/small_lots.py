@@ -16,7 +16,7 @@ SLOT_COLUMNS = ("slot_yaw", "slot_length", "slot_width", "slot_mouth", "slot_par
 
 
 def features(lot):
-    """What a lot is made of, by name."""
+    """Parameters of a lot, by name."""
     return {f.name: getattr(lot, f.name) for f in fields(lot) if f.init}
 
 
@@ -51,7 +51,7 @@ def small_lot(seed: int, shapes=SHAPES):
 
 
 def prices(lot, seed):
-    """What parking costs in each slot, s."""
+    """Parking cost of each slot, s."""
     return np.random.default_rng([8, seed]).choice([0.0, 5.0, 40.0], lot.n_slots) * (seed % 2)
 
 

@@ -27,7 +27,7 @@ def mean(rows, column):
 
 
 def frozen_world(lot, taken, **changes):
-    """Slots that are taken, or free, for ever, under a forecast that says 50 % of each."""
+    """Slots that are always taken or always free, with a forecast of 50 % for each."""
     occupancy = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
     prior = OccupancyProcess.from_demand(np.zeros(lot.n_slots), np.zeros(168), 1e9)
     return Scenario(name="frozen", lot=lot, occupancy=occupancy, prior=prior, **changes)
@@ -64,7 +64,7 @@ def test_an_agent_of_your_own_is_named_by_module_and_class(tmp_path, monkeypatch
     monkeypatch.setattr("sys.path", list(sys.path))
     scenario = make_scenario("mini")
     agent = make_agent("my_agents:Parker", scenario)
-    assert not hasattr(agent.given, "occupancy")  # what stands in the slots is kept from it
+    assert not hasattr(agent.given, "occupancy")  # it must not know the occupancy
     env = gym.make("parkenv/Search-v1", scenario=scenario)
     action, _ = agent.predict(env.reset(seed=0)[0])
     assert action == 4
@@ -194,7 +194,7 @@ def test_a_search_cut_off_is_charged_like_one_that_gave_up():
 
 
 def test_the_planner_plans_again_only_when_a_probability_changes():
-    """Where the forecast is what is seen, nothing changes but that slots become certain."""
+    """If observations agree with the forecast, the only change is that slots become certain."""
     lot = grid_lot(2, 20)
     scenario = frozen_world(lot, np.arange(lot.n_slots) % 2 == 0, sensor_model=SensorModel(view_range=0.0))
     agent = make_agent("mdp", scenario)
@@ -263,7 +263,7 @@ def test_the_oracle_must_be_shown_the_future():
 
 
 def test_the_oracle_turns_to_a_slot_where_the_lot_cannot_be_proven_full():
-    """Every slot is in view from everywhere, and one that nobody can drive to is free."""
+    """Every slot is in view from everywhere, and an unreachable one is free."""
     lot = cut_in_two()
     half = lot.n_slots // 2
     demand = np.where(np.arange(lot.n_slots) < half, 3.0, -25.0)

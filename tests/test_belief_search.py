@@ -1,4 +1,4 @@
-"""The planner on the true model: against the exact optimum, in the environment, where things go wrong."""
+"""The belief planner: against the exact optimum, in the environment, and in adverse cases."""
 
 import gymnasium as gym
 import numpy as np
@@ -33,7 +33,7 @@ LOTS = range(0, 324, 7)
 
 
 def has_large_trees(seed):
-    """Two aisles, where each slot is seen from its own place only."""
+    """Two aisles, where each slot is observed only from its own vertex."""
     return seed % 6 not in (3, 5) and seed // 18 % 2 == 0
 
 
@@ -145,7 +145,7 @@ def test_the_day_is_believed_to_differ_as_far_as_observations_say():
     day.update(near, np.ones(15, dtype=bool))
     fuller = day.p_occupied()
     assert (fuller > forecast).all()
-    # It learns more about slots as near as those that it observed.
+    # The belief changes most for slots about as near to the goal as the observed ones.
     moved = np.log(fuller / (1 - fuller)) - np.log(forecast / (1 - forecast))
     assert moved[near].mean() > 1.5 * moved[np.argsort(walk)[-15:]].mean()
 
@@ -183,7 +183,7 @@ def test_a_bad_forecast_error_model_is_refused(changes, told):
         ForecastErrorModel(**changes)
 
 
-# --- where things go wrong ---------------------------------------------------------------------------
+# --- adverse cases ---------------------------------------------------------------------------
 
 
 def test_nothing_free_anywhere_ends_in_proof():
@@ -240,7 +240,7 @@ def test_a_prior_that_is_badly_wrong_does_not_keep_it_from_parking(prior_logit):
 @pytest.mark.parametrize("said", [-8.0, 8.0])
 @pytest.mark.parametrize("name", ["campus", "jam"])
 def test_what_a_worthless_map_costs(name, said):
-    """All is said to be free, or taken. Told that all is free, the thesis's planner loses 90 s to the bound on jam."""
+    """The map has all slots free, or all taken. With all free, the thesis's planner is 90 s above the bound on jam."""
     scenario = make_scenario(name)
     prior = OccupancyProcess.from_demand(np.full(scenario.lot.n_slots, said), np.zeros(168))
     rows = Case(scenario.replace(prior=prior), "belief").run(range(8))[0]
@@ -267,7 +267,7 @@ def test_it_expects_slots_that_it_saw_taken_to_come_free():
             over = terminated or truncated
         assert info["parked"]
     assert len(expected) > 20
-    # Had each slot but one look, what is left once all have been seen would be to give up.
+    # With a single observation per slot, only giving up would remain once all slots have been observed.
     assert np.median(expected) < 600.0
 
 
@@ -284,7 +284,7 @@ def test_a_bad_budget_is_refused():
 
 
 def hidden_lots(name, seen_rate, occupancy=None):
-    """From every view alike: so what is not made out once never is, however often the car comes back."""
+    """Observations are the same from every view: a slot that is missed once is always missed."""
     bands = tuple(SensorBand(6.0, beside, seen_rate, 1.0, 0.0) for beside in (False, True))
     scenario = make_scenario(name).replace(sensor_model=SensorModel(bands=bands))
     return scenario if occupancy is None else at_occupancy(scenario, occupancy)
@@ -299,7 +299,7 @@ def test_a_slot_that_stays_hidden_is_not_looked_for_for_ever(seen_rate):
 
 @pytest.mark.parametrize("seen_rate", [0.3, 0.5])
 def test_hidden_slots_are_tried_where_nothing_better_is_left(seen_rate):
-    """On a small lot soon all slots are hidden, or taken; the planner that tries them one by one is the measure."""
+    """On a small lot, all slots are soon hidden or taken; the reference planner attempts them one by one."""
     scenario = hidden_lots("mini", seen_rate, 0.8)
     ours, theirs = (Case(scenario, agent).run(range(40))[0] for agent in ("belief", "mdp"))
     assert not any(row["truncated"] for row in ours)

@@ -1,4 +1,4 @@
-"""Benchmark suites: a result can be checked by anybody, and one that was tampered with is refused."""
+"""Benchmark suites: results can be checked, and altered ones are rejected."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""`parkenv compare` and its neighbours from the outside: results, resuming, faults."""
+"""`parkenv compare` and related commands: results, resuming, errors."""
 
 import csv
 import dataclasses
@@ -169,9 +169,9 @@ def test_the_sweep_over_failure_costs_tells_seen_slots_from_unseen_ones(tmp_path
     assert len(tries) == 26
     assert {r["scenario"] for r in rows if r["agent"] == "mdp-tuned"} == {"mini"}
     assert all(r["failed_s"] == 0.0 for (name, _), r in tries.items() if name == "mini")
-    unseen = [tries["mini-unseen", cost]["total_s"] for cost in (0.0, 8.0, 30.0, 120.0)]
-    assert unseen == sorted(unseen)
-    assert tries["mini-unseen", 120.0]["failed_parks"] > 0.0
+    blind = [tries["mini-blind", cost]["total_s"] for cost in (0.0, 8.0, 30.0, 120.0)]
+    assert blind == sorted(blind)
+    assert tries["mini-blind", 120.0]["failed_parks"] > 0.0
 
 
 def test_agents_may_be_given_maps_that_are_wrong(tmp_path):

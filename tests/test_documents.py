@@ -1,4 +1,4 @@
-"""What README, documentation and contributing guide print must be true."""
+"""Commands, code and numbers in README, documentation and contributing guide are correct."""
 
 import os
 import re
@@ -71,7 +71,7 @@ PROGRAMS = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_the_code_of_a_page_runs_from_top_to_bottom(name, tmp_path):
-    """In a process of its own for each page, which has its own folder, modules and registered environments."""
+    """Run each page in a separate process, with its own folder, modules and registered environments."""
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     path = os.pathsep.join(filter(None, [str(ROOT / "tests"), os.environ.get("PYTHONPATH")]))
     done = subprocess.run(

@@ -34,7 +34,7 @@ def make(lot="campus", **arguments):
 
 
 def random_drive(env, seed, steps=60):
-    """Drive at random; everything that was observed."""
+    """Drive at random, and return all observations."""
     rng = np.random.default_rng(seed)
     seen = [env.reset(seed=seed)]
     for _ in range(steps):
@@ -133,7 +133,7 @@ def test_rewards_of_batches_are_those_of_the_steps(dense):
     for a, d, r, i in zip(achieved, desired, rewards, infos, strict=True):
         assert env.unwrapped.compute_reward(a, d, i) == pytest.approx(r)
         assert sum(i["reward_terms"].values()) == pytest.approx(r)
-    # Goals of another time, as hindsight takes them, and no word of contacts.
+    # Goals from other steps, as in hindsight experience replay, without `contact`.
     relabeled = env.unwrapped.compute_reward(achieved, achieved, {})
     np.testing.assert_array_equal(relabeled, 0.0)
 

@@ -64,7 +64,7 @@ STEPS = {"ppo": 2_000, "sac": 1_000, "tqc": 1_000}
 
 
 class Always:
-    """A model that decides the same, whatever it sees."""
+    """A model that always decides the same."""
 
     def __init__(self, *action):
         self.action = np.array(action, dtype=np.float32)
@@ -156,7 +156,7 @@ def test_a_drive_that_stands_in_its_slot_has_parked():
     assert batch.took[0] == 0.0
 
 
-# What is seen and done
+# Observations and actions
 
 
 @given(
@@ -211,7 +211,7 @@ def test_a_decision_asks_for_a_speed_and_gets_it(asked, reached):
     assert batch.state[0, SPEED] == pytest.approx(reached, abs=0.02)
 
 
-# Practice
+# Curriculum
 
 
 def training_env(algorithm, n=4, lots=(MINI, STREET), levels=None):
@@ -351,7 +351,7 @@ def test_bad_settings_are_refused_in_words(make, wanted):
         make()
 
 
-# Hindsight
+# Hindsight experience replay
 
 
 def test_relabelled_rewards_are_those_of_the_drive():
@@ -524,7 +524,7 @@ def test_an_agent_wants_the_obstacle_map_and_serves_many_episodes(trained):
 
 
 def test_the_evaluation_uses_the_environments_own_tasks():
-    """Who drives blindly ahead ends in the batch as in the environment."""
+    """Blind driving ends in the batch as in the environment."""
     training = training_of("ppo", 10, lots=(STREET,))
     status, times = evaluate_parking(Always(0.5, 0.1), training._tasks["parallel"])
     view = PolicyInterface(VehicleParameters())
@@ -553,7 +553,7 @@ def test_success_is_drawn_by_kind(tmp_path):
     assert (tmp_path / "curve.png").stat().st_size > 10_000
 
 
-# One that learns from its last decisions, and one that keeps what it did for long.
+# One on-policy algorithm, and one with a replay buffer.
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
 def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algorithm):

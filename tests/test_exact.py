@@ -1,4 +1,4 @@
-"""The exact optimum: closed forms, brute force, nobody below it, limits."""
+"""The exact optimum: closed forms, brute force, no agent below it, limits."""
 
 import itertools
 from functools import cache
@@ -29,7 +29,7 @@ BLIND = SensorModel(view_range=0.0)
 
 
 def one_way_line(n, goal_x, pitch=10.0):
-    """Slots along a one-way lane, from west to east; whoever has passed one cannot come back."""
+    """Slots along a one-way lane, from west to east; a passed slot cannot be reached again."""
     xy = np.column_stack([np.arange(1, n + 1) * pitch, np.full(n, -3.0)])
     return ParkingLot(
         name="line",
@@ -60,7 +60,7 @@ def test_parking_along_a_line_is_the_threshold_policy(p_free, goal_x):
         onward = hop + here
     takes.reverse()
     solution = ExactSolution(problem, np.full(n, 1.0 - p_free), entry)
-    # The last look has no way on: it ends the search either way.
+    # There is no way on from the last vertex: the search ends there in any case.
     assert solution.expected_s == pytest.approx(onward)
     # Far from the goal it drives on past free slots, then takes the first one.
     assert takes == sorted(takes)
@@ -135,7 +135,7 @@ def test_the_agent_takes_as_long_as_it_says_and_nobody_takes_less(seed):
 
 
 def test_the_mean_of_searches_in_the_environment_is_the_expectation():
-    """The environment plays by the rules that the dynamic program assumes."""
+    """The environment follows the rules that the dynamic program assumes."""
     lot = packaged_lot("mini")
     # An hour of equilibrium at 60 %, in which nothing moves while a car searches.
     lasting = OccupancyProcess.from_demand(np.full(lot.n_slots, np.log(1.5)), np.zeros(168), 1e7)
@@ -184,7 +184,7 @@ def test_what_is_too_large_or_uncertain_is_refused_with_the_limit():
 
 
 def test_it_goes_on_from_what_it_knows():
-    """Knowing where a free slot is can only help; knowing that a slot is taken is worth what it spares."""
+    """Knowing where a free slot is can only help; knowing that a slot is taken is worth the time it saves."""
     problem, p, entry = small_lot(1)
     n = len(p)
     blind = ExactSolution(problem, p, entry).expected_s

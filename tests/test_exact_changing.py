@@ -13,7 +13,7 @@ from planners.bounds.exact_changing import ChangingAgent, ChangingSolution
 
 
 def busy(n_slots=3, stay_s=20.0, taken=(0.7, 0.85, 0.8), give_up_s=600.0):
-    """A row of slots that are seen from their own vertex alone; every move takes a multiple of 2 s."""
+    """A row of slots that are observed only from their own vertex; every move takes a multiple of 2 s."""
     p = np.array(taken)
     return Scenario(
         name="busy",
@@ -38,7 +38,7 @@ def times(scenario, agent, searches):
 
 
 def test_one_slot_is_one_look():
-    """Seen taken it proves the lot full: there is nothing to be had by waiting."""
+    """Observing it as taken proves that the lot is full: waiting gains nothing."""
     scenario = busy(1, taken=(0.8,), give_up_s=50.0)
     found = solved(scenario, 20.0, (0.8,))
     entry = int(scenario.lot.entry_vertices[0])
@@ -67,7 +67,7 @@ def test_searches_take_as_long_as_it_says_and_belief_hardly_longer():
     assert low - 1.0 < found.expected_s(int(scenario.lot.entry_vertices[0])) < high + 1.0
     ours = times(scenario, make_agent("belief", scenario), 200)
     assert ours.mean() - mean < 0.02 * mean
-    # The thesis's planner looks at the last slot as well, and so proves the lot full.
+    # The thesis's planner also observes the last slot, which proves that the lot is full.
     theirs = times(scenario, make_agent("mdp-tuned", scenario), 60)
     assert theirs.mean() > 3.0 * mean
 

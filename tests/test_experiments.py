@@ -1,4 +1,4 @@
-"""Experiment files: what they run, how a run folder is gone on with, and how bad files are refused."""
+"""Experiment files: what they run, how a run folder is resumed, and errors of invalid files."""
 
 import json
 import re
@@ -6,6 +6,7 @@ from pathlib import Path
 
 import jsonschema
 import pytest
+from command_line import parkenv
 
 from parkenv import InputError
 from parkenv.cli.schema import schemas
@@ -14,7 +15,6 @@ from parkenv.evaluation.experiments.experiment import Experiment, run_experiment
 from parkenv.evaluation.experiments.spec import SPEC_FILE, ExperimentSpec
 from parkenv.files.spec_file import read_tables
 from parkenv.world.scenario import KMH
-from tests.command_line import parkenv
 
 ROOT = Path(__file__).parents[1]
 COURTYARD = ROOT / "examples" / "courtyard"
@@ -71,7 +71,7 @@ def test_a_file_is_run_and_its_folder_says_what_was_run(tmp_path, sweep):
     kept = ExperimentSpec.read(out / SPEC_FILE)
     assert kept == ExperimentSpec.read(sweep)
 
-    # The folder alone is enough to go on, and to add to it.
+    # The folder alone is enough to resume the run and to extend it.
     (out / "summary.json").unlink()
     episodes = (out / "episodes.csv").read_text()
     (out / "episodes.csv").write_text("\n".join(episodes.splitlines()[:20]) + "\n")
@@ -81,7 +81,7 @@ def test_a_file_is_run_and_its_folder_says_what_was_run(tmp_path, sweep):
     assert {row["episodes"] for row in summary_of(out)["rows"]} == {5}
     assert ExperimentSpec.read(out / SPEC_FILE) == kept.changed(episodes=5, jobs=0)
 
-    # A file of the experiment that has changed is noticed.
+    # A changed file of the experiment is detected.
     (tmp_path / "own.toml").write_text('lot = "mini"\ncosts = { give_up_s = 70 }\n')
     again = parkenv("run", sweep, "--out", out, "--resume")
     assert again.returncode == 2
@@ -124,6 +124,16 @@ def test_python_runs_the_same_object(tmp_path):
     assert [case.scenario.v_drive for case, _ in result.experiment.cases] == [5 * KMH] * 2 + [20 * KMH] * 2
     slow, _, fast, _ = result.rows
     assert slow["drive_s"] > fast["drive_s"]
+
+
+def test_a_scenario_may_be_called_like_a_blind_one_but_no_two_alike():
+    named = {"name": "x-blind", "lot": "mini"}
+    spec = ExperimentSpec.parse({"agents": ["belief"], "scenarios": [named], "episodes": 2}, "test")
+    assert [case.scenario.name for case, _ in Experiment(spec).cases] == ["x-blind"]
+    plain = {"name": "x", "lot": "mini"}
+    both = {"agents": ["mdp"], "scenarios": [plain, named], "grid": {"blind": True}, "episodes": 2}
+    with pytest.raises(InputError, match="two scenarios are called 'x-blind'"):
+        Experiment(ExperimentSpec.parse(both, "test"))
 
 
 def test_agents_with_options_are_read_from_words_and_tables():

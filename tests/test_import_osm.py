@@ -361,7 +361,7 @@ def test_slots_that_no_aisle_reaches_are_listed(tmp_path):
 
 def test_slots_that_no_way_leads_to_are_listed(tmp_path):
     place = car_park()
-    # A one-way aisle from the lot's far side to the service road: nobody gets onto it.
+    # A one-way aisle from the lot's far side to the service road: no car can reach it.
     place.way([(-40, 20), (0, 20)], AISLE, oneway="yes").box(-20, 23, -17.5, 28, SPACE)
     draft = place.draft(tmp_path)
     assert reasons(draft)["slots that cannot be reached from an entry"] == ("way/31",)

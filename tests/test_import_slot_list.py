@@ -1,4 +1,4 @@
-"""Lots made from lists of slot centres: rows, aisles, and when not to guess."""
+"""Lots made from lists of slot centres: rows, aisles, and ambiguous cases."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Label setting against closed forms, the other solvers and itself mended; and the agents that plan with it."""
+"""Label setting against closed forms, other solvers and its own repair; and the agents that plan with it."""
 
 import gymnasium as gym
 import numpy as np
@@ -20,7 +20,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def random_process(seed, gamma, failure, *, shortest=0.5, wait_s=1.0, two_way=False):
-    """A random graph with dead ends, parts out of reach, and slots that are surely free or surely taken."""
+    """A random graph with dead ends, unreachable parts, and slots that are certainly free or taken."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 30))
     neighbors = np.where(rng.random((n, 4)) < 0.5, rng.integers(0, n, (n, 4)), -1)

@@ -1,4 +1,4 @@
-"""The local observation: what it says, and that it says it on any lot."""
+"""The local observation: its values, on any lot."""
 
 import warnings
 
@@ -75,7 +75,7 @@ def test_every_number_is_what_the_table_says(name):
             near = local[FIRST_NEAR:].reshape(K, PER_NEAR)
             np.testing.assert_allclose(near[:, 2], squashed(nearest), atol=1e-6)
             for row, seconds in zip(near, nearest, strict=True):
-                # Ties may come in any order, and by either way.
+                # Ties may have any order and either route.
                 tied = np.flatnonzero(np.isclose(reach, seconds))
                 told = [[free[s], belief.observed[s], squashed(scenario.walk_s[s])] for s in tied]
                 assert np.isclose(told, row[[0, 1, 3]], atol=1e-6).all(axis=1).any()
@@ -101,14 +101,14 @@ def test_every_number_is_what_the_table_says(name):
 
 
 def aisle(taken):
-    """One aisle of slots that are taken, or free, for ever."""
+    """One aisle of slots that are always taken or always free."""
     lot = grid_lot(1, len(taken))
     process = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
     return Scenario(name="aisle", lot=lot, occupancy=process)
 
 
 def test_what_lies_ahead_is_told_move_by_move():
-    """In an aisle that is full on one side and free on the other, the moves tell which way to go."""
+    """In an aisle that is full on one side and free on the other, the move features show the right direction."""
     taken = np.arange(12) >= 6
     scenario = aisle(taken)
     env = LocalObservation(gym.make("parkenv/Search-v1", scenario=scenario), K)

@@ -1,4 +1,4 @@
-"""Maps: the grid, slots, inference over sessions, the map file, found slots, and poses that are off."""
+"""Maps: the grid, slots, inference over sessions, the map file, discovered slots, and pose errors."""
 
 import math
 import os
@@ -336,7 +336,7 @@ def test_a_kill_leaves_whole_sessions_only(mini, tmp_path):
         assert np.isfinite(one.p_occupied).all()
 
 
-# Slots that nobody mapped, and poses that are off
+# Discovered slots, and pose errors
 
 
 def test_slots_are_found_where_cars_stand_again_and_again():

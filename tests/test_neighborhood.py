@@ -1,4 +1,4 @@
-"""Large lots are planned for in part: which part, that leaving out the rest changes nothing, and how it moves on."""
+"""Planning on a part of a large lot: which part, that the rest does not matter, and how the part moves."""
 
 import gymnasium as gym
 import numpy as np

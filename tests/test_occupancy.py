@@ -152,7 +152,7 @@ def test_without_rates_a_state_lasts_for_ever():
     assert np.array_equal(world.next_free(np.arange(50), NINE.time), np.where(first, np.inf, NINE.time))
 
 
-# Same key, same world, whoever looks
+# Same key, same world for every observer
 
 
 @settings(max_examples=60)

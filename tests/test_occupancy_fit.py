@@ -16,7 +16,7 @@ FIRST_MONDAY = np.datetime64("2024-01-01")
 
 
 def simulated_log(process, n_weeks, every_s, start_h=7, end_h=19, seed=0):
-    """What a camera notes that looks at all slots at the same times of every day."""
+    """Log of a camera that observes all slots at the same times every day."""
     n = process.n_slots
     world = process.world(world_key(seed, 0), Arrival(0.0))
     seconds = np.arange(start_h * HOUR_S, end_h * HOUR_S, every_s)
@@ -123,7 +123,7 @@ def test_intervals_are_split_exactly_at_full_hours():
 
 @pytest.fixture(scope="module")
 def hourly():
-    """A process with a morning rush, quiet weekends and uneven slots; its fit from looks every half hour."""
+    """A process with a morning rush, quiet weekends and uneven slots; its fit from observations every half hour."""
     rng = np.random.default_rng(5)
     hour = np.arange(24)
     weekday = 1e-4 * np.exp(2 * np.exp(-(((hour - 9) / 2) ** 2)))

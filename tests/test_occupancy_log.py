@@ -29,7 +29,7 @@ def write(tmp_path, text, name="log.csv"):
 
 
 def random_log(n_slots=4, days=(*MONDAYS, *SATURDAYS), seed=0, change_days=()):
-    """Looks every half hour from 7 to 19; slot s is taken with the probability (s + 1) / (n + 1)."""
+    """Observations every half hour from 7 to 19; slot s is taken with the probability (s + 1) / (n + 1)."""
     rng = np.random.default_rng(seed)
     days = tuple(sorted(days))
     slot, day, step = (
@@ -146,7 +146,7 @@ def test_a_bad_log_object_is_refused(fields, message):
 
 def replay_of(seconds, states, max_gap_s=7200.0):
     n = len(seconds)
-    # The other Monday is there to forecast from.
+    # The forecast comes from the other Monday.
     log = OccupancyLog(
         ("a",),
         MONDAYS[:2],
@@ -261,7 +261,7 @@ def test_the_forecast_knows_nothing_of_the_days_that_are_replayed(n, day):
     after = changed.forecast(arrival)
     assert np.array_equal(before.p_occupied, after.p_occupied)
     assert np.array_equal(before.decay_rate, after.decay_rate)
-    # The worlds themselves are exactly each other's opposite.
+    # The worlds are exact opposites of each other.
     slots = np.arange(n)
     assert np.array_equal(
         model.world(0, arrival).occupied(slots, arrival.time),

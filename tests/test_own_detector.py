@@ -1,4 +1,4 @@
-"""A detector of the user's own, in every place that takes one."""
+"""A user-defined detector, everywhere a detector is accepted."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""A price on slots counts like the walk, for the solvers, the planners, the bound and the heuristics."""
+"""Parking costs count like the walk, for solvers, planners, bound and heuristics."""
 
 import json
 from dataclasses import replace
@@ -24,7 +24,7 @@ def priced(lot, cost_s):
 
 
 def empty_lot(lot):
-    """All slots are free, and forecast to be so about as often as not."""
+    """All slots are free, with a forecast of about 50 %."""
     occupancy = OccupancyProcess.from_demand(np.full(lot.n_slots, -25.0), np.zeros(168), 1e9)
     prior = OccupancyProcess.from_demand(np.full(lot.n_slots, -0.5), np.zeros(168), 1e9)
     return Scenario(name="empty", lot=lot, occupancy=occupancy, prior=prior)
@@ -55,12 +55,12 @@ def test_agents_park_elsewhere_where_that_pays(name):
     lot = packaged_lot("mini")
     plain = empty_lot(lot)
     chosen = parked_at(make_agent(name, plain), plain)
-    # The half of the lot that it has chosen is dear.
+    # The chosen half of the lot is expensive.
     walk_m = lot.walk_m()
     near = walk_m <= np.median(walk_m) if walk_m[chosen] <= np.median(walk_m) else walk_m > np.median(walk_m)
     dear = empty_lot(priced(lot, np.where(near, DEAR_S, 0.0)))
     assert not near[parked_at(make_agent(name, dear), dear)]
-    # A price that all slots share changes nothing.
+    # The same price for all slots changes nothing.
     alike = empty_lot(priced(lot, np.full(lot.n_slots, DEAR_S)))
     assert parked_at(make_agent(name, alike), alike) == chosen
 

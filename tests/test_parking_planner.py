@@ -1,4 +1,4 @@
-"""The planner that parks: clearance against pymunk, paths that touch nothing, tracking, whole parkings."""
+"""The parking planner: clearance against pymunk, collision-free paths, tracking, whole parking manoeuvres."""
 
 import dataclasses
 import json
@@ -56,7 +56,7 @@ def polygon(rng, k):
 @given(seed=st.integers(0, 10**6), k=st.sampled_from([2, 3, 4, 8, 24]))
 @settings(max_examples=60)
 def test_the_planners_check_and_pymunk_agree_on_what_is_touched(seed, k):
-    """Where the footprint grown by a millimetre is free pymunk tells no contact, and likewise the other way."""
+    """If the footprint grown by a millimetre is free, pymunk reports no contact, and vice versa."""
     rng = np.random.default_rng(seed)
     things = Obstacles.of([(ObstacleKind.PARKED_CAR, polygon(rng, k)) for _ in range(4)])
     if any(len(np.unique(o.round(3), axis=0)) < len(o) for o in things.outlines()):
@@ -247,7 +247,7 @@ def test_stable_baselines_evaluates_the_planner():
         ParkingAgent(), DummyVecEnv([made, made]), n_eval_episodes=4, warn=False, return_episode_rewards=True
     )
     assert len(rewards) == 4
-    # A tenth of a second a step, and nothing for the last: nobody touched anything.
+    # 0.1 s per step, and nothing for the last one: there was no contact.
     np.testing.assert_allclose(rewards, -0.1 * (np.array(lengths) - 1), rtol=1e-6)
 
 
@@ -284,7 +284,20 @@ def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
     no_room = SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0)
     monkeypatch.setattr(parking_runs, "make_parking_agent", lambda name: ParkingAgent(search=no_room))
     out = tmp_path / "park"
-    options = ["--lot", "mini", "--way", "back-in", "--episodes", "2", "--slack", "0", "--out", str(out)]
+    options = [
+        "--lot",
+        "mini",
+        "--way",
+        "back-in",
+        "--episodes",
+        "2",
+        "--slack",
+        "0",
+        "--jobs",
+        "1",
+        "--out",
+        str(out),
+    ]
     result = CliRunner().invoke(app, ["park", "--seed", "3", *options])
     assert result.exit_code == 0, result.output
     assert "failed: mini, seed 3" in result.output

@@ -25,7 +25,7 @@ def line(p_free, walk_s, hop_s=1.0, failure_s=10.0, gamma=0.999):
 
 
 def retry_value(mdp):
-    """Trying at one slot until it works has a closed value: a geometric series."""
+    """Attempting one slot until it is free has a closed-form value: a geometric series."""
     p = mdp.p_free
     return (p * mdp.park_reward - (1 - p) * mdp.failure_s) / (1 - mdp.gamma * (1 - p))
 
@@ -43,7 +43,7 @@ def test_one_slot_is_a_geometric_series(solve):
 @pytest.mark.parametrize("solve", [policy_iteration, value_iteration, label_setting])
 @pytest.mark.parametrize("gamma", [0.9, 0.99, 0.999])
 def test_parking_along_a_line_is_the_best_stop(solve, gamma):
-    """The textbook case: the value is the best over slots of driving there and trying until it works."""
+    """The textbook case: the value is the best over all slots of driving there and attempting until it is free."""
     rng = np.random.default_rng(3)
     n = 30
     mdp = line(rng.uniform(0.05, 0.95, n), 40.0 - np.arange(n), gamma=gamma)
@@ -64,7 +64,7 @@ graphs = st.integers(0, 2**32 - 1)
 @given(seed=graphs, gamma=st.sampled_from([0.9, 0.99, 0.995]), failure=st.sampled_from([0.0, 5.0, 90.0]))
 @settings(max_examples=60)
 def test_policy_iteration_agrees_with_value_iteration(seed, gamma, failure):
-    """Random directed graphs, dead ends and slots that are surely free or surely taken among them."""
+    """Random directed graphs, including dead ends and slots that are certainly free or taken."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 25))
     neighbors = np.where(rng.random((n, 4)) < 0.6, rng.integers(0, n, (n, 4)), -1)

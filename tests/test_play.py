@@ -54,7 +54,7 @@ def test_every_environment_is_filmed(name: str, tmp_path: Path) -> None:
     pytest.importorskip("moviepy")
     options = {"lot": "mini"} if name == "Drive" else {"scenario": "mini"}
     env = RecordVideo(
-        gym.make(f"parkenv/{name}-v0", render_mode="rgb_array", **options), str(tmp_path / "films")
+        gym.make(f"parkenv/{name}-v1", render_mode="rgb_array", **options), str(tmp_path / "films")
     )
     env.reset(seed=0)
     env.action_space.seed(0)

@@ -55,7 +55,7 @@ def boxes_of(*boxes, ends=True):
 
 
 def test_the_middle_of_the_image_is_the_beam_to_the_right():
-    """Camera along -π/2 of the laser, first beam at -3π/4, steps of a quarter degree: beam 180 looks straight."""
+    """Camera along -π/2 of the laser, first beam at -3π/4, steps of a quarter degree: beam 180 points ahead."""
     scan = swept((0.0, -5.0, 0.0, 4.0, 2.0))
     box = np.array([[CAMERA.cx - 4.0, 0.0, CAMERA.cx + 4.0, 9.0]], dtype=np.float32)
     left, right = bearings(CAMERA, EYE, ORIGIN, box)[0]
@@ -251,7 +251,7 @@ def test_fitted_cars_stand_where_the_cars_do(name):
 
 @pytest.fixture(scope="module")
 def pairs():
-    """Pairs of a row of perpendicular slots and of a kerb, with what stands in their boxes."""
+    """Stereo pairs of a row of perpendicular slots and of a kerb, with the objects in their boxes."""
     rig = SensorRig.stereo()
     _, stereo, mount = rig.stereo_cameras[0]
     looks = []
@@ -300,7 +300,7 @@ def test_a_box_without_a_match_has_no_depth(pairs):
 
 
 def test_a_wall_fills_a_scan_from_stereo(pairs):
-    """Every pixel at 6 m: what stands at bumper height is met there in every direction, and angles ascend."""
+    """With every pixel at 6 m, objects at bumper height are hit there in every direction, and angles ascend."""
     stereo, mount, _ = pairs
     disparities = np.full((480, 640), stereo.camera.fx * stereo.baseline / 6.0, np.float32)
     scan = scan_from_stereo(stereo, mount, ORIGIN, disparities)

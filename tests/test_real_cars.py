@@ -44,7 +44,7 @@ def test_training_on_uiuc_generalizes_to_crops_held_out():
 @needs_uiuc
 @pytest.mark.slow
 def test_the_shipped_side_model_scans_real_photographs():
-    """Every crop as a picture of its own, and the backgrounds at twice their size, too."""
+    """Every crop as a separate image, and the backgrounds also at twice their size."""
     crops, nothing = read_uiuc_training(UIUC), np.empty((0, 4))
     images = [LabelledImage("car", c, np.array([[0.0, 0.0, 100.0, 40.0]])) for c in crops.positives]
     images += [LabelledImage("background", c, nothing) for c in crops.negatives]

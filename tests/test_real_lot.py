@@ -21,7 +21,7 @@ needs_data = pytest.mark.skipif(
 @pytest.fixture(scope="module")
 def scenario():
     lot = read_lot(MAP)
-    return make_scenario(lot, RecordedOccupancy(OccupancyLog.read(LOG), lot.walk_m()))
+    return make_scenario(lot, occupancy=RecordedOccupancy(OccupancyLog.read(LOG), lot.walk_m()))
 
 
 def totals(scenario, agent, episodes):
@@ -30,7 +30,7 @@ def totals(scenario, agent, episodes):
 
 @needs_data
 def test_the_world_is_the_log_and_the_forecast_is_not(scenario):
-    """Searches fall on recorded weekdays in the window, and what stands there is as full as the log was."""
+    """Searches fall on recorded weekdays in the window, with the occupancy of the log."""
     rows = Case(scenario, "greedy-drive").run(range(40))[0]
     days = set(scenario.occupancy.log.days)
     assert {row["day"] for row in rows} <= days

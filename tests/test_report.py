@@ -209,7 +209,7 @@ def test_other_commands_get_tables_and_figures(tmp_path):
 
 @pytest.mark.parametrize("drives", [False, True])
 def test_learning_curves_are_those_of_the_training(tmp_path, drives):
-    """Of searches one panel, of driving one for each kind of slot; other trainings are told of by their medians."""
+    """One panel for searches, one per kind of slot for driving; other trainings are shown by their medians."""
     names = ["oblique_success", "parallel_success"] if drives else ["total_s"]
     (tmp_path / "seed_3").mkdir()
     examinations = [["steps", *names], ["0", *("0.25" for _ in names)], ["500", *("0.5" for _ in names)]]

@@ -1,4 +1,4 @@
-"""The report in a real browser: it loads without a complaint, plays, steps, sorts, and shows the summary's numbers."""
+"""The report in a real browser: it loads without errors, plays, steps, sorts, and shows the summary's numbers."""
 
 import json
 import shutil
@@ -186,7 +186,7 @@ def test_the_end_of_a_replay_is_the_end_of_the_search(page):
         assert "at the goal" in panel.find_element(By.CSS_SELECTOR, ".status").text
         parts = [float(b.text) for b in panel.find_elements(By.CSS_SELECTOR, ".split b")]
         assert sum(parts) == pytest.approx(search["total_s"], abs=0.2)
-        assert panel.find_element(By.CSS_SELECTOR, ".check").text == "✓ as counted"
+        assert panel.find_element(By.CSS_SELECTOR, ".check").text == "✓ as in episodes.csv"
     # Back at the start, everything is as it was before.
     ActionChains(page).send_keys(Keys.ARROW_LEFT).perform()
     one(page, "#replay button[aria-label='To the start']").click()

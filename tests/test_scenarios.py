@@ -1,4 +1,4 @@
-"""Scenario files: what they make, and how bad ones are refused."""
+"""Scenario files: their scenarios, and errors of invalid files."""
 
 import gymnasium as gym
 import numpy as np

@@ -1,4 +1,4 @@
-"""`parkenv/Search-v1`: contract, determinism, rewards, ends, sight."""
+"""`parkenv/Search-v1`: contract, determinism, rewards, ends, observations."""
 
 import copy
 import hashlib
@@ -27,12 +27,12 @@ ENV_IDS = [name for name in gym.registry if name.startswith("parkenv/Search")]
 
 
 def always(lot, occupied):
-    """A world in which slot s is taken for ever where `occupied[s]`, free for ever elsewhere."""
+    """A world in which slot s is always taken if `occupied[s]`, else always free."""
     return OccupancyProcess.from_demand(np.where(occupied, 25.0, -25.0), np.zeros(168), 1e9)
 
 
 def random_episode(env, seed, steps=300):
-    """Act at random; everything that was observed."""
+    """Act at random, and return all observations."""
     rng = np.random.default_rng(seed)
     observation, _ = env.reset(seed=seed)
     seen = [observation]
@@ -297,7 +297,7 @@ def test_old_ids_are_not_registered():
 
 
 def test_only_slots_in_view_are_observed():
-    """The belief of a slot that was never in view stays at its forecast, whatever stands there."""
+    """The belief of a slot that was never in view stays at its forecast, whether it is taken or not."""
     scenario = make_scenario("campus", sensor_model=SensorModel(view_range=6.0))
     env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
     observation, _ = env.reset(seed=0)
@@ -319,7 +319,7 @@ def test_a_sighting_is_bayes_rule_and_relaxes_exponentially():
         0.6 + (said - 0.6) * np.exp(-0.5), rel=1e-14
     )
     assert decay_to_prior(0.6, 1 / 600, said, 0.0) == pytest.approx(said, rel=1e-15)
-    # What is certain stays so to the last bit until time passes.
+    # Certain beliefs stay exactly certain until time passes.
     assert [decay_to_prior(0.3, 1 / 600, certain, 0.0) for certain in (0.0, 1.0)] == [0.0, 1.0]
     assert decay_to_prior(0.6, 1 / 600, said, 1e9) == 0.6
     assert bayes_update(0.0, True, 1.0, 0.0) == 1.0, "a look that was held to be impossible is believed"

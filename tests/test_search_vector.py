@@ -20,7 +20,7 @@ LIMIT = 40
 
 
 class Rumour:
-    """A prior that is neither a process nor a log, and says something else at every hour."""
+    """A prior that is neither a process nor a log, and changes every hour."""
 
     def __init__(self, n_slots):
         self.n_slots = n_slots
@@ -84,7 +84,7 @@ def assert_parity(scenarios, observation="full", n=4, steps=250, k=5, **changes)
                     assert (there[:, n_slots:] == past_the_last).all()
                     there = there[:, :n_slots].ravel()
                 np.testing.assert_array_equal(there, value, err_msg=name)
-        # Mostly what the graph has, and now and then what it does not.
+        # Mostly valid actions, and sometimes invalid ones.
         actions = np.array(
             [
                 rng.choice(np.flatnonzero(o["action_mask"])) if rng.random() < 0.9 else rng.integers(5)

@@ -19,7 +19,7 @@ from planners import make_agent
 
 
 def rows_of(path: Path) -> Counter[str]:
-    """How often each entity was logged, as `rerun rrd print` tells."""
+    """How often each entity was logged, according to `rerun rrd print`."""
     told = subprocess.run(
         [sys.executable, "-m", "rerun", "rrd", "print", str(path)], capture_output=True, text=True, check=True
     ).stdout

@@ -82,7 +82,7 @@ def test_unseen_slots_are_known_once_they_were_tried():
     assert not env.state.belief.observed.any()
     observation, *_ = env.step(PARK)
     assert env.state.belief.observed.tolist() == [s == slot for s in range(lot.n_slots)]
-    assert observation["p_occupied"][slot] > 0.99  # the try took its time, in which cars may leave
+    assert observation["p_occupied"][slot] > 0.99  # cars may leave during the attempt
     others = np.arange(lot.n_slots) != slot
     np.testing.assert_array_equal(observation["p_occupied"][others], prior[others])
 
@@ -115,7 +115,7 @@ def test_too_few_looks_are_refused():
 
 
 def test_looks_of_a_real_search_are_counted():
-    """Every slot in view after every step is counted once, and the stack is right about most that it speaks of."""
+    """Every slot in view after every step is counted once, and most reported states are correct."""
     scenario = make_scenario("mini")
     looks = count_observations(scenario, "laser", "greedy-drive", range(3), "overcast").counts
     said = looks.sum(axis=(0, 1))

@@ -152,7 +152,7 @@ def test_negative_traffic_is_refused():
         Traffic(cars=-1)
 
 
-# What stands in the lot, and what moves there
+# Parked cars and moving road users
 
 
 def coming_and_going(lot):

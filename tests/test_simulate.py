@@ -15,7 +15,7 @@ MINI = make_scenario("mini")
 
 
 class Counter(Observer):
-    """Notes every call."""
+    """Records every call."""
 
     def __init__(self) -> None:
         self.calls, self.steps, self.results = [], [], []

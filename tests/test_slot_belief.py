@@ -19,7 +19,7 @@ def test_an_observation_is_bayes_rule_and_decays_to_the_forecast(p, rate, taken,
     after = belief.update([1], [taken], hit, false_alarm)
     if_taken, if_free = (hit, false_alarm) if taken else (1.0 - hit, 1.0 - false_alarm)
     evidence = if_taken * p + if_free * (1.0 - p)
-    # An observation that was held to be impossible is believed.
+    # An observation with prior probability 0 is believed.
     posterior = if_taken * p / evidence if evidence > 0.0 else float(taken)
     np.testing.assert_allclose(after.p_occupied, [p, posterior], atol=1e-12)
     assert after.age.tolist() == [np.inf, 0.0]

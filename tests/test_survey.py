@@ -1,4 +1,4 @@
-"""The stack on simulated drives: sessions, the map that they make, and searches that live on what it sees."""
+"""The perception stack on simulated drives: sessions, their map, and searches with its observations."""
 
 import json
 import subprocess
@@ -24,7 +24,7 @@ BUSY = Traffic(cars=2, pedestrians=4)
 
 
 def halves(name="mini"):
-    """Every other slot taken for ever."""
+    """Every other slot is always taken."""
     lot = make_scenario(name).lot
     taken = np.arange(lot.n_slots) % 2 == 0
     world = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
@@ -178,7 +178,7 @@ def test_bad_settings_are_named(wrong, message):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "rig", "accuracy"), [("campus", "laser", 0.97), ("street", "stereo", 0.94)])
 def test_held_out_sessions_are_as_right_as_promised(name, rig, accuracy):
-    """With a fifth of the captures that a survey makes unless it is asked for others."""
+    """A survey with a fifth of the default number of captures."""
     window = ArrivalWindow((1,), 36_000.0, 43_200.0)
     settings = SurveySettings(rig=rig, windows=(window,), seed=777, every=6.0)
     assert Survey(make_scenario(name, traffic=BUSY), settings).drive(0).slot_accuracy >= accuracy
@@ -186,7 +186,7 @@ def test_held_out_sessions_are_as_right_as_promised(name, rig, accuracy):
 
 @pytest.mark.slow
 def test_a_killed_survey_loses_only_the_drive_under_way(tmp_path):
-    """SIGKILL in the middle: what the map file holds is whole, and the same command goes on from there."""
+    """After SIGKILL the map file is intact, and the same command continues from there."""
     scenario, out = make_scenario("mini"), tmp_path / "s"
     command = [*PARKENV, "survey", "--scenario", "mini", "--every", "4", "--jobs", "1", "--out", str(out)]
     drive = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Learning agents: the batch for stable-baselines3, trainings that can be stopped, models that say what they are."""
+"""Learning agents: the batch for stable-baselines3, interruptible trainings, model metadata."""
 
 import dataclasses
 import json
@@ -176,7 +176,7 @@ def test_a_kill_between_the_last_checkpoint_and_its_examination_loses_neither(tm
 
 
 class Waits:
-    """Goes nowhere."""
+    """Never moves."""
 
     def predict(self, observation, state=None):
         return int(np.flatnonzero(observation["action_mask"] == 0)[0]), state
@@ -251,7 +251,7 @@ def without_network(path):
     [
         (torn, "maskable-ppo", "no model file, or a damaged one"),
         (with_card("{"), "maskable-ppo", "no model file, or a damaged one"),
-        (with_card("[]"), "maskable-ppo", "holds a list, want what it was trained for"),
+        (with_card("[]"), "maskable-ppo", "holds a list, want a model card"),
         (without_network, "maskable-ppo", "its network cannot be read"),
         (without_card, "maskable-ppo", "parkenv.json is missing"),
         (of_another_layout, "maskable-ppo", "observes 'local-0', this version of parkenv gives 'local-1'"),
@@ -271,7 +271,7 @@ def test_observations_of_another_kind_are_refused(trained):
     agent = LearnedAgent(SCENARIO, "maskable-ppo", trained / "model.zip")
     env = gym.make("parkenv/Search-v1", scenario=SCENARIO)
     plain, _ = env.reset(seed=0)
-    with pytest.raises(InputError, match=r"observes what .*LocalObservation says, got vertex, time"):
+    with pytest.raises(InputError, match=r"wants observations of .*LocalObservation, got vertex, time"):
         agent.predict(plain)
     with pytest.raises(InputError, match="observes 86 numbers, got 102 for its k = 5"):
         agent.predict(LocalObservation(env, k=7).reset(seed=0)[0])
@@ -317,7 +317,7 @@ def test_every_algorithm_trains_a_model_that_searches(algorithm, tmp_path, monke
     assert row["episodes"] == 4
 
 
-# One that learns from its last decisions, and one that keeps what it did for long.
+# One on-policy algorithm, and one with a replay buffer.
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["maskable-ppo", "dqn"])
 def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp_path, algorithm):

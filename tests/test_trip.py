@@ -1,4 +1,4 @@
-"""The whole trip: lines along lanes, lane keeping, tries that fail, and what many trips say of speeds and costs."""
+"""The whole trip: lines along lanes, lane keeping, failed attempts, and calibration of speeds and costs."""
 
 import dataclasses
 import json
@@ -19,7 +19,7 @@ from parkenv.driving.encounters import PREDICTION_TIMES_S
 from parkenv.driving.road_users import CLEAR_RADIUS_M, RoadUsers
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
-from parkenv.evaluation.experiments.compare import unseen
+from parkenv.evaluation.experiments.compare import blind_scenario
 from parkenv.evaluation.simulate import Observer
 from parkenv.evaluation.trips.calibration import (
     OBSERVED,
@@ -59,7 +59,9 @@ def lines_of(name):
 @lru_cache
 def searched(name, blind=False, notice_m=2.0):
     scenario = make_scenario(name)
-    return DrivenSearch(unseen(scenario) if blind else scenario, style=DrivingStyle(notice_m=notice_m))
+    return DrivenSearch(
+        blind_scenario(scenario) if blind else scenario, style=DrivingStyle(notice_m=notice_m)
+    )
 
 
 class Calling(Observer):
@@ -198,8 +200,8 @@ def test_a_lane_keeper_stays_near_its_path_at_any_speed_and_slows_down_in_turns(
 
 @pytest.mark.parametrize("name", ["mini", "campus"])
 def test_with_the_graphs_times_a_trip_is_the_search_itself(name):
-    """Replace what was driven by what the graph says, and every decision and second is that of Search-v1."""
-    scenario = unseen(make_scenario(name))
+    """With the graph's times instead of driven ones, every decision and time equals that of Search-v1."""
+    scenario = blind_scenario(make_scenario(name))
     agent = make_agent("mdp", scenario)
     plain, driven = SearchEnv(scenario), DrivenSearchEnv(scenario, GraphExecutor(scenario))
     failed = 0
@@ -584,7 +586,7 @@ def test_bad_input_is_one_clear_error():
         record_trip(searched("mini"), 0, None)
     for words, message in (
         (["--rerun", "trip.rrd"], "add --rig laser"),
-        (["--unseen", "--rig", "laser"], "--unseen and --rig"),
+        (["--blind", "--rig", "laser"], "--blind and --rig"),
     ):
         result = CliRunner().invoke(app, ["trip", "--scenario", "mini", *words])
         assert isinstance(result.exception, InputError)

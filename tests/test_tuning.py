@@ -17,7 +17,7 @@ COSTS = (1.0, 4.0, 16.0, 64.0)
 
 @pytest.mark.parametrize("seed", [3, 5, 21, 39, 59, 75])
 def test_the_simulation_agrees_with_the_planner_itself(seed):
-    """Its mean over worlds is the planner's exact expectation, up to the luck of the draw."""
+    """Its mean over worlds is the planner's exact expectation, up to sampling error."""
     problem, p, entry = small_lot(seed)
     found = tune_failure_cost(problem, p, entry, costs=COSTS, worlds=4000, seed=1)
     exact = [expected_time(make_agent("mdp", problem, failure_s=c), problem, p, entry) for c in COSTS]
@@ -33,7 +33,7 @@ def test_the_same_seed_gives_the_same_choice_and_another_one_other_worlds():
 
 
 def test_it_sees_the_forecast_and_not_the_world():
-    """Two worlds that could not differ more, one map: the choice is the same."""
+    """Two opposite worlds with the same map: the choice is the same."""
     scenario = make_scenario("jam")
     full = OccupancyProcess.from_demand(np.full(scenario.lot.n_slots, 9.0), np.zeros(168))
     chosen = []

@@ -120,7 +120,7 @@ def test_normals_are_unit_and_on_the_triangles_outer_side(body, level):
 @pytest.mark.parametrize("body", BODIES)
 @pytest.mark.parametrize("level", [DETAILED, COARSE])
 def test_no_gap_shows_a_surface_from_behind(body, level):
-    """Rays from all around at a car first meet the outside of something, never an inside through a hole."""
+    """Rays at a car from all directions first hit an outer surface, never an inner one through a hole."""
     rng = np.random.default_rng(8)
     model = VehicleModel.from_seed(body, 2)
     mesh = model.mesh(level)

@@ -1,1 +1,1 @@
-"""What the car knows of the slots: forecast, observations, decay."""
+"""The belief about the slots: forecast, observations, decay."""

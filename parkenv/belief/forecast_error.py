@@ -1,11 +1,11 @@
 """The forecast error model: how the occupancy of a whole day may differ from its forecast.
 
-Errors of a forecast are correlated: on the day of an event every slot near the goal is likelier to be taken than
-forecast, and a forecast may be plain wrong. The model is a mixture of hypotheses. Each gives every slot its own
-probability, and given the hypothesis slots are independent. Observations of the first slots update the weights of the
-hypotheses by Bayes' rule and so change what is believed of slots not observed yet. The same update is applied to
-hypothetical observations while planning: along a path on which the car has not parked, further slots are likelier to
-be taken, too.
+Forecast errors are correlated: on the day of an event every slot near the goal is more likely to be taken than
+forecast, and a forecast may be entirely wrong. The model is a mixture of hypotheses. Each hypothesis gives every slot a
+probability; given the hypothesis, slots are independent. Observations of the first slots update the weights of the
+hypotheses by Bayes' rule and so change the belief about unobserved slots. The same update is applied to hypothetical
+observations while planning: if the car has not parked along a path, the slots further on are also more likely to be
+taken.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from parkenv.errors import InputError
 FloatArray = NDArray[np.float64]
 
 NEGLIGIBLE = 5e-4
-"""Hypotheses with less weight are left out: where the forecast is right, the uninformative ones would only blur it."""
+"""Hypotheses with less weight are dropped: if the forecast is right, the uninformative ones would only blur it."""
 
 
 SHIFTS = {(logits, reach): 1e-3 for logits in (-2.0, -1.0, 1.0, 2.0) for reach in (0.2, 0.4, 0.6, 0.8, 1.0)}
@@ -32,21 +32,21 @@ UNINFORMED = {(level, slope): 3e-4 for level in (-2.0, 0.0, 2.0, 4.0) for slope 
 
 @dataclass(frozen=True)
 class ForecastErrorModel:
-    """Prior mixture of the ways in which a day may differ from its forecast.
+    """Prior mixture over the ways in which a day may differ from its forecast.
 
-    With the probability that is left over the forecast is right. As a forecast is of the average day, the log-odds of
+    The remaining probability is that of a correct forecast. A forecast describes the average day, so the log-odds of
     the slots on a usual day are chosen such that the mean over usual days, shifts and events is the forecast.
 
     Args:
-        shifts: (shift of the log-odds, part of the lot, nearest to the goal, that it reaches) -> prior probability.
-        events: part of the lot, nearest to the goal, that an event fills -> prior probability in a very large lot. With
-            higher ones the car would turn round after fewer taken slots: sooner on the day of an event, and more often
-            without reason on other days.
-        p_occupied_at_event: P(taken) there, unless the forecast is higher still.
-        half_events_at: slots of a lot in which events are half as likely as in a very large one: small lots fill up on
-            usual days.
-        uninformed: (log-odds of the slot in the middle, how much higher they are at the goal and lower at the far end)
-            -> prior probability: the forecast says nothing about the day.
+        shifts: (shift of the log-odds, fraction of the lot, nearest to the goal, that it affects) -> prior probability.
+        events: fraction of the lot, nearest to the goal, that an event fills -> prior probability in a very large lot.
+            With higher probabilities the car would turn round after fewer taken slots: sooner on the day of an event,
+            and more often without need on other days.
+        p_occupied_at_event: P(taken) of the affected slots, unless the forecast is even higher.
+        half_events_at: number of slots of a lot in which events are half as likely as in a very large one, because
+            small lots fill up on usual days.
+        uninformed: (log-odds of the middle slot, increase at the goal and decrease at the far end) -> prior probability
+            that the forecast says nothing about the day.
 
     Raises:
         InputError: a value out of its range, or probabilities that add up to more than 1.
@@ -71,15 +71,15 @@ class ForecastErrorModel:
 
     @classmethod
     def none(cls) -> Self:
-        """The model of a forecast that is right on every day."""
+        """The model of a forecast without errors."""
         return cls(shifts={}, events={}, uninformed={})
 
     def prior(self, forecast: ArrayLike, walk_s: FloatArray) -> DayBelief:
-        """Return the belief about the day before anything was observed.
+        """Return the belief about the day before any observation.
 
         Args:
             forecast: (n_slots,) P(taken).
-            walk_s: (n_slots,) s, walk from each slot to the goal, by which slots are near or far.
+            walk_s: (n_slots,) s, walk from each slot to the goal; orders the slots from near to far.
         """
         p = np.clip(np.asarray(forecast, dtype=np.float64), 1e-6, 1.0 - 1e-6)
         n = len(p)
@@ -110,10 +110,10 @@ class DayBelief:
 
     Args:
         p_taken: (k, n_slots) float64, P(taken) of each slot under each hypothesis.
-        log_weight: (k,) float64, logarithm of the prior probability of each.
+        log_weight: (k,) float64, logarithm of the prior probability of each hypothesis.
 
     Examples:
-        60 % are forecast everywhere. The first ten slots are all taken, so the others are believed to be fuller.
+        The forecast is 60 % for every slot. The first ten slots are all taken, so P(taken) of the others rises.
 
         >>> day = ForecastErrorModel().prior(np.full(40, 0.6), np.arange(40.0))
         >>> round(float(day.p_occupied()[20]), 2)
@@ -128,7 +128,7 @@ class DayBelief:
         self._log_taken, self._log_free = np.log(p_taken), np.log1p(-p_taken)
 
     def update(self, slots: NDArray[np.int64], taken: NDArray[np.bool_]) -> None:
-        """Update the weights by the first observations of slots, (k,) int64, that were taken or not, (k,) bool."""
+        """Update the weights from the first observations of slots, (k,) int64, taken or not, (k,) bool."""
         likelihood = self._log_taken[:, slots[taken]].sum(axis=1) + self._log_free[:, slots[~taken]].sum(
             axis=1
         )
@@ -141,7 +141,7 @@ class DayBelief:
         return weight[kept] / weight[kept].sum(), 1.0 - self._p_taken[kept]
 
     def p_occupied(self) -> FloatArray:
-        """P(taken), (n_slots,), of slots that were not observed yet."""
+        """P(taken), (n_slots,), of slots not observed yet."""
         weight, free = self.mixture()
         return np.asarray(1.0 - weight @ free)
 

@@ -1,4 +1,4 @@
-"""The belief state of the slots: what is known of each from the forecast and from the search's own observations."""
+"""The belief state of the slots, from the forecast and the search's own observations."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ BoolArray = NDArray[np.bool_]
 
 
 UNOBSERVED, OBSERVED_FREE, OBSERVED_TAKEN = 0, 1, 2
-"""What a slot's last observation showed."""
+"""Result of a slot's last observation."""
 
 
 @dataclass(eq=False)
 class SlotBelief:
-    """Probability that each slot is taken, at one moment of a search, and what it rests on.
+    """Probability that each slot is taken at one moment of a search, with the data behind it.
 
-    A slot that was never observed keeps its forecast. An observation updates its probability by Bayes' rule;
-    from then on the probability decays to the forecast as that of a two-state Markov chain:
-    p(t) = p∞ + (p_observed - p∞)·exp(-(λ+μ)t), p∞ being the forecast, λ and μ the rates of arrival and departure.
+    An unobserved slot keeps its forecast. An observation updates the probability by Bayes' rule; from then on it
+    decays to the forecast like that of a two-state Markov chain:
+    p(t) = p∞ + (p_observed - p∞)·exp(-(λ+μ)t), with the forecast p∞ and the rates of arrival λ and departure μ.
 
-    Instances are not changed once made: `update` and `decay` return new ones. (The class is not frozen, and keeps its
-    parts as the observation has them, because agents make one for each decision, of which some take microseconds.)
+    Treat instances as immutable: `update` and `decay` return new ones. (The class is not frozen and keeps its parts in
+    the layout of the observation because agents create one per decision, and some decisions take microseconds.)
 
     Args:
-        p_occupied: (n_slots,) float, P(taken) now.
-        parts: (4 * n_slots,) float, one after the other:
-            `forecast`, P(taken) before anything was observed;
+        p_occupied: (n_slots,) float, current P(taken).
+        parts: (4 * n_slots,) float, four consecutive parts:
+            `forecast`, P(taken) before any observation;
             `decay_rate`, 1/s, λ+μ: how fast an observation loses its value;
-            `p_observed`, P(taken) right after the slot's last observation, the forecast where there was none;
-            `observed_at`, s since the search began, when that was, -1 where there was none.
-        time: s since the search began, now.
+            `p_observed`, P(taken) right after the slot's last observation; the forecast if there was none;
+            `observed_at`, time of that observation, s since the search began; -1 if there was none.
+        time: current time, s since the search began.
 
     Examples:
-        Slot 1 is seen free and stays likely to be free for a while.
+        Slot 1 is observed free and stays likely to be free for a while.
 
         >>> belief = SlotBelief.of_forecast(np.array([0.8, 0.8]), np.array([1e-3, 1e-3]))
         >>> later = belief.update([1], [False]).decay(100.0)
@@ -57,10 +57,10 @@ class SlotBelief:
 
     @classmethod
     def of_observation(cls, observation: Mapping[str, Any]) -> Self:
-        """Return the belief that an observation of `parkenv/Search-v1` states. Its arrays are shared, not copied.
+        """Return the belief in an observation of `parkenv/Search-v1`, sharing its arrays.
 
         Raises:
-            InputError: the observation is of another environment.
+            InputError: the observation comes from another environment.
         """
         try:
             return cls(observation["p_occupied"], observation["belief"], float(observation["time"][1]))
@@ -70,12 +70,12 @@ class SlotBelief:
             ) from None
 
     def to_observation(self) -> dict[str, NDArray[np.float32]]:
-        """Return the entries of an observation that state this belief: `p_occupied` and `belief`, float32."""
+        """Return this belief as entries of an observation: `p_occupied` and `belief`, float32."""
         return {"p_occupied": self.p_occupied.astype(np.float32), "belief": self.parts.astype(np.float32)}
 
     @classmethod
     def of_forecast(cls, p_occupied: ArrayLike, decay_rate: ArrayLike) -> Self:
-        """Return the belief before anything was observed.
+        """Return the belief before any observation.
 
         Args:
             p_occupied: (n_slots,) the forecast.
@@ -91,7 +91,7 @@ class SlotBelief:
 
     @property
     def forecast(self) -> NDArray[np.floating]:
-        """(n_slots,) float, P(taken) before anything was observed."""
+        """(n_slots,) float, P(taken) before any observation."""
         row: NDArray[np.floating] = self._rows[0]
         return row
 
@@ -103,27 +103,27 @@ class SlotBelief:
 
     @property
     def p_observed(self) -> NDArray[np.floating]:
-        """(n_slots,) float, P(taken) right after the slot's last observation; the forecast where there was none."""
+        """(n_slots,) float, P(taken) right after the slot's last observation; the forecast if there was none."""
         row: NDArray[np.floating] = self._rows[2]
         return row
 
     @property
     def observed_at(self) -> NDArray[np.floating]:
-        """(n_slots,) float, s since the search began, when the slot was last observed; -1 where it never was."""
+        """(n_slots,) float, time of the slot's last observation, s since the search began; -1 if there was none."""
         row: NDArray[np.floating] = self._rows[3]
         return row
 
     @cached_property
     def observed(self) -> BoolArray:
-        """(n_slots,) bool, slots that were observed in this search."""
+        """(n_slots,) bool, whether the slot was observed in this search."""
         return self.observed_at >= 0.0
 
     @cached_property
     def state(self) -> NDArray[np.int8]:
-        """(n_slots,) int8, `UNOBSERVED`, `OBSERVED_FREE` or `OBSERVED_TAKEN`, by each slot's last observation.
+        """(n_slots,) int8, `UNOBSERVED`, `OBSERVED_FREE` or `OBSERVED_TAKEN`, from each slot's last observation.
 
-        A slot is observed free if the observation left it less likely to be taken than forecast, observed taken if more
-        likely; where the forecast is certain, an observation that confirms it counts, too.
+        A slot counts as observed free if the observation left P(taken) below the forecast, and as observed taken if
+        above. If the forecast is certain, an observation that confirms it counts, too.
         """
         states: NDArray[np.int8] = _states(self.parts)
         return states
@@ -140,7 +140,7 @@ class SlotBelief:
 
     @cached_property
     def age(self) -> FloatArray:
-        """(n_slots,) float64, s since each slot's last observation; inf where there was none."""
+        """(n_slots,) float64, s since each slot's last observation; inf if there was none."""
         return np.where(self.observed, self.time - self.observed_at.astype(np.float64), np.inf)
 
     def take(self, slots: NDArray[np.integer]) -> Self:
@@ -158,10 +158,10 @@ class SlotBelief:
         """Return the belief after observations of some slots (Bayes' rule).
 
         Args:
-            slots: (k,) int, each at most once.
-            looks_taken: (k,) bool, what the sensor reported.
-            hit_rate: (k,) or one for all, P(looks taken | taken).
-            false_alarm_rate: (k,) or one for all, P(looks taken | free).
+            slots: (k,) int, without repeats.
+            looks_taken: (k,) bool, observed states.
+            hit_rate: (k,) or scalar, P(observed taken | taken).
+            false_alarm_rate: (k,) or scalar, P(observed taken | free).
         """
         observed = np.asarray(slots, dtype=np.int64)
         reports, hits, false_alarms = (
@@ -178,7 +178,7 @@ class SlotBelief:
         return later
 
     def decay(self, seconds: float) -> Self:
-        """Return the belief some time later, nothing having been observed in between."""
+        """Return the belief after some time without observations."""
         later = type(self)(self.p_occupied, self.parts.astype(np.float64), self.time + seconds)
         later.p_occupied = _decay_slots(later.forecast, later.decay_rate, later.p_observed, later.age)
         return later
@@ -195,15 +195,15 @@ def bayes_update(p: float, looks_taken: bool, hit_rate: float, false_alarm_rate:
     """P(taken) of a slot after one observation (Bayes' rule).
 
     Args:
-        p: P(taken) before it.
-        looks_taken: what the sensor reported.
-        hit_rate: P(looks taken | taken).
-        false_alarm_rate: P(looks taken | free).
+        p: P(taken) before the observation.
+        looks_taken: observed state.
+        hit_rate: P(observed taken | taken).
+        false_alarm_rate: P(observed taken | free).
     """
     if_taken = hit_rate if looks_taken else 1.0 - hit_rate
     if_free = false_alarm_rate if looks_taken else 1.0 - false_alarm_rate
     evidence = if_taken * p + if_free * (1.0 - p)
-    # The belief ruled this observation out: trust the sensor, as if it never erred.
+    # The observation has probability 0 under the belief: trust the sensor as if it were error-free.
     if evidence <= 0.0:
         return 1.0 if looks_taken else 0.0
     return if_taken * p / evidence

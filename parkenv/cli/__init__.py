@@ -1,4 +1,4 @@
-"""The command line: `parkenv COMMAND --help` teaches each command."""
+"""The command line; `parkenv COMMAND --help` explains each command."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _global_options(
 
 
 def main() -> None:
-    """Entry point: bad input is one line on standard error and exit code 2."""
+    """Entry point; invalid input gives one line on standard error and exit code 2."""
     warnings.formatwarning = lambda message, *_: f"parkenv: warning: {message}\n"
     try:
         code = app(standalone_mode=False)
@@ -87,7 +87,7 @@ def main() -> None:
         sys.exit(_complain(str(error)))
     except typer.TyperException as error:
         message = error.format_message().rstrip(".")
-        # Without a command the help has been printed, and there is nothing to add.
+        # Without a command, the help has already been printed.
         sys.exit(_complain(f"{message}. See parkenv --help, and --help of each command") if message else 2)
     except typer.Abort:
         sys.exit(130)

@@ -1,4 +1,4 @@
-"""Options that several commands share, and how their words become objects."""
+"""Options shared by several commands, and their conversion to objects."""
 
 from __future__ import annotations
 
@@ -222,10 +222,10 @@ AddressOption = Annotated[
 
 
 def numbers(option: str, text: str) -> list[float]:
-    """Comma-separated numbers.
+    """Parse comma-separated numbers.
 
     Raises:
-        InputError: something else; the message names the option.
+        InputError: the text is something else; the message names the option.
     """
     try:
         values = [float(word) for word in text.split(",")]
@@ -237,14 +237,14 @@ def numbers(option: str, text: str) -> list[float]:
 
 
 def changed_axes(grid: Grid, options: Mapping[str, tuple[str, str | None]]) -> Grid:
-    """A grid with those axes replaced that options give as comma-separated numbers.
+    """Return a grid with the axes replaced that options give as comma-separated numbers.
 
     Args:
         grid: the grid.
-        options: the axis and the text of each option; None for one that is not given.
+        options: axis and text by option; the text is None if the option is not given.
 
     Raises:
-        InputError: no numbers, or some out of their range.
+        InputError: the text has no numbers, or a number is out of range.
     """
     for option, (axis, text) in options.items():
         if text is not None:
@@ -253,7 +253,7 @@ def changed_axes(grid: Grid, options: Mapping[str, tuple[str, str | None]]) -> G
 
 
 def words(option: str, text: str) -> list[str]:
-    """Comma-separated words, at least one, none twice."""
+    """Parse comma-separated words: at least one, without duplicates."""
     values = [word.strip() for word in text.split(",") if word.strip()]
     if not values:
         raise InputError(f"{option} is {text!r}, want names separated by commas")
@@ -263,10 +263,10 @@ def words(option: str, text: str) -> list[str]:
 
 
 def workers_of(jobs: int, backend: str, address: str | None) -> Workers:
-    """Where tasks run; with `with`, clusters are connected to, and left again.
+    """Return the workers for tasks, a context manager that connects to clusters.
 
     Raises:
-        InputError: options that do not go together.
+        InputError: the options are incompatible.
     """
     from parkenv.evaluation.experiments.workers import Workers
 
@@ -290,26 +290,26 @@ def scenario_specs(
     base: Sequence[ScenarioSpec] | None = None,
     default: str = "campus",
 ) -> list[ScenarioSpec]:
-    """The scenarios that options describe: each option changes what the scenario's own file says.
+    """Return the scenarios that options describe; options override the values of scenario files.
 
     Args:
         scenario: names of packaged scenarios and scenario files, separated by commas.
-        lot: names of packaged lots and lot files, separated by commas, for a typical week there.
-        occupancy: a log or process file, instead of the scenario's.
-        mapping: of the log's slots to the lot's.
+        lot: names of packaged lots and lot files, separated by commas, with the occupancy of a typical week.
+        occupancy: a log or process file to replace the scenario's occupancy.
+        mapping: file that maps the log's slots to the lot's.
         goal: a point, X,Y, or an index.
         arrival: hours, HH:MM-HH:MM.
-        days: such as weekdays.
-        sensor_model: by name, or a file.
-        view_range: m.
-        cars: that drive about.
-        pedestrians: that walk about.
-        traffic: where the scenario names none.
-        base: the scenarios to change where neither `scenario` nor `lot` is given.
-        default: names, where there is no base either.
+        days: days, such as weekdays.
+        sensor_model: a name or a file.
+        view_range: view range, m.
+        cars: number of moving cars.
+        pedestrians: number of pedestrians.
+        traffic: traffic of scenarios that name none.
+        base: scenarios to change if neither `scenario` nor `lot` is given.
+        default: names used if there is no base either.
 
     Raises:
-        InputError: an unknown name, a file that cannot be used, or options that exclude each other.
+        InputError: an unknown name, an unusable file, or options that exclude each other.
     """
     if scenario is not None and lot is not None:
         raise InputError("--scenario and --lot exclude each other: a scenario has its lot")
@@ -396,10 +396,10 @@ def _point(goal: str) -> list[float] | int:
 
 
 def one_scenario(specs: list[ScenarioSpec]) -> ScenarioSpec:
-    """The only scenario.
+    """Return the only scenario.
 
     Raises:
-        InputError: there are several.
+        InputError: there are several scenarios.
     """
     if len(specs) > 1:
         raise InputError(f"--scenario names {len(specs)} scenarios, want one")
@@ -416,7 +416,7 @@ DetectorOption = Annotated[
 
 
 def rig_of(word: str | None) -> str | None:
-    """A rig's name, checked."""
+    """Check the name of a rig, and return it."""
     from sim_sensors.rig import RIG_NAMES
 
     if word is not None and word not in RIG_NAMES:
@@ -425,7 +425,7 @@ def rig_of(word: str | None) -> str | None:
 
 
 def saved(folder: Path, name: str, kind: type[SpecT]) -> SpecT:
-    """The specification that a run left in its folder.
+    """Read the specification in the folder of a run.
 
     Raises:
         InputError: there is none.

@@ -1,4 +1,4 @@
-"""`parkenv bench`: how fast each part is, beside its peers."""
+"""`parkenv bench`: benchmark each part against peers."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ def bench(
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the lots and the noise.")] = 0,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for summary.json.")] = None,
 ) -> None:
-    """Measure throughput beside other ways to do the same, in the same run.
+    """Measure throughput, and that of other software for the same task, in the same run.
 
-    A ratio above 1 means that ours is the faster. Machines are noisy: compare ratios, and run on a quiet one.
-    After an installation each part first compiles what it measures, about 20 s; that is kept from then on.
+    A ratio above 1 means that ours is faster. Timings are noisy: compare ratios, and use an idle machine.
+    After an installation, each part first compiles its functions, which takes about 20 s; the result is cached.
 
     Examples:
     * `parkenv bench sensors`
@@ -105,7 +105,7 @@ def bench(
 
 
 def _figure(value: float | None) -> str:
-    """Three digits that count, and thousands apart."""
+    """Format a number with three significant digits and thousands separators."""
     if value is None:
         return ""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"

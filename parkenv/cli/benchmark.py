@@ -1,4 +1,4 @@
-"""`parkenv benchmark`: fixed suites, whose results can be compared and checked."""
+"""`parkenv benchmark`: fixed suites with comparable, checkable results."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def run(
 ) -> None:
     """Run agents through all episodes of a suite, and write a result that others can check.
 
-    Scenarios, costs, speeds and seeds are the suite's. An agent's score in a task is the mean total time of the
-    clairvoyant bound divided by the agent's own; the score of the suite is the mean over its tasks, at most 1.
+    The suite defines scenarios, costs, speeds and seeds. An agent's score in a task is the mean total time of the
+    clairvoyant bound divided by the agent's own; its score in the suite is the mean over the tasks, at most 1.
 
     Examples:
     * `parkenv benchmark run v1 --agents belief,mdp --out results/v1`
@@ -67,7 +67,7 @@ def run_suite(spec: BenchmarkSpec, out: Path, *, resume: bool = False, overwrite
     """Run a suite with a progress bar, write its result and print the scores.
 
     Raises:
-        InputError: an agent that cannot be made, or a folder that cannot be used.
+        InputError: an agent cannot be made, or the folder cannot be used.
     """
     from parkenv.evaluation.experiments.benchmark import Suite, result_of
     from parkenv.evaluation.experiments.compare import run_cases
@@ -115,11 +115,10 @@ def run_suite(spec: BenchmarkSpec, out: Path, *, resume: bool = False, overwrite
 def check(
     files: Annotated[list[Path], typer.Argument(help="Result files.")],
 ) -> None:
-    """Make sure that results are complete and of the suite's own worlds, and put them side by side.
+    """Check that results are complete and from the suite's own worlds, and print them side by side.
 
-    Every search has to be there; means and scores are computed anew, and so are the clairvoyant bounds of all
-    searches: a run in other worlds, or at other costs and speeds, has others. That an agent took what the file says
-    only a run of the agent can tell.
+    Every search must be present. Means, scores and the clairvoyant bounds of all searches are recomputed; the bounds
+    differ in other worlds or at other costs and speeds. The times of an agent cannot be verified without running it.
     """
     from parkenv.evaluation.experiments.benchmark import check_result
 
@@ -134,7 +133,7 @@ def check(
 
 @app.command("show")
 def show(suite: Annotated[str, typer.Argument(help="The suite.")] = "v1") -> None:
-    """Tell what a suite asks for."""
+    """Show the tasks and settings of a suite."""
     from parkenv.evaluation.experiments.benchmark import Suite
 
     its = Suite.named(suite)

@@ -1,4 +1,4 @@
-"""`parkenv calibrate` and `parkenv trip`: what driving takes, and a trip to look at."""
+"""`parkenv calibrate` measures driving times; `parkenv trip` films a trip."""
 
 from __future__ import annotations
 
@@ -63,11 +63,11 @@ def calibrate(
     ] = Path("results/calibrate"),
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the trips in --out.")] = False,
 ) -> None:
-    """Drive whole trips, and measure what the drive graph is told: driving speed and the cost of a failed try.
+    """Drive whole trips, and measure the parameters of the drive graph: driving speed and cost of a failed attempt.
 
-    A car is driven along the lanes and into slots, as the agent decides. Every seed is driven twice: seeing the slots
-    as the scenario has it, for the speed and the manoeuvre; and without seeing any before a try, for the tries that
-    fail. `parkenv compare --calibrated OUT/calibrated.json` then sets agents side by side under both costs.
+    A simulated car drives along the lanes and into slots, as the agent decides. Every seed is driven twice: with the
+    scenario's observations of slots, for the speed and the manoeuvre; and without observations before an attempt, for
+    failed attempts. `parkenv compare --calibrated OUT/calibrated.json` then compares agents under both costs.
 
     Examples:
     * `parkenv calibrate --scenario campus --episodes 200 --jobs 2 --out results/calibrate`
@@ -93,7 +93,7 @@ def calibrate(
     speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
     style = DrivingStyle(speed=speed, notice_m=notice_m)
     rig = args.rig_of(rig)
-    DrivenSearch(its, agent, style=style, rig=rig)  # complains before anything is driven
+    DrivenSearch(its, agent, style=style, rig=rig)  # raises an error before anything is driven
     make_folder(out)
     settings = {
         "version": __version__, "scenario": its.name,
@@ -160,7 +160,10 @@ def trip(
     scenario: args.ScenarioOption = None,
     agent: AgentOption = "mdp",
     blind: Annotated[
-        bool, typer.Option("--unseen", help="Let no slot be seen before a try, so that tries fail.")
+        bool,
+        typer.Option(
+            "--blind", help="Observe no slot before an attempt to park there, so that attempts fail."
+        ),
     ] = False,
     notice_m: NoticeOption = 2.0,
     rig: args.RigOption = None,
@@ -170,16 +173,16 @@ def trip(
     out: Annotated[Path, typer.Option("--out", "-o", help="The film, a GIF.")] = Path("results/trip.gif"),
     rerun: args.RerunOption = None,
 ) -> None:
-    """Drive one trip from the entry into a slot, and film it from above, five times as fast as in life.
+    """Drive one trip from the entry into a slot, and film it from above at five times real speed.
 
     Examples:
-    * `parkenv trip --scenario campus --seed 7 --unseen --out trip.gif`
+    * `parkenv trip --scenario campus --seed 7 --blind --out trip.gif`
 
     * `parkenv trip --scenario campus --rig laser --rerun trip.rrd`
 
     * `parkenv trip --scenario campus --cars 6 --pedestrians 8`
     """
-    from parkenv.evaluation.experiments.compare import unseen
+    from parkenv.evaluation.experiments.compare import blind_scenario
     from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.figures.picture_files import save_film
     from parkenv.evaluation.figures.trip_pictures import COLORS, FPS, film_trip
@@ -190,9 +193,7 @@ def trip(
     if out.suffix.lower() != ".gif":
         raise InputError(f"--out is {out}, want a file that ends in .gif")
     if blind and rig is not None:
-        raise InputError(
-            "--unseen and --rig: without observations no sensors are needed; name one of the two"
-        )
+        raise InputError("--blind and --rig: without observations no sensors are needed; name one of the two")
     if rerun is not None:
         if rig is None:
             raise InputError("--rerun records what sensors measure: add --rig laser")
@@ -200,7 +201,7 @@ def trip(
     spec = args.one_scenario(args.scenario_specs(scenario, cars=cars, pedestrians=pedestrians))
     its = build(spec)
     style = DrivingStyle(notice_m=notice_m)
-    search = DrivenSearch(unseen(its) if blind else its, agent, style=style, rig=args.rig_of(rig))
+    search = DrivenSearch(blind_scenario(its) if blind else its, agent, style=style, rig=args.rig_of(rig))
     make_folder(out.parent)
     console = make_console()
     with console.status("Driving and drawing"):

@@ -1,4 +1,4 @@
-"""`parkenv compare`: agents against each other in the same worlds."""
+"""`parkenv compare`: compare agents in the same worlds."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 
 SWEEP = "sweep"
-"""The failure cost that stands for many."""
+"""Keyword of `--failure-cost` for a range of costs."""
 LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
-"""Occupancy levels of a comparison that names none."""
+"""Default occupancy levels of a comparison."""
 MOST_TABLES = 12
-"""Settings that are printed; a larger grid is for its figures and files."""
+"""Maximum number of settings to print; see the figures and files for larger grids."""
 
 
 def compare(
@@ -128,9 +128,9 @@ def compare(
 ) -> None:
     """Compare agents over failure costs and speeds, all in the same worlds.
 
-    Episode i has the same seed for every agent, and so the same cars at the same times. The table gives mean total
+    Episode i has the same seed for every agent, hence the same cars at the same times. The table gives the mean total
     time (drive + failed attempts + walk) with its 95 % interval, the paired difference to the first agent, and the
-    regret to the clairvoyant bound. Options are short cuts for an experiment file, which `parkenv run` takes.
+    regret to the clairvoyant bound. Options are shortcuts for an experiment file, which `parkenv run` takes.
 
     Examples:
     * `parkenv compare --scenario campus,jam --failure-cost 10,90 --out results`
@@ -198,7 +198,7 @@ def run_comparison(
     """Run an experiment with a progress bar, print its tables and draw its figures.
 
     Raises:
-        InputError: what cannot be run, or a folder that cannot be used.
+        InputError: the experiment cannot be run, or the folder cannot be used.
     """
     from parkenv.evaluation.experiments.experiment import run_experiment
     from parkenv.evaluation.figures.registry import draw_figures
@@ -252,12 +252,12 @@ def run_comparison(
 
 
 def setting_count(rows: list[Row]) -> int:
-    """How many scenarios and settings rows are of."""
+    """Return the number of different scenarios and settings in rows."""
     return len({(r["scenario"], r["failure_cost_s"], r["v_walk_kmh"], r["v_drive_kmh"]) for r in rows})
 
 
 def _record(case: Case, seeds: range, path: Path) -> None:
-    """Record the first episode of a case through its sensors."""
+    """Record the first episode of a case with its sensors."""
     from parkenv.envs.perception import SearchPerceptionEnv
     from parkenv.evaluation.trips.sensor_log import record_search, sensor_log
     from planners.agent import make_agent
@@ -268,7 +268,7 @@ def _record(case: Case, seeds: range, path: Path) -> None:
 
 
 def episode_progress(console: Console) -> Progress:
-    """A progress bar that counts episodes."""
+    """Make a progress bar that counts episodes."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -296,7 +296,7 @@ _DETAILS: tuple[Column, ...] = (
 
 
 def result_tables(rows: list[Row], width: int) -> list[Table]:
-    """The results of each setting, in one table or in two where the terminal is narrow."""
+    """Make the tables of each setting: one, or two if the terminal is narrow."""
     settings: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
         key = (row["scenario"], row["failure_cost_s"], row["v_walk_kmh"], row["v_drive_kmh"])

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from parkenv.world.scenario import Scenario
 
 FIGURES = ("time_split", "time_distribution")
-"""Of `parkenv.evaluation.figures.registry`."""
+"""Names of figures in `parkenv.evaluation.figures.registry`."""
 
 
 def demo(
@@ -69,10 +69,10 @@ def run_demo(
     rerun: Path | None = None,
     report: bool = False,
 ) -> None:
-    """Run the demo; an unfinished one in the folder goes on, a finished one is replaced.
+    """Run the demo; continue an unfinished one in the folder, replace a finished one.
 
     Raises:
-        InputError: a scenario that cannot be made, or a folder that cannot be used.
+        InputError: the scenario cannot be made, or the folder cannot be used.
     """
     del overwrite
     from parkenv.evaluation.experiments.compare import run_cases, table
@@ -165,7 +165,7 @@ def run_demo(
 
 
 def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:
-    """Record the first session and the first search, on one time line."""
+    """Record the first session and the first search on one timeline."""
     from parkenv.envs.perception import SearchPerceptionEnv
     from parkenv.evaluation.trips.sensor_log import record_search, record_session, sensor_log
     from parkenv.mapping.survey import Survey

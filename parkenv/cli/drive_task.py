@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @dataclass(eq=False)
 class DriveTask(TrainingTask):
-    """Train to park on the lots of some scenarios."""
+    """Training of parking agents on the lots of some scenarios."""
 
     @property
     def algorithm(self) -> str:

@@ -1,4 +1,4 @@
-"""`parkenv occupancy`: from a recorded log to rates."""
+"""`parkenv occupancy`: estimate rates from a recorded log."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ app = typer.Typer(help="Learn from recorded occupancy.", no_args_is_help=True)
 
 @app.callback()
 def _occupancy() -> None:
-    """Learn from recorded occupancy."""
+    """Fit models to recorded occupancy."""
 
 
 @app.command()
@@ -34,15 +34,16 @@ def fit(
 ) -> None:
     """Fit arrival and departure rates to a log by maximum likelihood.
 
-    Every slot is a two-state Markov chain whose rates follow the hour, apart for weekdays and weekends,
-    and a factor of its own. The log shows it at single moments only; what may have happened in between is
-    counted in. The result, process.json, is an --occupancy for `parkenv compare`: on a lot of as many slots
-    as it is, on any other lot with the fullest slots nearest to the goal.
+    Every slot is a two-state Markov chain. Its rates depend on the hour, separately for weekdays and weekends, and on a
+    factor per slot. The log shows a slot only at single times; the likelihood covers all possible changes in between.
+    Use the result, process.json, as --occupancy of `parkenv compare`: unchanged on a lot with the same number of slots,
+    on any other lot with the fullest slots nearest to the goal.
     """
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.figures.rates_picture import save_rates
     from parkenv.world.occupancy_fit import fit_process
     from parkenv.world.occupancy_log import OccupancyLog
+    from parkenv.world.week import DAY_S, HOUR_S
 
     make_folder(out)
     console = make_console()
@@ -63,7 +64,7 @@ def fit(
     )
     for name, day in (("weekday", 0), ("weekend", 5)):
         for hour in range(7, 19):
-            occupied = float(np.mean(process.marginal(86400.0 * day + 3600.0 * hour)))
+            occupied = float(np.mean(process.marginal(day * DAY_S + hour * HOUR_S)))
             rates = mean_rate("arrival", day, hour), mean_rate("departure", day, hour)
             rows.append(
                 {

@@ -138,7 +138,7 @@ def park(
 
 
 def _labels(names: list[str]) -> dict[str, str]:
-    """A short label per agent, usable as a folder name, and the agent's full name."""
+    """Return a short label per agent, usable as a folder name, and the agent's full name."""
     labels: dict[str, str] = {}
     for name in names:
         word = name.partition(":")[0]
@@ -148,13 +148,13 @@ def _labels(names: list[str]) -> dict[str, str]:
 
 
 def _to_film(parkings: list[Parking]) -> dict[str, Any] | None:
-    """The row of the successful episode with the most direction changes; None without success."""
+    """Return the row of the successful episode with the most direction changes; None without success."""
     parked = [p.row for p in _one_of_each(parkings)]
     return max(parked, key=lambda row: row["direction_changes"], default=None)
 
 
 def _one_of_each(parkings: list[Parking]) -> list[Parking]:
-    """The first success per kind of slot and orientation."""
+    """Return the first success per kind of slot and orientation."""
     kept = {(p.row["kind"], p.row["way"]): p for p in reversed(parkings) if p.row["parked"]}
     return [kept[key] for key in sorted(kept)]
 
@@ -214,7 +214,7 @@ def _show(console: Any, title: str, table: list[dict[str, Any]]) -> None:
 
 
 def _pair(row: dict[str, Any], name: str, digits: int) -> str:
-    """A median with its 95th percentile; empty for agents without the quantity, e.g. planning time."""
+    """Format a median with its 95th percentile; empty for agents without the quantity, e.g. planning time."""
     median, p95 = (_known(row[key], digits) for key in (name, f"{name}_p95"))
     return median and f"{median} ({p95})"
 

@@ -1,4 +1,4 @@
-"""`parkenv plan`: what the thesis's planner makes of a lot."""
+"""`parkenv plan`: the plan of the thesis's planner on a lot."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ def plan(
         "results/plan"
     ),
 ) -> None:
-    """Plan a search, and drive it once in each setting, as in Fig. 4.9 to 4.12 of the thesis.
+    """Plan a search, and run it once in each setting, as in Fig. 4.9 to 4.12 of the thesis.
 
-    The picture shows at each slot the truth (inner disc) and the forecast (outer ring), an arrow for what
-    the plan says at each vertex, the path that was driven with re-planning, and the walk.
+    The picture shows the true occupancy (inner disc) and the forecast (outer ring) of each slot, the planned action at
+    each vertex (arrow), the path driven with replanning, and the walk.
 
     Examples:
     * `parkenv plan --scenario jam --failure-cost 10,90`

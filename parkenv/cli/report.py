@@ -1,4 +1,4 @@
-"""`parkenv report`: the results of a command as one page, with its searches and drives to watch again."""
+"""`parkenv report`: the results of a command on one page, with replays of its searches and drives."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 PAGE = "report.html"
 MAP_FILE = "map.sqlite"
 EPISODES, SENSED = 20, 4
-"""Searches that are replayed by default, and where every step goes through rendered sensors."""
+"""Default number of replayed searches: in general, and with rendered sensors at every step."""
 BESIDE_MODELS = 3
-"""Planners that are shown beside a trained model."""
+"""Number of planners shown beside a trained model."""
 
 Cases = list[tuple["Case", Sequence[int]]]
 Surveys = tuple[Callable[[], "Survey"], int]
@@ -59,10 +59,10 @@ def report(
         Path | None, typer.Option("--out", "-o", help=f"The HTML file.  [default: DIR/{PAGE}]")
     ] = None,
 ) -> None:
-    """Write one HTML file on a run: what was run, tables to sort, figures, and its searches and drives to watch again.
+    """Write an HTML page on a run: its settings, sortable tables, figures, and replays of its searches and drives.
 
-    It needs no network, and no other file. Searches and drives are run again under their seeds, and each search must
-    come to the total that it was counted with; where it does not, the page says so.
+    The page needs no network and no other file. Searches and drives are repeated with their seeds. If the total time of
+    a search differs from that in the results, the page says so.
 
     Examples:
     * `parkenv report results/compare`
@@ -97,7 +97,7 @@ def make_report(
     """Write the page; see `report` for the arguments.
 
     Raises:
-        InputError: no finished run of this version in the folder, or a choice that is not in it.
+        InputError: the folder holds no finished run of this version, or not the chosen searches.
     """
     from parkenv.evaluation.report.page import page_data, write_page
     from parkenv.evaluation.report.run_folder import RunFolder
@@ -111,7 +111,7 @@ def make_report(
     try:
         surveys, cases = _run_again(run)
     except (InputError, OSError) as error:
-        # Tables and figures are there all the same.
+        # The page still has tables and figures.
         notes.append(f"There is no replay: {error}")
     sensed = any(case.rig is not None for case, _ in cases)
     wanted = episodes if episodes is not None else SENSED if sensed else EPISODES
@@ -148,10 +148,10 @@ def make_report(
 
 
 def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
-    """What the run did, from its specification: its survey, with the number of drives, and its searches.
+    """Return the survey of a run, with its number of drives, and its searches, from its specification.
 
     Raises:
-        InputError, OSError: it cannot be done again.
+        InputError, OSError: the run cannot be repeated.
     """
     from parkenv.evaluation.experiments import spec as specs
     from parkenv.evaluation.experiments.experiment import Experiment, require_unchanged
@@ -186,7 +186,7 @@ def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
 
 
 def _trained(run: RunFolder) -> Cases:
-    """The best model and the best planners, where the models were tested; none where that was no search."""
+    """Return the best model and the best planners in the test scenarios; none for driving, or without a test."""
     from parkenv.evaluation.experiments.compare import Case
     from parkenv.evaluation.experiments.spec import SPEC_FILE, TrainingSpec
 
@@ -212,7 +212,7 @@ def _trained(run: RunFolder) -> Cases:
 
 
 def _chosen(cases: Cases, seeds: str | None, agents: str | None) -> Cases:
-    """The searches that were asked for."""
+    """Return the searches selected by `--seeds` and `--agents`."""
     if agents is not None:
         from parkenv.evaluation.experiments.agent_spec import split_agents
 
@@ -234,7 +234,7 @@ def _chosen(cases: Cases, seeds: str | None, agents: str | None) -> Cases:
 
 
 def _small_enough(cases: Cases) -> tuple[Cases, list[str]]:
-    """The searches on lots that can be drawn, and a line on the others."""
+    """Return the searches on lots that are small enough to draw, and notes on the others."""
     from parkenv.evaluation.report.search_recording import MOST_SLOTS
 
     large = {
@@ -250,7 +250,7 @@ def _small_enough(cases: Cases) -> tuple[Cases, list[str]]:
 
 
 def _differing(watched: Sequence[dict[str, Any]]) -> list[str]:
-    """A line for every search that came to another total than it was counted with."""
+    """Return a note for every search whose total time differs from that in the results."""
     return [
         f"{search['agent']}, {e['world']['scenario']}, seed {e['world']['seed']}: run again it took "
         f"{search['total_s']:.2f} s, episodes.csv says {search['counted_s']:.2f} s"

@@ -1,4 +1,4 @@
-"""`parkenv run`: an experiment from its file."""
+"""`parkenv run`: run an experiment file."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Kind(NamedTuple):
     """A kind of experiment file.
 
     Attributes:
-        spec: its specification, by module and class: it is loaded when it is needed.
-        run: the command's function.
+        spec: module and class of its specification, imported on demand.
+        run: function that runs it.
     """
 
     spec: str
@@ -59,9 +59,9 @@ def run(
 ) -> None:
     """Run an experiment file: agents, scenarios, and a grid of settings.
 
-    The file says everything; what it leaves out has the defaults of its command. The results' folder keeps a copy, as
-    experiment.json, from which `parkenv report` and `--resume` work. `kind` says which command runs it: compare (the
-    default), benchmark, survey, demo or train.
+    Settings that the file leaves out have the defaults of its command. The result folder keeps a copy, experiment.json,
+    for `parkenv report` and `--resume`. The key `kind` selects the command: compare (the default), benchmark, survey,
+    demo or train.
 
     Examples:
     * `parkenv run sweep.toml --out results/sweep --report`

@@ -14,7 +14,7 @@ from parkenv.files.spec_file import nearest
 
 
 def schemas() -> dict[str, dict[str, Any]]:
-    """The schema of each kind of file, made from the models that validate it."""
+    """Return the schema of each kind of file, made from the models that validate it."""
     from parkenv.evaluation.experiments import spec as specs
     from parkenv.scenarios.spec import ScenarioSpec
 
@@ -39,7 +39,7 @@ def schema(
         Path | None, typer.Option("--out", "-o", help="Folder for all schemas, KIND.schema.json.")
     ] = None,
 ) -> None:
-    """Print the JSON schema of a kind of file, or write all of them: editors check and complete files by it.
+    """Print the JSON schema of a kind of file, or write all schemas; editors use them to check and complete files.
 
     Examples:
     * `parkenv schema scenario`

@@ -40,7 +40,7 @@ PLANNERS = tuple(
 
 @dataclass(eq=False)
 class SearchTask(TrainingTask):
-    """Train to search in some scenarios."""
+    """Training of search agents in some scenarios."""
 
     @property
     def folder(self) -> str:

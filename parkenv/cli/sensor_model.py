@@ -36,8 +36,8 @@ def fit_sensor_model(
 ) -> None:
     """Search with simulated sensors, and count how often slots are observed correctly, by distance and side.
 
-    The rates become a sensor model: `parkenv compare --sensor-model FILE` then makes the same errors as the perception
-    pipeline, a thousand times as fast.
+    The rates define a sensor model for `parkenv compare --sensor-model FILE`, which makes the same errors as the
+    perception pipeline, a thousand times as fast.
 
     Example:
     * `parkenv fit-sensor-model --rig stereo --out stereo.json`

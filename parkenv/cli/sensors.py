@@ -42,10 +42,11 @@ def preview(
         "results/sensors"
     ),
 ) -> None:
-    """Draw the measurements of the sensors on the way from the entry to the slot nearest to the goal.
+    """Draw sensor measurements on the way from the entry to the slot nearest to the goal.
 
-    One figure for each weather, at the place with most parked cars: the side camera's image with the true boxes, its
-    depth, the stereo camera's disparity, and the laser scan from above; and a short video of the side camera.
+    Writes one figure per weather, at the place with the most parked cars: the side camera's image with the true boxes,
+    its depth, the stereo camera's disparity, and the laser scan from above. Also writes a short video of the side
+    camera.
 
     Examples:
     * `parkenv sensors preview`

@@ -58,8 +58,8 @@ def survey(
 ) -> None:
     """Drive past every slot with simulated sensors, detect the parked cars, and write the observations to a map file.
 
-    Cars are detected in the camera images and located with the laser (or the stereo camera); a Bayes filter estimates
-    the state of each slot; every drive is one session of the map. The same command resumes an interrupted survey.
+    Cars are detected in the camera images and located with the laser (or the stereo camera). A Bayes filter estimates
+    the state of each slot. Every drive is one session of the map. The same command resumes an interrupted survey.
 
     Examples:
     * `parkenv survey --sessions 21`
@@ -92,10 +92,10 @@ def run_survey_of(
     rerun: Path | None = None,
     report: bool = False,
 ) -> None:
-    """Drive the sessions that the map in the folder does not hold yet, print the errors and draw the figures.
+    """Drive the sessions that the map in the folder does not hold yet, print errors and draw figures.
 
     Raises:
-        InputError: a scenario that cannot be made, or a folder that cannot be used.
+        InputError: the scenario cannot be made, or the folder cannot be used.
     """
     del resume
     if overwrite:

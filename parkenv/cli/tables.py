@@ -1,4 +1,4 @@
-"""How results look on a terminal."""
+"""Tables of results on a terminal."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from rich.console import Console
 from rich.table import Table
 
 WIDE = 200
-"""Columns of text that are assumed where output goes to a file or a pipe."""
+"""Width assumed if output goes to a file or a pipe, characters."""
 
 
 def make_console() -> Console:
-    """Standard output, as wide as the terminal."""
+    """Make a console on standard output, as wide as the terminal."""
     return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=WIDE)
 
 
 def make_table(title: str | None, headings: Iterable[str]) -> Table:
-    """A table of figures; its first column names the rows."""
+    """Make a table of numbers; the first column names the rows."""
     table = Table(
         title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0)
     )

@@ -1,4 +1,4 @@
-"""`parkenv train`: reinforcement learning agents, evaluated beside the planners."""
+"""`parkenv train`: train agents by reinforcement learning, and evaluate them against planners."""
 
 from __future__ import annotations
 
@@ -136,12 +136,12 @@ def train(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the training in --out.")] = False,
     report: args.ReportOption = False,
 ) -> None:
-    """Train agents by reinforcement learning, several seeds, and draw their learning curves beside the planners.
+    """Train agents by reinforcement learning with several seeds, and draw their learning curves beside the planners.
 
-    Search agents are rewarded with minus the seconds and observe the surroundings of the car, so that they run on any
-    lot. Driving agents park the car in a slot, with hindsight experience replay (sac, tqc) or the dense reward (ppo),
-    starting one step before the slot. Both are evaluated in held-out worlds; each seed's best model is kept, and
-    tested in the end. Hyperparameters are in parkenv/evaluation/training/configs.py.
+    The reward of search agents is minus the time in seconds. They observe the surroundings of the car, so they run on
+    any lot. Driving agents park the car in a slot, with hindsight experience replay (sac, tqc) or the dense reward
+    (ppo); their curriculum starts just outside the slot. Both are evaluated in held-out worlds; each seed's best model
+    is kept, and tested at the end. Hyperparameters are in parkenv/evaluation/training/configs.py.
 
     Examples:
     * `parkenv train maskable-ppo --scenario campus`
@@ -185,7 +185,7 @@ def run_training(
     """Train, test and draw; see `train`.
 
     Raises:
-        InputError: what cannot be trained, or a folder that cannot be used.
+        InputError: the training is impossible, or the folder cannot be used.
     """
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.experiments.spec import SPEC_FILE
@@ -219,7 +219,7 @@ def run_training(
 
 
 def _require_free(out: Path, settings: Row, resume: bool, overwrite: bool) -> None:
-    """Check that the folder is free, resumable or to be replaced."""
+    """Check that the folder holds no training, or one to resume or replace."""
     from parkenv.evaluation.experiments.results import read_settings, require_same_settings
 
     if resume and overwrite:
@@ -234,12 +234,12 @@ def _require_free(out: Path, settings: Row, resume: bool, overwrite: bool) -> No
 
 
 def _claim(out: Path, settings: Row, overwrite: bool) -> None:
-    """Write the settings of the training that starts, and remove what the previous one left."""
+    """Write the settings of the new training, and remove the results of the previous one."""
     import shutil
 
     from parkenv.evaluation.experiments.results import SUMMARY, write_settings
 
-    # A folder without a summary holds an unfinished training.
+    # Delete the summary: a folder without one holds an unfinished training.
     for outcome in (SUMMARY, PAGE, FIGURE):
         (out / outcome).unlink(missing_ok=True)
     if overwrite:
@@ -257,7 +257,7 @@ def _train_all(
     workers: Workers,
     tensorboard: bool,
 ) -> list[list[Row]]:
-    """Train all seeds; a bar each, fed by the curves that the trainings write."""
+    """Train all seeds, with one progress bar each, updated from the curves that the trainings write."""
     from functools import partial
 
     from parkenv.evaluation.training.rl_training import CURVE, read_curve, train_one

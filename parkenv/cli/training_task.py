@@ -1,4 +1,4 @@
-"""The tasks of `parkenv train`: defaults, checks, settings, and reports of a training."""
+"""The tasks of `parkenv train`: defaults, checks, settings and reports."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class TrainingTask(ABC):
     """A kind of training: its defaults, checks and report.
 
     Args:
-        spec: the training's spec; the task supplies defaults for what it leaves open.
+        spec: specification of the training; the task supplies missing values.
     """
 
     spec: TrainingSpec
@@ -56,7 +56,7 @@ class TrainingTask(ABC):
         """
 
     def check(self) -> None:
-        """Check before training that everything can be trained, tested and drawn.
+        """Check, before training, that everything can be trained, tested and drawn.
 
         Raises:
             InputError: an invalid option, or a missing package.
@@ -68,11 +68,11 @@ class TrainingTask(ABC):
 
     @abstractmethod
     def settings(self) -> Row:
-        """Settings that a resumed training must share with this one."""
+        """Return the settings that a resumed training must share with this one."""
 
     @abstractmethod
     def evaluation_settings(self, settings: Row) -> Row:
-        """The settings that evaluations depend on: curves are comparable where these are equal."""
+        """Return the settings that evaluations depend on: curves are comparable if these are equal."""
 
     @property
     @abstractmethod
@@ -81,11 +81,11 @@ class TrainingTask(ABC):
 
     @abstractmethod
     def training(self, console: Console) -> Training:
-        """Make the training, with demonstrations where it needs any."""
+        """Make the training, with demonstrations if needed."""
 
     @abstractmethod
     def score_text(self, row: Row) -> str:
-        """The score of an evaluation for the progress bar."""
+        """Return the score of an evaluation as text for the progress bar."""
 
     @abstractmethod
     def report(
@@ -97,11 +97,11 @@ class TrainingTask(ABC):
         out: Path,
         beside: dict[str, list[list[Row]]],
     ) -> Row:
-        """Test the models, draw the figure, print the table; return the entries of the summary."""
+        """Test the models, draw the figure and print the table; return the entries of the summary."""
 
 
 def scenario_settings(scenarios: Sequence[ScenarioSpec]) -> Row:
-    """The settings that training depends on: scenarios and fingerprints of their files."""
+    """Return the settings that training depends on: scenarios and fingerprints of their files."""
     from parkenv.evaluation.experiments.experiment import fingerprints, flat_tables
 
     return {
@@ -111,7 +111,7 @@ def scenario_settings(scenarios: Sequence[ScenarioSpec]) -> Row:
 
 
 def name_of(settings: Row) -> str:
-    """Name of a training in a figure with others."""
+    """Return the name of a training in a figure with others."""
     name, cloned, scenarios = (
         str(settings["algorithm"]),
         settings.get("clone"),
@@ -123,15 +123,15 @@ def name_of(settings: Row) -> str:
 
 
 def curves_beside(folders: Sequence[str], out: Path, task: TrainingTask) -> dict[str, list[list[Row]]]:
-    """Read the curves of other trainings: by name, the rows of `curve.csv` of each seed.
+    """Read the curves of other trainings: the rows of `curve.csv` of each seed, by name.
 
     Args:
         folders: output folders of `parkenv train` (`--beside`).
         out: folder of the training to draw them with.
-        task: of that training.
+        task: task of that training.
 
     Raises:
-        InputError: a folder without a training, or one with other evaluations; the same one twice; or too
+        InputError: a folder has no training, or one with other evaluations; a folder is given twice; or there are too
             many to tell apart.
     """
     from parkenv.evaluation.experiments.results import read_settings
@@ -168,7 +168,7 @@ def curves_beside(folders: Sequence[str], out: Path, task: TrainingTask) -> dict
 
 
 def row_of(agent: str, scenario: str, number: int, curve: list[Row], own: Row, model: Path) -> Row:
-    """A row of the summary for one seed."""
+    """Return the summary row of one seed."""
     last = curve[-1]
     return {
         "agent": agent, "scenario": scenario, "seed": number, "steps": last["steps"], **own,
@@ -185,7 +185,7 @@ def print_tests(
     text_of: Callable[[Row], str],
     *further: str,
 ) -> None:
-    """Print a table: a column per scenario and further key, a line per model and planner."""
+    """Print a table with a column per scenario and further key, and a row per model and planner."""
     columns = list(
         dict.fromkeys((row["test_scenario"], *(row[name] for name in further)) for row in transfer)
     )

@@ -1,1 +1,1 @@
-"""Vehicle dynamics: the car, the obstacles around it, other road users, and tasks of parking in a slot."""
+"""Driving in a lot: vehicle model, obstacles, other road users, and parking tasks."""

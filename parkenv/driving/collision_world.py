@@ -19,7 +19,7 @@ IntArray = NDArray[np.int64]
 
 
 class ObstacleKind(IntEnum):
-    """Kind of an obstacle; `NOTHING` where the car touches none."""
+    """Kind of an obstacle; `NOTHING` if the car touches none."""
 
     NOTHING = 0
     PARKED_CAR = 1
@@ -42,8 +42,8 @@ class Obstacles:
     """Static obstacles around a car; world frame.
 
     Args:
-        corners: (n, k_max, 2) float64, m: convex outlines; a line has two corners. Outlines of fewer corners are
-            padded with their last.
+        corners: (n, k_max, 2) float64, m: convex outlines; a line has two corners. Outlines with fewer corners are
+            padded with their last corner.
         n_corners: (n,) int64, 2 to k_max.
         kind: (n,) int64, an `ObstacleKind` each.
 
@@ -78,7 +78,7 @@ class Obstacles:
 
     @classmethod
     def of(cls, outlines: Sequence[tuple[ObstacleKind, FloatArray]]) -> Self:
-        """Make obstacles from pairs of kind and outline, (k, 2) m."""
+        """Create obstacles from pairs of kind and outline, (k, 2) m."""
         k_max = max((len(outline) for _, outline in outlines), default=2)
         corners = np.empty((len(outlines), k_max, 2))
         for row, (_, outline) in zip(corners, outlines, strict=True):
@@ -88,7 +88,7 @@ class Obstacles:
         return cls(corners, count, np.array([int(kind) for kind, _ in outlines], dtype=np.int64))
 
     def only(self, *kinds: ObstacleKind) -> Self:
-        """The obstacles of some kinds."""
+        """Return the obstacles of the given kinds."""
         chosen = np.isin(self.kind, kinds)
         return type(self)(self.corners[chosen], self.n_corners[chosen], self.kind[chosen])
 
@@ -137,9 +137,9 @@ class CollisionWorld:
         """Place the car at a pose of its rear axle, m and rad; return the `ObstacleKind` that it touches.
 
         Args:
-            x: of the middle of the rear axle, m.
-            y: of the middle of the rear axle, m.
-            yaw: rad.
+            x: x of the middle of the rear axle, m.
+            y: y of the middle of the rear axle, m.
+            yaw: yaw, rad.
         """
         car = self.car
         car.position = x, y
@@ -164,5 +164,5 @@ class CollisionWorld:
 
     def _touch(self, arbiter: pymunk.Arbiter, space: pymunk.Space, kind: Any) -> None:
         del arbiter, space
-        # The least kind of several contacts counts, in whatever order they are reported.
+        # With several contacts the lowest kind counts, whatever their order.
         self._touched = min(self._touched, kind) if self._touched else kind

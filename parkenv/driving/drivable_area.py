@@ -42,7 +42,7 @@ class DrivableArea:
         np.minimum.at(reach, served_by, shapely.distance(lanes[served_by], mouth[slot]))
         self._lanes = lanes
         self._half_width = np.where(np.isinf(reach), ROAD_HALF_WIDTH, np.clip(reach, *HALF_WIDTHS))
-        # A bay continues, as wide as its mouth, to its lane; that of an oblique slot in the slot's direction.
+        # The approach of a slot is as wide as its mouth and extends to the lane, along an oblique slot's own direction.
         heading = mouth_heading(lot.slot_yaw, lot.slot_mouth)
         outward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
         away = ((lot.vertex_xy[: lot.n_slots] - lot.mouth_xy()) * outward).sum(axis=1)
@@ -54,7 +54,7 @@ class DrivableArea:
         self._whole: shapely.Geometry | None = None
 
     def around(self, center: FloatArray, reach: float) -> shapely.Geometry:
-        """The paved area near a point, (2,) m; exact within `reach` m along both axes only."""
+        """The paved area near a point, (2,) m; exact only within `reach` m along both axes."""
         if self._lot.n_slots > _JOINED_WHOLE:
             return self._joined(shapely.box(*(center - reach - 10.0), *(center + reach + 10.0)))
         if self._whole is None:

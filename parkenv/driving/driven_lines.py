@@ -17,7 +17,7 @@ from parkenv.world.lot import ParkingLot
 FloatArray = NDArray[np.float64]
 
 KEPT_RIGHT_M = 1.0
-"""From the centre of a two-way lane to that of a car, m: less than to the graph's vertices, for right turns."""
+"""Offset of a car from the centre of a two-way lane, m: less than that of the graph's vertices, for right turns."""
 
 _ON_LINE = 0.05  # m
 _LENGTH_TOLERANCE = 1.0  # m, between the length along a line with bends and that of the edge
@@ -78,7 +78,7 @@ class DrivenEdge:
         line: index in `DrivenLines.lines` of the line that it follows, or leads to.
         start: station of its start, m; equal to `end` where the edge crosses the lane.
         end: station of its end, m.
-        across: whether it crosses a two-way lane to the opposite direction.
+        across: whether it crosses a two-way lane to the line of the opposite direction.
     """
 
     line: int
@@ -139,14 +139,14 @@ class DrivenLines:
         return DrivenEdge(line, end, end, across=True)
 
     def at(self, vertex: int) -> tuple[int, float]:
-        """Index of the line of a slot's vertex, and its station there, m."""
+        """Return the line index of a slot's vertex, and its station on that line, m."""
         heading = self._lot.vertex_yaw[vertex]
         return max(
             self._on_lines(vertex), key=lambda at: math.cos(self.lines[at[0]].pose(at[1])[2] - heading)
         )
 
     def _on_lines(self, vertex: int) -> list[tuple[int, float]]:
-        """The lines that pass a vertex, and its station on each, m."""
+        """Return the lines that pass a vertex, and its station on each, m."""
         if vertex not in self._stations:
             lot = self._lot
             xy = lot.vertex_xy[vertex]

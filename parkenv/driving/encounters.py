@@ -1,4 +1,4 @@
-"""Predict which moving road users will be in the way of a car, at constant velocity."""
+"""Predict encounters of a car with moving road users, at constant velocity."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def to_car_frame(poses: FloatArray, points: FloatArray) -> FloatArray:
 def encounter_times(
     vehicle: VehicleParameters, own: FloatArray, outlines: Sequence[FloatArray], velocity: FloatArray
 ) -> FloatArray:
-    """Time until each road user comes too close to the car, at constant velocity.
+    """Return the time until each road user comes too close to the car, at constant velocity.
 
     Args:
         vehicle: the car.
         own: (6, 3) x, y in m and yaw in rad of its middle after `PREDICTION_TIMES_S`.
         outlines: current outline of each road user, (k, 2) m.
-        velocity: (n, 2) m/s of each.
+        velocity: (n, 2) velocity of each road user, m/s.
 
     Returns:
-        (n,) s, one of `PREDICTION_TIMES_S`; infinity where none is too close within them.
+        (n,) s, one of `PREDICTION_TIMES_S`; infinity for road users that stay far enough away.
     """
     when = np.full(len(outlines), np.inf)
     half = 0.5 * np.array([vehicle.length, vehicle.width])

@@ -27,13 +27,13 @@ OVERHANG_M = 0.25
 class LotObstacles:
     """Static obstacles in one world of a scenario.
 
-    The parked cars are those that the sensors see (`parkenv.world.lot_scene`).
+    The parked cars are the same as in the sensors' scene (`parkenv.world.lot_scene`).
 
     Args:
         scenario: defines lot and traffic.
 
     Attributes:
-        slots: of the lot, for the sensors.
+        slots: scene data of the lot, for the sensors.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -54,27 +54,27 @@ class LotObstacles:
         self._scenes = LotScenes(self.slots, self._scenario, key, world)
 
     def taken(self, center: FloatArray, time: float) -> list[int]:
-        """Indices of the occupied slots within `REACH_M` of a point, (2,) m, at a time, s; ascending."""
+        """Return the occupied slots within `REACH_M` of a point, (2,) m, at a time, s; ascending."""
         model = self._scenes.at(time).vehicle_model
         return [i for i in self._near(center) if model[i] >= 0]
 
     def at_time(self, center: FloatArray, time: float, slots: Iterable[int]) -> Obstacles:
-        """Cars in `slots`, which are occupied at `time`, s, and kerbs and walls around a point, (2,) m."""
+        """Return the cars in the occupied `slots` at `time`, s, and kerbs and walls around a point, (2,) m."""
         cars = [(ObstacleKind.PARKED_CAR, self.footprint(i, time)) for i in slots]
         return Obstacles.of([*cars, *self.kerbs_and_walls(center)])
 
     def footprint(self, slot: int, time: float) -> FloatArray:
-        """Outline, (k, 2) m, of the car in an occupied slot."""
+        """Return the outline, (k, 2) m, of the car in an occupied slot."""
         return self._scenes.at(time).footprint(slot)
 
     def worst_case(self, center: FloatArray) -> Obstacles:
-        """As `at_time` with all slots occupied: a path clear of these obstacles is clear at any time."""
+        """As `at_time`, with all slots occupied: a path clear of these obstacles is clear at any time."""
         boxes = [(ObstacleKind.PARKED_CAR, self._boxes[i]) for i in self._near(center)]
         return Obstacles.of([*boxes, *self.kerbs_and_walls(center)])
 
     def kerbs_and_walls(self, center: FloatArray) -> list[tuple[ObstacleKind, FloatArray]]:
-        """Kerbs and walls near a point."""
-        # Computed for a grid cell of 10 m, which nearby points share.
+        """Return the kerbs and walls near a point."""
+        # Computed per grid cell of 10 m, so that nearby points share the result.
         column, row = np.round(center / 10.0).astype(int).tolist()
         if (column, row) not in self._still:
             middle = 10.0 * np.array([column, row])

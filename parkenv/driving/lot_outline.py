@@ -1,4 +1,4 @@
-"""The shapes of a lot seen from above: the one description that all drawings of lots share."""
+"""The shapes of a lot from above, shared by all drawings of lots."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ class LotOutline:
     """The shapes of a lot, m, in the lot's frame.
 
     Attributes:
-        buildings: their outlines, (k, 2) each, closed.
-        walls: the other walls, (k, 2) each.
-        slots: (n_slots, 4, 2), corners.
-        slot_lines: (n_slots, 4, 2), painted lines: three sides of each slot, its mouth left open.
-        centre_lines: of the two-way lanes, (k, 2) each.
+        buildings: outlines of buildings, (k, 2) each, closed.
+        walls: other walls, (k, 2) each.
+        slots: (n_slots, 4, 2), corners of the slots.
+        slot_lines: (n_slots, 4, 2), painted lines: three sides of each slot, without its mouth.
+        centre_lines: centre lines of the two-way lanes, (k, 2) each.
         arrows: (a, 3), x, y and yaw of direction arrows on the one-way lanes.
-        entries: (e, 3), x, y and yaw of those who drive in.
-        goals: (g, 2).
-        bounds: least and largest x and y of the lot, (x0, y0, x1, y1).
+        entries: (e, 3), x, y and yaw of a car entering.
+        goals: (g, 2), goals.
+        bounds: bounds of the lot, (x0, y0, x1, y1).
         area: the asphalt.
     """
 
@@ -76,9 +76,9 @@ class LotOutline:
         """Return the polygons of the asphalt, which ends at the kerbs of `DrivableArea`.
 
         Args:
-            center: (2,); the whole lot where None.
+            center: (2,); None: the whole lot.
             reach: m, around the centre along both axes, within which the polygons are exact.
-            apron: m, of asphalt beyond the kerbs, on which the outer painted lines are visible.
+            apron: m, width of the asphalt beyond the kerbs, on which the outer painted lines are visible.
         """
         if center is None:
             low, high = np.array(self.bounds).reshape(2, 2)
@@ -92,7 +92,7 @@ class LotOutline:
 
 
 def _arrows(lot: ParkingLot) -> FloatArray:
-    """Spread arrows evenly over each straight piece of the one-way lanes."""
+    """Return arrows evenly spaced over each straight piece of the one-way lanes."""
     arrows = []
     for lane in lot.lanes:
         for start, step in zip(lane.points, np.diff(lane.points, axis=0), strict=False):
@@ -104,7 +104,7 @@ def _arrows(lot: ParkingLot) -> FloatArray:
 
 
 def _entries(lot: ParkingLot) -> FloatArray:
-    """Turn each entry along its lane; where cars may drive either way, toward the slots."""
+    """Return the entries with a yaw along their lane; on two-way lanes toward the slots."""
     lines = linestrings([lane.points for lane in lot.lanes])
     middle = lot.slot_xy.mean(axis=0)
     entries = []

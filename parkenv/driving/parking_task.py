@@ -1,4 +1,4 @@
-"""Parking tasks: the slot, the start of the car, and the obstacles around."""
+"""Parking tasks: the slot, the start of the car, and the surrounding obstacles."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ from sim_sensors.surroundings import Surroundings
 FloatArray = NDArray[np.float64]
 
 KINDS = ("perpendicular", "oblique", "parallel")
-"""Orientation of a slot to its lane."""
+"""Orientation of a slot relative to its lane."""
 WAYS = ("nose-in", "back-in")
 """Orientation of a car in a perpendicular or oblique slot; in a parallel slot it faces the direction of traffic."""
 STARTS = ("lane", "way-out")
 REACH = 30.0
-"""Distance, m along both axes, from the slot's middle beyond which obstacles are not part of a task."""
+"""Distance, m along both axes, from the slot's centre beyond which obstacles are not part of a task."""
 AREA = REACH - 3.0
-"""Distance, m, likewise, beyond which the car has left the area of its task."""
+"""Distance, m along both axes, from the slot's centre beyond which the car has left the area of its task."""
 FARTHEST = AREA - 7.0
 """Greatest `distance` of a start, m."""
 UPRIGHT = math.radians(75.0)
@@ -55,7 +55,7 @@ class ParkingTask:
         way: one of `WAYS`.
         slot: (3,) float64, x, y in m and yaw in rad of the slot, world frame.
         size: length and width of the slot, m.
-        target: (3,) wanted position of the car's middle, m, and its yaw, rad.
+        target: (3,) goal of the car's centre, x and y in m, and its yaw, rad.
         start: (6,) state of the vehicle at the start.
         obstacles: parked cars, walls and kerbs within `REACH`.
 
@@ -85,11 +85,11 @@ class ParkingTask:
 
     @cached_property
     def room(self) -> FloatArray:
-        """Free space, (2,) m, in front and at the side of a car in the middle of the slot."""
+        """Free space, (2,) m, in front of and beside a car in the middle of the slot."""
         return 0.5 * np.array([self.size[0] - self.vehicle.length, self.size[1] - self.vehicle.width])
 
     def in_slot_frame(self, points: FloatArray) -> FloatArray:
-        """Transform points, (..., 2) m, into the slot's frame: origin in its middle, x along its yaw."""
+        """Transform points, (..., 2) m, into the slot's frame: origin at its centre, x along its yaw."""
         x, y, yaw = self.slot.tolist()
         turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
         local: FloatArray = (points - np.array([x, y])) @ turn
@@ -103,15 +103,15 @@ class ParkingTasks:
     Args:
         lot: the lot.
         vehicle: the car.
-        kinds: kinds of slots to draw from, equally often; None for all that the lot has.
-        ways: orientations in perpendicular and oblique slots to draw from, equally often.
+        kinds: kinds of slots to draw from with equal probability; None for all kinds in the lot.
+        ways: orientations in perpendicular and oblique slots to draw from with equal probability.
         slot: id of the only slot to park in; None draws one.
         occupancy: fraction of the other slots that are occupied, 0 to 1.
-        slack: distance around the slot kept clear of parked cars, m. 0 keeps all neighbours, as crooked as `manners`
+        slack: distance around the slot kept clear of parked cars, m. 0 keeps all neighbours, as misaligned as `manners`
             allows; 3 clears the adjacent slots.
-        distance: least and greatest distance of the start before the slot, m.
+        distance: smallest and largest distance of the start before the slot, m.
         starts: `lane`: on the lane, `distance` before the slot, in either direction of a two-way lane; `way-out`: the
-            end of a random drive of `distance` out of the slot, so that a short one is an easy task.
+            end of a random drive of `distance` out of the slot; short drives give easy tasks.
         manners: distribution of the poses of parked cars in their slots.
 
     Raises:
@@ -222,8 +222,8 @@ class ParkingTasks:
             start: (3,) x, y in m and yaw in rad of the rear axle; None draws one.
 
         Raises:
-            InputError: a start that is not three finite numbers, touches an obstacle, or lies outside the
-                `AREA`; or no start without a contact was found.
+            InputError: a start that is not three finite numbers, touches an obstacle, or lies outside the `AREA`; or
+                no collision-free start was found.
         """
         rng = np.random.default_rng([int(key), 0])
         kinds = sorted(self._slots_by_kind)
@@ -366,10 +366,10 @@ class ParkingTasks:
 
 
 def require_room(vehicle: VehicleParameters, size: tuple[float, float], what: str) -> None:
-    """Refuse a slot that a car does not fit into.
+    """Check that a car fits into a slot.
 
     Raises:
-        InputError: a length or width that is not finite, or less than the car's.
+        InputError: a length or width of the slot that is not finite, or less than the car's.
     """
     for name, own, needed in (("long", size[0], vehicle.length), ("wide", size[1], vehicle.width)):
         if not (math.isfinite(own) and own >= needed):

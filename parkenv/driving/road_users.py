@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 CLEAR_RADIUS_M = 12.0
-"""Radius, m, around the car's middle within which hidden road users do not return."""
+"""Radius, m, around the car's centre within which hidden road users do not return."""
 
 _FAR_AWAY = np.array([1e6, 1e6, 0.0])
 
@@ -26,17 +26,17 @@ class RoadUsers:
     """Cars and pedestrians on their routes around a driving car.
 
     They wait for the car, and it waits for them. `hide_standing` resolves a deadlock: it removes standing road users
-    until the car is `CLEAR_RADIUS_M` away; then they continue from where they stood. Their evasive manoeuvres are not
-    simulated, so a deadlock costs the time that it lasts, and always ends. Road users do not interact.
+    until the car is `CLEAR_RADIUS_M` away; then they continue from the same position. This replaces evasive manoeuvres:
+    a deadlock costs time but always ends. Road users do not interact with each other.
 
     Args:
-        traffic: of the world.
+        traffic: traffic of the world.
         vehicle: the driving car.
 
     Attributes:
-        outlines: as of `YieldingTraffic`.
+        outlines: see `YieldingTraffic`.
         clocks: (n,) s; NaN for hidden road users.
-        poses: (n, 3) x, y in m and yaw in rad, now; far away for hidden road users.
+        poses: (n, 3) current x, y in m and yaw in rad; far away for hidden road users.
     """
 
     def __init__(self, traffic: YieldingTraffic, vehicle: VehicleParameters) -> None:
@@ -79,10 +79,12 @@ class RoadUsers:
         return self._placed(self._before + share * (self._clocks - self._before))
 
     def encounter_times(self, own: FloatArray) -> FloatArray:
-        """Time, (n,) s, until each road user is in the car's way at constant velocity; infinity beyond the horizon.
+        """Return the time, (n,) s, until each road user is in the car's way; infinity beyond the horizon.
+
+        Velocities are assumed constant.
 
         Args:
-            own: (6, 3) m and rad, poses of the car's middle after `PREDICTION_TIMES_S`.
+            own: (6, 3) m and rad, poses of the car's centre after `PREDICTION_TIMES_S`.
         """
         outlines = [
             placed(corners, pose) for (_, corners), pose in zip(self.outlines, self.poses, strict=True)
@@ -92,7 +94,7 @@ class RoadUsers:
         for i in np.flatnonzero(np.isfinite(when)).tolist():
             forward = to_car_frame(own[0], outlines[i])[:, 0]
             if (ahead * forward < -abs(ahead) * 0.5 * self._vehicle.length).all():
-                when[i] = np.inf  # road users behind the car yield themselves
+                when[i] = np.inf  # road users behind the car yield to it
         return when
 
     def _near(self, car: FloatArray) -> NDArray[np.bool_]:

@@ -26,22 +26,22 @@ STRAIGHT = 1e-6
 
 @dataclass(frozen=True)
 class VehicleParameters:
-    """A car: by default a Volkswagen Golf of 2012, whose turning circle is 10.9 m from kerb to kerb.
+    """Dimensions and limits of a car; by default a 2012 Volkswagen Golf with a kerb-to-kerb turning circle of 10.9 m.
 
     Args:
-        length, width: of the footprint, a rectangle without mirrors, m.
-        wheelbase: between the axles, m.
-        rear_overhang: from the rear axle to the rear end, m.
-        max_steering: of a wheel in the middle of the front axle, to either side, rad.
-        steering_rate: rad/s.
-        max_speed, max_reverse_speed: m/s, both above 0.
-        max_acceleration: in either direction, m/s².
-        max_braking: deceleration, m/s².
-        acceleration_rate: greatest rate of change of the acceleration, m/s³.
+        length, width: size of the footprint, a rectangle without mirrors, m.
+        wheelbase: distance between the axles, m.
+        rear_overhang: distance from the rear axle to the rear end, m.
+        max_steering: largest angle, to either side, of a wheel in the middle of the front axle, rad.
+        steering_rate: largest rate of change of that angle, rad/s.
+        max_speed, max_reverse_speed: largest speeds, m/s, both above 0.
+        max_acceleration: largest acceleration in either direction, m/s².
+        max_braking: largest deceleration, m/s².
+        acceleration_rate: largest rate of change of the acceleration, m/s³.
 
     Raises:
-        InputError: a value that is not a finite number above 0, axles outside the car, steering of a right angle
-            or more, or a speed above half a length of the car per physics step.
+        InputError: a value that is not a finite number above 0, axles outside the car, a steering angle of 90° or
+            more, or a speed above half a car length per physics step.
 
     Examples:
         >>> round(VehicleParameters().turning_radius, 2)
@@ -83,12 +83,12 @@ class VehicleParameters:
 
     @cached_property
     def turning_radius(self) -> float:
-        """Least turning radius of the middle of the rear axle, m: wheelbase / tan(steering)."""
+        """Smallest turning radius of the middle of the rear axle, m: wheelbase / tan(steering)."""
         return self.wheelbase / math.tan(self.max_steering)
 
     @cached_property
     def middle(self) -> float:
-        """From the rear axle forward to the middle of the footprint, m."""
+        """Distance from the rear axle to the centre of the footprint, m."""
         return 0.5 * self.length - self.rear_overhang
 
     @cached_property
@@ -116,16 +116,16 @@ class VehicleParameters:
         return placed(own, pose)
 
     def at_middle(self, pose: FloatArray) -> FloatArray:
-        """Convert poses of the rear axle, (..., 3), to poses of the footprint's middle."""
+        """Convert poses of the rear axle, (..., 3), to poses of the footprint's centre."""
         return _shifted(pose, self.middle)
 
     def at_rear_axle(self, pose: FloatArray) -> FloatArray:
-        """Convert poses of the footprint's middle, (..., 3), to poses of the rear axle."""
+        """Convert poses of the footprint's centre, (..., 3), to poses of the rear axle."""
         return _shifted(pose, -self.middle)
 
 
 def placed(points: FloatArray, pose: FloatArray) -> FloatArray:
-    """Transform points of a body, (k, 2) m, to poses, (..., 3): (..., k, 2) m."""
+    """Transform points of a body, (k, 2) m, to poses, (..., 3); returns (..., k, 2) m."""
     pose = np.asarray(pose, dtype=np.float64)
     cosine, sine = np.cos(pose[..., 2, None]), np.sin(pose[..., 2, None])
     x = pose[..., 0, None] + cosine * points[:, 0] - sine * points[:, 1]
@@ -142,7 +142,7 @@ def _shifted(pose: FloatArray, ahead: float) -> FloatArray:
 
 @compiled(error_model="numpy")
 def move_along(x: float, y: float, yaw: float, curvature: float, way: float) -> tuple[float, float, float]:
-    """The exact pose at the end of an arc of `way` m, backward where negative."""
+    """Return the exact pose at the end of an arc of length `way`, m, negative backward."""
     turned = curvature * way
     half = 0.5 * turned
     chord = way if abs(turned) < STRAIGHT else way * math.sin(half) / half
@@ -151,7 +151,7 @@ def move_along(x: float, y: float, yaw: float, curvature: float, way: float) -> 
 
 @compiled(error_model="numpy")
 def advance(state: FloatArray, acceleration: float, steering: float, limits: FloatArray) -> float:
-    """Move a car by one step of the physics, `PHYSICS_S`.
+    """Move a car by one physics step, `PHYSICS_S`.
 
     Kinematic bicycle model: no wheel slips, and the rear axle's middle moves on a circle of wheelbase / tan(steering).
     Steering angle and acceleration approach the command as fast as their rates allow, and are then constant for the
@@ -159,8 +159,8 @@ def advance(state: FloatArray, acceleration: float, steering: float, limits: Flo
 
     Args:
         state: (6,) float64, changed in place; columns: see `X`.
-        acceleration: fraction of the limit, -1 to 1; against the motion, of the braking limit.
-        steering: fraction of the greatest angle, -1 to 1, positive to the left.
+        acceleration: fraction of the limit, -1 to 1; of the braking limit against the direction of motion.
+        steering: fraction of the largest angle, -1 to 1, positive to the left.
         limits: `VehicleParameters.limits`.
 
     Returns:
@@ -201,7 +201,7 @@ def drive(
         vehicle: the car.
         state: (6,) float64, the start; not changed.
         acceleration: fraction of the limit, -1 to 1.
-        steering: fraction of the greatest angle, -1 to 1.
+        steering: fraction of the largest angle, -1 to 1.
         steps: number of physics steps.
 
     Examples:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 
 LOOK_AHEAD_S = (0.1, 0.6, 1.2)
-"""Times, s, for which road users predict their own positions when they check for the car."""
+"""Times ahead, s, at which road users check their own positions for conflicts with the car."""
 GAP_M = 0.4
 """Clearance to the car, m."""
 
@@ -34,13 +34,13 @@ _MOST_TRIES = 50
 class YieldingTraffic:
     """Road users on closed routes that are a pure function of (lot, key), each with its own clock.
 
-    The clock of a road user stops while it waits, so positions depend on the parking car and on nothing else.
+    The clock of a road user stops while it waits, so positions depend only on the parking car.
 
     Args:
-        lot: with the lanes to drive and walk on; pedestrians walk to its first goal.
+        lot: defines the lanes; pedestrians walk to its first goal.
         traffic: numbers of cars and pedestrians.
-        key: of the world.
-        slots: provide the vehicle models.
+        key: key of the world.
+        slots: scene data of the lot; provides the vehicle models.
 
     Attributes:
         outlines: kind and outline, (k, 2) m in its own frame, of each road user, cars first.
@@ -59,11 +59,11 @@ class YieldingTraffic:
             ]
 
     def poses(self, clocks: FloatArray) -> FloatArray:
-        """Poses, (n, 3) x, y in m and yaw in rad, at clocks, (n,) s."""
+        """Return poses, (n, 3) x, y in m and yaw in rad, at clocks, (n,) s."""
         return self._rounds.poses_at(clocks)
 
     def movers(self, clocks: FloatArray) -> Movers | None:
-        """Road users at clocks, (n,) s, for the sensors; None without any.
+        """Return the road users at clocks, (n,) s, for the sensors; None without any.
 
         Road users whose clock is NaN are left out.
         """
@@ -86,7 +86,7 @@ class YieldingTraffic:
         )
 
     def initial_clocks(self, car: FloatArray) -> FloatArray:
-        """Clocks, (n,) s, at which no road user is close to a car with these corners, (4, 2) m."""
+        """Return clocks, (n,) s, at which no road user is close to a car with these corners, (4, 2) m."""
         clocks = np.zeros(len(self.outlines))
         for _ in range(_MOST_TRIES):
             near = ~self._clear(clocks, car, LOOK_AHEAD_S[-1:]) | ~self._clear(clocks, car, (0.0,))
@@ -100,7 +100,7 @@ class YieldingTraffic:
         return np.where(self._clear(clocks, car, LOOK_AHEAD_S), clocks + seconds, clocks)
 
     def _clear(self, clocks: FloatArray, car: FloatArray, ahead: tuple[float, ...]) -> NDArray[np.bool_]:
-        """Mask, (n,), of the road users whose way is clear."""
+        """Return the mask, (n,), of the road users whose way is clear."""
         clear = np.ones(len(clocks), dtype=bool)
         body = shapely.Polygon(car)
         middle = car.mean(axis=0)

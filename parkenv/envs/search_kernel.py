@@ -179,7 +179,7 @@ def read_belief(
 
 @inlined
 def complete_step(search: Any) -> tuple[Any, ...]:
-    """Add the step to the episode and update the observed time; returns as `step_result`."""
+    """Add the step to the episode, update belief and observed time; returns as `step_result`."""
     finish_step(search)
     refresh_belief(search)
     tell_time(search)
@@ -226,7 +226,9 @@ def arrive(search: Any) -> None:
     search.step_drive_s = search.step_failed_s = search.step_walk_s = 0.0
     search.step_parking_cost_s = search.step_gave_up_s = 0.0
     search.driven_m = search.walked_m = search.n_observed_free = search.n_expected_free = 0.0
-    search.failed_parks = search.slots_passed = search.n_steps = search.n_observed = search.n_known_taken = 0
+    search.failed_parks = search.slots_passed = search.n_steps = search.n_observed = (
+        search.n_last_observed_taken
+    ) = 0
     search.remembered_slot = -1
 
 
@@ -286,9 +288,9 @@ def drive_or_park(search: Any, action: int) -> None:
 
 @inlined
 def finish_step(search: Any) -> None:
-    """Add the step to the episode; give up if the lot is proven full."""
+    """Add the step to the episode; give up if every slot was last observed taken."""
     scenario = scenario_at(search.scenario, 0)
-    full = search.n_known_taken == scenario.n_slots
+    full = search.n_last_observed_taken == scenario.n_slots
     search.step_gave_up_s = scenario.give_up_s if full else 0.0
     search.over = full or search.parked
     search.drive_s += search.step_drive_s
@@ -394,7 +396,7 @@ def set_belief(search: Any, column: int, observed_taken: bool, p: float) -> None
         search.n_observed += 1
         search.n_observed_free += 0.0 if observed_taken else 1.0
         search.n_expected_free += 1.0 - block.prior[i]
-    search.n_known_taken += int(observed_taken) - int(record.observed_taken)
+    search.n_last_observed_taken += int(observed_taken) - int(record.observed_taken)
     record.observed_taken = observed_taken
     block.p_observed[i], block.observed_at[i] = p, search.time
     if search.belief != 0:

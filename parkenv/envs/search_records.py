@@ -102,7 +102,7 @@ _PROGRESS = [
     ("n_observed", np.int64),
     ("n_observed_free", np.float64),
     ("n_expected_free", np.float64),
-    ("n_known_taken", np.int64),
+    ("n_last_observed_taken", np.int64),
     # For the local observation: forecast fraction of free slots in each quarter of the lot; the best slot observed
     # free, or -1.
     ("free_by_region", np.float64, (N_REGIONS,)),

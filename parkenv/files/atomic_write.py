@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Write files atomically: complete or not at all."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from parkenv.errors import InputError
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """A place beside `path` to write to; it becomes `path` when the block ends, and goes if that fails.
+    """Yield a temporary path beside `path`; it replaces `path` at the end of the block, or is deleted on failure.
 
-    What stood at `path` stays whole until then.
+    The previous file at `path` stays intact until then.
 
     Raises:
-        InputError: the place cannot be written; the message names it.
+        InputError: the file cannot be written; the message names it.
     """
     path = Path(path)
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")

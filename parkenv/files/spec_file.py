@@ -1,4 +1,4 @@
-"""Files that describe a scenario or an experiment: TOML or JSON, validated by pydantic, refused in one line."""
+"""Specification files of scenarios and experiments: TOML or JSON, validated by pydantic, with one-line errors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 
 MAX_BYTES = 4_000_000
-"""Largest file that is read: a description holds no data."""
+"""Maximum size of a specification file, which holds no data."""
 _SHOWN = 60
 _FOLDER = "folder"
 
@@ -45,13 +45,13 @@ _WANTED = {
     "too_short": "at least {min_length} values",
     "too_long": "at most {max_length} values",
 }
-"""What is wanted, by pydantic's kind of fault; its own words where they are plain already."""
+"""What is wanted, by pydantic's error type; other types keep pydantic's message."""
 
 T = TypeVar("T")
 
 
 def _resolved(value: object, info: ValidationInfo) -> object:
-    """A path as an absolute one: relative to the folder of the file that it was read from."""
+    """Resolve a path relative to the folder of the file that it was read from."""
     if not isinstance(value, str | Path):
         return value
     folder = (info.context or {}).get(_FOLDER, Path())
@@ -62,11 +62,11 @@ def _resolved(value: object, info: ValidationInfo) -> object:
 
 
 FilePath = Annotated[Path, BeforeValidator(_resolved)]
-"""An existing file; relative paths start at the folder of the file that names them."""
+"""An existing file; paths are relative to the folder of the file that names them."""
 
 
 class OrText:
-    """Annotation of a table for which text may stand, such as the name of a file: both are in the JSON schema."""
+    """Annotation of a table that may also be given as text, such as a file name: the JSON schema allows both."""
 
     def __get_pydantic_json_schema__(
         self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
@@ -75,7 +75,7 @@ class OrText:
 
 
 Several = Annotated[tuple[T, ...], Strict(False)]
-"""A list in a file, a tuple in the object."""
+"""A list in the file, a tuple in Python."""
 
 
 def _different(values: tuple[T, ...]) -> tuple[T, ...]:
@@ -88,11 +88,11 @@ def _different(values: tuple[T, ...]) -> tuple[T, ...]:
 Axis = Annotated[
     tuple[T, ...], Strict(False), Field(min_length=1, max_length=10_000), AfterValidator(_different)
 ]
-"""The values of one axis of a grid: at least one, none twice."""
+"""The values of one axis of a grid: at least one, without duplicates."""
 
 
 class Spec(BaseModel):
-    """Base of everything that is read from such a file: typed, bounded, frozen; unknown keys are refused."""
+    """Base class of specifications: typed, bounded, frozen; unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
@@ -101,19 +101,20 @@ class Spec(BaseModel):
         """Read a TOML file, or a JSON file (`.json`).
 
         Raises:
-            InputError: it cannot be read or is not valid; one line with file, field, value and what was wanted.
+            InputError: the file cannot be read or is invalid; the message is one line with file, field, value and what
+                was wanted.
         """
         path = Path(path)
         return cls.parse(read_tables(path), str(path), path.parent)
 
     @classmethod
     def parse(cls, tables: Mapping[str, Any], source: str, folder: str | Path = ".") -> Self:
-        """Validate what a file or an option says.
+        """Validate the content of a file or an option.
 
         Args:
             tables: nested mappings and lists.
-            source: named in messages, such as the file.
-            folder: relative paths start here.
+            source: name of the source for messages, such as the file.
+            folder: folder that relative paths start from.
 
         Raises:
             InputError: see `read`.
@@ -124,11 +125,11 @@ class Spec(BaseModel):
             raise InputError(_message(cls, error, source)) from error
 
     def changed(self, source: str = "", /, **changes: Any) -> Self:
-        """A copy with some fields changed, validated again.
+        """Return a copy with some fields changed, validated again.
 
         Args:
-            source: named in messages.
-            changes: by name of field; plain values or specs.
+            source: name of the source for messages.
+            changes: plain values or specs, by field name.
 
         Raises:
             InputError: see `read`.
@@ -137,12 +138,12 @@ class Spec(BaseModel):
         return type(self).parse(fields, source)
 
     def write(self, path: Path) -> None:
-        """Write it as JSON, whole or not at all; fields at their defaults are written, too."""
+        """Write the specification as JSON, atomically, including fields at their defaults."""
         with atomic_write(path) as beside:
             beside.write_text(json.dumps(self.tables(), indent=2) + "\n", encoding="utf-8")
 
     def files(self) -> list[Path]:
-        """Every file that it names, at any depth."""
+        """Return every file named in the specification, at any depth."""
         found: list[Path] = []
         for name in type(self).model_fields:
             value = getattr(self, name)
@@ -154,15 +155,15 @@ class Spec(BaseModel):
         return list(dict.fromkeys(found))
 
     def tables(self) -> dict[str, Any]:
-        """Plain JSON values, without fields that are not set."""
+        """Return the specification as plain JSON values, without unset fields."""
         return self.model_dump(mode="json", exclude_none=True)
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """The content of a TOML or JSON file, not validated.
+    """Read a TOML or JSON file without validation.
 
     Raises:
-        InputError: it cannot be read, is too large, or its syntax is wrong.
+        InputError: the file cannot be read, is too large, or has a syntax error.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -183,7 +184,7 @@ def read_tables(path: Path) -> dict[str, Any]:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """A hint for a misspelt name: the nearest known one, and all of them."""
+    """Return a hint for a misspelt name: the closest known name, and all known names."""
     names = list(known)
     close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
     return (f"did you mean {close[0]!r}? " if close else "") + f"known: {', '.join(names)}"
@@ -191,13 +192,13 @@ def nearest(name: str, known: Iterable[str]) -> str:
 
 def _message(model: type[BaseModel], error: ValidationError, source: str) -> str:
     details = error.errors(include_url=False)
-    # A list is also too short without its invalid items.
+    # Invalid items also make a list too short; drop that error.
     details = [d for d in details if d["type"] != "too_short"] or details
-    # A misspelt key first: it explains a missing one.
+    # Report a misspelt key first: it explains a missing one.
     first = min(details, key=lambda d: d["type"] != "extra_forbidden")
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     if source.startswith("--"):
-        # An option is the field.
+        # The source is an option, which names the field itself.
         return _fault(model, first, source)
     field = ".".join(str(part) for part in first["loc"])
     return f"{source}{': ' if source else ''}{_fault(model, first, field)}{more}"
@@ -226,7 +227,7 @@ def _fault(model: type[BaseModel], detail: ErrorDetails, field: str) -> str:
 
 
 def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> Iterator[str]:
-    """The keys that the table at a location of the file may have."""
+    """Yield the valid keys of the table at a location in the file."""
     at: type[BaseModel] = model
     for part in location:
         if isinstance(part, str) and part in at.model_fields:

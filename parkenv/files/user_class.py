@@ -1,4 +1,4 @@
-"""Classes of the user's own, named `MODULE:CLASS` on a command line or in a file."""
+"""User-defined classes, named `MODULE:CLASS` on a command line or in a file."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from parkenv.errors import InputError
 
 
 def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> Any:
-    """Import the class that `MODULE:CLASS` names; the module may be in the working directory.
+    """Import the class `MODULE:CLASS`; the module may be in the working directory.
 
     Args:
-        name: such as `my_detectors:Mine`.
-        kind: what the class is used as, for messages: `agent`, `detector`.
-        method: the method that the class must have, with its parameters: `detect(image)`.
-        alternatives: what else the part before the colon may be, for the message.
+        name: name, such as `my_detectors:Mine`.
+        kind: role of the class, for messages: `agent`, `detector`.
+        method: required method of the class, with its parameters: `detect(image)`.
+        alternatives: other valid values for the part before the colon, for the message.
 
     Raises:
-        InputError: no such module or class, or a class without the method.
+        InputError: the module or class does not exist, or the class lacks the method.
     """
     module, _, class_name = name.partition(":")
     here = str(Path.cwd())
-    # As `python -m` does; an installed command would search its own folder instead.
+    # Search the working directory, as `python -m` does; an installed command would search its own folder instead.
     if here not in sys.path:
         sys.path.insert(0, here)
     try:
@@ -43,6 +43,6 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
 
 
 def file_of_class(name: str) -> Path | None:
-    """Return the file of the module in `MODULE:CLASS`, which `load_class` has imported; None if it has no file."""
+    """Return the file of a module imported by `load_class`; None if it has no file."""
     file = sys.modules[name.partition(":")[0]].__file__
     return None if file is None else Path(file)

@@ -1,4 +1,4 @@
-"""Small files of ours: JSON that says what it is, and of which version."""
+"""Small JSON files with a format name and version."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from parkenv.files.atomic_write import atomic_write
 
 @dataclass(frozen=True)
 class JsonFormat:
-    """A kind of file.
+    """A file format.
 
     Args:
-        name: what `"format"` says in it.
-        version: what `"version"` says in those that this version of the package writes, and reads.
-        meaning: what people call it.
+        name: value of `"format"` in the file.
+        version: value of `"version"`; this version of the package reads and writes no other.
+        meaning: description of the format for messages.
     """
 
     name: str
@@ -28,10 +28,10 @@ class JsonFormat:
     meaning: str
 
     def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
-        """The fields of a file, but for format and version.
+        """Read the fields of a file, without format and version.
 
         Raises:
-            InputError: it cannot be read, is no JSON, or of another kind or version; the message names the file.
+            InputError: the file cannot be read, is not JSON, or is of another format or version; the message names it.
         """
         try:
             content = json.loads(Path(path).read_text(encoding="utf-8"))
@@ -46,10 +46,10 @@ class JsonFormat:
         return content
 
     def write(self, path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
-        """Write a file, whole or not at all.
+        """Write a file atomically.
 
         Raises:
-            InputError: it cannot be written.
+            InputError: the file cannot be written.
         """
         content = {"format": self.name, "version": self.version, **fields}
         with atomic_write(path) as beside:

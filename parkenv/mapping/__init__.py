@@ -1,1 +1,1 @@
-"""Maps of what stands where and how often, from drives past all slots (T §3.3)."""
+"""Occupancy maps from survey drives past all slots (T §3.3)."""

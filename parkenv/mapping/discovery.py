@@ -14,9 +14,9 @@ from parkenv.world.lot import ParkingLot
 
 FloatArray = NDArray[np.float64]
 
-_TURN_M = 3.0  # a quarter turn counts as so many metres when cars are compared
-_WIDTH = 0.7  # of the reach: standard deviation of the kernel by which density is told
-_ROOM = (4.2, 1.9)  # m along and across a slot, closer than which there is no other: a car's length and width
+_TURN_M = 3.0  # m, distance equivalent to a quarter turn when cars are compared
+_WIDTH = 0.7  # standard deviation of the density kernel, as a fraction of the reach
+_ROOM = (4.2, 1.9)  # m, least distance between slot centres along and across a slot: a car's length and width
 
 
 class FoundSlots(NamedTuple):
@@ -50,20 +50,20 @@ class DiscoveryScore(NamedTuple):
 
 
 def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSlots:
-    """Find slots in the poses of cars from many sessions: dense places are slots, single cars are not.
+    """Find slots in the poses of cars from many sessions: dense clusters are slots, single cars are not.
 
-    The densest place is a slot, then the densest of those where another slot does not reach, and so on: two cars never
-    stood in each other, so neighbours do not grow together however many sessions there are, as the clusters of a
-    chaining method do once poses scatter by more than the gap between cars. Directions count as well, a quarter turn
-    as 3 m; nose-in and nose-out are the same. A slot's place is the median of the cars within reach.
+    The densest position becomes a slot, then the densest one outside all slots so far, and so on. Cars cannot overlap,
+    so neighbouring slots stay separate however many sessions there are; a chaining method would merge their clusters
+    once poses scatter by more than the gap between cars. Directions count as well, with a quarter turn equivalent to
+    3 m; nose-in and nose-out are the same. A slot's position is the median of the cars within reach.
 
     Args:
         cars: (n, 3) x, y in m and yaw in rad, world frame, of all sessions.
-        reach: m, within which cars stand in the same slot.
-        least: how many cars make a slot.
+        reach: m, largest distance of cars in the same slot.
+        least: smallest number of cars that make a slot.
 
     Raises:
-        InputError: a wrong shape, a number that is not finite, a reach that is not above 0, or no least car.
+        InputError: a wrong shape, a number that is not finite, a reach not above 0, or `least` below 1.
 
     Examples:
         >>> found = discover(np.array([[0.0, 0.1, 1.6], [0.1, 0.0, 4.7], [-0.1, 0.0, 1.5], [2.5, 0.0, 1.6]]))
@@ -76,7 +76,7 @@ def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSl
         raise InputError(f"reach is {reach} m, want a finite number above 0")
     if least < 1:
         raise InputError(f"least is {least} cars, want at least 1")
-    # Twice the angle is the same for both ways round.
+    # Twice the angle is the same for nose-in and nose-out.
     turn = _TURN_M / 2.0 * np.stack([np.cos(2.0 * cars[:, 2]), np.sin(2.0 * cars[:, 2])], axis=1)
     place = np.column_stack([cars[:, :2], turn])
     tree = cKDTree(place)
@@ -88,7 +88,7 @@ def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSl
         if not open_to_slots[k]:
             continue
         middle = np.median(place[tree.query_ball_point(place[k], reach)], axis=0)
-        # Once more from the middle, where the cars on the other side of it are within reach as well.
+        # Repeat from the median, which also has the cars on its other side within reach.
         these = tree.query_ball_point(middle, reach) or [k]
         middle = np.median(place[these], axis=0)
         direction = 0.5 * math.atan2(middle[3], middle[2]) % math.pi
@@ -102,7 +102,7 @@ def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSl
 
 
 def _density(tree: cKDTree, reach: float) -> tuple[FloatArray, NDArray[np.int64]]:
-    """Of each pose how dense poses lie there, and how many are within reach, itself included."""
+    """Return the density of poses at each pose, and the number of poses within reach, including itself."""
     width = _WIDTH * reach
     pairs = tree.query_pairs(2.0 * width, output_type="ndarray")
     away = np.linalg.norm(tree.data[pairs[:, 0]] - tree.data[pairs[:, 1]], axis=1)
@@ -115,7 +115,7 @@ def _density(tree: cKDTree, reach: float) -> tuple[FloatArray, NDArray[np.int64]
 
 
 def _inside(away: FloatArray, direction: float) -> NDArray[np.bool_]:
-    """Which points, from a slot's middle, are too near to it for another slot's middle."""
+    """Return which points, relative to a slot's centre, are too close to be another slot's centre."""
     c, s = math.cos(direction), math.sin(direction)
     along, across = c * away[:, 0] + s * away[:, 1], c * away[:, 1] - s * away[:, 0]
     return np.asarray((np.abs(along) < _ROOM[0]) & (np.abs(across) < _ROOM[1]))
@@ -124,13 +124,13 @@ def _inside(away: FloatArray, direction: float) -> NDArray[np.bool_]:
 def score_discovery(
     found: FoundSlots, lot: ParkingLot, *, within: float = 1.0, turned: float = math.radians(15.0)
 ) -> DiscoveryScore:
-    """Match discovered slots to those of the lot, one to one, nearest pairs first.
+    """Match discovered slots to the lot's slots one to one, nearest pairs first, and compute the errors.
 
     Args:
-        found: from `discover`.
-        lot: the truth.
-        within: m, that a match may be off.
-        turned: rad, that it may be turned.
+        found: result of `discover`.
+        lot: the true lot.
+        within: m, largest distance of a match.
+        turned: rad, largest angle of a match.
     """
     away = np.hypot(*(found.xy[:, None] - lot.slot_xy[None]).transpose(2, 0, 1))
     turn = np.abs((found.yaw[:, None] - lot.slot_yaw[None] + math.pi / 2) % math.pi - math.pi / 2)

@@ -92,7 +92,7 @@ class OccupancyGrid:
             half_angle: rad, half the horizontal field of view; below π/2.
             cars: (n, 2) bearing, rad counter-clockwise from `yaw`, and distance, m, of each detected car.
             reach: m, d_max, distance of the frontier along the optical axis.
-            car: m, s_car, depth of the occupied cells behind a detection.
+            car: m, s_car, depth of the occupied cells behind the detected point.
             half_width: m, half the width of a car across the rays.
 
         Raises:

@@ -1,4 +1,4 @@
-"""Occupancy probability of each slot, from sessions at different times (T §3.3.3), by hour (T §6)."""
+"""Occupancy probability of each slot from survey sessions (T §3.3.3), by hour of the week (T §6)."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from parkenv.world.week import DAY_S, HOUR_S
 FloatArray = NDArray[np.float64]
 
 SLOT_WEIGHT, LOT_WEIGHT = 4.0, 6.0
-"""How many sessions a slot's own mean is worth against its hour, and the lot's hour against the slot."""
+"""Prior weights, in sessions, of the slot's mean and of the lot's mean at the same hour."""
 RELAXATION_S = 1800.0
-"""s, how fast a sighting grows old where nothing better is known: half an hour's stay, half an hour's gap."""
+"""Default decay time of an observation, s: mean stay and mean vacancy of half an hour each."""
 OTHER_WEEKDAY = 0.85
-"""What a session counts on another day of the same kind.
+"""Weight of a session on another day of the same kind (weekday or weekend).
 
-Days of CNRPark-EXT, left out one at a time, are predicted alike with anything from 0.7 to 1 and worse with less: one
-Tuesday is as good as a Monday to tell a Tuesday by.
+In leave-one-day-out tests on CNRPark-EXT, values from 0.7 to 1 predict equally well and lower ones worse: a Monday
+predicts a Tuesday as well as another Tuesday does.
 """
 _HOUR_WIDTH = 1.0
 
@@ -35,7 +35,7 @@ class SessionLog:
     Args:
         time: (k,) s since Monday 00:00.
         occupied: (k, n_slots) bool.
-        known: (k, n_slots) bool, whether the slot was in view.
+        known: (k, n_slots) bool, whether the slot was observed.
     """
 
     time: FloatArray
@@ -66,7 +66,7 @@ class Prediction:
     Attributes:
         p_occupied: (n_slots,) float64.
         low, high: (n_slots,) float64, bounds of the credible interval of P(occupied).
-        sessions: (n_slots,) int64, number of sessions in which the slot was in view.
+        sessions: (n_slots,) int64, number of sessions in which the slot was observed.
     """
 
     p_occupied: FloatArray
@@ -76,27 +76,27 @@ class Prediction:
 
 
 def counted(log: SessionLog) -> FloatArray:
-    """Return the thesis's prediction, (n_slots,): N_occupied / (N_occupied + N_free); 0.5 if unseen (eq. 3.10-3.12)."""
+    """Return the thesis's prediction, (n_slots,): N_occupied / (N_occupied + N_free), or 0.5 (eq. 3.10-3.12)."""
     seen = log.known.sum(axis=0)
     taken = (log.occupied & log.known).sum(axis=0)
     return np.where(seen > 0, taken / np.maximum(seen, 1), 0.5)
 
 
 def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0.9) -> Prediction:
-    """Predict every slot at a time of the week, or over all.
+    """Predict the occupancy of every slot at a time of the week, or over all sessions.
 
-    Counts back off from the particular to the general: the slot at this hour of this weekday, of the same kind of day
-    (`OTHER_WEEKDAY`), and then, each step a Beta prior worth a few sessions, the slot at all hours shifted by how full
-    the lot is at this hour, the lot at this hour, the lot. So one session is enough for a first guess, and many make
-    it sharp.
+    Counts back off from specific to general: the slot at this hour of this weekday; the slot at this hour on days of
+    the same kind (`OTHER_WEEKDAY`); then, each as a Beta prior worth a few sessions, the slot at all hours shifted by
+    the lot's occupancy at this hour, the lot at this hour, the lot. So one session is enough for a first estimate, and
+    more sessions refine it.
 
     Args:
         log: the sessions.
-        time: s since Monday 00:00; None: over all sessions alike.
-        confidence: of the interval.
+        time: s since Monday 00:00; None: all sessions with equal weight.
+        confidence: probability of the credible interval.
 
     Raises:
-        InputError: no session, or a confidence that is no probability.
+        InputError: no session, or a confidence outside (0, 1).
     """
     if not len(log.time):
         raise InputError("the map holds no session, want at least one")
@@ -108,7 +108,7 @@ def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0
     at_hour = (weight @ taken.sum(axis=1) + LOT_WEIGHT * lot_mean) / (weight @ known.sum(axis=1) + LOT_WEIGHT)
     slot_mean = (taken.sum(axis=0) + SLOT_WEIGHT * lot_mean) / (known.sum(axis=0) + SLOT_WEIGHT)
     prior = slot_mean if time is None else _expit(_logit(slot_mean) + _logit(at_hour) - _logit(lot_mean))
-    # Over all sessions the slot's own counts are in its mean already: what is left to add is the lot's prior.
+    # Over all sessions, the slot's mean already contains its counts: only the lot's prior must be added.
     strength = SLOT_WEIGHT
     base = np.full(log.n_slots, lot_mean) if time is None else prior
     a = weight @ taken + strength * base
@@ -124,11 +124,11 @@ def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0
 
 @dataclass(frozen=True, eq=False)
 class MapPrior:
-    """A map as what a search knows beforehand: stands where a `Scenario` wants a `prior`.
+    """A map as the `prior` of a `Scenario`.
 
     Args:
         log: the sessions.
-        relaxation_s: s, how fast sightings grow old.
+        relaxation_s: s, decay time of observations.
     """
 
     log: SessionLog
@@ -146,7 +146,7 @@ class MapPrior:
 
 
 def _alike(then: FloatArray, time: float) -> FloatArray:
-    """Return the weight of sessions for another time, 0 to 1: by weekday or kind of day, and by hour."""
+    """Return the weights of sessions for a prediction at another time, 0 to 1, by weekday, kind of day and hour."""
     day, today = np.floor(then / DAY_S) % 7, np.floor(time / DAY_S) % 7
     same = np.where(day == today, 1.0, np.where((day >= 5) == (today >= 5), OTHER_WEEKDAY, 0.0))
     apart = np.abs(then % DAY_S - time % DAY_S) / HOUR_S

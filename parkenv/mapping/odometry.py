@@ -17,13 +17,13 @@ FloatArray = NDArray[np.float64]
 class PoseNoise:
     """Errors of the estimated pose.
 
-    The error of the position is an Ornstein-Uhlenbeck process along the way: a fused filter follows its odometry from
-    metre to metre and its fixes from minute to minute. That of the heading is one, too.
+    The errors of position and heading are Ornstein-Uhlenbeck processes over the distance driven: a fused filter
+    follows its odometry from metre to metre and its fixes from minute to minute.
 
     Args:
-        position: m, standard deviation of each coordinate in the long run.
-        heading: rad, standard deviation in the long run.
-        length: m driven, after which an error has forgotten all but 1/e of itself.
+        position: m, stationary standard deviation of each coordinate.
+        heading: rad, stationary standard deviation.
+        length: m driven, over which the autocorrelation falls to 1/e.
 
     Raises:
         InputError: a number below 0, or a length of 0.

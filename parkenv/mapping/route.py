@@ -45,18 +45,19 @@ def survey_route(lot: ParkingLot, entry: int = 0, *, both_sides: bool = False) -
     """Drive from an entry past every slot, with the slot on the right, and back.
 
     Each side of a two-way lane is driven in its own direction. Slots on the left of a one-way lane would need a camera
-    on the left; for one on the right that lane is driven once more, against its direction, as people who map a lot
-    do at quiet hours. What must be driven is known, so this is the rural postman problem on a directed graph: the
-    cheapest ways that balance arrivals and departures at every junction are a minimum-cost flow, and then an Eulerian
-    circuit drives all (Christofides et al., "An algorithm for the rural postman problem on a directed graph", 1986).
+    on the left; with a camera on the right, that lane is driven again against its direction, as in real surveys at
+    quiet hours. The required lanes are known, so this is the rural postman problem on a directed graph: a minimum-cost
+    flow gives the cheapest extra sections that balance arrivals and departures at every junction, and an Eulerian
+    circuit then drives them all (Christofides et al., "An algorithm for the rural postman problem on a directed
+    graph", 1986).
 
     Args:
         lot: the lot.
-        entry: index into `lot.entries`, where the drive begins and ends.
-        both_sides: whether the car sees to the left as well.
+        entry: index into `lot.entries`, start and end of the drive.
+        both_sides: whether a camera also points to the left.
 
     Raises:
-        InputError: a lane to drive that cannot be reached from the entry, or from which no way leads back.
+        InputError: a required lane cannot be reached from the entry, or the entry cannot be reached from it.
     """
     passes = _passes(lot)
     needed = [p for p in passes if len(p.stops) > 2]
@@ -113,7 +114,7 @@ def _straight_on(lot: ParkingLot, vertex: int) -> tuple[int | None, float]:
     for column in np.flatnonzero(lot.neighbors[vertex] >= 0).tolist():
         to = lot.neighbors[vertex, column]
         way = lot.vertex_xy[to] - lot.vertex_xy[vertex]
-        # Across a two-way lane the other side's cars drive the other way.
+        # The other side of a two-way lane has the opposite direction.
         if to < lot.n_slots and np.cos(lot.vertex_yaw[to] - heading) < 0.0:
             continue
         ahead = float(way @ [np.cos(heading), np.sin(heading)]) / max(float(np.hypot(*way)), 1e-9)
@@ -153,7 +154,7 @@ def _balance(drive: nx.MultiDiGraph[Any], ways: nx.DiGraph[Any]) -> None:
     for v in drive:
         flow_graph.add_node(v, demand=drive.out_degree(v) - drive.in_degree(v))
     for a, b, length in ways.edges(data="length"):
-        # The network simplex is exact for whole numbers only.
+        # The network simplex is exact only for integers.
         flow_graph.add_edge(a, b, weight=round(length * _MILLIMETRES))
     for a, onward in nx.min_cost_flow(flow_graph).items():
         for b, times in onward.items():

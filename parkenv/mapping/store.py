@@ -45,11 +45,11 @@ class Session:
     """One survey drive.
 
     Attributes:
-        key: unique name; a resumed survey does not drive it again.
-        time: s since Monday 00:00, when it began.
-        rig, weather: words.
-        p_occupied: (n_slots,) float64; NaN where the slot was never in view.
-        cars: (n, 3) float64, x, y in m and yaw in rad of the cars that were found.
+        key: unique name; a resumed survey skips sessions already stored.
+        time: start of the session, s since Monday 00:00.
+        rig, weather: names.
+        p_occupied: (n_slots,) float64; NaN if the slot was never in view.
+        cars: (n, 3) float64, x, y in m and yaw in rad of the located cars.
 
     Raises:
         InputError: an empty key, a time or a car that is not finite, or a probability outside 0 to 1.
@@ -80,12 +80,13 @@ class MapStore:
     """A map file.
 
     Args:
-        path: the file; created if it does not exist, unless `create` is off.
+        path: the file; created if it does not exist, unless `create` is False.
         lot: the lot that the map describes.
         create: whether to create a missing file.
 
     Raises:
-        InputError: no such file; no map file, one of a newer parkenv or of another lot; or it cannot be written.
+        InputError: the file does not exist, is not a map file, belongs to a newer parkenv or to another lot, or cannot
+            be written.
     """
 
     def __init__(self, path: Path, lot: ParkingLot, *, create: bool = True) -> None:
@@ -116,11 +117,10 @@ class MapStore:
             return self._db.execute("SELECT 1 FROM session WHERE key = ?", (key,)).fetchone() is not None
 
     def add(self, session: Session) -> None:
-        """Write a session, in one transaction; several processes may do so at once.
+        """Write a session in one transaction; several processes may write at the same time.
 
         Raises:
-            InputError: a session with this key is there already, a wrong number of slots, or the file cannot be
-                written.
+            InputError: a session with this key exists, the number of slots is wrong, or the file cannot be written.
         """
         if session.p_occupied.shape != (self._lot.n_slots,):
             raise InputError(
@@ -178,14 +178,14 @@ class MapStore:
         )
 
     def _open(self) -> None:
-        # One transaction, so that a file which somebody else is making is empty or whole.
+        # One transaction, so that a file that another process is creating is either empty or complete.
         with self._transaction():
             empty = self._is_empty()
             if not empty:
                 self._check()
         if empty:
             with self._transaction("IMMEDIATE"):
-                # Somebody else may have been faster.
+                # Another process may have been faster.
                 if self._is_empty():
                     self._make()
                 self._check()
@@ -232,7 +232,7 @@ class MapStore:
 
     @contextmanager
     def _errors_in_words(self) -> Iterator[None]:
-        """Describe a database error in one line."""
+        """Convert database errors to one-line InputErrors."""
         try:
             yield
         except sqlite3.DatabaseError as error:
@@ -242,7 +242,7 @@ class MapStore:
 def lot_digest(lot: ParkingLot) -> str:
     """Return a hash of the lot's slot poses."""
     places = np.column_stack([lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width])
-    # Adding 0 makes one of the two zeros.
+    # Adding 0 turns -0.0 into 0.0.
     return hashlib.sha256((np.round(places, 3) + 0.0).tobytes()).hexdigest()[:16]
 
 

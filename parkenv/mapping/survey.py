@@ -1,4 +1,4 @@
-"""One survey session: drive past every slot, and estimate which are taken (T §3.3, §4)."""
+"""A survey session: drive past every slot, and estimate which are taken (T §3.3, §4)."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ _SEEDS = 1 << 31
 
 @dataclass(frozen=True)
 class SurveySettings:
-    """How a survey is driven.
+    """Settings of a survey.
 
     Args:
-        rig: `laser`: the thesis's camera and 270° laser; `stereo`: a stereo camera alone; `both_sides`: a laser, a
+        rig: `laser`: the thesis's camera and 270° laser; `stereo`: only a stereo camera; `both_sides`: a laser, a
             camera to the right and one to the left, so that aisles with slots on both sides are driven once.
-        every: m between captures.
+        every: distance between captures, m.
         weather: one of `sim_sensors.camera.weather.PRESETS`; None draws one for each session.
-        windows: when sessions begin; the k-th session uses the k-th window, cyclically.
+        windows: arrival windows of the sessions; the k-th session uses the k-th window, cyclically.
         pose_noise: the vehicle's localisation error.
-        seed: of worlds, weather and noise.
+        seed: seed of worlds, weather and noise.
         detector: as `make_detector` takes it: `hog`, `side`, `front`, a model file or `MODULE:CLASS`.
 
     Raises:
@@ -76,14 +76,14 @@ class SessionResult:
 
     Attributes:
         session: the record for the map file.
-        arrival: when the session began.
-        states: the filter's estimate at the end.
-        truth: (n_slots,) bool, taken when the slot was last observed, or when the drive began if it never was.
-        parked: number of cars that stood in slots then; `found`: how many of them were detected.
+        arrival: start of the session.
+        states: the filter's final estimate.
+        truth: (n_slots,) bool, taken when the slot was last observed, or at the start if it was never observed.
+        parked: number of cars in slots then; `found`: how many of them were detected.
         score: errors of detection and localisation.
         frame_s: (f,) s, processing time of each capture.
         grid: the occupancy grid of the session.
-        shown: results of some captures with many cars, for pictures.
+        shown: results of some captures with many cars, for figures.
     """
 
     session: Session
@@ -99,12 +99,12 @@ class SessionResult:
 
     @property
     def slot_accuracy(self) -> float:
-        """Fraction of all slots whose state is right; unknown slots count as wrong."""
+        """Fraction of all slots whose state is correct; unknown slots count as wrong."""
         return float(((self.states.occupied == self.truth) & self.states.in_view).mean())
 
     @property
     def slot_accuracy_seen(self) -> float:
-        """Fraction of the slots with evidence whose state is right."""
+        """Fraction of the slots with evidence whose state is correct."""
         seen = self.states.in_view
         return float((self.states.occupied == self.truth)[seen].mean()) if seen.any() else float("nan")
 
@@ -112,13 +112,13 @@ class SessionResult:
 class SurveyFrame(NamedTuple):
     """The state of a session after one capture.
 
-    Grid and slots are those of the session, which keep changing: copy them to keep them.
+    Grid and slots are shared with the session, which keeps updating them: copy them to keep them.
 
     Attributes:
-        result: what the pipeline made of the capture.
+        result: pipeline result for the capture.
         grid: the occupancy grid so far.
         slots: the slot filter so far.
-        truth: (n_slots,) bool, which slots are taken now; for pictures and scores only.
+        truth: (n_slots,) bool, true current states; only for figures and scores.
     """
 
     result: PerceptionResult
@@ -131,8 +131,8 @@ class Survey:
     """Survey sessions in a scenario's world.
 
     Args:
-        scenario: lot, occupancy and traffic.
-        settings: how to drive.
+        scenario: defines lot, occupancy and traffic.
+        settings: settings of the survey.
     """
 
     def __init__(self, scenario: Scenario, settings: SurveySettings | None = None) -> None:
@@ -144,7 +144,7 @@ class Survey:
         self._slots = slot_lot(scenario.lot)
 
     def key_of(self, number: int) -> str:
-        """Return the key of a session in the map file, equal for equal drives."""
+        """Return the key of a session in the map file; identical sessions have equal keys."""
         s = self.settings
         noise = f"{s.pose_noise.position:g}m{s.pose_noise.heading:g}rad"
         detector = "" if s.detector == DEFAULT_DETECTOR else f"{detector_version(s.detector)}/"
@@ -157,8 +157,8 @@ class Survey:
         """Drive one session: capture at every pose, run the pipeline, and update the grid.
 
         Args:
-            number: 0 or more; equal numbers are equal drives.
-            pictures: how many results to keep for pictures.
+            number: 0 or more; determines the session.
+            pictures: number of results to keep for figures.
             on_frame: called after every capture.
         """
         scenario, settings, lot = self.scenario, self.settings, self.scenario.lot
@@ -174,7 +174,7 @@ class Survey:
         poses = poses_along(self.route.path, settings.every)
         estimated = settings.pose_noise.estimated(poses, rng)
         times = arrival.time + settings.every / scenario.v_drive * np.arange(len(poses))
-        # Of each section of the route, the capture with most cars.
+        # For each section of the route, the capture with the most cars.
         shown: dict[int, PerceptionResult] = {}
 
         slots, score = SlotFilter(lot), SurveyScore(lot.n_slots)

@@ -24,7 +24,7 @@ DISTANCE_ENDS = (4.0, 6.0, 8.0, 10.0, 12.0, 15.0)
 CLEAR = 0.6
 """Visible fraction of a car in an image from which a frame without its detection counts as a miss."""
 METHODS = ("fitted", "thesis")
-"""How cars are located: by `localize_cars`, and by the median range as in the thesis (`localize_as_thesis`)."""
+"""Localisation methods: `localize_cars`, and the median range as in the thesis (`localize_as_thesis`)."""
 _TRUTH = LaserScanner()
 _LEAST_BEAMS = 3
 
@@ -60,8 +60,8 @@ class SurveyScore:
 
         Args:
             scene: the true scene.
-            result: what the pipeline made of the capture.
-            by_median: for each view, its cars as located by the thesis's method.
+            result: pipeline result for the capture.
+            by_median: for each view, its cars located by the thesis's method.
         """
         capture = result.captured.capture
         for view, median_cars in zip(result.views, by_median, strict=True):

@@ -1,1 +1,1 @@
-"""Scenario files: what a search takes place in, as TOML, and the packaged scenarios."""
+"""Scenario files (TOML) and the packaged scenarios."""

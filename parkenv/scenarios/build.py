@@ -1,4 +1,4 @@
-"""From the description of a scenario to the scenario."""
+"""Build scenarios from their specifications."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def make_scenario(source: ScenarioSource, **changes: Any) -> Scenario:
     """Make a scenario.
 
     Args:
-        source: the name of a packaged scenario (campus, jam, street, mini), a scenario file (.toml), a lot file, a
-            `ScenarioSpec`, a `ParkingLot` (on which a typical week takes place), or a `Scenario`.
+        source: name of a packaged scenario (campus, jam, street, mini), a scenario file (.toml), a lot file, a
+            `ScenarioSpec`, a `ParkingLot` (with the occupancy of a typical week), or a `Scenario`.
         changes: fields of `Scenario` to replace.
 
     Raises:
-        InputError: an unknown name or field, or what is wrong with a file; one line.
+        InputError: an unknown name or field, or an invalid file; the message is one line.
 
     Examples:
         >>> scenario = make_scenario("campus", failure_s=90.0)
@@ -68,10 +68,10 @@ def make_scenario(source: ScenarioSource, **changes: Any) -> Scenario:
 
 
 def build(spec: ScenarioSpec) -> Scenario:
-    """The scenario that a specification describes.
+    """Build the scenario of a specification.
 
     Raises:
-        InputError: a file that it names cannot be used, or does not fit the lot.
+        InputError: a file that it names cannot be used or does not fit the lot.
     """
     lot = _lot(spec.lot)
     goal = 0
@@ -158,12 +158,12 @@ def _typical(spec: TypicalWeek, lot: ParkingLot, goal: int) -> OccupancyProcess:
 
 def _process(path: Path, lot: ParkingLot, goal: int) -> OccupancyProcess:
     process = OccupancyProcess.from_file(path)
-    # A process carries no slot ids: one of the lot's size is taken to be the lot's own.
+    # A process has no slot ids: if its number of slots equals the lot's, assume that it was made for this lot.
     return process if process.n_slots == lot.n_slots else process.mapped_to_lot(lot.walk_m(goal))
 
 
 def sensor_model(spec: SensorModelSpec) -> SensorModel:
-    """The sensor model that a specification describes.
+    """Build the sensor model of a specification.
 
     Raises:
         InputError: its file cannot be used.

@@ -1,6 +1,6 @@
-"""What a scenario file may say.
+"""Specification of a scenario file.
 
-Every table of the file is a class here; the classes validate it, and the published JSON schema is made from them.
+Every table of the file has a class here, which validates it. The published JSON schema is made from these classes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from parkenv.world.occupancy import ArrivalWindow
 PackagedLot = Literal["campus", "jam", "street", "mini"]
 PACKAGED_LOTS: tuple[PackagedLot, ...] = ("campus", "jam", "street", "mini")
 LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")
-"""Endings of the names of lot files."""
+"""Suffixes of lot files."""
 SENSOR_MODELS = ("perfect", "blind", "laser", "stereo")
 RigName = Literal["laser", "stereo", "both_sides"]
 
@@ -62,7 +62,7 @@ class CityLot(Spec):
 
 
 def _lot_tables(value: object) -> object:
-    """A word as the table it stands for: a packaged lot's name, or else a file."""
+    """Expand text to a table: the name of a packaged lot, or else a file."""
     if isinstance(value, Path):
         return {"file": value}
     if not isinstance(value, str):
@@ -77,7 +77,7 @@ def _lot_tables(value: object) -> object:
 
 
 class LotSpec(Spec):
-    """Where the lot comes from: exactly one of the four."""
+    """Source of the lot: exactly one of the four."""
 
     name: PackagedLot | None = Field(None, description="A packaged lot.")
     file: FilePath | None = Field(
@@ -93,7 +93,7 @@ class LotSpec(Spec):
 
 
 class TypicalWeek(Spec):
-    """A working week: full by day, empty by night, and fuller near the goal."""
+    """A working week: full by day, empty by night, fuller near the goal."""
 
     pull: float = Field(
         1.6, ge=-20, le=20, description="Logits by which demand rises from the middle to the goal."
@@ -130,7 +130,7 @@ def _occupancy_tables(value: object) -> object:
 
 
 class OccupancySpec(Spec):
-    """Which slots are taken when: a typical week where nothing else is named."""
+    """When slots are taken: a typical week by default."""
 
     typical: TypicalWeek | None = None
     process: FilePath | None = Field(None, description="Rates that `parkenv occupancy fit` wrote (.json).")
@@ -165,7 +165,7 @@ def _forecast_tables(value: object) -> object:
 
 
 class ForecastSpec(Spec):
-    """What the car's map says before the search: the true occupancy's own forecast where nothing else is named."""
+    """Occupancy forecast before the search: by default that of the true occupancy model."""
 
     typical: TypicalWeek | None = None
     process: FilePath | None = None
@@ -218,7 +218,7 @@ class Speeds(Spec):
 
 
 class Costs(Spec):
-    """What a search is charged, s."""
+    """Costs of a search, s."""
 
     failure_s: Cost = Field(10.0, description="Failed attempt to park; planners know it.")
     wait_s: float = Field(1.0, gt=0.0, le=86_400.0, description="Move that the drive graph does not have.")
@@ -282,7 +282,7 @@ def _name(value: str) -> str:
 
 
 class ScenarioSpec(Spec):
-    """A scenario file: a lot, its occupancy, what the car knows, the goal, and what time costs."""
+    """A scenario file: lot, occupancy, forecast, sensor model, goal, speeds and costs."""
 
     name: Annotated[str, AfterValidator(_name)] = Field("", description="In tables; the file's by default.")
     lot: Annotated[LotSpec, BeforeValidator(_lot_tables), OrText()]
@@ -305,13 +305,13 @@ class ScenarioSpec(Spec):
 
     @property
     def title(self) -> str:
-        """The name that the scenario has in tables: its own, or else the lot's."""
+        """Name of the scenario in tables: its own, or else the lot's."""
         lot = self.lot
         return self.name or lot.name or (lot.file.stem if lot.file else "city" if lot.city else "grid")
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read a scenario file; without a name in it the scenario has the file's."""
+        """Read a scenario file; the default name of the scenario is that of the file."""
         path = Path(path)
         return cls.parse({"name": path.stem, **read_tables(path)}, str(path), path.parent)
 
@@ -322,13 +322,13 @@ _PACKAGED = Path(__file__).with_name("packaged")
 
 
 def scenario_spec(source: str | Path) -> ScenarioSpec:
-    """The specification of a packaged scenario, of a scenario file, or of a typical week on a lot file.
+    """Return the specification of a packaged scenario, a scenario file, or a typical week on a lot file.
 
     Args:
-        source: the name of a packaged scenario, or a file.
+        source: name of a packaged scenario, or a file.
 
     Raises:
-        InputError: neither; or what is wrong with the file.
+        InputError: the source is neither, or the file is invalid.
 
     Examples:
         >>> scenario_spec("jam").occupancy.event

@@ -1,4 +1,4 @@
-"""The decay of an observation: exp(-x), in arithmetic that gives the same result wherever it is compiled into."""
+"""The decay of an observation: exp(-x), with the same result wherever it is compiled."""
 
 import math
 
@@ -21,19 +21,19 @@ _2, _3, _4, _5, _6, _7, _8, _9, _10, _11, _12 = (1.0 / math.factorial(n) for n i
 def decay_factor(x: float) -> float:
     """exp(-x) for x >= 0, to the last place or two.
 
-    A library's exponential may be another one in a loop than alone; this one is plain arithmetic, so a batch and a
-    single search agree to the bit, and loops over slots become vector instructions.
+    A library may use a different exponential inside a loop than outside. This one is plain arithmetic, so a batch and
+    a single search agree to the bit, and loops over slots become vector instructions.
     """
     x = min(x, _LARGEST)
     rounded = _ROUNDING - x * _LOG2_E
     k = rounded - _ROUNDING
     r = (-x - k * _LN2_HIGH) - k * _LN2_LOW
-    # The series of exp(r) by pairs (Estrin's scheme): term after term, each would wait for the one before.
+    # Estrin's scheme for the series of exp(r): pairs of terms are independent, unlike in Horner's scheme.
     r2 = r * r
     r4 = r2 * r2
     low = (_2 + r * _3) + r2 * (_4 + r * _5)
     high = (_6 + r * _7) + r2 * (_8 + r * _9) + r4 * ((_10 + r * _11) + r2 * _12)
     p = 1.0 + (r + r2 * (low + r4 * high))
-    # 2**k, written down as the bits of a float64.
+    # 2**k from the bits of a float64.
     power: float = np.int64((np.float64(rounded).view(np.int64) + _BIAS) << _MANTISSA_BITS).view(np.float64)
     return p * power

@@ -1,10 +1,9 @@
 """Build the drive graph of a lot: stop positions and the moves between them.
 
 Every slot has one vertex, the point on the lane before its mouth; lane ends and junctions are further vertices.
-A two-way lane carries one directed chain of slot vertices per side, to the right of the centre line: a car passes
-the slots on its right in order, turns round at the ends of the lane, and may cross to the opposite slots. A one-way
-lane carries a single chain that serves both of its sides. All computations are vectorised: a million slots take
-seconds.
+A two-way lane has one directed chain of slot vertices per side, to the right of the centre line: a car passes the
+slots on its right in order, turns round at the ends of the lane, and may cross to the opposite slots. A one-way lane
+has a single chain that serves both sides. All computations are vectorised: a million slots take seconds.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ IntArray = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class GraphProblem:
-    """Why a drive graph cannot be built: kind of feature, its index within its kind, the reason, and the position."""
+    """A problem of a drive graph: kind of feature, index within its kind, reason, and position."""
 
     kind: str
     index: int
@@ -50,7 +49,7 @@ class GraphProblem:
 
 
 class GraphError(InputError):
-    """Lanes, slots and entries that form no drive graph; `problems` lists all reasons."""
+    """Lanes, slots and entries do not form a drive graph; `problems` lists all reasons."""
 
     def __init__(self, problems: Sequence[GraphProblem]) -> None:
         self.problems = tuple(problems)
@@ -236,7 +235,7 @@ def _centrelines(lanes: Sequence[tuple[FloatArray, bool]]) -> _Centrelines:
     node_of_point = np.full(len(xy), -1)
     node_of_point[cut] = node
     node_xy = np.empty((node.max() + 1, 2))
-    node_xy[node[::-1]] = xy[cut[::-1]]  # of points within the tolerance the first one counts
+    node_xy[node[::-1]] = xy[cut[::-1]]  # the first of the points within the tolerance counts
     return _Centrelines(
         xy=xy,
         station=station,
@@ -378,7 +377,7 @@ def _crossing_edges(
         along = np.abs(station[mate] - station[here])
         linked = (along <= CROSSING_REACH) & (segment[mate] == segment[here])
         here, mate, along = here[linked], mate[linked], along[linked]
-        # Across means to the left of the direction of travel.
+        # A crossing leads to the left of the direction of travel.
         bearing = np.arctan2(tangent[here, 0], -tangent[here, 1])
         edges.append((here, mate, np.hypot(2 * LANE_OFFSET, along), bearing))
     return edges

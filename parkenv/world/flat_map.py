@@ -1,4 +1,4 @@
-"""A forecast that is wrong on purpose: the same probability for every slot."""
+"""A deliberately wrong forecast: the same probability for every slot."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class FlatMap:
         InputError: `p_occupied` is not a probability.
 
     Examples:
-        >>> from parkenv import Scenario
+        >>> from parkenv import make_scenario
         >>> mini = make_scenario("mini")
         >>> FlatMap(1.0, mini.occupancy).forecast(Arrival(0.0)).p_occupied[:2].tolist()
         [0.999, 0.999]

@@ -1,6 +1,6 @@
 """Random numbers that are a pure function of (key, stream, slot, index).
 
-Nothing is stored between draws, so a world does not depend on which slots are observed, or in which order.
+Draws are stateless, so a world does not depend on which slots are observed, or in which order.
 The mixing function is the finaliser of SplitMix64 (Steele, Lea, Flood, "Fast splittable pseudorandom number
 generators", OOPSLA 2014), applied once for each of stream, slot and index.
 """
@@ -45,8 +45,8 @@ def keyed_uniform(key: np.uint64, stream: int, slot: int, index: int) -> float:
 
     `key` comes from `world_key`; `stream`, `slot` and `index` are non-negative integers below 2**63.
     """
-    # Cast here, so that the function below is compiled once and not for each constant that is passed; and all to
-    # uint64, since uint64 with int64 would be promoted to float64.
+    # Cast here, so that the function below is compiled once and not for each constant argument; and all to uint64,
+    # because uint64 with int64 would be promoted to float64.
     u: float = _uniform(np.uint64(key), np.uint64(stream), np.uint64(slot), np.uint64(index))
     return u
 
@@ -56,7 +56,7 @@ def _uniform(key: np.uint64, stream: np.uint64, slot: np.uint64, index: np.uint6
     h = _mix64(key + _GOLDEN * stream)
     h = _mix64(h + _GOLDEN * slot)
     h = _mix64(h + _GOLDEN * index)
-    # 52 bits and a half: neither 0 nor 1 can come out.
+    # 52 bits plus a half: the result is never 0 or 1.
     return (float(h >> _SHIFT_12) + 0.5) * 2.0**-52
 
 
@@ -75,7 +75,7 @@ def _absorbed(state: np.uint64, word: np.uint64) -> np.uint64:
 @compiled
 def episode_key(seed_state: np.uint64, episode: int) -> np.uint64:
     """Return the key of a world, from `seed_state` and an episode number below 2**64."""
-    # The number of words goes in first, so that no two (seed, episode) pairs spell the same words.
+    # Absorb the number of words first, so that no two (seed, episode) pairs give the same sequence of words.
     key: np.uint64 = _absorbed(_absorbed(seed_state, np.uint64(1)), np.uint64(episode))
     return key
 

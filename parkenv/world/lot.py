@@ -40,7 +40,7 @@ class Lane:
 
     Args:
         points: (k, 2) float64, m, lot frame, k ≥ 2. Lanes are connected where they share a point.
-        oneway: whether cars may drive in the order of the points only; else they keep to the right.
+        oneway: whether cars may drive only in the order of the points; otherwise they keep to the right.
 
     Raises:
         InputError: a wrong shape, a value that is not finite, or two equal consecutive points.
@@ -88,10 +88,10 @@ class ParkingLot:
         slot_mouth: (n_slots,) int8, a `Mouth` each: the side towards the lane.
         lanes: centre lines.
         entries: (n_entries, 2) float64, m, where cars enter; each must be within 15 m of a lane.
-        goals: (n_goals, 2) float64, m, where people walk to; anywhere.
-        walls: polylines, (k, 2) m each; they block the view, not the walker.
-        slot_parking_cost_s: (n_slots,) float64, s, at least 0: what parking in each slot costs, as time. A price
-            is converted by the value of time: 2 € at 12 € per hour are 600 s. Empty: all 0.
+        goals: (n_goals, 2) float64, m, walking destinations; anywhere.
+        walls: polylines, (k, 2) m each; they block the view, not pedestrians.
+        slot_parking_cost_s: (n_slots,) float64, s, at least 0: cost of parking in each slot, as time. A price is
+            converted by the value of time: 2 € at 12 € per hour are 600 s. Empty: all 0.
 
     Attributes:
         vertex_xy: (n_vertices, 2) float64, m.
@@ -278,7 +278,7 @@ def corner_points(xy: FloatArray, yaw: FloatArray, length: FloatArray, width: Fl
 
 
 def is_building(wall: FloatArray) -> bool:
-    """Whether a wall, (k, 2) m, is closed, and so the outline of a building."""
+    """Whether a wall, (k, 2) m, is a closed line, i.e. the outline of a building."""
     return len(wall) >= 4 and np.array_equal(wall[0], wall[-1])
 
 

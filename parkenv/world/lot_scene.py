@@ -32,12 +32,12 @@ def slot_lot(lot: ParkingLot, seed: int = 0) -> SlotLot:
 
     Closed walls become buildings, open ones free-standing walls. Place i of the scene is slot i, in the lot's frame.
 
+    Within a process, equal lots share one object: the ground texture and the vehicle meshes take seconds to create, and
+    every task of a worker process has a new copy of its lot.
+
     Args:
         lot: the lot.
-        seed: of vehicle models and textures.
-
-    Equal lots share one object in a process, and with it the ground's texture and the vehicles' meshes, which take
-    seconds to make: every task of a worker process brings a new copy of its lot.
+        seed: seed of vehicle models and textures.
     """
     key = _content(lot, seed)
     if key not in _SLOT_LOTS:
@@ -86,9 +86,9 @@ class LotScenes:
     Parked cars and traffic depend on the world alone. Consecutive scenes are updated incrementally.
 
     Args:
-        slots: of the scenario's lot, from `slot_lot`.
+        slots: `slot_lot` of the scenario's lot.
         scenario: defines lot and traffic.
-        key: of the world.
+        key: key of the world.
         world: occupancy of the slots over time.
     """
 
@@ -101,7 +101,7 @@ class LotScenes:
         self._scene: Scene | None = None
 
     def at(self, time: float, ego: FloatArray | None = None) -> Scene:
-        """The scene at a time; slot i is its place i.
+        """Return the scene at a time; place i is slot i.
 
         Args:
             time: s, at or after the world's arrival.

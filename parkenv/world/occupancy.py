@@ -1,4 +1,4 @@
-"""Which slots are taken when: the protocols of worlds and forecasts, and a process that generates worlds.
+"""Occupancy over time: the protocols of worlds and forecasts, and a process that generates worlds.
 
 Times are seconds since Monday 00:00 of the scenario's week; rates are 1/s.
 """
@@ -44,12 +44,12 @@ _FORMAT = JsonFormat("parkenv-occupancy-process", 1, "an occupancy process")
 
 @dataclass(frozen=True)
 class ArrivalWindow:
-    """When searches begin: on which weekdays, and between which times of day.
+    """Weekdays and times of day at which searches begin.
 
     Args:
-        weekdays: Monday = 0 ... Sunday = 6, none twice.
+        weekdays: Monday = 0 ... Sunday = 6, without repeats.
         start_s: first second of the day, in [0, 86400).
-        end_s: end of the window (not in it), in [start_s, 86400]; equal to start_s means that very moment.
+        end_s: end of the window (exclusive), in [start_s, 86400]; if equal to start_s, all searches begin then.
     """
 
     weekdays: tuple[int, ...] = (0, 1, 2, 3, 4)
@@ -72,7 +72,7 @@ class ArrivalWindow:
 
     @classmethod
     def parse(cls, hours: str, days: str = "weekdays") -> Self:
-        """Read a window as a user types it.
+        """Parse a window as typed by a user.
 
         >>> ArrivalWindow.parse("08:00-09:30", days="mon,sat")
         ArrivalWindow(weekdays=(0, 5), start_s=28800.0, end_s=34200.0)
@@ -96,7 +96,7 @@ class ArrivalWindow:
         return cls(weekdays, start_h * HOUR_S + start_min * 60.0, end_h * HOUR_S + end_min * 60.0)
 
     def draw_second(self, key: np.uint64) -> float:
-        """Second of the day, uniform in the window; the world's key decides."""
+        """Draw a second of the day, uniform in the window, from the world's key."""
         return self.start_s + float(keyed_uniform(key, ARRIVAL_STREAM, 0, 1)) * (self.end_s - self.start_s)
 
 
@@ -106,7 +106,7 @@ class Arrival:
 
     Args:
         time: s since Monday 00:00.
-        day: ISO date of the recorded day that the world replays; empty where nothing is replayed.
+        day: ISO date of the recorded day that the world replays; empty without a replay.
     """
 
     time: float
@@ -115,10 +115,10 @@ class Arrival:
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """What is known of a lot before anything was observed.
+    """Occupancy forecast of a lot, before any observation.
 
     Args:
-        p_occupied: (n,) float64, probability at the arrival.
+        p_occupied: (n,) float64, P(taken) at the arrival.
         decay_rate: (n,) float64, 1/s, arrival rate plus departure rate: how fast an observation loses its value.
     """
 
@@ -127,16 +127,16 @@ class Forecast:
 
 
 class World(Protocol):
-    """The hidden truth of one episode; any slots, any times from the arrival on, in any order."""
+    """The hidden occupancy of one episode; accepts any slots and times from the arrival on, in any order."""
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
-        """(k,) bool: is each of the slots (k,) taken at `time`?"""
+        """(k,) bool, whether each of the slots (k,) is taken at `time`."""
 
     def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
         """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
 
     def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
-        """(k,) int64: the number of the sojourn, the stretch of constant state, of each slot; it tells cars apart."""
+        """(k,) int64, number of the current sojourn (period of constant state) of each slot; distinguishes cars."""
 
 
 class PriorModel(Protocol):
@@ -147,17 +147,17 @@ class PriorModel(Protocol):
         """Number of slots."""
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """Return what is known at the arrival; it does not depend on the world."""
+        """Return the forecast for the arrival; it does not depend on the world."""
 
 
 class OccupancyModel(PriorModel, Protocol):
     """Draws arrivals and worlds, and forecasts occupancy."""
 
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
-        """The arrival of the episode with this key."""
+        """Draw the arrival of the episode with this key."""
 
     def world(self, key: np.uint64, arrival: Arrival) -> World:
-        """The world of the episode with this key."""
+        """Return the world of the episode with this key."""
 
 
 @kernel
@@ -194,14 +194,14 @@ def _marginals(process: int, hour: int, second: float, marginals: FloatArray) ->
 class ProcessWorld:
     """One episode of an `OccupancyProcess`: a pure function of (process, key, arrival).
 
-    Lazy: only slots that are asked about cost anything. A slot keeps a cursor on its latest sojourn; a query before the
+    Evaluation is lazy: only queried slots cost time. A slot keeps a cursor on its latest sojourn; a query before the
     cursor restarts that slot, so answers never depend on the order of the queries.
     """
 
     def __init__(self, process: "OccupancyProcess", key: np.uint64, arrival: Arrival) -> None:
         if not math.isfinite(arrival.time):
             raise InputError(f"Arrival.time: got {arrival.time}, wanted finite seconds")
-        # np.zeros takes memory from the system untouched, so a million slots that nobody asks about cost nothing.
+        # np.zeros does not touch its memory, so a million slots cost nothing until they are queried.
         self._cursors = np.zeros(process.n_slots, CURSOR)
         _, self._hour, self._second = hour_of_week(float(arrival.time))
         self.process = process
@@ -209,7 +209,7 @@ class ProcessWorld:
         self.arrival = arrival
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
-        """(k,) bool: is each of the slots (k,) taken at `time`, which is at or after the arrival?"""
+        """(k,) bool, whether each of the slots (k,) is taken at `time`, at or after the arrival."""
         return self._seek(self._checked(slots), time, np.empty(0))
 
     def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
@@ -219,7 +219,7 @@ class ProcessWorld:
         return np.where(self._seek(slots, time, ends), ends, time)
 
     def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
-        """(k,) int64: how many sojourns, stretches of constant state, each slot has begun since the arrival."""
+        """(k,) int64, number of sojourns (periods of constant state) that each slot has begun since the arrival."""
         slots = self._checked(slots)
         self._seek(slots, time, np.empty(0))
         begun: IntArray = self._cursors["sojourn"][slots].astype(np.int64)
@@ -246,9 +246,9 @@ class ProcessWorld:
 
 @dataclass(frozen=True, eq=False)
 class OccupancyProcess:
-    """Every slot an independent two-state Markov chain in continuous time, with rates that repeat weekly.
+    """Independent two-state continuous-time Markov chains, one per slot, with weekly periodic rates.
 
-    A free slot s is taken at the rate `arrival_factor[s] * arrival_profile[h]`, a taken one is left at the
+    A free slot s is taken at the rate `arrival_factor[s] * arrival_profile[h]`, a taken one becomes free at the
     rate `departure_factor[s] * departure_profile[h]`; h is the hour of the week, 0 = Monday 00:00 to 01:00.
 
     Args:
@@ -258,9 +258,9 @@ class OccupancyProcess:
         departure_profile: (168,) float64, 1/s, >= 0.
 
     Attributes:
-        factors: (2, n) float64, read-only, the two factors stacked; row = the state that is left.
-        profiles: (2, 168) float64, 1/s, read-only, likewise.
-        hazards: (2, 169) float64, read-only, the profiles summed up from Monday 00:00, at full hours.
+        factors: (2, n) float64, read-only, the two factors stacked; row = the state before the change.
+        profiles: (2, 168) float64, 1/s, read-only, the two profiles stacked in the same way.
+        hazards: (2, 169) float64, read-only, integrals of the profiles from Monday 00:00 to full hours.
         hourly_marginals: (168, n) float64, P(taken) at full hours, computed when first needed; 0 before.
         record: (1,) of the dtype PROCESS, for compiled code.
 
@@ -292,7 +292,7 @@ class OccupancyProcess:
         for name, array in (("factors", factors), ("profiles", profiles), ("hazards", hazards)):
             array.flags.writeable = False
             object.__setattr__(self, name, array)
-        # Memory that nobody has touched costs nothing, so a million slots may have their whole week.
+        # Untouched memory costs nothing, so even a million slots can have a whole week.
         marginals = np.zeros((WEEK_HOURS, arrival.size))
         addresses = (address_of(a, np.float64) for a in (factors, profiles, hazards, marginals))
         object.__setattr__(self, "hourly_marginals", marginals)
@@ -308,18 +308,18 @@ class OccupancyProcess:
 
     @classmethod
     def from_demand(cls, attraction: ArrayLike, demand: ArrayLike, mean_stay_s: float = 2 * HOUR_S) -> Self:
-        """Process whose equilibrium occupancy has the logit `attraction[s] + demand[h]`.
+        """Return a process whose equilibrium occupancy has the logit `attraction[s] + demand[h]`.
 
         Args:
             attraction: (n,) float64, logit, popularity of each slot.
             demand: (168,) float64, logit, by hour of the week.
-            mean_stay_s: s, mean time that a car stays, the same for all slots and hours.
+            mean_stay_s: s, mean parking duration, the same for all slots and hours.
         """
         if not 0 < mean_stay_s < math.inf:
             raise InputError(f"mean_stay_s: got {mean_stay_s}, wanted seconds > 0")
         attraction, demand = np.asarray(attraction, float), np.asarray(demand, float)
         for name, logits in (("attraction", attraction), ("demand", demand)):
-            # Past this even the exponential leaves the floating-point range.
+            # Beyond this, the exponential exceeds the floating-point range.
             if not np.all(np.abs(logits) <= 300):
                 raise InputError(f"{name}: wanted finite logits between -300 and 300")
         return cls(
@@ -331,7 +331,7 @@ class OccupancyProcess:
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Self:
-        """Read what `to_file` wrote; InputError names the file and what is wrong with it."""
+        """Read a file written by `to_file`; InputError names the file and the problem."""
         content = _FORMAT.read(path)
         wanted = set(_FIELDS)
         if content.keys() != wanted:
@@ -343,7 +343,7 @@ class OccupancyProcess:
             raise InputError(f"{path}: {error}") from error
 
     def to_file(self, path: str | os.PathLike[str]) -> None:
-        """Write as JSON; a file that is there stays whole until the new one is complete."""
+        """Write as JSON, replacing an existing file atomically."""
         rates = {name: getattr(self, name).tolist() for name in _FIELDS}
         _FORMAT.write(path, rates)
 
@@ -358,17 +358,16 @@ class OccupancyProcess:
         return address_of(self.record, PROCESS)
 
     def take(self, slots: ArrayLike) -> "OccupancyProcess":
-        """Process of a lot whose slot i has the rates of our slot `slots[i]`; (n,) int64."""
+        """Return a process whose slot i has the rates of this process's slot `slots[i]`; (n,) int64."""
         arrival, departure = self.factors[:, np.asarray(slots, np.int64)]
         return OccupancyProcess(arrival, self.arrival_profile, departure, self.departure_profile)
 
     def mapped_to_lot(self, walk_m: ArrayLike) -> "OccupancyProcess":
-        """Process of a lot of any size, from ours by rank: the fullest slots go nearest to the goal.
+        """Map the process by rank to a lot of any size: the fullest slots go nearest to the goal.
 
         Args:
-            walk_m: (n,) float64, m, walking distance from each slot of that lot to its goal. The slot of
-                rank r among them gets the rates of our slot of rank r * n_slots // n by mean occupancy over
-                the week.
+            walk_m: (n,) float64, m, walking distance from each slot of that lot to its goal. The slot of rank r gets
+                the rates of this process's slot of rank r * n_slots // n by mean occupancy over the week.
         """
         walk = np.asarray(walk_m, float)
         mean = np.mean([self.marginal(hour * HOUR_S) for hour in range(WEEK_HOURS)], axis=0)
@@ -378,7 +377,7 @@ class OccupancyProcess:
         return self.take(slots)
 
     def at_mean_occupancy(self, target: float, time: float) -> "OccupancyProcess":
-        """Process with all arrival rates scaled alike, so that the lot's mean marginal at `time` is `target`.
+        """Scale all arrival rates by one factor such that the lot's mean marginal at `time` is `target`.
 
         Scaling the arrival rates shifts every slot's attraction by the same logit.
         """
@@ -401,23 +400,23 @@ class OccupancyProcess:
         return scaled(brentq(excess, low, high, xtol=1e-10))
 
     def marginal(self, time: float) -> FloatArray:
-        """(n,) float64: P(occupied) at `time`, before anything was observed."""
+        """Return P(taken) at `time` before any observation, (n,) float64."""
         _, hour, second = hour_of_week(float(time))
         marginals = np.empty(self.n_slots)
         _marginals(self.address, hour, second, marginals)
         return marginals
 
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
-        """Weekday and time of day, both uniform in the window."""
+        """Draw a weekday and a time of day, both uniform in the window."""
         index = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(window.weekdays))
         return Arrival(window.weekdays[index] * DAY_S + window.draw_second(key))
 
     def world(self, key: np.uint64, arrival: Arrival) -> ProcessWorld:
-        """The world of the episode with this key; it begins in a state drawn from the marginal."""
+        """Return the world of the episode with this key; its initial state is drawn from the marginal."""
         return ProcessWorld(self, key, arrival)
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """The marginal at the arrival, clipped to [0.001, 0.999], and the rates of that hour."""
+        """Return the marginal at the arrival, clipped to [0.001, 0.999], and the rates of that hour."""
         _, hour, _ = hour_of_week(float(arrival.time))
         rates = self.factors * self.profiles[:, hour, None]
         return Forecast(

@@ -1,8 +1,8 @@
-"""Maximum-likelihood rates of two-state chains that are seen only now and then.
+"""Maximum-likelihood rates of two-state chains from intermittent observations.
 
-Counting flips between looks misses every car that came and left unseen. Here each pair of consecutive looks
-counts with its exact transition probability (Kalbfleisch and Lawless, "The analysis of panel data under a
-Markov assumption", JASA 1985), so coarse looks give the same rates as fine ones.
+Counting state changes between observations misses every car that came and left in between. Here each pair of
+consecutive observations enters with its exact transition probability (Kalbfleisch and Lawless, "The analysis of panel
+data under a Markov assumption", JASA 1985), so the estimated rates do not depend on how often slots were observed.
 """
 
 import math
@@ -22,7 +22,7 @@ from sim_sensors.compilation import compiled
 if TYPE_CHECKING:
     from parkenv.world.occupancy_log import OccupancyLog
 
-# From once in 30 years to once a second; a rate that the looks say nothing of stops here.
+# From once in 30 years to once a second; bounds for rates that the observations do not determine.
 _LOG_RATE_BOUNDS = (math.log(1e-9), 0.0)
 _LOG_FACTOR_BOUNDS = (-8.0, 8.0)
 _TINY = 1e-300
@@ -35,17 +35,17 @@ _MAX_SCORES = 2 * _MAX_PIECES + 2
 
 @dataclass(frozen=True, eq=False)
 class FittedProcess:
-    """A process fitted to a log, with what is needed to judge it.
+    """A process fitted to a log, with standard errors and log-likelihood.
 
     Args:
-        process: slot i of it is slot_ids[i]; each kind of factor has the geometric mean 1.
+        process: the process; its slot i is slot_ids[i], and each kind of factor has the geometric mean 1.
         slot_ids: the log's slots.
-        log_likelihood: of all intervals, without the prior.
-        n_intervals: pairs of consecutive looks that were used.
+        log_likelihood: log-likelihood of all intervals, without the prior.
+        n_intervals: number of pairs of consecutive observations used.
         arrival_factor_se: (n,) float64, standard error of the factor's natural logarithm.
-        arrival_profile_se: (168,) float64, likewise; NaN in hours that were never observed.
-        departure_factor_se: (n,) float64, likewise.
-        departure_profile_se: (168,) float64, likewise.
+        arrival_profile_se: (168,) float64, the same for the profile; NaN in hours that were never observed.
+        departure_factor_se: (n,) float64, as for arrivals.
+        departure_profile_se: (168,) float64, as for arrivals.
     """
 
     process: OccupancyProcess
@@ -59,14 +59,14 @@ class FittedProcess:
 
 
 def fit_constant_rates(dt: ArrayLike, start: ArrayLike, end: ArrayLike) -> tuple[float, float]:
-    """Arrival and departure rate, 1/s, of chains with constant rates, by maximum likelihood.
+    """Fit constant arrival and departure rates, 1/s, by maximum likelihood.
 
     P(occupied at t+dt | x) = π + (x−π)·exp(−(λ+μ)·dt), π = λ/(λ+μ). Rates stay between 1e-9/s and 1/s; a kind
-    of flip that never happened gets 1e-9/s.
+    of change that was never observed gets 1e-9/s.
 
     Args:
-        dt: (k,) float64, s, > 0, time between two looks.
-        start: (k,) bool, taken at the first look.
+        dt: (k,) float64, s, > 0, time between two observations.
+        start: (k,) bool, taken at the first observation.
         end: (k,) bool, taken at the second.
     """
     dt, start, end = np.asarray(dt, float), np.asarray(start, bool), np.asarray(end, bool)
@@ -94,8 +94,8 @@ def fit_constant_rates(dt: ArrayLike, start: ArrayLike, end: ArrayLike) -> tuple
         by_rate = by_total + (by_share - by_share @ share) / total
         return value / dt.size, by_rate * rate / dt.size
 
-    # Flips per second watched never exceed the true rates by much: the start lies below the plateau where
-    # looks are so rare against the rates that their order tells nothing.
+    # Observed changes per second hardly exceed the true rates. So the start lies below the plateau where observations
+    # are so rare relative to the rates that their order carries no information.
     flips, watched = np.array([take.sum(), leave.sum()]), n.sum(axis=0) @ gaps
     lowest, highest = np.exp(_LOG_RATE_BOUNDS)
     first = np.log(np.clip(flips / np.maximum(watched, gaps[0]), lowest, highest))
@@ -119,9 +119,9 @@ def _score(
     index: IntArray,
     score: FloatArray,
 ) -> tuple[float, int]:
-    """Log-probability of one interval, and m; its derivatives by `theta[index[:m]]` go to `score[:m]`.
+    """Return the log-probability of one interval, and m; derivatives by `theta[index[:m]]` go to `score[:m]`.
 
-    Forward, p = P(occupied) is carried through each piece of constant rates; backward, the adjoint of p.
+    The forward pass propagates p = P(occupied) through the pieces of constant rates, the backward pass its adjoint.
     """
     begun = np.empty(_MAX_PIECES)
     hour = int(start // HOUR_S)
@@ -135,7 +135,7 @@ def _score(
         total = arrival + rates[_N_BINS + bin_] * rates[at_departure]
         begun[pieces] = p
         p += (arrival / total - p) * -math.expm1(-total * (stop - start))
-        # Kept for the way back: the piece's duration.
+        # Keep the piece's duration for the backward pass.
         score[2 * pieces] = stop - start
         start = stop
         pieces += 1
@@ -178,11 +178,11 @@ def log_likelihood(
     before: BoolArray,
     after: BoolArray,
 ) -> tuple[float, FloatArray]:
-    """Log-likelihood of intervals between looks, and its gradient (compiled).
+    """Return the log-likelihood of intervals between observations, and its gradient (compiled).
 
     Args:
         theta: (96 + 2n,) float64, natural logarithms: arrival profile in 1/s (24 hours of a weekday, 24 of a
-            weekend day), departure profile likewise, arrival factors (n,), departure factors (n,).
+            weekend day), departure profile in the same order, arrival factors (n,), departure factors (n,).
         slot: (k,) int64.
         first_bin: (k,) int64, 0 on a weekday, 24 on a weekend day.
         start: (k,) float64, s of the day.
@@ -214,7 +214,7 @@ def _information(
     before: BoolArray,
     after: BoolArray,
 ) -> FloatArray:
-    """Empirical Fisher information: the sum of the outer products of the intervals' scores."""
+    """Return the empirical Fisher information: the sum of the outer products of the intervals' scores."""
     rates = np.exp(theta)
     n = (theta.size - 2 * _N_BINS) // 2
     index, score = np.empty(_MAX_SCORES, np.int64), np.empty(_MAX_SCORES)
@@ -230,24 +230,24 @@ def _information(
 def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float = 2.0) -> FittedProcess:
     """Fit an `OccupancyProcess` to a log by maximum likelihood.
 
-    Rates are a factor per slot times a profile per hour, one profile for weekdays and one for weekend days.
-    All pairs of consecutive looks on a day, no longer than `max_gap_s` apart, count; they are split exactly
-    at full hours. A weak log-normal prior keeps what never changed from running off to zero: each profile
-    value has its median at the constant rate of its class of day, each factor at 1, and the logarithm's
-    standard deviation is `prior_sd`.
+    A rate is a factor per slot times a profile per hour, with one profile for weekdays and one for weekend days. All
+    pairs of consecutive observations on a day at most `max_gap_s` apart are used, split exactly at full hours. A weak
+    log-normal prior keeps the rates of slots and hours without changes from going to zero: the median of each profile
+    value is the constant rate of its class of day, that of each factor is 1, and the standard deviation of the
+    logarithm is `prior_sd`.
 
-    Hours never observed: between observed hours the nearest observed one stands (the earlier, if equally
-    near). Before a day's first and after its last observed hour the lot comes to rest at the mean state of
-    the days' first looks, fast enough that the morning finds e⁻⁵ of the evening before: what the night did
-    is not known, but the morning is right. A class of day never observed takes the other's profile.
+    Hours that were never observed: between observed hours, the nearest observed one applies (the earlier one of two
+    equally near). Before a day's first and after its last observed hour, the lot relaxes to the mean state of the days'
+    first observations, fast enough that e⁻⁵ of the evening's state is left in the morning: the night is unknown, but
+    the morning is right. A class of day that was never observed gets the other's profile.
 
     Args:
-        log: looks.
+        log: the observations.
         max_gap_s: s, longest interval used.
         prior_sd: no unit, standard deviation of the logarithms under the prior.
 
     Raises:
-        InputError: no two looks at a slot on one day within `max_gap_s`.
+        InputError: no two observations of a slot on one day within `max_gap_s`.
     """
     if not prior_sd > 0:
         raise InputError(f"prior_sd: got {prior_sd}, wanted a number > 0")
@@ -290,7 +290,7 @@ def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float 
     begins = log.first[:-1][np.diff(log.first) > 0]
     for k in np.unique(kind):
         resting = log.occupied[begins[log.weekend[log.day[begins]] == k]]
-        # Half a look on either side keeps the logit finite.
+        # Half an observation of each state keeps the logit finite.
         at_rest = (resting.sum() + 0.5) / (resting.size + 1)
         _fill_unobserved(profile[:, k], observed[k], at_rest, factor)
         if not observed[1 - k].any():
@@ -315,7 +315,7 @@ def _split(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _centring(n: int) -> FloatArray:
-    """Matrix that moves the factors' geometric mean into the profiles: only their product is determined."""
+    """Return the matrix that moves the factors' geometric mean into the profiles: only their product is determined."""
     centring = np.eye(2 * _N_BINS + 2 * n)
     for side in range(2):
         bins = slice(side * _N_BINS, (side + 1) * _N_BINS)
@@ -326,14 +326,14 @@ def _centring(n: int) -> FloatArray:
 
 
 def _observed_hours(kind: IntArray, start: FloatArray, end: FloatArray) -> BoolArray:
-    """(2, 24) bool: does any interval reach into that hour of that class of day?"""
+    """Return whether any interval overlaps each hour of each class of day, (2, 24) bool."""
     hours = np.arange(_DAY_HOURS) * HOUR_S
     inside = (start[:, None] < hours + HOUR_S) & (end[:, None] > hours)
     return np.stack([inside[kind == k].any(axis=0) for k in range(2)])
 
 
 def _fill_unobserved(profile: FloatArray, observed: BoolArray, at_rest: float, factor: FloatArray) -> None:
-    """Fill in the log rates (2, 24) of one class of day where never observed; the rule is fit_process's."""
+    """Fill in the log rates (2, 24) of unobserved hours of one class of day; `fit_process` describes the rule."""
     hours = np.flatnonzero(observed)
     for hour in np.flatnonzero(~observed):
         profile[:, hour] = profile[:, hours[np.argmin(np.abs(hours - hour))]]
@@ -344,12 +344,12 @@ def _fill_unobserved(profile: FloatArray, observed: BoolArray, at_rest: float, f
         return float(expit(odds + shift).mean()) - at_rest
 
     reach = float(np.abs(odds).max()) + 50.0
-    # The day before may be of the other class, so the forgetting is left to the hours after midnight.
+    # The previous day may be of the other class, so the relaxation happens in the hours after midnight.
     duration = HOUR_S * (hours[0] or _DAY_HOURS - 1 - hours[-1] or 1)
     profile[1, night] = math.log(_NIGHT_MEMORY / duration * (1 - at_rest))
     profile[0, night] = profile[1, night] + brentq(excess, -reach, reach)
 
 
 def _week(by_class: FloatArray) -> FloatArray:
-    """(2, 2, 24) by class of day to (2, 168) by hour of the week."""
+    """Convert (2, 2, 24) by class of day to (2, 168) by hour of the week."""
     return np.concatenate([np.tile(by_class[:, 0], 5), np.tile(by_class[:, 1], 2)], axis=1)

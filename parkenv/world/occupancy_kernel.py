@@ -1,10 +1,11 @@
-"""Whether a slot is taken at a time, compiled: the one place where the hidden truth is computed.
+"""The compiled hidden occupancy: whether a slot is taken at a time.
 
 There are two kinds of worlds. In a process, every slot is a two-state Markov chain whose random numbers are a pure
 function of (key, slot, sojourn), so a state can be computed for any slot at any time in any order. A recorded day is
-read off a log. The worlds of `parkenv.world`, the search environment and its batch all call these functions.
+read from a log. The worlds of `parkenv.world`, the search environment and its batch all call these functions; the
+hidden occupancy is computed nowhere else.
 
-A *sojourn* is a stretch of time in which the state of a slot does not change.
+A *sojourn* is a period in which the state of a slot does not change.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from parkenv.world.pointers import ADDRESS, float64s, int64s, record_at, uint8s
 from parkenv.world.week import DAY_HOURS, DAY_S, HOUR_S, WEEK_HOURS, WEEK_S, hour_of_week
 from sim_sensors.compilation import compiled
 
-# No forecast is certain: a planner must be able to recover from a wrong one.
+# Forecasts are never certain, so that a planner can recover from a wrong one.
 MIN_PROBABILITY = 0.001
 MAX_PROBABILITY = 0.999
 
@@ -29,11 +30,11 @@ PRIOR_DAYS = 1.0
 
 _NEVER_WEEKS = 1e9
 _FORGOTTEN = 1e-17
-# The lower bound of a sojourn's end is taken this much earlier than computed, for rounding.
+# Safety factor against rounding for the lower bound of a sojourn's end.
 _SAFE = 1.0 - 1e-6
 _MOMENT_S = 1e-6
 
-# Without numba's reference counting, which would take most of a step's time: no kernel allocates anything.
+# No numba reference counting, which would take most of a step's time: the kernels allocate nothing.
 kernel = compiled(error_model="numpy", _nrt=False)
 inlined = compiled(error_model="numpy", _nrt=False, forceinline=True)
 
@@ -47,10 +48,10 @@ PROCESS = np.dtype(
     ],
     align=True,
 )
-"""An `OccupancyProcess`: addresses of its arrays. Rows of the first three are the states that are left.
+"""An `OccupancyProcess`: addresses of its arrays; a row of the first three is the state before the change.
 
-factors (2, n_slots); profiles (2, 168), 1/s; hazards (2, 169), the profiles summed up from Monday 00:00, at full hours;
-hourly_marginals (168, n_slots), P(taken) at full hours, computed when first needed; 0 before. All float64.
+factors (2, n_slots); profiles (2, 168), 1/s; hazards (2, 169), integrals of the profiles from Monday 00:00 to full
+hours; hourly_marginals (168, n_slots), P(taken) at full hours, computed when first needed, 0 before. All float64.
 """
 
 RECORDED_DAY = np.dtype(
@@ -69,7 +70,7 @@ RECORDED_DAY = np.dtype(
     ],
     align=True,
 )
-"""A day of a log that is replayed on a lot: fields of `MappedLog` and `OccupancyLog`, and midnight, s since Monday."""
+"""A log day replayed on a lot: fields of `MappedLog` and `OccupancyLog`, and its midnight, s since Monday 00:00."""
 
 CURSOR_FIELDS = [
     ("sojourn", np.int32),
@@ -79,10 +80,10 @@ CURSOR_FIELDS = [
     ("end_known", np.bool_),
 ]
 CURSOR = np.dtype(CURSOR_FIELDS, align=True)
-"""What has been computed of one slot's truth.
+"""The computed part of one slot's true state.
 
-sojourn: number of the sojourn, from 1; 0 before anything was computed. since: its begin, s. valid_until: s, the state
-surely lasts until then, and ends exactly then if end_known. Other records with these fields serve as well.
+sojourn: number of the sojourn, from 1; 0 before the first query. since: its begin, s. valid_until: s, the state lasts
+at least until then, and ends exactly then if end_known. Other records with these fields can be used as well.
 """
 
 process_at, recorded_day_at, cursor_at = record_at(PROCESS), record_at(RECORDED_DAY), record_at(CURSOR)
@@ -103,10 +104,10 @@ def process_state(
 
     Args:
         process: a PROCESS record.
-        key: of the world.
-        arrival: when the world begins, s since Monday 00:00.
-        hour: of the week, of the arrival.
-        second: of that hour.
+        key: key of the world.
+        arrival: begin of the world, s since Monday 00:00.
+        hour: hour of the week of the arrival.
+        second: second of that hour.
         slot: index of the slot.
         cursor: its cursor, changed in place.
         time: s, not before the cursor's sojourn began.
@@ -132,7 +133,7 @@ def _enter_first_sojourn(
     occupied = keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < p
     cursor.sojourn, cursor.since, cursor.occupied, cursor.end_known = 1, arrival, occupied, False
     # The sojourn ends when its hazard reaches -log(u), which is more than 1 - u; until the hour ends the rate is
-    # constant. Mostly this bound is late enough, and spares us the exact end.
+    # constant. This bound is usually late enough, so the exact end need not be computed.
     state = 1 if occupied else 0
     factor = float64s(process.factors)[state * process.n_slots + slot]
     rate = factor * float64s(process.profiles)[state * WEEK_HOURS + hour]
@@ -145,7 +146,7 @@ def _enter_first_sojourn(
 
 @kernel
 def find_sojourn_end(process: Any, key: np.uint64, slot: int, cursor: Any) -> None:
-    """Compute exactly when the cursor's sojourn ends, unless that is known."""
+    """Compute the exact end of the cursor's sojourn, unless it is known."""
     if cursor.end_known:
         return
     state = 1 if cursor.occupied else 0
@@ -161,7 +162,7 @@ def find_sojourn_end(process: Any, key: np.uint64, slot: int, cursor: Any) -> No
 
 @kernel
 def _time_after(profile: int, hazards: int, since: float, hazard: float) -> float:
-    """Return when the hazard of a slot of factor 1, gathered from `since` on, reaches `hazard`.
+    """Return when the hazard of a slot with factor 1, integrated from `since` on, reaches `hazard`.
 
     Args:
         profile: address of (168,) rates, 1/s.
@@ -176,7 +177,7 @@ def _time_after(profile: int, hazards: int, since: float, hazard: float) -> floa
     if not more_weeks < _NEVER_WEEKS:
         return np.inf
     rest = target - more_weeks * sums[WEEK_HOURS]
-    # sums[hour] < rest <= sums[hour + 1], hence a positive rate, but for rounding at the ends.
+    # sums[hour] < rest <= sums[hour + 1], hence a positive rate, except for rounding at the ends.
     hour = min(max(_count_below(hazards, 0, WEEK_HOURS + 1, rest, False) - 1, 0), WEEK_HOURS - 1)
     second = min((rest - sums[hour]) / rates[hour], HOUR_S) if rates[hour] > 0.0 else 0.0
     end: float = max((week + more_weeks) * WEEK_S + hour * HOUR_S + second, since)
@@ -185,8 +186,8 @@ def _time_after(profile: int, hazards: int, since: float, hazard: float) -> floa
 
 @kernel
 def _count_below(address: int, begin: int, end: int, value: float, equal_too: bool) -> int:
-    """Return how many of the ascending float64 from `begin` to `end` are below `value`, or equal to it as well."""
-    # Bisection by hand: numpy's, in compiled code, takes half a second to compile.
+    """Count the ascending float64 from `begin` to `end` below `value`; equal ones count with `equal_too`."""
+    # Own bisection: numpy's takes half a second to compile.
     values, low, high = float64s(address), begin, end
     while low < high:
         middle = (low + high) >> 1
@@ -212,18 +213,18 @@ def process_forecast(process: Any, hour: int, second: float, slot: int) -> tuple
 
 @inlined
 def marginal_later(start: float, arrival: float, rate: float, second: float) -> float:
-    """Return P(taken) `second` s after it was `start`; rates of arrival, and of arrival plus departure, constant."""
+    """Return P(taken) `second` s after it was `start`, with constant rates of arrival and arrival plus departure."""
     equilibrium = arrival / rate if rate > 0.0 else 0.0
     return float(equilibrium + (start - equilibrium) * decay_factor(rate * second))
 
 
 @kernel
 def _marginal_at_hour(process: Any, now: int, slot: int) -> float:
-    """Compute and keep P(taken) when hour `now` of the week begins.
+    """Compute and store P(taken) at the beginning of hour `now` of the week.
 
-    It is the periodic regime of p' = λ(t)(1-p) - μ(t)p. The affine map over the week that ends at `now` is gathered
-    backwards, latest hour first, so it stops as soon as the past is forgotten. A slot that never changes has no
-    regime; it gets 0.5.
+    It is the periodic solution of p' = λ(t)(1-p) - μ(t)p. The affine map over the week that ends at `now` is
+    accumulated backwards, latest hour first, until earlier hours have no more influence. A slot that never changes has
+    no unique solution; it gets 0.5.
     """
     n = process.n_slots
     factors, profiles = float64s(process.factors), float64s(process.profiles)
@@ -248,7 +249,7 @@ def _marginal_at_hour(process: Any, now: int, slot: int) -> float:
 
 @kernel
 def keep_hourly_marginals(process: Any, hour: int) -> None:
-    """Compute P(taken) of all slots at the beginning of an hour of the week, where that is not known yet."""
+    """Compute P(taken) of all slots at the beginning of an hour of the week, unless already stored."""
     n = process.n_slots
     start = float64s(process.hourly_marginals)
     missing = 0
@@ -262,7 +263,7 @@ def keep_hourly_marginals(process: Any, hour: int) -> None:
 
 @inlined
 def recorded_look(day: Any, slot: int, second: float) -> int:
-    """Return the index of the look of the log that tells the state of a slot at a second of a recorded day."""
+    """Return the index of the log's observation that defines a slot's state at a second of a recorded day."""
     record = int64s(day.record)[slot]
     begin, end = int64s(day.first)[record], int64s(day.first)[record + 1]
     look: int = begin + _count_below(day.from_s, begin, end, second, True) - 1
@@ -276,7 +277,7 @@ def recorded_state(day: Any, slot: int, cursor: Any, time: float) -> bool:
     Args:
         day: a RECORDED_DAY record.
         slot: index of the lot's slot.
-        cursor: changed in place; its sojourn is not counted.
+        cursor: its cursor, changed in place; sojourns are not counted.
         time: s since Monday 00:00.
     """
     look = recorded_look(day, slot, time - day.midnight)
@@ -291,8 +292,8 @@ def recorded_state(day: Any, slot: int, cursor: Any, time: float) -> bool:
 def recorded_forecast(day: Any, slot: int, second: float) -> float:
     """Return P(taken) of a slot at a second of a recorded day, from the hour around it on the other days.
 
-    The mean of the days that the world does not replay is shrunk by a Beta prior worth `PRIOR_DAYS` to the mean of all
-    slots of the log.
+    The mean over the days that the world does not replay is shrunk by a Beta prior worth `PRIOR_DAYS` to the mean of
+    all slots of the log.
     """
     share, lot_share = float64s(day.share), float64s(day.lot_share)
     log_slot = int64s(day.log_slot)[slot]

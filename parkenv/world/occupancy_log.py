@@ -1,8 +1,8 @@
-"""Recorded occupancy: a log of looks at slots.
+"""Recorded occupancy: a log of observations of slots.
 
-Between looks the last known state holds; in a gap longer than `max_gap_s`, the state of the look nearest in
-time. Before a day's first look its first state holds, after its last look its last. A slot that was not seen
-at all on a day has no record of that day.
+Between observations the last known state holds; in a gap longer than `max_gap_s`, the state of the observation nearest
+in time. Before a day's first observation the first state holds, after its last observation the last one. A slot that
+was not observed on a day has no record of that day.
 """
 
 import csv
@@ -32,12 +32,12 @@ _KNOWN = ("datetime", "camera", "slot_id", "weather", "occupied")
 
 
 def weekday_of(day: str) -> int:
-    """Monday = 0 ... Sunday = 6, of an ISO date."""
+    """Return the weekday of an ISO date, Monday = 0 ... Sunday = 6."""
     return date.fromisoformat(day).weekday()
 
 
 def day_class(day: str) -> DayClass:
-    """`weekday` or `weekend`, of an ISO date.
+    """Return the class of an ISO date, `weekday` or `weekend`.
 
     >>> day_class("2015-11-12"), day_class("2015-11-21")
     ('weekday', 'weekend')
@@ -53,10 +53,10 @@ def _is_date(text: str) -> bool:
 
 
 class Intervals(NamedTuple):
-    """Pairs of consecutive looks at one slot on one day; each field (k,).
+    """Pairs of consecutive observations of one slot on one day; each field (k,).
 
-    slot and day are int64 indices; start and end float64 seconds of the day, end > start; before and after
-    say whether the slot was taken then.
+    slot and day are int64 indices; start and end are float64 seconds of the day, end > start; before and after are the
+    states at start and end, True if taken.
     """
 
     slot: IntArray
@@ -70,27 +70,27 @@ class Intervals(NamedTuple):
 class _Hours(NamedTuple):
     """Seconds per (slot, day, hour of the day), each (m, n_days, 24) float64."""
 
-    replayed: FloatArray  # taken, over the whole day as it is replayed
-    occupied: FloatArray  # taken, between the day's first and last look only
-    seen: FloatArray  # between the day's first and last look
+    replayed: FloatArray  # taken, over the whole replayed day
+    occupied: FloatArray  # taken, only between the day's first and last observation
+    seen: FloatArray  # between the day's first and last observation
 
 
 @dataclass(frozen=True, eq=False)
 class OccupancyLog:
-    """What looks at the slots of a lot found, day by day.
+    """Observations of the slots of a lot over several days.
+
+    They are sorted by day, slot and time. Of several observations of a slot at the same time (by several cameras), only
+    the last in the input is kept.
 
     Args:
         slot_ids: the log's slots.
         days: recorded days, ISO dates, ascending.
-        slot: (k,) int64, index of the slot that a look saw.
+        slot: (k,) int64, index of the observed slot.
         day: (k,) int64, index of the day.
         second: (k,) float64, s since that day's midnight, in [0, 86400).
-        occupied: (k,) bool, what the look found.
+        occupied: (k,) bool, observed state.
         max_gap_s: s, longest gap over which the last known state holds to the end.
-        source: the name that error messages give to the log.
-
-    The looks are kept sorted by day, slot and time; of several looks at a slot at one instant (by several
-    cameras) only the last in the input is kept.
+        source: name of the log in error messages.
     """
 
     slot_ids: tuple[str, ...]
@@ -101,7 +101,7 @@ class OccupancyLog:
     occupied: BoolArray
     max_gap_s: float = MAX_GAP_S
     source: str = "occupancy log"
-    # Record r = day * n_slots + slot: looks first[r] to first[r + 1]. A look's state holds from from_s on.
+    # Record r = day * n_slots + slot: observations first[r] to first[r + 1]. Each state holds from from_s on.
     first: IntArray = field(init=False, repr=False)
     from_s: FloatArray = field(init=False, repr=False)
 
@@ -128,7 +128,7 @@ class OccupancyLog:
         slot, day, second, occupied = slot[order], day[order], second[order], occupied[order]
         first = np.searchsorted(record, np.arange(len(self.slot_ids) * len(self.days) + 1))
         gap = np.diff(second, prepend=second[0])
-        # In a long gap the state changes half-way, where the later look becomes the nearer one.
+        # In a long gap the state changes half-way, where the later observation becomes the nearer one.
         from_s = np.where(gap > self.max_gap_s, second - gap / 2, second)
         from_s[np.diff(record, prepend=-1) > 0] = 0.0
         arrays = {"slot": slot, "day": day, "second": second, "occupied": occupied}
@@ -143,16 +143,15 @@ class OccupancyLog:
     def read(cls, path: str | os.PathLike[str], max_gap_s: float = MAX_GAP_S) -> Self:
         """Read a CSV file, gzipped if its name ends in `.gz`.
 
-        Columns: `datetime` (ISO, local time), `slot_id`, `occupied` (0 or 1); `camera` and `weather` may be
-        there and are not used.
-        A slot may be seen by several cameras; its looks must be in order of time.
+        Columns: `datetime` (ISO, local time), `slot_id`, `occupied` (0 or 1); `camera` and `weather` are allowed and
+        ignored. Several cameras may observe a slot; its observations must be in order of time.
 
         Raises:
             InputError: names the file, and the line and value where there is one.
         """
         path = Path(path)
         slots: dict[str, int] = {}
-        moments: dict[str, datetime] = {}  # one look at many slots: many lines, one text
+        moments: dict[str, datetime] = {}  # one image shows many slots: many lines have the same text
         latest: dict[str, datetime] = {}
         looks: list[tuple[int, datetime, bool]] = []
         with csv_rows(path) as rows:
@@ -194,11 +193,11 @@ class OccupancyLog:
 
     @cached_property
     def weekend(self) -> BoolArray:
-        """(n_days,) bool: is the day a Saturday or a Sunday?"""
+        """(n_days,) bool, whether the day is a Saturday or Sunday."""
         return np.array([day_class(day) == "weekend" for day in self.days], bool)
 
     def intervals(self, max_gap_s: float = MAX_GAP_S) -> Intervals:
-        """Pairs of consecutive looks at one slot on one day, at most `max_gap_s` apart."""
+        """Return the pairs of consecutive observations of one slot on one day, at most `max_gap_s` apart."""
         same_record = (np.diff(self.slot) == 0) & (np.diff(self.day) == 0)
         earlier = np.flatnonzero(same_record & (np.diff(self.second) <= max_gap_s))
         later = earlier + 1
@@ -214,15 +213,15 @@ class OccupancyLog:
     def mean_occupancy(
         self, kind: DayClass, hours: tuple[int, int] = (0, DAY_HOURS), days: BoolArray | None = None
     ) -> FloatArray:
-        """(m,) float64: share of the time that each slot was taken, between the days' first and last looks.
+        """Return the fraction of time each slot was taken, between the days' first and last observations.
 
         Args:
             kind: class of the days.
-            hours: first hour of the day, and the hour before which to stop.
-            days: (n_days,) bool, of which days; all by default.
+            hours: first hour of the day, and end hour (exclusive).
+            days: (n_days,) bool, selected days; all by default.
 
         Returns:
-            NaN for a slot that was not watched then.
+            (m,) float64; NaN for a slot that was not observed in these hours.
         """
         if kind not in ("weekday", "weekend"):
             raise InputError(f"class of day: got {kind!r}, wanted weekday or weekend")
@@ -236,12 +235,12 @@ class OccupancyLog:
 
     @property
     def recorded(self) -> BoolArray:
-        """(m, n_days) bool: was the slot seen at all on that day?"""
+        """(m, n_days) bool, whether the slot was observed on that day."""
         return (np.diff(self.first) > 0).reshape(len(self.days), -1).T
 
     @property
     def replayed_share(self) -> FloatArray:
-        """(m, n_days, 24) float64: share of each hour that the replay is taken; 0 without a record."""
+        """(m, n_days, 24) float64, fraction of each hour that the slot is taken in the replay; 0 without a record."""
         return self._hours.replayed / HOUR_S
 
     @cached_property
@@ -287,7 +286,7 @@ def _sum_hours(
 
 @contextmanager
 def csv_rows(path: Path) -> Iterator[Iterator[tuple[int, list[str]]]]:
-    """Rows of a CSV file with their line numbers; whatever cannot be read becomes an InputError."""
+    """Iterate over the rows of a CSV file with their line numbers; read errors become InputError."""
     width = 0
 
     def rows(file: TextIO) -> Iterator[tuple[int, list[str]]]:
@@ -315,7 +314,7 @@ def csv_rows(path: Path) -> Iterator[Iterator[tuple[int, list[str]]]]:
 def csv_columns(
     path: Path, rows: Iterator[tuple[int, list[str]]], known: Sequence[str], needed: Sequence[str]
 ) -> list[int]:
-    """Where the needed columns stand in the header."""
+    """Return the positions of the required columns in the header."""
     _, header = next(rows, (0, []))
     if not header:
         raise InputError(f"{path}: empty, wanted a header with the columns {', '.join(needed)}")

@@ -1,7 +1,7 @@
-"""Typed access from compiled code to arrays and records whose addresses stand in records.
+"""Typed access from compiled code to arrays and records by addresses stored in records.
 
-A kernel that takes one record, with the addresses of all that belongs to it, compiles several times as fast as one that
-takes a dozen arrays, and is cheap to call from Python. Whoever writes an address into a record keeps the array alive.
+A kernel that takes one record with the addresses of all its data compiles several times as fast as one that takes a
+dozen arrays, and is cheap to call from Python. Code that writes an address into a record must keep the array alive.
 """
 
 from __future__ import annotations

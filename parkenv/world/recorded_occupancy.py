@@ -35,10 +35,10 @@ from parkenv.world.week import DAY_S
 
 
 def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
-    """Read which slot of a log each slot of a lot replays.
+    """Read the mapping from the slots of a lot to the slots of a log.
 
     Args:
-        path: CSV file with the columns `slot_id` (of the lot) and `log_slot_id`, a line a slot.
+        path: CSV file with the columns `slot_id` (of the lot) and `log_slot_id`, one line per slot.
         lot_slot_ids: ids of the lot's slots, n.
         log: the log.
 
@@ -46,7 +46,7 @@ def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log:
         (n,) int64, indices into `log.slot_ids`, in the order of `lot_slot_ids`.
 
     Raises:
-        InputError: names file, line and value.
+        InputError: an invalid file; the message names file, line and value.
     """
     path = Path(path)
     log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
@@ -83,7 +83,7 @@ def _occupied(days: int, slots: IntArray, second: float, occupied: BoolArray) ->
 
 @kernel
 def _next_free(days: int, slots: IntArray, second: float, free_from: FloatArray) -> None:
-    """Write the second, not before `second`, from which each slot is free; inf if never."""
+    """Write the first second >= `second` at which each slot is free; inf if never."""
     day = recorded_day_at(days, 0)
     for i in range(slots.size):
         look, end = recorded_look(day, slots[i], second), int64s(day.first)[int64s(day.record)[slots[i]] + 1]
@@ -95,7 +95,7 @@ def _next_free(days: int, slots: IntArray, second: float, free_from: FloatArray)
 
 @kernel
 def _changes(days: int, slots: IntArray, second: float, count: IntArray) -> None:
-    """Write how often each slot's state has changed from its first look to `second`."""
+    """Write how often each slot's state has changed between its first observation and `second`."""
     day = recorded_day_at(days, 0)
     taken = uint8s(day.occupied)
     for i in range(slots.size):
@@ -112,16 +112,16 @@ def _forecast(days: int, second: float, p: FloatArray) -> None:
 
 
 class RecordedWorld:
-    """One recorded day, replayed; past the end of the day its last state holds."""
+    """A replayed recorded day; after the end of the day its last state holds."""
 
     def __init__(self, occupancy: "RecordedOccupancy", arrival: Arrival) -> None:
         self.arrival = arrival
-        self._occupancy = occupancy  # keeps what the record points to
+        self._occupancy = occupancy  # keeps the record's arrays alive
         self._day = occupancy.day_records([arrival.day])
         self._midnight = float(self._day["midnight"][0])
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
-        """(k,) bool: is each of the slots (k,) taken at `time`, which is at or after the arrival?"""
+        """(k,) bool, whether each of the slots (k,) is taken at `time`, at or after the arrival."""
         slots, second = self._checked(slots), self._second(time)
         occupied = np.empty(slots.size, np.bool_)
         _occupied(address_of(self._day, RECORDED_DAY), slots, second, occupied)
@@ -135,7 +135,7 @@ class RecordedWorld:
         return np.maximum(free_from + self._midnight, time)
 
     def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
-        """(k,) int64: how often the state of each slot has changed since the day's first look at it."""
+        """(k,) int64, how often the state of each slot has changed since its first observation of the day."""
         slots, second = self._checked(slots), self._second(time)
         count = np.empty(slots.size, np.int64)
         _changes(address_of(self._day, RECORDED_DAY), slots, second, count)
@@ -157,15 +157,15 @@ class RecordedWorld:
 
 
 class MappedLog(NamedTuple):
-    """The log mapped to the lot for one replayed day: what does not depend on the second of the arrival."""
+    """The log mapped to the lot for one replayed day, independent of the time of arrival."""
 
     log_slot: IntArray  # (n,)
     record: IntArray  # (n,)
-    held_out: frozenset[int]  # days that the world replays: the forecast must not know them
-    share: FloatArray  # (m * 24,) share of each hour taken, summed over the other days
-    lot_share: FloatArray  # (24,) the same, summed over the slots, too
-    n_days: IntArray  # (m,) other days with a record
-    n_records: int  # all of them
+    held_out: frozenset[int]  # days that the world replays; the forecast must not use them
+    share: FloatArray  # (m * 24,) fraction of each hour taken, summed over the other days
+    lot_share: FloatArray  # (24,) the same, also summed over the slots
+    n_days: IntArray  # (m,) number of other days with a record
+    n_records: int  # sum of n_days
     decay_rate: float
 
 
@@ -175,16 +175,15 @@ class RecordedOccupancy:
 
     The lot's slots, nearest to the goal first, get the log's m slots, fullest first (mean occupancy on the
     days of the arrival's class, weekday or weekend): rank r gets log rank floor(r·m/n). If the lot is larger,
-    a log slot serves several lot slots: the k-th copy replays the k-th next recorded day of the class on
-    which the log slot was seen, cyclically, so no two slots share a record. If it is smaller, the ranks are
-    thinned evenly.
+    several lot slots share a log slot: the k-th copy replays the k-th next recorded day of the class on which the log
+    slot was observed, cyclically, so no two slots share a record. If it is smaller, the ranks are thinned evenly.
 
-    Nothing of the days that a world replays is used to map or to forecast it.
+    The days that a world replays are not used to map or forecast it.
 
     Args:
-        log: the recorded looks.
+        log: the recorded observations.
         walk_m: (n,) float64, m, walking distance from each slot to the goal.
-        mapping: (n,) int64, log slot of each lot slot, in place of the rule (see `read_mapping`).
+        mapping: (n,) int64, log slot of each lot slot, instead of this rule (see `read_mapping`).
     """
 
     log: OccupancyLog
@@ -210,13 +209,13 @@ class RecordedOccupancy:
         return int(self.walk_m.size)
 
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
-        """A recorded day, uniform among those on the window's weekdays, and a time of day, uniform in it."""
+        """Draw a recorded day among those on the window's weekdays, and a time of day, both uniform."""
         days = self.days_in(window)
         day = days[int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(days))]
         return Arrival(weekday_of(day) * DAY_S + window.draw_second(key), day)
 
     def days_in(self, window: ArrivalWindow) -> list[str]:
-        """The recorded days on the window's weekdays; InputError if there are none."""
+        """Return the recorded days on the window's weekdays; InputError if there are none."""
         days = [day for day in self.log.days if weekday_of(day) in window.weekdays]
         if not days:
             names = ",".join(DAY_NAMES[weekday] for weekday in window.weekdays)
@@ -224,16 +223,16 @@ class RecordedOccupancy:
         return days
 
     def world(self, key: np.uint64, arrival: Arrival) -> RecordedWorld:  # noqa: ARG002 - the day decides all
-        """The replay of the arrival's day."""
+        """Return the replay of the arrival's day."""
         self._at(arrival)
         return RecordedWorld(self, arrival)
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """What the other days of the class say of the hour around the arrival.
+        """Forecast the occupancy from the hour around the arrival on the other days of its class.
 
-        Per log slot the mean over the days that the world does not replay, shrunk by a Beta prior worth one
-        day to the mean of all the log's slots, and clipped to [0.001, 0.999]. The relaxation rate is that of
-        one chain with constant rates, fitted to all looks on those days.
+        P(taken) is the mean of a log slot over the days that the world does not replay, shrunk by a Beta prior worth
+        one day to the mean of all the log's slots, and clipped to [0.001, 0.999]. The decay rate is that of one chain
+        with constant rates, fitted to all observations on those days.
         """
         rate = self._at(arrival).decay_rate
         p = np.empty(self.n_slots)
@@ -242,7 +241,7 @@ class RecordedOccupancy:
         return Forecast(p, np.full(self.n_slots, rate))
 
     def day_records(self, days: Sequence[str]) -> NDArray[np.void]:
-        """(k,) of the dtype RECORDED_DAY: recorded days for compiled code; valid while this object lives."""
+        """Return recorded days for compiled code, (k,) of the dtype RECORDED_DAY; valid while this object lives."""
         log = self.log
         records = np.empty(len(days), RECORDED_DAY)
         for record, day in zip(records, days, strict=True):
@@ -269,7 +268,7 @@ class RecordedOccupancy:
         return self.mapped_log(arrival.day)
 
     def mapped_log(self, day: str) -> MappedLog:
-        """The log mapped to the lot for the replay of `day`, one of the log's."""
+        """Return the log mapped to the lot for the replay of `day`, a day of the log."""
         index = self.log.days.index(day)
         if index not in self._mapped_logs:
             self._mapped_logs[index] = self._map_log(index)
@@ -289,7 +288,7 @@ class RecordedOccupancy:
                 )
             log_slot = self._assign(log.days[day], others) if self.mapping is None else self.mapping
             days = self._replay_days(log_slot, replay_order)
-            # What is replayed must not have had a say in the ranks: rank again without it.
+            # Replayed days must not affect the ranks: rank again without them.
             if held_out.issuperset(days):
                 break
             held_out.update(days)
@@ -314,7 +313,7 @@ class RecordedOccupancy:
         )
 
     def _assign(self, day: str, others: BoolArray) -> IntArray:
-        """(n,) log slot of each lot slot, by the rule of the ranks."""
+        """Return the log slot of each lot slot by rank, (n,)."""
         n, m = self.n_slots, len(self.log.slot_ids)
         mean = self.log.mean_occupancy(day_class(day), days=others)
         unknown = np.isnan(mean)
@@ -326,7 +325,7 @@ class RecordedOccupancy:
         return log_slot
 
     def _replay_days(self, log_slot: IntArray, replay_order: IntArray) -> IntArray:
-        """(n,) day that each lot slot replays: copies of a log slot, nearest first, take the days in turn."""
+        """Return each lot slot's replay day, (n,): copies of a log slot, nearest first, cycle through the days."""
         recorded = self.log.recorded[:, replay_order]
         days = np.empty(self.n_slots, np.int64)
         left = {int(s): iter(replay_order[recorded[s]]) for s in np.unique(log_slot)}

@@ -1,4 +1,4 @@
-"""Scenarios: a lot, what stands in it, where people want to go, and what time costs."""
+"""Scenarios: a lot, its occupancy, the goal, speeds and costs."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ from parkenv.world.traffic import Traffic
 FloatArray = NDArray[np.float64]
 
 KMH = 1 / 3.6
-"""One kilometre an hour in metres a second."""
+"""1 km/h in m/s."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SearchProblem:
-    """What everybody may know of a search: the lot, the goal, speeds, costs, and how slots are seen.
+    """The public part of a search: lot, goal, speeds, costs and sensor model.
 
     Args:
         lot: the lot.
         goal: index into `lot.goals`.
-        v_drive: m/s (the thesis drives at 10 km/h).
-        v_walk: m/s (the thesis walks at 4 km/h).
-        failure_s: s that a try at a taken slot costs; planners are told the same figure.
-        wait_s: s that a move costs which the graph does not have (the thesis's Δt).
-        give_up_s: s that it costs to park elsewhere and walk, once the lot is proven full.
-        sensor_model: how slots are seen.
+        v_drive: driving speed, m/s (10 km/h in the thesis).
+        v_walk: walking speed, m/s (4 km/h in the thesis).
+        failure_s: cost of a failed parking attempt, s; planners use the same value.
+        wait_s: cost of a move that the graph does not have, s (the thesis's Δt).
+        give_up_s: give-up penalty, s: parking elsewhere and walking, once the lot is proven full.
+        sensor_model: range and error rates of observations.
 
     Raises:
-        InputError: a value out of its range, by name.
+        InputError: a value out of its range; the message names the field.
     """
 
     lot: ParkingLot
@@ -75,12 +75,12 @@ class SearchProblem:
 
     @cached_property
     def arrival_cost_s(self) -> FloatArray:
-        """What parking in each slot costs on arrival, (n_slots,) s: the walk and the price."""
+        """Cost of arriving in each slot, (n_slots,) s: walk plus parking cost."""
         return _read_only(self.walk_s + self.parking_cost_s)
 
     @property
     def parking_cost_s(self) -> FloatArray:
-        """Price of each slot times the inverse value of time, (n_slots,) s."""
+        """Parking cost of each slot as time, (n_slots,) s: price divided by the value of time."""
         return self.lot.slot_parking_cost_s
 
     @cached_property
@@ -90,7 +90,7 @@ class SearchProblem:
 
     @cached_property
     def action_masks(self) -> NDArray[np.int8]:
-        """(n_vertices, 5) 1 where the graph has the action: an edge to drive along, or a slot to park in."""
+        """(n_vertices, 5), 1 if the graph has the action: an edge to drive along, or a slot to park in."""
         masks = np.zeros((self.lot.n_vertices, len(ACTIONS)), dtype=np.int8)
         masks[:, :PARK] = self.lot.neighbors >= 0
         masks[: self.lot.n_slots, PARK] = 1
@@ -98,7 +98,7 @@ class SearchProblem:
 
     @cached_property
     def slots_in_view(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Slots seen from each vertex, ascending, in rows: `slots[starts[v]:starts[v + 1]]`."""
+        """Slots in view, as (starts, slots): for vertex v `slots[starts[v]:starts[v + 1]]`, ascending."""
         tree = cKDTree(self.lot.vertex_xy)
         # A slot's own vertex counts even at a range of 0.
         pairs = tree.query_pairs(self.sensor_model.view_range, output_type="ndarray")
@@ -112,10 +112,10 @@ class SearchProblem:
 
     @cached_property
     def sight_lines(self) -> tuple[FloatArray, NDArray[np.bool_]]:
-        """How far away each of `slots_in_view` is, m, and whether it is beside the car, row by row of it.
+        """Distance, m, of each of `slots_in_view`, and whether it is beside the car.
 
-        Distances are between vertices, as the view range is. A slot is beside a car that stands before it or another
-        slot if it lies to the right, within 45° of abreast.
+        Distances are between vertices, like the view range. A slot is beside a car at a slot's vertex if it lies to the
+        right, within 45° of the perpendicular.
         """
         starts, slots = self.slots_in_view
         viewer = np.repeat(np.arange(self.lot.n_vertices), np.diff(starts))
@@ -127,14 +127,14 @@ class SearchProblem:
 
     @cached_property
     def sensor_rates(self) -> SensorRates:
-        """How well each of `slots_in_view` is seen, row by row of it."""
+        """Sensor rates for each of `slots_in_view`."""
         return SensorRates(*map(_read_only, self.sensor_model.rates(*self.sight_lines)))
 
     def replace(self, **changes: Any) -> Self:
-        """A copy with some fields changed, checked again.
+        """Return a copy with some fields changed and validated.
 
         Raises:
-            InputError: a field that does not exist; the message lists the known ones.
+            InputError: an unknown field; the message lists the known ones.
         """
         known = [f.name for f in dataclasses.fields(self) if f.init]
         for name in changes:
@@ -145,16 +145,16 @@ class SearchProblem:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scenario(SearchProblem):
-    """A search problem together with the world it takes place in, which agents do not get to see.
+    """A search problem with its world, which is hidden from agents.
 
     Args:
-        name: a word for tables.
-        occupancy: what stands in the slots over time.
-        prior: whose forecast the car starts from; the occupancy's own where None. A prior that differs
-            from the world is a map that is out of date.
+        name: name for tables.
+        occupancy: true occupancy of the slots over time.
+        prior: model of the initial forecast; None: `occupancy`. A prior that differs from the world models an outdated
+            map.
         arrival: when searches start.
         entry: index into `lot.entries`; None draws one for each search.
-        traffic: what else moves in the lot, for those who look through sensors, and on driven trips.
+        traffic: other road users in the lot, visible to simulated sensors and on driven trips.
     """
 
     name: str
@@ -178,11 +178,11 @@ class Scenario(SearchProblem):
                 )
 
     def public(self) -> SearchProblem:
-        """What agents may know."""
+        """The public part, for agents."""
         return SearchProblem(**{f.name: getattr(self, f.name) for f in dataclasses.fields(SearchProblem)})
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """What the map predicts for a search that starts then."""
+        """Return the forecast for a search that starts at the arrival."""
         return (self.prior or self.occupancy).forecast(arrival)
 
 

@@ -1,4 +1,4 @@
-"""How well slots are seen from the lane."""
+"""The sensor model: range and error rates of slot observations from the lane."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from parkenv.files.versioned_json import JsonFormat
 FloatArray = NDArray[np.float64]
 
 SENSOR_MODEL_NAMES = ("laser", "stereo")
-"""Rigs for which the package brings what their stack was measured to see."""
+"""Rigs with a packaged fitted sensor model."""
 _FOLDER = Path(__file__).parent / "sensor_models"
 _FORMAT = JsonFormat("parkenv-sensor-model", 1, "a sighting model")
 
 
 class SensorRates(NamedTuple):
-    """How well each of k slots is seen.
+    """Sensor rates for k slots.
 
     Attributes:
-        seen: (k,) float64, P(a slot in view is made out at all).
-        hit: (k,) float64, P(looks taken | taken, seen).
-        false_alarm: (k,) float64, P(looks taken | free, seen).
+        seen: (k,) float64, P(a slot in view is observed).
+        hit: (k,) float64, P(observed taken | taken, observed).
+        false_alarm: (k,) float64, P(observed taken | free, observed).
     """
 
     seen: FloatArray
@@ -42,19 +42,18 @@ class SensorRates(NamedTuple):
 
 @dataclass(frozen=True)
 class SensorBand:
-    """How well slots are seen that lie at some distance, on one side.
+    """Sensor rates for slots within some distance, on one side.
 
     Args:
-        up_to: m, distance from the car to the slot's vertex; the nearest band that reaches holds.
-        beside: whether these are the slots on the right of a car that stands on its lane, where the thesis's camera
-            looks.
-        seen_rate: P(a slot in view is made out at all). What hides a slot goes on hiding it: who looks again from as
-            far away sees as much of it as before.
-        hit_rate: P(looks taken | taken).
-        false_alarm_rate: P(looks taken | free).
+        up_to: m, distance from the car to the slot's vertex; the nearest band that reaches the slot applies.
+        beside: whether the band is for slots to the right of a car on its lane, where the thesis's camera points.
+        seen_rate: P(a slot in view is observed). Occlusions persist: observing again from the same distance reveals
+            nothing new.
+        hit_rate: P(observed taken | taken).
+        false_alarm_rate: P(observed taken | free).
 
     Raises:
-        InputError: a rate outside [0, 1], a negative distance, or looks that say nothing (equal rates).
+        InputError: a rate outside [0, 1], a negative distance, or uninformative observations (equal rates).
     """
 
     up_to: float
@@ -73,17 +72,17 @@ class SensorBand:
 
 @dataclass(frozen=True)
 class SensorModel:
-    """How well a slot is seen from the lane.
+    """Range and error rates of slot observations from the lane.
 
     Args:
         view_range: m; a slot is in view while the car is within this distance of the slot's vertex. The
-            default shows the slot that the car stands at, its neighbours and those across the aisle.
-        hit_rate: P(looks taken | taken).
-        false_alarm_rate: P(looks taken | free).
-        bands: rates by distance and side, which go before these two where a band reaches.
+            default covers the slot at the car's vertex, its neighbours and those across the aisle.
+        hit_rate: P(observed taken | taken).
+        false_alarm_rate: P(observed taken | free).
+        bands: rates by distance and side; where a band applies, it overrides these two rates.
 
     Raises:
-        InputError: a rate outside [0, 1], a negative range, or looks that say nothing (equal rates).
+        InputError: a rate outside [0, 1], a negative range, or uninformative observations (equal rates).
     """
 
     view_range: float = 6.0
@@ -98,13 +97,13 @@ class SensorModel:
 
     @classmethod
     def named(cls, name: str) -> Self:
-        """How well the detection and mapping stack sees with a rig: what `parkenv fit-sensor-model` measured of it.
+        """Return the sensor model fitted to the perception stack with a rig by `parkenv fit-sensor-model`.
 
         Args:
-            name: `laser`, a camera and a 270° laser; `stereo`, a stereo pair alone.
+            name: `laser`, a camera and a 270° laser; `stereo`, only a stereo pair.
 
         Raises:
-            InputError: another name.
+            InputError: an unknown name.
 
         Examples:
             >>> SensorModel.named("laser").view_range
@@ -116,10 +115,10 @@ class SensorModel:
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Self:
-        """Read what `to_file` wrote.
+        """Read a file written by `to_file`.
 
         Raises:
-            InputError: it cannot be read; the message names the file and what is wrong with it.
+            InputError: the file cannot be read; the message names the file and the problem.
         """
         content = _FORMAT.read(path)
         try:
@@ -134,16 +133,16 @@ class SensorModel:
 
     @classmethod
     def blind(cls) -> Self:
-        """Nothing is seen of a slot before somebody tries to park there."""
+        """Return a model without observations: only a parking attempt reveals a slot's state."""
         return cls(0.0, bands=tuple(SensorBand(0.0, beside, 0.0, 1.0, 0.0) for beside in (False, True)))
 
     @property
     def perfect(self) -> bool:
-        """Whether every look shows the truth."""
+        """Whether all observations are error-free."""
         return not self.bands and self.hit_rate == 1.0 and self.false_alarm_rate == 0.0
 
     def rates(self, distance: FloatArray, beside: NDArray[np.bool_]) -> SensorRates:
-        """The rates of slots at given distances, (k,) m, beside the car or not, (k,) bool."""
+        """Return the rates of slots at given distances, (k,) m, beside the car or not, (k,) bool."""
         k = len(distance)
         rates = SensorRates(np.ones(k), np.full(k, self.hit_rate), np.full(k, self.false_alarm_rate))
         for band in sorted(self.bands, key=lambda band: -band.up_to):

@@ -38,8 +38,8 @@ _HALF_PERSON = np.array([0.35, 0.3])
 class Traffic:
     """Numbers of road users in a lot besides the searching car.
 
-    Traffic occupies no slots. In the search environments it blocks nothing and is only visible to the sensors. Where
-    the car is driven, on whole trips and in `parkenv/Drive-v1`, it and the road users yield to each other.
+    Traffic does not occupy slots. In the search environments it blocks nothing and is only visible to the sensors. On
+    driven trips and in `parkenv/Drive-v1`, the car and the road users yield to each other.
 
     Args:
         cars: number of cars that drive in loops along the lanes.
@@ -63,11 +63,11 @@ class LotTraffic:
     """The traffic of one world: a pure function of (lot, key, time).
 
     Args:
-        lot: with the lanes to drive and walk on.
+        lot: defines the lanes.
         goal: index of the goal that pedestrians walk to.
         traffic: numbers of cars and pedestrians.
-        key: of the world.
-        slots: provide the vehicle models.
+        key: key of the world.
+        slots: scene data of the lot; provides the vehicle models.
     """
 
     def __init__(self, lot: ParkingLot, goal: int, traffic: Traffic, key: np.uint64, slots: SlotLot) -> None:
@@ -80,7 +80,7 @@ class LotTraffic:
         ]
 
     def at(self, time: float, ego: FloatArray | None = None) -> Movers | None:
-        """Road users at a time.
+        """Return the road users at a time.
 
         Args:
             time: s.
@@ -111,7 +111,7 @@ class LotTraffic:
         return Movers(cars, model, people, stride, look)
 
     def poses_at(self, times: FloatArray) -> FloatArray:
-        """Poses of all road users, each at its own time, for traffic that waits.
+        """Return the poses of all road users, each at its own time, for traffic that waits.
 
         Args:
             times: (cars + pedestrians,) s, cars first.

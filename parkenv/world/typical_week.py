@@ -30,16 +30,16 @@ def typical_occupancy(
     demand: float = 0.0,
     mean_stay_s: float = 2 * 3600.0,
 ) -> OccupancyProcess:
-    """An occupancy process for a working week on any lot.
+    """Create an occupancy process for a working week on any lot.
 
     Args:
         lot: the lot.
         goal: index of the goal that drivers want to park near.
-        pull: logits by which demand for the nearest slot is above, and for the farthest below, that for the middle.
+        pull: logits by which the demand for the nearest slot is above, and for the farthest below, that of the middle.
         unevenness: standard deviation, in logits, of the demand for equally near slots. It is drawn from a fixed
-            seed: the same lot always has the same good and bad slots.
+            seed, so the same lot always has the same popular slots.
         demand: logits added at every hour.
-        mean_stay_s: mean time that a car stays, s.
+        mean_stay_s: mean parking duration, s.
     """
     walk = lot.walk_m(goal)
     span = float(np.ptp(walk)) or 1.0
@@ -51,14 +51,14 @@ def typical_occupancy(
 def with_event(
     usual: OccupancyProcess, lot: ParkingLot, *, goal: int = 0, share: float, factor: float
 ) -> OccupancyProcess:
-    """The process on a day with an event: cars arrive more often at the slots nearest to the goal.
+    """Create the process for a day with an event: cars arrive more often at the slots nearest to the goal.
 
     Args:
         usual: the process on ordinary days.
         lot: the lot.
         goal: index of the goal of the event.
-        share: fraction of the slots, the nearest ones, that the event fills.
-        factor: of their arrival rates.
+        share: fraction of the slots, nearest to the goal, that the event fills.
+        factor: factor of their arrival rates.
     """
     walk = lot.walk_m(goal)
     near = walk < np.quantile(walk, share)

@@ -1,4 +1,4 @@
-"""The scenario's week: its units of time, and where in it a moment lies."""
+"""Time within the scenario's week."""
 
 import numpy as np
 

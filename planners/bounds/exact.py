@@ -10,10 +10,10 @@ Three facts keep the state space small without loss of optimality (w is the arri
 between two slots):
 
 - Vertices that show nothing new need no decision: the car chooses among the *frontier*, the vertices that show
-something new and are reachable through vertices that do not.
+  something new and are reachable through vertices that do not.
 - A slot f' observed free can be left out if another free slot f is at least as good from there: w_f + D(f', f) <= w_f'.
 - The search ends when the best slot observed free, reached by a route that shows nothing new, costs no more than any
-other slot possibly could.
+  other slot possibly could.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class SearchSettings:
             the length of a search move, m. Cells are half as wide as a move is long.
         greed: weight of the heuristic, at least 1.
         most_expansions: number of expanded nodes after which an attempt fails.
-        patience: after the first path, the search expands this fraction of the nodes expanded so far.
+        patience: after the first path, the search expands further nodes, this fraction of those so far.
 
     Raises:
         InputError: a value out of its range.

@@ -1,9 +1,9 @@
-"""Reeds-Shepp curves: shortest obstacle-free paths of a car that drives forward and backward.
+"""Reeds-Shepp curves: shortest paths without obstacles of a car that drives forward and backward.
 
 After Reeds and Shepp, "Optimal paths for a car that goes both forwards and backwards", Pacific Journal of
-Mathematics 145 (1990): such a path is one of 48 words of at most five pieces, each a left turn, a right turn, both of
-the smallest radius, or straight. The words come from eight formulas (their section 8) and their mirror images in time,
-in the car's axis, and in the order of the pieces.
+Mathematics 145 (1990): such a path is one of 48 words of at most five pieces: left or right turns of the smallest
+radius, or straight lines. The words follow from eight formulas (their section 8) by reversing time, mirroring left and
+right, and reversing the order of the pieces.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def _turned(angle: float) -> float:
 
 @compiled(error_model="numpy")
 def _outer(u: float, v: float, xi: float, eta: float, phi: float) -> tuple[float, float]:
-    """First and last turn of a word of four turns, whose inner ones are u and v (their section 8, τ and ω)."""
+    """Return the first and last turn of a word of four turns with inner turns u and v (their section 8, τ and ω)."""
     delta = _turned(u - v)
     a, b = math.sin(u) - math.sin(delta), math.cos(u) - math.cos(delta) - 1.0
     tau = math.atan2(eta * a - xi * b, xi * a + eta * b)
@@ -47,9 +47,9 @@ def _outer(u: float, v: float, xi: float, eta: float, phi: float) -> tuple[float
 
 @compiled(error_model="numpy")
 def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, turn: IntArray) -> int:
-    """One of the eight formulas: signed lengths and turns of a word from the origin to a pose; pieces, or 0.
+    """Evaluate one of the eight formulas for a pose; fill lengths and turns, return the number of pieces or 0.
 
-    Lengths are in turning radii. A minus in the names below is a piece driven backward.
+    Lengths are signed, in turning radii. A minus in the names below marks a piece driven backward.
     """
     ahead, left = x - math.sin(phi), y - 1.0 + math.cos(phi)  # for words that end in a left turn
     across, down = x + math.sin(phi), y - 1.0 - math.cos(phi)  # for words that end in a right turn
@@ -152,28 +152,28 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
 def words_between(
     x: float, y: float, phi: float, pieces: FloatArray, turns: IntArray, counts: IntArray
 ) -> int:
-    """All words that lead from the origin to a pose, in turning radii.
+    """Find all words from the origin to a pose, in turning radii.
 
     Args:
         x: turning radii.
         y: turning radii.
         phi: rad.
-        pieces: (MOST_WORDS, 5), filled with the signed length of each piece, below 0 backward.
-        turns: (MOST_WORDS, 5), filled with `LEFT`, `STRAIGHT` or `RIGHT`.
-        counts: (MOST_WORDS,), filled with the number of pieces of each word.
+        pieces: (MOST_WORDS, 5), output: the signed length of each piece, negative backward.
+        turns: (MOST_WORDS, 5), output: `LEFT`, `STRAIGHT` or `RIGHT`.
+        counts: (MOST_WORDS,), output: the number of pieces of each word.
 
     Returns:
-        How many words there are, at least one.
+        The number of words, at least one.
     """
     n = 0
     back_x, back_y = x * math.cos(phi) + y * math.sin(phi), x * math.sin(phi) - y * math.cos(phi)
     for number in range(8):
-        # The order of pieces matters for words that do not read the same from both ends.
+        # Reversing the order gives a new word only for these.
         orders = 2 if number in (2, 5, 6) else 1
         for order in range(orders):
             ox, oy = (back_x, back_y) if order else (x, y)
-            for flip in range(2):  # in time: every piece the other way
-                for mirror in range(2):  # in the car's axis: left for right
+            for flip in range(2):  # reverse time: every piece in the other direction
+                for mirror in range(2):  # mirror: swap left and right
                     fx = -ox if flip else ox
                     fy = -oy if mirror else oy
                     angle = -phi if flip != mirror else phi
@@ -197,7 +197,7 @@ def words_between(
 
 @compiled(error_model="numpy")
 def word_cost(piece: FloatArray, count: int, radius: float, change_m: float) -> float:
-    """Length, m, of a word, and `change_m` for every change of direction within it."""
+    """Return the length, m, of a word plus `change_m` for every change of direction within it."""
     cost, direction = 0.0, 0.0
     for i in range(count):
         cost += abs(piece[i]) * radius
@@ -220,7 +220,7 @@ def distance_between(
     turns: IntArray,
     counts: IntArray,
 ) -> float:
-    """The least `word_cost` of all words to a pose, m; the arrays are `words_between`'s, to work in."""
+    """Return the lowest `word_cost` of all words to a pose, m; the arrays are buffers for `words_between`."""
     n = words_between(x / radius, y / radius, phi, pieces, turns, counts)
     best = math.inf
     for k in range(n):
@@ -231,16 +231,16 @@ def distance_between(
 def reeds_shepp(
     start: FloatArray, end: FloatArray, radius: float, change_m: float = 0.0
 ) -> tuple[FloatArray, IntArray]:
-    """The shortest way between two poses of a car that drives forward and backward.
+    """Return the shortest path between two poses of a car that drives forward and backward.
 
     Args:
         start: (3,) x, y in m and yaw in rad of the rear axle.
         end: (3,) likewise.
-        radius: m, of the smallest turning circle.
-        change_m: m that a change of direction counts.
+        radius: m, radius of the smallest turning circle.
+        change_m: m, cost of a change of direction.
 
     Returns:
-        (k,) signed lengths in m, below 0 backward, and (k,) turns, `LEFT`, `STRAIGHT` or `RIGHT`.
+        (k,) signed lengths in m, negative backward, and (k,) turns, `LEFT`, `STRAIGHT` or `RIGHT`.
 
     Examples:
         >>> length, turn = reeds_shepp(np.zeros(3), np.array([0.0, 2.0, np.pi]), radius=1.0)

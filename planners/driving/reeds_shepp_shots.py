@@ -1,4 +1,4 @@
-"""Reeds-Shepp shots: the cheapest obstacle-free word between two poses, checked exactly for collisions."""
+"""Reeds-Shepp shots: the cheapest collision-free word between two poses, checked exactly."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CHECK_M = 0.15
 def arc_is_free(
     space: Clearance, x: float, y: float, yaw: float, curvature: float, way: float, margin: float
 ) -> bool:
-    """Whether the car, with `margin`, touches nothing along an arc of `way` m."""
+    """Return whether the car, grown by `margin` m, is collision-free along an arc of `way` m."""
     n = max(1, math.ceil(abs(way) / CHECK_M))
     for i in range(1, n + 1):
         px, py, pyaw = move_along(x, y, yaw, curvature, way * i / n)
@@ -54,7 +54,7 @@ def _word_is_free(
 
 @compiled(error_model="numpy")
 def _steering_cost(turn: IntArray, count: int, before: float, steer_m: float) -> float:
-    """Cost, m, of turning the wheel along a word after a curvature of `before` times the greatest."""
+    """Return the cost, m, of turning the wheel along a word, after a curvature of `before` times the maximum."""
     cost = 0.0
     for i in range(count):
         cost += steer_m * abs(turn[i] - before)
@@ -81,7 +81,7 @@ def cheapest_shot(
     counts: IntArray,
     costs: FloatArray,
 ) -> tuple[int, float]:
-    """The cheapest free word to `end` that costs less than `below`: its row, or -1, and its cost, m."""
+    """Return the row, or -1, and cost, m, of the cheapest collision-free word to `end` that costs less than `below`."""
     dx, dy = end[0] - x, end[1] - y
     c, s = math.cos(yaw), math.sin(yaw)
     n = words_between(

@@ -1,9 +1,9 @@
-"""Repair of a label-setting plan after some probabilities changed, instead of planning from scratch.
+"""Repair of a label-setting plan after some probabilities have changed, instead of planning from scratch.
 
-After Ramalingam and Reps (1996): a change can make worse only the tree of vertices whose labels came from the changed
-stop. They get the best label that their other neighbours offer, and labels spread from there and from stops that became
-better, and nowhere else. Most observations touch a handful of vertices, whatever the size of the lot. Where a change
-reaches more than a fixed part of the lot, a pass from scratch is faster and is done instead.
+After Ramalingam and Reps (1996): a change can increase only the labels of the tree of vertices that were labelled from
+the changed stop. These get the best label that their other neighbours offer; labels then spread only from there and
+from stops that improved. Most observations affect a handful of vertices, whatever the size of the lot. If a change
+reaches more than a fixed part of the lot, planning from scratch is faster and is done instead.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ _AFFECTED = STOP + 1
 
 
 def repair(graph: StoppingGraph, labels: Labels, vertices: NDArray[np.int64], p_free: FloatArray) -> int:
-    """Update a plan in place; it then equals one made from scratch.
+    """Update a plan in place; the result equals a plan made from scratch.
 
     Args:
-        graph: that the plan was made with.
-        labels: the plan; `labels.settled` tells afterwards whether it is exact, as after `set_labels`.
+        graph: the stopping problem of the plan.
+        labels: the plan; afterwards `labels.settled` states whether it is exact, as after `set_labels`.
         vertices: (k,) int64, the slots whose probability changed.
         p_free: (k,) float64, their new probabilities.
 
     Returns:
-        How many labels were set; -1 where a pass from scratch was faster.
+        The number of labels set; -1 if it was planned from scratch.
     """
     labels.p_free[vertices] = p_free
     reach = max(_LEAST_REACH, int(REACH * len(labels.cost)))
@@ -60,7 +60,7 @@ def _repair(
     move: NDArray[np.int8],
     reach: int,
 ) -> int:
-    """Return the number of labels set; -1, and labels that are of no use, where the reach does not suffice."""
+    """Return the number of labels set; -1, with unusable labels, if more than `reach` vertices are affected."""
     affected, n_affected = np.empty(reach, dtype=np.int32), 0
     keys, queued, size = np.empty(2 * reach), np.empty(2 * reach, dtype=np.int32), 0
     for i in range(len(vertices)):

@@ -1,25 +1,24 @@
 """The thesis's MDP as a stopping problem, solved exactly by one pass of label setting.
 
-A failed attempt leads back to the slot that it was made at, so repeating it until it succeeds has a closed-form value,
-Q(u) = (p·(r_max - r_u) - (1-p)·c) / (1 - γ(1-p)), r being the arrival cost and c the failure cost. What is left to
-decide is where to stop: with costs J = -V,
+A failed attempt leaves the car at the same slot, so repeating it until it succeeds has a closed-form value,
+Q(u) = (p·(r_max - r_u) - (1-p)·c) / (1 - γ(1-p)), where r is the arrival cost and c the failure cost. What remains is
+to decide where to stop: with costs J = -V,
 
     J(u) = min( h(u), min over edges u→v of d + γ·J(v) ),
 
-where h(u) is the least cost of staying at u: attempts until one succeeds, waiting for ever, or shuttling for ever
-along an edge and back. Labels spread from the cheapest stops against the edges, as in Dijkstra's algorithm.
+where h(u) is the least cost of staying at u: attempts until one succeeds, waiting for ever, or shuttling for ever along
+an edge and back. As in Dijkstra's algorithm, labels spread from the cheapest stops against the direction of the edges.
 
-**Why it is exact.** An edge is called climbing where d + γ·J(v) > J(v), that is J(v) < d/(1-γ): driving on over such
-edges for ever costs more than v. While edges climb, labels are settled in ascending order, each once; in any
-digraph that holds for all labels below d_min/(1-γ). The queue has buckets as wide as the shortest edge. They are
-exact while that is at most the least climb (Denardo and Fox 1979), which γ lowers a little at positive labels. Where
-a label that was spread still improves, for either reason, it is spread again. So when the pass terminates no
-edge offers less than any label: J satisfies the equation above, whose solution is unique where γ < 1. Termination is
-the certificate.
+**Why it is exact.** An edge climbs if d + γ·J(v) > J(v), that is J(v) < d/(1-γ): driving over such edges for ever costs
+more than J(v). While edges climb, labels are settled in ascending order, each once; in any digraph this holds for all
+labels below d_min/(1-γ). The buckets of the queue are as wide as the shortest edge. They are exact while that is at
+most the smallest climb (Denardo and Fox 1979), which γ lowers a little at positive labels. If, for either reason, a
+label improves after it was spread, it is spread again. So when the pass terminates, no edge can improve any label: J
+satisfies the equation above, whose solution is unique for γ < 1. Termination is the certificate.
 
-It terminates on two-way edges, since h includes the cost of shuttling, so that every edge climbs or ties; and
-wherever no directed cycle beats every stop. Where one does, labels would fall for ever: a limit on the work stops
-that, first with a heap, whose order does not depend on climbs, and then policy iteration takes over.
+It terminates if all edges are two-way, since h includes the cost of shuttling, so every edge climbs or ties; and if no
+directed cycle is cheaper than every stop. Otherwise labels would fall for ever. A limit on the work then stops the
+pass: it is repeated with a heap, whose order does not depend on climbs, and if that fails policy iteration takes over.
 At γ = 1 it is Dijkstra's algorithm with a virtual source; plans that never end cost infinity.
 """
 
@@ -56,16 +55,15 @@ class StoppingGraph(NamedTuple):
     Attributes:
         neighbors: (n, 4) int32, the vertex that up, down, left, right lead to, or -1.
         move_s: (n, 4) float64, s, drive time of each edge.
-        in_start: (n + 1,) int32; the edges to v are rows in_start[v] to in_start[v + 1] of the next three.
-        in_source: (m,) int32, where the edge comes from.
-        in_move: (m,) int8, which move it is there.
-        in_s: (m,) float64, s, its drive time.
+        in_start: (n + 1,) int32; the edges to v are rows in_start[v] to in_start[v + 1] of the next three arrays.
+        in_source: (m,) int32, source of the edge.
+        in_move: (m,) int8, move at the source.
+        in_s: (m,) float64, s, drive time.
         park_reward: (n,) float64, s, r_max - r_u.
-        never_s: (n,) float64, s, least discounted cost of waiting, or shuttling along one edge, for ever; inf
-            at γ = 1.
-        failure_s: s, what the planner believes a failed attempt to cost.
-        wait_s: s, cost of a move that the graph does not have.
-        gamma: discount a decision.
+        never_s: (n,) float64, s, least discounted cost of waiting or shuttling along one edge for ever; inf at γ = 1.
+        failure_s: s, the planner's cost of a failed attempt.
+        wait_s: s, cost of a move without an edge.
+        gamma: discount per decision.
     """
 
     neighbors: NDArray[np.int32]
@@ -82,8 +80,8 @@ class StoppingGraph(NamedTuple):
 
     @classmethod
     def of(cls, mdp: ParkingMDP) -> StoppingGraph:
-        """Make the graph of a process, without its probabilities."""
-        # Copies: numba compiles a function once more for arrays that are read-only.
+        """Make the graph of a decision process, without its probabilities."""
+        # Copies: numba would compile every function again for read-only arrays.
         neighbors, move_s = mdp.neighbors.astype(np.int32), np.array(mdp.move_s, order="C")
         in_start, in_source, in_move, in_s = edges_in(neighbors, move_s)
         never_s = _never(neighbors, move_s, mdp.wait_s, mdp.gamma)
@@ -104,14 +102,14 @@ class StoppingGraph(NamedTuple):
 
 @dataclass
 class Labels:
-    """A plan: the cost of each vertex and the action there. `label_repair.repair` changes it in place.
+    """A plan: cost and action of each vertex. `label_repair.repair` changes it in place.
 
     Attributes:
         cost: (n,) float64, s, -V of each vertex.
-        move: (n,) int8, the move that the label came from, or `STOP`.
-        p_free: (n,) float64, the probabilities that it was made for.
-        settled: whether `move` leads from every vertex to a stop, by edges that the labels follow exactly; False
-            where another solver made the plan.
+        move: (n,) int8, the move that gave the label, or `STOP`.
+        p_free: (n,) float64, the probabilities of the plan.
+        settled: whether `move` leads from every vertex to a stop, along edges on which the labels are exact; False if
+            another solver made the plan.
     """
 
     cost: FloatArray
@@ -121,10 +119,10 @@ class Labels:
 
 
 def label_setting(mdp: ParkingMDP) -> Solution:
-    """Solve the process exactly, in near-linear time; the module states the conditions and the proof.
+    """Solve the process exactly, in near-linear time; see the module for conditions and proof.
 
-    Unlike policy iteration it takes gamma 1, where a vertex that can reach no slot has value -inf. The policy
-    breaks ties as `best_move` says. `iterations` is 1, or those of policy iteration where it had to take over.
+    Unlike policy iteration it accepts gamma 1; a vertex that cannot reach any slot then has value -inf. Ties are broken
+    as in `best_move`. `iterations` is 1, or that of policy iteration if it had to take over.
     """
     graph = StoppingGraph.of(mdp)
     labels = set_labels(graph, mdp.p_free)
@@ -142,7 +140,7 @@ def set_labels(graph: StoppingGraph, p_free: FloatArray) -> Labels:
         p_free: (n,) float64; kept, not copied.
 
     Returns:
-        The plan; where `settled` is False circling pays somewhere and the costs are upper bounds only.
+        The plan; if `settled` is False, circling pays somewhere, and the costs are only upper bounds.
     """
     n = len(p_free)
     labels = Labels(np.empty(n), np.empty(n, dtype=np.int8), p_free, settled=False)
@@ -151,7 +149,7 @@ def set_labels(graph: StoppingGraph, p_free: FloatArray) -> Labels:
 
 
 def update_labels(graph: StoppingGraph, labels: Labels) -> None:
-    """Update a plan to its present probabilities by one pass of label setting, in place."""
+    """Update a plan in place to its current probabilities by one pass of label setting."""
     width = float(graph.in_s.min()) if len(graph.in_s) else 1.0
     labels.settled = bool(
         _set_by_buckets(graph, labels.p_free, width, labels.cost, labels.move)
@@ -172,7 +170,7 @@ def by_policy_iteration(mdp: ParkingMDP, start: Labels | None = None) -> tuple[L
 
 
 def with_p_free(mdp: ParkingMDP, p_free: FloatArray) -> ParkingMDP:
-    """Return the same process with other probabilities, (n,)."""
+    """Return the process with other probabilities, (n,)."""
     return dataclasses.replace(mdp, p_free=p_free)
 
 
@@ -198,10 +196,10 @@ def move_cost(graph: StoppingGraph, cost: FloatArray, vertex: int, move: int) ->
 
 @compiled(error_model="numpy")
 def best_move(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, vertex: int) -> int:
-    """Return an optimal action of one vertex, by the costs alone, so that solvers which agree choose the same.
+    """Return an optimal action of one vertex, from the costs alone: solvers with equal costs choose equal actions.
 
-    Among actions that are equally good to within `TIE_S` parking comes first, then the moves in order. Where
-    every cost is infinite it waits if it can.
+    Of actions that are equal to within `TIE_S`, parking comes first, then the moves in order. If every cost is
+    infinite, it waits if it can.
     """
     p = p_free[vertex]
     park = (1.0 - p) * graph.failure_s - p * graph.park_reward[vertex]
@@ -234,10 +232,10 @@ def best_moves(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray) -> ND
 
 @compiled(error_model="numpy")
 def _is_source(graph: StoppingGraph, cost: FloatArray, u: int) -> bool:
-    """Return whether labels may have to start from a vertex: not where one hop to a cheaper stop beats stopping.
+    """Return whether labels may have to start from a vertex: not if one hop to a cheaper stop beats stopping.
 
-    The stop one hop off must be the cheaper one: at the cost of shuttling two vertices could otherwise each
-    leave it to the other by a rounding error.
+    The stop one hop away must be cheaper: otherwise, at the cost of shuttling, rounding could make two vertices each
+    leave the stop to the other.
     """
     own = cost[u]
     if own == np.inf:
@@ -259,7 +257,7 @@ def _set_by_buckets(
     are empty, and then refill them.
 
     Returns:
-        Whether the pass terminated within its limits.
+        True if the pass terminated within its limits.
     """
     n = len(cost)
     for u in range(n):
@@ -280,7 +278,7 @@ def _set_by_buckets(
 
     n_buckets = int(min((high - low) * per_s, _BUCKETS_PER_VERTEX * n)) + 64
     head = np.full(n_buckets, -1, dtype=np.int32)
-    # Where edges climb, a vertex is spread once: each source and each edge enters at most one label.
+    # If edges climb, a vertex is spread once: each source and each edge enters at most one label.
     pool = 2 * (n + len(graph.in_s)) + 64
     entry_vertex, entry_next, used = np.empty(pool, dtype=np.int32), np.empty(pool, dtype=np.int32), 0
     to_spread = np.zeros(n, dtype=np.bool_)
@@ -319,7 +317,7 @@ def _set_by_buckets(
                         else:
                             entry_next[used], later = later, used
                         used += 1
-        # What is left of `later` is distributed from its least label on.
+        # Distribute the rest of `later`, starting from its smallest label.
         first, e = np.iinfo(np.int64).max, later
         while e >= 0:
             if to_spread[entry_vertex[e]]:
@@ -342,7 +340,7 @@ def _set_by_buckets(
 
 @compiled(error_model="numpy")
 def _set_by_heap(graph: StoppingGraph, p_free: FloatArray, cost: FloatArray, move: NDArray[np.int8]) -> bool:
-    """Do the same with a heap, for climbs so small that buckets would be too many, or too wide."""
+    """Do the same with a heap, for climbs so small that there would be too many buckets or too wide ones."""
     n = len(cost)
     for u in range(n):
         cost[u] = stop_cost(graph, p_free, u)
@@ -375,7 +373,7 @@ def spread(
         size: how many there are.
 
     Returns:
-        How many labels were entered; -1 where they would have been more than there is room for.
+        The number of labels entered; -1 if there was not enough room.
     """
     n_entered, room = 0, len(keys) - size
     while size > 0:
@@ -422,7 +420,7 @@ def edges_in(
 
 @compiled
 def _never(neighbors: NDArray[np.int32], move_s: FloatArray, wait_s: float, gamma: float) -> FloatArray:
-    """Return the lower cost, (n,) s, of waiting for ever and shuttling along one edge for ever."""
+    """Return the lower cost, (n,) s, of waiting for ever or shuttling along one edge for ever."""
     n, n_moves = neighbors.shape
     never = np.full(n, np.inf)
     if gamma == 1.0:

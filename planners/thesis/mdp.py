@@ -23,25 +23,25 @@ class CirclingWarning(UserWarning):
 class ParkingMDP:
     """States are the vertices of the drive graph and the absorbing goal; actions are four moves and "park".
 
-    A move along an edge costs its drive time (eq. 3.16, 3.23); a move that the graph does not have costs
-    `wait_s` and stays. Parking at vertex s reaches the goal with probability `p_free[s]` and pays
-    r_max - r_s, what is saved against the slot with the highest arrival cost (eq. 3.17, 3.24): the walk, and the price
-    of parking where slots have one. Otherwise it costs `failure_s` and stays. The goal's value is zero.
+    A move along an edge costs its drive time (eq. 3.16, 3.23); a move without an edge costs `wait_s` and stays. Parking
+    at vertex s reaches the goal with probability `p_free[s]` and pays r_max - r_s, the saving against the slot with the
+    highest arrival cost (eq. 3.17, 3.24); the arrival cost is the walk, and the price where slots have one. Otherwise
+    parking costs `failure_s` and stays. The goal's value is zero.
 
     Args:
         neighbors: (n, 4) int, the vertex that up, down, left, right lead to, or -1.
         move_s: (n, 4) float64, s, drive time of each edge.
         p_free: (n,) float64, probability that a parking attempt succeeds; 0 where there is no slot.
-        arrival_cost_s: (n,) float64, s, what parking at each vertex costs on arrival (`SearchProblem.arrival_cost_s`).
-        failure_s: s, what the planner believes a failed attempt to cost.
-        wait_s: s, the cost of a move that does not exist (the thesis's Δt).
-        gamma: discount a decision, in (0, 1].
+        arrival_cost_s: (n,) float64, s, arrival cost of parking at each vertex (`SearchProblem.arrival_cost_s`).
+        failure_s: s, the planner's cost of a failed attempt.
+        wait_s: s, the cost of a move without an edge (the thesis's Δt).
+        gamma: discount per decision, in (0, 1].
 
     Attributes:
         park_reward: (n,) float64, s, r_max - r_s; r_max is taken over the vertices where parking is possible.
 
     Raises:
-        InputError: a value out of its range or arrays whose shapes do not agree.
+        InputError: a value is out of range, or shapes of arrays do not agree.
 
     Example:
         Two slots on a line; the second is nearer to the goal but always taken.
@@ -100,14 +100,13 @@ class ParkingMDP:
         failure_s: float | None = None,
         gamma: float = 0.9999,
     ) -> ParkingMDP:
-        """Make the process that the thesis plans on from a belief about the slots.
+        """Make the thesis's process from a belief about the slots.
 
         Args:
             problem: lot, goal, speeds and costs.
             p_occupied: (n_slots,) probability that each slot is taken.
-            failure_s: s, what the planner believes a failed attempt to cost; what the world charges
-                (`problem.failure_s`) where None.
-            gamma: discount a decision.
+            failure_s: s, the planner's cost of a failed attempt; None: the actual cost (`problem.failure_s`).
+            gamma: discount per decision.
         """
         n, n_slots = problem.lot.n_vertices, problem.lot.n_slots
         p_free = np.zeros(n)
@@ -157,14 +156,14 @@ class ParkingMDP:
         return self.rewards() + self.continuation() * values[self.successors()]
 
     def expected_time(self, values: FloatArray) -> FloatArray:
-        """Return the expected time, (n,) s, from each state to the goal: r_max less its value."""
+        """Return the expected time, (n,) s, from each state to the goal: r_max minus its value."""
         return float(self.arrival_cost_s.max()) - values
 
     def check_discount(self, values: FloatArray) -> None:
         """Warn where discounting breaks the equivalence with time (eq. 3.28).
 
-        Driving in circles for ever costs at least min(d_min, Δt)/(1 - γ), attempts at a taken slot for
-        ever `failure_s`/(1 - γ); as long as every state does better than both, neither can be optimal.
+        Driving in circles for ever costs at least min(d_min, Δt)/(1 - γ), and attempting a taken slot for ever costs
+        `failure_s`/(1 - γ). Neither can be optimal if the cost of every state is below both.
         """
         if self.gamma == 1.0:
             return

@@ -23,7 +23,7 @@ class Solution:
     Attributes:
         values: (n,) float64, s, the utility of each state (eq. 3.26); the goal's is 0.
         policy: (n,) int64, an optimal action of each state (eq. 3.27).
-        iterations: rounds of the solver.
+        iterations: number of rounds of the solver.
     """
 
     values: FloatArray
@@ -36,13 +36,13 @@ def policy_iteration(
 ) -> Solution:
     """Alternate evaluation by sparse LU (eq. 3.29) and greedy improvement (eq. 3.30).
 
-    Stops when the policy no longer changes. Among actions whose values differ by rounding alone the
-    current one is kept, so ties cannot make it run for ever.
+    Stops when the policy no longer changes. If actions differ only by rounding, the current one is kept, so ties cannot
+    make it run for ever.
 
     Args:
-        mdp: the process; gamma must be below 1, or evaluation of a policy that never parks has no solution.
-        policy: (n,) where to start from, for a warm start; parking everywhere where None.
-        max_iterations: rounds after which to give up.
+        mdp: the process; gamma must be below 1, since a policy that never parks has no finite value at 1.
+        policy: (n,) initial policy, for a warm start; None: park everywhere.
+        max_iterations: maximum number of rounds.
 
     Raises:
         InputError: gamma is 1, or the policy has the wrong shape.

@@ -1,4 +1,4 @@
-"""The thesis's agents: plan by the MDP, observe, update the belief, replan (T §3.4.4)."""
+"""The thesis's agents: plan with the MDP, observe, update the belief, replan (T §3.4.4)."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ class Plan:
 
     Attributes:
         graph: the stopping problem.
-        labels: cost and move of each vertex, and the probabilities that they were made for.
-        replans: how often the agent has replanned since the episode began.
+        labels: cost and move of each vertex, and the probabilities of the plan.
+        replans: number of times that the agent has replanned in this episode.
     """
 
     graph: StoppingGraph
@@ -56,20 +56,20 @@ class Plan:
 
 
 class StaticAgent(SearchAgent[Plan]):
-    """`mdp-static`: plans once on the forecast and follows that plan, whatever it observes.
+    """`mdp-static`: plans once with the forecast and follows that plan, whatever it observes.
 
-    Where its slot turns out taken it repeats the attempt, since in the thesis's model the next one is as likely
-    to succeed as the first; T §3.4.4 introduces replanning for that reason.
+    If its slot turns out to be taken, it repeats the attempt, since in the thesis's model the next one is as likely to
+    succeed as the first; T §3.4.4 introduces replanning for that reason.
 
     Args:
         problem: lot, goal, speeds and costs.
-        failure_s: s, what the planner believes a failed attempt to cost: a high one makes it careful. What the world
-            charges (`problem.failure_s`) where None.
-        gamma: discount a decision.
+        failure_s: s, the planner's cost of a failed attempt; a high cost makes it cautious. None: the actual cost
+            (`problem.failure_s`).
+        gamma: discount per decision.
         solver: one of `SOLVERS`.
 
     Raises:
-        InputError: an unknown solver, a value out of its range, or policy iteration with gamma 1.
+        InputError: the solver is unknown, a value is out of range, or gamma is 1 for policy iteration.
     """
 
     name: ClassVar[str] = "mdp-static"
@@ -102,7 +102,7 @@ class StaticAgent(SearchAgent[Plan]):
             p_occupied: (n_slots,) P(taken).
 
         Raises:
-            InputError: the belief has the wrong shape or is no probability somewhere.
+            InputError: the belief has the wrong shape, or a value outside 0 to 1.
         """
         n_slots = self.problem.lot.n_slots
         if p_occupied.shape != (n_slots,):
@@ -119,11 +119,11 @@ class StaticAgent(SearchAgent[Plan]):
         return labels
 
     def expected_time(self, p_occupied: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return the time, (n_vertices,) s, that the model expects a search from each vertex to take."""
+        """Return the expected time, (n_vertices,) s, of a search from each vertex according to the model."""
         return self._mdp.expected_time(-self.solve(p_occupied).cost)
 
     def begin(self, observation: Observation, belief: SlotBelief) -> Plan:
-        """Plan on the forecast."""
+        """Plan with the forecast."""
         del observation
         return Plan(self._graph, self.solve(belief.p_occupied))
 
@@ -134,7 +134,7 @@ class StaticAgent(SearchAgent[Plan]):
         return int(best_move(self._graph, labels.p_free, labels.cost, int(observation["vertex"])))
 
     def plan_preview(self, observation: Observation, action: int, memory: Plan) -> PlanPreview:
-        """Return the path along which the plan leads to a slot."""
+        """Return the path of the plan to a slot."""
         labels, vertex = memory.labels, int(observation["vertex"])
         path: list[int] = []
         while len(path) < MOST_HOPS and action != PARK:
@@ -146,7 +146,7 @@ class StaticAgent(SearchAgent[Plan]):
         return PlanPreview(tuple(path))
 
     def _solved(self, labels: Labels) -> Labels:
-        """Return the plan; by policy iteration where label setting did not terminate, since circling pays."""
+        """Return the plan; solve it by policy iteration if label setting did not terminate because circling pays."""
         if labels.settled:
             return labels
         return by_policy_iteration(with_p_free(self._mdp, labels.p_free), labels)[0]
@@ -160,10 +160,10 @@ class StaticAgent(SearchAgent[Plan]):
 class ReplanningAgent(StaticAgent):
     """`mdp`: the thesis's planner. It replans after every observation that changes a probability.
 
-    A change counts from `RELEVANT_CHANGE` on, or where an observation makes a slot certain; decay that adds up to as
-    much counts, too. The plan is repaired where the changes reach, not made from scratch.
+    A change is relevant from `RELEVANT_CHANGE` on, or if an observation makes a slot certain; accumulated decay counts
+    as well. The plan is repaired where it is affected, not made from scratch.
 
-    It goes on until it has parked or the lot is proven full. Where no reachable slot may be free, waiting is optimal in
+    It searches until it has parked or the lot is proven full. If no reachable slot can be free, waiting is optimal in
     the model, and the agent waits.
     """
 
@@ -194,10 +194,10 @@ _BLOCK = 1024
 def _changed_slots(
     p_occupied: NDArray[np.floating], planned: NDArray[np.float64], relevant: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return all slots whose probability differs from the planned one, and P(free), if one differs enough; else none.
+    """Return the slots whose probability differs from the plan, and their P(free), if any is relevant; else none.
 
-    An observation that makes a slot certain counts however likely it was: else the agent would go on attempting a
-    nearly hopeless slot that it has found taken.
+    An observation that makes a slot certain is always relevant, however small the change: otherwise the agent would
+    keep attempting a nearly hopeless slot that it has found taken.
     """
     n = len(p_occupied)
     blocks, n_blocks, n_changed = np.empty(n // _BLOCK + 1, dtype=np.int64), 0, 0

@@ -1,9 +1,8 @@
-"""`mdp-tuned`: the thesis's planner at the failure cost that simulation recommends for its forecast.
+"""`mdp-tuned`: the thesis's planner with a failure cost that is tuned to the forecast by simulation.
 
-The failure cost is the one parameter of the thesis's planner that has no right value (T §4.3 shows 10 s to be too bold
-and 90 s too careful). Here it is chosen by simulation: worlds are drawn from the forecast alone, with slots that are
-independent and do not change, the planner searches all of them at each cost, and the cost with the least mean time
-wins.
+The failure cost is the one parameter of the thesis's planner without a right value (T §4.3 shows that 10 s is too bold
+and 90 s too cautious). Here it is chosen by simulation: worlds with independent, constant slots are drawn from the
+forecast, the planner searches all of them at each cost, and the cost with the lowest mean time is chosen.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ class Tuning:
 
     Attributes:
         costs: (k,) float64, s, the failure costs compared.
-        mean_s: (k,) float64, s, mean total time of the planner at each, in the same worlds.
+        mean_s: (k,) float64, s, mean total time of the planner at each cost, in the same worlds.
     """
 
     costs: FloatArray
@@ -49,7 +48,7 @@ class Tuning:
 
     @property
     def best(self) -> float:
-        """The failure cost with the least mean time, s; among equals the lowest."""
+        """The failure cost with the lowest mean time, s; among equals the lowest cost."""
         return float(self.costs[self.mean_s.argmin()])
 
 
@@ -66,19 +65,19 @@ def tune_failure_cost(
     """Simulate the thesis's planner in worlds drawn from a forecast.
 
     Slots are observed without error when they come in view, and do not change; a lot that is proven full costs
-    `give_up_s`. A large lot is simulated in part, where the search will take place (`Neighborhoods`).
+    `give_up_s`. Of a large lot only the part where the search takes place is simulated (`Neighborhoods`).
 
     Args:
         problem: lot, goal, speeds and costs.
         p_occupied: (n_slots,) the forecast.
         vertex: where the search begins.
         costs: failure costs to compare, s, each above 0.
-        worlds: how many worlds are drawn; the same ones for each cost.
-        seed: of the worlds.
-        near: the part of the lot to simulate; made where None.
+        worlds: number of worlds; they are the same for each cost.
+        seed: seed of the worlds.
+        near: the part of the lot to simulate; None: choose it.
 
     Raises:
-        InputError: a cost or a number of worlds that is not positive, probabilities of a wrong number or size.
+        InputError: a cost or the number of worlds is not positive, or the probabilities have the wrong shape or values.
     """
     p = np.asarray(p_occupied, dtype=np.float64)
     compared = np.asarray(costs, dtype=np.float64)
@@ -93,7 +92,7 @@ def tune_failure_cost(
     start = here if here >= 0 else near.index(near.entry)
     p = p[near.slots]
     taken = np.random.default_rng(seed).random((worlds, len(p))) < p
-    # What a failed attempt costs in these worlds; what the planner believes it to cost is what is compared.
+    # The actual cost of a failed attempt in these worlds; the costs that are compared are the planner's.
     graph = near.planning_graph(problem, problem.failure_s)
     return Tuning(compared, _mean_times(start, taken, p, compared, graph))
 
@@ -102,7 +101,7 @@ def tune_failure_cost(
 def _mean_times(
     vertex: int, taken: NDArray[np.bool_], p_occupied: FloatArray, costs: FloatArray, graph: PlanningGraph
 ) -> FloatArray:
-    """Return the planner's mean total time, (k,) s, at each failure cost, in worlds, (n_worlds, n_slots) bool."""
+    """Return the planner's mean total time, (k,) s, at each failure cost over worlds, (n_worlds, n_slots) bool."""
     n_worlds, n = taken.shape
     mean = np.zeros(len(costs))
     odds, observed = np.empty(n), np.empty(n, np.bool_)
@@ -126,7 +125,7 @@ def _total_time(
 ) -> float:
     """Return the total time, s, of the thesis's planner in one world.
 
-    Its belief, `odds` = P(taken)/P(free), and `observed` are changed in place.
+    The belief `odds` = P(taken)/P(free) and `observed` are changed in place.
     """
     total, n_unobserved, found = 0.0, len(taken), False
     for _ in range(_MOST_STEPS):
@@ -136,7 +135,7 @@ def _total_time(
         if target == vertex and observed[target]:
             return float(total + graph.cost_s[target])
         if target == vertex:
-            # The search begins at this slot: an attempt without an observation.
+            # The search begins at this slot: attempt it without an observation.
             if not taken[target]:
                 return float(total + graph.cost_s[target])
             total += graph.failure_s
@@ -158,9 +157,9 @@ def _total_time(
 
 @compiled
 def _best_target(vertex: int, cost: float, graph: PlanningGraph, odds: FloatArray) -> tuple[int, float]:
-    """Return the slot that the thesis's planner drives to, and the time, s, that it expects.
+    """Return the slot that the thesis's planner drives to, and its expected time, s.
 
-    With γ = 1 its plan is to drive to one slot and to attempt until it is free: drive + arrival cost + cost·(1 - p)/p.
+    With γ = 1 its plan is to drive to one slot and attempt it until it is free: drive + arrival cost + cost·(1 - p)/p.
     """
     best, chosen = np.inf, -1
     drive_s = graph.drive_s[vertex]
@@ -176,8 +175,8 @@ class TunedPlan:
     """Memory of the tuned planner.
 
     Attributes:
-        failure_s: s, the failure cost that it chose.
-        entry: the vertex that it drives to before it follows its plan, or -1.
+        failure_s: s, the chosen failure cost.
+        entry: the vertex to drive to before following the plan, or -1.
         plan: memory of the thesis's planner.
     """
 
@@ -187,7 +186,7 @@ class TunedPlan:
 
     @property
     def replans(self) -> int:
-        """How often it has replanned since the episode began."""
+        """Number of times that the agent has replanned in this episode."""
         return self.plan.replans
 
     @property
@@ -197,19 +196,19 @@ class TunedPlan:
 
 
 class TunedAgent(SearchAgent[TunedPlan]):
-    """`mdp-tuned`: chooses a failure cost for the forecast on arrival, then is the thesis's planner.
+    """`mdp-tuned`: chooses a failure cost for the forecast on arrival, then acts as the thesis's planner.
 
-    On a lot too large to be simulated it first drives to the entry of the part that was.
+    On a lot too large to simulate as a whole it first drives to the entry of the simulated part.
 
     Args:
         problem: lot, goal, speeds and costs.
-        worlds: how many worlds are drawn from the forecast.
-        seed: of those worlds.
-        gamma: discount a decision.
-        most_vertices: a lot with more is simulated in part (`Neighborhoods`).
+        worlds: number of worlds drawn from the forecast.
+        seed: seed of those worlds.
+        gamma: discount per decision.
+        most_vertices: a larger lot is simulated in part (`Neighborhoods`).
 
     Raises:
-        InputError: no worlds, or a bad `most_vertices`.
+        InputError: `worlds` or `most_vertices` is out of range.
     """
 
     name: ClassVar[str] = "mdp-tuned"
@@ -233,8 +232,8 @@ class TunedAgent(SearchAgent[TunedPlan]):
         self._tuned: OrderedDict[tuple[int, bytes], Tuning] = OrderedDict()
 
     def tuning(self, p_occupied: NDArray[np.floating], vertex: int) -> Tuning:
-        """Return the simulation for a forecast, (n_slots,), and a start; kept for the next search like it."""
-        # To the percent, so that arrivals within minutes of each other share one.
+        """Return the simulation for a forecast, (n_slots,), and a start vertex; results are cached."""
+        # Forecasts are rounded to a percent, so arrivals within minutes of each other share a result.
         near = self._neighborhoods.toward(vertex)
         rounded = np.round(np.asarray(p_occupied, dtype=np.float64), 2)
         key = vertex, rounded[near.slots].tobytes()
@@ -262,7 +261,7 @@ class TunedAgent(SearchAgent[TunedPlan]):
         return TunedPlan(best, entry, self._planners[best].begin(observation, belief))
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: TunedPlan) -> int:
-        """Decide as the thesis's planner at the chosen cost, from the entry on."""
+        """Drive to the entry, then decide as the thesis's planner at the chosen cost."""
         vertex = int(observation["vertex"])
         if vertex == memory.entry:
             memory.entry = -1

@@ -14,16 +14,16 @@ FloatArray = NDArray[np.float64]
 
 
 def value_iteration(mdp: ParkingMDP, *, tolerance: float = 1e-9, max_iterations: int = 2_000_000) -> Solution:
-    """Apply the Bellman update until no value is farther than `tolerance` from the optimum.
+    """Apply the Bellman update until every value is within `tolerance` of the optimum.
 
-    It is slow where gamma is near 1 and little is free, and independent of the other solvers: it is there to
-    check them.
+    It is slow if gamma is close to 1 and few slots are free. It is independent of the other solvers and serves to check
+    them.
 
     Args:
         mdp: the process.
-        tolerance: s, bound on the error of the values: the last change times γ/(1-γ); at γ = 1, where
-            no such bound exists, the last change itself.
-        max_iterations: sweeps after which to give up.
+        tolerance: s, bound on the error of the values, which is the last change times γ/(1-γ); at γ = 1, where no such
+            bound exists, a limit on the last change itself.
+        max_iterations: maximum number of sweeps.
 
     Raises:
         InputError: the tolerance is not positive.
@@ -32,7 +32,7 @@ def value_iteration(mdp: ParkingMDP, *, tolerance: float = 1e-9, max_iterations:
     if not tolerance > 0.0:
         raise InputError(f"tolerance is {tolerance}, want above 0")
     rewards, successors, continuation = mdp.rewards(), mdp.successors(), mdp.continuation()
-    # Starting below the optimum, from attempts here for ever: at γ = 1 values above it could be fixed points, too.
+    # Start below the optimum, from attempts here for ever: at γ = 1 values above it could be fixed points, too.
     with np.errstate(divide="ignore", invalid="ignore"):
         retry = rewards[:, -1] / (1.0 - continuation[:, -1])
     values = np.where(
@@ -61,7 +61,7 @@ def _sweep_until(
             best = -np.inf
             for a in range(n_actions):
                 best = max(best, rewards[s, a] + continuation[s, a] * values[successors[s, a]])
-            # Rounding changes values by an ulp for ever: that does not count.
+            # Ignore changes by rounding, which can go on for ever.
             moved = abs(best - values[s])
             if moved > 4e-16 * abs(best):
                 change = max(change, moved)

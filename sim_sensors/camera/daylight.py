@@ -1,4 +1,4 @@
-"""Light that reaches a point: from the sun, the sky, and by mirror reflection."""
+"""Light that reaches a point: from the sun, from the sky, and by mirror reflection."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Color = tuple[float, float, float]
 SHADOW_BIAS = 0.05
 """m, toward the sun, against self-shadowing."""
 
-_GROUND_TONE = 0.12  # albedo of the ground where it is only mirrored or bounces light
+_GROUND_TONE = 0.12  # albedo of the ground in reflections and for bounced light
 
 
 class Light(NamedTuple):
@@ -30,7 +30,7 @@ class Light(NamedTuple):
         sun_direction: (3,) float64, unit vector to the sun, world frame.
         sun, sky, horizon: (3,) float64, as in `Weather`.
         haze, wetness, lit_windows: as in `Weather`.
-        background, mirrored: (n, n, 3) float32, the sky, sharp and blurred, as `look_up` takes it.
+        background, mirrored: (n, n, 3) float32, the sky, sharp and blurred, for `look_up`.
         ground: (3,) float64, radiance of open ground in reflections and as bounced light.
     """
 

@@ -14,12 +14,12 @@ from sim_sensors.compilation import compiled
 
 @compiled(**LEAF)
 def ground_level(row_z: float, height: float, focal: float, texel: float) -> float:
-    """Return the pyramid level at which a texel of the ground is about a pixel, in the middle of a row.
+    """Return the pyramid level at which a ground texel is about as large as a pixel, in the middle of a row.
 
     Args:
         row_z: world z of the row's ray at unit depth.
-        height: m, of the camera above the ground.
-        focal: px, along the row.
+        height: m, camera height above the ground.
+        focal: px, focal length along the row.
         texel: m, side of a texel of the finest level.
     """
     depth = -height / min(row_z, -1e-3)

@@ -17,7 +17,7 @@ from sim_sensors.mesh import Ground
 
 _FINEST = 0.025  # m a texel
 _MOST_TEXELS = 20e6
-_MARGIN = 6.0  # m of ground drawn round what is paved or painted
+_MARGIN = 6.0  # m of ground drawn around paved and painted areas
 _SUBPIXEL = 4  # bits of fraction in OpenCV's polygon corners
 
 
@@ -25,12 +25,12 @@ class GroundTexture(NamedTuple):
     """Albedo of the ground as an image pyramid.
 
     Attributes:
-        texels: (total, 3) uint8: square root of the grey albedo, fraction of grass, and how much water can collect
-            there, each 255 = 1; level after level, row-major, rows along y.
+        texels: (total, 3) uint8: square root of the grey albedo, fraction of grass, and capacity for water, each 255 =
+            1; level after level, row-major, rows along y.
         start: (n_levels,) int64, first texel of each level.
         shape: (n_levels, 2) int64, rows and columns of each level.
         per_m: (n_levels, 2) float64, texels per metre along y and x.
-        x, y: m, the corner of the image.
+        x, y: m, corner of the image.
         texel: m, side of a texel of the finest level.
     """
 
@@ -47,7 +47,7 @@ _TEXTURES: WeakKeyDictionary[Ground, GroundTexture] = WeakKeyDictionary()
 
 
 def ground_texture(ground: Ground) -> GroundTexture:
-    """Return the texture of a ground; made on first use (about 1 s) and kept as long as the ground exists."""
+    """Return the texture of a ground; made on first use (about 1 s) and cached as long as the ground exists."""
     if ground not in _TEXTURES:
         _TEXTURES[ground] = _draw(ground)
     return _TEXTURES[ground]
@@ -60,7 +60,7 @@ def _draw(ground: Ground) -> GroundTexture:
     columns, rows = (np.ceil((high - low) / texel / 16).astype(int) * 16).tolist()
 
     def corners(points: NDArray[np.float64]) -> NDArray[np.int32]:
-        # OpenCV counts from the centre of the first pixel.
+        # OpenCV's coordinates start at the centre of the first pixel.
         pixels: NDArray[np.float64] = (points - low) / texel - 0.5
         return np.asarray(np.round(pixels * 2**_SUBPIXEL), dtype=np.int32)
 
@@ -182,10 +182,10 @@ def _pyramid(image: NDArray[np.uint8], low: NDArray[np.float64], texel: float) -
 
 @compiled(**LEAF)
 def sample_ground(texture: GroundTexture, x: float, y: float, level: int) -> tuple[float, float, int, int]:
-    """Sample the ground at (x, y), m, bilinearly: grey albedo, fraction of grass; and the texel and the one below."""
+    """Sample the ground at (x, y), m: grey albedo and fraction of grass, bilinear; and the texel and the one below."""
     level = min(max(level, 0), texture.shape.shape[0] - 1)
     columns = texture.shape[level, 1]
-    # Beyond the drawn part it repeats, mirrored, so that no streaks run to the horizon.
+    # Beyond the drawn part the texture repeats, mirrored, so no streaks run to the horizon.
     u = _mirrored((x - texture.x) * texture.per_m[level, 1] - 0.5, columns)
     v = _mirrored((y - texture.y) * texture.per_m[level, 0] - 0.5, texture.shape[level, 0])
     column = int(u)

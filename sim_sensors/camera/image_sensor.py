@@ -18,8 +18,8 @@ from sim_sensors.errors import SensorError
 Float32Array = NDArray[np.float32]
 
 _CURVE_STEPS = 4096
-_BRIGHTEST = 4.0  # of the tone curve's input; 1 is where a plain sRGB curve would clip
-_KNEE = 0.7  # from there on highlights are compressed, as a camera's own curve does
+_BRIGHTEST = 4.0  # greatest input of the tone curve; a plain sRGB curve would clip at 1
+_KNEE = 0.7  # highlights above this are compressed, as in a camera's own curve
 _NOISE = 1 << 20  # numbers in the noise table
 
 
@@ -62,9 +62,10 @@ class ImageSensor:
             )
 
     def gain(self, radiance: Float32Array) -> float:
-        """Return the automatic exposure of an (h, w, 3) image: the factor that brings its mean to mid grey.
+        """Return the automatic exposure of an (h, w, 3) image: the factor that scales its mean to mid grey.
 
-        Every eighth pixel's green channel is measured, clipped at white: a low sun does not turn the street black.
+        It measures the green channel of every eighth pixel, clipped at white, so a low sun does not turn the street
+        black.
         """
         sample = radiance[::8, ::8, 1].astype(np.float64)
         mean = float(np.minimum(sample, 3.0 * np.median(sample)).mean())
@@ -77,9 +78,9 @@ class ImageSensor:
 
         Args:
             radiance: (h, w, 3) float32, linear RGB.
-            seed: of the noise; equal seeds give equal bytes.
-            gain: of `gain`, or chosen.
-            rain: 0 to 1, streaks of falling drops.
+            seed: seed of the noise; equal seeds give equal bytes.
+            gain: exposure, from the method `gain` or chosen.
+            rain: 0 to 1, strength of the streaks of falling drops.
 
         Returns:
             (h, w, 3) uint8, RGB.
@@ -90,7 +91,7 @@ class ImageSensor:
         if rain > 0.0:
             radiance = radiance.copy()
             _draw_rain(radiance, rain, generator)
-        # A kernel of three taps with the wanted variance.
+        # A kernel of three taps with the given variance.
         side = self.blur**2 / 2.0
         image = np.empty((height, width, 3), dtype=np.uint8)
         _expose(
@@ -116,7 +117,7 @@ def _noise_table() -> Float32Array:
 
 @lru_cache(maxsize=1)
 def _tone_curve() -> NDArray[np.uint8]:
-    """Return 8-bit codes over the square root of the light, so that dark tones get most of the steps."""
+    """Return 8-bit codes over the square root of the light: dark tones get most of the steps."""
     light = np.linspace(0.0, 1.0, _CURVE_STEPS) ** 2 * _BRIGHTEST
     over = np.maximum(light - _KNEE, 0.0)
     light = np.minimum(light, _KNEE) + (1.0 - _KNEE) * (1.0 - np.exp(-over / (1.0 - _KNEE)))

@@ -1,4 +1,4 @@
-"""Shadow maps around the camera: one of the sun, and one of the sky that vehicles hide from the ground."""
+"""Shadow maps around the camera: one for the sun, and one for the sky that vehicles hide from the ground."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
 _WINDOW = 72.0  # m, side of the square that the maps cover
-_STEP = 16.0  # m, the window moves in steps, so that a driving camera can keep it for a while
+_STEP = 16.0  # m; the window moves in steps of this size, so a moving camera can reuse it
 _SHADOW_TEXELS = 2048
 _CONTACT_TEXELS = 1024
-_CONTACT_CLEARANCE = 0.93  # a footprint's sides are drawn a little shorter: bumpers are off the ground
+_CONTACT_CLEARANCE = 0.93  # scale of the footprints: bumpers are off the ground
 _KEPT = 4  # windows kept per scene
 
 
@@ -32,11 +32,11 @@ class LightMaps(NamedTuple):
     """Occlusion of sun and sky.
 
     Attributes:
-        shadow: (n, n) float32, m, height towards the sun of the nearest occluder; 0 where there is none.
-        to_shadow: (3, 4) float64, world point (x, y, z, 1) to column, row (texels) and that height.
+        shadow: (n, n) float32, m, height towards the sun of the nearest occluder; 0 if there is none.
+        to_shadow: (3, 4) float64, maps a world point (x, y, z, 1) to column, row (texels) and that height.
         contact: (m, m) uint8, fraction of the sky that vehicles hide from the ground, 255 = all.
         x, y: m, corner of the contact map.
-        texels_per_m: of the contact map.
+        texels_per_m: resolution of the contact map.
     """
 
     shadow: Float32Array
@@ -52,7 +52,7 @@ _CACHE: WeakKeyDictionary[Instances, OrderedDict[_Key, LightMaps]] = WeakKeyDict
 
 
 def light_maps(pool: MeshPool, instances: Instances, weather: Weather, x: float, y: float) -> LightMaps:
-    """Return the maps around (x, y), m. Maps of static instances are kept as long as the instances exist."""
+    """Return the maps around (x, y), m. Maps of static instances are cached as long as the instances exist."""
     still = instances if instances.still is None else instances.still
     column, row = round(x / _STEP), round(y / _STEP)
     x, y = column * _STEP, row * _STEP
@@ -122,7 +122,7 @@ def _toward_the_sun(weather: Weather, x: float, y: float) -> FloatArray:
 def _shadow_map(
     pool: MeshPool, instances: Instances, drawn: NDArray[np.int32], to_shadow: FloatArray
 ) -> Float32Array:
-    """Rasterize the scene from the sun, with height towards the sun in place of inverse depth."""
+    """Rasterize the scene from the sun, with height towards the sun instead of inverse depth."""
     n = _SHADOW_TEXELS
     triangles = _seen_from_the_sun(
         pool.vertices,
@@ -208,7 +208,7 @@ def _seen_from_the_sun(
 def _contact_map(
     pool: MeshPool, instances: Instances, near: NDArray[np.int32], x: float, y: float
 ) -> NDArray[np.uint8]:
-    """Blur the footprints of the vehicles twice: the dark area between the wheels and its soft border."""
+    """Blur the footprints of the vehicles twice: for the dark area between the wheels and for its soft border."""
     image = np.zeros((_CONTACT_TEXELS, _CONTACT_TEXELS), dtype=np.uint8)
     boxes = bounding_boxes(pool)
     scale = _CONTACT_TEXELS / _WINDOW
@@ -231,7 +231,7 @@ _BOXES: WeakKeyDictionary[MeshPool, FloatArray] = WeakKeyDictionary()
 
 
 def bounding_boxes(pool: MeshPool) -> FloatArray:
-    """Return the bounding box of each mesh, (n_meshes, 6) float64, m: least and greatest x, y, z in its own frame."""
+    """Return the bounding box of each mesh, (n_meshes, 6) float64, m: minimum and maximum x, y, z in its own frame."""
     if pool not in _BOXES:
         start = pool.vertex_start[:-1]
         low = np.minimum.reduceat(pool.vertices, start, axis=0)

@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float64]
 _PAINT = int(Material.PAINT)
 _FACADE = int(Material.FACADE)
 _FOLIAGE = int(Material.FOLIAGE)
-_GLASS_TINT = 0.72  # of the light passes a pane
+_GLASS_TINT = 0.72  # fraction of the light that passes a pane
 
 RESPONSE = np.zeros((256, 4))
 RESPONSE[:, 3] = 1.0
@@ -54,9 +54,9 @@ class Materials(NamedTuple):
     """Lookup tables of surface appearance.
 
     Attributes:
-        grain, cloud: fine and soft noise on them.
-        response: (256, 4) float64, `RESPONSE`.
-        linear: (256,) float64, `LINEAR`.
+        grain, cloud: fine and soft noise of surfaces.
+        response: (256, 4) float64, see `RESPONSE`.
+        linear: (256,) float64, see `LINEAR`.
     """
 
     grain: Tile
@@ -189,7 +189,7 @@ def through_glass(
     light: Light,
     maps: LightMaps,
 ) -> Color:
-    """Return the radiance, linear RGB, through panes of glass plus the reflection of the nearest at (px, py, pz)."""
+    """Return the radiance, linear RGB, through panes of glass, plus the reflection of the nearest at (px, py, pz)."""
     tint = _GLASS_TINT
     for _ in range(1, min(n_panes, 4)):
         tint *= _GLASS_TINT

@@ -1,4 +1,4 @@
-"""Pinhole and stereo cameras: render a scene from a pose, in a weather, to image, depth and instance ids."""
+"""Pinhole and stereo cameras: render a scene from a pose, in given weather, to image, depth and instance ids."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from sim_sensors.mesh import Ground, Instances, MeshPool
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
-_AHEAD = 12.0  # m, before the camera: the middle of what is lit in detail
+_AHEAD = 12.0  # m ahead of the camera: the middle of the area that is lit in detail
 
 
 class Drawable(Protocol):
     """A scene that a camera can render.
 
-    The arrays must not change: shadows and textures made from them are kept as long as the objects exist. To change
+    The arrays must not change: shadows and textures made from them are cached as long as the objects exist. To change
     the scene make new `Instances`; pool and ground can be shared.
     """
 
@@ -52,11 +52,11 @@ class Frame:
 
     Attributes:
         image: (h, w, 3) uint8, RGB.
-        depth: (h, w) float32, m along the optical axis, of the first *opaque* surface at the pixel's centre: stereo and
-            lidar look through glass, too. inf for the sky.
-        glass_depth: (h, w) float32, m along the optical axis, of the nearest pane before that surface; inf where
+        depth: (h, w) float32, m along the optical axis, of the first *opaque* surface at the pixel's centre: stereo
+            cameras and lidar measure through glass, too. inf for the sky.
+        glass_depth: (h, w) float32, m along the optical axis, of the nearest pane in front of that surface; inf where
             there is none.
-        ids: (h, w) int32, `Instances.ids` of the first surface, glass included; 0 for scenery, ground and sky. So a
+        ids: (h, w) int32, `Instances.ids` of the first surface, glass included; 0 for scenery, ground and sky. A
             vehicle's pixels include its windows.
     """
 
@@ -75,12 +75,12 @@ class PinholeCamera:
         fx, fy: px, focal lengths.
         cx, cy: px, principal point.
         sensor: exposure, blur and noise.
-        supersampling: 1, or 2 to draw four samples a pixel: smoother edges at four times the cost. Depth and ids
-            are always taken at the pixel's centre.
+        supersampling: 1, or 2 for four samples per pixel: smoother edges at four times the cost. Depth and ids are
+            always taken at the pixel's centre.
         coarse_beyond: m; farther objects are drawn with coarse meshes if the pool has them.
 
     Raises:
-        SensorError: a size below 1, a focal length that is not positive, anything not finite.
+        SensorError: a size is below 1, a focal length is not positive, or a value is not finite.
     """
 
     width: int = 640
@@ -111,7 +111,7 @@ class PinholeCamera:
     def from_field_of_view(
         cls, width: int = 640, height: int = 480, horizontal: float = 1.1
     ) -> PinholeCamera:
-        """Make a camera with square pixels and the principal point in the image centre.
+        """Make a camera with square pixels and its principal point in the image centre.
 
         Args:
             width: px.
@@ -144,17 +144,18 @@ class PinholeCamera:
     ) -> Frame:
         """Render an image. Equal arguments give equal bytes, on any number of threads.
 
-        The first image of a ground draws its texture (about a second); the first call after an installation compiles.
+        The first image of a ground draws its texture (about a second); the first call after an installation compiles
+        the code.
 
         Args:
             scene: pool, instances and ground.
             pose: (4, 4) float64, camera (x right, y down, z forward) to world; see `camera_pose`.
             weather: the light; the default is a sunny day.
-            seed: of the sensor's noise.
+            seed: seed of the sensor's noise.
             gain: exposure; None for automatic.
 
         Raises:
-            SensorError: a pose that is not finite or no rotation, or lies below the ground or inside a vehicle.
+            SensorError: the pose is not finite, not a rotation, below the ground, or inside a vehicle.
         """
         weather = Weather() if weather is None else weather
         pose = checked_pose(scene, pose)
@@ -166,7 +167,7 @@ class PinholeCamera:
     def _render_radiance(
         self, scene: Drawable, pose: FloatArray, weather: Weather
     ) -> tuple[Float32Array, tuple[Float32Array, Float32Array, NDArray[np.int32]]]:
-        """Return radiance; and depth, glass depth and ids."""
+        """Return the radiance; and depth, glass depth and ids."""
         triangles, visibility = self.visibility(scene, pose)
         geometry = _geometry(visibility, triangles.instance, scene.instances.ids)
         texture = ground_texture(scene.ground)
@@ -186,7 +187,7 @@ class PinholeCamera:
         """Return the visible triangle of each pixel: geometry without light."""
         size = (self.width, self.height)
         triangles = project(scene.pool, scene.instances, pose, self.intrinsics, size, self.coarse_beyond)
-        # The ray meets the ground z = 0 where its z component times the depth equals the camera's height.
+        # A ray meets the ground z = 0 where its z component times the depth equals the camera's height.
         down = -pose[2, :3] / pose[2, 3]
         floor_x, floor_y = down[0] / self.fx, down[1] / self.fy
         floor = np.array([floor_x, floor_y, down[2] - floor_x * self.cx - floor_y * self.cy])
@@ -195,11 +196,13 @@ class PinholeCamera:
 
 @dataclass(frozen=True, eq=False)
 class StereoFrame:
-    """A rectified pair: rows agree, and a point's disparity is fx · baseline / depth, left minus right.
+    """A rectified image pair.
+
+    A point is in the same row of both images; its disparity, left minus right, is fx · baseline / depth.
 
     Attributes:
-        left: with depth and ids as of a single camera.
-        right: the same from the right camera.
+        left: frame of the left camera, with depth and ids.
+        right: frame of the right camera.
     """
 
     left: Frame
@@ -208,14 +211,14 @@ class StereoFrame:
 
 @dataclass(frozen=True)
 class StereoCamera:
-    """Two equal cameras side by side, Bumblebee-like; the left one's pose is the pair's.
+    """Two equal cameras side by side, like a Bumblebee; the pose of the pair is that of the left camera.
 
     Args:
-        camera: either of the two.
-        baseline: m, the right camera stands this far along the left one's x axis.
+        camera: the model of both cameras.
+        baseline: m, position of the right camera along the left one's x axis.
 
     Raises:
-        SensorError: a baseline that is not positive and finite.
+        SensorError: the baseline is not positive and finite.
     """
 
     camera: PinholeCamera = field(default_factory=PinholeCamera)
@@ -226,7 +229,7 @@ class StereoCamera:
             raise SensorError(f"baseline is {self.baseline} m, want a finite number above 0")
 
     def right_pose(self, pose: FloatArray) -> FloatArray:
-        """Pose of the right camera, (4, 4), from that of the left."""
+        """Return the pose of the right camera, (4, 4), from that of the left."""
         moved = np.array(pose, dtype=np.float64)
         moved[:3, 3] += self.baseline * moved[:3, 0]
         return moved
@@ -236,7 +239,7 @@ class StereoCamera:
     ) -> StereoFrame:
         """Render both images with one exposure; arguments and errors are those of `PinholeCamera.render`.
 
-        Both share textures, sky and shadows; their noise is independent.
+        The images share textures, sky and shadows; their noise is independent.
         """
         weather = Weather() if weather is None else weather
         sensor = self.camera.sensor
@@ -252,15 +255,15 @@ class StereoCamera:
 def camera_pose(
     x: float, y: float, z: float, yaw: float, pitch: float = 0.0, roll: float = 0.0
 ) -> FloatArray:
-    """Camera-to-world matrix of a camera that looks along `yaw`.
+    """Return the camera-to-world matrix of a camera that points along `yaw`.
 
     Args:
         x: m, world frame.
         y: m.
         z: m, above the ground.
         yaw: rad, counter-clockwise from x, of the optical axis.
-        pitch: rad, above 0 looks up.
-        roll: rad, about the optical axis, above 0 tilts the head to the right.
+        pitch: rad, positive upwards.
+        roll: rad, about the optical axis, positive when the camera tilts to the right.
 
     Returns:
         (4, 4) float64; columns are the camera's right, down and forward axes, and its position.
@@ -283,7 +286,8 @@ def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
     """Return the pose as a contiguous (4, 4) float64 array.
 
     Raises:
-        SensorError: of another shape, not finite, no rotation, not above the ground, or inside a vehicle.
+        SensorError: the pose has another shape, is not finite, not a rotation, not above the ground, or inside a
+        vehicle.
     """
     pose = np.ascontiguousarray(pose, dtype=np.float64)
     if pose.shape != (4, 4):

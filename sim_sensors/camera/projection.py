@@ -1,9 +1,9 @@
 """From a scene to triangles on the screen: culling, level of detail, projection, clipping at the near plane.
 
-A triangle's inverse depth and its normal (over depth) are linear in the pixel, whatever its corners do: both
-come from the cross products of its corners in the camera frame (Olano and Greer, *Triangle scan conversion
-using 2D homogeneous coordinates*, 1997). So clipping at the near plane only decides which pixels are covered,
-and depth is exact for triangles that pass behind the camera.
+A triangle's inverse depth and its normal (over depth) are linear in the pixel coordinates: both follow from the cross
+products of its corners in the camera frame (Olano and Greer, *Triangle scan conversion using 2D homogeneous
+coordinates*, 1997). Clipping at the near plane therefore only determines which pixels are covered, and depth is exact
+even for triangles that extend behind the camera.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
-NEAR = 0.05  # m, nothing nearer is drawn
+NEAR = 0.05  # m; nothing nearer is drawn
 
-# Things whose inside is never seen. A car's shell is not among them: one sees it through the windows.
+# Materials of closed objects, whose inside is never visible. A car's shell is not closed: its inside is visible through
+# the windows.
 _CLOSED = np.zeros(256, dtype=np.bool_)
 _CLOSED[[Material.RUBBER, Material.FACADE, Material.BARK, Material.STONE, Material.POST]] = True
 
@@ -59,7 +60,7 @@ def project(
     size: tuple[int, int],
     coarse_beyond: float = math.inf,
 ) -> ScreenTriangles:
-    """Cull, transform and clip; triangles that cover no pixel centre are left out.
+    """Cull, transform and clip the triangles of a scene; omit those that cover no pixel centre.
 
     Args:
         pool: the meshes.
@@ -128,7 +129,7 @@ def _visible_instances(
     center = (instances.pose[:, :3] - pose[:3, 3]) @ pose[:3, :3]
     reach = radius[instances.mesh].astype(np.float64)
     seen = center[:, 2] > NEAR - reach
-    # The pyramid's four side planes pass through the camera; their normals point out of it.
+    # The four side planes of the frustum pass through the camera; their normals point outwards.
     for plane in (
         (fx, 0.0, cx - size[0]),
         (-fx, 0.0, -cx),
@@ -166,7 +167,7 @@ def _project(
     polygon: FloatArray,
     out: ScreenTriangles,
 ) -> int:
-    """Fill `out` and return the number of triangles. The arrays before it are work space."""
+    """Fill `out` and return the number of triangles; `moved` to `polygon` are work arrays."""
     count = 0
     for index in range(visible.shape[0]):
         q = visible[index]
@@ -202,7 +203,7 @@ def _project(
                 cross[1, i] = c[j] * a[k] - c[k] * a[j]
                 cross[2, i] = a[j] * b[k] - a[k] * b[j]
             volume = a[0] * cross[0, 0] + a[1] * cross[0, 1] + a[2] * cross[0, 2]
-            # Seen edge-on (or no triangle at all); seen from behind.
+            # Seen edge-on (or degenerate), or from behind.
             if abs(volume) < 1e-12 or (volume > 0.0 and closed[material[t]]):
                 continue
             corners = _clip(a, b, c, fx, fy, cx, cy, polygon)

@@ -1,7 +1,7 @@
 """Rasterizer: a z-buffer in horizontal bands.
 
-Each band of rows is written by one thread, with the triangles in the same order, so the result does not depend on the
-number of threads.
+One thread writes each band of rows, with the triangles in a fixed order, so the result does not depend on the number of
+threads.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class Visibility(NamedTuple):
     Attributes:
         inverse_depth: float32, 1/m along the optical axis, of the first opaque surface; 0 for the sky.
         triangle: int32, of that surface; -1 for ground or sky.
-        pane_inverse_depth: float32, of the nearest pane of glass in front of it; 0 where there is none.
+        pane_inverse_depth: float32, 1/m, of the nearest pane of glass in front of it; 0 where there is none.
         pane: int32, that pane's triangle; -1 where there is none.
-        n_panes: uint8, how many panes stand in front.
+        n_panes: uint8, number of panes in front of it.
     """
 
     inverse_depth: Float32Array
@@ -57,10 +57,10 @@ def rasterize(
     """Find the nearest opaque surface of every pixel, and the glass in front of it.
 
     Args:
-        triangles: as `project` gives them.
+        triangles: from `project`.
         size: width, height, px.
         floor: (3,) inverse depth of the ground, a·x + b·y + c at (x, y) px.
-        minimum: 1/m; ground farther away than that is sky.
+        minimum: 1/m; ground with a smaller inverse depth is sky.
         panes: whether to draw glass; if not, its three arrays are (0, 0).
     """
     width, height = size
@@ -92,9 +92,9 @@ def rasterize(
 
 
 def interleaved(n: int) -> NDArray[np.int64]:
-    """Return a permutation of 0 to n - 1 in which every long run is spread over the whole range.
+    """Return a permutation of 0 to n - 1 in which every long run covers the whole range evenly.
 
-    Threads get runs of bands, and the top of an image (sky) is cheaper than its middle.
+    Each thread gets a run of bands, and the top of an image (sky) is cheaper than its middle.
     """
     step = max(1, round(n * 0.382))
     while math.gcd(step, n) != 1:
@@ -104,7 +104,7 @@ def interleaved(n: int) -> NDArray[np.int64]:
 
 @compiled
 def _sort_into_bands(corners: Float32Array, n_bands: int, height: int) -> tuple[NDArray[np.int64], IntArray]:
-    """Return the triangles of each band, in their order: `members[start[b]:start[b + 1]]`."""
+    """Return the triangles of each band in their order, `members[start[b]:start[b + 1]]`."""
     n = corners.shape[0]
     first = np.empty(n, dtype=np.int32)
     last = np.empty(n, dtype=np.int32)
@@ -174,7 +174,7 @@ def _rasterize(
         top = band * BAND
         bottom = min(height, top + BAND)
         for y in range(top, bottom):
-            # In double: toward the horizon little is left of the difference.
+            # In double precision: towards the horizon most of the digits cancel.
             base = floor[1] * (y + 0.5) + floor[2] + 0.5 * floor[0]
             for x in range(width):
                 value = base + floor[0] * x
@@ -184,7 +184,7 @@ def _rasterize(
                 pane_depth[y] = 0.0
                 pane[y] = -1
                 n_panes[y] = 0
-        # Glass comes second: it is drawn only in front of opaque surfaces.
+        # Draw glass second, since it is drawn only in front of opaque surfaces.
         for is_glass in range(2 if pane.shape[0] > 0 else 1):
             for member in range(start[band], start[band + 1]):
                 t = members[member]
@@ -201,7 +201,7 @@ def _rasterize(
                     py = y + 0.5
                     long = ax + (py - ay) * slope_ac
                     short = ax + (py - ay) * slope_ab if py < by else bx + (py - by) * slope_bc
-                    # Clamped before rounding: a clipped triangle can reach far out of the image.
+                    # Clamp before rounding: a clipped triangle can extend far beyond the image.
                     x_first = math.ceil(max(min(long, short), 0.0) - 0.5)
                     x_end = math.ceil(min(max(long, short), float(width)) - 0.5)
                     base = planes[t, 0] * (x_first + 0.5) + planes[t, 1] * py + planes[t, 2]

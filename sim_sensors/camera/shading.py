@@ -1,6 +1,6 @@
 """Deferred shading: the radiance of every pixel, from sky, ground or a surface, through haze and glass.
 
-The rasterizer has found the surfaces, so each pixel is shaded once, and once more for a pane of glass.
+The rasterizer has found the visible surfaces, so each pixel is shaded once, and once more for a pane of glass.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ def shade(
     """Return the radiance of every pixel.
 
     Args:
-        triangles: on the screen.
+        triangles: triangles on the screen.
         visibility: the visible triangle of each pixel.
         pose: (4, 4) camera to world.
         intrinsics: fx, fy, cx, cy, px.
         weather: the light.
-        ground: its texture.
-        maps: shadows.
+        ground: texture of the ground.
+        maps: shadow maps.
 
     Returns:
         (h, w, 3) float32, linear RGB, relative (see `Weather`).
@@ -88,7 +88,7 @@ def _shade(
     image: Float32Array,
 ) -> None:
     for task in prange(order.shape[0]):
-        # Assembled here: numba's parallel loops take tuples from outside, but no nested ones.
+        # Assemble the tuple here: numba's parallel loops accept tuples from outside, but not nested ones.
         materials = Materials(grain, cloud, response, linear)
         top = order[task] * BAND
         for y in range(top, min(image.shape[0], top + BAND)):
@@ -169,7 +169,7 @@ def _shade_row(
                     maps,
                     materials,
                 )
-            # 1 - exp(-k) to three decimals, for the k of any road.
+            # 1 - exp(-k) to three decimals, for the k of usual road scenes.
             k = light.haze * depth / inverse_length
             fog = 1.0 - 1.0 / (1.0 + k * (1.0 + 0.5 * k))
             red += (light.horizon[0] - red) * fog

@@ -1,4 +1,4 @@
-"""The sky as a paraboloid map, in which directions are looked up without trigonometry."""
+"""The sky as a paraboloid map, which allows look-ups by direction without trigonometry."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
 
-_SHARP = 1536  # texels over the half sphere: one is about 0.1°
+_SHARP = 1536  # texels across the hemisphere: one is about 0.1°
 _BLURRED = 160
 
 
@@ -22,8 +22,8 @@ _BLURRED = 160
 def sky_domes(weather: Weather) -> tuple[Float32Array, Float32Array]:
     """Return the upper hemisphere, sharp for the background and blurred for reflections.
 
-    Paraboloid maps: direction (x, y, z) with z ≥ 0 lies at ((x, y) / (1 + z) + 1) / 2 of the side. The skyline
-    of far trees and roofs is in it.
+    Both are paraboloid maps: direction (x, y, z) with z ≥ 0 lies at ((x, y) / (1 + z) + 1) / 2 of the side. They
+    include the skyline of distant trees and roofs.
 
     Returns:
         two arrays (n, n, 3) float32, linear RGB radiance.
@@ -34,7 +34,7 @@ def sky_domes(weather: Weather) -> tuple[Float32Array, Float32Array]:
     square = u * u + v * v
     inside = np.minimum(square, 1.0)
     z = (1.0 - inside) / (1.0 + inside)
-    # Corners outside the unit disc repeat the horizon, so that bilinear look-ups at the rim stay in it.
+    # Corners outside the unit disc repeat the horizon, so bilinear look-ups at the rim are valid.
     stretch = np.where(square > 1.0, 1.0 / np.sqrt(square), 1.0)
     x = 2.0 * u * stretch / (1.0 + inside)
     y = 2.0 * v * stretch / (1.0 + inside)
@@ -68,7 +68,7 @@ def _with_clouds(
     z: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     noise = (0.5 + 0.2 * fractal_noise(256, generator, 1.5)).astype(np.float32)
-    # A cloud sheet at unit height, drawn out toward the horizon but never to a point.
+    # A layer of clouds at unit height, stretched towards the horizon but not infinitely.
     column = (x / (z + 0.2) * 0.17 * 256) % 256
     row = (y / (z + 0.2) * 0.17 * 256) % 256
     sheet = cv2.remap(

@@ -1,7 +1,7 @@
-"""Triangle meshes from a few kinds of surface: curved grids, strips between curves, boxes, revolutions, prisms.
+"""Triangle meshes from a few types of surfaces: curved grids, strips between curves, boxes, revolutions, prisms.
 
-Every triangle has a *finish*, a small number whose material and colour come from a palette when the mesh is made. So
-one shape gives cars of many paints.
+Every triangle has a *finish*, a small number; a palette gives it a material and a colour when the mesh is made. So one
+shape serves cars of many colours.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sim_sensors.mesh import Mesh
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-CREASE = np.cos(np.radians(42.0))  # faces of two surfaces that meet at less than this angle look like one
+CREASE = np.cos(np.radians(42.0))  # surfaces whose faces meet at less than this angle are shaded as one
 WELD_M = 1e-5
 
 _BOX_FACES = {
@@ -47,7 +47,7 @@ class Shape:
     finish: NDArray[np.uint8]
 
     def dyed(self, material: NDArray[np.uint8], color: NDArray[np.uint8]) -> Mesh:
-        """Return the mesh with the materials and colours of a palette.
+        """Return the mesh with materials and colours from a palette.
 
         Args:
             material: (n_finishes,) uint8.
@@ -69,10 +69,10 @@ class ShapeBuilder:
         """Add a curved grid of quads.
 
         Args:
-            points: (a, b, 3) m. The outside is where ∂/∂a × ∂/∂b points.
+            points: (a, b, 3) m. ∂/∂a × ∂/∂b points to the outside.
             finish: () or (a - 1, b - 1) int.
-            flip: swaps inside and outside.
-            smooth: rounds the sheet and its seams with other smooth sheets by common normals; facets otherwise.
+            flip: whether to swap inside and outside.
+            smooth: whether the sheet, and its seams with other smooth sheets, have common normals; else it is faceted.
         """
         corner = np.asarray(points, dtype=np.float64)
         rows, columns = corner.shape[:2]
@@ -122,10 +122,10 @@ class ShapeBuilder:
         Args:
             center: (3,) m.
             size: (3,) m along x, y, z.
-            finish: of all faces.
+            finish: finish of all faces.
             taper: scale of the top along x and y.
-            lean: m, by which the top is shifted along x.
-            faces: which to keep, lower case for the low side of an axis.
+            lean: m, shift of the top along x.
+            faces: faces to keep, lower case for the low side of an axis.
         """
         x, y, z = np.asarray(size, dtype=np.float64) / 2
         bottom = np.array([[-x, -y, -z], [x, -y, -z], [x, y, -z], [-x, y, -z]])
@@ -141,9 +141,9 @@ class ShapeBuilder:
         Args:
             profile: (k, 2) radius and height, m; the outside lies to the right of its direction.
             finish: () or (k - 1,) int, of each band.
-            segments: around.
+            segments: number of segments around the axis.
             smooth: see `grid`.
-            phase: rad, of the first corner.
+            phase: rad, angle of the first corner.
         """
         radius, height = np.asarray(profile, dtype=np.float64).T
         angle = phase + np.linspace(0.0, 2 * np.pi, segments + 1)
@@ -169,9 +169,9 @@ class ShapeBuilder:
         Args:
             edge: (n, 3) m, from rear to front.
             across: (k,) fractions of the half width, 1 on the left edge to -1 on the right.
-            crown: () or (n,) m, how much higher the middle is.
+            crown: () or (n,) m, height of the middle above the edge.
             finish: () or (n - 1, k - 1) int.
-            flip: makes the sheet face down.
+            flip: whether the sheet faces down.
             smooth: see `grid`.
         """
         a = np.asarray(across, dtype=np.float64)
@@ -183,7 +183,7 @@ class ShapeBuilder:
     def put(
         self, shape: Shape, *, offset: ArrayLike = (0.0, 0.0, 0.0), turn: FloatArray | None = None
     ) -> None:
-        """Add a finished shape, turned by a (3, 3) rotation (or reflection), then shifted; it keeps its facets."""
+        """Add a built shape, rotated (or reflected) by a (3, 3) matrix, then shifted; it keeps its facets."""
         matrix = np.eye(3) if turn is None else turn
         triangles = shape.triangles.astype(np.int64)
         if np.linalg.det(matrix) < 0:
@@ -200,8 +200,8 @@ class ShapeBuilder:
     def build(self) -> Shape:
         """Weld equal points, drop triangles without area, and compute the vertex normals.
 
-        The corner of a smooth face gets the area-weighted mean normal of the smooth faces around the point that differ
-        by less than the crease angle; faceted faces keep their own normal.
+        The corner of a smooth face gets the area-weighted mean normal of those smooth faces around the point that
+        differ by less than the crease angle; faceted faces keep their own normal.
         """
         counts = np.cumsum([0, *(len(p) for p in self._points)])
         points = np.concatenate(self._points)
@@ -252,7 +252,7 @@ def _point_numbers(points: FloatArray) -> IntArray:
 def _corner_normals(
     corner: IntArray, face: FloatArray, area: FloatArray, smooth: NDArray[np.bool_]
 ) -> FloatArray:
-    """(3 t, 3) float64: the unit normal at each corner of each triangle."""
+    """Return the unit normal at each corner of each triangle, (3 t, 3) float64."""
     spot = corner.ravel()
     order = np.argsort(spot, kind="mergesort")
     normal = np.empty((len(spot), 3))

@@ -14,8 +14,8 @@ Float32Array = NDArray[np.float32]
 
 # All fastmath flags except the one that excludes infinities: the depth of the sky is infinite.
 FAST = {"reassoc", "nsz", "arcp", "contract", "afn"}
-# For functions that are called for every pixel or triangle and allocate nothing: numba's reference counting of their
-# array arguments would cost ten times the computation.
+# For functions that are called per pixel or triangle and do not allocate: numba's reference counting of their array
+# arguments would cost ten times the computation.
 LEAF = {"fastmath": FAST, "_nrt": False, "forceinline": True}
 
 
@@ -23,8 +23,8 @@ class Tile(NamedTuple):
     """A square, tileable grey texture with its image pyramid.
 
     Attributes:
-        levels: (total,) float32, 0 to 1, level after level, each row-major and half as wide as the last.
-        start: (n_levels,) int64, where each level begins.
+        levels: (total,) float32, 0 to 1, level after level, each row-major and half as wide as the previous one.
+        start: (n_levels,) int64, start of each level.
         size: texels along a side of the finest level, a power of two.
     """
 
@@ -73,7 +73,7 @@ def cloud_tile() -> Tile:
 
 @compiled(**LEAF)
 def sample_tile(tile: Tile, u: float, v: float, level: int) -> float:
-    """Return the bilinear value at (u, v), in periods of the tile, of one level of its pyramid."""
+    """Return the bilinear value at (u, v), in periods of the tile, at one level of its pyramid."""
     level = min(max(level, 0), tile.start.shape[0] - 1)
     n = tile.size >> level
     x = u * n - 0.5
@@ -102,7 +102,7 @@ def hash_unit(x: int, y: int) -> float:
 
 @compiled(**LEAF)
 def pixel_level(texels: float) -> int:
-    """Return the level of a 512-texel tile whose texels are as large as a pixel that spans `texels` periods."""
+    """Return the level of a 512-texel tile at which a texel is as large as a pixel that spans `texels` periods."""
     level = 0
     spans = texels * 512.0
     while spans > 1.4 and level < 7:

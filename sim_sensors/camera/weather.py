@@ -30,7 +30,7 @@ class _Drawn(NamedTuple):
 
 _BLACK: Color = (0.0, 0.0, 0.0)
 
-# Fields of `Weather` by preset, in the order in which they are drawn: another order is other weather.
+# Fields of `Weather` by preset, in the order in which they are drawn; another order would change the weather.
 _PRESETS: dict[str, dict[str, _Drawn | float | Color]] = {
     "sunny": {
         "sun_elevation": _Drawn(0.6, 1.1),
@@ -91,21 +91,21 @@ class Weather:
     """The light of a scene. Radiance is relative: a white wall under an open overcast sky has radiance 1.
 
     Args:
-        preset: the name of the preset it was drawn from.
-        sun_azimuth: rad, world frame, counter-clockwise from x, of the direction to the sun.
+        preset: name of the preset that it was drawn from.
+        sun_azimuth: rad, direction to the sun, world frame, counter-clockwise from x.
         sun_elevation: rad above the horizon.
         sun: radiance of a white surface that faces the sun, linear RGB; black when hidden.
         sky: radiance of a white surface under the whole sky, linear RGB.
-        zenith, horizon: radiance of the clear sky there, linear RGB.
+        zenith, horizon: radiance of the clear sky at zenith and horizon, linear RGB.
         clouds: fraction of the sky that clouds cover.
-        haze: 1/m, how fast things fade into the horizon's colour.
-        wetness: 0 dry to 1 puddles.
-        rain: 0 none to 1 streaks in the air.
+        haze: 1/m, rate at which objects fade into the horizon's colour.
+        wetness: from 0, dry, to 1, puddles.
+        rain: from 0, none, to 1, streaks in the air.
         lit_windows: fraction of the windows with light behind them.
-        seed: of clouds, skyline and puddles.
+        seed: seed of clouds, skyline and puddles.
 
     Raises:
-        SensorError: a value that is not finite, or out of range.
+        SensorError: a value is not finite, or out of range.
     """
 
     preset: str = "sunny"

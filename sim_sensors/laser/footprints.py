@@ -1,4 +1,4 @@
-"""Obstacles in a horizontal scan plane: convex footprints and walls, sorted into a grid of cells for fast queries."""
+"""Obstacles in a horizontal scan plane: convex footprints and walls, sorted into a grid for fast queries."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ NO_RETURN = -1
 WALL = -2
 NOWHERE = -1
 
-LANES = 16  # obstacles that one pass of vector code prepares
+LANES = 16  # obstacles per pass of vector code
 QUAD, OCTAGON = 4, 8
 FAR = 1e9
 
 CELL_M = 16.0
-LARGEST_IN_A_CELL_M = 8.0  # what reaches further from its centre is looked at in every scan
+LARGEST_IN_A_CELL_M = 8.0  # obstacles that extend further from their centre are checked in every scan
 SPARE_PLACES = 32
 SHORTEST_EDGE_M = 1e-6
 STRAIGHT_RAD = 1e-9
@@ -30,21 +30,22 @@ STRAIGHT_RAD = 1e-9
 class Cells(NamedTuple):
     """Obstacles for compiled code, in blocks of sixteen; a wall is a polygon of two corners.
 
-    Places `0:cell_start[-1]` are sorted by cell, row after row, so that neighbouring cells of a row are one run
-    of places. The places after them hold what is too large for a cell or has left its own, and spares. Unused
+    Places `0:cell_start[-1]` are sorted by cell, row after row, so neighbouring cells of a row are consecutive places.
+    The places after them hold obstacles that are too large for a cell or have left their cell, and spare places. Unused
     places lie `FAR` away.
 
     Attributes:
         corners: (n_places / LANES · k · 2 · LANES,) float32, m, counter-clockwise, relative to the centre: for
-            each block of LANES places the x and the y of corner 0, of corner 1, ... A polygon of fewer than k
-            corners repeats its last.
-        x, y: (n_places,) float64, m, world frame: the centre. Only differences to it are taken in float32, so
-            a lot may lie anywhere.
-        radius: (n_places,) float32, m, of the circle that encloses the obstacle.
+            each block of LANES places the x and the y of corner 0, of corner 1, ... A polygon with fewer than k corners
+            repeats its last one.
+        x, y: (n_places,) float64, m, world frame: the centre. Only offsets from it are float32, so a lot may lie
+            anywhere.
+        radius: (n_places,) float32, m, radius of a circle around the obstacle.
         label: (n_places,) int32, the footprint's id, or `WALL`.
         cell_start: (n_rows · n_columns + 1,) int64.
-        frame: (6,) float64: x and y of the first cell's corner and the cell size (m), rows, columns; places in use.
-        k: corners kept of each.
+        frame: (6,) float64: x and y of the first cell's corner and the cell size (m), rows, columns, number of places
+            in use.
+        k: number of corners per obstacle.
     """
 
     corners: NDArray[np.float32]
@@ -58,10 +59,10 @@ class Cells(NamedTuple):
 
 
 class CellTable:
-    """Convex polygons of at most k corners, sorted into cells; single polygons can be replaced.
+    """Convex polygons of at most k corners, sorted into cells; polygons can be replaced individually.
 
     Args:
-        k: most corners of one.
+        k: maximum number of corners.
         corners: (n, k_max, 2) float64, m, world frame, counter-clockwise.
         n_corners: (n,) int64; polygons with none or with more than k are omitted.
         labels: (n,) int64.
@@ -116,10 +117,10 @@ class CellTable:
             self.cells.x[place] = self.cells.y[place] = FAR
 
     def put(self, index: int, corners: Float64Array, label: int) -> bool:
-        """Replace polygon `index`; return False, without a change, if no free place is left and a new sort is due.
+        """Replace polygon `index`; return False, without a change, if no place is free and a new sort is due.
 
         Args:
-            index: of the polygon.
+            index: index of the polygon.
             corners: (3 to k, 2) float64, m, world frame, counter-clockwise.
             label: its label.
         """
@@ -162,21 +163,22 @@ class CellTable:
 class ScanPlane:
     """The obstacles in a horizontal laser plane (0.5 m above the ground): footprints and walls.
 
-    Footprints are convex polygons (a post is a polygon of eight or more corners), walls are line segments of
-    no thickness, seen from both sides. They may overlap. Preparing takes a sort over all of them; afterwards
-    changing one footprint touches that one alone, and a scan visits the cells within its range alone.
+    Footprints are convex polygons (a post is a polygon of eight or more corners); walls are line segments without
+    thickness, visible from both sides. They may overlap. Construction sorts all of them; afterwards a change affects
+    only one footprint, and a scan visits only the cells within its range.
 
     Args:
-        footprints: (n, k_max, 2) float, m, world frame: corners in order, of either orientation. Kept
+        footprints: (n, k_max, 2) float, m, world frame: corners in order, in either orientation. They are stored
             counter-clockwise, without corners on a straight edge.
-        n_corners: (n,) int, how many corners of each are used: 3 to k_max, or 0 for an empty place that
-            `replace` may fill later. None: all of them.
+        n_corners: (n,) int, number of corners used: 3 to k_max, or 0 for an empty place that `replace` may fill later.
+            None: all.
         walls: (m, 2, 2) float, m, world frame: the two ends of each.
-        ids: (n,) int, 0 or more, what a scan reports as hit; several footprints may share one. None: 0 to n-1.
+        ids: (n,) int, 0 or more, the id that a scan reports for a hit; several footprints may share one. None: 0 to
+            n-1.
 
     Raises:
-        SensorError: a shape that does not fit, a value that is not finite, a footprint that is concave, crosses
-            itself or has no area, or a wall of no length.
+        SensorError: a shape does not fit, a value is not finite, a footprint is concave, crosses itself or has no area,
+        or a wall has no length.
 
     Examples:
         >>> plane = ScanPlane([[[1, -1], [2, -1], [2, 1], [1, 1]]], walls=[[[5, -9], [5, 9]]])
@@ -210,7 +212,7 @@ class ScanPlane:
 
     @property
     def cells(self) -> tuple[Cells, Cells]:
-        """The obstacles for compiled code: those of up to four corners, and the others. Read-only."""
+        """The obstacles for compiled code: those with up to four corners, and the others. Read-only."""
         return self._quads.cells, self._others.cells
 
     @property
@@ -226,14 +228,14 @@ class ScanPlane:
     def replace(self, index: int, corners: ArrayLike | None) -> None:
         """Replace or clear a footprint; its id stays.
 
-        This takes microseconds, except that all are sorted again after every few dozen moves between cells.
+        This takes microseconds, except that all footprints are sorted again after a few dozen moves between cells.
 
         Args:
-            index: of the footprint, 0 to n_footprints - 1.
-            corners: (k, 2) float, m, world frame, 3 to k_max corners of either orientation; None to clear it.
+            index: index of the footprint, 0 to n_footprints - 1.
+            corners: (k, 2) float, m, world frame, 3 to k_max corners in either orientation; None to clear it.
 
         Raises:
-            SensorError: no such footprint, or invalid corners.
+            SensorError: the footprint does not exist, or the corners are invalid.
         """
         if not 0 <= index < self.n_footprints:
             raise SensorError(f"index: wanted 0 to {self.n_footprints - 1}, got {index}")
@@ -271,7 +273,7 @@ class ScanPlane:
 
 
 def _short_pieces(walls: Float64Array) -> Float64Array:
-    """Return walls cut into pieces that fit into a cell, (n, 2, 2) float64."""
+    """Return the walls cut into pieces that fit into a cell, (n, 2, 2) float64."""
     start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
     n = np.ceil(np.hypot(along[:, 0], along[:, 1]) / (2 * LARGEST_IN_A_CELL_M)).astype(np.int64)
     wall = np.repeat(np.arange(len(walls)), n)
@@ -284,7 +286,7 @@ def _frame(circle: Float64Array) -> Float64Array:
     """Return the frame of cells over all centres; see `Cells.frame`."""
     low, high = (circle[:, :2].min(0), circle[:, :2].max(0)) if len(circle) else (np.zeros(2), np.zeros(2))
     extent = high - low
-    # Where little stands on much ground, larger cells keep their number in proportion to the obstacles.
+    # If few obstacles cover a large area, larger cells keep the number of cells in proportion to them.
     size = max(CELL_M, float(np.sqrt(np.prod(extent) / (64 + 4 * len(circle)))), float(extent.max()) / 4096)
     columns, rows = np.floor(extent / size) + 1
     return np.array([*low, size, rows, columns])
@@ -299,10 +301,10 @@ def _cell_of(circle: Float64Array, frame: Float64Array) -> IntArray:
 
 
 def _as_floats(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float64Array:
-    """Return `value` as finite float64 of a shape; None stands for any length.
+    """Return `value` as a finite float64 array of the given shape; None stands for any length.
 
     Raises:
-        SensorError: another shape, or a value that is not a finite number.
+        SensorError: the shape differs, or a value is not a finite number.
     """
     try:
         array = np.array(value, dtype=np.float64)
@@ -341,10 +343,10 @@ def _enclosing_circles(corners: Float64Array, n_corners: IntArray) -> Float64Arr
 
 
 def _normalised(name: str, corners: Float64Array, n_corners: IntArray) -> tuple[Float64Array, IntArray]:
-    """Return footprints counter-clockwise, without collinear corners.
+    """Return the footprints counter-clockwise, without collinear corners.
 
     Args:
-        name: for error messages.
+        name: name for error messages.
         corners: (n, k_max, 2) float64, m.
         n_corners: (n,) int64.
 
@@ -376,7 +378,7 @@ def _normalised(name: str, corners: Float64Array, n_corners: IntArray) -> tuple[
             np.hypot(edge[..., 0], edge[..., 1]) < SHORTEST_EDGE_M,
         )
         turn = np.arctan2(_cross(before, edge), (before * edge).sum(-1))
-        # A convex outline turns left at every corner, and once around in all; one of no area turns back.
+        # A convex outline turns left at every corner, by one full turn in total; an outline without area turns back.
         flat = np.abs(np.abs(turn) - np.pi) < STRAIGHT_RAD
         _refuse(name, "an area above zero", group, outline, flat)
         crossed = np.abs(turn.sum(1, keepdims=True) - 2 * np.pi) > 1e-3

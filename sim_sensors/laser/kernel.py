@@ -2,9 +2,9 @@
 
 A ray caster tests every beam against all segments. Here a convex footprint becomes the interval of beams between its
 two silhouette corners, and the lines of its visible faces. The inverse range of a line
-along a beam is linear in the beam's direction (u, v): 1/r = a·u + b·v. The face that a beam enters by is the one
-of least inverse range, and the obstacle that it meets first the one of greatest, so a beam costs two products a
-face and a comparison, and no division. A rectangle shows two faces at most. A wall is a polygon of two corners.
+along a beam is linear in the beam's direction (u, v): 1/r = a·u + b·v. A beam enters a footprint through the face with
+the smallest inverse range, and hits first the obstacle with the largest. So a beam costs two products per face and a
+comparison, and no division. A rectangle shows at most two faces. A wall is a polygon of two corners.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from sim_sensors.laser.footprints import LANES, LARGEST_IN_A_CELL_M, NO_RETURN, 
 Float32Array = NDArray[np.float32]
 
 BEAMS_PER_BLOCK = 16
-BEAMS_PER_DRAW = 64  # neighbours in the noise table that one random offset serves
-POSES_PER_CHUNK = 8  # as many scans as the first-level cache holds
+BEAMS_PER_DRAW = 64  # beams that use neighbouring numbers of the noise table, from one random offset
+POSES_PER_CHUNK = 8  # number of scans that fit into the first-level cache
 
-# Intervals are this much wider (in beams) than float32 makes them: no beam slips between two walls that share
-# an end. At 30 m it is 0.03 mm.
+# Intervals are widened by this many beams against float32 rounding, so that no beam passes between two walls that share
+# an end. At 30 m this is 0.03 mm.
 WIDENING = 2e-4
 
-# No flag that forbids NaN or infinity: unused lanes hold the former, and inf is the range of no return.
+# No flag that forbids NaN or infinity: unused lanes hold NaN, and inf is the range without a return.
 _FAST = {"contract", "reassoc", "arcp", "nsz"}
 
 
 class BeamTable(NamedTuple):
-    """The beams, in a frame along their middle direction, padded to whole blocks.
+    """Beams in a frame along their middle direction, padded to whole blocks.
 
     Attributes:
         u, v: (n_padded,) float32, direction of each beam.
         number: (n_padded,) float32, 0, 1, 2, ...
-        n: beams.
-        middle: number of the beam, or of the half between two, along which the frame looks.
-        per_radian: beams.
+        n: number of beams.
+        middle: number of the beam along the frame's x axis; a half lies between two beams.
+        per_radian: beams per radian.
         max_range: m.
     """
 
@@ -78,11 +78,11 @@ def _prepare_block(  # type: ignore[no-untyped-def]
     k, block, corners, xs, ys, radius, label,
     x0, y0, cos, sin, excluded, per_radian, middle, max_range, shapes,
 ):  # fmt: skip
-    """Compute the interval of beams, the first and last visible face, and their number, for sixteen obstacles.
+    """Compute the interval of beams, the first and last visible face, and the number of faces, for sixteen obstacles.
 
-    `shapes`, (7 · LANES,) float32: lowest beam, highest beam, a and b of the first face, a and b of the last,
-    faces. Obstacles out of range or excluded get an empty interval. Written without branches, on flat arrays
-    and unsigned indices, so that the compiler vectorizes it; `k` is a literal for the same reason.
+    `shapes`, (7 · LANES,) float32: lowest beam, highest beam, a and b of the first face, a and b of the last face,
+    number of faces. Obstacles that are out of range or excluded get an empty interval. The code has no branches, flat
+    arrays and unsigned indices, so that the compiler vectorizes it; `k` is a literal for the same reason.
     """
     f, zero = np.float32, np.float32(0)
     lanes = np.uint64(LANES)
@@ -93,8 +93,8 @@ def _prepare_block(  # type: ignore[no-untyped-def]
         start_x = start_y = start_ex = start_ey = start_cross = zero
         end_x = end_y = end_ex = end_ey = end_cross = zero
         faces = zero
-        # Of an edge from p along e, seen from the sensor at 0: p × e < 0 for a visible face. The edge before
-        # corner 0 first; an edge of no length (a repeated corner) counts as the one before it.
+        # For an edge from p along e and the sensor at 0, the face is visible if p × e < 0. Start with the edge before
+        # corner 0; an edge without length (a repeated corner) counts as the one before it.
         lx, ly = corners[base + i], corners[base + lanes + i]
         last = base + np.uint64((k - 1) * 2 * LANES)
         px, py = corners[last + i], corners[last + lanes + i]
@@ -119,11 +119,12 @@ def _prepare_block(  # type: ignore[no-untyped-def]
             lx, ly, old_ex, old_ey, old_cross = nx, ny, ex, ey, cross
         reach, squared = radius[first + i] + max_range, dx * dx + dy * dy
         away = (squared > reach * reach) | (label[first + i] == excluded)
-        # No visible face: a wall or a sliver seen end on; else the sensor is inside, and the number of faces tells.
+        # Without a visible face it is a wall or a sliver seen end-on, or the sensor is inside: the number of faces
+        # tells which.
         hidden = away | (start_cross == zero)
         outside = (squared > radius[first + i] * radius[first + i]) | (label[first + i] == WALL)
         faces = f(1) if away | (hidden & outside) else faces
-        # Counter-clockwise corners run clockwise along the visible side: it starts at the highest beam.
+        # Counter-clockwise corners run clockwise along the visible side, which starts at the highest beam.
         high = _angle(cos * start_x + sin * start_y, cos * start_y - sin * start_x) * per_radian + middle
         low = _angle(cos * end_x + sin * end_y, cos * end_y - sin * end_x) * per_radian + middle
         shapes[i] = f(np.inf) if hidden else low - f(WIDENING)
@@ -139,7 +140,7 @@ def _prepare_block(  # type: ignore[no-untyped-def]
 
 @compiled(forceinline=True, error_model="numpy", fastmath=_FAST)
 def _visible_faces(k, place, corners, dx, dy, cos, sin, lines):  # type: ignore[no-untyped-def]
-    """Write a and b of every visible face of one obstacle into `lines`, (2 · k,) float32; return how many."""
+    """Write a and b of every visible face of one obstacle into `lines`, (2 · k,) float32; return their number."""
     f = np.float32
     base = place // LANES * (k * 2 * LANES) + place % LANES
     n = 0
@@ -155,7 +156,7 @@ def _visible_faces(k, place, corners, dx, dy, cos, sin, lines):  # type: ignore[
 
 @compiled(forceinline=True, error_model="numpy", fastmath=_FAST)
 def _draw_two_faces(a0, b0, a1, b1, low, high, begin, end, u, v, number, inverse, row):  # type: ignore[no-untyped-def]
-    """Keep the greater inverse range, for beams from `low` to `high`, all of them among `begin` to `end`."""
+    """Keep the larger inverse range for the beams from `low` to `high`, which lie within `begin` to `end`."""
     for i in range(np.uint64(begin), np.uint64(end)):
         here = min(a0 * u[i] + b0 * v[i], a1 * u[i] + b1 * v[i])
         here = here if (number[i] >= low) and (number[i] <= high) else np.float32(0)
@@ -164,7 +165,7 @@ def _draw_two_faces(a0, b0, a1, b1, low, high, begin, end, u, v, number, inverse
 
 @compiled(forceinline=True, error_model="numpy", fastmath=_FAST)
 def _draw_four_faces(lines, n, low, high, begin, end, u, v, number, inverse, row):  # type: ignore[no-untyped-def]
-    """As `_draw_two_faces` for three or four; the third counts twice where there is no fourth."""
+    """Do as `_draw_two_faces` for three or four faces; without a fourth, the third counts twice."""
     last = 2 * n - 2
     a0, b0, a1, b1 = lines[0], lines[1], lines[2], lines[3]
     a2, b2, a3, b3 = lines[4], lines[5], lines[last], lines[last + 1]
@@ -177,7 +178,7 @@ def _draw_four_faces(lines, n, low, high, begin, end, u, v, number, inverse, row
 
 @compiled(error_model="numpy", fastmath=_FAST)
 def _draw_lines(lines, n, low, high, begin, end, label, u, v, number, inverse, ids, row, here):  # type: ignore[no-untyped-def]
-    """As `_draw_two_faces` for any number of faces, and with ids if they are wanted."""
+    """Do as `_draw_two_faces` for any number of faces, with optional ids."""
     first, stop, start = np.uint64(begin), np.uint64(end), np.uint64(row)
     a, b = lines[0], lines[1]
     for i in range(first, stop):
@@ -201,10 +202,10 @@ def _draw_table(  # type: ignore[no-untyped-def]
     poses, first_pose, last_pose, heading, excluded, u, v, number, n_beams, per_radian, middle, max_range,
     shapes, lines, inverse, ids, here, covered,
 ):  # fmt: skip
-    """Draw the obstacles of a table of cells within range of several poses.
+    """Draw the obstacles of a cell table that are within range of several poses.
 
-    Scan s has row s of `inverse` and, if it is not empty, of `ids`, (chunk · n_padded,). `covered[s]` becomes the
-    label of a footprint that contains the sensor. One call takes all poses of a chunk, because the reference counting
+    Scan s has row s of `inverse` and, if it is not empty, of `ids`, (chunk · n_padded,). `covered[s]` is set to the
+    label of a footprint that contains the sensor. One call processes all poses of a chunk, because reference counting
     of its array arguments costs as much as drawing a dozen obstacles.
     """
     f = np.float32
@@ -218,7 +219,7 @@ def _draw_table(  # type: ignore[no-untyped-def]
         cos, sin = f(math.cos(forward)), f(math.sin(forward))
         low_row = int(min(max(math.floor((y0 - reach - bottom) / size), 0.0), frame[3]))
         high_row = int(min(max(math.floor((y0 + reach - bottom) / size), -1.0), frame[3] - 1))
-        done = 0  # blocks are met in order; one that two runs share is drawn once
+        done = 0  # blocks come in order; a block shared by two runs is drawn once
         for row in range(low_row, high_row + 2):
             run_begin, run_end = cell_start[rows * columns], int(frame[5])
             if row <= high_row:
@@ -254,7 +255,7 @@ def _draw_table(  # type: ignore[no-untyped-def]
                         covered[scan] = label[block * LANES + i]
                     if high == f(-np.inf):
                         continue
-                    # An interval that holds the direction opposite to the middle comes as its two ends.
+                    # An interval that contains the direction opposite to the middle is given by its two ends.
                     wraps = low - high > half_turn
                     for part in range(2 if wraps else 1):
                         lo = f(-1) if wraps and part == 1 else low
@@ -289,7 +290,7 @@ def _draw_table(  # type: ignore[no-untyped-def]
 
 @compiled(error_model="numpy", fastmath=_FAST)
 def _add_noise(ranges, scan, max_range, table, offsets, sd, lost):  # type: ignore[no-untyped-def]
-    """Add noise and drop-outs to one scan, both read from `table` at random offsets."""
+    """Add noise and dropouts to one scan, both read from `table` at random offsets."""
     f, n = np.float32, ranges.shape[1]
     for draw in range(offsets.shape[1]):
         noise, drop = np.uint64(offsets[scan, draw, 0]), np.uint64(offsets[scan, draw, 1])
@@ -303,7 +304,7 @@ def _add_noise(ranges, scan, max_range, table, offsets, sd, lost):  # type: igno
 
 @compiled(nogil=True, error_model="numpy", fastmath=_FAST)
 def scan_all(quads, others, poses, heading, exclude, beams, table, offsets, sd, lost, ranges, ids):  # type: ignore[no-untyped-def]
-    """Fill `ranges`, (b, n_beams) float32, and `ids`, of the same shape or (0, n_beams) if they are not wanted."""
+    """Fill `ranges`, (b, n_beams) float32, and `ids`, of the same shape, or (0, n_beams) to omit them."""
     f, n, n_padded, with_ids = np.float32, beams.n, len(beams.u), len(ids) > 0
     max_range, per_radian, middle = f(beams.max_range), f(beams.per_radian), f(beams.middle)
     u, v, number = beams.u, beams.v, beams.number

@@ -22,23 +22,23 @@ NOISE_TABLE_SIZE = 1 << 16
 
 @dataclass(frozen=True)
 class LaserScanner:
-    """A planar laser scanner; by default like a Hokuyo UTM-30LX: 1081 beams over 270°, 30 m.
+    """A planar laser scanner; the default is like a Hokuyo UTM-30LX: 1081 beams over 270°, 30 m.
 
-    Beam n looks along start + n·step, counter-clockwise, from the sensor's x axis. A range is the distance to the
-    nearest footprint or wall, `inf` where there is none below `max_range` or where the return dropped out. Inside
-    a footprint that is not excluded the lens is covered: every beam reads 0 m. On a wall's very line the wall
-    is not seen. Compiled and deterministic; runs on the calling thread alone and without the interpreter lock.
+    Beam n points along start + n·step, counter-clockwise from the sensor's x axis. A range is the distance to the
+    nearest footprint or wall, or `inf` if there is none below `max_range` or the return is lost. Inside a footprint
+    that is not excluded every beam reads 0 m. A wall is invisible to a sensor exactly on its line. The code is compiled
+    and deterministic; it runs on the calling thread only and releases the interpreter lock.
 
     Args:
         n_beams: number of beams.
         start: angle of beam 0, rad.
-        step: angle between beams, rad, above 0. All beams together stay within one turn.
+        step: angle between beams, rad, above 0. All beams must lie within one turn.
         max_range: m.
         noise_sd: standard deviation of the Gaussian range noise, m. Noisy ranges stay within 0 to max_range.
-        dropout: probability that a return is lost, 0 to 1, each beam on its own.
+        dropout: probability that a return is lost, 0 to 1, independent for each beam.
 
     Raises:
-        SensorError: a value out of these bounds.
+        SensorError: a value is out of these bounds.
 
     Examples:
         >>> plane = ScanPlane([[[1, -1], [2, -1], [2, 1], [1, 1]]])
@@ -105,14 +105,14 @@ class LaserScanner:
         Args:
             plane: the obstacles.
             pose: (3,) x, y in m and yaw in rad of the sensor, world frame.
-            rng: draws noise and drop-outs; None for exact ranges.
+            rng: generator for noise and dropouts; None for exact ranges.
             exclude: id of footprints to ignore, such as the vehicle that carries the sensor.
 
         Returns:
             (n_beams,) float32, m, `inf` for no return.
 
         Raises:
-            SensorError: a pose that is not three finite numbers.
+            SensorError: the pose is not three finite numbers.
         """
         ranges, _ = self._measure(plane, _poses(pose, "pose", 1), rng, exclude, False)
         return np.asarray(ranges[0])
@@ -142,14 +142,14 @@ class LaserScanner:
         Args:
             plane: the obstacles.
             poses: (b, 3) x, y in m and yaw in rad of the sensor, world frame.
-            rng: draws noise and drop-outs; None for exact ranges.
-            exclude: one id for all poses, or (b,) int, one for each; -1 for none.
+            rng: generator for noise and dropouts; None for exact ranges.
+            exclude: one id for all poses, or (b,) int, one per pose; -1 for none.
 
         Returns:
             (b, n_beams) float32, m, `inf` for no return.
 
         Raises:
-            SensorError: poses or ids of another shape, or a pose that is not finite.
+            SensorError: poses or ids have another shape, or a pose is not finite.
         """
         return self._measure(plane, _poses(poses, "poses", 2), rng, exclude, False)[0]
 
@@ -179,7 +179,7 @@ class LaserScanner:
             if given.shape not in ((), (b,)) or not np.issubdtype(given.dtype, np.integer):
                 raise SensorError(f"exclude: wanted an id or ({b},) of them, got {exclude!r}")
             excluded[:] = given
-        # The first offset of a pair is for the noise, the second for the drop-outs.
+        # The first offset of a pair is for the noise, the second for the dropouts.
         n_draws = 0 if rng is None else -(-self.n_beams // BEAMS_PER_DRAW)
         offsets = np.empty((b, 0, 2), np.int64)
         if rng is not None:
@@ -222,7 +222,7 @@ def _noise_table() -> Float32Array:
     """Return quantiles of the standard normal distribution in a fixed random order.
 
     (NOISE_TABLE_SIZE + BEAMS_PER_DRAW,) float32. The table is constant, as in the ziggurat algorithm; scans read it
-    from random offsets. All values have the same probability, so drop-outs drawn by a threshold have the exact rate.
+    from random offsets. All values have the same probability, so a threshold gives exactly the dropout rate.
     """
     quantiles = ndtri((np.arange(NOISE_TABLE_SIZE) + 0.5) / NOISE_TABLE_SIZE)
     shuffled = np.random.default_rng(0).permutation(quantiles)

@@ -1,9 +1,9 @@
-"""The shell of a vehicle: flanks lofted round the plan, bonnet, roof, glass, wheel arches, underside, cabin.
+"""The shell of a vehicle: flanks lofted around the plan, bonnet, tail, wheel arches and underside.
 
-The flanks are one sheet that runs from the middle of the tail round a corner, along the side and round to the
-middle of the nose; its columns follow the plan of the body (a superellipse at either end), its rows the section
-from sill to shoulder. Lamps, grille, seams and trim are cells of that sheet, so that they have its curvature. The
-glasshouse is a second such sheet between the shoulder and the roof's edge. Left and right are mirror images.
+A flank is one sheet from the middle of the tail, around the corner and along the side, to the middle of the nose. Its
+columns follow the plan of the body (a superellipse at either end), its rows the section from sill to shoulder. Lamps,
+grille, seams and trim are cells of that sheet, so they have its curvature. The glasshouse is a second such sheet
+between the shoulder and the roof's edge. Left and right are mirror images.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ class Finish(IntEnum):
     SEAM = 3
     GLASS = 4
     TRIM = 5
-    BUMPER = 6  # painted, or plastic on plain versions
-    CLADDING = 7  # along sills and arches: painted, or plastic on rugged versions
+    BUMPER = 6  # painted; plastic on basic versions
+    CLADDING = 7  # along sills and arches: painted; plastic on rugged versions
     GRILLE = 8
     BRIGHT = 9  # chrome, or black
     HEADLAMP = 10
@@ -59,36 +59,36 @@ class Finish(IntEnum):
 
 N_FINISHES = len(Finish)
 
-# Sections: height between sill (0) and shoulder (1), and how far (m) the surface there lies inside the plan.
+# Sections: height between sill (0) and shoulder (1), and the distance (m) of the surface inside the plan.
 ROWS = np.array([0.0, 0.09, 0.24, 0.40, 0.55, 0.68, 0.82, 0.93, 1.0])
 COARSE_ROWS = np.array([0.0, 0.40, 0.88, 1.0])
 _SIDE = np.array([0.060, 0.022, 0.006, 0.016, 0.020, 0.004, 0.012, 0.034, 0.080])
 _NOSE = np.array([0.110, 0.030, 0.004, 0.000, 0.022, 0.040, 0.070, 0.125, 0.230])
 _TAIL = np.array([0.140, 0.035, 0.000, 0.002, 0.030, 0.036, 0.044, 0.062, 0.105])
 
-# Plan angle, degrees from the car's axis, of the columns round either end: grille or tailgate edge, lamp, corner.
+# Plan angle, degrees from the car's axis, of the columns around either end: grille or tailgate edge, lamp, corner.
 ROUND = np.array([0.0, 11.0, 24.0, 37.0, 48.0, 58.0, 69.0, 80.0, 90.0])
 COARSE_ROUND = np.array([0.0, 37.0, 69.0, 90.0])
 GRILLE_EDGE, LAMP_INNER, LAMP_OUTER = 24.0, 37.0, 80.0
 
-UPRIGHT = ("suv", "van", "pickup")  # bodies whose nose leans back less
+UPRIGHT = ("suv", "van", "pickup")  # bodies with a more upright nose
 GAP = 0.014  # m, width of a seam
-FLARE = 0.022  # m, by which the arches stand out from the doors
-_LIP = 0.15  # m, how far above or below a height an arch's edge counts to its section
-_CUT = 0.012  # m, over which an arch's edge drops to the sill
+FLARE = 0.022  # m by which the arches protrude from the doors
+_LIP = 0.15  # m above or below a height within which an arch's edge belongs to its section
+_CUT = 0.012  # m over which an arch's edge drops to the sill
 
 
 class Skin:
-    """The surfaces of a vehicle's shell as points; left half, from the tail's middle to the nose's.
+    """The surfaces of a vehicle's shell as points: the left half, from the middle of the tail to that of the nose.
 
     Args:
-        form: the body's lines.
-        coarse: few columns and rows, no seams.
+        form: the lines of the body.
+        coarse: whether to use few columns and rows, without seams.
 
     Attributes:
         rows: (r,) heights between sill and shoulder.
         flank: (c, r, 3) m, clamped to the wheel arches.
-        plan_angle: (c,) degrees from the axis: above 0 round the nose, below 0 round the tail, ±90 along the side.
+        plan_angle: (c,) degrees from the axis: positive around the nose, negative around the tail, ±90 along the side.
         seams: x of the middle of each door seam, front first.
     """
 
@@ -101,7 +101,7 @@ class Skin:
         self.flank, self.plan_angle = self._loft()
 
     def _columns(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """x, y on the plan and plan angle of every column."""
+        """Return x, y on the plan and the plan angle of every column."""
         form = self.form
         half = form.length / 2
         tail, nose = -half + form.tail_depth, half - form.nose_depth
@@ -148,13 +148,13 @@ class Skin:
     def _loft(self) -> tuple[FloatArray, FloatArray]:
         form = self.form
         x, y, angle = self._columns()
-        # How much of a column's section is the nose's or the tail's: by where the plan faces there.
+        # Weight of the nose's or tail's section in a column, by the direction that the plan faces there.
         end = np.cos(np.radians(np.abs(angle))) ** 2
         side_inset = np.interp(self.rows, ROWS, _SIDE)
         end_inset = np.where(
             (angle < 0)[:, None], np.interp(self.rows, ROWS, _TAIL), np.interp(self.rows, ROWS, _NOSE)
         )
-        # A nose that leans back more than it is deep would have a hollow front edge.
+        # A nose that leans back by more than its depth would have a hollow front edge.
         depth = np.where(angle < 0, form.tail_depth, form.nose_depth)
         leaning = np.where(angle < 0, _TAIL.max(), _NOSE.max() * (0.75 if form.body in UPRIGHT else 1.0))
         end_inset *= (np.minimum(leaning, 0.45 * depth) / np.where(angle < 0, _TAIL.max(), _NOSE.max()))[
@@ -200,11 +200,11 @@ class Skin:
         return self.flank[:, -1]
 
     def edge_between(self, low: float, high: float) -> FloatArray:
-        """(k, 3) m: the shoulder from x = low to x = high, m, both included."""
+        """Return the shoulder from x = low to x = high, m, both included, (k, 3) m."""
         edge = self.edge
         inner = edge[(edge[:, 0] > low + 0.01) & (edge[:, 0] < high - 0.01)]
         along = abs(inner[:, 1]) > 0.8 * edge[:, 1].max()
-        # Straight stretches need few points: one in each cell of 0.2 m.
+        # Straight stretches need few points: one per 0.2 m.
         cell = np.floor(inner[:, 0] / 0.2)
         inner = inner[~along | (np.diff(cell, prepend=-1e9) > 0)]
         x = np.concatenate([[max(low, edge[0, 0])], inner[:, 0], [min(high, edge[-1, 0])]])
@@ -213,19 +213,19 @@ class Skin:
         )
 
     def section(self, height: float) -> FloatArray:
-        """(k, 2) m: where the left flank's columns cross a height, the wheel arches bridged."""
+        """Return the section of the left flank at a height, (k, 2) m, with the wheel arches bridged."""
         z = self._uncut[..., 2]
         crossing = (z[:, :-1] <= height) & (z[:, 1:] > height)
         column, row = np.nonzero(crossing)
         a, b = self._uncut[column, row], self._uncut[column, row + 1]
         share = (height - a[:, 2]) / (b[:, 2] - a[:, 2])
-        # Along an arch's edge the sheet keeps the outline of its lower rows: a lip.
+        # Along an arch's edge the sheet keeps the outline of its lower rows, which forms a lip.
         lip = self.flank[(self.flank[..., 2] > z) & (np.abs(self.flank[..., 2] - height) < _LIP)]
         return np.concatenate([(a + share[:, None] * (b - a))[:, :2], lip[:, :2]])
 
 
 def _shoulder_line(form: Form) -> PchipInterpolator:
-    """Z of the shoulder over x."""
+    """Return z of the shoulder over x."""
     half = form.length / 2
     middle = 0.5 * (form.cowl + form.glass_end)
     knots = [
@@ -241,7 +241,7 @@ def _shoulder_line(form: Form) -> PchipInterpolator:
 
 
 def _seams(form: Form) -> list[float]:
-    """X of the door seams of a side, front first."""
+    """Return x of the door seams of a side, front first."""
     front = min(form.front_axle - form.arch_radius - 0.09, form.cowl + 0.22)
     seams = [front, form.pillar]
     if form.doors == 2:
@@ -250,20 +250,20 @@ def _seams(form: Form) -> list[float]:
 
 
 def add_flanks(build: ShapeBuilder, skin: Skin) -> None:
-    """The sheet from sill to shoulder, both sides, with its lamps, grille, seams and dirt."""
+    """Add the sheets from sill to shoulder on both sides, with lamps, grille, seams and dirt."""
     points = skin.flank
     finish = flank_finish(skin)
     _both_sides(build, points, finish)
 
 
 def _both_sides(build: ShapeBuilder, points: FloatArray, finish: IntArray) -> None:
-    """A sheet on the left whose first axis runs forward and second up, and its mirror image."""
+    """Add a sheet on the left, whose first axis points forward and second up, and its mirror image."""
     build.grid(points, finish, flip=True)
     build.grid(points * [1.0, -1.0, 1.0], finish)
 
 
 def flank_finish(skin: Skin) -> IntArray:
-    """(c - 1, r - 1) int64: the `Finish` of each cell of the left flank."""
+    """Return the `Finish` of each cell of the left flank, (c - 1, r - 1) int64."""
     form = skin.form
     middle = 0.5 * (skin.rows[1:] + skin.rows[:-1])
     row = np.broadcast_to(middle, (len(skin.flank) - 1, len(middle)))
@@ -336,7 +336,7 @@ def _tail_finish(
 
 
 def add_underside(build: ShapeBuilder, skin: Skin) -> None:
-    """Wheel wells and floor, closing the flanks from below."""
+    """Add wheel wells and floor, which close the flanks from below."""
     lower = skin.flank[:, 0]
     floor = skin.form.sill + 0.03
     if skin.coarse:
@@ -352,7 +352,7 @@ def add_underside(build: ShapeBuilder, skin: Skin) -> None:
 
 
 def add_bonnet(build: ShapeBuilder, skin: Skin) -> None:
-    """The lid over the engine; behind the windscreen's foot it is the dashboard."""
+    """Add the bonnet; behind the foot of the windscreen it is the dashboard."""
     form = skin.form
     edge = skin.edge_between(form.cowl - 0.12, form.length)
     crown = 0.028 + 0.045 * np.clip((form.length / 2 - edge[:, 0]) / (form.length / 2 - form.cowl), 0.0, 1.0)
@@ -368,7 +368,7 @@ def add_bonnet(build: ShapeBuilder, skin: Skin) -> None:
 
 
 def add_tail_top(build: ShapeBuilder, skin: Skin) -> None:
-    """The boot lid, the shelf under a rear window, or a pick-up's bed."""
+    """Add the boot lid, the shelf under a rear window, or a pick-up's bed."""
     form = skin.form
     if form.body == "pickup":
         _add_bed(build, skin)

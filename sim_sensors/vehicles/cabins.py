@@ -14,11 +14,11 @@ from sim_sensors.vehicles.forms import Form
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-CURL = (0.055, 0.050)  # m, how far in and up the roof's edge turns above the panes
-BASE = 0.012  # m, by which the glasshouse reaches below the shoulder
+CURL = (0.055, 0.050)  # m inwards and upwards by which the roof's edge curves above the panes
+BASE = 0.012  # m by which the glasshouse extends below the shoulder
 HEADER_BOW = 0.10  # m
-BULGE = 0.018  # m, of the panes
-LEVELS = np.array([0.0, 0.06, 0.36, 0.70, 1.0])  # of the rows, from shoulder to the panes' upper edge
+BULGE = 0.018  # m, bulge of the panes
+LEVELS = np.array([0.0, 0.06, 0.36, 0.70, 1.0])  # of the rows, from the shoulder to the top of the panes
 COARSE_LEVELS = np.array([0.0, 1.0])
 
 # By body: the last pillar's width at its foot and at its top, m.
@@ -33,7 +33,7 @@ _LAST_PILLAR = {
 
 
 class Post(NamedTuple):
-    """A column of the glasshouse at the side: x at foot and top, m, and what the cell in front of it is."""
+    """A column at the side of the glasshouse: x at foot and top, m, and the finish of the cell in front of it."""
 
     foot: float
     top: float
@@ -41,7 +41,7 @@ class Post(NamedTuple):
 
 
 def _posts(form: Form) -> list[Post]:
-    """Columns of a side between the rear and the front corner, from the rear."""
+    """Return the columns of a side between the rear and the front corner, from the rear."""
     foot, top = _LAST_PILLAR[form.body]
     pillar = form.pillar
     panes = form.side_windows
@@ -62,12 +62,12 @@ def _posts(form: Form) -> list[Post]:
 
 
 class Glasshouse:
-    """Its left half as a sheet of points, from the rear window's middle to the windscreen's.
+    """The left half of the glasshouse as a sheet of points, from the rear window to the windscreen.
 
     Attributes:
         points: (c, r, 3) m, from the shoulder to the roof's edge.
         finish: (c - 1, r - 1) int64, `Finish` of each cell.
-        roof_crown: (c,) m, how much the roof rises from each point of its edge to the middle.
+        roof_crown: (c,) m, rise of the roof from each point of its edge to the middle.
         ridge: z of the roof's highest edge, m.
     """
 
@@ -151,7 +151,7 @@ class Glasshouse:
         return out
 
     def add_shell(self, build: ShapeBuilder, *, coarse: bool) -> None:
-        """Panes, pillars, roof and its lining."""
+        """Add panes, pillars, roof and headlining."""
         build.grid(self.points, self.finish, flip=True)
         build.grid(self.points * [1.0, -1.0, 1.0], self.finish)
         edge = self.points[:, -1]
@@ -164,7 +164,7 @@ class Glasshouse:
 
 
 def add_cabin(build: ShapeBuilder, skin: Skin) -> None:
-    """The tub under the windows: door panels, floor, bulkheads."""
+    """Add the tub below the windows: door panels, floor, bulkheads."""
     form = skin.form
     rear, front = form.glass_end + 0.05, form.cowl - 0.11
     edge = skin.edge_between(rear, front)
@@ -179,14 +179,14 @@ def add_cabin(build: ShapeBuilder, skin: Skin) -> None:
     wall = edge - [0.0, 0.05, 0.02]
     foot = edge - [0.0, 0.11, 0.0]
     foot[:, 2] = np.where(deep > 0, floor, edge[:, 2] - 0.02)
-    # The dashboard's back leans towards the driver, and stands on the bulkhead.
+    # The back of the dashboard leans towards the driver, above the bulkhead.
     half = np.stack([edge - [0, 0, 0.012], wall, foot], axis=1)
     sheet = np.concatenate([half, half[:, ::-1] * [1.0, -1.0, 1.0]], axis=1)
     build.grid(sheet, Finish.CABIN, flip=True, smooth=False)
 
 
 def add_seats(build: ShapeBuilder, skin: Skin) -> None:
-    """Front seats, a bench, headrests and the steering wheel."""
+    """Add front seats, a bench, headrests and the steering wheel."""
     form = skin.form
     top = form.height - 0.27
     across = 0.205 * form.width
@@ -203,7 +203,7 @@ def add_seats(build: ShapeBuilder, skin: Skin) -> None:
 def _add_seat(
     build: ShapeBuilder, place: tuple[float, float], top: float, width: float, headrests: tuple[float, ...]
 ) -> None:
-    """A seat whose back's foot stands at `place`; headrests at given offsets to the side, m."""
+    """Add a seat with the foot of its backrest at `place`; headrests at the given lateral offsets, m."""
     x, y = place
     cushion, back = top - 0.70, top - 0.16
     build.box(

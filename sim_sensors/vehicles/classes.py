@@ -1,21 +1,20 @@
 """Vehicle classes: bodies, market segments with their sizes, and paints.
 
-No law defines the sizes of segments (the European Commission only names them, case COMP/M.1406). Lengths
-follow what is commonly tabulated, cut to what is on the market:
+No law defines the sizes of segments (the European Commission only names them, case COMP/M.1406). Lengths follow common
+tables, limited to models on the market:
 
 - A to F, *Euro Car Segment*, Wikipedia: A 2.7-3.7 m, B 3.7-4.2, C 4.2-4.6, D 4.6-4.8, E 4.8-5.0.
 - SUVs, *Subcompact*, *Compact* and *Mid-size crossover SUV*, Wikipedia: below 4.4 m (JB), 4.4-4.7 (JC), 4.7-5.1 (JD
-  and JE). JC and JD begin 5 and 10 cm lower, for the older cars of a fleet: a Nissan Qashqai has 4.31 m in 2007, 4.43
-  in 2021.
+  and JE). JC and JD begin 5 and 10 cm lower, for older cars: a Nissan Qashqai has 4.31 m in 2007, 4.43 m in 2021.
 - People carriers, *Compact MPV* and *Minivan*, Wikipedia: 4.2-4.6 m (MC; those with seven seats 4.3-4.6), 1.6-1.8 m
   tall; large ones (MD) are about as long as a car of segment D.
-- Vans that people park among cars (N1) are the short ones of the medium class; no table is known, so what the makers
-  of the two named below publish.
+- Vans that park among cars (N1) are the short ones of the medium class; no table is known, so sizes are those that the
+makers of the two models below publish.
 - Pick-ups: most double cabs of the mid-size class have 5.2 to 5.4 m (CarExpert, *Ute tray dimensions detailed*).
 
-Widths, without mirrors, and heights span what makers publish for the models named below, generations of about 2010
-to 2020 (a BMW X5 of 2013: 1.94 m × 1.76 m). Check: JATO Dynamics gives the mean new car in Europe as 4.42 m × 1.80 m
-in 2013 and 4.53 m × 1.84 m in 2023.
+Widths, without mirrors, and heights span the makers' data for the models below, of generations from about 2010 to 2020
+(a BMW X5 of 2013: 1.94 m × 1.76 m). Check: JATO Dynamics gives the mean new car in Europe as 4.42 m × 1.80 m in 2013
+and 4.53 m × 1.84 m in 2023.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ BODY_SHARE = (0.37, 0.11, 0.16, 0.24, 0.10, 0.02)
 
 
 class SizeClass(NamedTuple):
-    """A market segment of one body; least and greatest value of each dimension, m."""
+    """A market segment of one body, with minimum and maximum of each dimension, m."""
 
     segment: str
     share: float
@@ -109,7 +108,7 @@ def draw_body(rng: np.random.Generator) -> str:
 def draw_size(body: str, rng: np.random.Generator) -> tuple[str, tuple[float, float, float]]:
     """Draw a segment of a body, and length, width and height within its limits.
 
-    The three are correlated, since longer cars of a class tend to be wider, and lie around the middle.
+    The dimensions are correlated, since longer cars of a class tend to be wider, and concentrate around the middle.
 
     Returns:
         The segment's name; length, width, height in m.

@@ -18,21 +18,21 @@ class Form:
 
     Attributes:
         body: one of `vehicle_classes.BODIES`.
-        length, width, height: of the whole, without mirrors.
+        length, width, height: overall, without mirrors.
         rear_axle, front_axle: x.
-        wheel_radius: of the tyres.
+        wheel_radius: outer radius of the tyres.
         sill, belt, nose, deck: z of the lower edge, of the side windows' lower edge, of the bonnet's front edge
             and of the body's upper edge at the tail.
         cowl, header: x of the windscreen's lower and upper edge, at its corners.
         roof_end, glass_end: x of the rear window's upper and lower edge (the cab's, for a pick-up), at its corners.
-        screen_bow, rear_bow: how far the two screens bulge out in plan.
-        tumblehome: how far the side windows lean in.
-        crown: how much higher the roof is at its middle than along its edges.
-        roof_drop: how much lower the roof's edge is at the header and at its end than at its highest.
-        nose_depth, tail_depth: how long the rounding of the plan is at either end.
+        screen_bow, rear_bow: bulge of the windscreen and the rear window in plan.
+        tumblehome: inward lean of the side windows.
+        crown: height of the middle of the roof above its edges.
+        roof_drop: drop of the roof's edge from its highest point to the header and to its rear end.
+        nose_depth, tail_depth: length of the rounding of the plan at either end.
         nose_power, tail_power: exponents of that rounding (superellipse); 2 is round, 4 boxy.
-        doors: at a side, 1 or 2.
-        side_windows: how many panes at a side, from the front; those left out are sheet metal.
+        doors: doors per side, 1 or 2.
+        side_windows: panes per side, from the front; the others are sheet metal.
         variety: (8,) in [0, 1], for choices of trim.
     """
 
@@ -71,7 +71,7 @@ class Form:
 
     @property
     def pillar(self) -> float:
-        """X of the middle of the B pillar, between front and rear door."""
+        """Position x of the middle of the B pillar, between front and rear door."""
         share = 0.44 if self.doors == 1 else 0.47
         if self.body == "pickup":
             share = 0.40
@@ -99,16 +99,16 @@ def draw_form(body: str, segment: str, size: tuple[float, float, float], rng: np
         body: one of `vehicle_classes.BODIES`.
         segment: as in `vehicle_classes.SIZE_CLASSES`.
         size: length, width, height, m.
-        rng: draws the rest.
+        rng: generator for all other proportions.
     """
     length, width, height = size
     usual = np.array(_USUAL[body])
     delivery = body == "van" and segment == "N1"
-    if delivery:  # a boxy nose, and the driver sits right behind it
+    if delivery:  # a boxy nose, with the driver right behind it
         usual[[4, 5, 6, 7, 8]] = [0.590, 0.490, 0.600, 0.215, 0.72]
     drawn = usual * (1.0 + np.clip(rng.normal(0.0, 0.022, len(usual)), -0.045, 0.045))
     front, rear, wheel, sill, belt, nose, deck, cowl, rake, glass_end, roof_end = drawn.tolist()
-    if body == "hatchback":  # small ones have their wheels at the very corners
+    if body == "hatchback":  # small hatchbacks have their wheels at the corners
         shrink = np.clip((length - 3.45) / 0.9, 0.0, 1.0)
         front, rear, cowl = (
             front - 0.03 * (1 - shrink),

@@ -45,7 +45,7 @@ _GLYPHS = (
 
 
 def wheel_shape(form: Form, *, coarse: bool) -> Shape:
-    """A wheel about the z axis, its outer face up at z = 0."""
+    """Return a wheel around the z axis; its outer face points up at z = 0."""
     build = ShapeBuilder()
     radius, width = form.wheel_radius, 0.185 + 0.12 * (form.wheel_radius - 0.28)
     rim = radius * (0.64 + 0.10 * form.variety[6])
@@ -88,7 +88,7 @@ def _add_spokes(build: ShapeBuilder, form: Form, rim: float) -> None:
 
 
 def add_wheels(build: ShapeBuilder, form: Form, *, coarse: bool) -> None:
-    """Four wheels, their outer faces a little inside the arches."""
+    """Add four wheels with their outer faces slightly inside the arches."""
     wheel = wheel_shape(form, coarse=coarse)
     out = form.width / 2 - 0.030
     for x in (form.rear_axle, form.front_axle):
@@ -98,7 +98,7 @@ def add_wheels(build: ShapeBuilder, form: Form, *, coarse: bool) -> None:
 
 
 def plate_places(skin: Skin) -> list[tuple[FloatArray, float]]:
-    """Where the plates are: middle of the outer face, (3,) m, and 1 for the front one, -1 for the rear one."""
+    """Return the place of each plate: the middle of its outer face, (3,) m, and 1 for front or -1 for rear."""
     low = skin.form.variety[7] < 0.35 or skin.form.body == "pickup"
     places = []
     for column, facing, row in ((-1, 1.0, 0.33), (0, -1.0, 0.31 if low else 0.475)):
@@ -109,11 +109,11 @@ def plate_places(skin: Skin) -> list[tuple[FloatArray, float]]:
 
 
 def add_plates(build: ShapeBuilder, skin: Skin, text: NDArray[np.int64]) -> None:
-    """Front and rear plate with the same dark characters.
+    """Add the front and rear plate with the same dark characters.
 
     Args:
-        build: takes them.
-        skin: where the bumpers are.
+        build: the builder to add them to.
+        skin: the shell with the bumpers.
         text: (n,) int64, index of each glyph.
     """
     for at, facing in plate_places(skin):
@@ -125,7 +125,7 @@ def _add_plate(build: ShapeBuilder, at: FloatArray, facing: float, text: NDArray
     build.box(at - [0.02 * facing, 0, 0], (0.04, width, height), Finish.PLATE)
 
     def patches(rectangles: FloatArray) -> FloatArray:
-        """Rectangles x0, z0, x1, z1 on the plate, x to the right as it is read, as quads."""
+        """Return quads of rectangles x0, z0, x1, z1 on the plate, with x in reading direction."""
         x0, z0, x1, z1 = rectangles.T
         depth = np.full_like(x0, at[0] + 0.0015 * facing)
         y0, y1 = facing * x0, facing * x1
@@ -144,7 +144,7 @@ def _add_plate(build: ShapeBuilder, at: FloatArray, facing: float, text: NDArray
 
 
 def add_reflectors(build: ShapeBuilder, skin: Skin) -> None:
-    """Two bright bowls in each headlamp."""
+    """Add two bright bowls to each headlamp."""
     first = len(skin.flank) - len(ROUND)
     lamp = np.flatnonzero(np.isclose(skin.plan_angle, LAMP_INNER))[-1]
     high = int(np.searchsorted(ROWS, 0.82))
@@ -167,7 +167,7 @@ def add_reflectors(build: ShapeBuilder, skin: Skin) -> None:
 
 
 def add_slats(build: ShapeBuilder, skin: Skin) -> None:
-    """Bright bars across the grille, and the maker's badge."""
+    """Add bright bars across the grille, and the maker's badge."""
     column = int(np.flatnonzero(np.isclose(skin.plan_angle, LAMP_INNER))[-1])
     for share in (0.62, 0.75):
         row = int(np.searchsorted(ROWS, share))
@@ -179,7 +179,7 @@ def add_slats(build: ShapeBuilder, skin: Skin) -> None:
 
 
 def add_mirrors(build: ShapeBuilder, skin: Skin) -> None:
-    """A rounded housing on either side, its glass to the rear."""
+    """Add a rounded housing on either side, with its glass to the rear."""
     form = skin.form
     x = form.cowl - 0.20
     foot = np.array([np.interp(x, skin.edge[:, 0], skin.edge[:, k]) for k in range(3)])
@@ -210,7 +210,7 @@ def add_mirrors(build: ShapeBuilder, skin: Skin) -> None:
 
 
 def add_handles(build: ShapeBuilder, skin: Skin) -> None:
-    """A handle near the rear edge of every door."""
+    """Add a handle near the rear edge of every door."""
     for seam in skin.seams[1:]:
         x = seam + 0.15
         column = int(np.argmin(np.abs(skin.edge[:, 0] - x)))
@@ -226,7 +226,7 @@ def add_handles(build: ShapeBuilder, skin: Skin) -> None:
 
 
 def add_rails(build: ShapeBuilder, house: Glasshouse) -> None:
-    """Rails along the roof's edges."""
+    """Add rails along the edges of the roof."""
     edge = house.points[:, -1]
     form = house.form
     front, rear = form.header - 0.18, form.roof_end + 0.16
@@ -241,7 +241,7 @@ def add_rails(build: ShapeBuilder, house: Glasshouse) -> None:
 
 
 def add_cladding(build: ShapeBuilder, skin: Skin) -> None:
-    """Plastic lips round the wheel arches."""
+    """Add plastic lips around the wheel arches."""
     form = skin.form
     lower = skin.flank[:, 0]
     for axle in (form.rear_axle, form.front_axle):

@@ -58,10 +58,10 @@ class VehicleModel:
         segment: market segment, as in `vehicle_classes.SIZE_CLASSES`; it determines wheels and nose.
         size: length, width without mirrors, height, m.
         paint: sRGB, 0 to 255.
-        seed: 0 or more, of all other details.
+        seed: 0 or more, seed of all other details.
 
     Raises:
-        SensorError: an unknown body, a size that no vehicle has, a paint or a seed out of range.
+        SensorError: the body is unknown, the size is implausible, or paint or seed is out of range.
 
     Examples:
         >>> car = VehicleModel.from_seed("estate", 7)
@@ -89,7 +89,7 @@ class VehicleModel:
 
     @classmethod
     def from_seed(cls, body: str | None, seed: int) -> VehicleModel:
-        """Draw a model: size, paint and trim by their frequency.
+        """Draw a model: size, paint and trim by frequency.
 
         Args:
             body: one of `vehicle_classes.BODIES`; None draws it by `BODY_SHARE`.
@@ -111,17 +111,17 @@ class VehicleModel:
 
     @property
     def length(self) -> float:
-        """M."""
+        """Length, m."""
         return self.size[0]
 
     @property
     def width(self) -> float:
-        """m, without mirrors."""
+        """Width without mirrors, m."""
         return self.size[1]
 
     @property
     def height(self) -> float:
-        """M."""
+        """Height, m."""
         return self.size[2]
 
     @cached_property
@@ -253,7 +253,7 @@ def _shape(model: VehicleModel, level: int) -> Shape:
 def _footprint(model: VehicleModel) -> FloatArray:
     skin = _skin(model, False)
     left = skin.section(KNEE_M)
-    for at, _ in plate_places(skin):  # flat ones stand out from a round bumper
+    for at, _ in plate_places(skin):  # flat plates protrude from a round bumper
         if abs(at[2] - KNEE_M) < PLATE_M[1] / 2:
             left = np.vstack([left, [at[0], PLATE_M[0] / 2]])
     hull = _convex_hull(np.vstack([left, left * [1.0, -1.0]]))

@@ -1,1 +1,1 @@
-"""Throughput of every part beside its peers."""
+"""Throughput benchmarks of each part against peers."""

@@ -26,11 +26,11 @@ STEPS = 100
 def drive_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     """Return the rows of `parkenv bench drive`: physics steps, environment steps and planning.
 
-    A physics step is 0.05 s here, pymunk's step and contacts included, and 1/15 s in highway-env's parking. Resets
-    are not counted.
+    A physics step is 0.05 s here, including pymunk's step and contacts, and 1/15 s in highway-env's parking. Resets are
+    not counted.
 
     Args:
-        seed: of the tasks and the actions.
+        seed: seed of the tasks and the actions.
         seconds: duration of each measurement.
     """
     rows = rate("drive", "car and pymunk alone", bare_physics(seed, seconds), "physics steps/s")
@@ -53,7 +53,7 @@ def drive_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
 
 
 def bare_physics(seed: int, seconds: float) -> float:
-    """Return steps per second of a car that drives back and forth among parked ones, with contacts."""
+    """Return steps per second of a car that drives back and forth among parked cars, with contacts."""
     task = ParkingTasks(packaged_lot("campus")).draw(seed)
     space, limits = CollisionWorld(task.vehicle, task.obstacles), task.vehicle.limits
     state = task.start.copy()
@@ -85,7 +85,7 @@ def highway_parking(seed: int, seconds: float) -> float:
 
 
 def reset_and_plan(lot: str, seed: int, seconds: float) -> tuple[float, float]:
-    """Return the median times, s, of a reset, and of a plan from its start."""
+    """Return the median times, s, of a reset and of planning from the start."""
     env = gym.make("parkenv/Drive-v1", lot=lot, obstacle_map=True, disable_env_checker=True)
     agent = ParkingAgent()
     reset = seconds_each(lambda i: env.reset(seed=seed + i), seconds, least=20)
@@ -104,7 +104,7 @@ def _pedalling(seed: int) -> Callable[[int], Any]:
 
 
 def _steps(env: gym.Env[Any, Any], action: Callable[[int], Any], seconds: float) -> float:
-    """Return steps per second, the median over runs of up to `STEPS`."""
+    """Return steps per second, the median over runs of up to `STEPS` steps."""
     rates: list[float] = []
     actions = [action(i) for i in range(STEPS)]
     end = time.perf_counter() + seconds

@@ -1,4 +1,4 @@
-"""Benchmark of environment steps, with peers."""
+"""Benchmark of environment steps against peers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _BLOCK = 200
 _DRAWN = 100
 
 Stepper = Callable[[], int]
-"""Runs some steps; returns their number."""
+"""Runs some steps and returns their number."""
 
 
 def env_rows(
@@ -34,18 +34,18 @@ def env_rows(
 ) -> list[BenchRow]:
     """Return the rows of `parkenv bench env`, on one core, with random actions.
 
-    A step is a whole `step()` of one environment, alone or in a batch: observations, infos and automatic resets
-    included. Actions are drawn beforehand. Gymnasium's CartPole batch is numpy on four numbers per environment, without
+    A step is a full `step()` of one environment, alone or in a batch, including observations, infos and automatic
+    resets. Actions are drawn beforehand. Gymnasium's CartPole batch is numpy on four numbers per environment, without
     a world to simulate or a belief to maintain.
 
-    Environments take turns, and each is rated by the median over its turns, in CPU seconds of this process, so that
-    other load on the machine affects all alike.
+    Environments take turns. The value of each is the median over its turns, in CPU seconds of this process, so that
+    other load on the machine affects all equally.
 
     Args:
-        seed: of worlds and actions.
+        seed: seed of worlds and actions.
         seconds: duration of each measurement.
-        batch: searches in a batch.
-        large: slots of the large lot.
+        batch: number of searches in a batch.
+        large: number of slots of the large lot.
     """
     import parkenv  # noqa: F401 - registers the environments
 
@@ -91,7 +91,7 @@ def _ours(scenario: Scenario, batch: int, observation: str, copy: bool) -> ParkS
 
 
 def batch_stepper(envs: gym.vector.VectorEnv[Any, Any, Any], n_actions: int, seed: int) -> Stepper:
-    """Step a batch with random actions."""
+    """Make a stepper for a batch with random actions."""
     actions = np.random.default_rng(seed).integers(0, n_actions, (_DRAWN, envs.num_envs))
     envs.reset(seed=seed)
 
@@ -104,7 +104,7 @@ def batch_stepper(envs: gym.vector.VectorEnv[Any, Any, Any], n_actions: int, see
 
 
 def single_stepper(env: gym.Env[Any, Any], seed: int) -> Stepper:
-    """Step one environment with random actions, with a reset after each episode."""
+    """Make a stepper for one environment with random actions and a reset after each episode."""
     env.action_space.seed(seed)
     actions = [env.action_space.sample() for _ in range(10 * _BLOCK)]
     env.reset(seed=seed)
@@ -120,7 +120,7 @@ def single_stepper(env: gym.Env[Any, Any], seed: int) -> Stepper:
 
 
 def installed_peers(batch: int, seed: int) -> tuple[dict[str, Stepper], list[str]]:
-    """Return steppers of installed peers, and the names of missing ones."""
+    """Return steppers of installed peers, and the names of missing peers."""
     found: dict[str, Stepper] = {}
     missing: list[str] = []
     for package, env_id in (("highway_env", "parking-v0"), ("minigrid", "MiniGrid-Empty-8x8-v0")):
@@ -148,11 +148,11 @@ def installed_peers(batch: int, seed: int) -> tuple[dict[str, Stepper], list[str
 
 
 def measured(steppers: dict[str, Stepper], seconds: float) -> dict[str, float]:
-    """Return steps per second of each."""
+    """Return the steps per second of each stepper."""
     rates: dict[str, list[float]] = {name: [] for name in steppers}
     spent = dict.fromkeys(steppers, 0.0)
     for step in steppers.values():
-        step()  # compiles, and ends the start phase in which all searches have the same age
+        step()  # compiles, and ends the initial phase in which all searches have the same age
     while not all(rates.values()) or min(spent.values()) < seconds:
         for name, step in steppers.items():
             if rates[name] and spent[name] >= seconds:

@@ -1,4 +1,4 @@
-"""How fast the detection and mapping stack is, beside OpenCV 4's detector and scikit-image's histograms."""
+"""Benchmark of detection and mapping, against OpenCV 4's detector and scikit-image's HOG."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ from parkenv.world.lot_scene import slot_lot
 from sim_sensors.rig import SensorRig
 
 PEERS_PYTHON = "PARKENV_BENCH_PYTHON"
-"""Environment variable that names the Python of another environment, with `opencv-python-headless<5` and
-`scikit-image`: OpenCV 5, which parkenv needs, has no HOGDescriptor any more."""
+"""Environment variable with the path of a Python that has `opencv-python-headless<5` and `scikit-image`: parkenv needs
+OpenCV 5, which no longer has a HOGDescriptor."""
 
 _PEERS = """
 import json, sys, time
@@ -63,14 +63,14 @@ print(json.dumps(found))
 
 
 def perception_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
-    """Rows of `parkenv bench perception`; peers where `PEERS_PYTHON` names an environment that has them.
+    """Return the rows of `parkenv bench perception`, with the peers that are installed for `PEERS_PYTHON`.
 
     Args:
-        seed: of the lot.
-        seconds: how long each figure is measured.
+        seed: seed of the lot.
+        seconds: duration of each measurement.
 
     Raises:
-        InputError: `PEERS_PYTHON` names no Python that runs.
+        InputError: `PEERS_PYTHON` is not a working Python.
     """
     scenario = make_scenario("campus")
     lot = scenario.lot
@@ -108,7 +108,7 @@ def perception_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
 
 
 def _detector_rows(grey: NDArray[np.uint8], seconds: float, peers: dict[str, float]) -> list[BenchRow]:
-    """One thread, the side model, every size from the window's own on, as OpenCV looks."""
+    """Measure the side model on one thread, at all sizes from the window's own upwards, as OpenCV does."""
     side = CarModel.load("side")
     plain = CarModel(side.descriptor, side.weights, -1e3, 2.0)
     detector = HogDetector((plain,), least_height=64.0, most_height=480.0, scale_step=1.2, margin=0.0)
@@ -124,7 +124,7 @@ def _detector_rows(grey: NDArray[np.uint8], seconds: float, peers: dict[str, flo
 
 
 def _peers(grey: NDArray[np.uint8], seconds: float) -> dict[str, float]:
-    """Seconds that each peer takes for the image, in the other environment; or in this one what it has."""
+    """Measure the time, s, that each installed peer takes for the image, with `PEERS_PYTHON` or else this Python."""
     python = os.environ.get(PEERS_PYTHON, sys.executable)
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "image.npy"

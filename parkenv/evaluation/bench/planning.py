@@ -39,17 +39,17 @@ Solver = Callable[[], NDArray[np.int64]]
 
 SIZES = (200, 2_000, 20_000, 200_000, 2_000_000)
 CITY = 1_000_000
-"""Slots of the city in which agents search."""
+"""Number of slots of the city in which agents search."""
 CITY_SEARCHES = 3
-"""Searches of each agent there."""
+"""Number of searches of each agent in the city."""
 PATIENCE_S = 60.0
-"""Peers expected to take longer on a lot are not measured there."""
+"""Peers are not measured on lots where they are expected to take longer, s."""
 MDPTOOLBOX_STATES = 5_000
-"""pymdptoolbox checks its input with a dense matrix of states by states."""
+"""Maximum number of states for pymdptoolbox, which checks its input with a dense matrix of states by states."""
 LONG_S = 2.0
-"""Slower solvers are timed once."""
+"""Solvers that take longer are timed only once, s."""
 EPSILON = 0.01
-"""Tolerance, s, of the values of iterative peers."""
+"""Tolerance of the values of iterative peers, s."""
 
 
 def planning_rows(
@@ -58,10 +58,10 @@ def planning_rows(
     """Return the rows of `parkenv bench planning`, on one core.
 
     Args:
-        seed: of the cities and of the observations.
+        seed: seed of the cities and of the observations.
         seconds: duration of each measurement.
-        lot: for replanning; the packaged campus where None.
-        largest: slots of the largest city.
+        lot: lot for replanning; None for the packaged campus.
+        largest: number of slots of the largest city.
     """
     sizes = [n for n in SIZES if n <= largest]
     return [
@@ -72,10 +72,10 @@ def planning_rows(
 
 
 def solving_rows(sizes: list[int], seed: int, seconds: float) -> list[BenchRow]:
-    """Measure planning from scratch in cities of growing size, and its growth.
+    """Measure planning from scratch in cities of increasing size, and its growth.
 
     Raises:
-        AssertionError: a peer's plan is not as good as ours.
+        AssertionError: a peer's plan is worse than ours.
     """
     rows: list[BenchRow] = []
     expected: dict[str, float] = {}
@@ -96,7 +96,7 @@ def solving_rows(sizes: list[int], seed: int, seconds: float) -> list[BenchRow]:
             policy, took = _timed(solve, seconds)
             _require_optimal(name, mdp, labels, policy)
             theirs[name] = 1e3 * took
-            # They grow faster than the lot, which grows tenfold: at least as fast as last time.
+            # The time grows faster than the lot, which grows tenfold: assume at least the last growth factor.
             expected[name] = took * max(12.0, took / measured.get(name, took))
             measured[name] = took
         rows += duration("plan", f"city, {n:,} vertices", 1e3 * ours, "ms", **theirs)
@@ -136,7 +136,7 @@ def repair_rows(lot: ParkingLot, seed: int, seconds: float) -> list[BenchRow]:
 
 
 def city_rows_apart(n_slots: int, seed: int) -> list[BenchRow]:
-    """Run `city_rows` in a process of its own, to measure its memory alone."""
+    """Run `city_rows` in a separate process, to measure its peak memory alone."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as apart:
         return apart.submit(city_rows, n_slots, seed).result()
 
@@ -147,8 +147,8 @@ def city_rows(
     """Measure searches in a city: an agent's time for the first and for later decisions, and peak memory.
 
     Args:
-        n_slots: of the city.
-        seed: of the city and of the worlds.
+        n_slots: number of slots of the city.
+        seed: seed of the city and of the worlds.
         agents: names of the agents.
     """
     scenario = make_scenario(city_lot(n_slots, seed))
@@ -176,7 +176,7 @@ def peak_memory_gib() -> float | None:
         return None
     import resource
 
-    # Kilobytes, but for macOS.
+    # Kilobytes, except on macOS.
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
 
@@ -184,7 +184,7 @@ def peak_memory_gib() -> float | None:
 def drive(
     graph: StoppingGraph, labels: Labels, n_slots: int, rng: np.random.Generator
 ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-    """Yield the observations of a drive along the plan: slots passed, less often free than believed."""
+    """Yield the observations of a drive along the plan: slots passed, which are free less often than predicted."""
     vertex = int(rng.integers(len(labels.cost)))
     seen: set[int] = set()
     for _ in range(1000):
@@ -219,7 +219,7 @@ def peers(n_states: int) -> dict[str, Callable[[ParkingMDP], Solver]]:
 
 
 def quantecon_solver(mdp: ParkingMDP, method: str) -> Solver:
-    """QuantEcon's `DiscreteDP` on sparse state-action pairs; its last state is the goal."""
+    """Make a solver with QuantEcon's `DiscreteDP` on sparse state-action pairs; the last state is the goal."""
     n, n_actions = mdp.n_states, PARK + 1
     process: Any = import_module("quantecon.markov").DiscreteDP(
         np.append(mdp.rewards().ravel(), 0.0),
@@ -237,14 +237,14 @@ def quantecon_solver(mdp: ParkingMDP, method: str) -> Solver:
 
 
 def pymdptoolbox_solver(mdp: ParkingMDP) -> Solver:
-    """Value iteration of pymdptoolbox on one sparse matrix an action; its last state is the goal."""
+    """Make a solver with pymdptoolbox's value iteration, one sparse matrix per action; the last state is the goal."""
     n, n_actions = mdp.n_states, PARK + 1
     by_pair = transitions(mdp)
     stay = csr_matrix(([1.0], ([0], [n])), shape=(1, n + 1))
     matrices = [vstack([by_pair[a : n * n_actions : n_actions], stay]).tocsr() for a in range(n_actions)]
     reward = np.vstack([mdp.rewards(), np.zeros(n_actions)])
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about its input checks
+        warnings.simplefilter("ignore")  # warnings of its input checks
         process: Any = import_module("mdptoolbox.mdp").ValueIteration(
             matrices, reward, mdp.gamma, epsilon=EPSILON, max_iter=1_000_000
         )

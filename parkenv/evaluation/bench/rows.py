@@ -14,9 +14,9 @@ class BenchRow(TypedDict):
 
     Keys:
         part, case: what was measured, and on which input.
-        value, unit: the value; None where nothing was measured, for a reason given in the case.
-        peer, peer_value: other software for the same task, and its value; None where there is none.
-        ratio: above 1 where ours is faster.
+        value, unit: the value; None if nothing was measured, for the reason given in `case`.
+        peer, peer_value: other software for the same task and its value; None without a peer.
+        ratio: above 1 if ours is faster.
     """
 
     part: str
@@ -29,14 +29,14 @@ class BenchRow(TypedDict):
 
 
 def rate(part: str, case: str, value: float, unit: str, **peers: float) -> list[BenchRow]:
-    """Return a row per peer for a value of which more is better; one row without peers.
+    """Return one row per peer for a value where higher is better; a single row without peers.
 
     Args:
         part: what was measured.
-        case: on which input.
-        value: per second.
-        unit: such as `scans/s`.
-        peers: the same value of others.
+        case: the input.
+        value: value per second.
+        unit: unit, such as `scans/s`.
+        peers: values of the peers.
     """
     if not peers:
         return [_row(part, case, value, unit, None, None, None)]
@@ -44,7 +44,7 @@ def rate(part: str, case: str, value: float, unit: str, **peers: float) -> list[
 
 
 def duration(part: str, case: str, value: float, unit: str, **peers: float) -> list[BenchRow]:
-    """Return rows as `rate` does for a value of which less is better."""
+    """Return rows like `rate` for a value where lower is better."""
     if not peers:
         return [_row(part, case, value, unit, None, None, None)]
     return [_row(part, case, value, unit, name, other, other / value) for name, other in peers.items()]
@@ -74,8 +74,8 @@ def seconds_each(work: Callable[[int], object], seconds: float = 0.6, least: int
 
     Args:
         work: the timed function.
-        seconds: for how long to repeat.
-        least: least number of timed calls.
+        seconds: minimum total duration.
+        least: minimum number of timed calls.
     """
     work(0)
     times: list[float] = []

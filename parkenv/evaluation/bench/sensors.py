@@ -1,4 +1,4 @@
-"""How fast the simulated sensors are, beside other ways to make the same measurements."""
+"""Benchmark of the simulated sensors against other implementations of the same measurements."""
 
 from __future__ import annotations
 
@@ -31,32 +31,32 @@ from sim_sensors.slot_scenes import scene_of_slots
 
 FloatArray = NDArray[np.float64]
 Scans = Callable[[FloatArray], NDArray[Any]]
-"""From poses, (n, 3), to ranges, (n, n_beams), m."""
+"""Maps poses, (n, 3), to ranges, (n, n_beams), m."""
 
 SLOT_WIDTH, SLOT_LENGTH, MODULE, MARGIN = 2.5, 5.0, 16.0, 6.0
 GRID_CELL = 0.05
-"""Cell, m, of the grid that the beam marcher walks."""
+"""Cell size of the grid for ray marching, m."""
 LIT_AHEAD = 12.0
-"""m, before the camera: about where light maps are drawn for the shading alone."""
+"""Distance of the light maps' centre in front of the camera, m, when shading is timed alone."""
 
 
 def sensor_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
-    """Rows of `parkenv bench sensors`.
+    """Return the rows of `parkenv bench sensors`.
 
     Args:
-        seed: of the lots and the noise.
-        seconds: how long each figure is measured.
+        seed: seed of the lots and the noise.
+        seconds: duration of each measurement.
     """
     return laser_rows(seed, seconds) + camera_rows(seed, seconds)
 
 
 def laser_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
-    """Scans a second of 1081 beams on one core, exact and noisy, in a batch and one by one.
+    """Measure scans per second of 1081 beams on one core, exact and noisy, in a batch and one by one.
 
-    A batch is compared with batches of the peers, one scan with one scan. Peers are always without noise.
+    Batches are compared with batches of the peers, single scans with single scans. Peers simulate no noise.
 
     Raises:
-        AssertionError: a peer does not see what the laser sees.
+        AssertionError: a peer measures other ranges than the laser.
     """
     rng = np.random.default_rng(seed)
     laser = LaserScanner()
@@ -100,10 +100,10 @@ def laser_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
 
 
 def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
-    """Frames of 640×480 a second, their stages, and pairs of them, on as many cores as numba is given.
+    """Measure 640×480 frames per second, their stages, and stereo pairs, on as many cores as numba uses.
 
-    OpenCV's rasteriser, on one core, draws the depth of the same triangles, which it finds already chosen and on the
-    screen; ours is given the scene.
+    OpenCV's rasteriser, on one core, draws the depth of the same triangles, which are already culled and projected for
+    it; ours starts from the scene.
     """
     scene, weather = parked_cars(seed), Weather.draw("sunny", 1)
     camera = PinholeCamera.from_field_of_view()
@@ -157,7 +157,7 @@ def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
 
 
 def parked_cars(seed: int = 0) -> Scene:
-    """200 cars in four full rows of 50 along a lane on the x axis."""
+    """Build 200 cars in four full rows of 50 along a lane on the x axis."""
     x = 2.55 * (np.arange(50) - 24.5)
     rows = np.array([-11.2, -6.0, 6.0, 11.2])
     xy = np.stack(np.meshgrid(x, rows), -1).reshape(-1, 2)
@@ -169,10 +169,10 @@ def parked_cars(seed: int = 0) -> Scene:
 def walled_lot(
     rng: np.random.Generator, n_cars: int, columns: int = 25
 ) -> tuple[ScanPlane, Callable[[int], FloatArray]]:
-    """A walled lot, four slots in five taken by cars of four corners, parked as people do.
+    """Build a walled lot with 80 % of the slots taken by rectangular cars, parked with realistic deviations.
 
     Returns:
-        What a laser meets, and a function that draws poses, (n, 3), in the aisles.
+        The scan plane, and a function that draws poses, (n, 3), in the aisles.
     """
     modules = math.ceil(n_cars * 1.25 / (2 * columns))
     size = np.array([2 * MARGIN + SLOT_WIDTH * columns, 2 * MARGIN + MODULE * modules])
@@ -197,7 +197,7 @@ def walled_lot(
 
 
 def pymunk_scanner(plane: ScanPlane, laser: LaserScanner) -> Scans:
-    """A segment query a beam."""
+    """Make a scanner with one pymunk segment query per beam."""
     space = pymunk.Space()
     corners, n_corners = plane.footprints
     for polygon, k in zip(corners, n_corners, strict=True):
@@ -220,7 +220,7 @@ def pymunk_scanner(plane: ScanPlane, laser: LaserScanner) -> Scans:
 
 
 def embree_scanner(plane: ScanPlane, laser: LaserScanner) -> Scans:
-    """All beams of all poses at once against upright faces, by Intel's ray tracer."""
+    """Make a scanner that casts all beams of all poses at once against upright faces, with Intel's ray tracer."""
     import embreex.mesh_construction as meshes
     from embreex.rtcore_scene import EmbreeScene
 
@@ -246,7 +246,7 @@ def embree_scanner(plane: ScanPlane, laser: LaserScanner) -> Scans:
         far = np.asarray(far, dtype=np.float32).reshape(angles.shape)
         return np.where(far < reach, far, np.float32(np.inf))
 
-    scans.__dict__["mesh"] = mesh  # the scene does not keep it alive
+    scans.__dict__["mesh"] = mesh  # the scene does not keep the mesh alive
     return scans
 
 
@@ -260,7 +260,7 @@ def _march(
     reach: float,
     ranges: FloatArray,
 ) -> None:
-    """Step along each beam by the distance to the nearest taken cell until there is none to step."""
+    """Step along each beam by the distance to the nearest occupied cell until that distance is zero."""
     rows, columns = clearance.shape
     for k in range(len(poses)):
         x, y = poses[k, 0], poses[k, 1]
@@ -280,7 +280,7 @@ def _march(
 
 
 def marching_scanner(plane: ScanPlane, laser: LaserScanner) -> Scans:
-    """Ray marching in the distance transform of an occupancy grid, the method of the f1tenth simulator."""
+    """Make a scanner by ray marching in the distance transform of an occupancy grid, as in the f1tenth simulator."""
     corners, n_corners = plane.footprints
     width, height = plane.walls.reshape(-1, 2).max(0)
     taken = np.zeros((int(height / GRID_CELL) + 1, int(width / GRID_CELL) + 1), dtype=np.bool_)
@@ -293,7 +293,7 @@ def marching_scanner(plane: ScanPlane, laser: LaserScanner) -> Scans:
         away = ((np.stack([column, row], -1) + 0.5) * GRID_CELL)[:, :, None] - polygon[:k]
         edge = np.roll(polygon[:k], -1, 0) - polygon[:k]
         taken[row, column] |= (edge[:, 0] * away[..., 1] - edge[:, 1] * away[..., 0] > 0.0).all(-1)
-    # Single precision halves what a look-up drags through the cache.
+    # Single precision halves the memory traffic of look-ups.
     clearance = np.asarray(distance_transform_edt(~taken) * GRID_CELL, dtype=np.float32)
 
     def scans(poses: FloatArray) -> FloatArray:
@@ -306,7 +306,7 @@ def marching_scanner(plane: ScanPlane, laser: LaserScanner) -> Scans:
 
 
 def opencv_rasterizer(triangles: ScreenTriangles, size: tuple[int, int]) -> Callable[[int], object]:
-    """Draws the depth of the same triangles with OpenCV, moved in front of its own camera."""
+    """Return a function that draws the depth of the same triangles with OpenCV, transformed for its camera."""
     corners = triangles.corners.reshape(-1, 3, 2).astype(np.float64)
     plane = triangles.inverse_depth[:, None, :]
     depth = 1.0 / np.maximum((corners * plane[..., :2]).sum(axis=2) + plane[..., 2], 1e-3)

@@ -1,4 +1,4 @@
-"""Agents as files and command lines name them: a name, with options where they differ from the agent's own."""
+"""Specification of agents in files and on command lines: a name, with any options that differ from the defaults."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ OptionValue = bool | int | float | str
 
 
 class AgentSpec(Spec):
-    """An agent and its options, as `planners.make_agent` takes them: `{ name = "mdp", failure_s = 90 }`."""
+    """An agent and its options for `planners.make_agent`: `{ name = "mdp", failure_s = 90 }`."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -28,10 +28,10 @@ class AgentSpec(Spec):
 
     @classmethod
     def of(cls, text: str) -> AgentSpec:
-        """The agent that a word such as `mdp(failure_s=90)` names.
+        """Parse an agent from text such as `mdp(failure_s=90)`.
 
         Raises:
-            InputError: brackets that do not match, or an option without a value.
+            InputError: brackets do not match, or an option has no value.
         """
         return cls.parse(parse_agent(text), "--agent")
 
@@ -42,12 +42,12 @@ class AgentSpec(Spec):
 
     @property
     def label(self) -> str:
-        """The agent in tables, and on command lines: `mdp(failure_s=90)`."""
+        """Text of the agent in tables and on command lines: `mdp(failure_s=90)`."""
         return label_of(self.name, self.options)
 
 
 def label_of(name: str, options: dict[str, Any]) -> str:
-    """An agent with its options in one word.
+    """Format an agent with its options, such as `mdp(failure_s=90)`.
 
     Examples:
         >>> label_of("belief", {"budget_ms": 2.0})
@@ -65,10 +65,10 @@ def _text(value: OptionValue) -> str:
 
 
 def parse_agent(text: str) -> dict[str, Any]:
-    """The table that a word such as `mdp(failure_s=90)` stands for.
+    """Parse text such as `mdp(failure_s=90)` into the fields of an `AgentSpec`.
 
     Raises:
-        InputError: brackets that do not match, or an option without a value.
+        InputError: brackets do not match, or an option has no value.
 
     Examples:
         >>> parse_agent("mdp(failure_s=90,solver=policy_iteration)")
@@ -100,7 +100,7 @@ def _value(text: str) -> OptionValue:
 
 
 def split_agents(text: str) -> list[str]:
-    """The agents of a comma-separated list; commas within brackets divide options.
+    """Split a comma-separated list of agents; commas within brackets separate options.
 
     Examples:
         >>> split_agents("mdp(failure_s=90,gamma=1),oracle")

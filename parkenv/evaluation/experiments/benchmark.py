@@ -1,7 +1,7 @@
-"""Benchmark suites: fixed scenarios, seeds and metrics, so that results of different people can be compared.
+"""Benchmark suites: fixed scenarios, seeds and metrics that make results of different groups comparable.
 
-A suite is a JSON file in the folder `suites`; it never changes once it is published: what would be better is another
-suite. A result file names the suite, carries every search's time, and can be checked by anybody who has it.
+A suite is a JSON file in the folder `suites`. A published suite never changes; improvements go into a new suite. A
+result file names its suite, contains the total time of every search, and can be checked by anybody.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ METRICS = (
     "episodes", "parked_fraction", "total_s", "total_s_ci95", "regret_s", "regret_s_ci95", "failed_parks",
     "decision_ms", "decision_ms_p99",
 )  # fmt: skip
-"""What a result tells of an agent in a task, in the words of `parkenv compare`; and its score."""
+"""Metrics of an agent in a task, named as in `parkenv compare`; a result also has the score."""
 _ROUNDING = 1e-6
 _FOLDER = Path(__file__).parent / "suites"
 
@@ -45,11 +45,11 @@ class Task:
     """One scenario of a suite.
 
     Args:
-        name: of the task.
-        scenario: of the packaged ones.
-        occupancy_level: the mean occupancy that the world is set to; as it is where None.
-        sight: `perfect`, or the rig whose measured sight is taken.
-        v_walk_kmh: walking speed; the scenario's own where None.
+        name: name of the task.
+        scenario: a packaged scenario.
+        occupancy_level: mean occupancy of the world; None for the scenario's own.
+        sight: `perfect`, or the rig whose fitted sensor model is used.
+        v_walk_kmh: walking speed; None for the scenario's own.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Task:
     v_walk_kmh: float | None = None
 
     def made(self, arrival: ArrivalWindow) -> Scenario:
-        """The scenario itself, named after the task."""
+        """Make the scenario, named after the task."""
         made = make_scenario(self.scenario).replace(name=self.name, arrival=arrival)
         if self.sight != "perfect":
             made = made.replace(sensor_model=SensorModel.named(self.sight))
@@ -73,11 +73,11 @@ class Suite:
     """A benchmark suite.
 
     Args:
-        name: such as v1.
-        description: a sentence.
+        name: name, such as v1.
+        description: one sentence.
         arrival: when searches begin.
-        seeds: one search for each, in every task.
-        tasks: where.
+        seeds: seeds; every task has one search per seed.
+        tasks: the tasks.
         fingerprint: SHA-256 of the suite's file, as JSON without white space.
     """
 
@@ -90,10 +90,10 @@ class Suite:
 
     @classmethod
     def named(cls, name: str) -> Self:
-        """A suite that comes with the package.
+        """Load a packaged suite.
 
         Raises:
-            InputError: there is none of that name; the message lists those there are.
+            InputError: an unknown name; the message lists the known ones.
 
         Examples:
             >>> suite = Suite.named("v1")
@@ -115,10 +115,10 @@ class Suite:
         )
 
     def cases(self, agents: Sequence[AgentSpec]) -> list[tuple[Case, range]]:
-        """Every agent in every task, for `run_cases`.
+        """Return the cases for `run_cases`: every agent in every task.
 
         Raises:
-            InputError: an agent that does not exist, or that refuses a task.
+            InputError: an agent does not exist or does not support a task.
         """
         worlds = [task.made(self.arrival) for task in self.tasks]
         for world in worlds:
@@ -134,7 +134,7 @@ class Suite:
 def result_of(
     suite: Suite, cases: Sequence[tuple[Case, range]], folder: ResultFolder, command: Sequence[str]
 ) -> Row:
-    """What a result file holds, from a folder in which all cases are finished."""
+    """Build the content of a result file from a folder in which all cases are finished."""
     episodes: dict[str, dict[str, dict[str, list[float]]]] = {}
     for case, seeds in cases:
         rows = [folder.episodes[case.key(s)] for s in seeds]
@@ -164,13 +164,13 @@ def result_of(
 
 
 def check_result(path: Path) -> Row:
-    """Read a result file and make sure that it is complete, agrees with itself, and is of the suite's own worlds.
+    """Read a result file, and check that it is complete, consistent, and from the suite's own worlds.
 
-    The clairvoyant bounds of all searches are computed anew: a run in other worlds, or with other costs and speeds,
-    has others. What an agent took there only a run of the agent can tell.
+    The check recomputes the clairvoyant bounds of all searches, which differ in other worlds or with other costs and
+    speeds. It cannot verify the times of an agent; for that, run the agent again.
 
     Raises:
-        InputError: what is wrong, with the agent and task.
+        InputError: the check failed; the message says where, with agent and task.
     """
     try:
         result: Row = json.loads(path.read_text(encoding="utf-8"))

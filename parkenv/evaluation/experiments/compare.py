@@ -1,4 +1,4 @@
-"""Agents against each other in the same worlds: the runs, in parallel, and their summary."""
+"""Compare agents in the same worlds: run their episodes in parallel and summarise them."""
 
 from __future__ import annotations
 
@@ -22,25 +22,26 @@ from parkenv.world.keyed_random import world_key
 from parkenv.world.occupancy import ArrivalWindow, OccupancyProcess
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
+from parkenv.world.week import DAY_S
 from planners.agent import make_agent
 
-UNSEEN = "-unseen"
+BLIND = "-blind"
 """Suffix of the names of scenarios whose slots are not observed before an attempt."""
 BLOCK = 10
-"""Episodes a task: few enough to lose little to a crash, enough to make up for starting one."""
+"""Episodes per task: a crash loses few of them, and the overhead of starting a task stays small."""
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One scenario with the costs and speeds of one setting, met by one agent.
+    """One agent in one scenario, with the costs and speeds of one setting.
 
     Attributes:
-        scenario: with the setting's costs and speeds.
-        agent: the agent's name.
-        occupancy_level: the mean occupancy that the world was set to; None where it was left as it is.
-        options: of the agent, as `make_agent` takes them.
-        rig: simulated sensors that observe the slots; None: the scenario's sensor model replaces them.
-        detector: of the rig's images, as `make_detector` takes it; None: the packaged one.
+        scenario: the scenario, with the setting's costs and speeds.
+        agent: name of the agent.
+        occupancy_level: mean occupancy of the world; None for the scenario's own.
+        options: options of the agent, for `make_agent`.
+        rig: simulated sensors that observe the slots; None to use the scenario's sensor model.
+        detector: detector for the rig's images, for `make_detector`; None for the packaged one.
     """
 
     scenario: Scenario
@@ -52,7 +53,7 @@ class Case:
 
     @property
     def label(self) -> str:
-        """The agent with its options, as tables name it."""
+        """Name of the agent with its options, for tables."""
         return label_of(self.agent, dict(self.options))
 
     @property
@@ -68,11 +69,11 @@ class Case:
         }
 
     def key(self, seed: int) -> tuple[Any, ...]:
-        """The key of one of its episodes in a `ResultFolder`."""
+        """Return the key of an episode in a `ResultFolder`."""
         return episode_key({**self.columns, "seed": seed})
 
     def run(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row]]:
-        """Run an episode for each seed: rows of `episodes.csv` and of `timings.csv`."""
+        """Run one episode per seed; return rows of `episodes.csv` and of `timings.csv`."""
         runner = self._runner()
         rows, timings = [], []
         for seed in seeds:
@@ -83,14 +84,14 @@ class Case:
         return rows, timings
 
     def run_reporting(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row], list[str]]:
-        """Run as `run` does, and also return the warnings: a worker's own would not reach the user in order."""
+        """Like `run`, but also return the warnings: those of a worker process would not reach the user in order."""
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("default")
             rows, timings = self.run(seeds)
         return rows, timings, [f"{self.label} in {self.scenario.name}: {w.message}" for w in caught]
 
     def trace(self, seed: int) -> SearchTrace:
-        """Run one episode for a picture."""
+        """Run one episode, and return its trace for a picture."""
         return self._runner().run(seed).trace
 
     def _runner(self) -> EpisodeRunner:
@@ -104,7 +105,7 @@ def settings_of(
     v_walk_kmh: Sequence[float] | None = None,
     v_drive_kmh: Sequence[float] | None = None,
 ) -> list[Scenario]:
-    """The scenario in every combination of failure cost, s, and speeds, km/h; None keeps the scenario's own."""
+    """Return the scenario in every combination of failure cost, s, and speeds, km/h; None keeps its own value."""
     axes = [
         [{"failure_s": value} for value in failure_s or ()],
         [{"v_walk": value * KMH} for value in v_walk_kmh or ()],
@@ -116,20 +117,20 @@ def settings_of(
     ]
 
 
-def unseen(scenario: Scenario) -> Scenario:
-    """The scenario without observations of slots before an attempt to park there, under a name of its own."""
-    return scenario.replace(name=f"{scenario.name}{UNSEEN}", sensor_model=SensorModel.blind())
+def blind_scenario(scenario: Scenario) -> Scenario:
+    """Return a renamed scenario in which slots are not observed before a parking attempt."""
+    return scenario.replace(name=f"{scenario.name}{BLIND}", sensor_model=SensorModel.blind())
 
 
 def at_occupancy(scenario: Scenario, level: float) -> Scenario:
-    """The scenario at the middle of the first day of its arrival window, made so full on average.
+    """Return the scenario with a mean occupancy of `level` at the middle of its arrival window, on its first day.
 
     Raises:
-        InputError: its world is a record, which is as full as it is.
+        InputError: its occupancy is a recorded log, which cannot be changed.
     """
     window = scenario.arrival
     middle = (window.start_s + window.end_s) / 2
-    # Days differ in how full they are, so that one level can be right for one of them only.
+    # Occupancy differs between days, so the level can hold on one day only.
     day = window.weekdays[0]
     moment = ArrivalWindow((day,), middle, middle)
 
@@ -138,7 +139,7 @@ def at_occupancy(scenario: Scenario, level: float) -> Scenario:
             return None
         if not isinstance(model, OccupancyProcess):
             raise InputError(f"scenario {scenario.name!r}: a recorded world cannot be made {level:.0%} full")
-        return model.at_mean_occupancy(level, day * 86400.0 + middle)
+        return model.at_mean_occupancy(level, day * DAY_S + middle)
 
     return scenario.replace(
         arrival=moment, occupancy=adjusted(scenario.occupancy), prior=adjusted(scenario.prior)
@@ -153,17 +154,17 @@ def run_cases(
     block_size: int = BLOCK,
     on_progress: Callable[[int], None] = lambda _: None,
 ) -> None:
-    """Run what the folder does not hold yet.
+    """Run the episodes that the folder does not hold yet.
 
     Args:
-        cases: each with the seeds of its episodes.
-        folder: where finished episodes go.
-        workers: where they run. The result does not depend on it.
-        block_size: episodes a task.
-        on_progress: told how many episodes have just been finished.
+        cases: cases, each with the seeds of its episodes.
+        folder: folder for finished episodes.
+        workers: where episodes run; results do not depend on it.
+        block_size: episodes per task.
+        on_progress: called with the number of episodes just finished.
 
     Raises:
-        KeyboardInterrupt: as it comes; what was finished is in the folder.
+        KeyboardInterrupt: passed on; finished episodes are in the folder.
     """
     tasks = [
         (case, block)
@@ -178,7 +179,7 @@ def run_cases(
         folder.add(rows, timings)
         on_progress(len(rows))
         for message in messages:
-            # Once an agent and scenario: figures in the text differ from episode to episode.
+            # Warn once per agent and scenario: numbers in the text differ between episodes.
             if (topic := message.partition(":")[0]) not in told:
                 told.add(topic)
                 warnings.warn(message, stacklevel=2)
@@ -187,7 +188,7 @@ def run_cases(
 def rows_of(
     agents: Sequence[AgentSpec], scenario: Scenario, seeds: Sequence[int], workers: Workers
 ) -> list[Row]:
-    """A row for each agent, as `table` has them, of searches of which nothing else is kept."""
+    """Run searches without saving them, and return the `table` row of each agent."""
     cases = [Case(scenario, agent.name, options=agent.options) for agent in agents]
     blocks = [(case, block) for case in cases for block in _blocks(seeds, 5 * BLOCK)]
     episodes: dict[str, list[Row]] = {case.label: [] for case in cases}
@@ -199,10 +200,10 @@ def rows_of(
 
 
 def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
-    """Make sure that the scenario has a world and a forecast for every search, before anything is written.
+    """Check, before anything is written, that the scenario has a world and a forecast for every search.
 
     Raises:
-        InputError: such as a log that has no other day to forecast from.
+        InputError: it has not, e.g. because a log has no other day to forecast from.
     """
     days = set()
     for seed in seeds:
@@ -220,9 +221,9 @@ def _blocks(seeds: Sequence[int], size: int) -> Iterator[Sequence[int]]:
 
 
 def table(cases: Sequence[tuple[Case, range]], folder: ResultFolder) -> list[Row]:
-    """A row for every case that has finished episodes, in order; differences are to the first agent's.
+    """Return a row for every case with finished episodes, in order; differences are to the first agent.
 
-    Where `exact` is among the agents, `gap_to_exact` says by which share of its mean others take longer.
+    If `exact` is among the agents, `gap_to_exact` is the relative excess of an agent's mean time over that of `exact`.
     """
     rows = []
     first: dict[tuple[Any, ...], list[Row]] = {}
@@ -246,11 +247,11 @@ def table(cases: Sequence[tuple[Case, range]], folder: ResultFolder) -> list[Row
 
 
 def against_occupancy(rows: Sequence[Mapping[str, Any]], edges: Sequence[float]) -> list[Row]:
-    """Total time against how full the lot was at the arrival, from episodes as they came.
+    """Bin episodes by the occupancy at arrival, and return their mean total times.
 
     Args:
         rows: episodes.
-        edges: ends of the bins of occupancy, ascending.
+        edges: ascending edges of the occupancy bins.
 
     Returns:
         Rows with agent, failure_cost_s, occupancy (the bin's mean), total_s, total_s_ci95, episodes.

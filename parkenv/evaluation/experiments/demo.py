@@ -1,4 +1,4 @@
-"""The demo: a survey, and searches on other days that know its map alone."""
+"""The demo: a survey, and searches on other days that use only its map."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ AGENTS = ("mdp", "greedy-goal", "greedy-drive", "first-free")
 RIG: RigName = "laser"
 _HOURS = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
 _APART = 1_000_000
-"""Between the seeds of the survey and those of the searches: their worlds differ."""
+"""Offset between the seeds of survey and searches, so that their worlds differ."""
 
 
 def demo_survey(spec: DemoSpec) -> tuple[Scenario, SurveySettings]:
-    """The world of the demo and its survey.
+    """Return the scenario of the demo and the settings of its survey.
 
     Raises:
         InputError: the scenario cannot be made.
@@ -37,11 +37,11 @@ def demo_survey(spec: DemoSpec) -> tuple[Scenario, SurveySettings]:
 
 
 def demo_cases(spec: DemoSpec, scenario: Scenario, log: SessionLog) -> list[tuple[Case, range]]:
-    """Every agent with the surveyed map, through simulated sensors, with the seeds of its searches.
+    """Return the cases: every agent with the surveyed map and simulated sensors, with the seeds of its searches.
 
     Args:
-        spec: of the demo.
-        scenario: from `demo_survey`.
+        spec: specification of the demo.
+        scenario: scenario from `demo_survey`.
         log: the sessions of the map.
     """
     known = scenario.replace(prior=MapPrior(log), sensor_model=SensorModel.named(RIG))

@@ -19,12 +19,12 @@ from parkenv.perception.hog_detector import HogDetector
 
 _SMALLEST = {"single": 0.85, "multi": 0.65}
 _LARGEST = {"single": 1.2, "multi": 2.6}
-"""Range of the searched sizes relative to UIUC's 100×40 box; the cars of the single-scale set have one size."""
+"""Range of searched sizes relative to UIUC's 100×40 box; all cars of the single-scale set have the same size."""
 
 
 @dataclass(frozen=True, eq=False)
 class TestSetScore:
-    """Result on one test set: its row in `summary.json`, and its curve."""
+    """Result on one test set: its row in `summary.json` and its curve."""
 
     row: dict[str, Any]
     curve: RecallPrecision
@@ -37,7 +37,7 @@ def score_on_uiuc(
 
     Args:
         model: a side model.
-        folder: the published `CarData`.
+        folder: the published folder `CarData`.
         on_image: called after every image.
 
     Raises:
@@ -86,7 +86,7 @@ def score_on(
 
 
 def save_curves(scores: Sequence[TestSetScore], title: str, path: Path) -> None:
-    """Plot recall against 1 - precision, as the papers of these data sets do."""
+    """Plot recall against 1 - precision, as in the papers on these data sets."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(5.4, 4.4))
         ax = figure.subplots()

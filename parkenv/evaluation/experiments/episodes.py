@@ -1,4 +1,4 @@
-"""Episodes of one agent in one scenario: a table row each, and what a picture of the search needs."""
+"""Run episodes of one agent in one scenario: a table row for each, and traces for pictures."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from planners.routes import DriveRoutes
 
 @dataclass
 class SearchTrace:
-    """One search, as pictures show it.
+    """Trace of one search, for pictures.
 
     Attributes:
-        scenario: where it took place.
+        scenario: the scenario.
         agent: name of the agent.
         path: vertices in the order driven, the entry first.
         occupied: (n_slots,) bool, the true occupancy at the arrival.
@@ -46,9 +46,9 @@ class Episode:
     """The outcome of one search.
 
     Attributes:
-        row: the line of `episodes.csv`, without the columns that name agent and setting.
-        decision_s: wall time of each decision, s. Not part of the row: it differs from run to run.
-        trace: for pictures.
+        row: row of `episodes.csv`, without the columns that identify agent and setting.
+        decision_s: wall time of each decision, s; not in the row because it differs from run to run.
+        trace: trace for pictures.
     """
 
     row: dict[str, Any]
@@ -57,34 +57,34 @@ class Episode:
 
 
 class FirstPlan(Observer):
-    """Keeps the plan of the first decision.
+    """Records the plan of the first decision.
 
     Attributes:
         policy: (n_vertices,) int64; None for agents without a policy.
     """
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Start over."""
+        """Reset the recorder."""
         del env, observation
         self.policy: NDArray[np.int64] | None = None
         self._decided = False
 
     def on_step(self, step: Step) -> None:
-        """Keep the first plan."""
+        """Record the first plan."""
         if not self._decided:
             self.policy = getattr(step.memory, "policy", None)
             self._decided = True
 
 
 class EpisodeRunner:
-    """Runs one agent in one scenario, episode after episode.
+    """Runs episodes of one agent in one scenario.
 
     Args:
         scenario: the scenario, with the costs and speeds of the setting.
-        name: the agent's name, for the trace.
+        name: name of the agent, for the trace.
         agent: the agent.
-        rig: of `parkenv/SearchPerception-v1`, whose sensors observe the slots; None: `parkenv/Search-v1`.
-        detector: of `parkenv/SearchPerception-v1`.
+        rig: sensor rig for `parkenv/SearchPerception-v1`; None for `parkenv/Search-v1`.
+        detector: detector for `parkenv/SearchPerception-v1`.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class EpisodeRunner:
         return self._bound_s()
 
     def run(self, seed: int, observers: Sequence[Observer] = ()) -> Episode:
-        """Search once in the world of `seed`."""
+        """Run one search in the world of `seed`."""
         scenario, first_plan = self.scenario, FirstPlan()
         result = simulate(self.env, self.agent, seed, (first_plan, *observers))
         metrics = {name: value for name, value in result.info.items() if name != "reward_terms"}

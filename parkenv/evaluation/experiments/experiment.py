@@ -1,4 +1,4 @@
-"""An experiment: from its specification to the cases to run, and from the finished cases to its results."""
+"""Run an experiment: make its cases from the specification, and its results from the finished cases."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.compare import (
-    UNSEEN,
     Case,
     at_occupancy,
+    blind_scenario,
     check_worlds,
     run_cases,
     settings_of,
     table,
-    unseen,
 )
 from parkenv.evaluation.experiments.results import ResultFolder, Row
 from parkenv.evaluation.experiments.spec import SPEC_FILE, ExperimentSpec
@@ -34,12 +33,13 @@ from parkenv.scenarios.spec import ScenarioSpec, SensorModelSpec
 from parkenv.world.flat_map import FlatMap
 from parkenv.world.occupancy import OccupancyProcess
 from parkenv.world.scenario import Scenario
+from parkenv.world.sensor_model import SensorModel
 from planners.agent import agent_file, make_agent
 
 NEEDS_OBSERVATIONS = ("belief", "mdp-tuned", "exact")
-"""Agents that refuse problems in which slots are observed only by attempts."""
+"""Agents that require observations of slots before an attempt."""
 MAP_SAYS = "-map-says-"
-"""Between the name of a scenario and the probability that its map gives for every slot."""
+"""Separator between the name of a scenario and the constant probability of its map."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,16 +47,16 @@ class Experiment:
     """An experiment with its scenarios made and its agents checked.
 
     Args:
-        spec: what to run.
+        spec: specification of the experiment.
 
     Raises:
-        InputError: a scenario or an agent that cannot be made, or parts that do not fit together.
+        InputError: a scenario or an agent cannot be made, or parts of the specification do not fit together.
     """
 
     spec: ExperimentSpec
 
     def __post_init__(self) -> None:
-        for scenario in self._own:
+        for scenario in self._base_scenarios:
             for agent in self.spec.agents:
                 make_agent(agent.name, scenario, **agent.options)
         if self.spec.grid.blind and not any(_works_blind(agent) for agent in self.spec.agents):
@@ -64,24 +64,27 @@ class Experiment:
                 "blind searches have no observations, and all agents plan on observations: "
                 f"{', '.join(agent.label for agent in self.spec.agents)}; add one that does not, such as mdp"
             )
-        if (measured := self.calibration) is not None:
-            names = [scenario.name for scenario in self.scenarios]
-            if names != [measured.scenario]:
-                raise InputError(
-                    f"{self.spec.grid.calibrated} was measured on {measured.scenario!r}, here are {', '.join(names)}; "
-                    "compare that scenario alone, neither blind nor with wrong maps"
-                )
+        names = [scenario.name for scenario in self.scenarios]
+        if repeated := [name for name in names if names.count(name) > 1]:
+            raise InputError(
+                f"two scenarios are called {repeated[0]!r}, want different names; rename one of them"
+            )
+        if (measured := self.calibration) is not None and names != [measured.scenario]:
+            raise InputError(
+                f"{self.spec.grid.calibrated} was measured on {measured.scenario!r}, here are {', '.join(names)}; "
+                "compare that scenario alone, neither blind nor with wrong maps"
+            )
 
     @cached_property
-    def _own(self) -> list[Scenario]:
+    def _base_scenarios(self) -> list[Scenario]:
         return [build(_seen_through(spec, self.spec.rig)) for spec in self.spec.scenarios]
 
     @cached_property
-    def maps(self) -> dict[str, tuple[Scenario, float]]:
-        """Scenarios with wrong maps and the probability that these give for every slot, by name."""
+    def wrong_map_scenarios(self) -> dict[str, tuple[Scenario, float]]:
+        """Scenarios with flat maps, and the constant probability of each map, by name."""
         made = {}
         for p_occupied in self.spec.grid.map_says:
-            for scenario in self._own:
+            for scenario in self._base_scenarios:
                 name = f"{scenario.name}{MAP_SAYS}{p_occupied:g}"
                 wrong = FlatMap(p_occupied, scenario.prior or scenario.occupancy)
                 made[name] = (scenario.replace(name=name, prior=wrong), p_occupied)
@@ -90,64 +93,67 @@ class Experiment:
     @cached_property
     def scenarios(self) -> list[Scenario]:
         """All scenarios, with their own costs and speeds."""
-        made = self._own + [flat for flat, _ in self.maps.values()]
+        made = self._base_scenarios + [flat for flat, _ in self.wrong_map_scenarios.values()]
         return (
-            [s for scenario in made for s in (scenario, unseen(scenario))] if self.spec.grid.blind else made
+            [s for scenario in made for s in (scenario, blind_scenario(scenario))]
+            if self.spec.grid.blind
+            else made
         )
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """The measured costs, if there are any."""
+        """The measured costs, if any."""
         path = self.spec.grid.calibrated
         return None if path is None else Calibration.from_file(path)
 
     @property
     def seeds(self) -> range:
-        """One for each episode."""
+        """Seeds of the episodes."""
         return range(self.spec.seed, self.spec.seed + self.spec.episodes)
 
     @cached_property
     def cases(self) -> list[tuple[Case, range]]:
-        """Every agent in every scenario and setting, with the seeds of its episodes."""
+        """Return every agent in every scenario and setting, with the seeds of its episodes."""
         return [
             (self._case(setting, agent), self.seeds)
             for scenario in self.scenarios
             for setting in self._settings(scenario)
             for agent in self.spec.agents
-            if not scenario.name.endswith(UNSEEN) or _works_blind(agent)
+            if scenario.sensor_model != SensorModel.blind() or _works_blind(agent)
         ]
 
     @cached_property
     def occupancy_cases(self) -> list[tuple[Case, range]]:
-        """The same at the occupancy levels, with a third of the episodes, at the first speeds of the grid."""
+        """Return the cases at the occupancy levels, with a third of the episodes, at the first speeds of the grid."""
         return [
             (self._case(setting, agent, level), self.seeds[: max(1, self.spec.episodes // 3)])
             for scenario in self.scenarios
-            if isinstance(scenario.occupancy, OccupancyProcess) and scenario.name not in self.maps
+            if isinstance(scenario.occupancy, OccupancyProcess)
+            and scenario.name not in self.wrong_map_scenarios
             for level in self.spec.grid.occupancy_levels
-            for setting in self._grid(at_occupancy(scenario, level), first_speeds=True)
+            for setting in self._grid_settings(at_occupancy(scenario, level), first_speeds=True)
             for agent in self.spec.agents
-            if not scenario.name.endswith(UNSEEN) or _works_blind(agent)
+            if scenario.sensor_model != SensorModel.blind() or _works_blind(agent)
         ]
 
     def _case(self, scenario: Scenario, agent: AgentSpec, level: float | None = None) -> Case:
         return Case(scenario, agent.name, level, self.spec.rig, agent.options)
 
     def _settings(self, scenario: Scenario) -> list[Scenario]:
-        settings = self._grid(scenario)
+        settings = self._grid_settings(scenario)
         if (measured := self.calibration) is not None:
             settings += settings_of(measured.applied(scenario), v_walk_kmh=self.spec.grid.v_walk_kmh)
         return settings
 
-    def _grid(self, scenario: Scenario, first_speeds: bool = False) -> list[Scenario]:
+    def _grid_settings(self, scenario: Scenario, first_speeds: bool = False) -> list[Scenario]:
         grid = self.spec.grid
         walk, drive = grid.v_walk_kmh, grid.v_drive_kmh
         if first_speeds:
             walk, drive = walk and walk[:1], drive and drive[:1]
         return settings_of(scenario, grid.failure_s, walk, drive)
 
-    def settings(self) -> Row:
-        """What decides the outcome of an episode: a run that is resumed must agree in it."""
+    def fingerprint(self) -> Row:
+        """Return everything that affects the outcome of an episode; a resumed run must have the same settings."""
         return {
             "version": __version__,
             "rig": self.spec.rig,
@@ -162,7 +168,7 @@ def _works_blind(agent: AgentSpec) -> bool:
 
 
 def _seen_through(spec: ScenarioSpec, rig: str | None) -> ScenarioSpec:
-    """The scenario with the sensor model that was measured with the rig, unless the scenario names another."""
+    """Return the scenario with the rig's fitted sensor model, unless the scenario names another."""
     if (
         rig is None
         or spec.sensor_model.name not in (None, "perfect")
@@ -178,7 +184,7 @@ def _seen_through(spec: ScenarioSpec, rig: str | None) -> ScenarioSpec:
 
 
 def flat_tables(tables: Mapping[str, Any], before: str = "") -> Row:
-    """Nested tables as one, with dotted keys.
+    """Flatten nested tables into one with dotted keys.
 
     Examples:
         >>> flat_tables({"costs": {"failure_s": 10.0}, "goal": 0})
@@ -193,24 +199,24 @@ def flat_tables(tables: Mapping[str, Any], before: str = "") -> Row:
 
 
 def fingerprints(files: Iterable[Path]) -> dict[str, str]:
-    """A short hash of each file's content, by path, so that a resumed run notices a changed file."""
+    """Return a short hash of each file's content, by path, so that a resumed run detects changed files."""
     return {str(path): hashlib.sha256(path.read_bytes()).hexdigest()[:16] for path in files}
 
 
 def agent_fingerprints(names: Iterable[str]) -> dict[str, str]:
-    """Fingerprints, by agent, of those agents that come from files: trained models and agents of your own."""
+    """Return the fingerprints of agents that come from files: trained models and user-defined agents."""
     files = {name: agent_file(name) for name in dict.fromkeys(names)}
     return {name: fingerprints([file])[str(file)] for name, file in files.items() if file is not None}
 
 
 @dataclass(frozen=True, eq=False)
 class ExperimentResult:
-    """What an experiment came to.
+    """Result of an experiment.
 
     Attributes:
-        experiment: what was run.
-        folder: its folder, with every finished episode.
-        rows: a row for each case with finished episodes, as `summary.json` has them.
+        experiment: the experiment.
+        folder: its result folder, with every finished episode.
+        rows: one row per case with finished episodes, as in `summary.json`.
         occupancy_rows: the same at the occupancy levels.
         complete: whether all episodes are finished.
     """
@@ -222,8 +228,11 @@ class ExperimentResult:
     complete: bool
 
     def figure_data(self) -> ComparisonResults:
-        """What the figures of a comparison are drawn from."""
-        flat = {name: (name.partition(MAP_SAYS)[0], p) for name, (_, p) in self.experiment.maps.items()}
+        """Return the data for the figures of a comparison."""
+        flat = {
+            name: (name.partition(MAP_SAYS)[0], p)
+            for name, (_, p) in self.experiment.wrong_map_scenarios.items()
+        }
         return ComparisonResults(
             self.experiment.cases,
             self.folder.episodes,
@@ -245,23 +254,23 @@ def run_experiment(
     on_start: Callable[[int], None] = lambda _: None,
     on_progress: Callable[[int], None] = lambda _: None,
 ) -> ExperimentResult:
-    """Run what the folder does not hold yet, and write its results.
+    """Run an experiment, and write its results; skip episodes that the folder already holds.
 
     The folder gets the specification (`experiment.json`), every episode (`episodes.csv`), and the table
-    (`summary.json`). Ctrl-C ends it early; what was finished is in the folder.
+    (`summary.json`). Ctrl-C stops the run; finished episodes stay in the folder.
 
     Args:
-        spec: what to run.
-        out: the folder.
-        command: that asked for it, for the summary's readers.
-        resume: go on from the episodes that an earlier run left.
+        spec: specification of the experiment.
+        out: result folder.
+        command: command line to record in the summary.
+        resume: continue an earlier run.
         overwrite: replace the results of another run.
-        workers: where episodes run; the results do not depend on it.
-        on_start: called with the number of episodes before the first.
+        workers: where episodes run; results do not depend on it.
+        on_start: called with the number of episodes before the first one starts.
         on_progress: called with the number of episodes just finished.
 
     Raises:
-        InputError: a scenario or an agent that cannot be made, or a folder that cannot be used.
+        InputError: a scenario or an agent cannot be made, or the folder cannot be used.
 
     Examples:
         >>> from tempfile import mkdtemp
@@ -277,7 +286,7 @@ def run_experiment(
         check_worlds(scenario, experiment.seeds)
     cases = experiment.cases + experiment.occupancy_cases
     with workers:
-        folder = ResultFolder(out, experiment.settings(), resume=resume, overwrite=overwrite)
+        folder = ResultFolder(out, experiment.fingerprint(), resume=resume, overwrite=overwrite)
         remove_figures(out)
         spec.write(out / SPEC_FILE)
         on_start(sum(len(seeds) for _, seeds in cases))
@@ -308,10 +317,10 @@ def run_experiment(
 
 
 def saved_spec(folder: Path) -> dict[str, Any] | None:
-    """The tables of the specification in a run folder; None where there is none.
+    """Read the tables of the specification in a run folder; return None if there is none.
 
     Raises:
-        InputError: the file is torn.
+        InputError: the file is damaged.
     """
     from parkenv.files.spec_file import read_tables
 
@@ -320,10 +329,10 @@ def saved_spec(folder: Path) -> dict[str, Any] | None:
 
 
 def require_unchanged(spec: Spec, settings: Mapping[str, Any]) -> None:
-    """Refuse files that are no longer those that a run read.
+    """Check that the files of a run have not changed since.
 
     Raises:
-        InputError: a file that has changed.
+        InputError: a file has changed.
     """
     before = settings.get("files", {})
     for path, now in fingerprints(spec.files()).items():

@@ -1,7 +1,7 @@
-"""The folder of a comparison: what is finished stays finished, whatever happens to the process.
+"""Result folder of a comparison: finished episodes survive a crash.
 
-`settings.json` says what was asked for, `episodes.csv` gains a line for every finished search,
-`timings.csv` one with the wall time of its decisions, and `summary.json` is written at the end.
+`settings.json` holds the settings. Every finished search appends a line to `episodes.csv`, and one with the wall time
+of its decisions to `timings.csv`. `summary.json` is written at the end.
 """
 
 from __future__ import annotations
@@ -56,15 +56,15 @@ Key = tuple[Any, ...]
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any], name: str = SUMMARY) -> None:
-    """Write a command's summary as strict JSON; numbers that do not exist become null."""
+    """Write a command's summary as strict JSON; NaN becomes null."""
     _write_text(folder / name, json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
 
 
 def read_settings(folder: Path) -> Row | None:
-    """What a run in a folder was asked for; None where there was none.
+    """Read the settings of the run in a folder; return None if there is no run.
 
     Raises:
-        InputError: the file is torn.
+        InputError: the file is damaged.
     """
     file = folder / SETTINGS
     if not file.exists():
@@ -79,25 +79,25 @@ def read_settings(folder: Path) -> Row | None:
 
 
 def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write down what a run is asked for."""
+    """Write the settings of a run."""
     _write_text(folder / SETTINGS, json.dumps(dict(settings), indent=2) + "\n")
 
 
 def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) -> Row:
-    """Refuse to go on with a run that was asked for something else.
+    """Check that a run to resume has the same settings.
 
-    Settings that are mappings, such as the files of its agents, need to agree in the names that both have.
+    Mappings, such as the files of agents, need to agree only in the names that both have.
 
     Args:
-        folder: of the run.
-        settings: what is asked for now.
-        kind: of run.
+        folder: folder of the run.
+        settings: the current settings.
+        kind: kind of run.
 
     Returns:
-        What the run was asked for, then and now.
+        The merged settings; new values take precedence.
 
     Raises:
-        InputError: there is no run, or one with other settings.
+        InputError: there is no run, or its settings differ.
     """
     before = read_settings(folder)
     if before is None:
@@ -117,7 +117,7 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) 
 
 
 def _parts(name: str, was: Any, its: Any) -> list[tuple[str, Any, Any]]:
-    """A setting then and now; a mapping by each name that both have, and what stands there by every name."""
+    """Pair an old and a new setting: mappings by the names that both have, nested mappings by all names."""
     if not (isinstance(was, dict) and isinstance(its, dict)):
         return [(name, was, its)]
     parts: list[tuple[str, Any, Any]] = []
@@ -133,10 +133,10 @@ def _parts(name: str, was: Any, its: Any) -> list[tuple[str, Any, Any]]:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder for results and make sure that it can be written, before any work is done.
+    """Make a folder for results, and check that it is writable before any work is done.
 
     Raises:
-        InputError: it cannot be made or written.
+        InputError: the folder cannot be made or written.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -148,7 +148,7 @@ def make_folder(path: Path) -> None:
 
 
 def episode_key(row: Mapping[str, Any]) -> Key:
-    """What makes an episode this one: its setting, agent and seed."""
+    """Return the key of an episode: its setting, agent and seed."""
     return (*(row[c] for c in SETTING_COLUMNS), row["seed"])
 
 
@@ -156,17 +156,17 @@ class ResultFolder:
     """Collects episodes as they finish.
 
     Args:
-        path: the folder; made where it does not exist.
-        settings: what was asked for; anything that changes the outcome of an episode.
-        resume: go on from the episodes that an earlier run with the same settings left.
-        overwrite: replace what another run left.
+        path: the folder; created if missing.
+        settings: settings of the run; everything that affects the outcome of an episode.
+        resume: continue an earlier run with the same settings.
+        overwrite: replace the results of another run.
 
     Attributes:
         episodes: finished episodes by key.
 
     Raises:
-        InputError: the folder cannot be written; it holds another run and neither `resume` nor `overwrite` is
-            set; or `resume` is set and the settings differ.
+        InputError: the folder is not writable, it holds another run and neither `resume` nor `overwrite` is set, or
+            `resume` is set and the settings differ.
     """
 
     def __init__(
@@ -188,30 +188,29 @@ class ResultFolder:
             )
         (path / SUMMARY).unlink(missing_ok=True)
         write_settings(path, settings)
-        # Rewritten from what could be read: a line that a crash tore is gone, and its episode runs again.
+        # Rewrite the readable lines: this drops a line truncated by a crash, and its episode runs again.
         _write_text(path / "episodes.csv", _csv_text(EPISODE_COLUMNS, self.episodes.values(), header=True))
         _write_text(path / "timings.csv", _csv_text(TIMING_COLUMNS, self._timings.values(), header=True))
 
     def add(self, rows: Sequence[Row], timings: Sequence[Row]) -> None:
-        """Append finished episodes; on the disk when this returns."""
-        # Memory first: after an interruption `finish` writes the files anew from what is known here.
+        """Append finished episodes, and flush them to disk."""
+        # Memory first: after an interruption, `finish` rewrites the files from it.
         self._timings |= {episode_key(r): r for r in timings}
         self.episodes |= {episode_key(r): r for r in rows}
-        # Then timings: an episode whose line is there is finished, and is not run again for its timing.
+        # Timings before episodes: an episode in `episodes.csv` is finished, and would not run again for its timing.
         _append(self.path / "timings.csv", _csv_text(TIMING_COLUMNS, timings))
         _append(self.path / "episodes.csv", _csv_text(EPISODE_COLUMNS, rows))
 
     def decision_s(self, key: Key) -> list[float]:
-        """Wall time of the decisions of an episode, s; empty where a crash lost them."""
+        """Return the wall times of an episode's decisions, s; empty if a crash lost them."""
         row = self._timings.get(key)
         return [int(us) * 1e-6 for us in row["decisions_us"].split()] if row else []
 
     def finish(self, order: Iterable[Key], summary: Mapping[str, Any], *, complete: bool = True) -> None:
         """Put the episodes in order and write the summary.
 
-        The order is the one asked for, not the one in which they finished, so that the file is the same
-        for any number of jobs. Episodes that were not asked for, but are there from a run that this one
-        resumed, come after. The summary of an incomplete run is called `summary.partial.json`.
+        Episodes are sorted by `order`, not by when they finished, so the file is the same for any number of jobs.
+        Further episodes of a resumed run come last. The summary of an incomplete run is called `summary.partial.json`.
         """
         wanted = dict.fromkeys(key for key in order if key in self.episodes)
         wanted |= dict.fromkeys(self.episodes)
@@ -245,7 +244,7 @@ def _append(path: Path, text: str) -> None:
 
 
 def _read(path: Path, columns: Sequence[str]) -> list[Row]:
-    """The whole lines of a file that `_append` wrote."""
+    """Read the complete lines of a file written by `_append`."""
     if not path.exists():
         return []
     whole, _, _ = path.read_text(encoding="utf-8").rpartition("\n")
@@ -268,7 +267,7 @@ def _parse(name: str, value: str) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """JSON has no NaN: an interval that does not exist is null."""
+    """Replace NaN, such as a missing interval, by None: JSON has no NaN."""
     if isinstance(value, Mapping):
         return {k: _plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):

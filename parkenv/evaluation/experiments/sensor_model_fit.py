@@ -1,4 +1,4 @@
-"""Fit a surrogate sensor model to the perception pipeline's errors, counted in searches with simulated sensors."""
+"""Fit a surrogate sensor model to the errors of the perception pipeline in searches with simulated sensors."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ from planners.agent import make_agent
 IntArray = NDArray[np.int64]
 
 BAND_ENDS = (0.5, 3.5, 6.5, 9.5, 12.5, 16.0)
-"""m, from the car to a slot's vertex; the first band is the slot at which the car stands."""
+"""Ends of the bands of distance from the car to a slot's vertex, m; the first band is the slot at the car's vertex."""
 AGENTS = ("greedy-drive", "mdp", "first-free")
-"""Agents whose searches are counted: observations are made where searches go."""
+"""Agents whose searches are counted, so that the observations are those of typical searches."""
 LEAST_OBSERVATIONS = 20
-"""Observations in a band from which its own rates are taken, not those of all bands."""
+"""Least number of observations in a band for rates of its own; otherwise those of all bands are used."""
 _ASSUMED = SensorModel(BAND_ENDS[-1], 0.98, 0.02)
 
 
 @dataclass(frozen=True, eq=False)
 class ObservationCounts:
-    """Slots in view after a step, and what the perception pipeline reported of them.
+    """Counts of the slots in view after each step, by true and observed state.
 
     Attributes:
         counts: (bands, 2, 2, 3) int64, by distance, by whether the slot lies beside the car, by whether it is taken,
-            and by the observed state: none, free, taken.
+            and by observed state: none, free, taken.
     """
 
     counts: IntArray
@@ -49,7 +49,7 @@ class ObservationCounts:
         return ObservationCounts(self.counts + other.counts)
 
     def fitted(self) -> SensorModel:
-        """Return the sensor model with these rates; half an error is added to each band's (Jeffreys prior).
+        """Return the sensor model with these rates, with a Jeffreys prior of half an error in each band.
 
         Raises:
             InputError: too few observations.
@@ -74,7 +74,7 @@ class ObservationCounts:
 
 
 def _taken_rates(reported: IntArray) -> tuple[float, float]:
-    """Return the fraction observed as taken: of free slots, and of taken slots."""
+    """Return the fraction observed as taken, for free slots and for taken slots."""
     free, taken = (float((row[1] + 0.5) / (row.sum() + 1.0)) for row in reported)
     return free, taken
 
@@ -83,7 +83,7 @@ class _ObservationCounter(Observer):
     """Counts what the perception pipeline reports after each step of a search, until the car is parked.
 
     Args:
-        scenario: the world.
+        scenario: the scenario.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -94,7 +94,7 @@ class _ObservationCounter(Observer):
         self.counts = ObservationCounts.none()
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Take the environment."""
+        """Store the environment."""
         del observation
         self._env: Any = env.unwrapped
 
@@ -117,11 +117,11 @@ def count_observations(
     """Search with simulated sensors, and compare the perception pipeline's reports with the true occupancy.
 
     Args:
-        scenario: the world.
+        scenario: the scenario.
         rig: `laser` or `stereo`.
         agent: name of the agent that searches.
-        seeds: one per search.
-        weather: drawn for each search where None.
+        seeds: one seed per search.
+        weather: the weather; None to draw it for each search.
 
     Raises:
         InputError: an unknown rig.
@@ -147,12 +147,12 @@ def measure_sensors(
     """Sum `count_observations` over all agents of `AGENTS` and all scenarios.
 
     Args:
-        scenarios: worlds.
+        scenarios: the scenarios.
         rig: `laser` or `stereo`.
-        searches: per agent and scenario.
-        seed: of the first search.
-        weather: drawn for each search where None.
-        workers: where the searches run; the result does not depend on it.
+        searches: number of searches per agent and scenario.
+        seed: seed of the first search.
+        weather: the weather; None to draw it for each search.
+        workers: where the searches run; results do not depend on it.
         on_progress: called after each search.
     """
     tasks = [

@@ -1,4 +1,4 @@
-"""What an experiment file may say: agents, scenarios, a grid of settings, episodes, seed."""
+"""Specification of an experiment file: agents, scenarios, a grid of settings, episodes, seed."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from parkenv.scenarios.spec import (
 )
 
 MAX_EPISODES = 10_000_000
-"""Most episodes of an experiment, all agents, scenarios and settings together."""
+"""Maximum number of episodes of an experiment, over all agents, scenarios and settings."""
 SPEC_FILE = "experiment.json"
-"""What a run folder holds of the experiment that made it."""
+"""File in a run folder with the specification of its experiment."""
 DEFAULT_AGENTS = (
     "mdp", "mdp-static", "mdp-tuned", "belief", "greedy-goal", "greedy-drive", "first-free", "random", "oracle",
 )  # fmt: skip
 FAILURE_COST_SWEEP = (0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0)
-"""s, the failure costs that `--failure-cost sweep` stands for."""
+"""Failure costs of `--failure-cost sweep`, s."""
 
 T = TypeVar("T")
 
 
 def _scenario_tables(value: object, info: ValidationInfo) -> object:
-    """A packaged scenario's name, or a file relative to the one that names it."""
+    """Resolve the name of a packaged scenario, or a file relative to the one that names it."""
     if not isinstance(value, str | Path):
         return value
     folder = (info.context or {}).get("folder", Path())
@@ -53,11 +53,11 @@ def _listed(value: object) -> object:
 
 Level = Annotated[float, Field(gt=0.0, lt=1.0)]
 Values = Annotated[Axis[T], BeforeValidator(_listed)]
-"""An axis of the grid; a single value may stand alone."""
+"""An axis of the grid; a single value needs no list."""
 
 
 class Grid(Spec):
-    """Settings that are varied; every combination is run. An axis that is absent keeps each scenario's own value."""
+    """Settings to vary; every combination is run. Scenarios keep their own values for missing axes."""
 
     failure_s: Values[Cost] | None = Field(
         None,
@@ -92,7 +92,7 @@ class Workplace(Spec):
 
 
 class ExperimentSpec(Workplace):
-    """An experiment file: agents meet the same worlds in every scenario and setting."""
+    """An experiment file: all agents search in the same worlds, in every scenario and setting."""
 
     kind: Literal["compare"] = "compare"
     agents: Several[AgentItem] = Field(
@@ -139,7 +139,7 @@ class ExperimentSpec(Workplace):
 
 
 class BenchmarkSpec(Workplace):
-    """A run of a benchmark suite: scenarios, costs, speeds and seeds are the suite's."""
+    """A run of a benchmark suite, which defines scenarios, costs, speeds and seeds."""
 
     kind: Literal["benchmark"] = "benchmark"
     suite: str = "v1"
@@ -154,14 +154,14 @@ class BenchmarkSpec(Workplace):
 
 
 BUSY = TrafficSpec(cars=3, pedestrians=5)
-"""Traffic where sensors are simulated and the scenario names none."""
+"""Default traffic of runs with simulated sensors."""
 Weather = Literal["sunny", "overcast", "low_sun", "dusk", "rain"]
 CaptureDistance = Annotated[float, Field(ge=0.1, le=1_000.0)]
-"""m between captures."""
+"""Distance between captures, m."""
 
 
 class SurveySpec(Workplace):
-    """Drives past every slot with simulated sensors, into a map file."""
+    """A survey: drives past every slot with simulated sensors, recorded in a map file."""
 
     kind: Literal["survey"] = "survey"
     scenario: ScenarioItem = scenario_spec("campus")
@@ -179,7 +179,7 @@ class SurveySpec(Workplace):
 
 
 class DemoSpec(Workplace):
-    """A survey, the map that it gives, and searches on other days with this map."""
+    """A survey, and searches on other days with its map."""
 
     kind: Literal["demo"] = "demo"
     scenario: ScenarioItem = scenario_spec("campus")
@@ -191,7 +191,7 @@ class DemoSpec(Workplace):
 
 
 class TrainingSpec(Workplace):
-    """Training by reinforcement learning, one model for each seed; values that are absent are the environment's."""
+    """Training by reinforcement learning, one model per seed; missing values depend on the environment."""
 
     kind: Literal["train"] = "train"
     env: Literal["search", "drive"] = Field("search", description="Search for a slot, or drive into one.")

@@ -1,4 +1,4 @@
-"""Means with intervals, and the table that a comparison comes down to."""
+"""Means with confidence intervals, and the summary rows of a comparison."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ RESAMPLES = 9999
 
 
 def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float, float]:
-    """Mean and bootstrap interval (bias-corrected and accelerated) of a sample.
+    """Compute the mean and bootstrap interval (bias-corrected and accelerated) of a sample.
 
     Args:
         values: (n,) numbers.
         confidence: coverage of the interval.
 
     Returns:
-        Mean, lower and upper end. The ends equal the mean where all values are the same, and are NaN
-        where there are fewer than two. The resampling has a fixed seed: equal samples, equal intervals.
+        Mean, lower and upper end. The ends equal the mean if all values are the same, and are NaN for fewer than two
+        values. The resampling has a fixed seed: equal samples have equal intervals.
 
     Examples:
         >>> mean_interval([1.0, 1.0, 1.0])
@@ -60,7 +60,7 @@ MEANS = (
     "occupancy",
     "bound_s",
 )
-"""Columns of an episode that the table gives as plain means."""
+"""Columns of an episode that the table shows as plain means."""
 
 
 def summarize(
@@ -69,13 +69,13 @@ def summarize(
     first: Sequence[Mapping[str, Any]] | None = None,
     decision_s: ArrayLike = (),
 ) -> dict[str, Any]:
-    """One row of the table: what an agent achieved in one setting.
+    """Summarise the results of an agent in one setting as a row of the table.
 
     Args:
-        columns: what names the row: scenario, agent, costs and speeds.
+        columns: columns that identify the row: scenario, agent, costs and speeds.
         episodes: rows of `episodes.csv`.
-        first: the rows of the agent to compare with, for the paired difference; those with the same seed
-            are paired. None for that agent itself.
+        first: rows of the agent to compare with, for the paired difference; rows with the same seed are paired. None
+            for that agent itself.
         decision_s: (k,) wall time of single decisions, s.
     """
     total = _column(episodes, "total_s")

@@ -1,4 +1,4 @@
-"""Surveys: many sessions into a map file, and the errors of sessions and map."""
+"""Run surveys: record many sessions in a map file, and measure the errors of sessions and map."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class SurveyRun:
 
     Attributes:
         rows: one row per session, in order.
-        shown: the first session, with results for pictures; None if all sessions existed already.
+        shown: the first session, with results for figures; None if all sessions already existed.
     """
 
     rows: list[Row]
@@ -57,7 +57,7 @@ class SurveyRun:
 
 
 def survey_of(spec: SurveySpec) -> tuple[Scenario, SurveySettings]:
-    """The world and the settings that a specification of a survey describes.
+    """Return the scenario and the settings of a survey specification.
 
     Raises:
         InputError: the scenario cannot be made.
@@ -114,26 +114,26 @@ def run_survey(
     pictures: int = 4,
     on_session: Callable[[Row], None] = lambda _: None,
 ) -> SurveyRun:
-    """Drive the sessions that the map file does not hold yet; each is written in one transaction when it ends.
+    """Drive the sessions that the map file does not hold yet, and write each in one transaction.
 
     Args:
-        scenario: the world.
-        settings: how to drive.
+        scenario: the scenario.
+        settings: settings of the survey.
         sessions: number of sessions.
         map_file: created if it does not exist. `sessions.csv` beside it holds the errors of each session.
-        workers: run the sessions; the result does not depend on them.
-        pictures: number of results kept of the first session.
+        workers: where the sessions run; results do not depend on it.
+        pictures: number of perception results to keep of the first session, for figures.
         on_session: called with the row of each completed session.
 
     Raises:
-        InputError: fewer than one session, or a map file that cannot be used.
+        InputError: fewer than one session, or an unusable map file.
     """
     if sessions < 1:
         raise InputError(f"sessions is {sessions}, want at least 1")
     survey = Survey(scenario, settings)
     table = map_file.with_name("sessions.csv")
     with MapStore(map_file, scenario.lot) as store:
-        # A row is written before its session: a row without a session is of an interrupted drive, which is repeated.
+        # A row is written before its session: a row without a session is from an interrupted drive, which is repeated.
         rows = {r["key"]: r for r in _read_rows(table) if store.has(r["key"])}
         wanted = [survey.key_of(k) for k in range(sessions)]
         missing = [k for k, key in enumerate(wanted) if not store.has(key) or key not in rows]
@@ -196,9 +196,9 @@ def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_
 
 
 def slots_found(store: MapStore, sessions: int) -> FoundSlots:
-    """Discover slots from the cars of all sessions in a map file, without the lot's slots.
+    """Discover slots from the cars of all sessions in a map file, without using the lot's slots.
 
-    Moving cars and false detections accumulate over sessions, so the least number of cars per slot grows with them.
+    Moving cars and false detections accumulate, so the least number of cars per slot grows with the sessions.
     """
     return discover(store.cars(), least=max(3, sessions // 2))
 
@@ -207,7 +207,7 @@ def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
     """Return how often a clearly visible parked car is detected in a frame, by weather and distance.
 
     Args:
-        rows: of sessions.
+        rows: rows of sessions.
 
     Returns:
         Rows with weather, distance_m (both ends of the bin), in_frame, detected, rate and its 95 % interval
@@ -238,10 +238,10 @@ def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
 
 
 def mean_occupancy(occupancy: OccupancyModel, window: ArrivalWindow) -> FloatArray:
-    """P(taken) of every slot in the middle of a window, (n_slots,): the truth that a map is compared with.
+    """Return the true P(taken) of every slot in the middle of a window, (n_slots,), as a reference for maps.
 
-    Of a process it is the marginal on the window's first day; of a recorded log, the fraction of its days on which
-    the slot was taken then.
+    For a process, this is the marginal on the window's first day; for a recorded log, the fraction of its days on
+    which the slot was taken at that time.
     """
     middle = 0.5 * (window.start_s + window.end_s)
     if isinstance(occupancy, RecordedOccupancy):
@@ -256,13 +256,13 @@ def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: Session
     """Return the mean absolute error of the map's predictions, and the error expected of raw counts.
 
     Args:
-        scenario: whose occupancy is the truth.
-        windows: in which sessions began; the map predicts the middle of each, on its first day.
+        scenario: the scenario with the true occupancy.
+        windows: time windows of the sessions; the map predicts the middle of each, on its first day.
         log: the map's sessions.
 
     Returns:
-        Mean over slots and windows of |predicted - true|; and the expected sampling error of raw counts: that of the
-        mean of as many independent draws, at the middle of the window, as there are sessions in the window.
+        Mean over slots and windows of |predicted - true|; and the expected error of raw counts, i.e. of the mean of
+        independent draws at the middle of the window, one per session in the window.
     """
     errors, chances = [], []
     hour = log.time % DAY_S
@@ -271,7 +271,7 @@ def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: Session
         draws = int(((hour >= window.start_s) & (hour <= window.end_s)).sum())
         true = mean_occupancy(scenario.occupancy, window)
         errors.append(np.abs(predict(log, time).p_occupied - true))
-        # Mean absolute deviation of a binomial share, by its normal limit.
+        # Mean absolute deviation of a binomial proportion (normal approximation).
         chances.append(np.sqrt(2.0 / np.pi * true * (1.0 - true) / max(draws, 1)))
     return float(np.mean(errors)), float(np.mean(chances))
 
@@ -293,7 +293,7 @@ _KEPT: dict[str, Survey] = {}
 
 
 def _drive(scenario: Scenario, settings: SurveySettings, number: int, pictures: int) -> SessionResult:
-    """Drive a session in a worker, which keeps the survey for the next session."""
+    """Drive a session in a worker process, which keeps the survey for the next session."""
     name = repr((scenario.name, settings))
     if name not in _KEPT:
         _KEPT.clear()
@@ -302,7 +302,7 @@ def _drive(scenario: Scenario, settings: SurveySettings, number: int, pictures: 
 
 
 def _mean(rows: Sequence[Row], column: str) -> float:
-    """Return the mean over the sessions with a finite value; NaN if there is none."""
+    """Return the mean over all sessions with a finite value; NaN if there is none."""
     finite = [r[column] for r in rows if np.isfinite(r[column])]
     return float(np.mean(finite)) if finite else math.nan
 

@@ -1,6 +1,6 @@
 """Compile the functions of surveys and searches before many processes need them at once.
 
-Compiled code is kept on disk, but processes that start together would all compile the same functions, each on its own.
+Compiled code is cached on disk, but processes that start together would all compile the same functions.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ _ONE_CAPTURE_M = 1e6
 
 
 def warm_up_tasks(settings: SurveySettings, agents: Sequence[str]) -> list[Task[None]]:
-    """Return tasks that run a survey of one or two captures, and a search of each agent without sensors.
+    """Return two tasks: a survey of one or two captures, and one search of each agent without sensors.
 
-    They share few functions, so two processes can run them side by side.
+    They share few functions, so two processes can run them in parallel.
 
     Args:
-        settings: of the survey whose functions are needed.
+        settings: settings of the survey whose functions are needed.
         agents: names of the agents whose functions are needed.
     """
     scenario = make_scenario("mini", traffic=Traffic(cars=2, pedestrians=2))

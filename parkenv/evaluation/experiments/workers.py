@@ -1,4 +1,4 @@
-"""Where tasks run: this process, others on this machine, or a Ray or Dask cluster of several machines."""
+"""Run tasks in this process, in other processes of this machine, or on a Ray or Dask cluster."""
 
 from __future__ import annotations
 
@@ -19,29 +19,28 @@ from parkenv.errors import InputError
 
 BACKENDS = ("loky", "ray", "dask")
 CONNECT_S = 5.0
-"""s that a cluster has to answer at its address."""
+"""Time for a cluster to answer at its address, s."""
 LOSSES = 3
-"""Workers that may die one after the other without any task being finished between."""
+"""Maximum number of workers that may die in a row without finishing a task."""
 
 Result = TypeVar("Result")
 Task = Callable[[], Result]
 
 
 class Workers:
-    """Runs independent tasks, wherever they were asked to run; the results do not depend on where.
+    """Runs independent tasks; the results do not depend on where they run.
 
-    A worker that dies, killed or on a machine that went away, takes its own task with it and no other; that task is run
-    again.
+    If a worker dies, e.g. because its machine went down, only its current task is lost, and is run again.
 
     Args:
-        jobs: processes; 1 with loky runs everything in this one; None takes all cores. A cluster at an address
-            has as many as it has.
+        jobs: number of processes; 1 with loky runs everything in this process; None uses all cores. Ignored for a
+            cluster at an address.
         backend: `loky` for processes of this machine, through joblib; or `ray` or `dask`.
-        address: of a cluster (dask: `tcp://HOST:8786`; ray: `HOST:6379` or `ray://HOST:10001`). Without one,
-            ray and dask start a cluster on this machine and stop it in the end.
+        address: address of a cluster (dask: `tcp://HOST:8786`; ray: `HOST:6379` or `ray://HOST:10001`). Without one,
+            ray and dask start a cluster on this machine and stop it at the end.
 
     Raises:
-        InputError: an unknown backend, an extra that is not installed, or nobody listens at the address.
+        InputError: the backend is unknown or not installed, or there is no cluster at the address.
 
     Examples:
         >>> with Workers(jobs=1) as workers:
@@ -79,14 +78,14 @@ class Workers:
 
     @property
     def in_process(self) -> bool:
-        """Whether tasks run in this very process."""
+        """Whether tasks run in this process."""
         return self.backend == "loky" and (self.jobs or core_count()) == 1
 
     def results(self, tasks: Sequence[Task[Result]]) -> Iterator[tuple[int, Result]]:
-        """Run all tasks; each one's index and result as it is finished, in no order.
+        """Run all tasks; yield index and result of each as it finishes, in any order.
 
         Raises:
-            RuntimeError: workers die again and again without finishing anything.
+            RuntimeError: workers die repeatedly without finishing a task.
         """
         left = dict(enumerate(tasks))
         losses = 0
@@ -105,7 +104,7 @@ class Workers:
                     ) from error
 
     def in_order(self, tasks: Sequence[Task[Result]]) -> Iterator[Result]:
-        """Run all tasks; their results in the tasks' order, each as soon as those before it are there."""
+        """Run all tasks; yield their results in the order of the tasks, each as soon as all previous ones are done."""
         ready: dict[int, Result] = {}
         due = 0
         for number, result in self.results(tasks):
@@ -123,12 +122,12 @@ class Workers:
         )
         yield from parallel(delayed(_numbered)(i, task) for i, task in tasks.items())
 
-    # joblib's backend for Ray hands out nothing before all is done, and the one for Dask no task that failed:
-    # a crash would lose what was finished. Ray's and Dask's own queues do what is wanted.
+    # joblib's Ray backend returns no result before all tasks are done, and its Dask backend does not say which task
+    # failed: a crash would lose finished tasks. So use the queues of Ray and Dask themselves.
 
     def _start_ray(self, opened: ExitStack) -> None:
-        # Before ray is imported, which is when it reads them. The second has tasks that ask for no accelerator leave
-        # those of the machine alone, as ray will do on its own in time, and warns of otherwise.
+        # Ray reads these variables on import. The second one hides accelerators from tasks that request none; this will
+        # become Ray's default, and Ray warns if it is not set.
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         ray = _required("ray", "ray")
@@ -178,7 +177,7 @@ def _run_by_ray(tasks: dict[int, Task[Result]]) -> Iterator[tuple[int, Result]]:
 
 def _run_by_dask(client: Any, tasks: dict[int, Task[Result]]) -> Iterator[tuple[int, Result]]:
     distributed = importlib.import_module("distributed")
-    # Not pure: equal tasks of two comparisons are not one.
+    # Not pure: equal tasks of two comparisons must both run.
     futures = [client.submit(_numbered, i, task, pure=False) for i, task in tasks.items()]
     for future in distributed.as_completed(futures, loop=client.loop):
         yield future.result()
@@ -186,11 +185,11 @@ def _run_by_dask(client: Any, tasks: dict[int, Task[Result]]) -> Iterator[tuple[
 
 
 HERE = Workers(1)
-"""This process alone."""
+"""Runs everything in this process."""
 
 
 def core_count() -> int:
-    """How many cores this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -198,7 +197,7 @@ def _numbered(number: int, task: Task[Result]) -> tuple[int, Result]:
     try:
         return number, task()
     except SystemError as error:
-        # An interruption that comes while numba unpacks compiled code reaches us in a wrapping.
+        # Ctrl-C while numba unpacks compiled code arrives wrapped in a SystemError.
         inner: BaseException | None = error
         while inner is not None:
             if isinstance(inner, KeyboardInterrupt):
@@ -208,7 +207,7 @@ def _numbered(number: int, task: Task[Result]) -> tuple[int, Result]:
 
 
 def _require_listener(address: str) -> None:
-    """Refuse an address at which nobody answers: the libraries themselves try for a minute, and more."""
+    """Raise an error if no cluster answers at an address: the libraries themselves would retry for over a minute."""
     parts = urlsplit(address if "://" in address else f"//{address}")
     try:
         host, port = parts.hostname, parts.port

@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from parkenv.evaluation.experiments.compare import UNSEEN, Case
+from parkenv.evaluation.experiments.compare import BLIND, Case
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,14 +45,14 @@ class ComparisonResults:
     def scenarios(self) -> list[str]:
         """Names, in order, without the variants of flat forecasts and of failure-cost sweeps."""
         names = dict.fromkeys(row["scenario"] for row in self.rows)
-        sweep = {name.removesuffix(UNSEEN) for name in names if name.endswith(UNSEEN)}
-        return [n for n in names if n.removesuffix(UNSEEN) not in sweep and n not in self.flat_forecasts]
+        sweep = {name for name in names if f"{name}{BLIND}" in names}
+        return [n for n in names if n.removesuffix(BLIND) not in sweep and n not in self.flat_forecasts]
 
     @property
     def failure_cost_sweeps(self) -> list[str]:
         """Names of the scenarios that were also run without observations of slots."""
         names = dict.fromkeys(row["scenario"] for row in self.rows)
-        return [name for name in names if f"{name}{UNSEEN}" in names]
+        return [name for name in names if f"{name}{BLIND}" in names]
 
     def rows_of(self, scenario: str) -> list[Row]:
         """Return the table's rows of a scenario."""

@@ -14,7 +14,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.compare import UNSEEN, against_occupancy
+from parkenv.evaluation.experiments.compare import BLIND, against_occupancy
 from parkenv.evaluation.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
 from parkenv.evaluation.figures.registry import ComparisonResults
 
@@ -75,7 +75,7 @@ def times_against_occupancy(results: ComparisonResults) -> Iterator[tuple[str, F
 def times_against_failure_cost(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
     """Yield `draw_time_against_failure_cost` of each scenario of a sweep."""
     for name in results.failure_cost_sweeps:
-        yield name, draw_time_against_failure_cost(results.rows_of(name), results.rows_of(name + UNSEEN))
+        yield name, draw_time_against_failure_cost(results.rows_of(name), results.rows_of(name + BLIND))
 
 
 def times_against_map(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
@@ -221,21 +221,21 @@ def draw_time_against_occupancy(rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def draw_time_against_failure_cost(seen: Sequence[Row], unseen: Sequence[Row]) -> Figure:
+def draw_time_against_failure_cost(observed: Sequence[Row], blind: Sequence[Row]) -> Figure:
     """Draw the total time against the failure cost, with and without observations of slots before an attempt.
 
     Args:
-        seen: rows of one scenario with failure_cost_s, agent, total_s, total_s_ci95.
-        unseen: the same without observations from the lane.
+        observed: rows of one scenario with failure_cost_s, agent, total_s, total_s_ci95.
+        blind: the same without observations from the lane.
 
     Raises:
         InputError: there are no rows.
     """
-    _require_rows(seen)
-    _require_rows(unseen)
+    _require_rows(observed)
+    _require_rows(blind)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(11.0, 4.2), layout="constrained")
-        panels = (("slots observed from the lane", seen), ("no observation before an attempt", unseen))
+        panels = (("slots observed from the lane", observed), ("no observation before an attempt", blind))
         for ax, (title, rows) in zip(figure.subplots(1, 2), panels, strict=True):
             _draw_lines(ax, rows, _limit(rows), lambda row: float(row["failure_cost_s"]))
             last = max(row["failure_cost_s"] for row in rows)
@@ -247,7 +247,7 @@ def draw_time_against_failure_cost(seen: Sequence[Row], unseen: Sequence[Row]) -
             ax.set_title(title)
             ax.set_xlabel("failure cost, s (in the world and in the planners' models)")
             ax.set_ylabel("mean total time, s; 95 % interval")
-        _name(figure, seen)
+        _name(figure, observed)
     return figure
 
 

@@ -23,7 +23,7 @@ from scipy import stats
 
 from parkenv.driving.parking_task import KINDS
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.compare import unseen
+from parkenv.evaluation.experiments.compare import blind_scenario
 from parkenv.evaluation.experiments.results import require_same_settings, write_settings
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.experiments.workers import HERE, Workers
@@ -117,7 +117,9 @@ class TripPlan:
 
     def run(self, slots: str, seeds: Sequence[int]) -> list[Row]:
         """Drive the trips; return the `trip_row` of each."""
-        scenario, rig = (self.scenario, self.rig) if slots == OBSERVED else (unseen(self.scenario), None)
+        scenario, rig = (
+            (self.scenario, self.rig) if slots == OBSERVED else (blind_scenario(self.scenario), None)
+        )
         search = DrivenSearch(scenario, self.agent, style=self.style, rig=rig)
         return [trip_row(search.run(seed), slots) for seed in seeds]
 

@@ -178,6 +178,7 @@ class DrivenSearch:
 
     Example:
         >>> import math
+        >>> from parkenv import make_scenario
         >>> trip = DrivenSearch(make_scenario("mini")).run(seed=1)
         >>> parts = trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.parking_cost_s + trip.gave_up_s
         >>> trip.parked, math.isclose(trip.total_s, parts)
