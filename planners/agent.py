@@ -159,9 +159,9 @@ _AGENTS: dict[str, tuple[str, str]] = {
 }
 
 SMALL_LOTS_ONLY = ("exact",)
-"""Agents that refuse lots over a certain size and sensors that err."""
+"""Agents for small lots and sensors without errors only."""
 AGENT_NAMES = tuple(name for name in _AGENTS if name not in SMALL_LOTS_ONLY)
-"""Agents for lots of any kind and size."""
+"""Agents for all lots."""
 
 
 def require_observations(name: str, problem: SearchProblem) -> None:

@@ -22,7 +22,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MOST_VERTICES = 2000
-"""The table of drives of a subgraph grows with the square: this many vertices take 40 MB."""
+"""Default maximum number of vertices of a subgraph. The table of drives grows with its square and takes 40 MB."""
 _LEAST_VERTICES = 16
 _KEPT = 4
 

@@ -30,9 +30,9 @@ from platformdirs import user_cache_path
 
 _PACKAGES = ("sim_sensors", "parkenv", "planners")
 _HOME = Path(__file__).resolve().parents[1]
-"""The folder in which these packages are."""
+"""The folder that contains these packages."""
 _KEPT_DAYS = 30
-"""Code of other versions of a module is deleted once it is older than this."""
+"""Age at which compiled code of other versions of a module is deleted."""
 _LOGGER = logging.getLogger("parkenv")
 
 

@@ -17,7 +17,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 LOOKS = 12
-"""How many different people there are."""
+"""Number of different pedestrians."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -307,7 +307,7 @@ def lamp_post_mesh(height: float = 5.5) -> Mesh:
 
 
 GAITS = 8
-"""How many pictures of a stride there are, where meshes are shared."""
+"""Number of phases of a stride for which meshes are shared."""
 
 
 def pedestrian_mesh(phase: float, seed: int) -> Mesh:

@@ -23,7 +23,7 @@ LIBRARY_MODELS = 100
 """Number of vehicle models from which cars are drawn."""
 PAVED_MARGIN_M = 7.0
 KERB_ROOM_M = 0.1
-"""m; a kerbside slot must be this much wider than its car."""
+"""m by which a kerbside slot must be wider than its car."""
 NOSE_GAP_M = 0.05
 """m; least distance between a car and the closed end of its slot, where another row may begin."""
 

@@ -18,9 +18,9 @@ Rings = tuple[FloatArray, ...]
 """A polygon, m: its outer ring, (k, 2) closed, and its holes."""
 
 APRON = 0.25
-"""m."""
+"""Width of the asphalt beyond the kerbs, m."""
 ARROW_EVERY = 24.0
-"""m, about the distance between two direction arrows on a one-way lane."""
+"""Approximate distance between two direction arrows on a one-way lane, m."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 """Lots: read and write lot files, import real places, generate lots by rule, check lots.
 
-`ParkingLot` itself knows no files; the functions here make it from files and rules.
+`ParkingLot` is independent of file formats; the functions here create it from files and rules.
 """
 
 from parkenv.lots.checks import check_lot

@@ -1,7 +1,7 @@
-"""Make the packaged lots: `python -m parkenv.lots.build [FOLDER]`.
+"""Build the packaged lots: `python -m parkenv.lots.build [FOLDER]`.
 
-Sizes are metres. Positions are rounded to a millimetre and angles to a nanoradian, so that the files do not
-depend on the mathematics library.
+Sizes are in metres. Positions are rounded to a millimetre and angles to a nanoradian, so that the files do not
+depend on the math library.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Row = tuple[str, Slots]
 
 
 def row(letter: str, start: tuple[float, float], heading: float, *runs: int, angle: float = np.pi / 2) -> Row:
-    """A row with planted islands: `runs` are numbers of slots where positive, of left-out slots where negative."""
+    """Create a row with planted islands: positive `runs` are numbers of slots, negative ones of omitted slots."""
     parts = []
     along = np.array([np.cos(heading), np.sin(heading)]) * PITCH / np.sin(angle)
     at = np.array(start)
@@ -40,7 +40,7 @@ def row(letter: str, start: tuple[float, float], heading: float, *runs: int, ang
 
 
 def rectangle(x0: float, y0: float, x1: float, y1: float) -> list[tuple[float, float]]:
-    """A closed outline, m."""
+    """Return the closed outline of a rectangle, m."""
     return [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
 
 
@@ -53,7 +53,7 @@ def lot(
     walls: Iterable[ArrayLike],
     turned: float = 0.0,
 ) -> ParkingLot:
-    """Make a lot: number the slots row by row, rotate everything by `turned` rad, and round it."""
+    """Create a lot: number the slots row by row, rotate everything by `turned` rad, and round it."""
     turn = np.array([[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]])
 
     def placed(points: ArrayLike) -> FloatArray:
@@ -74,11 +74,11 @@ def lot(
 
 
 def campus() -> ParkingLot:
-    """A wide lot of double rows after that of the Freiburg campus (T Fig. 4.5).
+    """Create a wide lot with double rows, modelled on the Freiburg campus (T Fig. 4.5).
 
-    Three aisles between a straight road in the west and a slanting one in the east, a passage half-way,
-    planted islands. The northern aisle is one-way eastward with angled slots on its north side. Cars come
-    in from the west; the goal is the door of the building in the east.
+    Three aisles connect a straight road in the west and a slanting one in the east, with a passage half-way and
+    planted islands. The northern aisle is one-way eastward with angled slots on its north side. Cars enter from the
+    west; the goal is the door of the building in the east.
     """
     two_way = False
     south, middle, north = 0.0, 16.0, 32.0
@@ -125,10 +125,10 @@ def campus() -> ParkingLot:
 
 
 def jam() -> ParkingLot:
-    """A lot on a site that narrows to the north (after T Fig. 4.10), turned by 11° as its street is.
+    """Create a lot on a site that narrows to the north (after T Fig. 4.10), rotated by 11° like its street.
 
-    Four aisles of unequal length; the northern one is a dead end. Cars come in from the west at the second
-    aisle; the goal lies beyond the eastern road.
+    There are four aisles of unequal length; the northern one is a dead end. Cars enter from the west at the second
+    aisle; the goal is beyond the eastern road.
     """
     half = AISLE / 2
     y = [0.0, 16.0, 32.0, 48.0]
@@ -160,11 +160,10 @@ def jam() -> ParkingLot:
 
 
 def street() -> ParkingLot:
-    """Kerbside slots round six city blocks, three of the seven streets one-way.
+    """Create kerbside slots around six city blocks; three of the seven streets are one-way.
 
-    Cars come in from the west and from the east. Houses line the streets, round courtyards with
-    one driveway each whose kerb is kept clear; trees replace some more slots. The goal is a door in a
-    courtyard.
+    Cars enter from the west and from the east. Houses line the streets around courtyards with one driveway each, whose
+    kerb is kept clear; trees replace some more slots. The goal is a door in a courtyard.
     """
     crossings = np.array(
         [
@@ -201,7 +200,7 @@ def street() -> ParkingLot:
 
 
 def mini() -> ParkingLot:
-    """Ten slots on one aisle; cars come in from the west, the goal is in the east."""
+    """Create ten slots on one aisle; cars enter from the west, the goal is in the east."""
     rows = [row("A", (15.0, -AISLE / 2), WEST, 6), row("B", (2.5, AISLE / 2), EAST, 2, -1, 2)]
     walls = [[(-1.0, -8.6), (16.0, -8.6)], rectangle(21.0, -7.0, 29.0, -2.0)]
     return lot("mini", rows, [([(-9.0, 0.0), (17.0, 0.0)], False)], [(-9.0, 0.0)], [(25.0, 0.0)], walls)

@@ -20,22 +20,22 @@ from parkenv.world.drive_graph import node_labels
 from parkenv.world.lot import Lane, ParkingLot, corner_points, mouth_heading, mouth_points
 
 LANE_GAP = 1.0
-"""A lane that ends this close to another, m, without a common point was probably meant to join it."""
+"""Distance, m: a lane that ends closer to another one without a common point was probably meant to join it."""
 SLOT_OVERLAP = 0.1
-"""Least depth, m, of an overlap of two slots that is reported; less is drawing accuracy."""
+"""Smallest depth, m, of a reported overlap of two slots; smaller ones are drawing inaccuracies."""
 GOAL_REACH = 50.0
-"""A goal farther from the nearest lane, m, is reported."""
+"""Distance, m, from the nearest lane beyond which a goal is reported."""
 
 
 def check_lot(path: str | Path) -> list[LotProblem]:
     """List all errors and warnings of a lot file, errors first; none for a valid file. Does not raise.
 
-    A file with errors cannot be read. Warnings concern lots that can be driven but contain probable mistakes: goals
-    far from all lanes, lanes that cross or nearly touch without a common point, slots that overlap, face away from
-    their lane, cannot be reached from an entry or lead to no other slot, entries that lead to no slot.
+    A file with errors cannot be read. Warnings are about usable lots with probable mistakes: goals far from all lanes;
+    lanes that cross or nearly touch without a common point; slots that overlap, face away from their lane, cannot be
+    reached from an entry or do not lead to another slot; entries that do not lead to a slot.
 
-    For OpenStreetMap files and lists of slots, errors state what is missing before a search can run there, and
-    warnings what an import leaves out.
+    For OpenStreetMap files and lists of slots, errors state what a search still needs, and warnings what an import
+    leaves out.
     """
     path = Path(path)
     file_format = lot_format(path)
@@ -56,7 +56,7 @@ def check_lot(path: str | Path) -> list[LotProblem]:
 
 
 def _import_problems(path: Path) -> list[LotProblem]:
-    """What an importable file lacks, and what its import leaves out."""
+    """Return what an importable file lacks, and what its import leaves out."""
     try:
         draft = import_lot(path)
     except InputError as error:
@@ -74,7 +74,7 @@ def _import_problems(path: Path) -> list[LotProblem]:
 
 
 def _drawing_warnings(contents: LotContents) -> list[LotProblem]:
-    """Probable mistakes of drawing."""
+    """Return warnings about probable drawing mistakes."""
 
     def warn(feature: int, message: str) -> None:
         warnings.append(LotProblem("warning", feature, message))
@@ -111,7 +111,7 @@ def _drawing_warnings(contents: LotContents) -> list[LotProblem]:
 
 
 def _loose_lanes(lanes: Sequence[Lane], numbers: Sequence[int]) -> Iterator[tuple[int, str]]:
-    """Lanes that cross or end close to one another without a common point: cars cannot turn there."""
+    """Yield lanes that cross or end close to each other without a common point: cars cannot turn there."""
     count = [len(lane.points) for lane in lanes]
     xy = np.concatenate([lane.points for lane in lanes])
     lane_of = np.repeat(np.arange(len(lanes)), count)
@@ -157,11 +157,11 @@ def _loose_lanes(lanes: Sequence[Lane], numbers: Sequence[int]) -> Iterator[tupl
 def _reach_warnings(
     lot: ParkingLot, numbers: Sequence[int | None], entry_numbers: Sequence[int | None]
 ) -> Iterator[LotProblem]:
-    """Slots that cannot be reached or that lead to no other slot, and entries that lead to no slot."""
+    """Return slots that cannot be reached or do not lead to another slot, and entries that do not lead to a slot."""
     n = lot.n_slots
     graph = lot.drive_matrix()
     reached = np.isfinite(dijkstra(graph, indices=lot.entry_vertices, min_only=True))
-    # The same on the reversed graph: which vertices lead to some slot (or are one)?
+    # On the reversed graph: the vertices that lead to a slot, or belong to one.
     to_slot = np.isfinite(dijkstra(graph.T.tocsr(), indices=np.arange(n), min_only=True))
     _, component = connected_components(graph, connection="strong")
     slots_in = np.bincount(component[:n], minlength=component.max() + 1)

@@ -22,11 +22,11 @@ def dragon_lake_lot(path: Path) -> ParkingLot:
     as "A-0-13": area, row from the north, column from the west. The rows of an area are back to back and open
     to the aisles north and south of it; a single row opens to the nearer aisle. Aisles are the waypoint
     rows R1 to R4 from column C1 to their east ends, which are dead ends; C1 and C2 connect them, and EXT
-    leads in from the north. All are two-way. Cars enter at the outer end of EXT. The map has no goal; it is
+    leads in from the north. All are two-way. Cars enter at the outer end of EXT. The map has no goal; the goal is
     set to (80, -4), a door at the southern end of the middle column C2.
 
     Raises:
-        InputError: the file cannot be read or is not such a map.
+        InputError: the file cannot be read or is not a Dragon Lake map.
     """
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
@@ -74,7 +74,7 @@ def dragon_lake_lot(path: Path) -> ParkingLot:
         for row in range(n_rows):
             if n_rows == 2:
                 opens_north = row == 0
-            # Slots lie on the left of the line of their mouths, which runs west for the northern rows.
+            # Slots are on the left of the line of their mouths, which runs west for the northern rows.
             line = (
                 bay_row((east, north), np.pi, n_columns, size=size)
                 if opens_north

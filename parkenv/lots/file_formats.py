@@ -19,12 +19,12 @@ class LotFormat(Enum):
 
     @property
     def is_complete(self) -> bool:
-        """Whether a file of this format is a whole lot; of the others, `import_lot` derives one by rules."""
+        """Whether a file of this format defines a whole lot; for other formats, `import_lot` derives one by rules."""
         return self in (LotFormat.GEOJSON, LotFormat.DRAGON_LAKE)
 
 
 def lot_format(path: Path) -> LotFormat | None:
-    """The format of a file by its suffix and, for JSON, its content; None for an unknown suffix. Does not raise.
+    """Return a file's format by its suffix and, for JSON, its content; None for an unknown suffix. Does not raise.
 
     A JSON file that cannot be read counts as native: its reader then reports the error.
     """

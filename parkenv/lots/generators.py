@@ -23,13 +23,13 @@ BAY_SIZE = (5.0, 2.5)
 KERB_SIZE = (6.0, 2.1)
 """Length and width, m, of a kerbside slot."""
 TWO_WAY_HALF_WIDTH = 3.0
-"""From the centre line of a two-way street to its parked cars, m."""
+"""Distance from the centre line of a two-way street to its parked cars, m."""
 ONE_WAY_HALF_WIDTH = 2.0
-"""From the centre line of a one-way street to its parked cars, m."""
+"""Distance from the centre line of a one-way street to its parked cars, m."""
 CROSSING_CLEARANCE = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 5.0
-"""From the middle of a crossing to the first parked car, m: parking is forbidden within 5 m of the kerbs' corner."""
+"""Distance from the centre of a crossing to the first parked car, m: no parking within 5 m of the kerbs' corner."""
 BUILDING_SETBACK = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 2.9
-"""From the centre line of a street to the buildings, m: half the street, parked cars and a footway."""
+"""Distance from the centre line of a street to the buildings, m: half the street, parked cars and a footway."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,7 @@ class Slots:
 
     @classmethod
     def of_lot(cls, lot: ParkingLot) -> Self:
-        """The slots of a lot."""
+        """Return the slots of a lot."""
         return cls(*(getattr(lot, f"slot_{f.name}") for f in fields(cls)))
 
     @classmethod
@@ -67,7 +67,7 @@ class Slots:
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
     def columns(self) -> dict[str, Any]:
-        """The keyword arguments that `ParkingLot` takes."""
+        """Return the keyword arguments of `ParkingLot`."""
         return {f"slot_{f.name}": getattr(self, f.name) for f in fields(self)}
 
 
@@ -79,21 +79,21 @@ def bay_row(
     size: tuple[float, float] = BAY_SIZE,
     angle: float = np.pi / 2,
 ) -> Slots:
-    """Make a row of n perpendicular or angled slots on the left of a line, entered from that line.
+    """Create a row of n perpendicular or angled slots on the left of a line, entered from that line.
 
     Args:
-        start: (2,) m, start of the line of the slots' mouths.
+        start: (2,) m, start of the line along the slots' mouths.
         heading: rad, direction of that line.
         n: number of slots.
         size: length and width of a slot, m.
-        angle: rad, between the line and the parked cars; below a right angle, cars that drive along the
-            line can turn in directly.
+        angle: rad, angle between the line and the parked cars; below a right angle, cars that drive along the line can
+            turn in directly.
     """
     length, width = size
     along = np.array([np.cos(heading), np.sin(heading)])
     left = np.array([-along[1], along[0]])
     nose = np.cos(angle) * along + np.sin(angle) * left
-    # The near corner of an angled slot touches the line, so the middle of its mouth lies behind it.
+    # The near corner of an angled slot touches the line, so the middle of its mouth is behind it.
     mouth = (
         np.asarray(start, dtype=np.float64)
         + (np.arange(n)[:, None] + 0.5) * width / np.sin(angle) * along
@@ -111,7 +111,7 @@ def bay_row(
 def kerb_rows(
     start: FloatArray, end: FloatArray, left: BoolArray, size: tuple[float, float] = KERB_SIZE
 ) -> tuple[Slots, NDArray[np.intp]]:
-    """Make as many kerbside slots as fit along each of m kerbs, evenly spread; return them and the kerb of each.
+    """Create as many kerbside slots as fit along each of m kerbs, evenly spaced; return slots and kerb indices.
 
     Args:
         start: (m, 2) m, start of the edge between carriageway and parked cars.
@@ -121,7 +121,7 @@ def kerb_rows(
     """
     length, width = size
     reach = np.hypot(*(end - start).T)
-    # The small allowance keeps a kerb of exactly k slots from losing one to rounding.
+    # The small tolerance keeps rounding from removing a slot at a kerb of exactly k slots.
     n_on = np.floor(reach / length + 1e-9).astype(np.intp)
     kerb = np.repeat(np.arange(len(start)), n_on)
     rank = np.arange(len(kerb)) - np.repeat(np.cumsum(n_on) - n_on, n_on)
@@ -147,10 +147,10 @@ def grid_lot(
     depth: float = 5.0,
     aisle: float = 6.0,
 ) -> ParkingLot:
-    """Make rows of perpendicular slots along parallel two-way aisles, joined by a road at either end.
+    """Create rows of perpendicular slots along parallel two-way aisles, connected by a road at either end.
 
-    Rows lie in pairs back to back: row 0 south of the first aisle, rows 1 and 2 between the first and
-    the second, and so on. The entry is at the west end of the south aisle, the goal east of the lot.
+    Rows are in pairs back to back: row 0 south of the first aisle, rows 1 and 2 between the first and the second, and
+    so on. The entry is at the west end of the south aisle, the goal east of the lot.
 
     Args:
         rows: number of rows of slots; two rows share an aisle.
@@ -161,7 +161,7 @@ def grid_lot(
         aisle: width of an aisle and of the end roads, m.
 
     Raises:
-        InputError: a count below one, or a size that leaves no room to drive or no lane within reach.
+        InputError: a count below one, or sizes without room to drive or without a lane within reach.
     """
     _require_count("grid lot: rows", rows)
     _require_count("grid lot: columns", columns)
@@ -178,7 +178,7 @@ def grid_lot(
     west, east = -aisle / 2, columns * pitch + aisle / 2
 
     row, column = (index.ravel() for index in np.indices((rows, columns)))
-    up = row % 2 == 1  # the second row of an aisle lies north of it
+    up = row % 2 == 1  # the second row of an aisle is north of it
     side = np.where(up, 1.0, -1.0)
     slots = Slots(
         xy=np.stack([(column + 0.5) * pitch, aisle_y[row // 2] + side * (aisle + depth) / 2], axis=1),
@@ -201,21 +201,20 @@ def grid_lot(
 
 
 def city_lot(n_slots: int, seed: int = 0) -> ParkingLot:
-    """Make kerbside slots round the blocks of a city of one-way and two-way streets, `n_slots` in all.
+    """Create a city of one-way and two-way streets with `n_slots` kerbside slots around its blocks.
 
     A million slots take seconds. The same seed gives the same city.
 
-    Every street runs from one edge of the city to the other, and the streets along its edges are two-way:
-    whatever the one-way streets between them, every slot can be reached from every other. Slots are
-    numbered crossing by crossing from the south-west, so neighbours have close numbers. Where more slots
-    fit than are wanted, random ones are left out, like driveways. The block in the middle is a square
-    without a building; the goal is its centre.
+    Every street runs from one edge of the city to the other, and the streets along the edges are two-way, so every
+    slot can be reached from every other. Slots are numbered crossing by crossing from the south-west, so neighbours
+    have close numbers. If more slots fit than requested, random ones are omitted, like driveways. The block in the
+    middle is a square without a building; the goal is its centre.
 
     Raises:
         InputError: `n_slots` is below one.
     """
     _require_count("city: n_slots", n_slots)
-    # Blocks hold about 45 slots; one row of blocks more at a time until all fit.
+    # A block has about 45 slots: add rows of blocks until all slots fit.
     for n_blocks in count(max(1, int(np.sqrt(n_slots / 48)))):
         streets = _random_streets(n_blocks, np.random.default_rng([seed, n_blocks]))
         slots = streets.kerb_slots()
@@ -243,7 +242,7 @@ def city_lot(n_slots: int, seed: int = 0) -> ParkingLot:
 
 
 def _random_streets(n_blocks: int, rng: np.random.Generator) -> StreetGrid:
-    """Streets round `n_blocks` × `n_blocks` blocks of 60-140 m × 50-110 m, two in five of them one-way."""
+    """Draw streets around `n_blocks` × `n_blocks` blocks of 60-140 m × 50-110 m; two in five are one-way."""
     x = np.cumsum(rng.uniform(60.0, 140.0, n_blocks + 1))
     y = np.cumsum(rng.uniform(50.0, 110.0, n_blocks + 1))
     crossings = np.stack(np.meshgrid(x, y), axis=-1) + rng.uniform(-6.0, 6.0, (n_blocks + 1, n_blocks + 1, 2))
@@ -257,7 +256,7 @@ class StreetGrid:
     """A grid of streets, `along` from west to east and `across` from south to north.
 
     Args:
-        crossings: (n_along, n_across, 2) m, where street i along crosses street j across.
+        crossings: (n_along, n_across, 2) m, crossing of street i along and street j across.
         along: (n_along,) int: 0 for a two-way street, 1 for a one-way street eastward, -1 westward.
         across: (n_across,) int: 0 for a two-way street, 1 for a one-way street northward, -1 southward.
     """
@@ -267,7 +266,7 @@ class StreetGrid:
     across: NDArray[np.int64]
 
     def lanes(self) -> list[Lane]:
-        """One lane a street."""
+        """Return one lane per street."""
         streets = [*self.crossings, *self.crossings.swapaxes(0, 1)]
         directions = np.concatenate([self.along, self.across])
         return [
@@ -276,12 +275,12 @@ class StreetGrid:
         ]
 
     def blocks(self) -> FloatArray:
-        """Corners, (n_along - 1, n_across - 1, 4, 2) m, of the blocks, counter-clockwise."""
+        """Return the corners of the blocks, (n_along - 1, n_across - 1, 4, 2) m, counter-clockwise."""
         p = self.crossings
         return np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2)
 
     def kerb_slots(self, outer: bool = True) -> Slots:
-        """Make slots on both sides of all streets, crossing by crossing; `outer`: also on the outer sides."""
+        """Create slots on both sides of all streets, crossing by crossing; `outer`: also on the outer sides."""
         p = self.crossings
         n_along, n_across = p.shape[:2]
         row, column = np.indices((n_along, n_across))
@@ -301,7 +300,7 @@ class StreetGrid:
             np.where(backward[:, 0], left_open, right_open),
             np.where(backward[:, 0], right_open, left_open),
         )
-        # On the left of a one-way street cars face the way they drive, of a two-way street the other way.
+        # Cars on the left of a one-way street face the direction of traffic, of a two-way street the opposite one.
         oneway = direction != 0
         kerb_start = np.concatenate([start, np.where(oneway[:, None], start, end)])
         kerb_end = np.concatenate([end, np.where(oneway[:, None], end, start)])
@@ -326,7 +325,7 @@ class StreetGrid:
 
 
 def outlines(corners: FloatArray, setback: float) -> list[FloatArray]:
-    """Closed outlines, (k, 2) m each, of the polygons `corners` (n, k, 2) m shrunk by `setback` m."""
+    """Return closed outlines, (k, 2) m each, of the polygons `corners`, (n, k, 2) m, shrunk by `setback` m."""
     shrunk = shapely.buffer(shapely.polygons(corners), -setback, join_style="mitre")
     return [shapely.get_coordinates(polygon) for polygon in np.asarray(shrunk) if not polygon.is_empty]
 

@@ -1,9 +1,9 @@
-"""Native lot files (GeoJSON): writing, reading, and collecting all errors of a file.
+"""Read and write native lot files (GeoJSON), and collect all errors of a file.
 
-The native file is a GeoJSON FeatureCollection with the further members
+The native file is a GeoJSON FeatureCollection with the additional members
 `"parkenv": {"format": "lot", "version": 1}`, `"name"` and `"frame": "local"` (metres). Without
 `frame`, positions are longitude and latitude (RFC 7946), and are projected to metres east and north of the
-middle of the features. `properties.kind` is the kind of a feature:
+centre of the features. `properties.kind` is the kind of a feature:
 
 | kind | geometry | properties |
 |---|---|---|
@@ -37,7 +37,7 @@ LOT_VERSION = 1
 
 
 def write_lot(lot: ParkingLot, path: str | Path) -> None:
-    """Write a lot as native GeoJSON, which `read_lot` reads back exactly. The file appears whole or not at all.
+    """Write a lot as native GeoJSON, atomically; `read_lot` restores it exactly.
 
     Raises:
         InputError: the name does not end in `.geojson` or `.json`, or the file cannot be written.
@@ -169,7 +169,7 @@ def _load(path: Path) -> Any:
 
 
 def _check_head(document: Any, stem: str) -> tuple[str, bool]:
-    """Validate the head; return the lot's name, and whether positions are metres in a local frame."""
+    """Validate the top-level members; return the lot's name, and whether positions are metres in a local frame."""
     if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
         kind = document.get("type") if isinstance(document, dict) else type(document).__name__
         raise InputError(f"type is {kind!r:.40}, want a GeoJSON 'FeatureCollection'")

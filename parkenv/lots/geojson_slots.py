@@ -22,9 +22,9 @@ SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")
 """The properties that define a slot exactly."""
 MOUTHS = {mouth.name.lower(): mouth for mouth in Mouth}
 FARTHEST = 1e8
-"""Greatest coordinate, m: enough for any map grid, and small enough for float64 to keep the millimetre."""
+"""Largest coordinate, m: enough for any map grid, and small enough for millimetres in float64."""
 SLOT_AGREEMENT = 0.01
-"""Greatest distance, m, between a slot's polygon and the rectangle that its properties describe."""
+"""Largest distance, m, between a slot's polygon and the rectangle of its properties."""
 
 
 @dataclass(frozen=True)
@@ -40,14 +40,14 @@ class RawFeature:
 
 def is_coordinate(value: Any) -> bool:
     """Whether a JSON value is a finite number within `FARTHEST`."""
-    # NaN compares as false; a bool is an int to Python but no number to JSON.
+    # Comparisons with NaN are false; a bool is an int in Python but not a number in JSON.
     return type(value) in (float, int) and abs(value) <= FARTHEST
 
 
 def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exact: bool) -> None:
     """Validate the slots of a file and add the valid ones.
 
-    Exact properties are used in a local frame only: after a projection stale ones would go unnoticed.
+    Exact properties are used only in a local frame: after a projection, stale ones would go unnoticed.
     """
     if not raw:
         return
@@ -125,7 +125,7 @@ def _slot_id(feature: RawFeature) -> str:
 
 
 def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
-    """Seconds that parking in a slot costs; 0 where the file does not say."""
+    """Return the parking cost of a slot, s; 0 if not given."""
     cost = properties.get("parking_cost_s", 0.0)
     if not is_coordinate(cost) or cost < 0.0:
         raise InputError(f"slot {slot_id!r:.40}: parking_cost_s is {cost!r:.40}, want seconds, at least 0")
@@ -133,7 +133,7 @@ def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
 
 
 def _slot_shape(properties: dict[str, Any], slot_id: str) -> tuple[float, ...] | None:
-    """Exact x, y, yaw, length, width and mouth, or None for a slot with its polygon only."""
+    """Return exact x, y, yaw, length, width and mouth; None for a slot with only a polygon."""
     absent = [name for name in SLOT_SHAPE if name not in properties]
     if len(absent) == len(SLOT_SHAPE):
         return None

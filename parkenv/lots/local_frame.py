@@ -19,11 +19,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """An azimuthal equidistant projection: distances and bearings from its middle are exact.
+    """An azimuthal equidistant projection: distances and bearings from its centre are exact.
 
     Args:
-        lon: longitude of the middle, degrees, WGS 84.
-        lat: latitude of the middle, degrees.
+        lon: longitude of the centre, degrees, WGS 84.
+        lat: latitude of the centre, degrees.
 
     Raises:
         InputError: coordinates that are not on the globe.
@@ -43,19 +43,19 @@ class LocalFrame:
 
     @classmethod
     def around(cls, lonlat: ArrayLike) -> Self:
-        """The frame in the middle of positions, (n, 2) degrees, longitude first; n ≥ 1."""
+        """Return the frame centred on positions, (n, 2) degrees, longitude first; n ≥ 1."""
         lon, lat = np.asarray(lonlat, dtype=np.float64).T
         if np.ptp(lon) > 180.0:
             lon = np.where(lon < 0.0, lon + 360.0, lon)  # positions on both sides of the date line
         return cls(float(lon.min() + lon.max()) / 2, float(lat.min() + lat.max()) / 2)
 
     def to_xy(self, lonlat: ArrayLike) -> FloatArray:
-        """Metres east and north, (n, 2), of positions, (n, 2) degrees, longitude first."""
+        """Convert positions, (n, 2) degrees, longitude first, to metres east and north, (n, 2)."""
         lon, lat = np.asarray(lonlat, dtype=np.float64).reshape(-1, 2).T
         return np.column_stack(self._projection(lon, lat))
 
     def to_lonlat(self, xy: ArrayLike) -> FloatArray:
-        """Positions, (n, 2) degrees, longitude first, of points, (n, 2) m."""
+        """Convert points, (n, 2) m, to positions, (n, 2) degrees, longitude first."""
         x, y = np.asarray(xy, dtype=np.float64).reshape(-1, 2).T
         return np.column_stack(self._projection(x, y, inverse=True))
 

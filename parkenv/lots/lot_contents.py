@@ -1,4 +1,4 @@
-"""What a lot file contains: its valid features, and the errors of the others."""
+"""The contents of a lot file: its valid features, and the errors of the others."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class LotProblem:
 
 @dataclass
 class LotContents:
-    """The valid features of a file; `numbers[kind]` are their feature numbers, `errors` the faults of the others."""
+    """The valid features of a file; `numbers[kind]` are their feature numbers, `errors` those of the other features."""
 
     name: str
     slot_ids: list[str] = field(default_factory=list)
@@ -53,7 +53,7 @@ class LotContents:
     errors: list[LotProblem] = field(default_factory=list)
 
     def columns(self) -> dict[str, Any]:
-        """The keyword arguments that `ParkingLot` takes."""
+        """Return the keyword arguments of `ParkingLot`."""
         return {
             "name": self.name,
             "slot_ids": tuple(self.slot_ids),
@@ -70,7 +70,7 @@ class LotContents:
 
 
 def graph_errors(contents: LotContents) -> list[LotProblem]:
-    """Errors of the drive graph: slots and entries that no lane serves, junctions of too many lanes."""
+    """Return errors of the drive graph: slots and entries without a lane, junctions with too many lanes."""
     lanes = [(lane.points, lane.oneway) for lane in contents.lanes]
     if not lanes:
         return []
@@ -80,7 +80,7 @@ def graph_errors(contents: LotContents) -> list[LotProblem]:
     entries = np.array(contents.entries).reshape(-1, 2)
     errors = []
     while True:
-        # Faulty features are left out and the rest is tried again, so that all faults are found.
+        # Remove faulty features and repeat, so that all faults are found.
         try:
             build_drive_graph(lanes, mouth_xy[left["slot"]], entries[left["entry"]])
         except GraphError as error:

@@ -1,4 +1,4 @@
-"""Lots in files: reading the formats that describe a whole lot, and the packaged lots."""
+"""Read lot files that describe a whole lot, and the packaged lots."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from parkenv.world.drive_graph import GraphError
 from parkenv.world.lot import ParkingLot
 
 PACKAGED_LOTS = ("campus", "jam", "street", "mini")
-"""The lots that come with the package."""
+"""Names of the packaged lots."""
 
 
 def load_lot(name_or_path: str | Path) -> ParkingLot:
     """Load a packaged lot by its name, or a lot file by its path.
 
     Raises:
-        InputError: neither a packaged lot nor a file, or the file holds no valid lot (see `read_lot`).
+        InputError: neither a packaged lot nor a file, or the file contains no valid lot (see `read_lot`).
 
     Examples:
         >>> load_lot("campus").n_slots
@@ -38,10 +38,10 @@ def load_lot(name_or_path: str | Path) -> ParkingLot:
 
 
 def packaged_lot(name: str) -> ParkingLot:
-    """Load one of the lots that come with the package: campus, jam, street, mini.
+    """Load a packaged lot: campus, jam, street, mini.
 
     Raises:
-        InputError: no lot of that name comes with the package.
+        InputError: an unknown name.
     """
     if name not in PACKAGED_LOTS:
         raise InputError(f"no packaged lot {name!r}, want one of {', '.join(PACKAGED_LOTS)}")
@@ -55,8 +55,8 @@ def read_lot(path: str | Path) -> ParkingLot:
     Slots without exact properties take their shape from their polygons (`slots_from_polygons`).
 
     Raises:
-        InputError: the file cannot be read or holds no valid lot; the message states the first fault and the
-            number of further ones, `parkenv.lots.check_lot` lists all.
+        InputError: the file cannot be read or contains no valid lot; the message states the first fault and the
+            number of further ones, and `parkenv.lots.check_lot` lists all.
     """
     path = Path(path)
     file_format = lot_format(path)

@@ -1,4 +1,4 @@
-"""Slots whose outline alone is known: shape, yaw and mouth from polygons and lanes."""
+"""Infer the shape, yaw and mouth of slots from their polygons and the lanes."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ BoolArray = NDArray[np.bool_]
 def slots_from_polygons(polygons: NDArray[np.object_], lanes: Sequence[Lane]) -> Slots:
     """Infer length, width, yaw and mouth of slots from their outlines.
 
-    A slot is the smallest rectangle round its polygon. A side faces a lane if the lane's nearest point lies
-    within 60° of the side's outward normal. The car enters by the short side that faces a lane (of two, by
-    the nearer one): a perpendicular or angled slot. If no short side faces a lane, as where the lane
-    runs along the slot, but a long side does, it is a kerbside slot, and the car faces the direction of
-    traffic: that of a one-way lane, else with the lane on its left. If no side faces a lane,
-    the short side nearest to one counts.
+    A slot is the smallest rectangle around its polygon. A side faces a lane if the lane's nearest point is within 60°
+    of the side's outward normal. A slot with a short side that faces a lane is perpendicular or angled, and entered by
+    that side (the nearer one of two). If only a long side faces a lane, it is a kerbside slot, and the car faces the
+    direction of traffic: that of a one-way lane, otherwise with the lane on its left. If no side faces a lane, the
+    short side nearest to one counts.
 
     Args:
         polygons: (n,) polygons with an area, m.
@@ -45,7 +44,7 @@ def slots_from_polygons(polygons: NDArray[np.object_], lanes: Sequence[Lane]) ->
     to_lane = nearest.reshape(middle.shape) - middle
     distance = np.hypot(to_lane[..., 0], to_lane[..., 1])
     faced = np.where((to_lane * outward).sum(axis=2) >= 0.5 * distance, distance, np.inf)
-    # A lane that touches the side has no direction from it, and counts as faced.
+    # A lane that touches the side has no direction from it; the side counts as facing it.
     short_faced, long_faced = (np.isfinite(np.min(faced[:, sides], axis=1)) for sides in ([0, 2], [1, 3]))
     kerbside = np.asarray(~short_faced & long_faced)
     by = np.where(np.asarray(short_faced | long_faced)[:, None], faced, distance)
@@ -53,7 +52,7 @@ def slots_from_polygons(polygons: NDArray[np.object_], lanes: Sequence[Lane]) ->
 
     row = np.arange(len(polygons))
     mouthward = outward[row, side]
-    # A car heading this way has its mouth on the right, one heading the other way on the left.
+    # For a car with this heading the mouth is on the right, for the opposite heading on the left.
     along = np.stack([-mouthward[:, 1], mouthward[:, 0]], axis=1)
     with_lane = (along * tangent.reshape(middle.shape)[row, side]).sum(axis=1) > 0.0
     on_right = oneway.reshape(side_length.shape)[row, side] & with_lane
@@ -68,7 +67,7 @@ def slots_from_polygons(polygons: NDArray[np.object_], lanes: Sequence[Lane]) ->
 
 
 def nearest_on_lanes(lanes: Sequence[Lane], xy: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Nearest point on any lane to each of `xy` (n, 2) m, the lane's unit direction there, and whether it is one-way.
+    """Return the lane point nearest to each of `xy`, (n, 2) m, the lane's unit direction, and whether it is one-way.
 
     Without lanes, each point is its own nearest point.
     """

@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 SLOT_WEIGHT, LOT_WEIGHT = 4.0, 6.0
 """Prior weights, in sessions, of the slot's mean and of the lot's mean at the same hour."""
 RELAXATION_S = 1800.0
-"""Default decay time of an observation, s: mean stay and mean vacancy of half an hour each."""
+"""Default decay time of an observation, s: 1/(λ+μ) for a mean stay and a mean vacancy of one hour each."""
 OTHER_WEEKDAY = 0.85
 """Weight of a session on another day of the same kind (weekday or weekend).
 

@@ -1,1 +1,1 @@
-"""Cars in images, and how far away they are (T §3.2)."""
+"""Detect cars in images and measure their distance (T §3.2)."""

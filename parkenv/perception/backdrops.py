@@ -1,8 +1,7 @@
-"""Random textures behind the cars of simulated images: a model must not learn that backgrounds are smooth.
+"""Random textures behind the cars of simulated images, so that models do not learn that backgrounds are smooth.
 
 Real streets have brick, leaves, fences, shop windows and posters right behind the cars; the simulated ones have flat
-walls. Grain, bars and boxes of random shape and contrast stand in for all of them (domain randomization, Tobin et al.
-2017).
+walls. Grain, bars and boxes of random shape and contrast replace them (domain randomization, Tobin et al. 2017).
 """
 
 from __future__ import annotations
@@ -25,8 +24,8 @@ def with_backdrop(grey: Image, far: NDArray[np.bool_], rng: np.random.Generator)
 
     Args:
         grey: (h, w) uint8.
-        far: (h, w) bool, what lies behind the cars.
-        rng: what texture, and how strong.
+        far: (h, w) bool, mask of the background behind the cars.
+        rng: random generator.
     """
     if not far.any():
         return grey
@@ -40,7 +39,7 @@ def with_backdrop(grey: Image, far: NDArray[np.bool_], rng: np.random.Generator)
 
 
 def random_texture(shape: tuple[int, ...], rng: np.random.Generator) -> Float32Array:
-    """Return random texture, (h, w) float32, mean 0, deviation 1: grain, bars or neither, perhaps with boxes."""
+    """Return random texture, (h, w) float32, mean 0, standard deviation 1: grain, bars or neither, perhaps boxes."""
     texture = np.zeros(shape, dtype=np.float32)
     kind = rng.choice(["grain", "bars", "boxes"], p=[0.6, 0.2, 0.2])
     if kind == "grain":

@@ -14,12 +14,12 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 
 CAR_LENGTH, CAR_WIDTH = 4.4, 1.8
-"""m; what is taken for the sides that are not seen."""
+"""Assumed length and width, m, of sides that are not visible."""
 LONG_SIDE = 2.3
-"""m; no car is as wide, so that a side of this length is a flank."""
-_SIDE_SEEN = 0.6  # m, of a side from which it counts as seen
-_NEAREST = 0.02  # m; points closer to a side than this count alike
-_CUT = 0.1  # m; an end of the run as close to a side is taken to be on it
+"""Length, m, from which a side is a flank: no car is this wide."""
+_SIDE_SEEN = 0.6  # m, visible length from which a side counts as seen
+_NEAREST = 0.02  # m; points closer to a side than this all count the same
+_CUT = 0.1  # m; an end of the run this close to a side counts as on it
 _STEPS = 90
 
 
@@ -27,7 +27,7 @@ class FittedCar(NamedTuple):
     """A car's rectangle.
 
     Attributes:
-        x, y: m, its middle.
+        x, y: m, its centre.
         yaw: rad, along the car, in [0, π): beams do not distinguish front and rear.
         length, width: m; at least those of a typical car.
         seen_length, seen_width: m, visible part of a side and of an end; near 0 for a side that is not visible.
@@ -47,16 +47,16 @@ def fit_box(
 ) -> FittedCar:
     """Fit a car to points on its sides.
 
-    The direction is the one whose sides the points are nearest to, by the closeness criterion of Zhang et al.
-    ("Efficient L-shape fitting for vehicle detection using laser scanners", IV 2017). A side longer than any car is
-    wide is a flank; where there is none, `end_on` tells front from flank. What is not seen of a side is completed to
-    a car's usual size, away from the sensor, or from where the view is cut.
+    The direction is that of the rectangle closest to the points, by the closeness criterion of Zhang et al.
+    ("Efficient L-shape fitting for vehicle detection using laser scanners", IV 2017). A side longer than the width of
+    any car is a flank; without one, `end_on` distinguishes front and flank. Partly visible sides are extended to a
+    car's usual size, away from the sensor or beyond the point where the view is cut.
 
     Args:
-        points: (k, 2) m, k at least 1, world frame, as they lie side by side.
-        sensor: (2,) m, where they were seen from.
-        end_on: whether the car shows its front or rear rather than its flank.
-        cut: whether the car goes on unseen before the first and behind the last point.
+        points: (k, 2) m, k at least 1, world frame, in order of direction.
+        sensor: (2,) m, position of the sensor.
+        end_on: whether the front or rear of the car is visible rather than its flank.
+        cut: whether the car continues unseen before the first and after the last point.
 
     Raises:
         InputError: no point, or one that is not finite.
@@ -80,12 +80,10 @@ def fit_box(
     size = np.full(2, CAR_WIDTH)
     size[along] = CAR_LENGTH
     size = np.maximum(size, extent)
-    anchor = np.zeros(
-        2
-    )  # -1: the low side is the car's own, 1: the high side, 0: neither more than the other
+    anchor = np.zeros(2)  # -1: the low side is a true side of the car, 1: the high side, 0: undecided
     for i in (0, 1):
         anchor[i] = -1.0 if seen_from[i] < low[i] else 1.0 if seen_from[i] > high[i] else 0.0
-        # Which of the sides are just where the view ends?
+        # Whether the low or the high side is only where the view ends.
         low_cut = any(c and local[k, i] - low[i] < _CUT for k, c in zip((0, -1), cut, strict=True))
         high_cut = any(c and high[i] - local[k, i] < _CUT for k, c in zip((0, -1), cut, strict=True))
         if low_cut != high_cut and extent[i] > _SIDE_SEEN:

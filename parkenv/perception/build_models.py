@@ -1,4 +1,4 @@
-"""Train the packaged models, on simulated images alone: `python -m parkenv.perception.build_models`.
+"""Train the packaged models on simulated images only: `python -m parkenv.perception.build_models`.
 
 This takes some minutes; equal seeds give equal files.
 """

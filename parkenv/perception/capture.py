@@ -8,7 +8,7 @@ from sim_sensors.rig import Capture
 
 
 class TimedCapture(NamedTuple):
-    """What a rig measured at one moment.
+    """Measurements of a rig at one moment.
 
     Attributes:
         time: s since Monday 00:00.

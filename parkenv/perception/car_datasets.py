@@ -1,4 +1,4 @@
-"""Labelled photographs of cars: the UIUC car data set as published, and plain folders of crops."""
+"""Labelled photographs of cars: the published UIUC car data set, and plain folders of crops."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Crops:
     """Aligned images of cars, and images without cars.
 
     Attributes:
-        positives: grey, uint8, with the car at the same place in each.
+        positives: grey, uint8, with the car at the same position in each.
         negatives: grey, uint8, of any size.
     """
 
@@ -44,7 +44,7 @@ class LabelledImage:
     """A photograph with the boxes of its cars.
 
     Attributes:
-        name: of the file.
+        name: name of the file.
         image: (h, w) uint8.
         boxes: (n, 4) float64 px, left, top, right, bottom.
     """
@@ -58,7 +58,7 @@ def read_uiuc_training(folder: Path) -> Crops:
     """Read UIUC's training images: `TrainImages/pos-N.pgm` and `neg-N.pgm`, in a folder or in its `.tar.gz`.
 
     Raises:
-        InputError: neither is there, an image is missing or torn.
+        InputError: neither exists, or an image is missing or truncated.
     """
     archive = folder if folder.is_file() else folder / "TrainImages.tar.gz"
     if (folder / "TrainImages").is_dir():

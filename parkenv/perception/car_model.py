@@ -21,9 +21,9 @@ from parkenv.perception.hog import Descriptor
 Float32Array = NDArray[np.float32]
 
 PACKAGED_MODELS = ("side", "front")
-"""Models that come with the package; trained on simulated images alone."""
+"""Packaged models, trained only on simulated images."""
 _FORMAT = "parkenv-car-model"
-_VERSION = 2  # 1 took no square root of the grey values
+_VERSION = 2  # version 1 did not take the square root of the grey values
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # equal models are equal files
 
 
@@ -37,7 +37,7 @@ class CarModel:
         bias: added to the weighted sum; a score above 0 means car.
         region_aspect: width over height of the image region that is resized to the window.
         car: left, top, right, bottom of the car within the window, as fractions of its width and height.
-        calibration: slope and offset: the probability of a score s is 1/(1 + exp(-(slope·s + offset))).
+        calibration: slope and offset; the probability of a score s is 1/(1 + exp(-(slope·s + offset))).
         end_on: whether it was trained on fronts and rears rather than on sides.
         trained_on: one line that describes the training data.
 
@@ -76,7 +76,7 @@ class CarModel:
         return np.array([self.descriptor.describe(c) @ flat + self.bias for c in crops], dtype=np.float32)
 
     def save(self, path: Path) -> None:
-        """Write the model to an `.npz` file of some 10 kB; equal models give equal bytes."""
+        """Write the model to an `.npz` file of about 10 kB; equal models give equal bytes."""
         settings = {
             "format": _FORMAT,
             "version": _VERSION,

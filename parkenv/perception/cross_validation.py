@@ -17,7 +17,7 @@ from parkenv.perception.detection_scores import recall_at
 from parkenv.perception.training import train
 
 BLOCKS = 30
-"""Runs of file order that a set is cut into; near one another lie pictures of one car, which belong together."""
+"""Number of blocks of consecutive files; images of the same car are neighbours and should share a block."""
 FALSE_POSITIVES = (0.001, 0.002, 0.01)
 _Image = NDArray[np.uint8]
 
@@ -66,17 +66,17 @@ def cross_validated(
     progress: Callable[[str], None] = lambda _: None,
     **training: Any,
 ) -> list[CropScore]:
-    """Train on all blocks of consecutive files but some, and score on these, until each block was held out once.
+    """Cross-validate over blocks of consecutive files: each block is held out once.
 
     Args:
-        crops: of cars and of others.
+        crops: crops of cars and of others.
         folds: number of models to train.
-        seed: of the assignment of blocks to folds.
+        seed: seed of the assignment of blocks to folds.
         progress: called with a line for each fold.
-        **training: of `train`.
+        **training: arguments of `train`.
 
     Raises:
-        InputError: fewer than two folds, more than blocks, or fewer crops than blocks.
+        InputError: fewer than two folds, more folds than blocks, or fewer crops than blocks.
     """
     if not 2 <= folds <= BLOCKS:
         raise InputError(f"folds is {folds}, want 2 to {BLOCKS}")

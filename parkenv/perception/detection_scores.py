@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 
 REACH = 0.25
-"""Semi-axes of the ellipse about a true box, as shares of its width and height (README of the UIUC set)."""
+"""Semi-axes of the ellipse around a true box, as fractions of its width and height (README of the UIUC set)."""
 
 
 @dataclass(frozen=True, eq=False)
 class RecallPrecision:
-    """One point for every threshold, from the strictest.
+    """A recall-precision curve with one point per threshold, strictest first.
 
     Attributes:
         threshold: (k,) float64.
-        recall: (k,) float64, share of the cars that are found.
-        precision: (k,) float64, share of the detections that are cars.
+        recall: (k,) float64, fraction of the cars that are found.
+        precision: (k,) float64, fraction of the detections that are cars.
     """
 
     threshold: FloatArray
@@ -30,7 +30,7 @@ class RecallPrecision:
 
     @property
     def equal_error(self) -> float:
-        """Equal-error rate: the greatest value that recall and precision both reach at one threshold."""
+        """Equal-error rate: the largest value that recall and precision both reach at one threshold."""
         if not len(self.recall):
             return 0.0
         return float(np.minimum(self.recall, self.precision).max())
@@ -56,12 +56,12 @@ def recall_precision(
     *,
     scales: bool = True,
 ) -> RecallPrecision:
-    """Match detections to true boxes, best detection first, one per car.
+    """Match detections to true boxes, best detection first, one per car, and return the curve.
 
     Args:
-        boxes: of each image, (n, 4) left, top, right, bottom of what was found.
-        scores: of each image, (n,).
-        truth: of each image, (m, 4) the cars.
+        boxes: for each image, (n, 4) left, top, right, bottom of the detections.
+        scores: for each image, (n,) scores of the detections.
+        truth: for each image, (m, 4) boxes of the cars.
         scales: whether the width counts as a third axis, as in the multi-scale set.
     """
     cars = sum(len(t) for t in truth)
@@ -77,7 +77,7 @@ def recall_precision(
     hit, value = np.concatenate(hits), np.concatenate(values)
     order = np.argsort(-value, kind="stable")
     value, right = value[order], np.cumsum(hit[order])
-    # Detections of one score are taken or left together.
+    # Detections with equal scores are accepted or rejected together.
     last = (
         np.flatnonzero(np.append(np.diff(value) != 0.0, True)) if len(value) else np.empty(0, dtype=np.int64)
     )

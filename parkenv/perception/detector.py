@@ -13,8 +13,8 @@ Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
 LEAST_PROBABILITY = 0.08
-"""A detector should return what it takes for a car with at least this probability: the pipeline keeps such a box if
-range measurements in it fit a car on the ground, and other boxes from 0.25 on."""
+"""Least probability of the boxes that a detector should return. The pipeline keeps a box below 0.25 only if the range
+measurements in it fit a car on the ground."""
 
 
 class Detections:
@@ -24,11 +24,11 @@ class Detections:
         boxes: (n, 4) float32, px: left, top, right, bottom of each car in image coordinates (x right, y down, origin at
             the upper left corner). Boxes may reach beyond the image.
         probability: (n,) float32, P(car) of each box, in [0, 1].
-        end_on: (n,) bool, whether the car is seen from its front or rear rather than from its side: that decides how a
-            car of which little is seen is oriented. None: every car is seen from its side.
+        end_on: (n,) bool, whether the car is seen from its front or rear rather than from its side; determines the
+            orientation of a barely visible car. None: every car is seen from its side.
         score: (n,) float32, the detector's own scale, greater is better; None: the probabilities.
-        regions: (n, 4) float32, px, the image region that was classified, with some background around the car; for
-            labels that are drawn that way (UIUC). None: the boxes.
+        regions: (n, 4) float32, px, the classified image region, with some background around the car, for data sets
+            with such labels (UIUC). None: the boxes.
 
     Raises:
         InputError: an array of another shape, a number that is not finite, a box without area, or a probability
@@ -72,21 +72,21 @@ class Detections:
 class Detector(Protocol):
     """Finds cars in camera images.
 
-    A detector of your own is a class with this one method and a constructor without arguments. It is named
-    `MODULE:CLASS` wherever a detector is named: `parkenv survey --detector my_detectors:Mine`,
+    A custom detector is a class with this method and a constructor without arguments. Its name is `MODULE:CLASS`
+    wherever a detector is expected: `parkenv survey --detector my_detectors:Mine`,
     `gym.make("parkenv/SearchPerception-v1", detector="my_detectors:Mine")`.
 
-    The method must not depend on earlier calls: images of several cameras, and of several episodes, come in any order.
+    The method must not depend on earlier calls: images of several cameras and episodes arrive in any order.
     """
 
     def detect(self, image: Image) -> Detections:
         """Find the cars in one image.
 
         Args:
-            image: (h, w, 3) uint8, RGB, row 0 at the top; (h, w) uint8 if it is grey. It must not be changed.
+            image: (h, w, 3) uint8, RGB, row 0 at the top; (h, w) uint8 if grey. It must not be changed.
 
         Returns:
-            One box per car (overlapping boxes of one car are suppressed), those below `LEAST_PROBABILITY` left out.
+            One box per car (without overlapping boxes of the same car), with at least `LEAST_PROBABILITY`.
         """
         ...
 

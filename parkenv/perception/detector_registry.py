@@ -20,12 +20,11 @@ def make_detector(name: str | Detector | None = None) -> Detector:
 
     Args:
         name: `hog` (the packaged HOG models, of sides and of fronts and rears), `side` or `front` (one of them), the
-            path of a model file that `parkenv train-detector` wrote, or `MODULE:CLASS` for a detector of your own
-            (see `Detector`; the module may be in the working directory). A detector is returned as it is; None is
-            `hog`.
+            path of a model file written by `parkenv train-detector`, or `MODULE:CLASS` for a custom detector (see
+            `Detector`; the module may be in the working directory). A detector is returned unchanged; None is `hog`.
 
     Raises:
-        InputError: an unknown name, a file that holds no model, or a class that is no detector.
+        InputError: an unknown name, a file without a model, or a class that does not implement `Detector`.
 
     Examples:
         >>> len(make_detector("hog").models)
@@ -50,10 +49,10 @@ def make_detector(name: str | Detector | None = None) -> Detector:
 
 
 def detector_version(name: str) -> str:
-    """Return the name with a hash of the file behind it, which changes if the model or module does.
+    """Return the name with a hash of its model or module file.
 
     Args:
-        name: as `make_detector` takes it, which has made a detector of it before.
+        name: as for `make_detector`, which must have accepted it before.
     """
     file = Path(name) if Path(name).is_file() else file_of_class(name) if ":" in name else None
     return name if file is None else f"{name}@{hashlib.sha256(file.read_bytes()).hexdigest()[:8]}"

@@ -29,8 +29,8 @@ ORIENTATIONS = 9
 """Bins over half a turn; opposite gradients count as one."""
 NORMALIZATIONS = ("neighbors", "cell", "blocks")
 
-_NOISE = 25.0  # energy of a cell that holds nothing but the sensor's noise; what is weaker is not blown up
-_CLIP = 0.2  # no single orientation says more than this (Dalal and Triggs's L2-Hys)
+_NOISE = 25.0  # energy of a cell with sensor noise only; weaker cells are not amplified
+_CLIP = 0.2  # largest value of a single orientation (L2-Hys of Dalal and Triggs)
 _BLOCK = 2
 _ROOT = np.round(np.sqrt(255.0 * np.arange(256))).astype(np.uint8)
 
@@ -40,10 +40,10 @@ class Descriptor:
     """The features of a window.
 
     Args:
-        width, height: px of the window, whole cells.
-        normalization: `cell`: each cell by its own energy, the thesis's count of values. `neighbors`: each cell by the
-            energies of the four blocks of 2×2 cells that it is part of, the mean of the four; as many values. `blocks`:
-            Dalal and Triggs (2005), every block of 2×2 cells on its own, 36 values each.
+        width, height: size of the window, px; whole cells.
+        normalization: `cell`: each cell by its own energy, with as many values as in the thesis. `neighbors`: each cell
+            by the energies of the four blocks of 2×2 cells that contain it, averaged; the same number of values.
+            `blocks`: Dalal and Triggs (2005), each block of 2×2 cells separately, 36 values each.
 
     Raises:
         InputError: a size that is not whole cells, or an unknown normalization.
@@ -104,7 +104,7 @@ class Descriptor:
         """
         if crop.shape != (self.height, self.width):
             raise InputError(f"crop is {crop.shape}, want ({self.height}, {self.width})")
-        # One cell more on each side, as a window in an image has neighbours.
+        # One more cell on each side, because a window in an image has neighbours.
         wider = cv2.copyMakeBorder(crop, CELL, CELL, CELL, CELL, cv2.BORDER_REPLICATE)
         rows, _, columns = self.shape
         return np.ascontiguousarray(self.features(wider)[1 : 1 + rows, :, 1 : 1 + columns]).reshape(-1)
@@ -132,7 +132,7 @@ def cell_histograms(image: Image) -> Float32Array:
     orientations and the four nearest cells.
 
     Args:
-        image: (h, w) uint8; pixels beyond the last whole cell are left out.
+        image: (h, w) uint8; pixels beyond the last whole cell are ignored.
 
     Returns:
         (h // 8, 9, w // 8) float32; orientation k is centred at (k + 0.5)/9 of half a turn, counted from a gradient
@@ -218,7 +218,7 @@ def _bin_rows(
             down = f0 * v0 + f1 * v1 + f2 * v2 + f3 * v3
             a[_HALF + x] += v0 + v1 + v2 + v3 - down
             b[_HALF + x] += down
-    # Half a turn is where it began: what lies beyond the last bin's centre is near the first one's, and vice versa.
+    # Orientations wrap at half a turn: the first and the last bin are neighbours.
     for k, center in ((0, np.float32(ORIENTATIONS)), (ORIENTATIONS - 1, np.float32(-1.0))):
         a = upper[k]
         b = lower[k]
@@ -377,7 +377,7 @@ def correlate(features: Float32Array, weights: Float32Array) -> Float32Array:
             for k in range(features.shape[1]):
                 source = features[y + i, k]
                 j = 0
-                # Four columns of the window at a time, so that the line is loaded and stored a quarter as often.
+                # Four columns of the window at a time: a quarter of the loads and stores of the line.
                 while j + 4 <= width:
                     w0, w1 = weights[i, k, j], weights[i, k, j + 1]
                     w2, w3 = weights[i, k, j + 2], weights[i, k, j + 3]

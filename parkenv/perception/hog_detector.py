@@ -1,4 +1,4 @@
-"""The HOG detector of the thesis: a window slides over an image pyramid, a linear classifier scores each place.
+"""The HOG detector of the thesis: a linear classifier scores sliding windows over an image pyramid.
 
 T §3.2.1 and §3.2.2.
 """
@@ -22,7 +22,7 @@ Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
 _ZOOM = 1.6
-_MOST_WINDOWS = 2000  # the best of them; beyond that a model separates nothing
+_MOST_WINDOWS = 2000  # only the best are kept; a useful model does not report more
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +31,8 @@ class HogDetector:
 
     Args:
         models: the packaged side and front models, or others.
-        least_height: px, height of the smallest regions that are searched; None: five eighths of each model's window,
-            because smaller cars show little detail when enlarged, and cost the most time.
+        least_height: px, height of the smallest regions searched; None: five eighths of each model's window, because
+            smaller cars show little detail when enlarged, and cost the most time.
         most_height: px, height of the largest regions; None: as large as the image and its margin allow.
         scale_step: ratio of one region size to the next smaller one.
         threshold: probability from which a window is reported as a car.
@@ -101,7 +101,7 @@ class HogDetector:
         most = self.most_height or max(height, width / model.region_aspect) * (1.0 + 2.0 * self.margin)
         window = model.descriptor
         regions, scores = [np.empty((0, 4), np.float32)], [np.empty(0, np.float32)]
-        # The score at the threshold; lower ones need not be kept.
+        # The score at the threshold; lower ones are dropped.
         slope, offset = model.calibration
         enough = (math.log(self.threshold / (1.0 - self.threshold)) - offset) / slope
         least = self.least_height or window.height / _ZOOM

@@ -21,13 +21,14 @@ def read_image(path: Path) -> Image:
     """Read an image file as (h, w) grey or (h, w, 3) RGB, uint8; transparency is dropped.
 
     Raises:
-        InputError: no such file, no image, a torn one, more than 8 bits a channel, or over 100 million pixels.
+        InputError: a missing file, not an image, a truncated image, more than 8 bits per channel, or over 100 million
+            pixels.
     """
     return decode_image(_bytes_of(path), str(path))
 
 
 def decode_image(data: bytes, name: str) -> Image:
-    """Decode an image from bytes as `read_image` does; `name` is for error messages."""
+    """Decode an image from bytes, as `read_image`; `name` is for error messages."""
     raw = np.frombuffer(data, dtype=np.uint8)
     image = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if len(raw) else None
     if image is None or _torn(data):

@@ -1,4 +1,4 @@
-"""The perception pipeline: from what a sensor rig measured to which slots are taken (T §3.2, §3.3.2)."""
+"""The perception pipeline: from a rig's measurements to slot occupancy (T §3.2, §3.3.2)."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ from sim_sensors.rig import Capture, Mount, SensorRig
 FloatArray = NDArray[np.float64]
 
 PROBABILITY = 0.25
-"""A detection counts from this probability on; from `LEAST_PROBABILITY` on if it could be located as well."""
+"""Least probability of a detection; a located one needs only `LEAST_PROBABILITY`."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
-    """One camera's image and what was made of it.
+    """One camera's image with its detections and located cars.
 
     Attributes:
-        name: of the camera in the rig.
+        name: name of the camera in the rig.
         camera, mount: its model, and its pose on the vehicle.
         image: (h, w, 3) uint8, RGB.
         detections: the cars in the image.
-        scan: the ranges with which they were located.
-        stereo: the stereo camera, and its disparity, (h, w) float32 px, where there is no laser; else None.
+        scan: the ranges used to locate them.
+        stereo: without a laser, the stereo camera and its disparity, (h, w) float32 px; else None.
         cars: the detections that could be located.
         slots: (n,) int64, the slot that each of `cars` stands in; -1 for none.
     """
@@ -54,7 +54,7 @@ class CameraView:
 
 @dataclass(frozen=True, eq=False)
 class PerceptionResult:
-    """What the pipeline made of one capture.
+    """The pipeline's result for one capture.
 
     Attributes:
         captured: the capture and its time.
@@ -100,10 +100,10 @@ class PerceptionPipeline:
     def process(
         self, captured: TimedCapture, slots: SlotFilter, vehicle: FloatArray | None = None
     ) -> PerceptionResult:
-        """Process one capture, and update the slots with what was observed.
+        """Process one capture, and update the slots from its observations.
 
         Args:
-            captured: measured with the pipeline's rig.
+            captured: capture of the pipeline's rig.
             slots: the filter to update.
             vehicle: (3,) estimated x, y, yaw of the vehicle; None: the true pose.
         """
@@ -126,17 +126,17 @@ class PerceptionPipeline:
     def observe(
         self, captures: Sequence[TimedCapture]
     ) -> tuple[tuple[PerceptionResult, ...], SlotObservation]:
-        """Process the captures of one step together, without evidence from earlier ones.
+        """Process the captures of one step together, without evidence from earlier steps.
 
         Returns:
-            The result of each capture, and the states of the slots that were observed.
+            The result of each capture, and the observed slots with their states.
         """
         slots = SlotFilter(self.lot)
         results = tuple(self.process(captured, slots) for captured in captures)
         return results, slots.observation()
 
     def _ranging_sensor(self, camera: str) -> str:
-        """Name of the sensor whose ranges locate the detections of a camera."""
+        """Return the name of the sensor whose ranges locate the detections of a camera."""
         if self.rig.lasers:
             return self.rig.lasers[0][0]
         stereo_cameras = [name for name, _, _ in self.rig.stereo_cameras]
@@ -154,7 +154,7 @@ class PerceptionPipeline:
         disparities: dict[str, tuple[StereoCamera, NDArray[np.float32]]],
         vehicle: FloatArray,
     ) -> dict[str, RangeScan]:
-        """Range scans by the sensor's name, those of lasers first."""
+        """Return the range scans by sensor name, lasers first."""
         lasers = {
             name: scan_from_laser(laser, mount, vehicle, capture.scans[name])
             for name, laser, mount in self.rig.lasers
@@ -166,7 +166,7 @@ class PerceptionPipeline:
         return lasers | stereo
 
     def _images(self, capture: Capture) -> list[tuple[str, PinholeCamera, Mount, NDArray[np.uint8]]]:
-        """Name, camera, mount and image of every camera; of stereo cameras the left one."""
+        """Return name, camera, mount and image of every camera; of stereo cameras the left one."""
         return [
             *((name, camera, mount, capture.images[name].image) for name, camera, mount in self.rig.cameras),
             *(
@@ -180,7 +180,7 @@ def localize_as_thesis(view: CameraView, vehicle: FloatArray) -> LocatedCars:
     """Locate the detections of a view as the thesis does, for comparison: by the median range in each box (T §3.2.3).
 
     Args:
-        view: of a `PerceptionResult`.
+        view: view of a `PerceptionResult`.
         vehicle: (3,) estimated x, y, yaw of the vehicle, world frame.
     """
     if view.stereo is not None:

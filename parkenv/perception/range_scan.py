@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
 STEREO_RANGE = 12.0
-"""m; beyond it, half a pixel of disparity is a metre."""
+"""Range of stereo measurements, m; beyond it, half a pixel of disparity corresponds to more than a metre."""
 _NEAREST = 1.0  # m, the shortest depth that the matcher searches
 _BAND = (0.35, 1.1)  # m above ground: bumpers and doors, below the windows
 _LEAST_PIXELS = 6
@@ -32,7 +32,7 @@ class RangeScan:
     Args:
         x, y: m, position of the sensor, world frame.
         angle: (k,) float64, rad, world frame, ascending (counter-clockwise).
-        distance: (k,) float64, m; inf if the beam meets nothing within `max_range`, NaN if the range is unknown.
+        distance: (k,) float64, m; inf if the beam hits nothing within `max_range`, NaN if the range is unknown.
         max_range: m.
     """
 
@@ -51,7 +51,7 @@ class RangeScan:
 def scan_from_laser(
     laser: LaserScanner, mount: Mount, vehicle: FloatArray, ranges: Float32Array
 ) -> RangeScan:
-    """Place the ranges of a laser scanner in the world.
+    """Convert the ranges of a laser scanner to the world frame.
 
     Args:
         laser: the scanner.
@@ -76,7 +76,7 @@ def scan_from_stereo(
 ) -> RangeScan:
     """Find the nearest obstacle at bumper height in every few columns of a disparity image.
 
-    A direction in which only ground is seen is free; a direction without matches is unknown.
+    A direction in which only ground is visible is free; a direction without matches is unknown.
 
     Args:
         stereo: the camera.
@@ -109,7 +109,7 @@ def disparity(pair: StereoFrame, stereo: StereoCamera, nearest: float = _NEAREST
     Args:
         pair: rectified images.
         stereo: the camera.
-        nearest: m, the shortest depth that is searched.
+        nearest: m, shortest depth searched.
     """
     most = 16 * math.ceil(stereo.camera.fx * stereo.baseline / nearest / 16)
     matcher = cv2.StereoSGBM.create(
@@ -164,6 +164,6 @@ def _column_depths(
         if obstacle >= _LEAST_PIXELS:
             out[c] = np.sort(found[:obstacle])[obstacle // 4]
         elif ground > 0.0:
-            # Free if the ground is seen nearly to the maximum range; else it is not known what stands beyond.
+            # Free if the ground is visible nearly to the maximum range; otherwise unknown.
             out[c] = np.inf if ground > 0.8 * max_range else np.nan
     return out

@@ -38,7 +38,7 @@ CAR_HEIGHT = (0.8, 3.2)
 """m; range of the height of a box's upper edge."""
 _LEAST_BEAMS = 3
 _MARGIN = 0.02  # of an image's width; boxes that come this close to its border count as clipped by it
-_SAME_AXIS = 0.1  # m, largest distance between a camera and the sensor that ranges for it
+_SAME_AXIS = 0.1  # m, largest distance between a camera and its ranging sensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +129,8 @@ def car_beams(
 ) -> CarBeams:
     """Select the beams of a box that end on its car: the run of end points that best fills the middle of the box.
 
-    Neighbouring beams whose end points are more than `GAP` apart met different objects: a car and its background, or an
-    obstacle in front of it. Beams near the middle of the box weigh more, since other objects fill its margins.
+    Neighbouring beams whose end points are more than `GAP` apart hit different objects: a car and its background, or an
+    obstacle in front of it. Beams near the middle of the box weigh more, because other objects fill its margins.
 
     Args:
         scan: the ranges around the car.
@@ -173,15 +173,15 @@ def localize_cars(
 ) -> LocatedCars:
     """Locate the detected cars: fit a car's rectangle to the `car_beams` of each box.
 
-    Dropped are detections without an obstacle at bumper height, those that at its distance would not stand on the
-    ground or have a car's height, and cars of which too little is visible to estimate the orientation: neither a side
-    nor an end, or a part of them at the image border. Later captures show them better.
+    The following detections are dropped: those without an obstacle at bumper height; those that, at its distance, would
+    not be on the ground or have a car's height; and cars too hidden to estimate their orientation, with neither a side
+    nor an end visible, or only a part of one at the image border. Later captures show them better.
 
     Args:
-        detections: in the camera's image.
+        detections: detections in the camera's image.
         scan: ranges from the same vehicle pose.
         camera: the camera that took the image.
-        mount: its pose on the vehicle: on one vertical axis with the ranging sensor.
+        mount: its pose on the vehicle, on the same vertical axis as the ranging sensor.
         vehicle: (3,) x, y in m and yaw in rad of the vehicle, world frame.
 
     Raises:
@@ -243,7 +243,7 @@ def localize_disparity(
     """Locate the detected cars as the thesis does with a stereo camera: directly behind the median depth of the box.
 
     Args:
-        detections: in the left camera's image.
+        detections: detections in the left camera's image.
         disparity_px: (h, w) float32, px, NaN where nothing matches.
         stereo: the camera.
         mount: pose of its left camera on the vehicle.
@@ -301,7 +301,7 @@ def _hidden(distance: FloatArray) -> bool:
     Args:
         distance: (k,) m, of the car's last beam and of those after it, outwards.
     """
-    # The next beam may have dropped out; so look at the one after it, too.
+    # The next beam may have dropped out, so check the one after it, too.
     after = distance[1:3]
     if not len(after) or np.isnan(after).any():
         return True

@@ -1,4 +1,4 @@
-"""Labelled images of simulated cars, varied and difficult: the training data of the packaged models."""
+"""Labelled images of simulated cars in varied conditions: the training data of the packaged models."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ Image = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
 
 SIDE_CAR = (0.08, 0.22, 0.92, 0.885)
-"""Where a car lies in a side view's region, left, top, right, bottom: as in UIUC's crops."""
+"""Left, top, right, bottom of the car in a side view's region, as fractions; as in UIUC's crops."""
 SIDE_ASPECT = 2.5
 END_CAR = (0.08, 0.12, 0.92, 0.92)
-"""The same of a front or rear."""
+"""The same for a front or rear view."""
 END_ASPECT = 1.0
 
-_CLEAR = 0.8  # visible share from which a car is a positive
-_NEGLIGIBLE = 0.25  # share below which a car may be missed
+_CLEAR = 0.8  # visible fraction from which a car is a positive
+_NEGLIGIBLE = 0.25  # visible fraction below which a car may be missed
 _LEAST_WIDTH = 36  # px
 _WEATHERS = 4
-_FROM_AFAR = 0.6  # share of pictures that long lenses take
+_FROM_AFAR = 0.6  # fraction of images with a long focal length
 _AFAR_SIZE = (400, 300)  # px
-_TEXTURED = 0.9  # share of pictures with a backdrop
+_TEXTURED = 0.9  # fraction of images with a backdrop
 _SEEDS = 1 << 20
 
 FRAMES = 20
-"""Pictures of every street."""
+"""Number of images per street."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +46,9 @@ class SimulatedPhoto:
     """An image, its cars, and crops of them.
 
     Attributes:
-        labelled: the grey picture with the boxes of all cars in it.
-        sides: crops of cars seen from the side, aligned alike.
-        ends: crops of fronts and rears.
+        labelled: the grey image with the boxes of all its cars.
+        sides: aligned crops of cars seen from the side.
+        ends: aligned crops of fronts and rears.
     """
 
     labelled: LabelledImage
@@ -57,13 +57,14 @@ class SimulatedPhoto:
 
 
 def simulated_photos(n_scenes: int, seed: int = 0) -> Iterator[SimulatedPhoto]:
-    """Render images of random streets in random light, twenty of each, every fifth without cars.
+    """Render images of random streets in random light, twenty per street, every fifth without cars.
 
-    Cars are parked along the street, perpendicular or at an angle; half of the images have a long focal length, the
-    others are those of a rig. The background gets random texture, and every image random exposure, blur and noise.
+    Cars are parked along the street, perpendicular or at an angle. About half of the images have a long focal length,
+    the others come from a rig's camera. The background gets random texture, and every image random exposure, blur and
+    noise.
 
     Args:
-        n_scenes: how many streets.
+        n_scenes: number of streets.
         seed: 0 or more.
     """
     for number in range(n_scenes):
@@ -80,7 +81,7 @@ def region_of(box: FloatArray, car: tuple[float, float, float, float], aspect: f
 
     Args:
         box: (4,) px, left, top, right, bottom of the car.
-        car: where the car lies in the window, as shares.
+        car: left, top, right, bottom of the car in the window, as fractions.
         aspect: width over height of the window.
     """
     width = (box[2] - box[0]) / (car[2] - car[0])
@@ -94,7 +95,7 @@ def roughened(image: Image, rng: np.random.Generator) -> Image:
     """Simulate another camera: exposure, contrast, gamma, blur, sharpening, noise."""
     values = image.astype(np.float32) / 255.0
     height = len(values)
-    # As a photographer would, it is exposed for what stands on the ground, and not for the sky.
+    # Expose for the objects on the ground, as a photographer would, and not for the sky.
     middle = values[int(0.3 * height) : int(0.8 * height) + 1]
     low, high = np.quantile(middle, [rng.uniform(0.0, 0.04), rng.uniform(0.93, 1.0)])
     if rng.random() < 0.75 and high - low > 0.03:
@@ -135,7 +136,7 @@ def _photo(
         nearest = boxes.distance[clear].min() if clear.any() else rng.uniform(6.0, 20.0)
         behind = nearest + rng.uniform(1.5, 5.0)
         grey = with_backdrop(grey, frame.depth > behind, rng)
-        # Cars that the texture may lie on are no examples; nor does it make them wrong.
+        # Cars that the texture may cover are neither positives nor negatives.
         clear &= boxes.distance < behind - 1.5
     grey = roughened(grey, rng)
     sides, ends = _crops(grey, boxes, clear, rng)
@@ -144,14 +145,14 @@ def _photo(
 
 
 def _from_afar(street: Street, car: int, rng: np.random.Generator) -> tuple[PinholeCamera, FloatArray]:
-    """Place the camera across the street, with a long lens, facing one car."""
+    """Place a camera with a long lens across the street, facing one car."""
     width, height = _AFAR_SIZE
     away, height_m = rng.uniform(7.0, 32.0), rng.uniform(0.9, 2.4)
     extent, smallest, largest = (4.6, 90.0, 230.0) if street.kind == "along" else (1.8, 56.0, 170.0)
     focal = math.exp(rng.uniform(math.log(smallest), math.log(largest))) * away / extent
     camera = PinholeCamera(width, height, focal, focal, width / 2.0, height / 2.0, coarse_beyond=math.inf)
     aside = rng.normal(0.0, 0.17) * away
-    # The car is not always in the middle of the picture.
+    # Random pan and tilt: the car is not always in the middle of the image.
     pan, tilt = rng.normal(0.0, 0.15, 2) * np.array([2.0 * width, height]) / (2.0 * focal)
     pose = camera_pose(
         float(street.pose[car, 0]) + aside, street.front - away, height_m,
@@ -162,7 +163,7 @@ def _from_afar(street: Street, car: int, rng: np.random.Generator) -> tuple[Pinh
 
 
 def _as_rigs_see(street: Street, rng: np.random.Generator) -> tuple[PinholeCamera, FloatArray]:
-    """Place the camera on a car that passes the slots: a wide angle at close range."""
+    """Place a wide-angle camera on a car that passes the slots at close range."""
     camera = PinholeCamera.from_field_of_view(horizontal=rng.uniform(0.8, 1.6))
     pose = camera_pose(
         rng.uniform(-14.0, 14.0), street.front - rng.uniform(1.6, 9.0), rng.uniform(1.0, 1.8),
@@ -174,7 +175,7 @@ def _as_rigs_see(street: Street, rng: np.random.Generator) -> tuple[PinholeCamer
 def _crops(
     grey: Image, boxes: VehicleBoxes, clear: NDArray[np.bool_], rng: np.random.Generator
 ) -> tuple[list[Image], list[Image]]:
-    """Return crops of sides and ends of unoccluded cars that are completely in the image and seen straight on."""
+    """Return crops of sides and ends of unoccluded cars that are completely in the image and seen at a right angle."""
     crops: dict[View, list[Image]] = {View.SIDE: [], View.END: []}
     height, width = grey.shape
     for i in np.flatnonzero(clear).tolist():
@@ -193,7 +194,7 @@ def _crops(
 
 
 def _patch(grey: Image, region: FloatArray, size: tuple[int, int], rng: np.random.Generator) -> Image:
-    """Cut out a region at the resolution of photographs: enlarge small ones, reduce large ones to double."""
+    """Cut out a region at the resolution of photographs: enlarge small ones, reduce large ones to twice the size."""
     edge = int(max(region[2] - region[0], region[3] - region[1])) + 2
     wider = cv2.copyMakeBorder(grey, edge, edge, edge, edge, cv2.BORDER_REPLICATE)
     left, top, right, bottom = np.round(region + edge).astype(int)

@@ -15,7 +15,7 @@ from sim_sensors.vehicles.vehicle import VehicleModel
 FloatArray = NDArray[np.float64]
 
 BODY_SHARE = {"hatchback": 0.26, "sedan": 0.34, "estate": 0.14, "suv": 0.14, "van": 0.09, "pickup": 0.03}
-"""How common each body is. Flatter than a European lot's: photographs come from everywhere and from any decade."""
+"""Frequency of each body type; flatter than in a European lot, as photographs come from all regions and decades."""
 
 _KINDS = ("along", "across", "aslant")
 _REACH = 24.0  # m, half the length of a row
@@ -25,14 +25,14 @@ _SEEDS = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class Street:
-    """Cars in rows along the x axis; pictures are taken from the negative y side.
+    """Cars in rows along the x axis; cameras are on the negative y side.
 
     Attributes:
-        kind: `along`: the first row shows its sides; `across` or `aslant`: its ends.
-        pose: (n, 3) float64: x, y in m, yaw in rad; the first row's first.
-        first: how many cars are in the first row.
+        kind: `along`: the sides of the first row are visible; `across` or `aslant`: its ends.
+        pose: (n, 3) float64: x, y in m, yaw in rad; cars of the first row come first.
+        first: number of cars in the first row.
         front: m, y of the first row's mouth.
-        fleet: a model for every car, in order, and the surroundings.
+        fleet: vehicle model of every car, in order, and the surroundings.
     """
 
     kind: str
@@ -72,7 +72,7 @@ class Street:
 def _row(
     rng: np.random.Generator, kind: str, y: float, reach: float
 ) -> tuple[list[list[float]], list[VehicleModel]]:
-    """Return poses and models of cars side by side, or one behind the other, from -reach to reach."""
+    """Return poses and models of cars in a row, from -reach to reach."""
     turn = {"along": 0.0, "across": 0.5 * math.pi, "aslant": rng.uniform(0.9, 1.3) * rng.choice([-1.0, 1.0])}[
         kind
     ]
@@ -82,7 +82,7 @@ def _row(
     x = -reach
     while x < reach:
         model = VehicleModel.from_seed(str(rng.choice(bodies, p=shares)), int(rng.integers(_SEEDS)))
-        # Cars aslant lie beside each other along their flanks, not along the boxes about them.
+        # Oblique cars are spaced by the distance of their flanks, not by their bounding boxes.
         wide = (
             model.length if kind == "along" else model.width / abs(math.sin(turn)) + 0.3 * abs(math.cos(turn))
         )

@@ -21,7 +21,7 @@ IntArray = NDArray[np.int64]
 P_FREE, P_OCCUPIED, P_PRIOR = 0.45, 0.95, 0.5
 """The observation model of eq. 3.9."""
 CORE = (0.8, 0.45)
-"""Half length and half width, m, of the core of a slot, which every parked car covers."""
+"""Half the length and width, m, of the core of a slot, which every parked car covers."""
 MARGIN = 0.35
 """m; a parked car may extend out of its slot towards the lane by this much."""
 INSET = 0.1
@@ -72,9 +72,9 @@ class SlotObservation(NamedTuple):
 class SlotFilter:
     """Log-odds that each slot is taken, from located cars and from the beams of range scans.
 
-    The thesis uses detections alone: a car is assigned to the nearest slot, and slots without a car at the end of a
+    The thesis uses only detections: a car is assigned to the nearest slot, and slots without a car at the end of a
     session are free (`thesis_states`). Here a slot that was never in view stays unknown. A car counts only inside a
-    slot, so that traffic and pedestrians are not taken for parked cars. Beams that end within a slot are evidence that
+    slot, so traffic and pedestrians are not mistaken for parked cars. Beams that end within a slot are evidence that
     it is taken; beams that cross its core are evidence that it is free.
 
     Args:
@@ -98,7 +98,7 @@ class SlotFilter:
         self._visual = np.zeros(lot.n_slots)
 
     def slots_of(self, cars: LocatedCars) -> IntArray:
-        """Return the slot that each car stands in, (n,) int64; -1 for cars outside all slots."""
+        """Return the slot of each car, (n,) int64; -1 for cars outside all slots."""
         if not len(cars):
             return np.empty(0, dtype=np.int64)
         nearest = np.asarray(self._tree.query(cars.xy)[1], dtype=np.int64)
@@ -107,7 +107,7 @@ class SlotFilter:
         return np.where(inside, nearest, -1).astype(np.int64)
 
     def update_from_cars(self, cars: LocatedCars) -> IntArray:
-        """Update the slots that the cars of one image stand in; return `slots_of(cars)`."""
+        """Update the slots of the cars in one image; return `slots_of(cars)`."""
         slots = self.slots_of(cars)
         if len(cars):
             _, nearest = self._tree.query(cars.xy)
@@ -120,7 +120,7 @@ class SlotFilter:
         return slots
 
     def update_from_scan(self, scan: RangeScan) -> None:
-        """Update the slots whose core is hit by beams: taken if they end within the slot, free if they pass it."""
+        """Update the slots whose core beams cross: taken if beams end within the slot, free if they pass it."""
         near = self._near(scan)
         if not len(near):
             return
@@ -143,7 +143,7 @@ class SlotFilter:
         return SlotStates(np.where(self.in_view, p, 0.5), self.in_view.copy())
 
     def observation(self) -> SlotObservation:
-        """Return the slots whose evidence is for one state, and that state."""
+        """Return the slots with evidence for one of the states, and that state."""
         slots = np.flatnonzero(self.in_view & (self.log_odds != 0.0))
         return SlotObservation(slots, self.log_odds[slots] > 0.0)
 
@@ -183,7 +183,7 @@ def _beams_on_slots(
     half_size: FloatArray,
     core: tuple[float, float],
 ) -> tuple[IntArray, IntArray]:
-    """Count, of the beams that hit each slot's core, those that end within the slot and those that pass the core."""
+    """Count, for each slot, the beams toward its core that end within the slot and those that pass the core."""
     n = len(slot_xy)
     ended = np.zeros(n, dtype=np.int64)
     passed = np.zeros(n, dtype=np.int64)

@@ -30,7 +30,7 @@ class TrainingSettings:
     """Parameters of the training.
 
     Args:
-        penalty: of the support vector machine (its C).
+        penalty: C of the support vector machine.
         rounds: rounds of hard-negative mining, each on another part of the images.
         jitter: number of shifted and scaled copies of each positive.
         shift: largest shift of a copy, as a fraction of the window.
@@ -38,7 +38,7 @@ class TrainingSettings:
         misaligned: number of misaligned crops of each positive that become negatives.
         per_image: largest number of hard negatives from one image per round.
         positives_weight: weight of a positive relative to a negative.
-        seed: of the jitter and the solver.
+        seed: seed of the jitter and the solver.
     """
 
     penalty: float = 0.01
@@ -76,18 +76,18 @@ def train(
     trained_on: str = "",
     progress: Progress = lambda _: None,
 ) -> CarModel:
-    """Train a model; equal arguments give equal weights, bit for bit, on one machine.
+    """Train a model; equal arguments give bitwise equal weights on one machine.
 
-    All crops are mirrored, and positives are jittered; windows with half a car are negatives from the start. Then the
-    model scans the negative images, and its false positives join the negatives, round after round (Dalal and Triggs
-    2005). Scores are calibrated to probabilities on cross-validated ones (Platt 1999).
+    All crops are mirrored, and positives are jittered; windows with half a car are negatives from the start. In each
+    following round the model scans the negative images, and its false positives join the negatives (Dalal and Triggs
+    2005). Probabilities are calibrated on cross-validated scores (Platt 1999).
 
     Args:
         positives: aligned grey crops of cars, uint8; resized to the window.
         negatives: grey images of any size without cars.
-        photos: images with all their cars labelled; false positives beside the cars are mined, too.
+        photos: images with all cars labelled; false positives beside the cars are mined, too.
         descriptor: None: 128×64, for side views.
-        region_aspect: width over height of the crops; None: that of the first one.
+        region_aspect: width over height of the crops; None: that of the first crop.
         car: left, top, right, bottom of the car in the crops, as fractions.
         end_on: whether the crops show fronts and rears rather than sides.
         settings: None: the defaults.
@@ -198,7 +198,7 @@ def _calibration(yes: Float32Array, no: Float32Array, settings: TrainingSettings
     """Return slope and offset of the probability, from scores of held-out samples."""
     from sklearn.linear_model import LogisticRegression
 
-    # Copies of one car are at a fixed distance from it; blocks keep most of them together.
+    # Copies of a car are a fixed number of rows apart; blocks keep most of them together.
     scores, labels = [], []
     for fold in range(_FOLDS):
         in_yes, in_no = (np.arange(len(x)) * _FOLDS // len(x) == fold for x in (yes, no))
@@ -207,7 +207,7 @@ def _calibration(yes: Float32Array, no: Float32Array, settings: TrainingSettings
             scores.append(x @ weights + bias)
             labels.append(np.full(len(x), label))
     fit = LogisticRegression(C=1e3).fit(np.concatenate(scores)[:, None], np.concatenate(labels))
-    # Its last digits depend on the number of threads; rounded, equal training makes equal files.
+    # The last digits depend on the number of threads; rounding gives equal files for equal training.
     return round(float(fit.coef_[0, 0]), 6), round(float(fit.intercept_[0]), 6)
 
 

@@ -30,21 +30,21 @@ from planners.routes import DriveRoutes
 FloatArray = NDArray[np.float64]
 
 FAILURE_COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
-"""s, failure costs with which the thesis's planner rolls out the paths that the search starts from."""
+"""s, failure costs of the thesis's planner for the initial paths of the search."""
 DEPTH = 3
-"""Targets of a path at most before the thesis's planner takes over."""
+"""Maximum number of targets before a path follows the thesis's planner."""
 WORK_PER_MS = 50_000
-"""Steps of the path search that take about a millisecond."""
+"""Steps of the path search per millisecond, approximately."""
 WORTH_PASSING_S = 1.0
-"""s that driving on must promise over a free slot at hand, unless the forecast is trusted.
+"""s by which driving on must be better than a known free slot, unless the forecast is trusted.
 
-Where the forecast is right, next to nothing is lost by not driving on for less than that; where it is wrong, the slot
-passed may have been the last one for long.
+If the forecast is right, stopping for a smaller gain costs next to nothing; if it is wrong, the slot that was passed
+may have been the last one for a long time.
 """
 STALE_S = 60.0
 """s without a newly observed slot after which the search moves on to another part of the lot."""
 PREVIEW_S = 60.0
-"""s ahead that a plan is previewed."""
+"""s, horizon of the plan preview."""
 
 
 @dataclass

@@ -21,9 +21,9 @@ from planners.belief.planning_graph import (
 from sim_sensors.compilation import compiled
 
 MOST_OPTIONS = 12
-"""Slots known to be free that are considered, best first."""
+"""Maximum number of slots known to be free that are considered, best first."""
 NOWHERE, ATTEMPT = -1, -2
-"""What comes next where there is no path, or on one that begins with a parking attempt where the car is."""
+"""Values of `next_vertex`: there is no path, or the path begins with a parking attempt at the current vertex."""
 
 
 class PathChoice(NamedTuple):

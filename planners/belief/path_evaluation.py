@@ -25,7 +25,7 @@ from planners.belief.planning_graph import (
 from sim_sensors.compilation import compiled
 
 KEPT_IN_MIND = 32
-"""Stops along which a free slot that was passed is kept in mind."""
+"""Number of stops for which a passed free slot is remembered."""
 
 
 @compiled(error_model="numpy")

@@ -23,11 +23,11 @@ from planners.belief.planning_graph import (
 from sim_sensors.compilation import compiled
 
 NEGLIGIBLE = 0.002
-"""P(nothing worth stopping for was found) at which a path ends; what remains is estimated."""
+"""P(no slot worth stopping for was found) at which a path ends; the remaining time is estimated."""
 WORTH_OBSERVING = 0.1
-"""Part of its usual P(free) to which a slot observed taken must have come back to be worth another observation."""
+"""Fraction of its usual P(free) from which a slot observed taken is worth another observation."""
 OBSERVE_AGAIN_S = 10.0
-"""s that must pass before a slot is observed once more; a later observation makes up for those left out."""
+"""s between observations of the same slot; a later observation makes up for those left out."""
 
 
 @compiled(error_model="numpy")

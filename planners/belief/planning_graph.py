@@ -19,15 +19,15 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 Records = NDArray[Any]
-"""A structured array. One array of records compiles several times as fast as an array for each of their fields."""
+"""A structured array. One array of records compiles several times faster than one array per field."""
 
 MOST_HYPOTHESES = 64
-"""Hypotheses of the forecast error model that there is room for."""
+"""Maximum number of hypotheses of the forecast error model."""
 MOST_STOPS = 400
-"""Vertices of a path at most."""
+"""Maximum number of vertices of a path."""
 
 VIEW = np.dtype([("slot", np.int64), ("rate", np.float64)])
-"""A slot in view of a vertex, and P(it is detected from there at all)."""
+"""A slot in view of a vertex, and P(the slot can be detected from there)."""
 
 SLOT = np.dtype(
     [
@@ -40,7 +40,7 @@ SLOT = np.dtype(
         ("state", np.int64),  # `SlotBelief.state`
     ]
 )
-"""What is believed of a slot at a decision."""
+"""The belief about a slot at a decision."""
 
 STOP = np.dtype(
     [
@@ -67,7 +67,7 @@ OBSERVATION = np.dtype(
 """An observation of a slot along a path."""
 
 MARK = np.dtype([("observed_at", np.float64), ("scratch", np.float64)])
-"""When a path last observed a slot; -1 where it has not yet, -inf where it need not: the slot is known to be free."""
+"""Time at which a path last observed a slot; -1: not yet; -inf: not needed, the slot is known to be free."""
 
 
 class PlanningGraph(NamedTuple):

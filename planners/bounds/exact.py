@@ -36,9 +36,9 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MOST_SLOTS = 25
-"""Slots that the key of a belief state has room for."""
+"""Maximum number of slots; the key of a belief state has room for no more."""
 MOST_STATES = 8_000_000
-"""Belief states that are kept by default; they take about 200 MB, and twice that on the way."""
+"""Default maximum number of belief states: about 200 MB, and twice that while solving."""
 
 _POSITION_BITS = 10
 _SEARCH_ENDS = -1

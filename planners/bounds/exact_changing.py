@@ -28,7 +28,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 MOST_STATES = 20_000_000
-"""Belief states that are kept at most; they take 180 MB."""
+"""Maximum number of belief states: 180 MB."""
 _TOLERANCE = 1e-4
 _MOST_SWEEPS = 20_000
 _WAIT = 4

@@ -16,7 +16,7 @@ from parkenv.world.scenario import SearchProblem
 from planners.agent import Agent
 
 MOST_STEPS = 2000
-"""Decisions after which a search is truncated and charged `give_up_s`, as comparisons do."""
+"""Decisions after which a search is truncated at a cost of `give_up_s`, as in comparisons."""
 
 
 def expected_time(agent: Agent, problem: SearchProblem, p_occupied: ArrayLike, vertex: int) -> float:

@@ -22,7 +22,7 @@ FloatArray = NDArray[np.float64]
 Observation = Mapping[str, Any]
 
 MOST_PLANS = 12
-"""Greatest number of plans in one episode; after that the car stays where it is."""
+"""Maximum number of plans per episode; after that the car stays where it is."""
 STRAYED_M, STRAYED_RAD = 0.20, math.radians(12.0)
 """Deviation from the path, m and rad, that triggers replanning."""
 

@@ -28,9 +28,9 @@ ACTION_REPEAT = 4
 BEAMS = 48
 """Number of directions in which free distance is measured, all around, the first one ahead."""
 FARTHEST_M = 10.0
-"""Greatest measured free distance, m."""
+"""Maximum measured free distance, m."""
 SPEEDS = (2.0, 1.5)
-"""Greatest commanded speed forward and backward, m/s: about the planner's."""
+"""Maximum commanded speed forward and backward, m/s: about that of the planner."""
 STAND = 0.2
 """Dead band of the speed command, within which the car stands."""
 OBSERVATION_SIZE = 8 + BEAMS

@@ -16,7 +16,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 CHECK_M = 0.15
-"""Greatest distance, m, between checked poses."""
+"""Maximum distance, m, between checked poses."""
 
 
 @compiled(error_model="numpy")

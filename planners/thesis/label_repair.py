@@ -24,7 +24,7 @@ from planners.thesis.label_setting import (
 from sim_sensors.compilation import compiled
 
 REACH = 0.1
-"""Part of the lot's vertices that a repair may touch before a pass from scratch takes over."""
+"""Fraction of the lot's vertices that a repair may change; above it the plan is made from scratch."""
 _LEAST_REACH = 64
 _AFFECTED = STOP + 1
 

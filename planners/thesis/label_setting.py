@@ -44,9 +44,9 @@ STOP = PARK
 TIE_S = 1e-7
 """s: actions whose values differ by less are equally good; solvers agree to well within it."""
 _BUCKETS_PER_VERTEX = 2
-"""Buckets per vertex at most, so that passing over empty ones costs little."""
+"""Maximum number of buckets per vertex, so that skipping empty ones costs little."""
 _REFILLS = 64
-"""How often all buckets may be refilled before a heap is faster."""
+"""Maximum number of refills of all buckets; beyond it a heap is faster."""
 
 
 class StoppingGraph(NamedTuple):

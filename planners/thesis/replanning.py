@@ -27,11 +27,11 @@ from planners.thesis.mdp import ParkingMDP
 from sim_sensors.compilation import compiled
 
 RELEVANT_CHANGE = 0.01
-"""Replan once a probability differs by more than this from the one that the plan was made for."""
+"""Replan once a probability differs by more than this from that of the plan."""
 SOLVERS = ("label_setting", "policy_iteration")
 """How plans are made: exactly in near-linear time, or as in the thesis. They lead to the same actions."""
 MOST_HOPS = 400
-"""Vertices of a plan that are previewed at most."""
+"""Maximum number of vertices of a plan preview."""
 
 
 @dataclass

@@ -28,7 +28,7 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 
 COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
-"""s, failure costs to choose from: twice as high each time."""
+"""s, failure costs to choose from; each is twice the previous one."""
 WORLDS = 128
 _MOST_STEPS = 2000
 _KEPT = 256

@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 Color = tuple[float, float, float]
 
 SHADOW_BIAS = 0.05
-"""m, toward the sun, against self-shadowing."""
+"""m, offset towards the sun, against self-shadowing."""
 
 _GROUND_TONE = 0.12  # albedo of the ground in reflections and for bounced light
 

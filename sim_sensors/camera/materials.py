@@ -43,7 +43,7 @@ for _material, _row in {
 }.items():
     RESPONSE[_material] = _row
 """(256, 4) float64, for every material: mirror reflection at normal incidence, width of the sun's glint (1 - cosine),
-roughness noise on the albedo, and how much of the sky it gets (things inside a car get little)."""
+roughness noise on the albedo, and fraction of the sky light that reaches it (low inside a car)."""
 
 _CODES = np.arange(256) / 255.0
 LINEAR = np.where(_CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4)

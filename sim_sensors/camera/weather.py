@@ -83,7 +83,7 @@ _PRESETS: dict[str, dict[str, _Drawn | float | Color]] = {
 }
 
 PRESETS = tuple(_PRESETS)
-"""Names of the kinds of weather."""
+"""Names of the weather presets."""
 
 
 @dataclass(frozen=True)

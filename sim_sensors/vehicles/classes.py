@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 BODIES = ("hatchback", "sedan", "estate", "suv", "van", "pickup")
-"""The kinds of body."""
+"""Body types."""
 
 BODY_SHARE = (0.37, 0.11, 0.16, 0.24, 0.10, 0.02)
 """How common each of `BODIES` is in a lot: a European fleet of about 2020, hatchbacks first, SUVs rising."""
@@ -71,7 +71,7 @@ SIZE_CLASSES: dict[str, tuple[SizeClass, ...]] = {
     ),
     "pickup": (SizeClass("N1", 1.0, (5.20, 5.40), (1.80, 1.92), (1.74, 1.86)),),  # Toyota Hilux, Ford Ranger
 }
-"""By body, the segments it comes in."""
+"""Segments of each body."""
 
 
 class Paint(NamedTuple):

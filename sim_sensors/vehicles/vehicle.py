@@ -41,7 +41,7 @@ FloatArray = NDArray[np.float64]
 KNEE_M = 0.5
 """Height of the laser plane above ground, m (T §3.3.2)."""
 FOOTPRINT_CORNERS = 24
-"""The most corners of a footprint."""
+"""Maximum number of corners of a footprint."""
 DETAILED, COARSE = 0, 1
 """Levels of detail of a mesh."""
 

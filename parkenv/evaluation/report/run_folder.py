@@ -82,7 +82,7 @@ class RunFolder:
         """Read the total time, s, of every search in `episodes.csv`, by `results.episode_key`; empty without the file.
 
         Raises:
-            InputError: this version does not write such a file.
+            InputError: the file is not in the format of this version.
         """
         file = self.path / "episodes.csv"
         if not file.exists():

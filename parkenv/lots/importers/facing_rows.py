@@ -1,4 +1,4 @@
-"""Which rows of slots face each other across an aisle, and to which side each row opens."""
+"""Find rows of slots that face each other across an aisle, and the side to which each row opens."""
 
 from __future__ import annotations
 
@@ -37,27 +37,27 @@ class FacingRows:
                     self._found[key] = (j, room)
 
     def row(self, i: int, side: int) -> int | None:
-        """The row across an aisle, or None."""
+        """Return the row across the aisle on a side, or None."""
         other, room = self._found.get((i, side), (None, np.inf))
         return other if AISLE[0] <= room <= AISLE[1] else None
 
     def is_blocked(self, i: int, side: int) -> bool:
-        """Whether another row stands back to back on that side."""
+        """Return whether another row is back to back on that side."""
         return self._found.get((i, side), (0, np.inf))[1] < AISLE[0]
 
 
 def opens_toward(rows: Sequence[Row], side: int | None, j: int, i: int) -> bool:
-    """Whether row j, open to a side, has row i there."""
+    """Return whether row j opens to a side and row i is there."""
     return side is not None and float(side * rows[j].left @ (rows[i].middle - rows[j].middle)) > 0.0
 
 
 def open_sides(
     rows: Sequence[Row], faced: FacingRows, xy: FloatArray, yaw: FloatArray | None, names: Sequence[str]
 ) -> list[int]:
-    """The side to which each row opens: 1 left, -1 right.
+    """Return the side to which each row opens: 1 left, -1 right.
 
     Raises:
-        AmbiguousLayoutError: a row could open to either side, or to none.
+        AmbiguousLayoutError: a row could open to both sides, or to neither.
     """
     sides: list[int | None] = [None] * len(rows)
     for i, row in enumerate(rows):
@@ -83,13 +83,13 @@ def open_sides(
                 f"{who} faces no other and could open to either side; give a yaw column", rows, xy
             )
         elif not facing:
-            # Parallel cars face the direction of traffic and stand on the right: the aisle is on their left.
+            # Parallel cars face the direction of traffic and park on the right: the aisle is on their left.
             heading = yaw[row.members[0]] if yaw is not None else 0.0
             sides[i] = 1 if np.array([np.cos(heading), np.sin(heading)]) @ row.along > 0.0 else -1
     for i, row in enumerate(rows):
         if sides[i] is not None:
             continue
-        # Rows on both sides: the row shares the aisle of the one that opens to it, if the other does not.
+        # Rows on both sides: if only one of them opens to this row, they share an aisle.
         toward = [
             side
             for side in (1, -1)

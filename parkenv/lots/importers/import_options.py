@@ -13,7 +13,7 @@ from parkenv.lots.local_frame import LocalFrame
 FloatArray = NDArray[np.float64]
 
 NEAR_ON_GLOBE = 1.0
-"""Degrees: a pair of numbers this near to a place on the globe is a latitude and a longitude, else metres."""
+"""Degrees: a pair of numbers this close to the lot's position is a latitude and a longitude, otherwise metres."""
 
 
 @dataclass(frozen=True)
@@ -21,10 +21,10 @@ class ImportOptions:
     """Goals, entries and bounds that complete or replace those of a file.
 
     Args:
-        goals: places that people walk to, pairs of numbers: metres east and north in the lot's frame or, in a file
-            with latitudes and longitudes, a latitude and a longitude (any pair within a degree of the place).
-        entries: places where cars enter, likewise.
-        bounds: two corners, likewise; elements outside are not read.
+        goals: walking destinations as pairs of numbers: metres east and north in the lot's frame or, for a file with
+            latitudes and longitudes, a latitude and a longitude (any pair within a degree of the lot).
+        entries: places where cars enter, in the same form.
+        bounds: two corners, in the same form; elements outside are not read.
         with_disabled: whether slots for disabled drivers count as slots.
 
     Raises:
@@ -43,7 +43,7 @@ class ImportOptions:
                     raise InputError(f"{what} is {point!r}, want two finite numbers")
 
     def box(self, frame: LocalFrame | None) -> tuple[float, float, float, float] | None:
-        """The bounds in the lot's frame: least x and y, greatest x and y, m; None without bounds.
+        """Return the bounds in the lot's frame: least x and y, greatest x and y, m; None without bounds.
 
         Raises:
             InputError: bounds without an area.
@@ -60,7 +60,7 @@ class ImportOptions:
 def points_in_frame(frame: LocalFrame | None, pairs: tuple[tuple[float, float], ...]) -> FloatArray:
     """Convert pairs of numbers to metres, (n, 2), in the lot's frame.
 
-    A pair within a degree of the frame's origin on the globe is a latitude and a longitude, any other metres.
+    A pair within a degree of the frame's origin is a latitude and a longitude; any other pair is metres.
     """
     points = np.array(pairs, dtype=np.float64).reshape(-1, 2)
     if frame is None or not len(points):

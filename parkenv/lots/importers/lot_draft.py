@@ -1,4 +1,4 @@
-"""The result of an import: a lot, or what a lot still lacks."""
+"""The result of an import: a lot, or an incomplete lot with a list of what is missing."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ class LotDraft:
         name: the lot's name.
         slot_ids: n_slots names.
         slots: their geometry, lot frame.
-        slot_source: n_slots names of what each slot was made from.
+        slot_source: n_slots names of the source of each slot.
         lanes: centre lines.
         entries: (n_entries, 2) m.
         goals: (n_goals, 2) m.
         walls: (k, 2) m each.
-        outlines: (k, 2) m each, parking areas in the file; for pictures.
-        found: what was found, a line each.
+        outlines: (k, 2) m each, parking areas in the file; for figures.
+        found: one line per finding.
         left_out: elements that were not used.
-        missing: what a search needs and the file lacks, a sentence each that states how to give it.
-        frame: of the lot on the globe; None if the file has none.
-        loose: (k, 2) m, centres of slots whose shape is unknown; for pictures.
+        missing: one sentence per missing part that a search needs, with how to provide it.
+        frame: geographic frame of the lot; None if the file has none.
+        loose: (k, 2) m, centres of slots whose shape is unknown; for figures.
     """
 
     name: str
@@ -67,7 +67,7 @@ class LotDraft:
 
     @classmethod
     def of_lot(cls, lot: ParkingLot) -> LotDraft:
-        """The draft of a lot that is complete already."""
+        """Return the draft of a complete lot."""
         return cls(
             name=lot.name,
             slot_ids=lot.slot_ids,
@@ -81,10 +81,10 @@ class LotDraft:
         )
 
     def lot(self) -> ParkingLot:
-        """Make the lot.
+        """Create the lot.
 
         Raises:
-            InputError: something is missing or the parts do not fit together; the message states what.
+            InputError: something is missing or the parts do not fit together; the message gives details.
         """
         if self.missing:
             raise InputError("; ".join(self.missing))
@@ -104,9 +104,9 @@ class LotDraft:
             raise InputError(f"{what} {problem.message}") from error
 
     def searchable(self) -> LotDraft:
-        """Leave out the slots that cannot be reached from an entry, and list them.
+        """Return the draft without slots that cannot be reached from an entry; they are listed in `left_out`.
 
-        An incomplete draft is returned as it is.
+        An incomplete draft is returned unchanged.
         """
         try:
             lot = self.lot()

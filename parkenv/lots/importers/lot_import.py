@@ -17,20 +17,20 @@ from parkenv.lots.lot_files import read_lot
 def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
     """Draft a lot from a file of a real place.
 
-    Supported are OpenStreetMap (`.osm`, `.xml`, Overpass JSON, overpass-turbo GeoJSON; see
+    Supported formats are OpenStreetMap (`.osm`, `.xml`, Overpass JSON, overpass-turbo GeoJSON; see
     `parkenv.lots.importers.osm`), lists of slot centres (`.csv`; see
     `parkenv.lots.importers.slot_list`), the Dragon Lake map and native lots.
-    Files in latitude and longitude are projected to metres east and north of their middle.
+    Latitudes and longitudes are projected to metres east and north of the file's centre.
 
     Args:
         path: the file.
-        options: goals, entries and bounds that the user gives.
+        options: goals, entries and bounds given by the user.
 
     Returns:
-        A draft; `LotDraft.lot()` makes it a lot, or states what is missing.
+        A draft; `LotDraft.lot()` converts it to a lot, or states what is missing.
 
     Raises:
-        InputError: the file cannot be read, holds no parking, or is of an unknown kind.
+        InputError: the file cannot be read, contains no parking, or has an unknown format.
     """
     path = Path(path)
     options = options or ImportOptions()

@@ -1,23 +1,23 @@
-"""Lots made from OpenStreetMap.
+"""Import lots from OpenStreetMap.
 
-What becomes a slot:
+Slots come from:
 
 - `amenity=parking_space` areas, by their outlines; one with a `capacity` is split into that many along its road;
-- `amenity=parking` areas that contain no such space, filled by the rule of `fill_outline`;
+- `amenity=parking` areas without such spaces, filled by the rule of `fill_outline`;
 - kerbside parking tagged on streets, see `osm_kerbs`.
 
-Left out, and listed, are spaces for disabled drivers (unless asked for; they are subtracted from a tagged
-capacity), private and closed parking, parking below the ground or on a deck, and spaces for other vehicles.
+The import leaves out, and lists, spaces for disabled drivers (unless requested; they are subtracted from a tagged
+capacity), private and closed parking, parking underground or on a deck, and spaces for other vehicles.
 
-What becomes a lane: `highway=service` ways. Where slots open to a public street, or the service roads are not
-connected, the public streets within 60 m of the slots are lanes too. Roads to which no slot opens and that lead
-nowhere are dropped. A slot opens to a parking aisle before another service road, and to that before a street.
+Lanes come from `highway=service` ways. If slots open to a public street, or the service roads are not connected, the
+public streets within 60 m of the slots are lanes too. Roads that serve no slot and lead nowhere are dropped. A slot
+prefers a parking aisle to another service road, and a service road to a street.
 
-Entries are where service roads meet a public street or, where streets are lanes, where these leave the map: at
-its edge, or else at their ends that are not tagged as blind. Goals are the building entrances (`entrance`) near
-the slots, main entrances first, or the middle of the nearest building. Buildings block the view. Traffic keeps to
-the right, as everywhere in parkenv: in a country that drives on the left, slots and lanes are correct, the sides
-are not.
+Entries are the points where service roads meet a public street or, if streets are lanes, where the streets leave the
+map: at its edge, or otherwise at ends not tagged as dead ends. Goals are the building entrances (`entrance`) near the
+slots, main entrances first, or the centre of the nearest building. Buildings block the view. Traffic keeps to the
+right, as everywhere in parkenv: in a country with left-hand traffic, slots and lanes are correct, but the sides are
+not.
 """
 
 from __future__ import annotations
@@ -59,25 +59,25 @@ from parkenv.world.lot import mouth_points
 FloatArray = NDArray[np.float64]
 
 OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "garage_boxes", "sheds")
-"""Values of `parking` whose slots do not lie open on the ground."""
+"""Values of `parking` for slots that are not in the open at ground level."""
 FARTHEST = 100_000.0
-"""How far from the middle of a map its parking and roads may lie, m."""
+"""Largest distance of parking and roads from the centre of a map, m."""
 STREETS_AROUND = 60.0
-"""How far beyond the slots streets are lanes, m, where no bounds are given."""
+"""Distance beyond the slots, m, within which streets are lanes if no bounds are given."""
 MAPPED_OVERLAP, RULE_OVERLAP = 0.4, 0.1
-"""Overlap, m, up to which slots stay that are drawn by hand, and that are made by rule."""
+"""Largest allowed overlap, m, of slots drawn by hand, and of slots created by rule."""
 
 
 def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
-    """Draft a lot from a file of OpenStreetMap; see the module for the rules.
+    """Draft a lot from an OpenStreetMap file; see the module for the rules.
 
     Args:
         path: `.osm`, `.xml`, or the JSON and GeoJSON of Overpass.
-        options: goals, entries and bounds that the user gives.
+        options: goals, entries and bounds given by the user.
 
     Raises:
-        InputError: the file is incomplete or of another format, holds no parking, an outline crosses itself, or its
-            elements lie too far apart.
+        InputError: the file is incomplete, has another format or contains no parking, an outline crosses itself, or
+            the elements are too far apart.
     """
     path = Path(path)
     importer = _OsmImporter(path, read_elements(path), options or ImportOptions())
@@ -110,7 +110,7 @@ class _Group:
 
 
 class _OsmImporter:
-    """What one file has given so far: roads, areas, slots, and what was left out."""
+    """The state of an import: roads, areas, slots, and elements left out."""
 
     def __init__(self, path: Path, elements: Sequence[OsmElement], options: ImportOptions) -> None:
         self.path = path
@@ -183,7 +183,7 @@ class _OsmImporter:
     # ---- slots ----
 
     def read_spaces(self) -> None:
-        """Make slots of mapped spaces."""
+        """Create slots from mapped spaces."""
         private = [a.polygon for a in self.outlines if closed_to_cars(a.element.tags)]
         kept: list[Area] = []
         for area in self.spaces:
@@ -213,7 +213,7 @@ class _OsmImporter:
             owners += [area.element.id] * len(parts)
         self.blocked += [area.polygon for area in kept]
 
-        # An aisle is preferred to another service road, and that to a street, even where these are nearer.
+        # Prefer an aisle to another service road, and that to a street, even if these are nearer.
         left = np.arange(len(polygons))
         array = np.array(polygons, dtype=np.object_)
         for rank in Rank:
@@ -279,7 +279,7 @@ class _OsmImporter:
                 self.notes.append(f"{name}: {len(slots)} of the tagged {capacity} slots fit by the rule")
 
     def line_kerbs(self) -> None:
-        """Make slots along streets."""
+        """Create slots along streets."""
         crossings = [e.lines[0] for e in self.nodes if e.tags.get("highway") == "crossing"]
         if not any(road.has_kerb_parking for road in self.roads):
             return
@@ -383,7 +383,7 @@ class _OsmImporter:
         return [names[i] for i in index], [sources[i] for i in index], slots[index], ranks[index]
 
     def _edge(self, slots: Slots) -> shapely.Geometry:
-        """The box within which streets are lanes."""
+        """Return the box within which streets are lanes."""
         if self.box is not None:
             return shapely.Polygon(shapely.box(*self.box))
         low, high = slots.xy.min(axis=0) - STREETS_AROUND, slots.xy.max(axis=0) + STREETS_AROUND
@@ -443,7 +443,7 @@ def _is_parking(element: OsmElement) -> bool:
 
 
 def _refuse_far_away(path: Path, elements: Sequence[OsmElement]) -> None:
-    """Refuse a map of more than one place: no plane preserves the distances of a continent."""
+    """Raise an error for a map of more than one place: a plane cannot preserve distances across a continent."""
     positions = np.concatenate([line for e in elements for line in e.lines])
     order = len(positions) // 2
     lon, lat = (float(np.partition(degrees, order)[order]) for degrees in positions.T)

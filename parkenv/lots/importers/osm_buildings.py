@@ -1,4 +1,4 @@
-"""Buildings of OpenStreetMap: the goals that people walk to, and the walls that block the view."""
+"""Goals and walls from buildings in OpenStreetMap."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from parkenv.lots.local_frame import LocalFrame
 FloatArray = NDArray[np.float64]
 
 ENTRANCE_REACH = 100.0
-"""How far from the nearest slot a building's entrance may lie to be a goal, m."""
+"""Largest distance, m, from the nearest slot of a building entrance that is a goal."""
 BUILDING_REACH = 200.0
-"""The same for the nearest building where there is no entrance."""
+"""The same for the nearest building if there is no entrance."""
 NOT_GOALS = ("no", "garage", "emergency", "exit", "service")
-"""Values of `entrance` that people do not walk to."""
+"""Values of `entrance` that are not goals."""
 NOT_WALKED_TO = ("garage", "garages", "carport", "roof", "shed", "parking", "hut", "no", "transformer_tower")
-"""Values of `building` that people do not walk to."""
+"""Values of `building` that are not goals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +38,10 @@ class Area:
 def find_goals(
     slots: Slots, nodes: Sequence[OsmElement], buildings: Sequence[Area], frame: LocalFrame
 ) -> tuple[FloatArray, str | None]:
-    """The places that people walk to, (n, 2) m, and a note on what they are.
+    """Return the goals, (n, 2) m, and a note that describes them.
 
-    These are the building entrances near the slots, main entrances first, or else the middle of the nearest
-    building; none where there is neither.
+    Goals are the building entrances near the slots, main entrances first, or else the centre of the nearest building;
+    without either there are none.
     """
     none = np.empty((0, 2))
     if not len(slots):
@@ -68,9 +68,9 @@ def find_goals(
 def split_walls(
     slots: Slots, roads: Sequence[Road], buildings: Sequence[Area]
 ) -> tuple[list[FloatArray], list[str]]:
-    """Outlines, (k, 2) m each, of the buildings near the slots, and the ids of those over slots or lanes.
+    """Return outlines, (k, 2) m each, of the buildings near the slots, and the ids of those over slots or lanes.
 
-    A building over a slot or a lane is no wall: cars pass below it.
+    A building over a slot or a lane is not a wall: cars pass below it.
     """
     if not len(slots) or not buildings:
         return [], []
@@ -90,7 +90,7 @@ def split_walls(
 
 
 def _distance_to_slots(slots: Slots, geometries: NDArray[np.object_]) -> FloatArray:
-    """Distance, (n,) m, from each of n geometries to the nearest slot centre."""
+    """Return the distance, (n,) m, from each of n geometries to the nearest slot centre."""
     tree = shapely.STRtree(np.asarray(shapely.points(slots.xy)))
     (index, _), distance = tree.query_nearest(geometries, all_matches=False, return_distance=True)
     result = np.full(len(geometries), np.inf)

@@ -4,8 +4,8 @@ Three formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Ove
 JSON (`elements`, with node references or `out geom;`), and GeoJSON as overpass-turbo and osmtogeojson write
 it (an element's id in `id` or `@id`, its tags in `properties` or `properties.tags`).
 
-OSM XML has no document type, so a file that declares one is refused before its entities are read: none
-can be expanded into gigabytes or made to fetch other files.
+OSM XML has no document type. A file that declares one is rejected before its entities are read, so entities cannot
+expand into gigabytes or fetch other files.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ class OsmElement:
     """A node, way or multipolygon.
 
     Attributes:
-        id: such as `way/123`, as in the map's own addresses.
+        id: such as `way/123`, as in OpenStreetMap URLs.
         tags: its keys and values.
-        lines: (k, 2) degrees, longitude first: a node's one position, a way's line, a multipolygon's outer
-            rings. A closed line ends where it starts.
+        lines: (k, 2) degrees, longitude first: the single position of a node, the line of a way, the outer rings of a
+            multipolygon. A closed line ends where it starts.
         holes: a multipolygon's inner rings.
     """
 
@@ -55,7 +55,7 @@ class OsmElement:
 
     @property
     def is_closed(self) -> bool:
-        """Whether all of its lines end where they start, round an area."""
+        """Whether all of its lines are closed, i.e. enclose an area."""
         return all(len(line) >= 4 and np.array_equal(line[0], line[-1]) for line in self.lines)
 
 
@@ -63,8 +63,8 @@ def read_elements(path: Path) -> list[OsmElement]:
     """Read all tagged nodes, ways and multipolygons of a file, in its order.
 
     Raises:
-        InputError: the file cannot be read, is incomplete or of another format, a position is not on the globe,
-            a tagged way refers to a node that is not in the file, or an element appears twice and differs.
+        InputError: the file cannot be read, is incomplete or has another format; a position is not on the globe; a
+            tagged way refers to a node that is not in the file; or an element appears twice with different content.
     """
     try:
         if path.suffix.lower() in (".osm", ".xml"):
@@ -185,7 +185,7 @@ class _Raw:
 
 
 def _rings(name: str, lines: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
-    """Closed rings of lines that meet end to end."""
+    """Join lines that meet end to end into closed rings."""
     if not lines:
         return ()
     joined = shapely.line_merge(shapely.MultiLineString([line.tolist() for line in lines]))
@@ -218,7 +218,7 @@ def _is_area_relation(tags: Mapping[str, str]) -> bool:
 
 
 class _XmlReader:
-    """Collects elements from an `ElementTree.XMLParser`, without a tree."""
+    """Target of an `ElementTree.XMLParser` that collects elements without building a tree."""
 
     def __init__(self) -> None:
         self.raw = _Raw()
@@ -299,7 +299,7 @@ def _read_xml(path: Path) -> list[OsmElement]:
 
 
 def elements_of_json(document: Any) -> list[OsmElement]:
-    """The elements of parsed Overpass JSON or GeoJSON.
+    """Return the elements of parsed Overpass JSON or GeoJSON.
 
     Raises:
         InputError: see `read_elements`; the message does not name the file.
@@ -358,7 +358,7 @@ def _geometry(name: str, holder: Mapping[str, Any]) -> FloatArray | None:
 
 
 def _feature_element(index: int, feature: Any) -> OsmElement | None:
-    """Convert a GeoJSON feature; None without a geometry that an import can use."""
+    """Convert a GeoJSON feature; None without a usable geometry."""
     if not isinstance(feature, dict):
         raise InputError(f"features[{index}] is {feature!r:.40}, want a GeoJSON feature")
     properties = feature["properties"] if _is_object(feature, "properties") else {}

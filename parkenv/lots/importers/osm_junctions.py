@@ -1,4 +1,4 @@
-"""Junctions of more lanes than a drive graph has moves."""
+"""Reduce junctions with more lanes than the drive graph has moves."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from parkenv.world.lot import MOVES, Lane
 FloatArray = NDArray[np.float64]
 
 JOIN_DISTANCE = 4.0
-"""Where on its neighbour, m from the junction, a lane joins that has no room at it; half of a shorter neighbour."""
+"""Distance from the junction, m, at which an excess lane joins its neighbour; half the length of a shorter one."""
 
 
 def limit_junctions(lanes: Sequence[Lane]) -> list[Lane]:
     """Change lanes so that at most four lead away from every junction.
 
-    Where more do, a lane that ends there joins the neighbouring arm a few metres before the junction instead.
-    A junction at which too few lanes end stays as it is.
+    At junctions with more, a lane that ends there joins the neighbouring arm a few metres before the junction instead.
+    A junction at which too few lanes end stays unchanged.
     """
     lines = [lane.points for lane in lanes]
     oneway = [lane.oneway for lane in lanes]
@@ -32,7 +32,7 @@ def limit_junctions(lanes: Sequence[Lane]) -> list[Lane]:
 
 
 def _leaving(lines: Sequence[FloatArray], oneway: Sequence[bool], at: set[tuple[int, int]]) -> int:
-    """The number of ways that lead away from a node, given as (lane, point) pairs."""
+    """Count the ways that lead away from a node, given as (lane, point) pairs."""
     forward = sum(i + 1 < len(lines[k]) for k, i in at)
     return forward + sum(i > 0 and not oneway[k] for k, i in at)
 
@@ -49,7 +49,7 @@ def _crowded_node(lines: Sequence[FloatArray], oneway: Sequence[bool]) -> set[tu
 
 
 def _move_lane_end(lines: list[FloatArray], users: set[tuple[int, int]]) -> bool:
-    """Move the end of the lane that lies closest to another arm onto that arm."""
+    """Move the end of the lane closest to another arm onto that arm."""
     arms = []  # lane, point, neighbouring point, whether the lane ends here
     for k, i in sorted(users):
         ends = i in (0, len(lines[k]) - 1)

@@ -1,8 +1,8 @@
-"""Kerbside parking as OpenStreetMap tags it on streets.
+"""Kerbside parking from OpenStreetMap's street tags.
 
 Both tagging schemes are read: `parking:left|right|both` with `:orientation`, `:capacity`, `:restriction` and
 `:access`, and the deprecated `parking:lane:left|right|both` with `parking:condition:...`. Restrictions at
-certain hours (`:conditional`) are ignored. A capacity of `both` sides is that of each side.
+certain hours (`:conditional`) are ignored. A capacity of `both` applies to each side.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ OLD_ORIENTATIONS = {
     **{"inline": "parallel", "orthogonal": "perpendicular", "marked": "parallel", "yes": "parallel"},
 }
 CORNER_CLEARANCE = 5.0
-"""From the kerbs' corner at a crossing of streets, and from a pedestrian crossing, to the first car, m."""
+"""Distance from the kerbs' corner at a junction, and from a pedestrian crossing, to the first car, m."""
 DRIVEWAY_CLEARANCE = 1.0
-"""From the edge of a service road that joins to the first car, m."""
+"""Distance from the edge of a joining service road to the first car, m."""
 SHORTEST_KERB_SLOT = 5.0
-"""Where a tagged capacity needs more slots than fit at the usual length, they are as short as this, m."""
+"""Smallest slot length, m, if a tagged capacity needs more slots than fit at the usual length."""
 STRAIGHT_ON = np.radians(30.0)
-"""Arms that turn off by less are the street itself, split into several ways."""
+"""Largest angle between an arm and the street at which the arm continues the street."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Kerb:
 
     Args:
         orientation: a key of `ARRANGEMENTS`.
-        capacity: how many slots; None where the tags do not say.
+        capacity: number of slots; None if not tagged.
         on_carriageway: whether parked cars are within `width`.
     """
 
@@ -63,7 +63,7 @@ class Kerb:
 
 
 def kerb_of(tags: Mapping[str, str], side: Side) -> Kerb | str | None:
-    """Parking on one side of a way by its tags; a reason where parking is tagged but unusable; None without tags."""
+    """Return the parking on one side of a way; a reason if tagged but unusable; None without tags."""
 
     def tag(start: str, end: str = "") -> str | None:
         return tags.get(f"{start}:{side}{end}", tags.get(f"{start}:both{end}"))
@@ -95,17 +95,17 @@ def kerb_of(tags: Mapping[str, str], side: Side) -> Kerb | str | None:
 
 
 def kerb_slots(road: Road, side: Side, kerb: Kerb, closed: Sequence[tuple[float, float]]) -> Slots:
-    """Make the slots along one side of a road.
+    """Create the slots along one side of a road.
 
-    Cars face the direction of traffic, on the right. There are as many slots as fit at 6 m (2.5 m across the
-    street), or as are tagged, spread over the free intervals; but no more than fit at 5 m. A tagged `width`
-    includes cars parked on the carriageway.
+    Cars face the direction of traffic, on the right. The number of slots is the tagged one, at most as many as fit at
+    5 m, or otherwise as many as fit at 6 m (2.5 m if cars park across the street). Slots are spread over the free
+    intervals. A tagged `width` includes cars parked on the carriageway.
 
     Args:
         road: the road.
-        side: as seen in the order of its points.
-        kerb: how cars park.
-        closed: intervals, from and to, m from the road's start, that stay free.
+        side: side of the road in the order of its points.
+        kerb: arrangement of the parked cars.
+        closed: intervals that stay free, start and end in m from the road's start.
     """
     how = ARRANGEMENTS[kerb.orientation]
     total = float(np.hypot(*np.diff(road.points, axis=0).T).sum())
@@ -160,7 +160,7 @@ def _distribute(
 
 
 class Junctions:
-    """Where roads meet, and which parts of a kerb stay free because of it.
+    """The junctions of roads, and the parts of kerbs that they keep free.
 
     Args:
         roads: all roads, whether cars may park there or not.
@@ -174,7 +174,7 @@ class Junctions:
         self._first = np.cumsum([0] + [len(road.points) for road in roads])
         self._label = label
         self._crossings = set(label[self._first[-1] :].tolist())
-        # For every node the arms that leave it: road, unit vector.
+        # For every node, its arms: road, unit vector.
         self._arms: dict[int, list[tuple[int, FloatArray]]] = {}
         for k, road in enumerate(roads):
             for i, at in enumerate(label[self._first[k] : self._first[k + 1]].tolist()):
@@ -184,10 +184,10 @@ class Junctions:
                         self._arms.setdefault(at, []).append((k, away / np.hypot(*away)))
 
     def closed_intervals(self, k: int, side: Side) -> list[tuple[float, float]]:
-        """Intervals of a side of road k, from and to, m from its start, where parking is forbidden.
+        """Return the intervals without parking on a side of road k, start and end in m from its start.
 
-        At junctions with streets both sides stay free for 5 m beyond the corner and the cars parked round it, at
-        service roads the side that they join, at pedestrian crossings 5 m before and after.
+        At junctions with streets, both sides stay free for 5 m beyond the corner and the cars parked around it; at
+        service roads, the side that they join; at pedestrian crossings, 5 m before and after.
         """
         points = self._roads[k].points
         stations = np.r_[0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T))].tolist()

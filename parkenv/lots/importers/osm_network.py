@@ -1,4 +1,4 @@
-"""The network that OpenStreetMap's roads form: where they meet, which of them serve slots, where cars come in."""
+"""The road network from OpenStreetMap: junctions, roads that serve slots, and entries."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ FloatArray = NDArray[np.float64]
 
 
 def lanes_of(roads: Sequence[Road]) -> list[Lane]:
-    """One lane per road."""
+    """Return one lane per road."""
     return [Lane(road.points, road.oneway) for road in roads]
 
 
 def clipped_road(road: Road, box: shapely.Geometry) -> list[Road]:
-    """The parts of a road within a box, each in the direction of the road."""
+    """Return the parts of a road within a box, each in the direction of the road."""
     line = shapely.LineString(road.points)
     if shapely.covers(box, line):
         return [road]
@@ -40,11 +40,11 @@ def clipped_road(road: Road, box: shapely.Geometry) -> list[Road]:
 
 
 def used_roads(roads: Sequence[Road], around: Sequence[Road], slots: Slots) -> list[Road]:
-    """The roads connected to slots, without service roads that lead to no slot.
+    """Return the roads connected to slots, without service roads that do not lead to a slot.
 
     Args:
         roads: candidates for lanes.
-        around: roads that are no candidates but keep a road that meets them from being a dead end.
+        around: other roads; a road that meets one of them is not a dead end.
         slots: the slots to reach.
     """
     parts = components_with_slots(roads, slots)
@@ -63,9 +63,9 @@ def used_roads(roads: Sequence[Road], around: Sequence[Road], slots: Slots) -> l
 
 
 def open_ends(roads: Sequence[Road], edge: shapely.Geometry, blind: FloatArray) -> FloatArray:
-    """Where streets leave the map and cars may drive in, (n, 2) m.
+    """Return the points where streets leave the map and cars may enter, (n, 2) m.
 
-    These are the road ends at the edge of the map or, where no road is cut there, all ends that are not blind.
+    These are the road ends at the edge of the map or, if no road ends there, all ends that are not dead ends.
 
     Args:
         roads: all lanes.
@@ -90,13 +90,13 @@ def open_ends(roads: Sequence[Road], edge: shapely.Geometry, blind: FloatArray) 
 
 
 def _road_nodes(roads: Sequence[Road]) -> list[NDArray[np.int64]]:
-    """Node labels of the points of each road; roads meet where they share a label."""
+    """Return the node labels of the points of each road; roads meet where they share a label."""
     label = node_labels(np.concatenate([road.points for road in roads]))
     return np.split(label, np.cumsum([len(road.points) for road in roads])[:-1])
 
 
 def _serving_roads(roads: Sequence[Road], slots: Slots) -> set[int]:
-    """Indices of the roads that are the nearest one to the mouth of some slot."""
+    """Return the indices of the roads that are nearest to the mouth of some slot."""
     if not roads or not len(slots):
         return set()
     mouth = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
@@ -106,7 +106,7 @@ def _serving_roads(roads: Sequence[Road], slots: Slots) -> set[int]:
 
 
 def components_with_slots(roads: Sequence[Road], slots: Slots) -> list[list[Road]]:
-    """The connected components of the roads, without those that serve no slot."""
+    """Return the connected components of the roads, without those that serve no slot."""
     if not roads:
         return []
     along = _road_nodes(roads)
@@ -120,7 +120,7 @@ def components_with_slots(roads: Sequence[Road], slots: Slots) -> list[list[Road
 
 
 def _shared_node_counts(roads: Sequence[Road], around: Sequence[Road]) -> list[int]:
-    """The number of nodes that each road shares with other roads of either list."""
+    """Count the nodes that each road shares with other roads of either list."""
     along = [set(p.tolist()) for p in _road_nodes([*roads, *around])]
     users: dict[int, int] = {}
     for labels in along:
@@ -130,14 +130,14 @@ def _shared_node_counts(roads: Sequence[Road], around: Sequence[Road]) -> list[i
 
 
 def street_junctions(roads: Sequence[Road], streets: Sequence[Road]) -> FloatArray:
-    """Where cars turn in from a street: (n, 2) m, nodes that a road shares with a street."""
+    """Return the nodes that a road shares with a street, where cars turn in, (n, 2) m."""
     if not streets:
         return np.empty((0, 2))
     along = _road_nodes([*roads, *streets])
     public = set(np.concatenate(along[len(roads) :]).tolist())
     shared: dict[int, FloatArray] = {}
     for road, on_road in zip(roads, along, strict=False):
-        # Cars cannot enter by the end of a one-way road.
+        # Cars cannot enter at the end of a one-way road.
         last = len(on_road) - 1 if road.oneway else len(on_road)
         for i in range(last):
             if int(on_road[i]) in public:
@@ -146,12 +146,12 @@ def street_junctions(roads: Sequence[Road], streets: Sequence[Road]) -> FloatArr
 
 
 def dead_ends(roads: Sequence[Road]) -> FloatArray:
-    """Road ends, (n, 2) m, at which no other road begins."""
+    """Return the road ends, (n, 2) m, at which no other road begins."""
     return np.array([xy for _, xy, _ in road_ends(roads)]).reshape(-1, 2)
 
 
 def road_ends(roads: Sequence[Road]) -> list[tuple[Road, FloatArray, bool]]:
-    """Road ends that no other road shares: the road, the point (2,) m, and whether it is the road's first point."""
+    """Return unshared road ends: the road, the point, (2,) m, and whether it is the road's first point."""
     along = _road_nodes(roads)
     users = np.bincount(np.concatenate(along))
     return [

@@ -1,4 +1,4 @@
-"""Parking areas of which only the outline is mapped: rows of slots by rule."""
+"""Fill parking areas that are mapped only by their outline with rows of slots."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from parkenv.world.lot import mouth_heading, mouth_points
 FloatArray = NDArray[np.float64]
 
 OUTLINE_TOLERANCE = 0.4
-"""How far, m, a slot may stick out of the outline: as exact as outlines are drawn."""
+"""Largest overhang, m, of a slot beyond the outline: the accuracy of mapped outlines."""
 PHASES = (0.0, 0.25, 0.5, 0.75)
-"""A row is tried at these shares of a slot's width along its aisle; the one that holds most slots counts."""
+"""Trial offsets of a row along its aisle, as fractions of a slot's width; the one with the most slots is used."""
 CORRIDOR = 0.8
-"""Share of a road's half width into which no slot of another road may reach."""
+"""Fraction of a road's half width that must be clear of slots of other roads."""
 
 
 def fill_outline(
@@ -43,21 +43,20 @@ def fill_outline(
 ) -> Slots:
     """Fill an area with slots by rule: rows of 2.5 × 5 m along both sides of every aisle.
 
-    Cars stand across the aisle unless an orientation is given; where they do not fit and 6 × 2.1 m along the
-    aisle do, they park along it. Rows begin at the edge of the carriageway, or at the outline where the road passes
-    outside. A slot lies in the outline, clear of the roads and of all that blocks, and the road that it
-    opens to is the nearest to its mouth. Rows with more slots are placed first; slots beyond the capacity are
-    dropped from the end.
+    Cars park across the aisle unless an orientation is given; if only slots of 6 × 2.1 m along the aisle fit, cars park
+    along it. Rows begin at the edge of the carriageway, or at the outline if the road passes outside. A slot is inside
+    the outline, clear of roads and blocked areas, and its mouth is nearest to its own road. Rows with more slots are
+    placed first; slots beyond the capacity are dropped from the end.
 
     Args:
         outline: the area, m.
-        roads: those that pass it within 8 m.
-        blocked: what slots must not lie on: buildings, mapped slots.
+        roads: roads that pass it within 8 m.
+        blocked: areas without slots: buildings, mapped slots.
         orientation: a key of `ARRANGEMENTS`, or None.
-        capacity: how many cars the area holds, or None.
+        capacity: number of slots in the area, or None.
 
     Returns:
-        The slots; none without a road nearby.
+        The slots; empty without a road nearby.
     """
     if not roads:
         return NO_SLOTS
@@ -91,21 +90,21 @@ def fill_outline(
 
 
 def _intervals(line: shapely.LineString, outline: shapely.Geometry) -> list[tuple[float, float]]:
-    """The parts of a road that pass the outline, from and to, m from its start."""
+    """Return the parts of a road that pass the outline, start and end in m from its start."""
     parts = shapely.get_parts(shapely.intersection(line, shapely.buffer(outline, SLOT_REACH)))
     ends = [
         sorted(line.project(shapely.Point(xy)) for xy in shapely.get_coordinates(part)[[0, -1]])
         for part in parts
         if part.length > 0.0
     ]
-    # A road that runs in a ring through the area starts and ends at one place.
+    # A ring road through the area starts and ends at the same point.
     return [(0.0, line.length) if end - start < 1e-6 else (float(start), float(end)) for start, end in ends]
 
 
 def _row(
     road: Road, side: Side, start: float, end: float, how: Arrangement, outline: shapely.Geometry
 ) -> Slots:
-    """All slots between two stations of a road, as near to it as road and outline allow."""
+    """Return all slots between two stations of a road, as close to it as road and outline allow."""
     n = max(int((end - start + DRAWN) / how.pitch), 0)
     stations = np.asarray(start + (np.arange(n) + 0.5) * how.pitch, dtype=np.float64)
     anchors = row_anchors(road.points, stations, how.pitch, side)
@@ -124,7 +123,7 @@ def _fitting(
     lines: NDArray[np.object_],
     own: int,
 ) -> Slots:
-    """The slots that lie in the outline, on nothing else, and open to their own road."""
+    """Return the slots that are inside the outline, clear of everything else, and open to their own road."""
     if not len(slots):
         return slots
     boxes = boxes_of(slots, shrink=0.02)
@@ -132,7 +131,7 @@ def _fitting(
     mouth = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
     distance = shapely.distance(np.asarray(shapely.points(mouth))[:, None], lines[None])
     fits &= distance[:, own] <= np.minimum(distance.min(axis=1) + 1e-6, SLOT_REACH)
-    # The nearest place of a road that ends or bends may lie behind the mouth.
+    # The nearest point of a road that ends or bends may be behind the mouth.
     on_line = shapely.get_coordinates(
         shapely.line_interpolate_point(
             lines[own], shapely.line_locate_point(lines[own], shapely.points(mouth))

@@ -1,4 +1,4 @@
-"""Roads that cars may drive, as OpenStreetMap tags them."""
+"""Roads open to cars, from OpenStreetMap tags."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ STREET_WIDTH = {
     "living_street": 5.0,
     "service": 5.0,
 }
-"""Carriageway, m, without parked cars, of two-way roads that tag neither `width` nor `lanes`."""
+"""Carriageway width, m, without parked cars, of two-way roads without the tags `width` and `lanes`."""
 AISLE_WIDTH = 6.0
-"""The same of a `service=parking_aisle`."""
+"""The same for a `service=parking_aisle`."""
 LANE_WIDTH = 3.0
-"""Of each lane that `lanes` counts, m."""
+"""Width of each of the tagged `lanes`, m."""
 NOT_FOR_PARKING = ("drive-through", "emergency_access", "bus")
-"""Kinds of `highway=service` that are no lanes."""
+"""Kinds of `highway=service` that are not lanes."""
 
 
 class Rank(IntEnum):
-    """Kind of road; a slot that faces several roads opens to the one of least rank."""
+    """Kind of road; a slot that faces several roads opens to the one of lowest rank."""
 
     AISLE = 0
     SERVICE = 1
@@ -44,15 +44,15 @@ class Rank(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Road:
-    """A way that cars may drive.
+    """A way open to cars.
 
     Args:
-        id: `way/123`.
-        tags: of the way.
-        points: (k, 2) m, in the direction of traffic where it is one-way.
-        rank: what kind of road.
-        oneway: whether cars drive in the order of the points only.
-        turned: whether the points are in reverse order of the way, so that its tags for left and right swap.
+        id: such as `way/123`.
+        tags: tags of the way.
+        points: (k, 2) m, in the direction of traffic if one-way.
+        rank: kind of road.
+        oneway: whether cars may drive only in the order of the points.
+        turned: whether the points are in reverse order of the way, which swaps its tags for left and right.
     """
 
     id: str
@@ -64,7 +64,7 @@ class Road:
 
     @property
     def half_width(self) -> float:
-        """From the centre line to the edge of the carriageway without parked cars, m."""
+        """Distance from the centre line to the edge of the carriageway without parked cars, m."""
         width = metres(self.tags.get("width"))
         if width is not None and not self.has_kerb_parking:
             return width / 2
@@ -84,7 +84,7 @@ class Road:
 
 
 def road_of(element_id: str, tags: Mapping[str, str], points: FloatArray) -> Road | str | None:
-    """Make a road of a way; a reason where a road is left out; None for any other way."""
+    """Create a road from a way; returns a reason if the road is left out, None if the way is not a road."""
     kind = tags.get("highway", "").removesuffix("_link")
     if kind not in STREET_WIDTH or tags.get("area") == "yes":
         return None
@@ -114,7 +114,7 @@ def road_of(element_id: str, tags: Mapping[str, str], points: FloatArray) -> Roa
 
 
 def closed_to_cars(tags: Mapping[str, str]) -> str | None:
-    """The tag that excludes cars (the most specific access tag decides), or None."""
+    """Return the tag that excludes cars (the most specific access tag decides), or None."""
     for key in ("motorcar", "motor_vehicle", "vehicle", "access"):
         if key in tags:
             return f"{key}={tags[key]}" if tags[key] in ("no", "private") else None
@@ -122,7 +122,7 @@ def closed_to_cars(tags: Mapping[str, str]) -> str | None:
 
 
 def off_the_ground(tags: Mapping[str, str]) -> str | None:
-    """The tag that places an element below the ground or on a deck, or None."""
+    """Return the tag that places an element underground or on a deck, or None."""
     if tags.get("tunnel", "no") not in ("no", "building_passage"):
         return f"tunnel={tags['tunnel']}"
     if tags.get("location") in ("underground", "indoor", "roof"):

@@ -18,12 +18,12 @@ Side = Literal["left", "right"]
 
 @dataclass(frozen=True)
 class Arrangement:
-    """How cars park along a road.
+    """Arrangement of parked cars along a road.
 
     Args:
-        angle: rad, between the road and the cars, from 0 (along it) to π/2 (across).
-        length: of a slot, m.
-        width: of a slot, m.
+        angle: angle between the road and the cars, rad, from 0 (along it) to π/2 (across).
+        length: length of a slot, m.
+        width: width of a slot, m.
     """
 
     angle: float
@@ -32,7 +32,7 @@ class Arrangement:
 
     @property
     def pitch(self) -> float:
-        """From one slot to the next along the road, m."""
+        """Distance from one slot to the next along the road, m."""
         return self.length if self.angle == 0.0 else self.width / float(np.sin(self.angle))
 
 
@@ -41,15 +41,15 @@ ARRANGEMENTS = {
     "diagonal": Arrangement(np.pi / 3, *BAY_SIZE),
     "perpendicular": Arrangement(np.pi / 2, *BAY_SIZE),
 }
-"""By the values of OpenStreetMap's `orientation`; diagonal cars stand at 60°."""
+"""Arrangement for each value of OpenStreetMap's `orientation`; diagonal cars park at 60°."""
 DRAWN = 0.05
-"""Length, m, by which a row may be too short: OpenStreetMap's seven digits round to a centimetre."""
+"""Tolerance, m, of the length of a row: OpenStreetMap's seven digits round to a centimetre."""
 NO_SLOTS = bay_row((0.0, 0.0), 0.0, 0)
 
 
 @dataclass(frozen=True, eq=False)
 class RowAnchors:
-    """Where the slots of a row meet the road: n points on its centre line.
+    """Anchors of a row's slots: n points on the road's centre line.
 
     Args:
         xy: (n, 2) m.
@@ -63,7 +63,7 @@ class RowAnchors:
 
 
 def row_anchors(points: FloatArray, stations: FloatArray, pitch: float, side: Side) -> RowAnchors:
-    """Anchors on a road, points (k, 2) m, at stations, (n,) m from its start; a slot takes `pitch` m of the road."""
+    """Return anchors on a road, (k, 2) m, at stations, (n,) m from its start; a slot takes `pitch` m of the road."""
     run = np.r_[0.0, np.cumsum(np.hypot(*np.diff(points, axis=0).T))]
     ends = [
         np.stack([np.interp(stations + half, run, points[:, i]) for i in (0, 1)], axis=1)
@@ -76,12 +76,12 @@ def row_anchors(points: FloatArray, stations: FloatArray, pitch: float, side: Si
 
 
 def row_at(anchors: RowAnchors, offset: FloatArray | float, how: Arrangement, *, with_points: bool) -> Slots:
-    """Make the slots of a row.
+    """Create the slots of a row.
 
     Args:
-        anchors: where the row meets its road.
-        offset: m, (n,) or one for all, from the centre line to the near edge of the slots.
-        how: how cars park.
+        anchors: anchors of the row on its road.
+        offset: distance from the centre line to the near edge of the slots, m, (n,) or scalar.
+        how: arrangement of the parked cars.
         with_points: whether cars pass the row in the order of the road's points.
     """
     heading = anchors.along if with_points else -anchors.along
@@ -93,7 +93,7 @@ def row_at(anchors: RowAnchors, offset: FloatArray | float, how: Arrangement, *,
         on_right = heading[:, 1] * outward[:, 0] - heading[:, 0] * outward[:, 1] > 0.0
         mouth = np.where(on_right, Mouth.LEFT, Mouth.RIGHT)
     else:
-        # The near corner of an angled slot touches the edge, so the middle of its mouth lies behind it.
+        # The near corner of an angled slot touches the edge, so the middle of its mouth is behind it.
         center = anchors.xy + (reach + how.width / 2 * np.cos(how.angle)) * outward + how.length / 2 * nose
         mouth = np.full(len(outward), int(Mouth.REAR))
     return Slots(
@@ -106,9 +106,9 @@ def row_at(anchors: RowAnchors, offset: FloatArray | float, how: Arrangement, *,
 
 
 def bend_factor(points: FloatArray, start: float, end: float, side: Side, reach: float) -> float:
-    """How much longer a part of a road is than its parallel `reach` m to a side; at least 1.
+    """Return the length ratio of a part of a road to its parallel `reach` m to a side; at least 1.
 
-    On the inside of a bend slots need more room along the road by this factor.
+    On the inside of a bend, slots need more room along the road by this factor.
     """
     n = max(int((end - start) / 2.0), 2)
     step = (end - start) / n
@@ -120,7 +120,7 @@ def bend_factor(points: FloatArray, start: float, end: float, side: Side, reach:
 
 
 def boxes_of(slots: Slots, shrink: float = 0.0) -> NDArray[np.object_]:
-    """The slots' rectangles, (n,) polygons, m, narrower and shorter by `shrink` m."""
+    """Return the slots' rectangles, (n,) polygons, m, narrower and shorter by `shrink` m."""
     if not len(slots):
         return np.empty(0, dtype=np.object_)
     corners = corner_points(slots.xy, slots.yaw, slots.length - shrink, slots.width - shrink)
@@ -128,7 +128,7 @@ def boxes_of(slots: Slots, shrink: float = 0.0) -> NDArray[np.object_]:
 
 
 def without_overlaps(boxes: NDArray[np.object_]) -> NDArray[np.bool_]:
-    """Mask, (n,), of the rectangles to keep so that no two of them overlap; earlier ones take precedence."""
+    """Return the mask, (n,), of rectangles to keep so that none overlap; earlier ones take precedence."""
     kept = np.ones(len(boxes), dtype=bool)
     if len(boxes) < 2:
         return kept

@@ -1,4 +1,4 @@
-"""Mapped parking spaces of OpenStreetMap: which of them are slots, and their outlines."""
+"""Slots from mapped parking spaces in OpenStreetMap."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from parkenv.world.lot import Lane
 CAR_SPACES = ("normal", "yes", "car", "parent", "parents", "women", "woman", "customers", "residents")
 """Values of `parking_space` that any car may use."""
 LARGEST_SPACE = 30.0
-"""m²; a larger space without a capacity counts as several and is left out."""
+"""Largest area of a slot, m²; a larger space without a capacity counts as several and is left out."""
 
 
 def why_no_slot(
@@ -24,12 +24,12 @@ def why_no_slot(
     *,
     with_disabled: bool,
 ) -> str | None:
-    """Why a mapped space is no slot; None for a slot.
+    """Return the reason why a mapped space is not a slot; None for a slot.
 
     Args:
-        tags: of the space.
+        tags: tags of the space.
         polygon: its outline, m.
-        private: outlines of the parking areas that are closed to the public, m.
+        private: outlines of parking areas closed to the public, m.
         with_disabled: whether spaces for disabled drivers are slots.
     """
     kind = tags.get("parking_space", "normal")
@@ -56,7 +56,7 @@ def why_no_slot(
 def squared(polygon: shapely.Geometry) -> shapely.Geometry:
     """Turn a parallelogram into the rectangle along its longer sides with the same centre and area.
 
-    Polygons without exactly four corners are returned as they are.
+    Polygons without exactly four corners are returned unchanged.
     """
     corners = shapely.get_coordinates(polygon)
     if len(corners) != 5:

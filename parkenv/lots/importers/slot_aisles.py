@@ -17,15 +17,15 @@ from parkenv.world.lot import Lane
 FloatArray = NDArray[np.float64]
 
 OPEN_AISLE = TWO_WAY_HALF_WIDTH
-"""From the mouths of a row that faces none to the middle of its aisle, and from an aisle's last slot to its end, m."""
+"""Distance from a row without a facing row to the middle of its aisle, and from an aisle's last slot to its end, m."""
 ACROSS_GAP = 15.0
-"""Widest gap, m, in the rows that an aisle goes on across."""
+"""Widest gap, m, in the rows across which an aisle continues."""
 LEAST_GAP = 4.5
 """Least width, m, of a gap in a row through which a road may lead."""
 SAME_AISLE = 1.5
-"""Farthest, m, that the lines of two pieces of one aisle lie apart."""
+"""Largest offset, m, between the lines of two pieces of one aisle."""
 SAME_STOP = 1.5
-"""Roads that meet an aisle closer to each other than this, m, meet it at one place."""
+"""Distance, m, within which roads that meet an aisle share one junction."""
 ROAD_HALF_WIDTH = 1.25
 LONGEST_LINK = 60.0
 """Longest road, m, between two aisles."""
@@ -46,12 +46,12 @@ class Aisle:
 
 
 def find_aisles(rows: Sequence[Row], sides: Sequence[int], faced: FacingRows) -> list[Aisle]:
-    """The aisles that rows open to, midway between rows that face each other.
+    """Return the aisles that rows open to, midway between rows that face each other.
 
     Args:
         rows: all rows.
         sides: the side to which each row opens, 1 left, -1 right.
-        faced: which rows face each other.
+        faced: the rows that face each other.
     """
     pieces: list[Aisle] = []
     done: set[tuple[int, int]] = set()
@@ -76,7 +76,7 @@ def find_aisles(rows: Sequence[Row], sides: Sequence[int], faced: FacingRows) ->
 
 
 def _joined(pieces: Sequence[Aisle]) -> list[Aisle]:
-    """Merge pieces in one line; an aisle continues across gaps of up to `ACROSS_GAP`."""
+    """Merge collinear pieces; an aisle continues across gaps of up to `ACROSS_GAP`."""
     left = list(pieces)
     while True:
         for a, one in enumerate(left):
@@ -111,7 +111,7 @@ def _in_line(one: Aisle, other: Aisle) -> bool:
 
 
 def extended_aisle(aisle: Aisle, mouth_xy: FloatArray) -> Aisle:
-    """Extend an aisle beyond its last slots by half its width, so that these still open to it."""
+    """Extend an aisle by half its width beyond its last slots, so that they still open to it."""
     line = shapely.LineString([aisle.start, aisle.end])
     beyond = max(OPEN_AISLE, float(shapely.distance(shapely.MultiPoint(mouth_xy), line))) * aisle.along
     return Aisle(aisle.start - beyond, aisle.end + beyond)
@@ -124,7 +124,7 @@ def lanes_through(
     mouth_xy: FloatArray,
     xy: FloatArray,
 ) -> list[Lane]:
-    """Make lanes of the aisles and of the roads that connect them, with common points where they meet.
+    """Create lanes from the aisles and the roads that connect them, with common points where they meet.
 
     Raises:
         AmbiguousLayoutError: an aisle would cross slots, or no road connects some aisles.
@@ -142,7 +142,7 @@ def lanes_through(
     links = _links(aisles, rows, boxes, mouth_xy)
     part = np.arange(len(aisles))
     chosen: list[tuple[int, int, FloatArray, FloatArray]] = []
-    # All roads perpendicular to the aisles are built; others only where nothing else connects two components.
+    # Build all roads perpendicular to the aisles; others only if nothing else connects two components.
     for square in (True, False):
         for i, j, start, end, is_square in links:
             if is_square == square and (square or part[i] != part[j]):
@@ -173,7 +173,7 @@ def lanes_through(
 def _links(
     aisles: Sequence[Aisle], rows: Sequence[Row], boxes: NDArray[np.object_], mouth_xy: FloatArray
 ) -> list[tuple[int, int, FloatArray, FloatArray, bool]]:
-    """Roads that could connect two aisles: indices, ends, whether perpendicular to the second; shortest first."""
+    """Return possible roads between two aisles, shortest first: indices, ends, whether perpendicular to the second."""
     lines = np.array([shapely.LineString([aisle.start, aisle.end]) for aisle in aisles])
     tree = shapely.STRtree(boxes)
     mouths = np.asarray(shapely.points(mouth_xy))
@@ -216,7 +216,7 @@ def _links(
 
 
 def _gaps_between_rows(aisle: Aisle, rows: Sequence[Row]) -> list[FloatArray]:
-    """Points on an aisle next to gaps between two rows in one line."""
+    """Return points on an aisle next to gaps between two collinear rows."""
     points = []
     for a, row in enumerate(rows):
         for other in rows[a + 1 :]:

@@ -2,17 +2,16 @@
 
 1. A slot's row runs toward its nearest neighbour. Neighbours at about that distance whose rows have the same
    direction form one row, which must be straight. Single slots and pairs join a row in line with them.
-2. With a yaw, the angle between cars and row tells how cars park. Without, rows with a slot every 3.7 m or less
-   are taken for perpendicular, with one every 4.8 m or more for parallel parking.
-3. Two parallel rows with 2.8 to 10 m between them face each other across an aisle; closer ones stand back to
-   back. A row opens to the side on which it faces another or, where it faces none, to the side without a
-   neighbour. A yaw decides the side for cars that are not parallel to the aisle; parallel cars have it on their
-   left where no row is faced.
-4. Aisles run midway between the rows that open to them (3 m from a row that faces none), and continue across
-   gaps of up to 15 m. Roads connect them at their ends and through gaps in the rows, where no slot is in the way.
+2. With a yaw, the angle between cars and row determines the arrangement. Without, rows with a slot every 3.7 m or less
+   are perpendicular parking, with one every 4.8 m or more parallel parking.
+3. Two parallel rows with 2.8 to 10 m between them face each other across an aisle; closer ones are back to back. A row
+   opens to the side of its facing row or, without one, to the side without a neighbour. A yaw decides the side for
+   cars that are not parallel to the aisle; for parallel cars without a facing row the aisle is on their left.
+4. Aisles run midway between the rows that open to them (3 m from a row without a facing row), and continue across
+   gaps of up to 15 m. Roads connect them at their ends and through gaps in the rows, if no slot is in the way.
    All are two-way.
 
-Where a step is ambiguous, `infer_layout` refuses and states what it found.
+If a step is ambiguous, `infer_layout` raises an error that states what it found.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ from parkenv.world.lot import Lane, corner_points, mouth_points
 FloatArray = NDArray[np.float64]
 
 MOST_STRAYS = 0.1
-"""Greatest share of slots that may be in no row."""
+"""Largest allowed fraction of slots in no row."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,7 @@ class SlotLayout:
         slots: these slots.
         lanes: aisles and the roads that connect them, all two-way.
         strays: indices of the slots in no row.
-        found: what was found, a line each.
+        found: one line per finding.
     """
 
     index: tuple[int, ...]

@@ -21,19 +21,19 @@ FloatArray = NDArray[np.float64]
 
 COLUMNS = ("x", "y", "lat", "lon", "yaw", "id", "parking_cost_s")
 SAME_PLACE = 0.1
-"""Slots whose centres lie closer than this, m, are one slot listed twice."""
+"""Distance, m, within which two slot centres are one slot listed twice."""
 
 
 @dataclass(frozen=True, eq=False)
 class SlotList:
-    """Slots whose centres are known.
+    """Slots given by their centres.
 
     Args:
         ids: n_slots names.
         xy: (n_slots, 2) m.
         yaw: (n_slots,) rad, heading of a car parked nose-in; None without the column.
         parking_cost_s: (n_slots,) s, at least 0.
-        frame: of the lot on the globe; None for a file in metres.
+        frame: geographic frame of the lot; None for a file in metres.
     """
 
     ids: tuple[str, ...]
@@ -48,7 +48,7 @@ def read_slot_list(path: str | Path) -> SlotList:
 
     The first line names the columns: `x,y` in metres east and north, or `lat,lon` in degrees; optional are `yaw`,
     the heading in rad, counter-clockwise from east, of a car parked nose-in, `id` (by default the row number), and
-    `parking_cost_s`, what parking there costs in seconds (by default 0).
+    `parking_cost_s`, the parking cost in seconds (by default 0).
 
     Raises:
         InputError: the file cannot be read, a column is missing or unknown, a value is not a finite number or
@@ -124,8 +124,8 @@ def _require_apart(path: Path, xy: FloatArray, ids: tuple[str, ...], rows: tuple
 def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
     """Draft a lot from a list of slots.
 
-    See `parkenv.lots.importers.slot_layout` for the rules. Where they are ambiguous the draft has slot centres
-    only, and states so; it can still be drawn. A list states neither entries nor goals.
+    See `parkenv.lots.importers.slot_layout` for the rules. If they are ambiguous, the draft has only slot centres and
+    says so; it can still be drawn. A list has neither entries nor goals.
 
     Raises:
         InputError: see `read_slot_list`.

@@ -1,4 +1,4 @@
-"""Rows of slots, found from the slots' centres and, where known, their yaw."""
+"""Find rows of slots from the slots' centres and, if known, their yaw."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ IntArray = NDArray[np.int64]
 SPACING = (1.8, 8.0)
 """Least and greatest distance, m, from a slot to the next in its row."""
 SAME_SPACING = 1.3
-"""Neighbours in a row are at most this many times as far apart as the nearest one."""
+"""Largest distance of neighbours in a row, as a multiple of the nearest neighbour's distance."""
 SAME_WAY = np.radians(15.0)
-"""Greatest angle between a slot's row and the way to a neighbour in it."""
+"""Largest angle between a slot's row and the direction to a neighbour in it."""
 STRAIGHT = 0.6
-"""Farthest, m, that a slot's centre lies from the line of its row."""
+"""Largest distance, m, of a slot's centre from the line of its row."""
 PARALLEL_ROWS = np.radians(10.0)
 WIDEST_BAY, SHORTEST_KERB = 3.7, 4.8
 """Spacing, m, up to which a row without yaw is perpendicular, and from which it is parallel."""
 GAP_IN_ROW = 4.5
-"""Slots alone or in pairs belong to a row whose next slot is at most this many spacings away."""
+"""Largest distance, in spacings, at which single slots and pairs join a row."""
 
 
 class AmbiguousLayoutError(InputError):
     """Slot centres that allow several layouts of rows or aisles.
 
     Attributes:
-        found: what was found, a line each.
+        found: one line per finding.
         rows: (k, 2) m each, the slot centres of each row found, in order.
     """
 
@@ -55,12 +55,12 @@ class Row:
         members: (k,) indices, in order along the row.
         middle: (2,) m.
         along: (2,) unit vector.
-        low: m along the row from its middle to the outer edge of its first slot.
-        high: the same of its last slot.
-        spacing: m from slot to slot.
-        angle: rad, between row and cars, 0 to π/2.
-        length: of a slot, m.
-        width: of a slot, m.
+        low: position along the row of the outer edge of its first slot, m from its middle.
+        high: the same for its last slot.
+        spacing: distance from slot to slot, m.
+        angle: angle between row and cars, rad, 0 to π/2.
+        length: length of a slot, m.
+        width: width of a slot, m.
     """
 
     members: IntArray
@@ -80,12 +80,12 @@ class Row:
 
     @property
     def depth(self) -> float:
-        """How much room the slots take across the row, m."""
+        """Extent of the slots across the row, m."""
         return float(self.length * np.sin(self.angle) + self.width * np.cos(self.angle))
 
 
 def describe_rows(rows: Sequence[Row]) -> Iterator[str]:
-    """What was found, a line each: number and length of the rows, spacing of the slots."""
+    """Describe the rows, one line per kind: number and length of the rows, spacing of the slots."""
     yield f"{len(rows)} rows of {', '.join(str(len(row.members)) for row in rows[:12])}" + (
         ", ..." if len(rows) > 12 else " slots"
     )
@@ -95,7 +95,7 @@ def describe_rows(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def find_rows(xy: FloatArray, names: Sequence[str]) -> tuple[list[Row], list[int]]:
-    """Find the rows, and the indices of the slots in no row.
+    """Return the rows, and the indices of the slots in no row.
 
     Args:
         xy: (n, 2) m, slot centres.
@@ -211,7 +211,7 @@ def with_arrangement(
     """Complete a row with the angle and size of its slots.
 
     Raises:
-        AmbiguousLayoutError: the spacing fits no way of parking, or cars stand at different angles.
+        AmbiguousLayoutError: the spacing fits no arrangement, or cars are parked at different angles.
     """
     first, last = names[row.members[0]], names[row.members[-1]]
     who = f"the row of slots {first!r:.40} to {last!r:.40}"
@@ -237,11 +237,11 @@ def with_arrangement(
 
 
 def row_slots(row: Row, side: int, xy: FloatArray, yaw: FloatArray | None) -> Slots:
-    """Make the slots of a row.
+    """Create the slots of a row.
 
     Args:
-        row: with angle and size.
-        side: to which the row opens, 1 left, -1 right.
+        row: a row with angle and size.
+        side: side to which the row opens, 1 left, -1 right.
         xy: (n, 2) m, centres of all slots.
         yaw: (n,) rad, heading of a car parked nose-in, or None.
     """
@@ -249,7 +249,7 @@ def row_slots(row: Row, side: int, xy: FloatArray, yaw: FloatArray | None) -> Sl
     opens = side * row.left
     if row.angle == 0.0:
         if yaw is None:
-            # Cars stand on the right of a two-way aisle, so the aisle is on their left.
+            # Cars park on the right of a two-way aisle, so the aisle is on their left.
             heading = np.tile([opens[1], -opens[0]], (n, 1))
         else:
             heading = np.stack([np.cos(yaw[row.members]), np.sin(yaw[row.members])], axis=1)
