@@ -26,6 +26,7 @@ needs_kitti = pytest.mark.skipif(
 
 
 @needs_uiuc
+@pytest.mark.slow
 def test_the_shipped_side_model_knows_real_cars():
     score = score_on_crops(CarModel.load("side"), read_uiuc_training(UIUC))
     assert score.auc > 0.9985

@@ -50,8 +50,11 @@ def digest(env, seed):
     return hashlib.sha256(repr(random_episode(env, seed)).encode()).hexdigest()
 
 
-@pytest.mark.parametrize("env_id", ENV_IDS)
-@pytest.mark.parametrize("scenario", SCENARIO_NAMES)
+# Gymnasium's checker takes many steps. SearchPerception captures the images that SearchSensors shows.
+@pytest.mark.parametrize(
+    ("scenario", "env_id"),
+    [(s, e) for s in SCENARIO_NAMES for e in ENV_IDS if s == "mini" or "SearchSensors" not in e],
+)
 def test_every_id_passes_the_checker_without_a_warning(env_id, scenario):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
