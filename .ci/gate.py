@@ -100,9 +100,9 @@ STAGES = (
         for file in built/*.whl built/*.tar.gz; do
             echo "--- $file"
             "$uv" pip install --quiet --python package/bin/python --reinstall-package parkenv "$file"
-            package/bin/parkenv survey --scenario mini --sessions 1 --every 6 --overwrite --out survey > /dev/null
-            package/bin/parkenv compare --scenario mini --episodes 4 --report --overwrite --out results > /dev/null
-            ls results
+            package/bin/parkenv survey --scenario mini --sessions 1 --every 6 --out "$file-survey" > /dev/null
+            package/bin/parkenv compare --scenario mini --episodes 4 --report --out "$file-results" > /dev/null
+            ls "$file-results"
         done
         """,
         needs=("README: tests",),
