@@ -228,7 +228,9 @@ class _SourceKeyedCache(FunctionCache):  # type: ignore[misc]
 
     def __init__(self, py_func: Any, options: dict[str, Any]) -> None:
         super().__init__(py_func)
-        name = f"{self._impl.filename_base}-{_short_hash(str(sorted(options.items())))}"
+        # A set of options, as of fastmath, has another order in each process.
+        ordered = {k: sorted(v) if isinstance(v, (set, frozenset)) else v for k, v in sorted(options.items())}
+        name = f"{self._impl.filename_base}-{_short_hash(str(ordered))}"
         self._cache_file = _CodeFiles(self._cache_path, name)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:

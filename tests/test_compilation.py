@@ -26,7 +26,7 @@ OWN = {
     "package/rates.py": "RATE = 2.0\n",
     "caller.py": (
         "from callee import f\nfrom package import \\\n    RATE\nfrom sim_sensors.compilation import compiled\n"
-        "@compiled\ndef g(x):\n    return RATE * f(x)\n"
+        "@compiled(fastmath={'nnan', 'ninf', 'nsz', 'arcp', 'contract'})\ndef g(x):\n    return RATE * f(x)\n"
     ),
 }
 """A user's own modules: g(1.0) is 4."""
