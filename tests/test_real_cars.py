@@ -64,7 +64,7 @@ def test_training_on_real_crops_generalizes_to_others(tmp_path):
         read_crop_folder(tmp_path),
         folds=3,
         descriptor=Descriptor(128, 128, "blocks"),
-        ends=True,
+        end_on=True,
         settings=settings,
     )
     assert np.mean([s.auc for s in scores]) > 0.993
