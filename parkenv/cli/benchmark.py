@@ -31,6 +31,10 @@ app = typer.Typer(
 def run(
     suite: Annotated[str, typer.Argument(help="The suite; `parkenv benchmark show v1` describes it.")] = "v1",
     agents: args.AgentsOption = None,
+    by: Annotated[
+        str,
+        typer.Option("--by", metavar="TEXT", help="Who submits the result: a name, an address of the code."),
+    ] = "",
     jobs: args.JobsOption = 0,
     backend: args.BackendOption = "loky",
     address: args.AddressOption = None,
@@ -58,7 +62,9 @@ def run(
 
     out = out or Path("results") / suite
     base = args.saved(out, SPEC_FILE, BenchmarkSpec) if resume else BenchmarkSpec()
-    given = {} if agents is None else {"agents": split_agents(agents)}
+    given: dict[str, Any] = {} if agents is None else {"agents": split_agents(agents)}
+    if by:
+        given["by"] = by
     spec = base.changed(suite=suite, jobs=jobs, backend=backend, address=address, **given)
     run_suite(spec, out, resume=resume, overwrite=overwrite)
 
@@ -102,7 +108,7 @@ def run_suite(spec: BenchmarkSpec, out: Path, *, resume: bool = False, overwrite
         folder.finish(order, {"command": command, "complete": False}, complete=False)
         console.print(f"Interrupted. What was finished is in {out}; --resume --out {out} goes on.")
         raise typer.Exit(130)
-    result = result_of(suite, cases, folder, command)
+    result = result_of(suite, cases, folder, command, spec.by)
     folder.finish(
         order, {"command": command, "version": __version__, "complete": True, "rows": result["rows"]}
     )
@@ -129,6 +135,40 @@ def check(
         raise InputError("the results are of different suites; check those of one at a time")
     _print(console, results)
     console.print(f"{'Complete and consistent' if len(files) == 1 else 'All complete and consistent'}.")
+
+
+@app.command("page")
+def page(
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE|DIR...", help=f"Result files, or folders with {RESULT} in them."),
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", help="The HTML file.")] = Path("results/benchmark.html"),
+) -> None:
+    """Check submitted results of a suite, and write a page that compares them.
+
+    The page needs no network and no other file. Its tables sort by a click on a heading. A result that fails
+    `parkenv benchmark check` is refused, and no page is written.
+
+    Example:
+    * `parkenv benchmark page submissions --out benchmark.html`
+    """
+    from parkenv.evaluation.experiments.benchmark import check_result
+    from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.evaluation.report.benchmark_page import benchmark_data
+    from parkenv.evaluation.report.page import write_page
+
+    found = [each for file in files for each in (sorted(file.rglob(RESULT)) if file.is_dir() else [file])]
+    if not found:
+        raise InputError(f"{files[0]}: no {RESULT} below it")
+    make_folder(out.parent)
+    console = make_console()
+    with console.status("Checking"):
+        results = [check_result(file) for file in found]
+    write_page(benchmark_data(results, ["parkenv", *sys.argv[1:]]), out)
+    console.print(
+        f"Written: {out}, {sum(len(r['scores']) for r in results)} agents in {len(results)} results"
+    )
 
 
 @app.command("show")

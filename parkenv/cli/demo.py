@@ -3,40 +3,60 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.compare import result_tables
-from parkenv.cli.tables import make_console
+from parkenv.cli.tables import StageProgress, make_console
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import DemoSpec
+    from parkenv.mapping.inference import SessionLog
     from parkenv.mapping.survey import SurveySettings
     from parkenv.world.scenario import Scenario
 
 FIGURES = ("time_split", "time_distribution")
 """Names of figures in `parkenv.evaluation.figures.registry`."""
+FILM = "search.gif"
+NEXT = (
+    (
+        "parkenv compare --scenario jam --agents mdp,belief,oracle --report",
+        "1,000s of searches in a minute, other worlds",
+    ),
+    ("parkenv trip --scenario campus --out results/trip.gif", "a whole trip with steering, as a film"),
+    ("parkenv train --scenario mini", "train an agent of your own"),
+)
+"""Commands to try after the demo, and what they do."""
 
 
 def demo(
     scenario: args.ScenarioOption = None,
-    sessions: Annotated[int, typer.Option("--sessions", min=1, help="Survey drives.")] = 4,
-    episodes: Annotated[int, typer.Option("--episodes", "-n", min=2, help="Searches of each agent.")] = 6,
+    quick: Annotated[
+        bool,
+        typer.Option("--quick", help="A shorter demo: 2 survey drives, captures farther apart, 2 episodes."),
+    ] = False,
+    sessions: Annotated[
+        int | None, typer.Option("--sessions", min=1, help="Survey drives.  [default: 4]")
+    ] = None,
+    episodes: Annotated[
+        int | None, typer.Option("--episodes", "-n", min=2, help="Searches of each agent.  [default: 6]")
+    ] = None,
     every: Annotated[
-        float, typer.Option("--every", min=0.1, help="Metres between captures of the survey.")
-    ] = 2.5,
+        float | None,
+        typer.Option("--every", min=0.1, help="Metres between captures of the sensors.  [default: 2.5]"),
+    ] = None,
     detector: args.DetectorOption = "hog",
     seed: args.SeedOption = 0,
     jobs: args.JobsOption = 0,
     rerun: args.RerunOption = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for everything.")] = Path("results/demo"),
-    report: args.ReportOption = False,
 ) -> None:
     """Survey a lot with simulated sensors, estimate how often each slot is taken, and search there on other days.
 
@@ -45,29 +65,29 @@ def demo(
 
     2. Map: the probability that each slot is taken at the hour of the search, from these sessions alone.
 
-    3. Searches on other days, with camera, laser and detector: the thesis's planner and three heuristic baselines, all
-    with the same map, in the same worlds.
+    3. Searches on other days, with camera, laser and detector: the thesis's planner, the planner in belief space and
+    two heuristic baselines, all with the same map, in the same worlds; and the clairvoyant lower bound.
 
-    Example:
+    4. A report with replays, and a film of one search.
+
+    Examples:
     * `parkenv demo`
+
+    * `parkenv demo --quick --out results/quick`
     """
+    from parkenv.evaluation.experiments.demo import QUICK
     from parkenv.evaluation.experiments.spec import DemoSpec
 
+    given = {"sessions": sessions, "episodes": episodes, "every": every}
     spec = DemoSpec().changed(
-        scenario=args.one_scenario(args.scenario_specs(scenario)),
-        sessions=sessions, episodes=episodes, every=every, detector=detector, seed=seed, jobs=jobs,
+        scenario=args.one_scenario(args.scenario_specs(scenario)), detector=detector, seed=seed, jobs=jobs,
+        **(QUICK if quick else {}) | {name: value for name, value in given.items() if value is not None},
     )  # fmt: skip
-    run_demo(spec, out, rerun=rerun, report=report)
+    run_demo(spec, out, rerun=rerun)
 
 
 def run_demo(
-    spec: DemoSpec,
-    out: Path,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    rerun: Path | None = None,
-    report: bool = False,
+    spec: DemoSpec, out: Path, *, resume: bool = False, overwrite: bool = False, rerun: Path | None = None
 ) -> None:
     """Run the demo; continue an unfinished one in the folder, replace a finished one.
 
@@ -75,19 +95,19 @@ def run_demo(
         InputError: the scenario cannot be made, or the folder cannot be used.
     """
     del overwrite
+    from parkenv.cli.report import make_report
     from parkenv.evaluation.experiments.compare import run_cases, table
-    from parkenv.evaluation.experiments.demo import AGENTS, demo_cases, demo_survey
+    from parkenv.evaluation.experiments.demo import AGENTS, FILMED, demo_cases, demo_survey
     from parkenv.evaluation.experiments.results import ResultFolder, make_folder
     from parkenv.evaluation.experiments.spec import SPEC_FILE
-    from parkenv.evaluation.experiments.surveys import mean_occupancy, run_survey, summarize
+    from parkenv.evaluation.experiments.surveys import run_survey, summarize
     from parkenv.evaluation.experiments.warm_up import warm_up_tasks
     from parkenv.evaluation.figures.registry import ComparisonResults, draw_figures
-    from parkenv.evaluation.figures.survey_pictures import save_detections, save_map, save_session
+    from parkenv.evaluation.figures.search_film import film_search
+    from parkenv.evaluation.figures.survey_pictures import save_detections, save_session
+    from parkenv.evaluation.report.drive_recording import record_drive
     from parkenv.evaluation.trips.sensor_log import require_viewer
-    from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
-    from parkenv.world.occupancy import DAY_NAMES
-    from parkenv.world.week import DAY_S
 
     if rerun is not None:
         require_viewer()
@@ -97,54 +117,53 @@ def run_demo(
     map_file = out / "map.sqlite"
     folder = ResultFolder(out, _settings(spec), resume=resume or _goes_on(out), overwrite=True)
     spec.write(out / SPEC_FILE)
-    with args.workers_of(spec.jobs, spec.backend, spec.address) as workers, Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        console=console, disable=not console.is_terminal,
-    ) as progress:  # fmt: skip
-        tasks = warm_up_tasks(settings, AGENTS)
-        bar = progress.add_task("compiling, once after an installation", total=len(tasks))
-        for _ in workers.results(tasks):
-            progress.advance(bar)
-        bar = progress.add_task("1/3 surveying", total=spec.sessions)
-        run = run_survey(
-            its,
-            settings,
-            spec.sessions,
-            map_file,
-            workers=workers,
-            on_session=lambda _: progress.advance(bar),
-        )
-        progress.update(bar, completed=spec.sessions)
+    with (
+        args.workers_of(spec.jobs, spec.backend, spec.address) as workers,
+        StageProgress(console) as progress,
+    ):
 
-        bar = progress.add_task("2/3 drawing the map", total=1)
+        def run_all(description: str, tasks: Sequence[Callable[[], object]]) -> None:
+            bar = progress.add_task(description, total=len(tasks))
+            for _ in workers.results(tasks):
+                progress.advance(bar)
+
+        run_all("compiling, once after an installation", warm_up_tasks(settings, AGENTS))
+        bar = progress.add_task("1/4 survey drives", total=spec.sessions)
+        run = run_survey(
+            its, settings, spec.sessions, map_file, workers=workers, record=record_drive,
+            on_session=lambda _: progress.advance(bar),
+        )  # fmt: skip
+        progress.update(bar, completed=spec.sessions)
+        surveyed = summarize(its, settings, run, map_file)
         with MapStore(map_file, its.lot, create=False) as store:
             log = store.log()
-        shown = replace(its.arrival, weekdays=its.arrival.weekdays[:2][-1:])
-        time = DAY_S * shown.weekdays[0] + 0.5 * (shown.start_s + shown.end_s)
-        hour, minute = divmod(int(time % DAY_S // 60), 60)
-        title = (
-            f"{its.name}, {DAY_NAMES[shown.weekdays[0]]} {hour:02d}:{minute:02d}, {spec.sessions} sessions"
-        )
-        true = mean_occupancy(its.occupancy, shown)
-        save_map(its.lot, predict(log, time), true, title, out / "map.png")
-        if run.shown is not None:
-            save_detections(run.shown, out / "detections.png")
-            save_session(its.lot, run.shown, out / "session.png")
-        progress.advance(bar)
 
         cases = demo_cases(spec, its, log)
-        bar = progress.add_task("3/3 searching with simulated sensors", total=len(cases) * spec.episodes)
+        bar = progress.add_task("2/4 searches through the sensors", total=len(cases) * spec.episodes)
         run_cases(
             cases, folder, workers=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n)
         )
-    rows = table(cases, folder)
-    surveyed = summarize(its, settings, run, map_file)
-    summary = {
-        "command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": spec.seed, "rows": rows,
-        "survey": surveyed,
-    }  # fmt: skip
-    folder.finish([case.key(s) for case, its_seeds in cases for s in its_seeds], summary)
-    draw_figures(ComparisonResults(cases, folder.episodes, rows), out, FIGURES)
+        rows = table(cases, folder)
+        filmed = next(case for case, _ in cases if case.agent == FILMED)
+        tasks: list[Callable[[], object]] = [
+            partial(film_search, filmed, cases[0][1][0], out / FILM),
+            partial(_draw_map, its, log, spec.sessions, out / "map.png"),
+            partial(draw_figures, ComparisonResults(cases, folder.episodes, rows), out, FIGURES),
+        ]
+        if run.shown is not None:
+            tasks += [
+                partial(save_detections, run.shown, out / "detections.png"),
+                partial(save_session, its.lot, run.shown, out / "session.png"),
+            ]
+        run_all("3/4 pictures and film", tasks)
+        summary = {
+            "command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": spec.seed, "rows": rows,
+            "survey": surveyed,
+        }  # fmt: skip
+        folder.finish([case.key(s) for case, its_seeds in cases for s in its_seeds], summary)
+    page = make_report(
+        out, jobs=spec.jobs, drives=None if run.recorded is None else [run.recorded], stage="4/4 report"
+    )
     console.print(
         f"{spec.sessions} drives past {its.lot.n_slots} slots: {surveyed['car_detection_rate']:.1%} of the parked cars "
         f"were found, {surveyed['slot_accuracy']:.1%} of the slots classified correctly. Mean absolute error of the "
@@ -152,16 +171,39 @@ def run_demo(
     )
     for printed in result_tables(rows, console.width):
         console.print(printed)
-    console.print(f"Pictures, the map, episodes.csv and summary.json are in {out}")
     if rerun is not None:
         with console.status(f"Running the first session and the first search again for {rerun}"):
             case, seeds = cases[0]
             _record(case.scenario, settings, seeds[0], rerun)
         console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
-    if report:
-        from parkenv.cli.report import make_report
+    _say(
+        "Open:",
+        ((page, "everything on one page, with replays (in a browser)"), (out / FILM, "a search as a film")),
+    )
+    _say("Try next:", NEXT)
 
-        make_report(out, jobs=spec.jobs)
+
+def _say(title: str, lines: Sequence[tuple[object, str]]) -> None:
+    """Print what can be copied, each with an explanation; long paths are not broken."""
+    console = make_console()
+    console.print(f"\n{title}")
+    for text, explained in lines:
+        console.print(f"  {text}\n      {explained}", soft_wrap=True, markup=False)
+
+
+def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) -> None:
+    """Draw the map at the middle of the arrival window, and the true probabilities."""
+    from parkenv.evaluation.experiments.surveys import mean_occupancy
+    from parkenv.evaluation.figures.survey_pictures import save_map
+    from parkenv.mapping.inference import predict
+    from parkenv.world.occupancy import DAY_NAMES
+    from parkenv.world.week import DAY_S
+
+    shown = replace(scenario.arrival, weekdays=scenario.arrival.weekdays[:2][-1:])
+    time = DAY_S * shown.weekdays[0] + 0.5 * (shown.start_s + shown.end_s)
+    hour, minute = divmod(int(time % DAY_S // 60), 60)
+    title = f"{scenario.name}, {DAY_NAMES[shown.weekdays[0]]} {hour:02d}:{minute:02d}, {sessions} sessions"
+    save_map(scenario.lot, predict(log, time), mean_occupancy(scenario.occupancy, shown), title, path)
 
 
 def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from parkenv.cli import arguments as args
-from parkenv.cli.tables import make_console
+from parkenv.cli.tables import StageProgress, make_console
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
@@ -93,8 +92,13 @@ def make_report(
     frames: int = 120,
     jobs: int = 0,
     out: Path | None = None,
-) -> None:
-    """Write the page; see `report` for the arguments.
+    drives: Sequence[dict[str, Any]] | None = None,
+    stage: str = "running the replayed searches and drives again",
+) -> Path:
+    """Write the page, and return its path.
+
+    The arguments are those of `report`; `drives` are survey drives that are already recorded (None: `sessions` of them
+    are driven again), and `stage` describes the progress bar.
 
     Raises:
         InputError: the folder holds no finished run of this version, or not the chosen searches.
@@ -118,22 +122,16 @@ def make_report(
     cases, too_large = _small_enough(_chosen(cases, seeds, agents))
     notes += too_large
     encounters = choose(cases, wanted) if wanted else []
-    drives = range(min(sessions, surveys[1])) if surveys is not None else range(0)
+    again = range(min(sessions, surveys[1])) if surveys is not None and drives is None else range(0)
     counted = run.totals()
     tasks: list[Callable[[], dict[str, Any]]] = []
     for encounter in encounters:
         keys = [case.key(encounter.seed) for case in encounter.cases]
         tasks.append(partial(record, encounter, {k: counted[k] for k in keys if k in counted}))
     if surveys is not None:
-        tasks += [
-            partial(_drive_again, surveys[0], number, frames // max(len(drives), 1)) for number in drives
-        ]
-    progress = Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), console=console,
-        disable=not console.is_terminal,
-    )  # fmt: skip
-    with args.workers_of(jobs, "loky", None) as workers, progress:
-        bar = progress.add_task("Running again", total=len(tasks))
+        tasks += [partial(_drive_again, surveys[0], number, frames // max(len(again), 1)) for number in again]
+    with args.workers_of(jobs, "loky", None) as workers, StageProgress(console) as progress:
+        bar = progress.add_task(stage, total=len(tasks))
         done: list[dict[str, Any]] = []
         for recorded in workers.in_order(tasks):
             done.append(recorded)
@@ -141,10 +139,12 @@ def make_report(
     watched = done[: len(encounters)]
     notes += _differing(watched)
     path = out or folder / PAGE
-    write_page(run, page_data(run, watched, done[len(encounters) :], notes), path)
+    recorded = done[len(encounters) :] if drives is None else drives
+    write_page(page_data(run, watched, recorded, notes), path, run.figures)
     for note in notes:
         console.print(f"Note: {note}")
     console.print(f"Written: {path}, {path.stat().st_size / 1e6:.1f} MB")
+    return path
 
 
 def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
@@ -269,4 +269,4 @@ def _survey(scenario: Any, settings: Any) -> Survey:
 def _drive_again(survey: Callable[[], Survey], number: int, frames: int) -> dict[str, Any]:
     from parkenv.evaluation.report.drive_recording import record_drive
 
-    return record_drive(survey(), number, frames)
+    return record_drive(survey(), number, most_frames=frames)[1]

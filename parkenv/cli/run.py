@@ -85,5 +85,5 @@ def run(
         spec = spec.changed(jobs=jobs)
     out = out or Path("results") / file.stem
     kind.run(spec, out, resume=resume, overwrite=overwrite)
-    if report:
+    if report and name != "demo":  # which makes its own
         make_report(out, jobs=spec.jobs)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
+from typing import Any
 
 from rich import box
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 WIDE = 200
@@ -26,3 +28,23 @@ def make_table(title: str | None, headings: Iterable[str]) -> Table:
     for i, heading in enumerate(headings):
         table.add_column(heading, justify="right" if i else "left", no_wrap=True)
     return table
+
+
+class StageProgress(Progress):
+    """Progress bars of the stages of a command; a line per stage if the output is not a terminal that can redraw.
+
+    Args:
+        console: where to print.
+    """
+
+    def __init__(self, console: Console) -> None:
+        columns = TextColumn("{task.description}"), BarColumn(24), MofNCompleteColumn(), TimeElapsedColumn()
+        super().__init__(
+            *columns, console=console, disable=not console.is_terminal or console.is_dumb_terminal
+        )
+
+    def add_task(self, description: str, *args: Any, **options: Any) -> TaskID:
+        """Start a stage."""
+        if self.disable:
+            self.console.print(f"{description} ...")
+        return super().add_task(description, *args, **options)

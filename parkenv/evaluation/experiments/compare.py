@@ -42,6 +42,7 @@ class Case:
         options: options of the agent, for `make_agent`.
         rig: simulated sensors that observe the slots; None to use the scenario's sensor model.
         detector: detector for the rig's images, for `make_detector`; None for the packaged one.
+        every: least distance between the rig's captures, m; None for the environment's.
     """
 
     scenario: Scenario
@@ -50,6 +51,7 @@ class Case:
     rig: str | None = None
     options: Mapping[str, Any] = field(default_factory=dict)
     detector: str | None = None
+    every: float | None = None
 
     @property
     def label(self) -> str:
@@ -74,7 +76,7 @@ class Case:
 
     def run(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row]]:
         """Run one episode per seed; return rows of `episodes.csv` and of `timings.csv`."""
-        runner = self._runner()
+        runner = self.runner()
         rows, timings = [], []
         for seed in seeds:
             episode = runner.run(seed)
@@ -92,11 +94,12 @@ class Case:
 
     def trace(self, seed: int) -> SearchTrace:
         """Run one episode, and return its trace for a picture."""
-        return self._runner().run(seed).trace
+        return self.runner().run(seed).trace
 
-    def _runner(self) -> EpisodeRunner:
+    def runner(self) -> EpisodeRunner:
+        """Return a runner of this case's episodes."""
         agent = make_agent(self.agent, self.scenario, **self.options)
-        return EpisodeRunner(self.scenario, self.label, agent, self.rig, self.detector)
+        return EpisodeRunner(self.scenario, self.label, agent, self.rig, self.detector, self.every)
 
 
 def settings_of(
