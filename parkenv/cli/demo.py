@@ -18,6 +18,7 @@ from parkenv.cli.tables import StageProgress, make_console
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import DemoSpec
+    from parkenv.evaluation.experiments.workers import Workers
     from parkenv.mapping.inference import SessionLog
     from parkenv.mapping.survey import SurveySettings
     from parkenv.world.scenario import Scenario
@@ -27,11 +28,14 @@ FIGURES = ("time_split", "time_distribution")
 FILM = "search.gif"
 NEXT = (
     (
-        "parkenv compare --scenario jam --agents mdp,belief,oracle --report",
-        "1,000s of searches in a minute, other worlds",
+        "parkenv compare --scenario jam --agents mdp,belief,oracle --episodes 40 --report",
+        "another lot, where the forecast is wrong; many more searches, without images",
     ),
-    ("parkenv trip --scenario campus --out results/trip.gif", "a whole trip with steering, as a film"),
-    ("parkenv train --scenario mini", "train an agent of your own"),
+    (
+        "parkenv trip --scenario campus --out results/trip.gif",
+        "a trip with steering and manoeuvres, as a film",
+    ),
+    ("parkenv plan --scenario jam --failure-cost 10,90", "what the thesis's planner intends, in a picture"),
 )
 """Commands to try after the demo, and what they do."""
 
@@ -119,15 +123,17 @@ def run_demo(
     spec.write(out / SPEC_FILE)
     with (
         args.workers_of(spec.jobs, spec.backend, spec.address) as workers,
+        # Only processes of this machine write files.
+        args.workers_of(spec.jobs, "loky", None) as here,
         StageProgress(console) as progress,
     ):
 
-        def run_all(description: str, tasks: Sequence[Callable[[], object]]) -> None:
+        def run_all(description: str, tasks: Sequence[Callable[[], object]], where: Workers) -> None:
             bar = progress.add_task(description, total=len(tasks))
-            for _ in workers.results(tasks):
+            for _ in where.results(tasks):
                 progress.advance(bar)
 
-        run_all("compiling, once after an installation", warm_up_tasks(settings, AGENTS))
+        run_all("compiling, once after an installation", warm_up_tasks(settings, AGENTS), workers)
         bar = progress.add_task("1/4 survey drives", total=spec.sessions)
         run = run_survey(
             its, settings, spec.sessions, map_file, workers=workers, record=record_drive,
@@ -155,7 +161,7 @@ def run_demo(
                 partial(save_detections, run.shown, out / "detections.png"),
                 partial(save_session, its.lot, run.shown, out / "session.png"),
             ]
-        run_all("3/4 pictures and film", tasks)
+        run_all("3/4 pictures and film", tasks, here)
         summary = {
             "command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": spec.seed, "rows": rows,
             "survey": surveyed,
