@@ -126,7 +126,7 @@ def _figure(path: Path) -> str:
     if picture.width > MOST_WIDTH:
         picture = picture.resize((MOST_WIDTH, round(picture.height * MOST_WIDTH / picture.width)))
     source, (width, height) = _webp(picture), picture.size
-    white = (np.asarray(picture).min(axis=2) > 250).mean() > _WHITE
+    white = bool((np.asarray(picture).min(axis=2) > 250).mean() > _WHITE)
     return (
         f'<figure{" class=plotted" * white}><button type="button" class="enlarge" aria-label="Enlarge: {caption}">'
         f'<img src="{source}" width="{width}" height="{height}" alt="{caption}"></button>'
