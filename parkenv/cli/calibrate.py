@@ -14,6 +14,7 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
+from parkenv.files.file_names import file_name
 from parkenv.scenarios.build import build
 
 AgentOption = Annotated[
@@ -136,7 +137,7 @@ def calibrate(
         },
     )
     title = f"{its.name}: {episodes} trips with and {episodes} without observations of slots, by {agent}"
-    save_distributions(rows, speed, title, out / f"calibration_{its.name}.png")
+    save_distributions(rows, speed, title, out / file_name(f"calibration_{its.name}", ".png"))
     printed = make_table(title, ("what", "n", "mean [95 %]", "median", "p95"))
     for row in table:
         low, high = row["mean_ci95"]
