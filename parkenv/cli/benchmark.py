@@ -139,12 +139,17 @@ def show(suite: Annotated[str, typer.Argument(help="The suite.")] = "v1") -> Non
     its = Suite.named(suite)
     console = make_console()
     console.print(f"{its.name}: {its.description}")
-    table = make_table(None, ["task", "scenario", "slots", "mean occupancy", "sight", "walking"])
+    table = make_table(None, ["task", "scenario", "slots", "mean occupancy", "sensor model", "walking"])
     for task in its.tasks:
         made = task.made(its.arrival)
         level = "as it comes" if task.occupancy_level is None else f"{task.occupancy_level:.0%}"
         table.add_row(
-            task.name, task.scenario, str(made.lot.n_slots), level, task.sight, f"{made.v_walk * 3.6:g} km/h"
+            task.name,
+            task.scenario,
+            str(made.lot.n_slots),
+            level,
+            task.sensor_model,
+            f"{made.v_walk * 3.6:g} km/h",
         )
     console.print(table)
     console.print(

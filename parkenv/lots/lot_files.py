@@ -13,8 +13,7 @@ from parkenv.lots.lot_contents import graph_errors
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.lot import ParkingLot
 
-PACKAGED_LOTS = ("campus", "jam", "street", "mini")
-"""Names of the packaged lots."""
+PACKAGED_LOTS = ("campus", "jam", "street", "mini")  # names of the packaged lots
 
 
 def load_lot(name_or_path: str | Path) -> ParkingLot:

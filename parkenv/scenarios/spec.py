@@ -16,19 +16,15 @@ from parkenv.world.occupancy import ArrivalWindow
 
 PackagedLot = Literal["campus", "jam", "street", "mini"]
 PACKAGED_LOTS: tuple[PackagedLot, ...] = ("campus", "jam", "street", "mini")
-LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")
-"""Suffixes of lot files."""
+LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")  # suffixes of lot files
 SENSOR_MODELS = ("perfect", "blind", "laser", "stereo")
 RigName = Literal["laser", "stereo", "both_sides"]
 
-Speed = Annotated[float, Field(ge=0.1, le=300.0)]
-"""km/h."""
-Cost = Annotated[float, Field(ge=0.0, le=86_400.0)]
-"""s, at most a day."""
+Speed = Annotated[float, Field(ge=0.1, le=300.0)]  # km/h
+Cost = Annotated[float, Field(ge=0.0, le=86_400.0)]  # s, at most a day
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=0, le=1_000)]
-Size = Annotated[float, Field(ge=1.0, le=100.0)]
-"""m."""
+Size = Annotated[float, Field(ge=1.0, le=100.0)]  # m
 MAX_SLOTS = 1_000_000
 
 
@@ -186,8 +182,7 @@ def _hours(value: str) -> str:
     return value
 
 
-Hours = Annotated[str, AfterValidator(_hours)]
-"""HH:MM-HH:MM."""
+Hours = Annotated[str, AfterValidator(_hours)]  # HH:MM-HH:MM
 
 
 def _days(value: object) -> object:
@@ -316,8 +311,7 @@ class ScenarioSpec(Spec):
         return cls.parse({"name": path.stem, **read_tables(path)}, str(path), path.parent)
 
 
-SCENARIO_NAMES = ("campus", "jam", "street", "mini")
-"""Packaged scenarios."""
+SCENARIO_NAMES = ("campus", "jam", "street", "mini")  # packaged scenarios
 _PACKAGED = Path(__file__).with_name("packaged")
 
 
