@@ -24,7 +24,7 @@ from typing import Annotated, Any, NamedTuple, get_type_hints
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
-from parkenv.cli import arguments
+from parkenv.cli import arguments as args
 from parkenv.cli.completion import COMPLETERS, NAMES
 from parkenv.errors import InputError, nearest
 
@@ -58,7 +58,7 @@ def read_docstring(doc: str | None) -> tuple[str, str, dict[str, Entry]]:
     return text.strip(), examples, entries
 
 
-_, _, SHARED = read_docstring(arguments.__doc__)
+_, _, SHARED = read_docstring(args.__doc__)
 """Options that stand in several commands."""
 
 
@@ -150,7 +150,8 @@ def add(app: typer.Typer, name: str, function: Callable[..., None], heading: str
     """
     text, examples, own = read_docstring(function.__doc__)
     signature = inspect.signature(function, eval_str=True)
-    groups = {n: p.annotation for n, p in signature.parameters.items() if is_dataclass(p.annotation)}
+    annotations: dict[str, Any] = {name: p.annotation for name, p in signature.parameters.items()}
+    groups = {name: kind for name, kind in annotations.items() if is_dataclass(kind)}
     parameters: list[Parameter] = []
     for parameter in signature.parameters.values():
         kind = groups.get(parameter.name)
@@ -171,7 +172,8 @@ def add(app: typer.Typer, name: str, function: Callable[..., None], heading: str
     def run(**given: Any) -> None:
         for name, kind in groups.items():
             given[name] = kind(**{f.name: given.pop(f.name) for f in fields(kind)})
-        function(*(given.pop(name) for name in first), **given)
+        arguments = [given.pop(name) for name in first]
+        function(*arguments, **given)
 
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {}
