@@ -12,8 +12,14 @@ from parkenv.errors import InputError, nearest
 if TYPE_CHECKING:
     from parkenv.evaluation.bench.rows import BenchRow
 
-PARTS = ("sensors", "perception", "planning", "env", "drive")
-"""Modules of `parkenv.evaluation.bench`; each has a function NAME_rows."""
+PARTS = {
+    "sensors": "sensor_rows",
+    "perception": "perception_rows",
+    "planning": "planning_rows",
+    "env": "env_rows",
+    "drive": "drive_rows",
+}
+"""Modules of `parkenv.evaluation.bench`, and the function of each that measures."""
 
 
 def bench(
@@ -39,7 +45,7 @@ def bench(
     """
     from parkenv.evaluation.experiments.results import make_folder
 
-    chosen = parts or PARTS
+    chosen = parts or list(PARTS)
     for part in chosen:
         if part not in PARTS:
             raise InputError(f"there is no part {part!r} to measure; {nearest(part, PARTS)}")
@@ -50,7 +56,7 @@ def bench(
     rows: list[BenchRow] = []
     for part in chosen:
         with console.status(f"Measuring {part}"):
-            measured = getattr(import_module(f"parkenv.evaluation.bench.{part}"), f"{part}_rows")
+            measured = getattr(import_module(f"parkenv.evaluation.bench.{part}"), PARTS[part])
             rows += measured(seed, seconds)
     cells = []
     before = None
