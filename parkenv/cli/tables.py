@@ -18,12 +18,12 @@ WIDE = 200
 """Width assumed if output goes to a file or a pipe, characters."""
 
 
-def make_console(**options: Any) -> Console:
-    """Make a console on standard output, as wide as the terminal."""
+def make_console(*, soft_wrap: bool = False) -> Console:
+    """Make a console on standard output, as wide as the terminal; it prints names as they are, without markup."""
     from rich.console import Console
 
-    width = {} if sys.stdout.isatty() else {"width": WIDE}
-    return Console(highlight=False, **width | options)
+    width = None if soft_wrap or sys.stdout.isatty() else WIDE
+    return Console(highlight=False, markup=False, emoji=False, soft_wrap=soft_wrap, width=width)
 
 
 def make_table(title: str | None, headings: Iterable[str], rows: Iterable[Sequence[str]] = ()) -> Table:
@@ -53,7 +53,7 @@ def progress_bar(console: Console, unit: str = "") -> Progress:
     )
 
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn(unit),
