@@ -10,12 +10,8 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError
-<<<<<<< HEAD
-from parkenv.files.names import RigName
-=======
 from parkenv.files.file_names import file_name
-from parkenv.scenarios.build import build
->>>>>>> main
+from parkenv.files.names import RigName
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -89,35 +85,12 @@ def calibrate(
     made, table = calibration.calibrate(rows, its, speed)
     made.to_file(out / "calibrated.json")
     touched, stuck = (sum(row[name] for row in rows) for name in ("contacts", "rescues"))
-<<<<<<< HEAD
     counts = {"trips": len(rows), "contacts": touched, "rescues": stuck}
     save_summary(out, seed, table, **settings | counts, calibrated=dataclasses.asdict(made))
     title = f"{its.name}: {episodes} trips with and {episodes} without observations of slots, by {agents}"
-    calibration.save_distributions(rows, speed, title, out / f"calibration_{its.name}.png")
+    calibration.save_distributions(rows, speed, title, out / file_name(f"calibration_{its.name}", ".png"))
     cells = (
         (
-=======
-    write_summary(
-        out,
-        {
-            "command": ["parkenv", *sys.argv[1:]],
-            "version": __version__,
-            "seed": seed,
-            **settings,
-            "trips": len(rows),
-            "contacts": touched,
-            "rescues": stuck,
-            "calibrated": dataclasses.asdict(made),
-            "rows": table,
-        },
-    )
-    title = f"{its.name}: {episodes} trips with and {episodes} without observations of slots, by {agent}"
-    save_distributions(rows, speed, title, out / file_name(f"calibration_{its.name}", ".png"))
-    printed = make_table(title, ("what", "n", "mean [95 %]", "median", "p95"))
-    for row in table:
-        low, high = row["mean_ci95"]
-        printed.add_row(
->>>>>>> main
             row["what"],
             str(row["n"]),
             f"{row['mean']:.2f} [{row['mean_ci95'][0]:.2f}, {row['mean_ci95'][1]:.2f}]",

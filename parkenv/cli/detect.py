@@ -62,16 +62,9 @@ def detect(
             rows.append({"file": str(file), "box": box, "probability": p, "view": view})
             cells.append((str(file), *(f"{v:.0f}" for v in box), f"{p:.2f}", view))
         if out is not None:
-<<<<<<< HEAD
             colored = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
             drawn = draw_detections(colored, found)
-            with atomic_write(out / f"{file.stem}_cars.png") as beside:
-=======
-            drawn = draw_detections(
-                image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), found
-            )
             with atomic_write(out / file_name(f"{file.stem}_cars", ".png")) as beside:
->>>>>>> main
                 beside.write_bytes(cv2.imencode(".png", drawn[..., ::-1])[1].tobytes())
     headings = ["file", "left", "top", "right", "bottom", "probability", "view"]
     console.print(make_table(None, headings, cells))

@@ -6,14 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
-<<<<<<< HEAD
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError, nearest
-=======
-from parkenv.cli.tables import make_console, make_table
-from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
->>>>>>> main
 
 if TYPE_CHECKING:
     from parkenv.evaluation.trips.parking_runs import Parking, ParkingCase
@@ -78,16 +73,6 @@ def park(
     parking_agents = {label: make_parking_agent(name) for label, name in labels.items()}
     make_folder(out)
     console = make_console()
-<<<<<<< HEAD
-=======
-    progress = Progress(
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-    )
->>>>>>> main
     seeds = range(seed, seed + episodes)
     parkings: dict[str, list[Parking]] = {label: [] for label in labels}
     with progress_bar(console, "episodes") as progress, machines.workers() as workers:

@@ -7,16 +7,9 @@ from pathlib import Path
 from parkenv.cli import arguments as args
 from parkenv.cli.command import add, group
 from parkenv.cli.tables import make_console
-<<<<<<< HEAD
 from parkenv.errors import InputError, nearest
-from parkenv.files.names import WEATHERS
-=======
-from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
-from parkenv.scenarios.build import build
-
-app = typer.Typer(help="Preview the simulated sensors.", no_args_is_help=True)
->>>>>>> main
+from parkenv.files.names import WEATHERS
 
 
 def preview(

@@ -6,17 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from parkenv.cli import arguments as args
-<<<<<<< HEAD
 from parkenv.cli.report import MAP_FILE, make_report
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError, nearest
-from parkenv.files.names import RigName, WeatherName
-=======
-from parkenv.cli.tables import make_console, make_table
-from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
-from parkenv.scenarios.build import build
->>>>>>> main
+from parkenv.files.names import RigName, WeatherName
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import SurveySpec
@@ -128,44 +122,23 @@ def run_survey_of(spec: SurveySpec, out: Path, folder: args.RunFolder, rerun: Pa
         log = store.log()
         found = slots_found(store, len(log.time))
     window = settings.windows[0]
-<<<<<<< HEAD
     predicted = predict(log, 86_400.0 * window.weekdays[0] + 0.5 * (window.start_s + window.end_s))
     true = mean_occupancy(its.occupancy, window)
     title = f"{its.name} after {row['sessions']} sessions"
-    pictures.save_map(its.lot, predicted, true, title, out / f"map_{its.name}.png")
+    pictures.save_map(its.lot, predicted, true, title, out / file_name(f"map_{its.name}", ".png"))
     if row["detection_by_distance"]:
         title = f"{its.name}, rig {settings.rig}, {row['sessions']} sessions"
-        pictures.save_detection_reach(row["detection_by_distance"], title, out / f"reach_{its.name}.png")
-    if run.shown is not None:
-        pictures.save_detections(run.shown, out / f"detections_{its.name}.png")
-        pictures.save_session(its.lot, run.shown, out / f"session_{its.name}.png")
-        pictures.save_graph(its.lot, predicted, run.shown, out / f"graph_{its.name}.png")
-    scored = score_discovery(found, its.lot)
-    pictures.save_found_slots(its.lot, found, scored, out / f"slots_found_{its.name}.png")
-    error, mae = row["range_abs_error_m"], row["occupancy_mae"]
-    rates = (
-=======
-    time = 86_400.0 * window.weekdays[0] + 0.5 * (window.start_s + window.end_s)
-    predicted = predict(log, time)
-    save_map(
-        its.lot, predicted, mean_occupancy(its.occupancy, window),
-        f"{its.name} after {row['sessions']} sessions", out / file_name(f"map_{its.name}", ".png"),
-    )  # fmt: skip
-    title = f"{its.name}, rig {settings.rig}, {row['sessions']} sessions"
-    if row["detection_by_distance"]:
-        save_detection_reach(
+        pictures.save_detection_reach(
             row["detection_by_distance"], title, out / file_name(f"reach_{its.name}", ".png")
         )
     if run.shown is not None:
-        save_detections(run.shown, out / file_name(f"detections_{its.name}", ".png"))
-        save_session(its.lot, run.shown, out / file_name(f"session_{its.name}", ".png"))
-        save_graph(its.lot, predicted, run.shown, out / file_name(f"graph_{its.name}", ".png"))
-    save_found_slots(
-        its.lot, found, score_discovery(found, its.lot), out / file_name(f"slots_found_{its.name}", ".png")
-    )
-    table = make_table(None, ["figure", "value"])
-    for name in (
->>>>>>> main
+        pictures.save_detections(run.shown, out / file_name(f"detections_{its.name}", ".png"))
+        pictures.save_session(its.lot, run.shown, out / file_name(f"session_{its.name}", ".png"))
+        pictures.save_graph(its.lot, predicted, run.shown, out / file_name(f"graph_{its.name}", ".png"))
+    scored = score_discovery(found, its.lot)
+    pictures.save_found_slots(its.lot, found, scored, out / file_name(f"slots_found_{its.name}", ".png"))
+    error, mae = row["range_abs_error_m"], row["occupancy_mae"]
+    rates = (
         "car_detection_rate",
         "detection_precision",
         "slot_accuracy",
