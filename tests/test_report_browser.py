@@ -41,7 +41,7 @@ def run(tmp_path_factory):
         "-n", "6", "--occupancy-levels", "none", "--jobs", "1", "--out", str(out),
     ]  # fmt: skip
     assert parkenv(*command).returncode == 0
-    make_report(out, machines=Machines(jobs=1))
+    make_report(out, Machines(jobs=1))
     return out
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import re
 import sys
 import tempfile
 import traceback
@@ -98,7 +99,8 @@ def main() -> None:
     except (InputError, SensorError) as error:
         sys.exit(_complain(str(error)))
     except typer.TyperException as error:
-        message = error.format_message().rstrip(".")
+        pattern = r"Invalid value for '([^']+)'(?: / '[^']+')*: (?:Value error, )?"
+        message = re.sub(pattern, r"\1: ", error.format_message()).rstrip(".")
         path = getattr(getattr(error, "ctx", None), "command_path", "parkenv")
         # Without a command, the help has already been printed.
         sys.exit(_complain(f"{message}; see {path} --help") if message else 2)

@@ -74,7 +74,7 @@ def report(
 
 def make_report(
     folder: Path,
-    machines: args.Machines | Workplace = args.Machines(),
+    machines: args.Machines | Workplace,
     *,
     episodes: int | None = None,
     replay: str | None = None,
