@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.errors import InputError
+from parkenv.errors import InputError, nearest
 from parkenv.files.user_class import file_of_class, load_class
 from parkenv.world.occupancy import World
-from parkenv.world.scenario import Scenario, SearchProblem
+from parkenv.world.scenario import SearchProblem
 from planners.learned import ALGORITHMS
+from planners.names import AGENTS
 
 Observation = Mapping[str, Any]
 Memory = TypeVar("Memory")
@@ -28,11 +29,7 @@ class Agent(Protocol):
     """Interface of planners, heuristic baselines and stable-baselines3 models."""
 
     def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[Any, Any]:
         """Return an action for an observation, and the state to pass to the next call."""
         ...
@@ -70,26 +67,15 @@ class SearchAgent(ABC, Generic[Memory]):
 
     def __init__(self, problem: SearchProblem) -> None:
         # From a whole scenario, keep the public part only.
-        self.problem = problem.public() if isinstance(problem, Scenario) else problem
+        self.problem = problem.public()
 
     @abstractmethod
     def begin(self, observation: Observation, belief: SlotBelief) -> Memory:
-        """Return the memory for an episode that starts with this observation.
-
-        Args:
-            observation: from `parkenv/Search-v1`.
-            belief: its belief about the slots.
-        """
+        """Return the memory for an episode that starts with this observation and the belief that it contains."""
 
     @abstractmethod
     def decide(self, observation: Observation, belief: SlotBelief, memory: Memory) -> int:
-        """Choose the action.
-
-        Args:
-            observation: from `parkenv/Search-v1`.
-            belief: its belief about the slots.
-            memory: memory of this episode; may be changed in place.
-        """
+        """Choose the action; `memory`, that of this episode, may be changed in place."""
 
     def predict(
         self,
@@ -132,6 +118,11 @@ class SearchAgent(ABC, Generic[Memory]):
             memory = self.begin(observation, belief)
         return np.asarray(self.decide(observation, belief, memory), dtype=np.int64), memory
 
+    def wait(self, vertex: int) -> int:
+        """Return a move without an edge, which waits; the shortest move if all four have edges."""
+        missing = np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)
+        return int(missing[0]) if len(missing) else int(self.problem.move_s[vertex].argmin())
+
     def plan_preview(self, observation: Observation, action: int, memory: Memory) -> PlanPreview:
         """Return where the agent intends to drive, right after `predict` chose `action`, without side effects.
 
@@ -144,47 +135,19 @@ class SearchAgent(ABC, Generic[Memory]):
         return PlanPreview()
 
 
-# Modules are imported when an agent is made: heuristics need no sparse solver, and only trained models need torch.
-_AGENTS: dict[str, tuple[str, str]] = {
-    "mdp": ("planners.thesis.replanning", "ReplanningAgent"),
-    "mdp-static": ("planners.thesis.replanning", "StaticAgent"),
-    "greedy-goal": ("planners.greedy", "GreedyGoalAgent"),
-    "greedy-drive": ("planners.greedy", "GreedyDriveAgent"),
-    "first-free": ("planners.greedy", "FirstFreeAgent"),
-    "random": ("planners.greedy", "RandomAgent"),
-    "oracle": ("planners.bounds.oracle", "OracleAgent"),
-    "belief": ("planners.belief.agent", "BeliefAgent"),
-    "mdp-tuned": ("planners.thesis.tuning", "TunedAgent"),
-    "exact": ("planners.bounds.exact", "ExactAgent"),
-}
-
-SMALL_LOTS_ONLY = ("exact",)
-"""Agents for small lots and sensors without errors only."""
-AGENT_NAMES = tuple(name for name in _AGENTS if name not in SMALL_LOTS_ONLY)
-"""Agents for all lots."""
-
-
 def require_observations(name: str, problem: SearchProblem) -> None:
-    """Raise an error if slots can never be observed from the lane.
-
-    Args:
-        name: name of the agent, for the message.
-        problem: a problem with its sensor model.
-
-    Raises:
-        InputError: no slot can be observed.
-    """
+    """Raise an `InputError` for the agent `name` if the problem's sensor can never observe a slot from the lane."""
     if not problem.sensor_rates.seen.any():
         raise InputError(
             f"{name} plans on observations from the lane, and this sensor model has none; take mdp"
         )
 
 
-def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) -> Agent:
+def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
     """Make an agent that knows the scenario's public part: lot, goal, speeds and costs.
 
     Args:
-        name: one of `AGENT_NAMES` or `SMALL_LOTS_ONLY`; `ALGORITHM:FILE` for a model of `parkenv train`, such as
+        name: one of `planners.names.AGENTS`; `ALGORITHM:FILE` for a model of `parkenv train`, such as
             `ppo:models/ppo.zip`; or `MODULE:CLASS` for your own agent, such as `my_agents:Patient`: a class whose first
             argument is the problem. The module may be in the working directory.
         scenario: the scenario; its hidden occupancy is not passed to the agent.
@@ -207,17 +170,19 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
             "predict(observation, state, episode_start, deterministic)",
             alternatives=f"; nor is it an algorithm ({', '.join(ALGORITHMS)})",
         )
-        scenario = scenario.public() if isinstance(scenario, Scenario) else scenario
-    elif name in _AGENTS:
-        module, class_name = _AGENTS[name]
+        scenario = scenario.public()
+    elif name in AGENTS:
+        module, class_name = AGENTS[name]
         agent = getattr(import_module(module), class_name)
     else:
-        others = "ALGORITHM:FILE for a trained model, MODULE:CLASS for your own"
-        raise InputError(f"unknown agent {name!r}; known: {', '.join(_AGENTS)}, {others}")
+        raise InputError(
+            f"unknown agent {name!r}; {nearest(name, AGENTS)}, ALGORITHM:FILE for a trained model, MODULE:CLASS for "
+            "your own"
+        )
     known = [p for p in inspect.signature(agent).parameters if p != "problem"]
     for option in options:
         if option not in known:
-            raise InputError(f"agent {name!r} has no option {option!r}; known: {', '.join(known) or 'none'}")
+            raise InputError(f"agent {name!r} has no option {option!r}; {nearest(option, known)}")
     return agent(scenario, **options)
 
 

@@ -9,13 +9,13 @@ import pytest
 from command_line import parkenv
 
 from parkenv import InputError
+from parkenv.files.images import images_in, read_image
 from parkenv.perception.car_datasets import Crops, read_crop_folder, read_uiuc_test, read_uiuc_training
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.cross_validation import cross_validated
 from parkenv.perception.detection_scores import matches, recall_at, recall_precision
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, as_grey, best_boxes
-from parkenv.perception.image_files import images_in, read_image
 from parkenv.perception.training import TrainingSettings, train
 
 
@@ -98,7 +98,7 @@ def test_bad_model_files_are_told_apart(model, tmp_path):
         archive.writestr("weights.npy", weights)
         archive.writestr("settings.npy", raw[:start] + text)
     for name, message in (
-        ("text.npz", "not a car model"),
+        ("text.npz", "not a zip archive"),
         ("other.npz", "not a car model"),
         ("new.npz", "format version 9, want 2"),
         ("none.npz", "no such model; want side, front, or an .npz file"),

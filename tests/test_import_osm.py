@@ -827,7 +827,7 @@ FAULTS = [
         lambda: car_park().geojson().replace('"Polygon", "coordinates": [[', '"Polygon", "coordinates": [[], [', 1),
         r"way/4: coordinates are \[\], want positions",
     ),
-    ("a.json", lambda: '{"elements": [', "not JSON: line 1, column 15"),
+    ("a.json", lambda: '{"elements": [', "not JSON: .* at line 1 column 14"),
     ("a.json", lambda: '{"elements": [{"type": "node", "id": "x"}]}', r"elements\[0\]: id is 'x'"),
     (
         "a.json",
@@ -909,7 +909,7 @@ def test_every_cut_of_a_map_is_refused(tmp_path):
 
 
 def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(InputError, match="cannot be read: No such file"):
+    with pytest.raises(InputError, match="No such file"):
         import_lot(tmp_path / "a.osm")
 
 
@@ -1011,7 +1011,7 @@ def test_the_command_line_imports_draws_and_checks(tmp_path):
     assert run("import", place, "--out", lot, "--disabled").exit_code == 0
     assert read_lot(lot).n_slots == 24
     refused = run("import", place, "--out", lot, "--goal", "48")
-    assert str(refused.exception) == "--goal is '48', want 2 numbers separated by commas"
+    assert str(refused.exception) == "--goal is '48', want 2 numbers separated by commas, e.g. 10,90"
 
 
 def test_the_command_line_draws_what_it_refuses_and_writes_no_lot(tmp_path):

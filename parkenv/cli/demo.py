@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.compare import result_tables
-from parkenv.cli.tables import StageProgress, make_console
+from parkenv.cli.report import make_report
+from parkenv.cli.tables import command_line, make_console, print_recorded, progress_bar
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import DemoSpec
@@ -41,26 +39,18 @@ NEXT = (
 
 
 def demo(
-    scenario: args.ScenarioOption = None,
-    quick: Annotated[
-        bool,
-        typer.Option("--quick", help="A shorter demo: 2 survey drives, captures farther apart, 2 episodes."),
-    ] = False,
-    sessions: Annotated[
-        int | None, typer.Option("--sessions", min=1, help="Survey drives.  [default: 4]")
-    ] = None,
-    episodes: Annotated[
-        int | None, typer.Option("--episodes", "-n", min=2, help="Searches of each agent.  [default: 6]")
-    ] = None,
-    every: Annotated[
-        float | None,
-        typer.Option("--every", min=0.1, help="Metres between captures of the sensors.  [default: 2.5]"),
-    ] = None,
-    detector: args.DetectorOption = "hog",
-    seed: args.SeedOption = 0,
-    jobs: args.JobsOption = 0,
-    rerun: args.RerunOption = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for everything.")] = Path("results/demo"),
+    scenario: str | None = None,
+    quick: bool = False,
+    sessions: int | None = None,
+    episodes: int | None = None,
+    seed: int = 0,
+    out: Path = Path("results/demo"),
+    *,
+    every: float | None = None,
+    detector: str = "hog",
+    rerun: Path | None = None,
+    folder: args.RunFolder,
+    machines: args.Machines,
 ) -> None:
     """Survey a lot with simulated sensors, estimate how often each slot is taken, and search there on other days.
 
@@ -75,31 +65,34 @@ def demo(
     4. A report with replays, and a film of one search.
 
     Examples:
-    * `parkenv demo`
+        parkenv demo
+        parkenv demo --quick --out results/quick
 
-    * `parkenv demo --quick --out results/quick`
+    Options:
+        quick: A shorter demo: fewer drives and episodes, captures farther apart.
+        sessions (N >= 1): Survey drives.  [default: 4]
+        episodes, -n (N >= 2): Episodes of each agent.  [default: 6]
+        out, -o (DIR): Folder for everything.
+
+    Sensors:
+        every (M >= 0.1): Metres between captures.  [default: 2.5]
     """
     from parkenv.evaluation.experiments.demo import QUICK
     from parkenv.evaluation.experiments.spec import DemoSpec
 
-    given = {"sessions": sessions, "episodes": episodes, "every": every}
+    settings = (QUICK if quick else {}) | args.not_none(sessions=sessions, episodes=episodes, every=every)
     spec = DemoSpec().changed(
-        scenario=args.one_scenario(args.scenario_specs(scenario)), detector=detector, seed=seed, jobs=jobs,
-        **(QUICK if quick else {}) | {name: value for name, value in given.items() if value is not None},
-    )  # fmt: skip
-    run_demo(spec, out, rerun=rerun)
+        scenario=args.World().spec(scenario), detector=detector, seed=seed, **settings, **machines.given
+    )
+    run_demo(spec, out, folder, rerun)
 
 
-def run_demo(
-    spec: DemoSpec, out: Path, *, resume: bool = False, overwrite: bool = False, rerun: Path | None = None
-) -> None:
+def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | None = None) -> None:
     """Run the demo; continue an unfinished one in the folder, replace a finished one.
 
     Raises:
         InputError: the scenario cannot be made, or the folder cannot be used.
     """
-    del overwrite
-    from parkenv.cli.report import make_report
     from parkenv.evaluation.experiments.compare import run_cases, table
     from parkenv.evaluation.experiments.demo import AGENTS, FILMED, demo_cases, demo_survey
     from parkenv.evaluation.experiments.results import ResultFolder, make_folder
@@ -119,13 +112,14 @@ def run_demo(
     make_folder(out)
     console = make_console()
     map_file = out / "map.sqlite"
-    folder = ResultFolder(out, _settings(spec), resume=resume or _goes_on(out), overwrite=True)
+    resume = folder.resume or (_goes_on(out) and not folder.overwrite)
+    results = ResultFolder(out, _settings(spec), resume=resume, overwrite=True)
     spec.write(out / SPEC_FILE)
     with (
-        args.workers_of(spec.jobs, spec.backend, spec.address) as workers,
+        args.workers_of(spec) as workers,
         # Only processes of this machine write files.
-        args.workers_of(spec.jobs, "loky", None) as here,
-        StageProgress(console) as progress,
+        args.Machines(spec.jobs).workers() as here,
+        progress_bar(console) as progress,
     ):
 
         def run_all(description: str, tasks: Sequence[Callable[[], object]], where: Workers) -> None:
@@ -147,14 +141,14 @@ def run_demo(
         cases = demo_cases(spec, its, log)
         bar = progress.add_task("2/4 searches through the sensors", total=len(cases) * spec.episodes)
         run_cases(
-            cases, folder, workers=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n)
+            cases, results, workers=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n)
         )
-        rows = table(cases, folder)
+        rows = table(cases, results)
         filmed = next(case for case, _ in cases if case.agent == FILMED)
         tasks: list[Callable[[], object]] = [
             partial(film_search, filmed, cases[0][1][0], out / FILM),
             partial(_draw_map, its, log, spec.sessions, out / "map.png"),
-            partial(draw_figures, ComparisonResults(cases, folder.episodes, rows), out, FIGURES),
+            partial(draw_figures, ComparisonResults(cases, results.episodes, rows), out, FIGURES),
         ]
         if run.shown is not None:
             tasks += [
@@ -163,13 +157,11 @@ def run_demo(
             ]
         run_all("3/4 pictures and film", tasks, here)
         summary = {
-            "command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": spec.seed, "rows": rows,
+            "command": command_line(), "version": __version__, "seed": spec.seed, "rows": rows,
             "survey": surveyed,
         }  # fmt: skip
-        folder.finish([case.key(s) for case, its_seeds in cases for s in its_seeds], summary)
-    page = make_report(
-        out, jobs=spec.jobs, drives=None if run.recorded is None else [run.recorded], stage="4/4 report"
-    )
+        results.finish([case.key(s) for case, its_seeds in cases for s in its_seeds], summary)
+    page = make_report(out, spec, drives=None if run.recorded is None else [run.recorded], stage="4/4 report")
     console.print(
         f"{spec.sessions} drives past {its.lot.n_slots} slots: {surveyed['car_detection_rate']:.1%} of the parked cars "
         f"were found, {surveyed['slot_accuracy']:.1%} of the slots classified correctly. Mean absolute error of the "
@@ -181,20 +173,14 @@ def run_demo(
         with console.status(f"Running the first session and the first search again for {rerun}"):
             case, seeds = cases[0]
             _record(case.scenario, settings, seeds[0], rerun)
-        console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
-    _say(
-        "Open:",
-        ((page, "everything on one page, with replays (in a browser)"), (out / FILM, "a search as a film")),
-    )
-    _say("Try next:", NEXT)
-
-
-def _say(title: str, lines: Sequence[tuple[object, str]]) -> None:
-    """Print what can be copied, each with an explanation; long paths are not broken."""
-    console = make_console()
-    console.print(f"\n{title}")
-    for text, explained in lines:
-        console.print(f"  {text}\n      {explained}", soft_wrap=True, markup=False)
+        print_recorded(console, rerun)
+    console = make_console(soft_wrap=True)
+    console.print("\nOpen")
+    console.print(f"  {page}\n    the results on one page, with replays, in a browser")
+    console.print(f"  {out / FILM}\n    a film of one search")
+    console.print("\nTry next")
+    for command, explained in NEXT:
+        console.print(f"  {command}\n    {explained}")
 
 
 def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) -> None:

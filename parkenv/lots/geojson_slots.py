@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.file_names import is_plain
 from parkenv.lots.generators import Slots
 from parkenv.lots.lot_contents import LotContents
 from parkenv.lots.slot_polygons import slots_from_polygons
@@ -18,13 +19,10 @@ from parkenv.world.lot import SLOT_SIDE, Mouth, corner_points
 
 FloatArray = NDArray[np.float64]
 
-SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")
-"""The properties that define a slot exactly."""
+SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")  # the properties that define a slot exactly
 MOUTHS = {mouth.name.lower(): mouth for mouth in Mouth}
-FARTHEST = 1e8
-"""Largest coordinate, m: enough for any map grid, and small enough for millimetres in float64."""
-SLOT_AGREEMENT = 0.01
-"""Largest distance, m, between a slot's polygon and the rectangle of its properties."""
+FARTHEST = 1e8  # largest coordinate, m: enough for any map grid, and small enough for millimetres in float64
+SLOT_AGREEMENT = 0.01  # largest distance, m, between a slot's polygon and the rectangle of its properties
 
 
 @dataclass(frozen=True)
@@ -119,7 +117,7 @@ def _slot_id(feature: RawFeature) -> str:
     given = feature.number if feature.given_id is None else feature.given_id
     if type(given) is int:
         return str(given)
-    if not isinstance(given, str) or not given:
+    if not isinstance(given, str) or not given or not is_plain(given):
         raise InputError(f"slot: id is {given!r:.40}, want a text")
     return given
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tarfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,14 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.archives import tar_members
+from parkenv.files.images import decode_image, images_in, natural_order, read_image
+from parkenv.files.limited_reading import read_text
 from parkenv.perception.hog_detector import as_grey
-from parkenv.perception.image_files import decode_image, images_in, natural_order, read_image
 
 Image = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
 
-UIUC_SIZE = (100, 40)
-"""Width and height, px, of UIUC's training crops and of its true boxes at scale 1."""
+UIUC_SIZE = (100, 40)  # width and height, px, of UIUC's training crops and of its true boxes at scale 1
 UIUC_TESTS = {
     "single": ("TestImages", "trueLocations.txt"),
     "multi": ("TestImages_Scale", "trueLocations_Scale.txt"),
@@ -28,30 +28,19 @@ _POSITIVE, _NEGATIVE = ("positives", "vehicles", "pos"), ("negatives", "non-vehi
 
 @dataclass(frozen=True, eq=False)
 class Crops:
-    """Aligned images of cars, and images without cars.
+    """Aligned images of cars, and images without cars."""
 
-    Attributes:
-        positives: grey, uint8, with the car at the same position in each.
-        negatives: grey, uint8, of any size.
-    """
-
-    positives: list[Image]
-    negatives: list[Image]
+    positives: list[Image]  # grey, uint8, with the car at the same position in each
+    negatives: list[Image]  # grey, uint8, of any size
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledImage:
-    """A photograph with the boxes of its cars.
+    """A photograph with the boxes of its cars."""
 
-    Attributes:
-        name: name of the file.
-        image: (h, w) uint8.
-        boxes: (n, 4) float64 px, left, top, right, bottom.
-    """
-
-    name: str
-    image: Image
-    boxes: FloatArray
+    name: str  # name of the file
+    image: Image  # (h, w) uint8
+    boxes: FloatArray  # (n, 4) float64 px, left, top, right, bottom
 
 
 def read_uiuc_training(folder: Path) -> Crops:
@@ -94,7 +83,7 @@ def read_uiuc_test(folder: Path, test_set: str) -> list[LabelledImage]:
     if not truth.is_file():
         raise InputError(f"{truth}: no such file; want the folder as UIUC publishes it")
     labelled = []
-    for line in truth.read_text().splitlines():
+    for line in read_text(truth).splitlines():
         if not line.strip():
             continue
         number, _, places = line.partition(":")
@@ -129,16 +118,7 @@ def read_crop_folder(folder: Path) -> Crops:
 
 
 def _images_of(archive: Path) -> dict[str, Image]:
-    images = {}
-    try:
-        with tarfile.open(archive) as files:
-            members = [m for m in files.getmembers() if m.isfile() and m.name.endswith(".pgm")]
-            for member in sorted(members, key=lambda m: natural_order(Path(m.name))):
-                stream = files.extractfile(member)
-                assert stream is not None
-                images[Path(member.name).name] = as_grey(
-                    decode_image(stream.read(), f"{archive}: {member.name}")
-                )
-    except (tarfile.TarError, EOFError, OSError) as error:
-        raise InputError(f"{archive}: is no archive that can be read: {error}") from error
-    return images
+    images = {
+        name: as_grey(decode_image(data, f"{archive}: {name}")) for name, data in tar_members(archive, ".pgm")
+    }
+    return {Path(name).name: images[name] for name in sorted(images, key=lambda n: natural_order(Path(n)))}

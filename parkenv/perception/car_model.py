@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.archives import parse_arrays, read_arrays
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import parse_json
 from parkenv.perception.hog import Descriptor
 
 Float32Array = NDArray[np.float32]
 
-PACKAGED_MODELS = ("side", "front")
-"""Packaged models, trained only on simulated images."""
+PACKAGED_MODELS = ("side", "front")  # packaged models, trained only on simulated images
 _FORMAT = "parkenv-car-model"
 _VERSION = 2  # version 1 did not take the square root of the grey values
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # equal models are equal files
@@ -31,28 +32,20 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)  # equal models are equal files
 class CarModel:
     """A linear classifier (support vector machine) of image windows on HOG features (T §3.2.1).
 
-    Args:
-        descriptor: the features of a window.
-        weights: `descriptor.shape` float32.
-        bias: added to the weighted sum; a score above 0 means car.
-        region_aspect: width over height of the image region that is resized to the window.
-        car: left, top, right, bottom of the car within the window, as fractions of its width and height.
-        calibration: slope and offset; the probability of a score s is 1/(1 + exp(-(slope·s + offset))).
-        end_on: whether it was trained on fronts and rears rather than on sides.
-        trained_on: one line that describes the training data.
-
     Raises:
         InputError: weights of another shape, or a number outside its range.
     """
 
-    descriptor: Descriptor
-    weights: Float32Array
-    bias: float
-    region_aspect: float
+    descriptor: Descriptor  # the features of a window
+    weights: Float32Array  # `descriptor.shape` float32
+    bias: float  # added to the weighted sum; a score above 0 means car
+    region_aspect: float  # width over height of the image region that is resized to the window
+    # left, top, right, bottom of the car within the window, as fractions of its width and height
     car: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    # slope and offset; the probability of a score s is 1/(1 + exp(-(slope·s + offset)))
     calibration: tuple[float, float] = (1.0, 0.0)
-    end_on: bool = False
-    trained_on: str = ""
+    end_on: bool = False  # whether it was trained on fronts and rears rather than on sides
+    trained_on: str = ""  # one line that describes the training data
 
     def __post_init__(self) -> None:
         weights = np.ascontiguousarray(self.weights, dtype=np.float32)
@@ -113,24 +106,19 @@ class CarModel:
         """
         if str(name) in PACKAGED_MODELS:
             source = resources.files("parkenv.perception") / "models" / f"{name}.npz"
-            data = source.read_bytes()
+            parts = parse_arrays(source.read_bytes(), str(name))
         elif Path(name).is_file():
-            data = Path(name).read_bytes()
+            parts = read_arrays(name)
         else:
             raise InputError(f"{name}: no such model; want {', '.join(PACKAGED_MODELS)}, or an .npz file")
-        try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as parts:
-                settings = json.loads(bytes(parts["settings"]).decode())
-                weights = parts["weights"]
-            if settings["format"] != _FORMAT:
-                raise KeyError("format")
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        settings = parse_json(parts.get("settings", np.zeros(0)).tobytes() or b"0", str(name))
+        if "weights" not in parts or not isinstance(settings, dict) or settings.get("format") != _FORMAT:
+            raise InputError(f"{name}: not a car model; want an .npz file that parkenv train-detector wrote")
+        weights = parts["weights"]
+        if settings.get("version") != _VERSION:
             raise InputError(
-                f"{name}: not a car model; want an .npz file that parkenv train-detector wrote"
-            ) from error
-        if settings["version"] != _VERSION:
-            raise InputError(
-                f"{name}: format version {settings['version']}, want {_VERSION}: written by another version of parkenv"
+                f"{name}: format version {settings.get('version')!r:.40}, want {_VERSION}: "
+                "written by another version of parkenv"
             )
         try:
             return cls(
@@ -143,5 +131,5 @@ class CarModel:
                 bool(settings["ends"]),
                 str(settings["trained_on"]),
             )
-        except (KeyError, TypeError) as error:
-            raise InputError(f"{name}: the model's settings are incomplete: {error}") from error
+        except (LookupError, TypeError, ValueError) as error:
+            raise InputError(f"{name}: the model's settings: {error}") from error

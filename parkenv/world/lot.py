@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.file_names import is_plain
 from parkenv.world.drive_graph import NODE_TOLERANCE, GraphError, GraphProblem, build_drive_graph
 
 if TYPE_CHECKING:
@@ -19,11 +20,9 @@ FloatArray = NDArray[np.float64]
 
 MOVES = ("up", "down", "left", "right")
 """The names of the four columns of `ParkingLot.neighbors`, in order (eq. 3.13)."""
-PARK = len(MOVES)
-"""The action "park" (eq. 3.14); lower actions are the moves."""
+PARK = len(MOVES)  # the action "park" (eq. 3.14); lower actions are the moves.
 ACTIONS = (*MOVES, "park")
-SLOT_SIDE = 0.1
-"""Least length and width of a slot, m."""
+SLOT_SIDE = 0.1  # least length and width of a slot, m
 
 
 class Mouth(IntEnum):
@@ -139,6 +138,9 @@ class ParkingLot:
         n = len(self.slot_ids)
         if n == 0:
             raise InputError(f"lot {self.name!r} has no slot")
+        if not is_plain("".join((self.name, *self.slot_ids))):
+            name = next(name for name in (self.name, *self.slot_ids) if not is_plain(name))
+            raise InputError(f"lot: name {name!a:.60} has control characters")
         if len(set(self.slot_ids)) < n:
             seen: set[str] = set()
             twice = next(i for i in self.slot_ids if i in seen or seen.add(i))  # type: ignore[func-returns-value]

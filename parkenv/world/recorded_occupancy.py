@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.limited_reading import csv_rows
 from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.world.occupancy import (
     DAY_NAMES,
@@ -27,9 +28,9 @@ from parkenv.world.occupancy_kernel import (
     kernel,
     recorded_day_at,
     recorded_forecast,
-    recorded_look,
+    recorded_index,
 )
-from parkenv.world.occupancy_log import OccupancyLog, csv_columns, csv_rows, day_class, weekday_of
+from parkenv.world.occupancy_log import OccupancyLog, csv_columns, day_class, weekday_of
 from parkenv.world.pointers import address_of, float64s, int64s, uint8s
 from parkenv.world.week import DAY_S
 
@@ -52,19 +53,19 @@ def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log:
     log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
     lot_index = {slot_id: i for i, slot_id in enumerate(lot_slot_ids)}
     mapping = np.full(len(lot_slot_ids), -1, np.int64)
-    with csv_rows(path) as rows:
-        at_slot, at_log_slot = csv_columns(path, rows, ("slot_id", "log_slot_id"), ("slot_id", "log_slot_id"))
-        for line, row in rows:
-            slot_id, log_slot_id = row[at_slot], row[at_log_slot]
-            if slot_id not in lot_index:
-                raise InputError(f"{path}: line {line}: slot_id: got {slot_id!r}, wanted a slot of the lot")
-            if mapping[lot_index[slot_id]] >= 0:
-                raise InputError(f"{path}: line {line}: slot_id: {slot_id!r} a second time, wanted it once")
-            if log_slot_id not in log_index:
-                raise InputError(
-                    f"{path}: line {line}: log_slot_id: got {log_slot_id!r}, wanted a slot of {log.source}"
-                )
-            mapping[lot_index[slot_id]] = log_index[log_slot_id]
+    rows = csv_rows(path)
+    at_slot, at_log_slot = csv_columns(path, rows, ("slot_id", "log_slot_id"), ("slot_id", "log_slot_id"))
+    for line, row in rows:
+        slot_id, log_slot_id = row[at_slot], row[at_log_slot]
+        if slot_id not in lot_index:
+            raise InputError(f"{path}: line {line}: slot_id: got {slot_id!r}, wanted a slot of the lot")
+        if mapping[lot_index[slot_id]] >= 0:
+            raise InputError(f"{path}: line {line}: slot_id: {slot_id!r} a second time, wanted it once")
+        if log_slot_id not in log_index:
+            raise InputError(
+                f"{path}: line {line}: log_slot_id: got {log_slot_id!r}, wanted a slot of {log.source}"
+            )
+        mapping[lot_index[slot_id]] = log_index[log_slot_id]
     missing = [slot_id for slot_id, i in lot_index.items() if mapping[i] < 0]
     if missing:
         raise InputError(
@@ -78,7 +79,7 @@ def _occupied(days: int, slots: IntArray, second: float, occupied: BoolArray) ->
     """Write whether each slot is taken at a second of the day."""
     day = recorded_day_at(days, 0)
     for i in range(slots.size):
-        occupied[i] = uint8s(day.occupied)[recorded_look(day, slots[i], second)] != 0
+        occupied[i] = uint8s(day.occupied)[recorded_index(day, slots[i], second)] != 0
 
 
 @kernel
@@ -86,11 +87,11 @@ def _next_free(days: int, slots: IntArray, second: float, free_from: FloatArray)
     """Write the first second >= `second` at which each slot is free; inf if never."""
     day = recorded_day_at(days, 0)
     for i in range(slots.size):
-        look, end = recorded_look(day, slots[i], second), int64s(day.first)[int64s(day.record)[slots[i]] + 1]
+        k, end = recorded_index(day, slots[i], second), int64s(day.first)[int64s(day.record)[slots[i]] + 1]
         free_from[i] = second
-        while look < end and uint8s(day.occupied)[look] != 0:
-            look += 1
-            free_from[i] = float64s(day.from_s)[look] if look < end else np.inf
+        while k < end and uint8s(day.occupied)[k] != 0:
+            k += 1
+            free_from[i] = float64s(day.from_s)[k] if k < end else np.inf
 
 
 @kernel
@@ -101,8 +102,8 @@ def _changes(days: int, slots: IntArray, second: float, count: IntArray) -> None
     for i in range(slots.size):
         first = int64s(day.first)[int64s(day.record)[slots[i]]]
         count[i] = 0
-        for look in range(first + 1, recorded_look(day, slots[i], second) + 1):
-            count[i] += taken[look] != taken[look - 1]
+        for k in range(first + 1, recorded_index(day, slots[i], second) + 1):
+            count[i] += taken[k] != taken[k - 1]
 
 
 @kernel

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import jsonschema
 import numpy as np
@@ -24,6 +24,7 @@ from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.compare import Case, at_occupancy, table
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.results import ResultFolder, Row
+from parkenv.files.limited_reading import read_json
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.occupancy import ArrivalWindow
 from parkenv.world.scenario import KMH, Scenario
@@ -45,27 +46,20 @@ _FOLDER = Path(__file__).parent / "suites"
 
 @dataclass(frozen=True)
 class Task:
-    """One scenario of a suite.
+    """One scenario of a suite."""
 
-    Args:
-        name: name of the task.
-        scenario: a packaged scenario.
-        occupancy_level: mean occupancy of the world; None for the scenario's own.
-        sight: `perfect`, or the rig whose fitted sensor model is used.
-        v_walk_kmh: walking speed; None for the scenario's own.
-    """
-
-    name: str
-    scenario: str
-    occupancy_level: float | None = None
-    sight: str = "perfect"
-    v_walk_kmh: float | None = None
+    name: str  # name of the task
+    scenario: str  # a packaged scenario
+    occupancy_level: float | None = None  # mean occupancy of the world; None for the scenario's own
+    # `perfect`, or the rig whose fitted sensor model is used; `sight` in the suite's file
+    sensor_model: str = "perfect"
+    v_walk_kmh: float | None = None  # walking speed; None for the scenario's own
 
     def made(self, arrival: ArrivalWindow) -> Scenario:
         """Make the scenario, named after the task."""
         made = make_scenario(self.scenario).replace(name=self.name, arrival=arrival)
-        if self.sight != "perfect":
-            made = made.replace(sensor_model=SensorModel.named(self.sight))
+        if self.sensor_model != "perfect":
+            made = made.replace(sensor_model=SensorModel.named(self.sensor_model))
         if self.v_walk_kmh is not None:
             made = made.replace(v_walk=self.v_walk_kmh * KMH)
         return made if self.occupancy_level is None else at_occupancy(made, self.occupancy_level)
@@ -73,23 +67,14 @@ class Task:
 
 @dataclass(frozen=True)
 class Suite:
-    """A benchmark suite.
+    """A benchmark suite."""
 
-    Args:
-        name: name, such as v1.
-        description: one sentence.
-        arrival: when searches begin.
-        seeds: seeds; every task has one search per seed.
-        tasks: the tasks.
-        fingerprint: SHA-256 of the suite's file, as JSON without white space.
-    """
-
-    name: str
-    description: str
-    arrival: ArrivalWindow
-    seeds: range
-    tasks: tuple[Task, ...]
-    fingerprint: str
+    name: str  # name, such as v1
+    description: str  # one sentence
+    arrival: ArrivalWindow  # when searches begin
+    seeds: range  # seeds; every task has one search per seed
+    tasks: tuple[Task, ...]  # the tasks
+    fingerprint: str  # SHA-256 of the suite's file, as JSON without white space
 
     @classmethod
     def named(cls, name: str) -> Self:
@@ -105,7 +90,7 @@ class Suite:
         """
         if name not in SUITES:
             raise InputError(f"there is no benchmark suite {name!r}; known: {', '.join(SUITES)}")
-        content = json.loads(_file(f"{name}.json"))
+        content = _packaged(name)
         canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
         first = content["first_seed"]
         return cls(
@@ -113,7 +98,7 @@ class Suite:
             content["description"],
             ArrivalWindow.parse(content["arrival"], content["days"]),
             range(first, first + content["episodes"]),
-            tuple(Task(**task) for task in content["tasks"]),
+            tuple(Task(sensor_model=task.pop("sight", "perfect"), **task) for task in content["tasks"]),
             hashlib.sha256(canonical.encode()).hexdigest(),
         )
 
@@ -190,10 +175,8 @@ def check_result(path: Path) -> Row:
         InputError: the check failed; the message says where, with agent and task.
     """
     try:
-        result: Row = json.loads(path.read_text(encoding="utf-8"))
-        jsonschema.validate(result, json.loads(_file("result.schema.json")))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: no benchmark result ({error})") from error
+        result: Row = read_json(path)
+        jsonschema.validate(result, _packaged("result.schema"))
     except jsonschema.ValidationError as error:
         raise InputError(f"{path}: {error.json_path} {error.message[:200]}") from error
     suite = Suite.named(result["suite"])
@@ -262,5 +245,5 @@ def _mean_score(tasks: Mapping[str, Mapping[str, Sequence[float]]]) -> float:
     return float(np.mean([_score(searches) for searches in tasks.values()]))
 
 
-def _file(name: str) -> str:
-    return (_FOLDER / name).read_text(encoding="utf-8")
+def _packaged(name: str) -> Any:
+    return read_json(_FOLDER / f"{name}.json")

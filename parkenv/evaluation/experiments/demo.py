@@ -5,9 +5,9 @@ from __future__ import annotations
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.spec import DemoSpec, SurveySpec
 from parkenv.evaluation.experiments.surveys import survey_of
+from parkenv.files.names import RigName
 from parkenv.mapping.inference import MapPrior, SessionLog
 from parkenv.mapping.survey import SurveySettings
-from parkenv.scenarios.spec import RigName
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 
@@ -17,8 +17,7 @@ QUICK = {"sessions": 2, "episodes": 2, "every": 4.0}
 """Settings of a shorter demo."""
 RIG: RigName = "laser"
 _HOURS = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
-_APART = 1_000_000
-"""Offset between the seeds of survey and searches, so that their worlds differ."""
+_APART = 1_000_000  # offset between the seeds of survey and searches, so that their worlds differ
 
 
 def demo_survey(spec: DemoSpec) -> tuple[Scenario, SurveySettings]:

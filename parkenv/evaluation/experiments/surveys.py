@@ -18,6 +18,7 @@ from parkenv.errors import InputError
 from parkenv.evaluation.experiments.spec import BUSY, SurveySpec
 from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import csv_records
 from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
 from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.odometry import PoseNoise
@@ -50,17 +51,12 @@ SESSION_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class SurveyRun:
-    """A completed survey.
+    """A completed survey."""
 
-    Attributes:
-        rows: one row per session, in order.
-        shown: the first session, with results for figures; None if it already existed.
-        recorded: what `run_survey`'s `record` made of it; else None.
-    """
-
-    rows: list[Row]
+    rows: list[Row]  # one row per session, in order
+    # the first session, with results for figures; None if all sessions already existed
     shown: SessionResult | None
-    recorded: Any = None
+    recorded: Any = None  # what `record` of `run_survey` made of it
 
 
 def survey_of(spec: SurveySpec) -> tuple[Scenario, SurveySettings]:
@@ -329,12 +325,15 @@ def _read_rows(path: Path) -> list[Row]:
     if not path.exists():
         return []
     rows = []
-    for raw in csv.DictReader(path.read_text(encoding="utf-8").splitlines()):
+    whole = ("parked", "found", "detections", "right")
+    words = ("key", "weather", "cars_in_frame", "cars_detected")
+    for line, raw in csv_records(path):
         if tuple(raw) != SESSION_COLUMNS:
             raise InputError(f"{path}: not written by this version of parkenv; use another folder")
-        whole = ("parked", "found", "detections", "right")
-        words = ("key", "weather", "cars_in_frame", "cars_detected")
-        rows.append({k: v if k in words else int(v) if k in whole else float(v) for k, v in raw.items()})
+        try:
+            rows.append({k: v if k in words else int(v) if k in whole else float(v) for k, v in raw.items()})
+        except ValueError as error:
+            raise InputError(f"{path}: line {line}: {error}") from error
     return rows
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.evaluation.experiments.compare import BLIND, Case
+from parkenv.files.file_names import file_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -141,7 +142,7 @@ def draw_figures(results: ComparisonResults, folder: Path, names: Sequence[str] 
     for kind in FIGURES:
         if names is None or kind.name in names:
             for name, caption, figure in kind.draw(results):
-                files.append(folder / f"{name}.png")
+                files.append(folder / file_name(name, ".png"))
                 save_picture(figure, files[-1], caption)
     return files
 

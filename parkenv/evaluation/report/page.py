@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from PIL import Image as PillowImage
 
-from parkenv.errors import InputError
 from parkenv.evaluation.experiments.results import Row
 from parkenv.evaluation.figures.picture_files import CAPTION
 from parkenv.evaluation.figures.registry import FIGURES
@@ -23,6 +22,7 @@ from parkenv.evaluation.report.learning import learning_of
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.report.tables import tables_of
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.images import read_image
 
 FORMAT, VERSION = "parkenv-report", 1
 SCHEMA = Path(__file__).with_name("report.schema.json")
@@ -117,12 +117,9 @@ def _rank(path: Path) -> int:
 
 
 def _figure(path: Path) -> str:
-    try:
-        with PillowImage.open(path) as opened:
-            picture = opened.convert("RGB")
-            caption = html.escape(opened.info.get(CAPTION) or path.stem.replace("_", " "))
-    except OSError as error:
-        raise InputError(f"{path}: not a readable image: {error}") from error
+    picture = PillowImage.fromarray(read_image(path)).convert("RGB")
+    with PillowImage.open(path) as opened:
+        caption = html.escape(opened.info.get(CAPTION) or path.stem.replace("_", " "))
     if picture.width > MOST_WIDTH:
         picture = picture.resize((MOST_WIDTH, round(picture.height * MOST_WIDTH / picture.width)))
     source, (width, height) = _webp(picture), picture.size
