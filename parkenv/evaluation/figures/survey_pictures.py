@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from parkenv.envs.drawing import write_tag
 from parkenv.evaluation.figures.lot_picture import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.evaluation.figures.picture_files import INK, STYLE, save_picture
 from parkenv.mapping.discovery import DiscoveryScore, FoundSlots
@@ -57,7 +58,7 @@ def draw_detections(
             continue
         color = END_COLOR if end else SIDE_COLOR
         cv2.rectangle(drawn, (left, top), (right, bottom), color, 2, cv2.LINE_AA)
-        cv2.putText(drawn, f"{p:.2f}", (left + 4, max(top, 0) + 16), color, cv2.FontFace("sans"), 14, 700)
+        write_tag(drawn, f"{p:.2f}", (left, max(top, 0)), color)
     return drawn
 
 
@@ -104,7 +105,11 @@ def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
             shown, origin="lower", extent=extent, cmap=BELIEF_MAP, vmin=0, vmax=1, alpha=0.8, zorder=3
         )
         axes[0].set_title("occupancy grid: where cars were detected")
-        _draw_scale(figure, axes[0], BELIEF_MAP, "P(a car is here)")
+        scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(0, 1), BELIEF_MAP)
+        inset = axes[0].inset_axes((0.76, 0.1, 0.2, 0.025))
+        figure.colorbar(
+            scale, cax=inset, orientation="horizontal", label="P(a car is here)", ticks=[0, 0.5, 1]
+        )
         cars = result.session.cars
         axes[1].quiver(
             cars[:, 0], cars[:, 1], np.cos(cars[:, 2]), np.sin(cars[:, 2]), pivot="mid", headwidth=1, headlength=0,
@@ -196,7 +201,7 @@ def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, ti
             panels.append(("the truth", "P(taken)", BELIEF_MAP, true))
         width = predicted.high - predicted.low
         # Neither colour map passes through the grey of the asphalt.
-        panels.append(("how sure it is", "width of the 95 % interval", mpl.colormaps["plasma"], width))
+        panels.append(("how unsure it is", "width of the 95 % interval", mpl.colormaps["plasma"], width))
         figure = Figure(figsize=(11.0, _height(lot, 11.0, len(panels))), layout="constrained")
         axes = np.atleast_1d(figure.subplots(len(panels), 1))
         for ax, (name, label, colors, values) in zip(axes, panels, strict=True):
