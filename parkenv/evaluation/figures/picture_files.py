@@ -92,5 +92,5 @@ def save_film(
             append_images=pictures[1:],
             duration=round(1000 / fps),
             loop=0,
-            optimize=False,
+            optimize=colors is not None,  # store only what changes
         )

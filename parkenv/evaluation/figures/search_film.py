@@ -43,7 +43,7 @@ DRIVE_SPEEDUP, WALK_SPEEDUP = 3.0, 12.0
 """Playback speed relative to real time."""
 MOST_FRAMES = 360
 """Maximum number of frames; longer searches are played faster."""
-COLORS = 128
+COLORS = 192
 """Number of colours of a film: enough for drawings and the camera's image."""
 WIDTH, CAPTION, PANEL = 840, 48, 172
 """Width of a frame, and heights of the caption and of the panel below the map, px."""
