@@ -110,9 +110,17 @@ class Command(_Page, TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse arguments; an unknown option is answered by the nearest known one."""
+        if ctx.resilient_parsing:  # completion: no value needs to be converted, which would load pydantic
+            ctx.params, ctx.args, _ = self.make_parser(ctx).parse_args(args)
+            return ctx.args
         try:
             return super().parse_args(ctx, args)
         except typer.TyperException as error:
+            option = getattr(error, "param", None)
+            if isinstance(option, TyperOption) and "Input should be" in str(error):
+                raise InputError(
+                    f"{option.opts[0]}: want {option.metavar}; see {ctx.command_path} --help"
+                ) from None
             if not hasattr(error, "possibilities"):
                 raise
             known = [name for p in self.params for name in (*p.opts, *p.secondary_opts) if name[:2] == "--"]
@@ -126,6 +134,17 @@ class Command(_Page, TyperCommand):
 class Group(_Page, TyperGroup):
     """A group of commands."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse arguments; without any, print the help page."""
+        if ctx.resilient_parsing:  # see `Command.parse_args`
+            ctx.params, rest, _ = self.make_parser(ctx).parse_args(args)
+            ctx._protected_args, ctx.args = rest[:1], rest[1:]
+            return rest
+        if args:
+            return super().parse_args(ctx, args)
+        typer.echo(ctx.get_help())
+        raise typer.Exit(2)
+
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command; an unknown one is answered by the nearest known one."""
         if args[0] not in self.commands and not ctx.resilient_parsing and args[0][:1] != "-":
@@ -137,9 +156,7 @@ class Group(_Page, TyperGroup):
 
 def group(name: str, text: str) -> typer.Typer:
     """Make a group of commands."""
-    return typer.Typer(
-        name=name, help=text, cls=Group, no_args_is_help=True, rich_markup_mode=None, context_settings=CONTEXT
-    )
+    return typer.Typer(name=name, help=text, cls=Group, rich_markup_mode=None, context_settings=CONTEXT)
 
 
 def add(app: typer.Typer, name: str, function: Callable[..., None], heading: str | None = None) -> None:
