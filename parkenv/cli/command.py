@@ -68,6 +68,13 @@ class _Page:
     help: str | None
     params: list[Any]
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse arguments; for a completion leave them text, since converting them loads pydantic."""
+        if ctx.resilient_parsing:
+            for param in self.params:
+                param.process_value = lambda _, value: value
+        return super().parse_args(ctx, args)  # type: ignore[misc, no-any-return]
+
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the words after the command, without the braces of required arguments."""
         return [piece.strip("{}") for piece in super().collect_usage_pieces(ctx)]  # type: ignore[misc]
@@ -110,9 +117,6 @@ class Command(_Page, TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse arguments; an unknown option is answered by the nearest known one."""
-        if ctx.resilient_parsing:  # completion: no value needs to be converted, which would load pydantic
-            ctx.params, ctx.args, _ = self.make_parser(ctx).parse_args(args)
-            return ctx.args
         try:
             return super().parse_args(ctx, args)
         except typer.TyperException as error:
@@ -136,11 +140,7 @@ class Group(_Page, TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse arguments; without any, print the help page."""
-        if ctx.resilient_parsing:  # see `Command.parse_args`
-            ctx.params, rest, _ = self.make_parser(ctx).parse_args(args)
-            ctx._protected_args, ctx.args = rest[:1], rest[1:]
-            return rest
-        if args:
+        if args or ctx.resilient_parsing:
             return super().parse_args(ctx, args)
         typer.echo(ctx.get_help())
         raise typer.Exit(2)
