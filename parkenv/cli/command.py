@@ -71,13 +71,13 @@ class _Page:
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse arguments; for a completion leave them text, since converting them loads pydantic."""
         if ctx.resilient_parsing:
-            for param in self.params:
+            for param in self.get_params(ctx):  # type: ignore[attr-defined]
                 param.process_value = lambda _, value: value
         return super().parse_args(ctx, args)  # type: ignore[misc, no-any-return]
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the words after the command, without the braces of required arguments."""
-        return [piece.strip("{}") for piece in super().collect_usage_pieces(ctx)]  # type: ignore[misc]
+        return [re.sub("[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]  # type: ignore[misc]
 
     def format_help_text(self, ctx: Any, formatter: Any) -> None:
         """Write the text, and the examples as they are."""

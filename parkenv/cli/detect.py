@@ -94,8 +94,8 @@ def train_detector(
 
     Examples:
         parkenv train-detector --uiuc CarData --out side.npz
-        parkenv train-detector --crops kitti --front --folds 3 --out front.npz --penalty 0.02
-            --normalization blocks --jitter 0 --misaligned 0 --rounds 0
+        parkenv train-detector --crops kitti --front --out front.npz \\
+            --normalization blocks --penalty 0.02 --jitter 0 --misaligned 0
 
     Options:
         out, -o (FILE.npz): The model file to write.
