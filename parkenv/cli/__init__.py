@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from typing import NoReturn
 
 import typer
 
@@ -26,6 +27,7 @@ from parkenv.cli import (
     survey,
     train,
 )
+from parkenv.cli.stop_signals import stop_signals
 from parkenv.errors import InputError
 from sim_sensors.errors import SensorError
 
@@ -79,7 +81,18 @@ def _global_options(
 
 
 def main() -> None:
-    """Entry point; invalid input gives one line on standard error and exit code 2."""
+    """Entry point; invalid input gives one line on standard error and exit code 2, signal n exit code 128 + n."""
+    with stop_signals() as received:
+        try:
+            _run_command()
+        except BaseException:
+            # Libraries turn an interruption into errors of their own, such as failed imports.
+            if received:
+                sys.exit(128 + received[0])
+            raise
+
+
+def _run_command() -> NoReturn:
     warnings.formatwarning = lambda message, *_: f"parkenv: warning: {message}\n"
     try:
         code = app(standalone_mode=False)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 
@@ -194,18 +194,24 @@ DriveOption = Annotated[
 ]
 SeedOption = Annotated[int, typer.Option("--seed", min=0, help="First seed; episode i uses seed + i.")]
 JobsOption = Annotated[
-    int,
-    typer.Option("--jobs", "-j", min=0, help="Worker processes; 0 takes all cores. The result is the same."),
+    int | None,
+    typer.Option(
+        "--jobs",
+        "-j",
+        metavar="N",
+        min=0,
+        help="Worker processes, at most one per core and per task; 0 takes all cores. The result is the same.  "
+        "[default: 0; of a saved run or a file, its own]",
+        rich_help_panel=MACHINES,
+    ),
 ]
-
-
 BackendOption = Annotated[
-    str,
+    str | None,
     typer.Option(
         "--backend",
         metavar="loky|ray|dask",
         help="Where workers run: on this machine (loky), or on a Ray or Dask cluster (extras ray, dask). The result is "
-        "the same.",
+        "the same.  [default: loky]",
         rich_help_panel=MACHINES,
     ),
 ]
@@ -262,7 +268,15 @@ def words(option: str, text: str) -> list[str]:
     return values
 
 
-def workers_of(jobs: int, backend: str, address: str | None) -> Workers:
+def workplace(jobs: int | None, backend: str | None = None, address: str | None = None) -> dict[str, Any]:
+    """Return the fields of a specification that the options set; a new backend does not keep the saved address."""
+    given = {"jobs": jobs, "backend": backend, "address": address}
+    return {
+        name: value for name, value in given.items() if value is not None or (name == "address" and backend)
+    }
+
+
+def workers_of(jobs: int | None, backend: str | None = None, address: str | None = None) -> Workers:
     """Return the workers for tasks, a context manager that connects to clusters.
 
     Raises:
@@ -270,7 +284,7 @@ def workers_of(jobs: int, backend: str, address: str | None) -> Workers:
     """
     from parkenv.evaluation.experiments.workers import Workers
 
-    return Workers(jobs or None, backend, address)
+    return Workers(jobs or None, backend or "loky", address)
 
 
 def scenario_specs(

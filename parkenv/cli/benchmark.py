@@ -12,6 +12,7 @@ from rich.console import Console
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.compare import episode_progress
+from parkenv.cli.run_folder import run_folder
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
 
@@ -31,8 +32,8 @@ app = typer.Typer(
 def run(
     suite: Annotated[str, typer.Argument(help="The suite; `parkenv benchmark show v1` describes it.")] = "v1",
     agents: args.AgentsOption = None,
-    jobs: args.JobsOption = 0,
-    backend: args.BackendOption = "loky",
+    jobs: args.JobsOption = None,
+    backend: args.BackendOption = None,
     address: args.AddressOption = None,
     out: Annotated[
         Path | None,
@@ -59,8 +60,9 @@ def run(
     out = out or Path("results") / suite
     base = args.saved(out, SPEC_FILE, BenchmarkSpec) if resume else BenchmarkSpec()
     given = {} if agents is None else {"agents": split_agents(agents)}
-    spec = base.changed(suite=suite, jobs=jobs, backend=backend, address=address, **given)
-    run_suite(spec, out, resume=resume, overwrite=overwrite)
+    spec = base.changed(suite=suite, **args.workplace(jobs, backend, address), **given)
+    with run_folder(out, f"--resume --out {out}"):
+        run_suite(spec, out, resume=resume, overwrite=overwrite)
 
 
 def run_suite(spec: BenchmarkSpec, out: Path, *, resume: bool = False, overwrite: bool = False) -> None:
@@ -100,8 +102,7 @@ def run_suite(spec: BenchmarkSpec, out: Path, *, resume: bool = False, overwrite
     command = ["parkenv", *sys.argv[1:]]
     if not complete:
         folder.finish(order, {"command": command, "complete": False}, complete=False)
-        console.print(f"Interrupted. What was finished is in {out}; --resume --out {out} goes on.")
-        raise typer.Exit(130)
+        raise KeyboardInterrupt
     result = result_of(suite, cases, folder, command)
     folder.finish(
         order, {"command": command, "version": __version__, "complete": True, "rows": result["rows"]}

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
+from parkenv.cli.run_folder import run_folder
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
 from parkenv.scenarios.build import build
@@ -52,8 +53,8 @@ def calibrate(
     cars: args.CarsOption = None,
     pedestrians: args.PedestriansOption = None,
     seed: args.SeedOption = 0,
-    jobs: args.JobsOption = 0,
-    backend: args.BackendOption = "loky",
+    jobs: args.JobsOption = None,
+    backend: args.BackendOption = None,
     address: args.AddressOption = None,
     out: Annotated[
         Path,
@@ -76,7 +77,7 @@ def calibrate(
     """
     from parkenv.evaluation.experiments.agent_spec import AgentSpec
     from parkenv.evaluation.experiments.experiment import agent_fingerprints, fingerprints, flat_tables
-    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.results import write_summary
     from parkenv.evaluation.trips.calibration import (
         TripFolder,
         TripPlan,
@@ -94,66 +95,66 @@ def calibrate(
     style = DrivingStyle(speed=speed, notice_m=notice_m)
     rig = args.rig_of(rig)
     DrivenSearch(its, agent, style=style, rig=rig)  # raises an error before anything is driven
-    make_folder(out)
-    settings = {
-        "version": __version__, "scenario": its.name,
-        "scenarios": {its.name: flat_tables(spec.model_dump(mode="json"))},
-        "files": fingerprints(spec.files()), "agent": agent, "style": dataclasses.asdict(style),
-        "rig": rig,
-        "traffic": dataclasses.asdict(its.traffic), "agent files": agent_fingerprints([AgentSpec.of(agent).name]),
-    }  # fmt: skip
-    folder = TripFolder(out, settings, resume=resume)
-    console = make_console()
-    progress = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("trips"),
-        TimeRemainingColumn(),
-        console=console,
-    )
-    seeds = range(seed, seed + episodes)
-    with progress, args.workers_of(jobs, backend, address) as workers:
-        bar = progress.add_task("Driving", total=2 * episodes)
-        rows = drive_trips(
-            TripPlan(its, agent, style, rig), seeds, folder, workers, lambda n: progress.advance(bar, n)
+    with run_folder(out, "the same command with --resume"):
+        settings = {
+            "version": __version__, "scenario": its.name,
+            "scenarios": {its.name: flat_tables(spec.model_dump(mode="json"))},
+            "files": fingerprints(spec.files()), "agent": agent, "style": dataclasses.asdict(style),
+            "rig": rig,
+            "traffic": dataclasses.asdict(its.traffic), "agent files": agent_fingerprints([AgentSpec.of(agent).name]),
+        }  # fmt: skip
+        folder = TripFolder(out, settings, resume=resume)
+        console = make_console()
+        progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("trips"),
+            TimeRemainingColumn(),
+            console=console,
         )
-    made, table = calibration_of(rows, its, speed)
-    made.to_file(out / "calibrated.json")
-    touched, stuck = (sum(row[name] for row in rows) for name in ("contacts", "rescues"))
-    write_summary(
-        out,
-        {
-            "command": ["parkenv", *sys.argv[1:]],
-            "version": __version__,
-            "seed": seed,
-            **settings,
-            "trips": len(rows),
-            "contacts": touched,
-            "rescues": stuck,
-            "calibrated": dataclasses.asdict(made),
-            "rows": table,
-        },
-    )
-    title = f"{its.name}: {episodes} trips with and {episodes} without observations of slots, by {agent}"
-    save_distributions(rows, speed, title, out / f"calibration_{its.name}.png")
-    printed = make_table(title, ("what", "n", "mean [95 %]", "median", "p95"))
-    for row in table:
-        low, high = row["mean_ci95"]
-        printed.add_row(
-            row["what"],
-            str(row["n"]),
-            f"{row['mean']:.2f} [{low:.2f}, {high:.2f}]",
-            f"{row['median']:.2f}" if "median" in row else "",
-            f"{row['p95']:.2f}" if "p95" in row else "",
+        seeds = range(seed, seed + episodes)
+        with progress, args.workers_of(jobs, backend, address) as workers:
+            bar = progress.add_task("Driving", total=2 * episodes)
+            rows = drive_trips(
+                TripPlan(its, agent, style, rig), seeds, folder, workers, lambda n: progress.advance(bar, n)
+            )
+        made, table = calibration_of(rows, its, speed)
+        made.to_file(out / "calibrated.json")
+        touched, stuck = (sum(row[name] for row in rows) for name in ("contacts", "rescues"))
+        write_summary(
+            out,
+            {
+                "command": ["parkenv", *sys.argv[1:]],
+                "version": __version__,
+                "seed": seed,
+                **settings,
+                "trips": len(rows),
+                "contacts": touched,
+                "rescues": stuck,
+                "calibrated": dataclasses.asdict(made),
+                "rows": table,
+            },
         )
-    console.print(printed)
-    console.print(
-        f"Calibrated: driving at {made.v_drive / KMH:.2f} km/h, a failed attempt costs {made.failure_s:.1f} s, and "
-        f"parking takes {made.manoeuvre_s:.1f} s that the drive graph leaves out. In {len(rows)} trips: "
-        f"{touched} contacts, {stuck} times stuck."
-    )
-    console.print(f"Calibration, trips, summary and figure are in {out}")
+        title = f"{its.name}: {episodes} trips with and {episodes} without observations of slots, by {agent}"
+        save_distributions(rows, speed, title, out / f"calibration_{its.name}.png")
+        printed = make_table(title, ("what", "n", "mean [95 %]", "median", "p95"))
+        for row in table:
+            low, high = row["mean_ci95"]
+            printed.add_row(
+                row["what"],
+                str(row["n"]),
+                f"{row['mean']:.2f} [{low:.2f}, {high:.2f}]",
+                f"{row['median']:.2f}" if "median" in row else "",
+                f"{row['p95']:.2f}" if "p95" in row else "",
+            )
+        console.print(printed)
+        console.print(
+            f"Calibrated: driving at {made.v_drive / KMH:.2f} km/h, a failed attempt costs {made.failure_s:.1f} s, and "
+            f"parking takes {made.manoeuvre_s:.1f} s that the drive graph leaves out. In {len(rows)} trips: "
+            f"{touched} contacts, {stuck} times stuck."
+        )
+        console.print(f"Calibration, trips, summary and figure are in {out}")
 
 
 def trip(

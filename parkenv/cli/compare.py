@@ -21,6 +21,7 @@ from rich.progress import (
 from rich.table import Table
 
 from parkenv.cli import arguments as args
+from parkenv.cli.run_folder import run_folder
 from parkenv.cli.tables import WIDE, make_console, make_table
 from parkenv.errors import InputError
 
@@ -103,8 +104,8 @@ def compare(
         int | None,
         typer.Option("--seed", min=0, help="First seed; episode i uses seed + i.  [default: 0]"),
     ] = None,
-    jobs: args.JobsOption = 0,
-    backend: args.BackendOption = "loky",
+    jobs: args.JobsOption = None,
+    backend: args.BackendOption = None,
     address: args.AddressOption = None,
     out: Annotated[
         Path | None,
@@ -155,6 +156,8 @@ def compare(
     if failure_cost == SWEEP:
         grid = grid.changed(failure_s=FAILURE_COST_SWEEP, blind=True, occupancy_levels=())
         failure_cost, occupancy_levels = None, None
+    elif failure_cost is not None and grid.failure_s == FAILURE_COST_SWEEP:
+        grid = grid.changed(blind=False)
     if occupancy_levels == "none":
         grid, occupancy_levels = grid.changed(occupancy_levels=()), None
     if calibrated is not None:
@@ -180,10 +183,11 @@ def compare(
     spec = base.changed(
         scenarios=tuple(specs),
         grid=grid,
-        jobs=jobs, backend=backend, address=address,
+        **args.workplace(jobs, backend, address),
         **{name: value for name, value in given.items() if value is not None},
     )  # fmt: skip
-    run_comparison(spec, out, resume=resume, overwrite=overwrite, rerun=rerun, report=report)
+    with run_folder(out, f"--resume --out {out}"):
+        run_comparison(spec, out, resume=resume, overwrite=overwrite, rerun=rerun, report=report)
 
 
 def run_comparison(
@@ -199,6 +203,7 @@ def run_comparison(
 
     Raises:
         InputError: the experiment cannot be run, or the folder cannot be used.
+        KeyboardInterrupt: the run was interrupted; the results of finished episodes are printed and in the folder.
     """
     from parkenv.evaluation.experiments.experiment import run_experiment
     from parkenv.evaluation.figures.registry import draw_figures
@@ -235,8 +240,7 @@ def run_comparison(
             "into the slot, under either cost; the tables leave that out."
         )
     if not result.complete:
-        console.print(f"Interrupted. What was finished is in {out}; --resume --out {out} goes on.")
-        raise typer.Exit(130)
+        raise KeyboardInterrupt
     if spec.figures:
         with console.status("Drawing figures"):
             draw_figures(result.figure_data(), out)

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.compare import result_tables
+from parkenv.cli.run_folder import run_folder
 from parkenv.cli.tables import make_console
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def demo(
     ] = 2.5,
     detector: args.DetectorOption = "hog",
     seed: args.SeedOption = 0,
-    jobs: args.JobsOption = 0,
+    jobs: args.JobsOption = None,
     rerun: args.RerunOption = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for everything.")] = Path("results/demo"),
     report: args.ReportOption = False,
@@ -55,9 +56,11 @@ def demo(
 
     spec = DemoSpec().changed(
         scenario=args.one_scenario(args.scenario_specs(scenario)),
-        sessions=sessions, episodes=episodes, every=every, detector=detector, seed=seed, jobs=jobs,
+        sessions=sessions, episodes=episodes, every=every, detector=detector, seed=seed,
+        **args.workplace(jobs),
     )  # fmt: skip
-    run_demo(spec, out, rerun=rerun, report=report)
+    with run_folder(out, "the same command"):
+        run_demo(spec, out, rerun=rerun, report=report)
 
 
 def run_demo(
@@ -77,7 +80,7 @@ def run_demo(
     del overwrite
     from parkenv.evaluation.experiments.compare import run_cases, table
     from parkenv.evaluation.experiments.demo import AGENTS, demo_cases, demo_survey
-    from parkenv.evaluation.experiments.results import ResultFolder, make_folder
+    from parkenv.evaluation.experiments.results import ResultFolder
     from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.experiments.surveys import mean_occupancy, run_survey, summarize
     from parkenv.evaluation.experiments.warm_up import warm_up_tasks
@@ -92,7 +95,6 @@ def run_demo(
     if rerun is not None:
         require_viewer()
     its, settings = demo_survey(spec)
-    make_folder(out)
     console = make_console()
     map_file = out / "map.sqlite"
     folder = ResultFolder(out, _settings(spec), resume=resume or _goes_on(out), overwrite=True)

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
+from parkenv.cli.run_folder import run_folder
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
 
@@ -62,7 +63,7 @@ def park(
         typer.Option("--slack", min=0.0, help="Distance around the slot kept clear of parked cars, m."),
     ] = 0.0,
     seed: args.SeedOption = 0,
-    jobs: args.JobsOption = 0,
+    jobs: args.JobsOption = None,
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Output folder for pictures, episodes.csv and summary.json.")
     ] = Path("results/park"),
@@ -94,47 +95,47 @@ def park(
         cases.append(case)
     labels = _labels(args.words("--agents", agents))
     parking_agents = {label: make_parking_agent(name) for label, name in labels.items()}
-    make_folder(out)
-    console = make_console()
-    progress = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-    )
-    seeds = range(seed, seed + episodes)
-    parkings: dict[str, list[Parking]] = {label: [] for label in labels}
-    with progress, args.workers_of(jobs, "loky", None) as workers:
-        for label, name in labels.items():
-            what = "Parking" if len(labels) == 1 else label
-            bar = progress.add_task(what, total=len(cases) * episodes)
-            for some in park_all(cases, seeds, workers, name):
-                parkings[label] += some
-                progress.advance(bar, len(some))
-
-    rows = [{"agent": label, **p.row} for label, its in parkings.items() for p in its]
-    table = [
-        {"agent": label, **row}
-        for label, its in parkings.items()
-        for row in parking_table([p.row for p in its])
-    ]
-    names = [case.lot.name for case in cases]
-    write_parkings(rows, out / "episodes.csv")
-    summary = {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "lots": names}
-    write_summary(out, summary | {"agents": labels, "rows": table})
-    film = _to_film(next(iter(parkings.values())))
-    for label, its in parkings.items():
-        folder = out if len(labels) == 1 else out / label
-        make_folder(folder)
-        _picture(its, cases, parking_agents[label], film, folder)
-    _show(console, f"{', '.join(names)}: {episodes} episodes per lot", table)
-    for row in [row for row in rows if not row["parked"]][:SHOWN_ROWS]:
-        who = f"{row['agent']}, " if len(labels) > 1 else ""
-        console.print(
-            f"failed: {who}{row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
+    with run_folder(out):
+        console = make_console()
+        progress = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            console=console,
         )
-    console.print(f"Episodes, summary and pictures are in {out}")
+        seeds = range(seed, seed + episodes)
+        parkings: dict[str, list[Parking]] = {label: [] for label in labels}
+        with progress, args.workers_of(jobs) as workers:
+            for label, name in labels.items():
+                what = "Parking" if len(labels) == 1 else label
+                bar = progress.add_task(what, total=len(cases) * episodes)
+                for some in park_all(cases, seeds, workers, name):
+                    parkings[label] += some
+                    progress.advance(bar, len(some))
+
+        rows = [{"agent": label, **p.row} for label, its in parkings.items() for p in its]
+        table = [
+            {"agent": label, **row}
+            for label, its in parkings.items()
+            for row in parking_table([p.row for p in its])
+        ]
+        names = [case.lot.name for case in cases]
+        write_parkings(rows, out / "episodes.csv")
+        summary = {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "lots": names}
+        write_summary(out, summary | {"agents": labels, "rows": table})
+        film = _to_film(next(iter(parkings.values())))
+        for label, its in parkings.items():
+            folder = out if len(labels) == 1 else out / label
+            make_folder(folder)
+            _picture(its, cases, parking_agents[label], film, folder)
+        _show(console, f"{', '.join(names)}: {episodes} episodes per lot", table)
+        for row in [row for row in rows if not row["parked"]][:SHOWN_ROWS]:
+            who = f"{row['agent']}, " if len(labels) > 1 else ""
+            console.print(
+                f"failed: {who}{row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
+            )
+        console.print(f"Episodes, summary and pictures are in {out}")
 
 
 def _labels(names: list[str]) -> dict[str, str]:

@@ -54,7 +54,7 @@ def report(
     frames: Annotated[
         int, typer.Option("--frames", min=2, max=250, help="Captures of them to keep, all drives together.")
     ] = 120,
-    jobs: args.JobsOption = 0,
+    jobs: args.JobsOption = None,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help=f"The HTML file.  [default: DIR/{PAGE}]")
     ] = None,
@@ -91,7 +91,7 @@ def make_report(
     agents: str | None = None,
     sessions: int = 1,
     frames: int = 120,
-    jobs: int = 0,
+    jobs: int | None = None,
     out: Path | None = None,
 ) -> None:
     """Write the page; see `report` for the arguments.
@@ -132,7 +132,7 @@ def make_report(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), console=console,
         disable=not console.is_terminal,
     )  # fmt: skip
-    with args.workers_of(jobs, "loky", None) as workers, progress:
+    with args.workers_of(jobs) as workers, progress:
         bar = progress.add_task("Running again", total=len(tasks))
         done: list[dict[str, Any]] = []
         for recorded in workers.in_order(tasks):

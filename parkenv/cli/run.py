@@ -13,6 +13,7 @@ from parkenv.cli.benchmark import run_suite
 from parkenv.cli.compare import run_comparison
 from parkenv.cli.demo import run_demo
 from parkenv.cli.report import make_report
+from parkenv.cli.run_folder import run_folder
 from parkenv.cli.survey import run_survey_of
 from parkenv.cli.train import run_training
 from parkenv.errors import InputError
@@ -45,10 +46,7 @@ def run(
         Path,
         typer.Argument(metavar="FILE|DIR", help="An experiment file (.toml, .json), or the folder of a run."),
     ],
-    jobs: Annotated[
-        int | None,
-        typer.Option("--jobs", "-j", min=0, help="Worker processes; 0 for all cores.  [default: the file's]"),
-    ] = None,
+    jobs: args.JobsOption = None,
     out: Annotated[
         Path | None,
         typer.Option("--out", "-o", help="Folder for the results.  [default: results/NAME of the file]"),
@@ -81,9 +79,9 @@ def run(
         raise InputError(f"{file}: kind is {name!r}; {nearest(str(name), KINDS)}")
     kind = KINDS[name]
     spec: Any = getattr(specs, kind.spec).parse(tables, str(file), file.parent)
-    if jobs is not None:
-        spec = spec.changed(jobs=jobs)
+    spec = spec.changed(**args.workplace(jobs))
     out = out or Path("results") / file.stem
-    kind.run(spec, out, resume=resume, overwrite=overwrite)
-    if report:
-        make_report(out, jobs=spec.jobs)
+    with run_folder(out, f"parkenv run --resume {out}"):
+        kind.run(spec, out, resume=resume, overwrite=overwrite)
+        if report:
+            make_report(out, jobs=spec.jobs)

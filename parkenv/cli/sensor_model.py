@@ -27,8 +27,8 @@ def fit_sensor_model(
     days: args.DaysOption = None,
     weather: args.WeatherOption = None,
     seed: args.SeedOption = 500_000,
-    jobs: args.JobsOption = 0,
-    backend: args.BackendOption = "loky",
+    jobs: args.JobsOption = None,
+    backend: args.BackendOption = None,
     address: args.AddressOption = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="The JSON file to write.")] = Path(
         "sensor_model.json"

@@ -11,6 +11,7 @@ from rich.progress import Progress
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
+from parkenv.cli.run_folder import run_folder
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
 from parkenv.scenarios.build import build
@@ -47,8 +48,8 @@ def survey(
     cars: args.CarsOption = None,
     pedestrians: args.PedestriansOption = None,
     seed: args.SeedOption = 0,
-    jobs: args.JobsOption = 0,
-    backend: args.BackendOption = "loky",
+    jobs: args.JobsOption = None,
+    backend: args.BackendOption = None,
     address: args.AddressOption = None,
     rerun: args.RerunOption = None,
     out: Annotated[
@@ -78,9 +79,10 @@ def survey(
             )
         ),
         sessions=sessions, rig=rig, detector=detector, weather=weather, every=every, pose_noise=pose_noise, seed=seed,
-        jobs=jobs, backend=backend, address=address, **given,
+        **args.workplace(jobs, backend, address), **given,
     )  # fmt: skip
-    run_survey_of(spec, out, rerun=rerun, report=report)
+    with run_folder(out, "the same command"):
+        run_survey_of(spec, out, rerun=rerun, report=report)
 
 
 def run_survey_of(
@@ -100,7 +102,7 @@ def run_survey_of(
     del resume
     if overwrite:
         raise InputError("--overwrite: a survey adds sessions to its map; name another folder for a new one")
-    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.results import write_summary
     from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.experiments.surveys import (
         mean_occupancy,
@@ -126,7 +128,6 @@ def run_survey_of(
     if rerun is not None:
         require_viewer()
     its, settings = survey_of(spec)
-    make_folder(out)
     spec.write(out / SPEC_FILE)
     console = make_console()
     with (

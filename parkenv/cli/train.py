@@ -16,6 +16,7 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.drive_task import DriveTask
 from parkenv.cli.report import PAGE
+from parkenv.cli.run_folder import run_folder
 from parkenv.cli.search_task import SearchTask
 from parkenv.cli.tables import make_console
 from parkenv.cli.training_task import FIGURE, Row, TrainingTask, curves_beside
@@ -110,8 +111,8 @@ def train(
         ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="First seed of the trainings.")] = 0,
-    jobs: args.JobsOption = 0,
-    backend: args.BackendOption = "loky",
+    jobs: args.JobsOption = None,
+    backend: args.BackendOption = None,
     address: args.AddressOption = None,
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Keep logs for TensorBoard in --out.")
@@ -132,7 +133,13 @@ def train(
             help="Folders of other trainings with the same evaluations, to draw in the same figure.",
         ),
     ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoints in --out.")] = False,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Continue from the checkpoints in --out; the models differ from those of an unbroken training.",
+        ),
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the training in --out.")] = False,
     report: args.ReportOption = False,
 ) -> None:
@@ -167,15 +174,17 @@ def train(
     spec = TrainingSpec().changed(
         env=env, algorithm=algorithm, steps=steps, seeds=seeds, seed=seed, clone=clone, demonstrations=demonstrations,
         k=k, evaluate_every=evaluate_every, evaluation_episodes=evaluation_episodes, tensorboard=tensorboard,
-        jobs=jobs, backend=backend, address=address, **given,
+        **args.workplace(jobs, backend, address), **given,
     )  # fmt: skip
     others = args.words("--beside", beside) if beside else ()
-    run_training(spec, out, resume=resume, overwrite=overwrite, beside=others, report=report)
+    out = out or Path("results") / TASKS[env](spec).folder
+    with run_folder(out, "the same command with --resume"):
+        run_training(spec, out, resume=resume, overwrite=overwrite, beside=others, report=report)
 
 
 def run_training(
     spec: TrainingSpec,
-    out: Path | None = None,
+    out: Path,
     *,
     resume: bool = False,
     overwrite: bool = False,
@@ -187,18 +196,20 @@ def run_training(
     Raises:
         InputError: the training is impossible, or the folder cannot be used.
     """
-    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.results import write_summary
     from parkenv.evaluation.experiments.spec import SPEC_FILE
-    from parkenv.evaluation.training.rl_training import MODEL
+    from parkenv.evaluation.training.rl_training import CHECKPOINT, MODEL
 
     task = TASKS[spec.env](spec)
     task.check()
     settings = {"version": __version__, **task.settings()}
-    out = out or Path("results") / task.folder
     others = curves_beside(beside, out, task)
-    make_folder(out)
     _require_free(out, settings, resume, overwrite)
     console = make_console()
+    if resume and any(out.glob(f"seed_*/{CHECKPOINT}")):
+        console.print(
+            "From the checkpoints on, the training meets other worlds than an unbroken one: models differ."
+        )
     with args.workers_of(spec.jobs, spec.backend, spec.address) as workers:
         training = task.training(console)
         _claim(out, settings, overwrite)
@@ -286,9 +297,6 @@ def _train_all(
             for i, trained in workers.results(tasks):
                 trained.save(out / f"seed_{seeds[i]}")
                 curves[i] = trained.curve
-        except KeyboardInterrupt:
-            console.print(f"Interrupted. Checkpoints are in {out}; the same command with --resume goes on.")
-            raise typer.Exit(130) from None
         finally:
             over.set()
             watcher.join()
