@@ -57,7 +57,9 @@ class Run:
             if time.monotonic() > sent + GONE_S:
                 for pid in living:
                     os.kill(pid, signal.SIGKILL)
-                raise AssertionError(f"{living} at work {GONE_S} s after {number!r}: {self.process.communicate()}")
+                raise AssertionError(
+                    f"{living} at work {GONE_S} s after {number!r}: {self.process.communicate()}"
+                )
             time.sleep(0.05)
         self.gone_s = time.monotonic() - sent
         return self.end()
@@ -98,7 +100,11 @@ def result_of(name, out):
     """Return what does not depend on wall time."""
     summary = json.loads((out / "summary.json").read_text())
     if name in ("compare", "benchmark"):
-        return (out / "episodes.csv").read_bytes(), summary["complete"], [r["total_s"] for r in summary["rows"]]
+        return (
+            (out / "episodes.csv").read_bytes(),
+            summary["complete"],
+            [r["total_s"] for r in summary["rows"]],
+        )
     if name == "survey":
         with (out / "sessions.csv").open(newline="") as file:
             rows = [{**row, "seconds_per_frame": None} for row in csv.DictReader(file)]
@@ -146,11 +152,15 @@ def trials(name, number, seeds):
         for seed in seeds:
             moment = random.Random(f"{name} {number} {seed}").uniform(0.0, lasts)
             with tempfile.TemporaryDirectory() as its:
-                yield f"{moment:5.2f} s of {lasts:.1f}", trial(name, number, moment, Path(its), result_of(name, whole))
+                yield (
+                    f"{moment:5.2f} s of {lasts:.1f}",
+                    trial(name, number, moment, Path(its), result_of(name, whole)),
+                )
 
 
 if __name__ == "__main__":
     command, name_of_signal, count, *first = sys.argv[1:]
     start = int(first[0]) if first else 0
     for when, outcome in trials(command, signal.Signals[name_of_signal], range(start, start + int(count))):
-        print(command, name_of_signal, when, outcome, sep=" | ", flush=True)
+        sys.stdout.write(f"{command} | {name_of_signal} | {when} | {outcome}\n")
+        sys.stdout.flush()

@@ -81,7 +81,7 @@ def run(
     spec: Any = getattr(specs, kind.spec).parse(tables, str(file), file.parent)
     spec = spec.changed(**args.workplace(jobs))
     out = out or Path("results") / file.stem
-    with run_folder(out, f"parkenv run --resume {out}"):
+    with run_folder(out, f"parkenv run {out} --resume"):
         kind.run(spec, out, resume=resume, overwrite=overwrite)
         if report:
             make_report(out, jobs=spec.jobs)
