@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import sys
+import tempfile
+import traceback
 import warnings
-from typing import NoReturn
 
 import typer
 
@@ -81,36 +84,58 @@ def _global_options(
 
 
 def main() -> None:
-    """Entry point; invalid input gives one line on standard error and exit code 2, signal n exit code 128 + n."""
+    """Entry point; exit code 2 and one line for invalid input, 70 for an error of parkenv's own, 128 + n for signal n."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # Names may hold what the terminal cannot show.
+        sys.stdout.reconfigure(errors="backslashreplace")
+    warnings.formatwarning = lambda message, *_: f"parkenv: warning: {message}\n"
     with stop_signals() as received:
         try:
-            _run_command()
-        except BaseException:
+            code = app(standalone_mode=False)
+        except (Exception, KeyboardInterrupt) as error:
             # Libraries turn an interruption into errors of their own, such as failed imports.
-            if received:
-                sys.exit(128 + received[0])
-            raise
-
-
-def _run_command() -> NoReturn:
-    warnings.formatwarning = lambda message, *_: f"parkenv: warning: {message}\n"
-    try:
-        code = app(standalone_mode=False)
-    except (InputError, SensorError) as error:
-        sys.exit(_complain(str(error)))
-    except typer.TyperException as error:
-        message = error.format_message().rstrip(".")
-        # Without a command, the help has already been printed.
-        sys.exit(_complain(f"{message}. See parkenv --help, and --help of each command") if message else 2)
-    except typer.Abort:
-        sys.exit(130)
-    except OSError as error:
-        if error.filename is None:
-            raise
-        sys.exit(_complain(f"{error.filename}: {error.strerror}"))
+            code = None if received else _report(error)
+    if received:
+        code = 128 + received[0]
     sys.exit(code if isinstance(code, int) else 0)
 
 
+def _report(error: BaseException) -> int:
+    """Print an error in a line; return the exit code."""
+    match error:
+        case InputError() | SensorError():
+            return _complain(str(error))
+        case typer.TyperException():
+            message = error.format_message().rstrip(".")
+            # Without a command, the help has already been printed.
+            return _complain(f"{message}. See parkenv --help, and --help of each command") if message else 2
+        case typer.Abort() | KeyboardInterrupt():
+            return 130
+        case OSError() if error.filename is not None or error.errno in (
+            errno.ENOSPC,
+            errno.EDQUOT,
+            errno.EFBIG,
+        ):
+            return _complain(": ".join(str(part) for part in (error.filename, error.strerror) if part))
+    return _report_crash(error)
+
+
 def _complain(message: str) -> int:
-    typer.echo(f"parkenv: error: {' '.join(message.split())}", err=True)
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(message.split()))
+    typer.echo(f"parkenv: error: {line}", err=True)
     return 2
+
+
+def _report_crash(error: BaseException) -> int:
+    """Keep the traceback of an unforeseen error in a file, and name it; return the exit code of such errors."""
+    text = "".join(traceback.format_exception(error))
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="parkenv-", suffix=".txt", encoding="utf-8", errors="backslashreplace", delete=False
+        ) as file:
+            file.write(f"{sys.argv}\n{text}")
+    except OSError:
+        typer.echo(text, err=True)
+        return 70
+    _complain(f"unforeseen {type(error).__name__}: {error!s:.200}; please report it with {file.name}")
+    return 70  # EX_SOFTWARE
