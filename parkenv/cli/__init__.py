@@ -84,7 +84,7 @@ def _global_options(
 
 
 def main() -> None:
-    """Entry point; exit code 2 and one line for invalid input, 70 for an error of parkenv's own, 128 + n for signal n."""
+    """Entry point; exit codes: 2 for invalid input, 70 for an error of parkenv's own, 128 + n after signal n."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Names may hold what the terminal cannot show.
         sys.stdout.reconfigure(errors="backslashreplace")

@@ -39,7 +39,7 @@ def folder_lock(folder: Path) -> Iterator[None]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.seek(0)
-            owner = file.read() or "another process"
+            owner = file.read(200) or "another process"
             file.close()
             raise InputError(
                 f"{folder}: {owner}, writes there; wait for its end, or use another folder"
