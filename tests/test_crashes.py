@@ -37,7 +37,7 @@ def test_a_full_disk_is_no_error_of_ours(monkeypatch):
 
 def test_a_reader_that_ends_is_not_complained_about():
     with subprocess.Popen(
-        [*PARKENV, "schema", "experiment"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        [*PARKENV, "schema", "compare"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as command:
         command.stdout.close()
         complaints = command.stderr.read()
