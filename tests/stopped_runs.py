@@ -15,16 +15,20 @@ import time
 import uuid
 from pathlib import Path
 
+from command_line import parkenv
+
 from parkenv.evaluation.training.rl_training import CHECKPOINT
 
 COMMANDS = {
-    "compare": "compare --scenario mini --agents mdp,greedy-goal,oracle -n 800 --occupancy-levels none --no-figures",
-    "survey": "survey --scenario mini --sessions 6 --every 4",
-    "calibrate": "calibrate --scenario mini -n 25",
+    "compare": "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --occupancy-levels none --no-figures",
+    "survey": "survey --scenario mini --sessions 3 --every 6",
+    "calibrate": "calibrate --scenario mini -n 6",
     "benchmark": "benchmark run v1 --agents first-free",
-    "train": "train ppo --scenario mini --steps 30000 --seeds 2 --evaluate-every 6000 --evaluation-episodes 16 "
+    "train": "train ppo --scenario mini --steps 16000 --seeds 2 --evaluate-every 4000 --evaluation-episodes 16 "
     "--planners none",
 }
+START_S = 1.5
+"""Time that a process takes to import its modules."""
 GONE_S = 5.0
 """Time until no process of a stopped run is left."""
 
@@ -81,11 +85,9 @@ class Run:
 
 
 def finished(name, out, *options):
-    """Run a command to its end."""
-    run = Run(name, out, *options)
-    code, output, errors = run.end()
-    assert code == 0, (code, output, errors)
-    return time.monotonic() - run.started
+    """Run a command to its end, in this process; other workers, same result."""
+    done = parkenv(*COMMANDS[name].split(), "--jobs", 1, "--out", out, *options)
+    assert done.returncode == 0, (done.stdout, done.stderr)
 
 
 def resumed(name, out):
@@ -112,7 +114,7 @@ def result_of(name, out):
     if name == "calibrate":
         return (out / "calibrated.json").read_bytes()
     return [(row["seed"], row["total_s"]) for row in summary["rows"]], all(
-        row["steps"] >= 30_000 for row in summary["rows"]
+        row["steps"] >= 16_000 for row in summary["rows"]
     )
 
 
@@ -129,10 +131,10 @@ def trial(name, number, moment, folder, unbroken):
     assert code in ends, (code, output, errors)
     if number != signal.SIGKILL:
         assert "Traceback" not in errors, errors
-        assert code == 0 or not output.strip() or "Interrupted" in output, output
+        assert not output.strip() or "Interrupted" in output or (out / "summary.json").exists(), output
     kept = any(out.glob("*")) if out.exists() else False
     assert not (out / ".lock").exists() or number == signal.SIGKILL
-    if code == 0:
+    if code == 0 or (out / "summary.json").exists():
         return "over before"
     same = resumed(name, out)
     assert not list(out.rglob(".*.part"))
@@ -148,7 +150,9 @@ def trials(name, number, seeds):
     """Yield the outcome of trials at random moments of a run."""
     with tempfile.TemporaryDirectory() as folder:
         whole = Path(folder) / "whole"
-        lasts = finished(name, whole)
+        started = time.monotonic()
+        finished(name, whole)
+        lasts = START_S + time.monotonic() - started
         for seed in seeds:
             moment = random.Random(f"{name} {number} {seed}").uniform(0.0, lasts)
             with tempfile.TemporaryDirectory() as its:
