@@ -15,6 +15,7 @@ from parkenv.cli import arguments as args
 from parkenv.cli.run_folder import run_folder
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
+from parkenv.files.file_names import file_name
 from parkenv.scenarios.build import build
 
 AgentOption = Annotated[
@@ -106,7 +107,7 @@ def calibrate(
         folder = TripFolder(out, settings, resume=resume)
         console = make_console()
         progress = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("trips"),
@@ -137,7 +138,7 @@ def calibrate(
             },
         )
         title = f"{its.name}: {episodes} trips with and {episodes} without observations of slots, by {agent}"
-        save_distributions(rows, speed, title, out / f"calibration_{its.name}.png")
+        save_distributions(rows, speed, title, out / file_name(f"calibration_{its.name}", ".png"))
         printed = make_table(title, ("what", "n", "mean [95 %]", "median", "p95"))
         for row in table:
             low, high = row["mean_ci95"]

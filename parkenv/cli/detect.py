@@ -15,6 +15,7 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
+from parkenv.files.file_names import file_name
 
 if TYPE_CHECKING:
     from parkenv.perception.cross_validation import CropScore
@@ -73,7 +74,7 @@ def detect(
             drawn = draw_detections(
                 image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), found
             )
-            with atomic_write(out / f"{file.stem}_cars.png") as beside:
+            with atomic_write(out / file_name(f"{file.stem}_cars", ".png")) as beside:
                 beside.write_bytes(cv2.imencode(".png", drawn[..., ::-1])[1].tobytes())
     console.print(table)
     console.print(f"{len(rows)} cars in {len(chosen)} images")

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 import typer
-from rich.console import Console
 
 from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
+from parkenv.files.file_names import file_name
 
 if TYPE_CHECKING:
     from parkenv.world.lot import ParkingLot
@@ -42,7 +42,7 @@ def show(
     from parkenv.lots import load_lot
 
     its_lot = load_lot(lot)
-    picture = out or Path(f"{its_lot.name}.png")
+    picture = out or Path(file_name(its_lot.name, ".png"))
     save_lot_picture(its_lot, picture, show_graph=graph)
     make_console().print(f"{_summary(its_lot)}. Picture: {picture}")
 
@@ -82,25 +82,24 @@ def check(
     from parkenv.lots import check_lot, read_lot
     from parkenv.lots.file_formats import lot_format
 
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console(soft_wrap=True)
     problems = check_lot(file)
     for problem in problems:
         place = "" if problem.feature is None else f"feature {problem.feature}: "
         console.print(
             f"{problem.severity}: {place}{problem.message}",
             style="red" if problem.severity == "error" else "yellow",
-            markup=False,
         )
     errors = sum(p.severity == "error" for p in problems)
     if not problems:
-        console.print(f"{file}: no errors, no warnings", markup=False)
+        console.print(f"{file}: no errors, no warnings")
     else:
-        console.print(f"{file}: {errors} errors, {len(problems) - errors} warnings", markup=False)
+        console.print(f"{file}: {errors} errors, {len(problems) - errors} warnings")
     if errors:
         raise typer.Exit(2)
     file_format = lot_format(file)
     if file_format is not None and file_format.is_complete:
-        console.print(_summary(read_lot(file)), markup=False)
+        console.print(_summary(read_lot(file)))
 
 
 @app.command("import")
@@ -156,22 +155,22 @@ def import_place(
         with_disabled=disabled,
     )
     draft = import_lot(file, wishes)
-    console = Console(highlight=False, soft_wrap=True)
+    console = make_console(soft_wrap=True)
     for line in draft.found:
-        console.print(line, markup=False)
+        console.print(line)
     for left in draft.left_out:
-        console.print(f"left out: {left}", style="yellow", markup=False)
+        console.print(f"left out: {left}", style="yellow")
     if picture is not None:
         from parkenv.evaluation.figures.import_picture import save_import_picture
 
         save_import_picture(draft, picture)
-        console.print(f"Picture: {picture}", markup=False)
+        console.print(f"Picture: {picture}")
     try:
         lot = draft.lot()
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
     write_lot(lot, out)
-    console.print(f"Wrote {out}. {_summary(lot)}", markup=False)
+    console.print(f"Wrote {out}. {_summary(lot)}")
 
 
 def _numbers(option: str, text: str, count: int) -> list[float]:

@@ -14,6 +14,7 @@ from parkenv.cli import arguments as args
 from parkenv.cli.run_folder import run_folder
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
+from parkenv.files.file_names import file_name
 
 if TYPE_CHECKING:
     from parkenv.evaluation.trips.parking_runs import Parking, ParkingCase
@@ -98,7 +99,7 @@ def park(
     with run_folder(out):
         console = make_console()
         progress = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TimeRemainingColumn(),
@@ -126,7 +127,7 @@ def park(
         write_summary(out, summary | {"agents": labels, "rows": table})
         film = _to_film(next(iter(parkings.values())))
         for label, its in parkings.items():
-            folder = out if len(labels) == 1 else out / label
+            folder = out if len(labels) == 1 else out / file_name(label)
             make_folder(folder)
             _picture(its, cases, parking_agents[label], film, folder)
         _show(console, f"{', '.join(names)}: {episodes} episodes per lot", table)

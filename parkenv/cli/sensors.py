@@ -12,6 +12,7 @@ from rich.progress import track
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
+from parkenv.files.file_names import file_name
 from parkenv.scenarios.build import build
 
 app = typer.Typer(help="Preview the simulated sensors.", no_args_is_help=True)
@@ -100,7 +101,9 @@ def preview(
         capture = rig.capture(scene, poses[middle], light, seed)
         boxes = vehicle_boxes(camera, scene, eye, capture.images[name])
         title = f"{its.name}, {preset.replace('_', ' ')}"
-        save_sensor_preview(its.lot, rig, capture, boxes, title, out / f"sensors_{its.name}_{preset}.png")
+        save_sensor_preview(
+            its.lot, rig, capture, boxes, title, out / file_name(f"sensors_{its.name}_{preset}", ".png")
+        )
     n = int(drive / every)
     if n:
         frames = []

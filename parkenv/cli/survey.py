@@ -14,6 +14,7 @@ from parkenv.cli import arguments as args
 from parkenv.cli.run_folder import run_folder
 from parkenv.cli.tables import make_console, make_table
 from parkenv.errors import InputError
+from parkenv.files.file_names import file_name
 from parkenv.scenarios.build import build
 
 if TYPE_CHECKING:
@@ -153,16 +154,20 @@ def run_survey_of(
     predicted = predict(log, time)
     save_map(
         its.lot, predicted, mean_occupancy(its.occupancy, window),
-        f"{its.name} after {row['sessions']} sessions", out / f"map_{its.name}.png",
+        f"{its.name} after {row['sessions']} sessions", out / file_name(f"map_{its.name}", ".png"),
     )  # fmt: skip
     title = f"{its.name}, rig {settings.rig}, {row['sessions']} sessions"
     if row["detection_by_distance"]:
-        save_detection_reach(row["detection_by_distance"], title, out / f"reach_{its.name}.png")
+        save_detection_reach(
+            row["detection_by_distance"], title, out / file_name(f"reach_{its.name}", ".png")
+        )
     if run.shown is not None:
-        save_detections(run.shown, out / f"detections_{its.name}.png")
-        save_session(its.lot, run.shown, out / f"session_{its.name}.png")
-        save_graph(its.lot, predicted, run.shown, out / f"graph_{its.name}.png")
-    save_found_slots(its.lot, found, score_discovery(found, its.lot), out / f"slots_found_{its.name}.png")
+        save_detections(run.shown, out / file_name(f"detections_{its.name}", ".png"))
+        save_session(its.lot, run.shown, out / file_name(f"session_{its.name}", ".png"))
+        save_graph(its.lot, predicted, run.shown, out / file_name(f"graph_{its.name}", ".png"))
+    save_found_slots(
+        its.lot, found, score_discovery(found, its.lot), out / file_name(f"slots_found_{its.name}", ".png")
+    )
     table = make_table(None, ["figure", "value"])
     for name in (
         "car_detection_rate",

@@ -13,9 +13,10 @@ WIDE = 200
 """Width assumed if output goes to a file or a pipe, characters."""
 
 
-def make_console() -> Console:
-    """Make a console on standard output, as wide as the terminal."""
-    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=WIDE)
+def make_console(*, soft_wrap: bool = False) -> Console:
+    """Make a console on standard output, as wide as the terminal; it prints names as they are, without markup."""
+    width = None if soft_wrap or sys.stdout.isatty() else WIDE
+    return Console(highlight=False, markup=False, emoji=False, soft_wrap=soft_wrap, width=width)
 
 
 def make_table(title: str | None, headings: Iterable[str]) -> Table:
