@@ -24,8 +24,8 @@ COMMANDS = {
     "survey": "survey --scenario mini --sessions 3 --every 6",
     "calibrate": "calibrate --scenario mini -n 6",
     "benchmark": "benchmark run v1 --agents first-free",
-    "train": "train ppo --scenario mini --steps 16000 --seeds 2 --evaluate-every 4000 --evaluation-episodes 16 "
-    "--planners none",
+    "train": "train ppo --scenario mini --steps 16000 --trainings 2 --evaluate-every 4000 --evaluation-episodes 16 "
+    "--agents none",
 }
 START_S = 1.5
 """Time that a process takes to import its modules."""

@@ -17,7 +17,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, closing, contextmanager
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, get_args
 from urllib.parse import urlsplit
 
 from joblib import Parallel, cpu_count, delayed
@@ -25,8 +25,9 @@ from joblib.externals.loky import process_executor
 from joblib.externals.loky.backend import resource_tracker
 
 from parkenv.errors import InputError
+from parkenv.files.names import BackendName
 
-BACKENDS = ("loky", "ray", "dask")
+BACKENDS = get_args(BackendName)
 CONNECT_S = 5.0
 """Time for a cluster to answer at its address, s."""
 PR_SET_PDEATHSIG = 1

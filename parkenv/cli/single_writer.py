@@ -11,7 +11,7 @@ from parkenv.files.folder_lock import folder_lock
 
 
 @contextmanager
-def run_folder(out: Path, resumed_by: str | None = None) -> Iterator[None]:
+def writing_into(out: Path, resumed_by: str | None = None) -> Iterator[None]:
     """Make the folder, and be its only writer during the block; after an interruption, say what is in it.
 
     A folder made in vain, for a command that turns out to be invalid, is removed.
