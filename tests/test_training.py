@@ -323,8 +323,8 @@ def test_every_algorithm_trains_a_model_that_searches(algorithm, tmp_path, monke
 def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp_path, algorithm):
     out = tmp_path / "out"
     command = [
-        "train", algorithm, "--scenario", "mini", "--steps", "40000", "--seeds", "2", "--evaluate-every",
-        "8000", "--evaluation-episodes", "16", "--planners", "mdp", "--jobs", "2", "--out", str(out),
+        "train", algorithm, "--scenario", "mini", "--steps", "40000", "--trainings", "2", "--evaluate-every",
+        "8000", "--evaluation-episodes", "16", "--agents", "mdp", "--jobs", "2", "--out", str(out),
     ]  # fmt: skip
     process = subprocess.Popen(
         [*PARKENV, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
@@ -347,7 +347,7 @@ def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp
     assert [row["seed"] for row in summary["rows"]] == [0, 1]
     assert all(row["steps"] >= 40_000 for row in summary["rows"])
     beside = [*command[:-1], str(tmp_path / "longer"), "--beside", str(out)]
-    assert parkenv(*beside, "--seeds", 1).returncode == 0
+    assert parkenv(*beside, "--trainings", 1).returncode == 0
     summary = json.loads((tmp_path / "longer" / "summary.json").read_text())
     (means,) = summary["beside"].values()
     assert [row["steps"] for row in means] == [row["steps"] for row in curve]
@@ -370,7 +370,7 @@ def course_of(algorithm="ppo"):
     return SearchTask(
         TrainingSpec(
             algorithm=algorithm, scenarios=(scenario_spec("mini"),), steps=10, evaluate_every=10,
-            evaluation_episodes=16, planners=(),
+            evaluation_episodes=16, agents=(),
         )
     )  # fmt: skip
 
@@ -437,7 +437,7 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
     wrong = (
         ["dqn", "--clone", "mdp", "--overwrite"],
         ["ppo", "--clone", "nobody", "--overwrite"],
-        ["ppo", "--planners", "belif", "--overwrite"],
+        ["ppo", "--agents", "belif", "--overwrite"],
         ["ppo", "--resume", "--overwrite"],
         ["ppo"],
     )
@@ -466,10 +466,10 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
             ["sac", "--env", "drive", "--lot", "nowhere.geojson"],
             "--lot is 'nowhere.geojson', want a file; there is",
         ),
-        (["sac", "--env", "drive", "--planners", "mdp"], "--planners names other agents than planner"),
+        (["sac", "--env", "drive", "--agents", "mdp"], "--agents names other agents than planner"),
         (["ppo", "--resume"], "holds no training to go on with"),
         (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
-        (["ppo", "--planners", "mdp,belif"], "unknown agent 'belif'"),
+        (["ppo", "--agents", "mdp,belif"], "unknown agent 'belif'"),
         (["ppo", "--clone", "oracle"], "oracle cannot be cloned"),
         (["ppo", "--demonstrations", "5"], "demonstrations goes with clone"),
         (["ppo", "--env", "drive", "--demonstrations", "5"], "demonstrations goes with env search"),
