@@ -141,7 +141,7 @@ def show(suite: str = "v1", /) -> None:
         made = task.made(its.arrival)
         level = "as it comes" if task.occupancy_level is None else f"{task.occupancy_level:.0%}"
         walk = f"{made.v_walk * 3.6:g} km/h"
-        cells.append((task.name, task.scenario, str(made.lot.n_slots), level, task.sight, walk))
+        cells.append((task.name, task.scenario, str(made.lot.n_slots), level, task.sensor_model, walk))
     headings = ["task", "scenario", "slots", "mean occupancy", "sensor model", "walking"]
     console.print(make_table(None, headings, cells))
     console.print(

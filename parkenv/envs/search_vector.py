@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from parkenv.envs.local_observation import Surroundings, local_space, observe_surroundings
 from parkenv.envs.search import REWARD_TERMS, search_space
-from parkenv.envs.search_kernel import arrive, init_prior, refresh_belief, take_step, tell_time
+from parkenv.envs.search_kernel import arrive, init_prior, refresh_belief, take_step, write_clock
 from parkenv.envs.search_records import N_ACTIONS, ScenarioRecords, Searches, scenario_at, search_at
 from parkenv.envs.search_state import arrival_of
 from parkenv.errors import InputError
@@ -109,7 +109,7 @@ def step_full(
             take_step(search, actions[e])
             refresh_belief(search)
         _report(search, e, fresh[e], limit, steps, mask)
-        tell_time(search)
+        write_clock(search)
         vertex[e], time[e, 0], time[e, 1] = search.vertex, search.clock[0], search.clock[1]
 
 
@@ -418,13 +418,13 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         """Put the selected cars at the entries of their next worlds."""
         searches = self._searches
         arrive_all(searches.address, which)
-        if not len(searches.external_prior):
+        if not len(searches.external_forecast):
             return
         for i in np.flatnonzero(which):
             scenario = self.scenarios[i % len(self.scenarios)]
             forecast = scenario.forecast(arrival_of(scenario, searches.records[i]))
             n = len(forecast.p_occupied)
-            searches.external_prior[i, :, :n] = forecast.p_occupied, forecast.decay_rate
+            searches.external_forecast[i, :, :n] = forecast.p_occupied, forecast.decay_rate
 
     def _observations(self) -> dict[str, NDArray[Any]]:
         return {name: a.copy() for name, a in self._seen.items()} if self._copy else dict(self._seen)
