@@ -44,7 +44,7 @@ def calibrate(
         parkenv compare --calibrated results/calibrate/calibrated.json
 
     Options:
-        episodes, -n (N >= 1): Trips with observations, and as many without.
+        episodes, -n (1 <= N <= 1000000): Trips with observations, and as many without.
         agents (NAME): The agent that searches, with any options in brackets: mdp(failure_s=90).
         out, -o (DIR): Folder for calibrated.json, trips.jsonl, summary.json and the figure.
 

@@ -48,7 +48,7 @@ def park(
         agents (NAME[,...]): Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of
             `parkenv train --env drive`.
         scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus,street]
-        episodes, -n (N >= 1): Episodes per lot.
+        episodes, -n (1 <= N <= 1000000): Episodes per lot.
         out, -o (DIR): Folder for pictures, episodes.csv and summary.json.
 
     Parking tasks:
