@@ -77,7 +77,9 @@ def bench(
 def _markdown(rows: list[BenchRow]) -> str:
     """Return the rows of one part as a table for a page: a line a case, with all of its peers."""
     lines = ["| | ours | peers | ratio |", "|---|---|---|---|"]
-    cases = dict.fromkeys((row["case"], row["value"], row["unit"]) for row in rows if row["value"] is not None)
+    cases = dict.fromkeys(
+        (row["case"], row["value"], row["unit"]) for row in rows if row["value"] is not None
+    )
     for case, value, unit in cases:
         peers = [row for row in rows if row["case"] == case and row["unit"] == unit and row["peer"]]
         theirs = "; ".join(f"{row['peer']}: {_figure(row['peer_value'])}" for row in peers)
