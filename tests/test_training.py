@@ -32,6 +32,7 @@ from parkenv.evaluation.training.cloning import Demonstrations, clone
 from parkenv.evaluation.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
 from parkenv.evaluation.training.rl_training import read_curve, train_one, write_curve
 from parkenv.evaluation.training.search_training import SearchTraining, episode_times, search_times
+from parkenv.evaluation.trips.driven_search import DrivenSearch
 from parkenv.scenarios.spec import scenario_spec
 from planners.agent import make_agent
 from planners.learned import ALGORITHMS, LearnedAgent, ModelCard
@@ -215,6 +216,17 @@ def test_a_model_runs_on_lots_that_it_was_not_trained_on(trained):
     campus = make_scenario("campus")
     row = search_times(LearnedAgent(campus, "maskable-ppo", trained / "model.zip"), campus, range(4))
     assert row["episodes"] == 4
+
+
+def test_a_model_decides_on_driven_trips(trained):
+    """On the lanes of the same world, it drives as in the search environment, as long as no attempt fails."""
+    name = f"maskable-ppo:{trained / 'model.zip'}"
+    search = DrivenSearch(SCENARIO, name)
+    planned = {row["seed"]: row for row in Case(SCENARIO, name).run(range(6))[0]}
+    trips = [search.run(seed) for seed in planned]
+    assert all(trip.parked for trip in trips)
+    same = [trip.slot == planned[trip.seed]["slot"] for trip in trips]
+    assert sum(same) >= 4
 
 
 def torn(path):

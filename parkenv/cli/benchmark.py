@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from typer import Exit
-
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.command import add, group
 from parkenv.cli.report import make_report
+from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import command_line, make_console, make_table, progress_bar
 from parkenv.errors import InputError
 
@@ -52,7 +51,9 @@ def run(
     out = out or Path("results") / suite
     base = args.saved(out, BenchmarkSpec) if folder.resume else BenchmarkSpec()
     given = args.not_none(by=by, agents=None if agents is None else split_agents(agents))
-    run_suite(base.changed(suite=suite, **given, **machines.given), out, folder)
+    spec = base.changed(suite=suite, **given, **machines.given)
+    with writing_into(out, f"--resume --out {out}"):
+        run_suite(spec, out, folder)
 
 
 def run_suite(spec: BenchmarkSpec, out: Path, folder: args.RunFolder) -> None:
@@ -89,8 +90,7 @@ def run_suite(spec: BenchmarkSpec, out: Path, folder: args.RunFolder) -> None:
     command = command_line()
     if not complete:
         results.finish(order, {"command": command, "complete": False}, complete=False)
-        console.print(f"Interrupted. What was finished is in {out}; --resume --out {out} goes on.")
-        raise Exit(130)
+        raise KeyboardInterrupt
     result = result_of(suite, cases, results, command, spec.by)
     summary = {"command": command, "version": __version__, "complete": True, "rows": result["rows"]}
     results.finish(order, summary)
