@@ -47,7 +47,7 @@ def report(
 
     Examples:
         parkenv report results/compare
-        parkenv report results/compare --replay 3,17 --agents mdp,belief --out two.html
+        parkenv report results/compare --replay 3,17 --agents mdp --out two.html
         parkenv report results/survey --sessions 2
 
     Options:
