@@ -178,8 +178,8 @@ def _trained(run: RunFolder) -> Cases:
     spec = TrainingSpec.read(run.path / SPEC_FILE)
     if spec.env != "search" or not run.summary.get("transfer"):
         return []
-    from parkenv.cli.search_task import SearchTask
-    from parkenv.cli.training_task import TEST_SEED
+    from parkenv.evaluation.training.search_task import SearchTask
+    from parkenv.evaluation.training.training_task import TEST_SEED
 
     best = min(run.summary["rows"], key=lambda row: float(row["total_s"]))
     model = run.path / f"seed_{best['seed']}" / "model.zip"
