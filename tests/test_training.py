@@ -423,7 +423,7 @@ def curve_of_another_kind(folder):
         ({}, lambda folder: shutil.rmtree(folder / "seed_0"), "holds no training"),
         ({}, torn_settings, "settings.json: not JSON"),
         ({}, settings_of_another_kind, "want the settings of a command"),
-        ({}, torn_curve, "curve.csv: want numbers in every column"),
+        ({}, torn_curve, "curve.csv: line 2: got 1 fields, want 2"),
         ({}, curve_of_another_kind, "was not written by this version"),
     ],
 )

@@ -182,7 +182,7 @@ def table_of_tests(
     columns = list(
         dict.fromkeys((row["test_scenario"], *(row[name] for name in further)) for row in transfer)
     )
-    found: dict[str, Row] = {}
+    found: dict[str, dict[tuple[Any, ...], Row]] = {}
     for row in transfer:
         key = (row["test_scenario"], *(row[name] for name in further))
         found.setdefault(f"{algorithm}, seed {row['seed']}", {})[key] = row
