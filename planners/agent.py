@@ -18,7 +18,6 @@ from parkenv.errors import InputError
 from parkenv.files.user_class import file_of_class, load_class
 from parkenv.world.occupancy import World
 from parkenv.world.scenario import Scenario, SearchProblem
-from planners.learned import ALGORITHMS
 
 Observation = Mapping[str, Any]
 Memory = TypeVar("Memory")
@@ -158,6 +157,15 @@ _AGENTS: dict[str, tuple[str, str]] = {
     "exact": ("planners.bounds.exact", "ExactAgent"),
 }
 
+ALGORITHMS = {
+    "dqn": ("stable_baselines3", "DQN"),
+    "ppo": ("stable_baselines3", "PPO"),
+    "maskable-ppo": ("sb3_contrib", "MaskablePPO"),
+    "recurrent-ppo": ("sb3_contrib", "RecurrentPPO"),
+    "sac": ("stable_baselines3", "SAC"),
+    "tqc": ("sb3_contrib", "TQC"),
+}
+"""Module and class of each learning algorithm; `ALGORITHM:FILE` names a trained model."""
 SMALL_LOTS_ONLY = ("exact",)
 """Agents for small lots and sensors without errors only."""
 AGENT_NAMES = tuple(name for name in _AGENTS if name not in SMALL_LOTS_ONLY)
@@ -185,7 +193,7 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
 
     Args:
         name: one of `AGENT_NAMES` or `SMALL_LOTS_ONLY`; `ALGORITHM:FILE` for a model of `parkenv train`, such as
-            `ppo:models/ppo.zip`; or `MODULE:CLASS` for your own agent, such as `my_agents:Patient`: a class whose first
+            `ppo:ppo.safetensors`; or `MODULE:CLASS` for your own agent, such as `my_agents:Patient`: a class whose first
             argument is the problem. The module may be in the working directory.
         scenario: the scenario; its hidden occupancy is not passed to the agent.
         options: options of the agent, such as `failure_s=5.0` for "mdp".

@@ -294,7 +294,7 @@ def test_drives_on_the_way_in_begin_as_far_from_its_end_as_the_level_says():
     env = training_env("ppo", 64, lots=(STREET,), levels={"parallel": level})
     env.seed(1)
     env.reset()
-    ways = [task.path for task in env._cached[env._groups["parallel"][0], level]]
+    ways = [task.path for task in env._made[env._groups["parallel"][0], level].values()]
     low, high = curriculum[level].distance
     checked = 0
     for i in np.flatnonzero([at == ("parallel", level) for at in env._at]):

@@ -75,7 +75,7 @@ def park(
     Examples:
     * `parkenv park --episodes 250 --scenario campus,street,jam`
 
-    * `parkenv park --agents planner,sac:results/drive-sac/seed_0/model.zip`
+    * `parkenv park --agents planner,sac:results/drive-sac/seed_0/model.safetensors`
 
     * `parkenv park --lot parking_map.yml --way back-in`
     """

@@ -195,9 +195,10 @@ def _trained(run: RunFolder) -> Cases:
         return []
     from parkenv.cli.search_task import SearchTask
     from parkenv.cli.training_task import TEST_SEED
+    from parkenv.evaluation.training.rl_training import MODEL
 
     best = min(run.summary["rows"], key=lambda row: float(row["total_s"]))
-    model = run.path / f"seed_{best['seed']}" / "model.zip"
+    model = run.path / f"seed_{int(best['seed'])}" / MODEL
     task = SearchTask(spec)
     agents = {agent.label: agent for agent in task.compared}
     seeds = range(TEST_SEED, TEST_SEED + int(run.summary["transfer"][0]["episodes"]))
@@ -205,7 +206,7 @@ def _trained(run: RunFolder) -> Cases:
     for scenario in task.tested:
         planners = [row for row in run.summary.get("planners", []) if row["scenario"] == scenario.name]
         beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
-        cases.append((Case(scenario, f"{best['agent']}:{model}"), seeds))
+        cases.append((Case(scenario, f"{task.algorithm}:{model}"), seeds))
         shown = [agents[row["agent"]] for row in beside if row["agent"] in agents]
         cases += [(Case(scenario, agent.name, options=agent.options), seeds) for agent in shown]
     return cases

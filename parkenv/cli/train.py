@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import threading
 from collections.abc import Mapping, Sequence
@@ -154,7 +155,7 @@ def train(
 
     * `parkenv train sac --env drive --scenario campus,street --seeds 3`
 
-    * `parkenv compare --agents mdp,maskable-ppo:results/maskable-ppo/seed_0/model.zip`
+    * `parkenv compare --agents mdp,maskable-ppo:results/maskable-ppo/seed_0/model.safetensors`
     """
     from parkenv.evaluation.experiments.agent_spec import split_agents
     from parkenv.evaluation.experiments.spec import TrainingSpec
@@ -200,7 +201,7 @@ def run_training(
     _require_free(out, settings, resume, overwrite)
     console = make_console()
     with args.workers_of(spec.jobs, spec.backend, spec.address) as workers:
-        training = task.training(console)
+        training = dataclasses.replace(task.training(console), command=("parkenv", *sys.argv[1:]))
         _claim(out, settings, overwrite)
         spec.write(out / SPEC_FILE)
         numbers = range(spec.seed, spec.seed + spec.seeds)

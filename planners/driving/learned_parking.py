@@ -21,7 +21,7 @@ from planners.driving.policy_interface import (
     encode_observation,
     pedal_command,
 )
-from planners.learned import load_model
+from planners.model_file import load_model
 
 Observation = Mapping[str, Any]
 
@@ -54,8 +54,7 @@ class LearnedParkingAgent:
 
     Attributes:
         card: metadata of the model file.
-        model: a model of stable-baselines3 or sb3-contrib; its observation is that of
-            `planners.driving.policy_interface`.
+        model: the policy; its observation is that of `planners.driving.policy_interface`.
     """
 
     def __init__(
