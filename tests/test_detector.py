@@ -9,13 +9,13 @@ import pytest
 from command_line import parkenv
 
 from parkenv import InputError
+from parkenv.files.images import images_in, read_image
 from parkenv.perception.car_datasets import Crops, read_crop_folder, read_uiuc_test, read_uiuc_training
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.cross_validation import cross_validated
 from parkenv.perception.detection_scores import matches, recall_at, recall_precision
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, as_grey, best_boxes
-from parkenv.perception.image_files import images_in, read_image
 from parkenv.perception.training import TrainingSettings, train
 
 

@@ -50,8 +50,8 @@ def detect(
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.figures.survey_pictures import draw_detections
     from parkenv.files.atomic_write import atomic_write
+    from parkenv.files.images import images_in, read_image
     from parkenv.perception.hog_detector import HogDetector
-    from parkenv.perception.image_files import images_in, read_image
 
     detector = HogDetector.load(*(model or ()), threshold=threshold, least_height=least_height)
     chosen = [f for path in files for f in (images_in(path) if path.is_dir() else [path])]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar, get_args
@@ -25,9 +24,8 @@ from pydantic_core import CoreSchema, ErrorDetails
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import MAX_SPEC_BYTES, read_json, read_toml
 
-MAX_BYTES = 4_000_000
-"""Maximum size of a specification file, which holds no data."""
 _SHOWN = 60
 _FOLDER = "folder"
 
@@ -165,19 +163,7 @@ def read_tables(path: Path) -> dict[str, Any]:
     Raises:
         InputError: the file cannot be read, is too large, or has a syntax error.
     """
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: has {path.stat().st_size} bytes, want at most {MAX_BYTES}")
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file in UTF-8 ({error.reason})") from error
-    try:
-        tables = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
-        kind = "JSON" if path.suffix == ".json" else "TOML"
-        raise InputError(f"{path}: not {kind}: {error}") from error
+    tables = read_json(path, MAX_SPEC_BYTES) if path.suffix == ".json" else read_toml(path)
     if not isinstance(tables, dict):
         raise InputError(f"{path}: is a {type(tables).__name__}, want a JSON object")
     return tables

@@ -11,6 +11,7 @@ from typing import Any
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import read_json
 
 
 @dataclass(frozen=True)
@@ -34,11 +35,9 @@ class JsonFormat:
             InputError: the file cannot be read, is not JSON, or is of another format or version; the message names it.
         """
         try:
-            content = json.loads(Path(path).read_text(encoding="utf-8"))
-        except OSError as error:
-            raise InputError(f"{path}: {error.strerror or error}, want {self.meaning}") from error
-        except ValueError as error:
-            raise InputError(f"{path}: not JSON ({error}), want {self.meaning}") from error
+            content = read_json(Path(path))
+        except InputError as error:
+            raise InputError(f"{error}; want {self.meaning}") from error
         if not isinstance(content, dict) or content.pop("format", None) != self.name:
             raise InputError(f'{path}: want {self.meaning}, a JSON object with "format": "{self.name}"')
         if (version := content.pop("version", None)) != self.version:

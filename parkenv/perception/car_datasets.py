@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tarfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.archives import tar_members
+from parkenv.files.images import decode_image, images_in, natural_order, read_image
+from parkenv.files.limited_reading import read_text
 from parkenv.perception.hog_detector import as_grey
-from parkenv.perception.image_files import decode_image, images_in, natural_order, read_image
 
 Image = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
@@ -94,7 +95,7 @@ def read_uiuc_test(folder: Path, test_set: str) -> list[LabelledImage]:
     if not truth.is_file():
         raise InputError(f"{truth}: no such file; want the folder as UIUC publishes it")
     labelled = []
-    for line in truth.read_text().splitlines():
+    for line in read_text(truth).splitlines():
         if not line.strip():
             continue
         number, _, places = line.partition(":")
@@ -129,16 +130,7 @@ def read_crop_folder(folder: Path) -> Crops:
 
 
 def _images_of(archive: Path) -> dict[str, Image]:
-    images = {}
-    try:
-        with tarfile.open(archive) as files:
-            members = [m for m in files.getmembers() if m.isfile() and m.name.endswith(".pgm")]
-            for member in sorted(members, key=lambda m: natural_order(Path(m.name))):
-                stream = files.extractfile(member)
-                assert stream is not None
-                images[Path(member.name).name] = as_grey(
-                    decode_image(stream.read(), f"{archive}: {member.name}")
-                )
-    except (tarfile.TarError, EOFError, OSError) as error:
-        raise InputError(f"{archive}: is no archive that can be read: {error}") from error
-    return images
+    images = {
+        name: as_grey(decode_image(data, f"{archive}: {name}")) for name, data in tar_members(archive, ".pgm")
+    }
+    return {Path(name).name: images[name] for name in sorted(images, key=lambda n: natural_order(Path(n)))}

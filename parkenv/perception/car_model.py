@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.archives import parse_arrays, read_arrays
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import parse_json
 from parkenv.perception.hog import Descriptor
 
 Float32Array = NDArray[np.float32]
@@ -113,24 +115,19 @@ class CarModel:
         """
         if str(name) in PACKAGED_MODELS:
             source = resources.files("parkenv.perception") / "models" / f"{name}.npz"
-            data = source.read_bytes()
+            parts = parse_arrays(source.read_bytes(), str(name))
         elif Path(name).is_file():
-            data = Path(name).read_bytes()
+            parts = read_arrays(name)
         else:
             raise InputError(f"{name}: no such model; want {', '.join(PACKAGED_MODELS)}, or an .npz file")
-        try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as parts:
-                settings = json.loads(bytes(parts["settings"]).decode())
-                weights = parts["weights"]
-            if settings["format"] != _FORMAT:
-                raise KeyError("format")
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        settings = parse_json(parts.get("settings", np.zeros(0)).tobytes(), str(name))
+        if "weights" not in parts or not isinstance(settings, dict) or settings.get("format") != _FORMAT:
+            raise InputError(f"{name}: not a car model; want an .npz file that parkenv train-detector wrote")
+        weights = parts["weights"]
+        if settings.get("version") != _VERSION:
             raise InputError(
-                f"{name}: not a car model; want an .npz file that parkenv train-detector wrote"
-            ) from error
-        if settings["version"] != _VERSION:
-            raise InputError(
-                f"{name}: format version {settings['version']}, want {_VERSION}: written by another version of parkenv"
+                f"{name}: format version {settings.get('version')!r:.40}, want {_VERSION}: "
+                "written by another version of parkenv"
             )
         try:
             return cls(
@@ -143,5 +140,5 @@ class CarModel:
                 bool(settings["ends"]),
                 str(settings["trained_on"]),
             )
-        except (KeyError, TypeError) as error:
-            raise InputError(f"{name}: the model's settings are incomplete: {error}") from error
+        except (LookupError, TypeError, ValueError) as error:
+            raise InputError(f"{name}: the model's settings: {error}") from error

@@ -13,7 +13,6 @@ from typing import Any
 
 from PIL import Image as PillowImage
 
-from parkenv.errors import InputError
 from parkenv.evaluation.experiments.results import Row
 from parkenv.evaluation.figures.registry import FIGURES
 from parkenv.evaluation.report.drive_recording import data_uri
@@ -21,6 +20,7 @@ from parkenv.evaluation.report.learning import learning_of
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.report.tables import tables_of
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.images import read_image
 
 FORMAT, VERSION = "parkenv-report", 1
 SCHEMA = Path(__file__).with_name("report.schema.json")
@@ -125,11 +125,7 @@ def _in_order(figures: Sequence[Path]) -> list[Path]:
 
 def _figure(path: Path) -> str:
     caption = html.escape(_caption(path))
-    try:
-        with PillowImage.open(path) as opened:
-            picture = opened.convert("RGB")
-    except OSError as error:
-        raise InputError(f"{path}: not a readable image: {error}") from error
+    picture = PillowImage.fromarray(read_image(path)).convert("RGB")
     if picture.width > MOST_WIDTH:
         picture = picture.resize((MOST_WIDTH, round(picture.height * MOST_WIDTH / picture.width)))
     source, (width, height) = _webp(picture), picture.size

@@ -1,42 +1,64 @@
-"""Reading images from files and folders."""
+"""Read images from files and folders, within limits."""
 
 from __future__ import annotations
 
+import io
+import struct
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image as PillowImage
 
 from parkenv.errors import InputError
+from parkenv.files.limited_reading import read_bytes
 
 Image = NDArray[np.uint8]
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff", ".webp")
-_LARGEST = 100_000_000
+_FORMATS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP")
+MAX_PIXELS = 100_000_000
 
 
 def read_image(path: Path) -> Image:
     """Read an image file as (h, w) grey or (h, w, 3) RGB, uint8; transparency is dropped.
 
     Raises:
-        InputError: a missing file, not an image, a truncated image, more than 8 bits per channel, or over 100 million
-            pixels.
+        InputError: the file cannot be read, or see `decode_image`.
     """
-    return decode_image(_bytes_of(path), str(path))
+    return decode_image(read_bytes(path), str(path))
 
 
 def decode_image(data: bytes, name: str) -> Image:
-    """Decode an image from bytes, as `read_image`; `name` is for error messages."""
-    raw = np.frombuffer(data, dtype=np.uint8)
-    image = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED) if len(raw) else None
-    if image is None or _torn(data):
+    """Decode an image as `read_image`; its size is read from its header before memory is taken.
+
+    Raises:
+        InputError: not a whole image, more than 8 bits per channel, or over 100 million pixels; the message starts
+            with `name`.
+    """
+    try:
+        # OpenCV takes the memory that the header claims, and cannot read the header alone.
+        with (
+            warnings.catch_warnings(action="ignore"),
+            PillowImage.open(io.BytesIO(data), formats=_FORMATS) as header,
+        ):
+            width, height = header.size
+        if width * height > MAX_PIXELS:
+            raise PillowImage.DecompressionBombError(f"{width}×{height} px")
+        image = (
+            None if _is_truncated(data) else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        )
+    except PillowImage.DecompressionBombError as error:
+        raise InputError(f"{name}: is too large ({error}), want at most {MAX_PIXELS:,} pixels") from error
+    except (OSError, SyntaxError, ValueError, LookupError, ArithmeticError, struct.error, cv2.error):
+        image = None
+    if image is None:
         raise InputError(f"{name}: is no image that can be read whole; want {', '.join(SUFFIXES)}")
     if image.dtype != np.uint8:
         raise InputError(f"{name}: has {8 * image.dtype.itemsize} bits a channel, want 8")
-    if image.shape[0] * image.shape[1] > _LARGEST:
-        raise InputError(f"{name}: is {image.shape[1]}×{image.shape[0]} px, want at most {_LARGEST:,} pixels")
     if image.ndim == 2:
         return np.asarray(image, dtype=np.uint8)
     code = {1: None, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}.get(image.shape[2])
@@ -75,14 +97,7 @@ def _parts(text: str) -> Iterator[tuple[str, int]]:
     yield word, int(digits or -1)
 
 
-def _bytes_of(path: Path) -> bytes:
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from error
-
-
-def _torn(data: bytes) -> bool:
+def _is_truncated(data: bytes) -> bool:
     """Return whether a PNG, JPEG or PGM file is truncated; OpenCV fills the missing part without an error."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data[-16:]

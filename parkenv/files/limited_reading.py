@@ -1,0 +1,244 @@
+"""Read text files from anywhere within limits: bytes, nesting, aliases, and types of values.
+
+Every file that a user names is read through this module, `parkenv.files.archives` or `parkenv.files.images`.
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import io
+import re
+import tomllib
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from pydantic_core import from_json
+
+from parkenv.errors import InputError
+
+MAX_BYTES = 64_000_000
+"""Maximum size of a file, if its reader sets no other; 64 MB of JSON become at most about 1.5 GB in memory."""
+MAX_SPEC_BYTES = 1_000_000
+"""Maximum size of TOML and YAML, which hold no data and are read slowly."""
+MAX_DEPTH = 100
+"""Maximum nesting of tables and lists in TOML and YAML; JSON may have 200 levels, the limit of its parser."""
+_LONG_NUMBER = re.compile(rb"[0-9]{301,}")
+# tomllib takes cubic time for a key of many parts.
+_DEEP_KEY = re.compile(r"(?:\.[ \t]*[\w\"'-]+[ \t]*){100}")
+
+
+class _Counted(io.RawIOBase):
+    """A stream that fails after `most` bytes, such as an unpacked one of unknown size."""
+
+    def __init__(self, stream: IO[bytes], most: int, name: object) -> None:
+        self._stream, self._left, self._most, self._name = stream, most, most, name
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._stream.read(min(len(buffer), self._left + 1))
+        self._left -= len(data)
+        if self._left < 0:
+            raise InputError(f"{self._name}: has more than {self._most:,} bytes, the most that is read")
+        buffer[: len(data)] = data
+        return len(data)
+
+
+@contextmanager
+def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]:
+    """Open a file for reading at most `most` bytes; a name that ends in `.gz` is unpacked.
+
+    Raises:
+        InputError: the file cannot be read or unpacked, or more bytes were asked for; the message names it.
+    """
+    try:
+        file = Path(path).open("rb")  # noqa: SIM115  # its own errors are caught here, those of reading below
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from error
+    except ValueError as error:
+        raise InputError(f"{str(path)!a}: is not a file's name") from error
+    with file:
+        try:
+            packed = str(path).endswith((".gz", ".tgz"))
+            stream = gzip.GzipFile(fileobj=file) if packed else file
+            yield io.BufferedReader(_Counted(stream, most, path), 1 << 20)
+        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+            raise InputError(f"{path}: not a whole gzip file ({error})") from error
+        except OSError as error:
+            raise InputError(f"{path}: {error.strerror or error}") from error
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
+
+
+def read_bytes(path: str | Path, most: int = MAX_BYTES) -> bytes:
+    """Return the content of a file.
+
+    Raises:
+        InputError: see `open_limited`.
+    """
+    with open_limited(path, most) as file:
+        return file.read()
+
+
+def read_text(path: str | Path, most: int = MAX_BYTES) -> str:
+    """Return the content of a text file in UTF-8, without its byte order mark.
+
+    Raises:
+        InputError: see `open_limited`, or the file is not UTF-8.
+    """
+    with open_limited(path, most) as file:
+        return file.read().decode("utf-8-sig")
+
+
+def read_json(path: str | Path, most: int = MAX_BYTES) -> Any:
+    """Return the content of a JSON file; see `parse_json`.
+
+    Raises:
+        InputError: the file cannot be read, is too large or is not JSON within the limits; the message names it.
+    """
+    return parse_json(read_text(path, most), str(path))
+
+
+def parse_json(text: str | bytes, name: str) -> Any:
+    """Return the value of a JSON text: at most 200 levels deep, numbers that fit a float, no lone surrogates.
+
+    Raises:
+        InputError: the text is anything else; the message starts with `name`.
+    """
+    data = text.encode() if isinstance(text, str) else text
+    _require_short_numbers(data, name)
+    try:
+        return from_json(data)
+    except ValueError as error:
+        what = str(error).replace("recursion limit exceeded", "nested deeper than 200 levels")
+        raise InputError(f"{name}: not JSON: {what}") from error
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Return the content of a TOML file of at most `MAX_SPEC_BYTES`.
+
+    Raises:
+        InputError: the file cannot be read, is too large, is not TOML, or is nested deeper than `MAX_DEPTH`.
+    """
+    text = read_text(path, MAX_SPEC_BYTES)
+    _require_short_numbers(text.encode(), str(path))
+    try:
+        if _DEEP_KEY.search(text):
+            raise RecursionError
+        tables = tomllib.loads(text)
+    except RecursionError as error:
+        raise InputError(f"{path}: not TOML: nested deeper than {MAX_DEPTH} levels") from error
+    except ValueError as error:
+        raise InputError(f"{path}: not TOML: {error}") from error
+    _require_shallow(tables, str(path))
+    return tables
+
+
+def read_yaml(path: str | Path) -> Any:
+    """Return the content of a YAML file of at most `MAX_SPEC_BYTES` without aliases: what JSON could hold too.
+
+    Raises:
+        InputError: the file cannot be read, is too large, is not YAML, has an alias (which could stand for
+            gigabytes), a date or another special type, or is nested deeper than `MAX_DEPTH`.
+    """
+    import yaml
+
+    class PlainLoader(yaml.SafeLoader):
+        depth = 0
+
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                raise ValueError(f"*{self.peek_event().anchor}: aliases are not read")
+            if self.depth == MAX_DEPTH:
+                raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
+            self.depth += 1
+            node = super().compose_node(parent, index)
+            self.depth -= 1
+            return node
+
+    text = read_text(path, MAX_SPEC_BYTES)
+    _require_short_numbers(text.encode(), str(path))
+    try:
+        content = yaml.load(text, PlainLoader)
+    except (yaml.YAMLError, ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+    _require_shallow(content, str(path), plain=True)
+    return content
+
+
+def csv_rows(
+    path: str | Path, most: int = MAX_BYTES, *, whole_lines: bool = False
+) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of a CSV file that are not empty, with their line numbers; all are as wide as the first.
+
+    Args:
+        path: the file, gzipped if its name ends in `.gz`.
+        most: maximum size, bytes unpacked.
+        whole_lines: leave out a last line without its end, which a crash cut off.
+
+    Raises:
+        InputError: the file cannot be read, is too large or is not CSV; the message names file and line.
+    """
+    width = 0
+    with open_limited(path, most) as file:
+        text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
+        lines = (line for line in text if line.endswith("\n")) if whole_lines else text
+        reader = csv.reader(lines)
+        try:
+            for row in reader:
+                width = width or len(row)
+                if row and len(row) != width:
+                    raise InputError(f"{path}: line {reader.line_num}: got {len(row)} fields, want {width}")
+                if row:
+                    yield reader.line_num, row
+        except csv.Error as error:
+            raise InputError(f"{path}: line {reader.line_num}: not CSV: {error}") from error
+
+
+def csv_records(
+    path: str | Path, most: int = MAX_BYTES, *, whole_lines: bool = False
+) -> Iterator[tuple[int, dict[str, str]]]:
+    """Yield the rows of a CSV file below its header, by the header's names, with their line numbers.
+
+    Raises:
+        InputError: see `csv_rows`.
+    """
+    rows = csv_rows(path, most, whole_lines=whole_lines)
+    _, header = next(rows, (0, []))
+    for line, row in rows:
+        yield line, dict(zip(header, row, strict=True))
+
+
+def _require_short_numbers(data: bytes, name: str) -> None:
+    """Refuse integers that no float can hold."""
+    if _LONG_NUMBER.search(data):
+        raise InputError(f"{name}: has a number of more than 300 digits, the most that is read")
+
+
+def _require_shallow(content: Any, name: str, *, plain: bool = False) -> None:
+    """Check depth, size of integers and, if `plain`, types of a parsed file; iterative, as it may be deep."""
+    rest = [(content, 0)]
+    while rest:
+        value, depth = rest.pop()
+        if depth > MAX_DEPTH:
+            raise InputError(f"{name}: nested deeper than {MAX_DEPTH} levels")
+        if isinstance(value, dict):
+            rest += [(part, depth + 1) for pair in value.items() for part in pair]
+        elif isinstance(value, list):
+            rest += [(part, depth + 1) for part in value]
+        elif isinstance(value, int) and abs(value) >= 1 << 63:
+            raise InputError(f"{name}: has an integer above {1 << 63}")
+        elif plain and not isinstance(value, str | int | float | None):
+            raise InputError(f"{name}: has a {type(value).__name__} ({value!r:.40}), want text or a number")
+        elif (
+            plain
+            and isinstance(value, str)
+            and not value.isascii()
+            and value != value.encode(errors="replace").decode()
+        ):
+            raise InputError(f"{name}: has text that is not Unicode: {value!a:.40}")

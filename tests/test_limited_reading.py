@@ -1,0 +1,227 @@
+"""Files from anywhere: what is too large, too deep or damaged is refused in one line before memory is taken."""
+
+import gzip
+import io
+import struct
+import tarfile
+import zipfile
+import zlib
+
+import numpy as np
+import pytest
+
+from parkenv.errors import InputError
+from parkenv.files.archives import MAX_MEMBERS, parse_arrays, read_arrays, read_zip, tar_members
+from parkenv.files.images import decode_image, read_image
+from parkenv.files.limited_reading import (
+    csv_records,
+    csv_rows,
+    open_limited,
+    read_bytes,
+    read_json,
+    read_text,
+    read_toml,
+    read_yaml,
+)
+
+
+def npy(descr="'<f8'", shape="(2,)", content=bytes(16), version=b"\x01\x00"):
+    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}".encode()
+    return b"\x93NUMPY" + version + struct.pack("<H", len(header)) + header + content
+
+
+def zipped(**members):
+    data = io.BytesIO()
+    with zipfile.ZipFile(data, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return data.getvalue()
+
+
+def png(width, height, rows=b""):
+    def chunk(name, data):
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", head)
+        + chunk(b"IDAT", zlib.compress(rows))
+        + chunk(b"IEND", b"")
+    )
+
+
+BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
+    f"{new}: &{new} [{','.join([f'*{old}'] * 9)}]\n" for old, new in zip("abcdefgh", "bcdefghi", strict=True)
+)
+DEEP = 100_000
+
+
+@pytest.mark.parametrize(
+    ("read", "content", "message"),
+    [
+        (read_json, "[" * DEEP, "not JSON: nested deeper than 200 levels"),
+        (read_json, '{"a":' * DEEP, "not JSON: nested deeper than 200 levels"),
+        (read_json, "1" * 400, "a number of more than 300 digits"),
+        (read_json, '"\\ud800"', "not JSON"),
+        (read_json, b"\xff\xfe", "not UTF-8 text"),
+        (read_json, "", "not JSON"),
+        (read_toml, "a = " + "[" * DEEP, "not TOML: nested deeper"),
+        (read_toml, "a = " + "[" * 150 + "]" * 150, "nested deeper than 100"),
+        (read_toml, ".".join("a" * DEEP) + " = 1", "not TOML: nested deeper"),
+        (read_toml, "a = 0x" + "f" * 40, "an integer above"),
+        (read_yaml, BOMB, "not YAML: *a: aliases are not read"),
+        (read_yaml, "[" * DEEP, "not YAML: nested deeper than 100 levels"),
+        (read_yaml, "a: 2015-13-45", "not YAML: month must be"),
+        (read_yaml, "a: 2015-11-12", "has a date (datetime.date(2015, 11, 12)), want text or a number"),
+        (read_yaml, '"\\uD800"', "text that is not Unicode"),
+        (read_yaml, "? {a: 1}\n: 2", "not YAML"),
+        (read_yaml, "!!python/object:os.system {}", "not YAML"),
+    ],
+)
+def test_a_text_that_is_too_deep_or_damaged_is_refused(tmp_path, read, content, message):
+    path = tmp_path / "file"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(InputError) as caught:
+        read(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert message in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
+def test_json_is_read_exactly(tmp_path):
+    (tmp_path / "a").write_text(
+        '\ufeff{"a": [1, -0.1, 1e-300, true, null, "é\\u0000"], "b": 9007199254740993}'
+    )
+    assert read_json(tmp_path / "a") == {"a": [1, -0.1, 1e-300, True, None, "é\0"], "b": 9007199254740993}
+
+
+def test_bytes_are_counted_unpacked_and_endless_files_end(tmp_path):
+    (tmp_path / "a.gz").write_bytes(gzip.compress(bytes(10_000_000)))
+    assert len(read_bytes(tmp_path / "a.gz", 10_000_000)) == 10_000_000
+    for path in (tmp_path / "a.gz", "/dev/zero"):
+        with pytest.raises(InputError, match="has more than 9,999,999 bytes"):
+            read_bytes(path, 9_999_999)
+    (tmp_path / "a.gz").write_bytes(gzip.compress(b"abc" * 1000)[:-9])
+    with pytest.raises(InputError, match="not a whole gzip file"):
+        read_bytes(tmp_path / "a.gz")
+
+
+@pytest.mark.parametrize("name", ["absent", ".", "a\0b", "\ud800", "x" * 300])
+def test_what_cannot_be_opened_is_named(tmp_path, name):
+    with pytest.raises(InputError) as caught, open_limited(tmp_path / name):
+        pass
+    str(caught.value).encode()
+
+
+def test_csv_rows_have_one_width_and_a_torn_end_is_left_out(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text('a,b\n1,"2\n3"\n\n4')
+    assert list(csv_records(path, whole_lines=True)) == [(3, {"a": "1", "b": "2\n3"})]
+    with pytest.raises(InputError, match="line 5: got 1 fields, want 2"):
+        list(csv_rows(path))
+    path.write_text("a\n" + "x" * 200_000)
+    with pytest.raises(InputError, match="line 2: not CSV: field larger"):
+        list(csv_rows(path))
+
+
+def test_a_zip_is_measured_before_it_is_unpacked(tmp_path):
+    path = tmp_path / "a.zip"
+    path.write_bytes(zipped(card="{}", data=b"x" * 1000))
+    assert read_zip(path) == {"card": b"{}", "data": b"x" * 1000}
+    with pytest.raises(InputError, match="unpacks to 1,002 bytes, want at most 500"):
+        read_zip(path, 500)
+    path.write_bytes(zipped(**{str(i): "" for i in range(MAX_MEMBERS + 1)}))
+    with pytest.raises(InputError, match="holds 10,001 files"):
+        read_zip(path)
+    path.write_bytes(b"PK\x03\x04 no zip")
+    with pytest.raises(InputError, match="not a zip archive"):
+        read_zip(path)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("a", b"x" * 1000)
+    with pytest.raises(InputError, match="deflate"):
+        read_zip(path)
+
+
+def test_arrays_are_read_as_numpy_wrote_them(tmp_path):
+    arrays = {
+        "a": np.arange(6.0).reshape(2, 3),
+        "b": np.asfortranarray(np.arange(6).reshape(2, 3)),
+        "c": np.array("name"),
+        "d": np.zeros((0, 3), np.float32),
+    }
+    np.savez_compressed(tmp_path / "a.npz", **arrays)
+    read = read_arrays(tmp_path / "a.npz")
+    assert read.keys() == arrays.keys()
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(read[name], array)
+        assert read[name].dtype == array.dtype
+        assert read[name].flags.writeable
+
+
+@pytest.mark.parametrize(
+    "member",
+    [
+        npy(shape="(100000000000,)"),
+        npy(shape="(1000000, 1000000)"),
+        npy(shape="(-1, -2)"),
+        npy(shape="(3,)"),
+        npy("'|O'"),
+        npy("'V0'", "(10**30,)"),
+        npy("'nonsense'"),
+        npy(version=b"\x09\x00"),
+        npy(shape="(" * 5000),
+        npy(shape="-" * 8000 + "1"),
+        np.lib.format.magic(1, 0),
+        b"",
+    ],
+)
+def test_an_array_is_as_large_as_its_header_says(member):
+    with pytest.raises(InputError, match=r"a\.npz: a\.npy: not an array of numbers"):
+        parse_arrays(zipped(**{"a.npy": member}), "a.npz")
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (png(100_000, 100_000), "is too large .* want at most 100,000,000 pixels"),
+        (png(11_000, 10_000), "is too large .11000×10000 px."),
+        (b"P5 100000 100000 255\n", "is too large"),
+        (b"P5 10000000000 1 255\n", "is no image"),
+        (b"P5 10 10 255\n" + bytes(99), "is no image that can be read whole"),
+        (png(10, 10, bytes(110))[:-5], "is no image that can be read whole"),
+        (b"\xff\xd8\xff\xe0\x00\x10JFIF", "is no image that can be read whole"),
+        (b"", "is no image that can be read whole"),
+    ],
+)
+def test_an_image_is_measured_before_it_is_decoded(data, message):
+    with pytest.raises(InputError, match=message):
+        decode_image(data, "a.png")
+
+
+def test_an_image_is_read(tmp_path):
+    (tmp_path / "a.png").write_bytes(png(10, 5, bytes(55)))
+    assert read_image(tmp_path / "a.png").shape == (5, 10)
+
+
+def test_a_tar_archive_is_unpacked_within_limits(tmp_path):
+    path = tmp_path / "a.tar.gz"
+    with tarfile.open(path, "w:gz") as archive:
+        for name, size in (("x/a.pgm", 10), ("b.txt", 20), ("c.pgm", 3000)):
+            member = tarfile.TarInfo(name)
+            member.size = size
+            archive.addfile(member, io.BytesIO(bytes(size)))
+    assert [(name, len(data)) for name, data in tar_members(path, ".pgm")] == [
+        ("x/a.pgm", 10),
+        ("c.pgm", 3000),
+    ]
+    with pytest.raises(InputError, match="has more than 2,000 bytes"):
+        list(tar_members(path, ".pgm", 2000))
+    path.write_bytes(gzip.compress(b"no archive" * 100))
+    with pytest.raises(InputError, match="not a tar archive"):
+        list(tar_members(path, ".pgm"))
+
+
+def test_text_loses_its_byte_order_mark(tmp_path):
+    (tmp_path / "a").write_bytes(b"\xef\xbb\xbfabc")
+    assert read_text(tmp_path / "a") == "abc"
