@@ -193,8 +193,8 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
 
     Args:
         name: one of `AGENT_NAMES` or `SMALL_LOTS_ONLY`; `ALGORITHM:FILE` for a model of `parkenv train`, such as
-            `ppo:ppo.safetensors`; or `MODULE:CLASS` for your own agent, such as `my_agents:Patient`: a class whose first
-            argument is the problem. The module may be in the working directory.
+            `ppo:ppo.safetensors`; or `MODULE:CLASS` for your own agent, such as `my_agents:Patient`: a class whose
+            first argument is the problem. The module may be in the working directory.
         scenario: the scenario; its hidden occupancy is not passed to the agent.
         options: options of the agent, such as `failure_s=5.0` for "mdp".
 
@@ -227,6 +227,19 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
         if option not in known:
             raise InputError(f"agent {name!r} has no option {option!r}; known: {', '.join(known) or 'none'}")
     return agent(scenario, **options)
+
+
+def shown_name(name: str) -> str:
+    """Return the name of an agent for tables: the attribute `name` of a user's class, if it has one.
+
+    Args:
+        name: a name that `make_agent` accepts.
+    """
+    before, colon, _ = name.partition(":")
+    if not colon or before in ALGORITHMS:
+        return name
+    own = getattr(load_class(name, "agent", "predict"), "name", None)
+    return own if isinstance(own, str) and own else name
 
 
 def agent_file(name: str) -> Path | None:

@@ -21,6 +21,7 @@ from pydantic import Field, JsonValue
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import parse_json, read_bytes
 from parkenv.files.spec_file import Several, Spec
 from planners.agent import ALGORITHMS
 
@@ -32,7 +33,7 @@ FIXED_NUMBERS, NUMBERS_PER_SLOT = 46, 8
 COMMANDS = {"search": "parkenv compare", "drive": "parkenv park"}
 """Commands that run the models of each task."""
 _KEY = "parkenv"
-_MAX_CARD = 1_000_000
+_MAX_HEADER, _MAX_BYTES = 1_000_000, 500_000_000
 _ZIP = b"PK"
 
 # Bounds, so that a card cannot ask for more memory than a network of a few million weights needs.
@@ -129,33 +130,27 @@ class ModelCard(Spec):
         Raises:
             InputError: the file is missing or damaged, is a pickled archive, or has no card of this version.
         """
-        try:
-            with Path(path).open("rb") as file:
-                start = file.read(8)
-        except OSError as error:
-            raise InputError(f"{path}: no model file ({error.strerror or error})") from error
-        if start.startswith(_ZIP):
+        return cls._of_bytes(read_bytes(path, _MAX_BYTES), path)
+
+    @classmethod
+    def _of_bytes(cls, data: bytes, path: str | os.PathLike[str]) -> Self:
+        if data.startswith(_ZIP):
             raise InputError(
                 f"{path}: is an archive of pickled objects, which run code when they are loaded; if you trust its "
-                f"author, add --trust-model, which converts it to a {SUFFIX} file"
+                f"author, convert it to a {SUFFIX} file: name it once with --trust-model (compare, park, benchmark run)"
             )
-        from safetensors import SafetensorError, safe_open
-
-        try:
-            with safe_open(path, "np") as opened:
-                text = (opened.metadata() or {}).get(_KEY)
-        except (SafetensorError, OSError) as error:
-            raise InputError(f"{path}: no model file, or a damaged one ({error})") from error
-        if text is None:
+        # The layout of safetensors: the header's length, 8 bytes; the header, JSON; the tensors.
+        size = int.from_bytes(data[:8], "little")
+        if not data[8:9] == b"{" or size > min(_MAX_HEADER, len(data) - 8):
+            raise InputError(f"{path}: no model file, or a damaged one")
+        header = parse_json(data[8 : 8 + size], f"{path}: header")
+        text = header.get("__metadata__", {})
+        text = text.get(_KEY) if isinstance(text, dict) else None
+        if not isinstance(text, str):
             raise InputError(f"{path}: no model of `parkenv train`: it has no card")
-        if len(text) > _MAX_CARD:
-            raise InputError(f"{path}: its card has {len(text)} characters, want at most {_MAX_CARD}")
-        try:
-            content = json.loads(text)
-        except (ValueError, RecursionError) as error:
-            raise InputError(f"{path}: its card is no JSON ({error})") from error
+        content = parse_json(text, f"{path}: card")
         if not isinstance(content, dict):
-            raise InputError(f"{path}: its card is a {type(content).__name__}, want a JSON object")
+            raise InputError(f"{path}: card is a {type(content).__name__}, want a JSON object")
         return cls.parse(content, f"{path}: card")
 
     def build(self) -> Any:
@@ -261,9 +256,8 @@ def load_model(
     Raises:
         InputError: the file is not a model, or is one of another algorithm, task or observation.
     """
-    from safetensors.torch import load_file
-
-    card = ModelCard.of_file(path)
+    data = read_bytes(path, _MAX_BYTES)
+    card = ModelCard._of_bytes(data, path)
     if card.algorithm != algorithm:
         raise InputError(f"{path}: is a model of {card.algorithm}, not of {algorithm}")
     if card.task != task:
@@ -277,7 +271,7 @@ def load_model(
         )
     try:
         policy = card.build()
-        policy.load_state_dict(load_file(path, "cpu"))
+        policy.load_state_dict(import_module("safetensors.torch").load(data))
     except InputError:
         raise
     except Exception as error:  # torch and stable-baselines3 raise many types for weights that do not fit

@@ -13,6 +13,7 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.compare import episode_progress
 from parkenv.cli.tables import make_console, make_table
+from parkenv.cli.trust import TrustModelOption, TrustOption, readable_models, require_trust
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ def run(
         bool, typer.Option("--resume", help="Finish the run in --out. It needs no other option.")
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results in --out.")] = False,
+    trust: TrustOption = False,
+    trust_model: TrustModelOption = False,
 ) -> None:
     """Run agents through all episodes of a suite, and write a result that others can check.
 
@@ -58,7 +61,9 @@ def run(
 
     out = out or Path("results") / suite
     base = args.saved(out, SPEC_FILE, BenchmarkSpec) if resume else BenchmarkSpec()
-    given = {} if agents is None else {"agents": split_agents(agents)}
+    if agents is None:
+        require_trust(base, out, trust)
+    given = {} if agents is None else {"agents": readable_models(split_agents(agents), trust_model)}
     spec = base.changed(suite=suite, jobs=jobs, backend=backend, address=address, **given)
     run_suite(spec, out, resume=resume, overwrite=overwrite)
 

@@ -22,6 +22,7 @@ from rich.table import Table
 
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import WIDE, make_console, make_table
+from parkenv.cli.trust import TrustModelOption, TrustOption, readable_models, require_trust
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
@@ -125,6 +126,8 @@ def compare(
     figures: Annotated[bool | None, typer.Option(help="Draw figures.  [default: figures]")] = None,
     rerun: args.RerunOption = None,
     report: args.ReportOption = False,
+    trust: TrustOption = False,
+    trust_model: TrustModelOption = False,
 ) -> None:
     """Compare agents over failure costs and speeds, all in the same worlds.
 
@@ -149,6 +152,8 @@ def compare(
     out = out or Path("results/compare")
     if resume:
         base = args.saved(out, SPEC_FILE, ExperimentSpec)
+        if agents is None:
+            require_trust(base, out, trust)
     else:
         base = ExperimentSpec().changed(grid={"occupancy_levels": list(LEVELS)})
     grid = base.grid
@@ -174,8 +179,8 @@ def compare(
         sensor_model=sensor_model, view_range=view_range, base=base.scenarios,
     )  # fmt: skip
     given = {
-        "agents": None if agents is None else split_agents(agents), "episodes": episodes, "seed": seed, "rig": rig,
-        "figures": figures,
+        "agents": None if agents is None else readable_models(split_agents(agents), trust_model),
+        "episodes": episodes, "seed": seed, "rig": rig, "figures": figures,
     }  # fmt: skip
     spec = base.changed(
         scenarios=tuple(specs),
@@ -248,7 +253,7 @@ def run_comparison(
     if report:
         from parkenv.cli.report import make_report
 
-        make_report(out, jobs=spec.jobs)
+        make_report(out, jobs=spec.jobs, trust=True)
 
 
 def setting_count(rows: list[Row]) -> int:

@@ -161,7 +161,7 @@ def run_demo(
     if report:
         from parkenv.cli.report import make_report
 
-        make_report(out, jobs=spec.jobs)
+        make_report(out, jobs=spec.jobs, trust=True)
 
 
 def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:

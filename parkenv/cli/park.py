@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table
+from parkenv.cli.trust import TrustModelOption, readable_models
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
@@ -66,6 +67,7 @@ def park(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Output folder for pictures, episodes.csv and summary.json.")
     ] = Path("results/park"),
+    trust_model: TrustModelOption = False,
 ) -> None:
     """Evaluate parking agents in `parkenv/Drive-v1`: success rate, planning time, driving time, manoeuvres.
 
@@ -92,7 +94,7 @@ def park(
         case = ParkingCase(build(spec).lot, kinds, ways, occupancy_level, slack)
         case.environment().close()  # validates the options before the first episode
         cases.append(case)
-    labels = _labels(args.words("--agents", agents))
+    labels = _labels(readable_models(args.words("--agents", agents), trust_model))
     parking_agents = {label: make_parking_agent(name) for label, name in labels.items()}
     make_folder(out)
     console = make_console()

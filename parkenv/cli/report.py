@@ -12,11 +12,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console
+from parkenv.cli.trust import TrustOption, require_trust
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.compare import Case
+    from parkenv.evaluation.experiments.spec import TrainingSpec
     from parkenv.evaluation.report.run_folder import RunFolder
+    from parkenv.files.spec_file import Spec
     from parkenv.mapping.survey import Survey
 
 PAGE = "report.html"
@@ -58,6 +61,7 @@ def report(
     out: Annotated[
         Path | None, typer.Option("--out", "-o", help=f"The HTML file.  [default: DIR/{PAGE}]")
     ] = None,
+    trust: TrustOption = False,
 ) -> None:
     """Write an HTML page on a run: its settings, sortable tables, figures, and replays of its searches and drives.
 
@@ -80,6 +84,7 @@ def report(
         frames=frames,
         jobs=jobs,
         out=out,
+        trust=trust,
     )
 
 
@@ -93,11 +98,13 @@ def make_report(
     frames: int = 120,
     jobs: int = 0,
     out: Path | None = None,
+    trust: bool = False,
 ) -> None:
     """Write the page; see `report` for the arguments.
 
     Raises:
-        InputError: the folder holds no finished run of this version, or not the chosen searches.
+        InputError: the folder holds no finished run of this version, not the chosen searches, or names classes that
+            are not trusted.
     """
     from parkenv.evaluation.report.page import page_data, write_page
     from parkenv.evaluation.report.run_folder import RunFolder
@@ -109,7 +116,13 @@ def make_report(
     cases: Cases = []
     notes: list[str] = []
     try:
-        surveys, cases = _run_again(run)
+        spec = run.spec()
+    except (InputError, OSError) as error:
+        spec, notes = None, [f"There is no replay: {error}"]
+    if spec is not None:
+        require_trust(spec, folder, trust)
+    try:
+        surveys, cases = _run_again(run, spec)
     except (InputError, OSError) as error:
         # The page still has tables and figures.
         notes.append(f"There is no replay: {error}")
@@ -147,7 +160,7 @@ def make_report(
     console.print(f"Written: {path}, {path.stat().st_size / 1e6:.1f} MB")
 
 
-def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
+def _run_again(run: RunFolder, spec: Spec | None) -> tuple[Surveys | None, Cases]:
     """Return the survey of a run, with its number of drives, and its searches, from its specification.
 
     Raises:
@@ -157,58 +170,53 @@ def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
     from parkenv.evaluation.experiments.experiment import Experiment, require_unchanged
     from parkenv.evaluation.experiments.results import read_settings
 
-    file = run.path / specs.SPEC_FILE
-    if run.kind == "compare":
-        spec = specs.ExperimentSpec.read(file)
-        require_unchanged(spec, read_settings(run.path) or {})
-        return None, [*Experiment(spec).cases]
-    if run.kind == "benchmark":
-        from parkenv.evaluation.experiments.benchmark import Suite
+    match spec:
+        case specs.ExperimentSpec():
+            require_unchanged(spec, read_settings(run.path) or {})
+            return None, [*Experiment(spec).cases]
+        case specs.BenchmarkSpec():
+            from parkenv.evaluation.experiments.benchmark import Suite
 
-        benchmark = specs.BenchmarkSpec.read(file)
-        return None, [*Suite.named(benchmark.suite).cases(benchmark.agents)]
-    if run.kind == "survey":
-        from parkenv.evaluation.experiments.surveys import survey_of
+            return None, [*Suite.named(spec.suite).cases(spec.agents)]
+        case specs.SurveySpec():
+            from parkenv.evaluation.experiments.surveys import survey_of
 
-        return (partial(_survey, *survey_of(specs.SurveySpec.read(file))), len(run.table("sessions.csv"))), []
-    if run.kind == "demo":
-        from parkenv.evaluation.experiments.demo import demo_cases, demo_survey
-        from parkenv.mapping.store import MapStore
+            return (partial(_survey, *survey_of(spec)), len(run.table("sessions.csv"))), []
+        case specs.DemoSpec():
+            from parkenv.evaluation.experiments.demo import demo_cases, demo_survey
+            from parkenv.mapping.store import MapStore
 
-        demo = specs.DemoSpec.read(file)
-        its, settings = demo_survey(demo)
-        with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:
-            log = store.log()
-        return (partial(_survey, its, settings), len(log.time)), [*demo_cases(demo, its, log)]
-    if run.kind == "train":
-        return None, _trained(run)
+            its, settings = demo_survey(spec)
+            with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:
+                log = store.log()
+            return (partial(_survey, its, settings), len(log.time)), [*demo_cases(spec, its, log)]
+        case specs.TrainingSpec():
+            return None, _trained(run, spec)
     return None, []
 
 
-def _trained(run: RunFolder) -> Cases:
+def _trained(run: RunFolder, spec: TrainingSpec) -> Cases:
     """Return the best model and the best planners in the test scenarios; none for driving, or without a test."""
-    from parkenv.evaluation.experiments.compare import Case
-    from parkenv.evaluation.experiments.spec import SPEC_FILE, TrainingSpec
-
-    spec = TrainingSpec.read(run.path / SPEC_FILE)
     if spec.env != "search" or not run.summary.get("transfer"):
         return []
     from parkenv.cli.search_task import SearchTask
     from parkenv.cli.training_task import TEST_SEED
+    from parkenv.evaluation.experiments.compare import Case
     from parkenv.evaluation.training.rl_training import MODEL
 
     best = min(run.summary["rows"], key=lambda row: float(row["total_s"]))
     model = run.path / f"seed_{int(best['seed'])}" / MODEL
     task = SearchTask(spec)
-    agents = {agent.label: agent for agent in task.compared}
     seeds = range(TEST_SEED, TEST_SEED + int(run.summary["transfer"][0]["episodes"]))
     cases: Cases = []
     for scenario in task.tested:
         planners = [row for row in run.summary.get("planners", []) if row["scenario"] == scenario.name]
         beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
         cases.append((Case(scenario, f"{task.algorithm}:{model}"), seeds))
-        shown = [agents[row["agent"]] for row in beside if row["agent"] in agents]
-        cases += [(Case(scenario, agent.name, options=agent.options), seeds) for agent in shown]
+        made = {
+            case.label: case for case in (Case(scenario, a.name, options=a.options) for a in task.compared)
+        }
+        cases += [(made[row["agent"]], seeds) for row in beside if row["agent"] in made]
     return cases
 
 

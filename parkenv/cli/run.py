@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated
 
 import typer
 
@@ -15,29 +15,18 @@ from parkenv.cli.demo import run_demo
 from parkenv.cli.report import make_report
 from parkenv.cli.survey import run_survey_of
 from parkenv.cli.train import run_training
+from parkenv.cli.trust import TrustOption, require_trust
 from parkenv.errors import InputError
 from parkenv.files.spec_file import nearest, read_tables
 
-
-class Kind(NamedTuple):
-    """A kind of experiment file.
-
-    Attributes:
-        spec: module and class of its specification, imported on demand.
-        run: function that runs it.
-    """
-
-    spec: str
-    run: Callable[..., None]
-
-
-KINDS: Mapping[str, Kind] = {
-    "compare": Kind("ExperimentSpec", run_comparison),
-    "benchmark": Kind("BenchmarkSpec", run_suite),
-    "survey": Kind("SurveySpec", run_survey_of),
-    "demo": Kind("DemoSpec", run_demo),
-    "train": Kind("TrainingSpec", run_training),
+KINDS: Mapping[str, Callable[..., None]] = {
+    "compare": run_comparison,
+    "benchmark": run_suite,
+    "survey": run_survey_of,
+    "demo": run_demo,
+    "train": run_training,
 }
+"""Functions that run the specifications of each kind."""
 
 
 def run(
@@ -56,6 +45,7 @@ def run(
     resume: Annotated[bool, typer.Option("--resume", help="Go on with the run in --out.")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results in --out.")] = False,
     report: args.ReportOption = False,
+    trust: TrustOption = False,
 ) -> None:
     """Run an experiment file: agents, scenarios, and a grid of settings.
 
@@ -68,8 +58,7 @@ def run(
 
     * `parkenv run results/sweep --resume`
     """
-    from parkenv.evaluation.experiments import spec as specs
-    from parkenv.evaluation.experiments.spec import SPEC_FILE
+    from parkenv.evaluation.experiments.spec import SPEC_FILE, SPECS
 
     if file.is_dir():
         if out is not None:
@@ -79,11 +68,11 @@ def run(
     name = tables.get("kind", "compare")
     if name not in KINDS:
         raise InputError(f"{file}: kind is {name!r}; {nearest(str(name), KINDS)}")
-    kind = KINDS[name]
-    spec: Any = getattr(specs, kind.spec).parse(tables, str(file), file.parent)
+    spec = SPECS[name].parse(tables, str(file), file.parent)
     if jobs is not None:
         spec = spec.changed(jobs=jobs)
     out = out or Path("results") / file.stem
-    kind.run(spec, out, resume=resume, overwrite=overwrite)
+    require_trust(spec, file, trust)
+    KINDS[name](spec, out, resume=resume, overwrite=overwrite)
     if report:
-        make_report(out, jobs=spec.jobs)
+        make_report(out, jobs=spec.jobs, trust=True)

@@ -194,7 +194,7 @@ def run_survey_of(
     if report:
         from parkenv.cli.report import make_report
 
-        make_report(out, jobs=spec.jobs)
+        make_report(out, jobs=spec.jobs, trust=True)
     if rerun is not None:
         with console.status(f"Driving the first session once more for {rerun}"):
             first = Survey(its, settings)

@@ -216,7 +216,7 @@ def run_training(
     if report:
         from parkenv.cli.report import make_report
 
-        make_report(out, jobs=spec.jobs)
+        make_report(out, jobs=spec.jobs, trust=True)
 
 
 def _require_free(out: Path, settings: Row, resume: bool, overwrite: bool) -> None:
