@@ -18,6 +18,7 @@ from parkenv.cli import (
     occupancy,
     park,
     plan,
+    publish,
     report,
     run,
     schema,
@@ -56,6 +57,7 @@ app.command("detect")(detect.detect)
 app.command("train-detector")(detect.train_detector)
 app.command("evaluate-detector")(detect.evaluate_detector)
 app.command("train")(train.train)
+app.command("publish")(publish.publish)
 app.command("report")(report.report)
 app.command("bench")(bench.bench)
 app.add_typer(benchmark.app, name="benchmark")
