@@ -50,6 +50,35 @@ def imports(path):
     return {module for module, _ in import_statements(path)}
 
 
+# What reads a file of any size and depth, by the modules that may do so within limits.
+READS = {
+    "json.load": (),
+    "json.loads": ("planners/learned.py",),
+    "yaml.load": ("parkenv/files/limited_reading.py",),
+    "yaml.safe_load": (),
+    "tomllib.load": (),
+    "tomllib.loads": ("parkenv/files/limited_reading.py",),
+    "csv.reader": ("parkenv/files/limited_reading.py",),
+    "csv.DictReader": (),
+    "gzip.open": (),
+    "np.load": (),
+    "np.loadtxt": (),
+    "np.genfromtxt": (),
+    "cv2.imread": (),
+    "cv2.imdecode": ("parkenv/files/images.py",),
+    "PillowImage.open": ("parkenv/files/images.py",),
+    "Image.open": (),
+    "tarfile.open": ("parkenv/files/archives.py",),
+    "zipfile.ZipFile": (
+        "parkenv/files/archives.py",
+        "parkenv/perception/car_model.py",
+        "planners/learned.py",
+    ),
+    "pickle.load": (),
+    "pickle.loads": ("sim_sensors/compilation.py",),
+}
+
+
 def import_graph(root):
     """The modules below a folder, and which of them each imports."""
     modules = {
@@ -93,6 +122,17 @@ def test_packages_import_those_below_them_only(path):
         return
     above = LAYERS[LAYERS.index(here) + 1 :]
     assert not [m for m in imports(path) if m.startswith("parkenv.") and m.split(".")[1] in above]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_files_are_read_within_limits(package):
+    for path in sources(package):
+        name = path.relative_to(ROOT).as_posix()
+        calls = {
+            ast.unparse(n.func) for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)
+        }
+        unlimited = {call for call in calls & READS.keys() if name not in READS[call]}
+        assert not unlimited, f"{name}: read by parkenv.files instead"
 
 
 def test_parkenv_holds_nothing_but_its_layers():

@@ -97,4 +97,4 @@ def test_the_command_tells_of_suites_and_refuses_what_is_none(tmp_path):
     for content in ('{"format": "park', "[" * 100_000):
         (tmp_path / "torn.json").write_text(content)
         torn = parkenv("benchmark", "check", tmp_path / "torn.json")
-        assert (torn.returncode, "no benchmark result" in torn.stderr) == (2, True)
+        assert (torn.returncode, "not JSON" in torn.stderr) == (2, True)

@@ -98,7 +98,7 @@ def test_bad_model_files_are_told_apart(model, tmp_path):
         archive.writestr("weights.npy", weights)
         archive.writestr("settings.npy", raw[:start] + text)
     for name, message in (
-        ("text.npz", "not a car model"),
+        ("text.npz", "not a zip archive"),
         ("other.npz", "not a car model"),
         ("new.npz", "format version 9, want 2"),
         ("none.npz", "no such model; want side, front, or an .npz file"),

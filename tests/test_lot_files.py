@@ -358,8 +358,15 @@ def test_dragon_lake_goes_through_the_native_format(tmp_path):
     ("text", "message"),
     [
         ("a: [1", "not YAML: .*line 1"),
-        ("- 1", "no WAYPOINTS.R1L.bounds, want 2 points"),
-        ("WAYPOINTS: {R1L: {bounds: [[1, 2], [3, .nan]]}}", "WAYPOINTS.R1L.bounds is"),
+        ("- 1", r"is \[1\], want a table"),
+        ("PARKING_AREAS: {A: {bounds: [[1, 2], [3, .nan]]}}", "A.bounds.1.1 is nan, want a finite number"),
+        ("PARKING_AREAS: [A]", r"PARKING_AREAS is \['A'\]"),
+        (
+            "PARKING_AREAS: {A: {bounds: [[0, 0], [9, 0], [9, 9], [0, 9]], areas: [{shape: [1, 1000000000]}]}}",
+            "A.areas.0.shape.1 is 1000000000, want a number of at most 1000",
+        ),
+        ("PARKING_AREAS: {A: {bounds: 2015-11-12}}", "has a date"),
+        ("PARKING_AREAS: {1: {}}", "PARKING_AREAS.1"),
     ],
 )
 def test_a_map_that_is_none_is_refused(tmp_path, text, message):
@@ -436,7 +443,7 @@ FAULTS = [
     ),
     (set_feature(4, "goal", "Point", ["45", 0]), 4, "goal: position ['45', 0], want two finite numbers"),
     (set_feature(4, "goal", "Point", [True, 0]), 4, "goal: position [True, 0], want two finite numbers"),
-    (set_feature(4, "goal", "Point", [10**400, 0]), 4, "want two finite numbers"),
+    (set_feature(4, "goal", "Point", [10**200, 0]), 4, "want two finite numbers"),
     (set_feature(4, "goal", "Point", 7), 4, "goal: position 7, want two finite numbers"),
     (set_feature(2, "lane", "LineString", [[0, 0]]), 2, "want at least 2 positions"),
     (set_feature(2, "lane", "LineString", [[0, 0], [0, 0]]), 2, "are equal, want different points"),
@@ -521,11 +528,11 @@ def test_faults_are_named(tmp_path, change, number, message):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "not JSON: line 1, column 1"),
-        ('{"type": "FeatureCollection",\n "features": [', "not JSON: line 2, column 15"),
+        ("", "not JSON: EOF .* at line 1 column 0"),
+        ('{"type": "FeatureCollection",\n "features": [', "not JSON: EOF .* at line 2 column 14"),
         ("[1, 2]", "type is 'list', want a GeoJSON 'FeatureCollection'"),
         ("[" * 100_000, "not JSON"),
-        ("9" * 5000, "not JSON"),
+        ("9" * 5000, "a number of more than 300 digits"),
     ],
 )
 def test_files_that_are_no_geojson_are_refused(tmp_path, text, message):
@@ -539,12 +546,12 @@ def test_files_that_are_no_geojson_are_refused(tmp_path, text, message):
 def test_every_cut_of_a_file_is_refused(tmp_path):
     whole = json.dumps(document())
     for length in range(0, len(whole), 37):
-        with pytest.raises(InputError, match="not JSON: line 1, column"):
+        with pytest.raises(InputError, match=r"not JSON: .* at line 1 column"):
             read(tmp_path, whole[:length])
 
 
 def test_files_that_are_not_there_or_no_text_are_refused(tmp_path):
-    with pytest.raises(InputError, match="cannot be read: No such file"):
+    with pytest.raises(InputError, match="No such file"):
         read_lot(tmp_path / "lot.geojson")
     with pytest.raises(InputError, match=r"unknown kind of file '\.osm'"):
         read_lot(tmp_path / "lot.osm")

@@ -87,13 +87,13 @@ def test_camera_and_weather_may_be_absent_and_the_later_of_two_cameras_stands(tm
         (HEADER + "2024-01-01,1,a,sunny,1\n", "line 2: datetime: got '2024-01-01'"),
         (HEADER + "2024-01-01 07:00+01:00,1,a,sunny,1\n", r"line 2: datetime: got '2024-01-01 07:00\+01:00'"),
         (HEADER + "2024-01-01 07:00,1,,sunny,1\n", "line 2: slot_id: empty"),
-        (HEADER + "2024-01-01 07:00,1,a\n", "line 2: got 3 fields, wanted 5"),
+        (HEADER + "2024-01-01 07:00,1,a\n", "line 2: got 3 fields, want 5"),
         (
             HEADER
             + "2024-01-01 07:05,1,a,sunny,1\n2024-01-01 07:00,1,b,sunny,1\n2024-01-01 07:04,1,a,sunny,1\n",
             "line 4: datetime: 2024-01-01 07:04 of slot a is before",
         ),
-        (HEADER + "\0\udcff", "not CSV text in UTF-8"),
+        (HEADER + "\0\udcff", "not UTF-8 text"),
     ],
 )
 def test_a_bad_log_is_refused_by_line(tmp_path, text, message):

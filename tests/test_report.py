@@ -155,7 +155,7 @@ def test_folders_that_hold_no_finished_run_are_refused_in_words(tmp_path):
     with pytest.raises(InputError, match="want the summary of a command, with rows"):
         RunFolder.read(summary_in(tmp_path, rows=None))
     (tmp_path / "summary.json").write_text('{"command": [')
-    with pytest.raises(InputError, match="is torn"):
+    with pytest.raises(InputError, match="not JSON"):
         RunFolder.read(tmp_path)
     (tmp_path / "summary.json").rename(tmp_path / "summary.partial.json")
     with pytest.raises(InputError, match="was interrupted; finish it"):

@@ -409,7 +409,7 @@ def curve_of_another_kind(folder):
         ({"scenario": ["jam", "mini"]}, None, "scenario is 'jam' in .* and 'mini' here; their evaluations"),
         ({"evaluation_episodes": 8}, None, "evaluation_episodes is 8 in .* and 16 here"),
         ({}, lambda folder: shutil.rmtree(folder / "seed_0"), "holds no training"),
-        ({}, torn_settings, "settings.json: is torn"),
+        ({}, torn_settings, "settings.json: not JSON"),
         ({}, settings_of_another_kind, "want the settings of a command"),
         ({}, torn_curve, "curve.csv: want numbers in every column"),
         ({}, curve_of_another_kind, "was not written by this version"),

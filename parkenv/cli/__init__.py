@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import sys
+import tempfile
+import traceback
 import warnings
 
 import typer
@@ -81,7 +85,10 @@ def _global_options(
 
 
 def main() -> None:
-    """Entry point; invalid input gives one line on standard error and exit code 2."""
+    """Entry point; invalid input gives one line on standard error and exit code 2, an error of parkenv's own 70."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # Names may hold what the terminal cannot show.
+        sys.stdout.reconfigure(errors="backslashreplace")
     warnings.formatwarning = lambda message, *_: f"parkenv: warning: {message}\n"
     try:
         code = app(standalone_mode=False)
@@ -94,12 +101,30 @@ def main() -> None:
     except typer.Abort:
         sys.exit(130)
     except OSError as error:
-        if error.filename is None:
-            raise
-        sys.exit(_complain(f"{error.filename}: {error.strerror}"))
+        if error.filename is None and error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            sys.exit(_report_crash(error))
+        sys.exit(_complain(": ".join(str(part) for part in (error.filename, error.strerror) if part)))
+    except Exception as error:
+        sys.exit(_report_crash(error))
     sys.exit(code if isinstance(code, int) else 0)
 
 
 def _complain(message: str) -> int:
-    typer.echo(f"parkenv: error: {' '.join(message.split())}", err=True)
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(message.split()))
+    typer.echo(f"parkenv: error: {line}", err=True)
     return 2
+
+
+def _report_crash(error: Exception) -> int:
+    """Keep the traceback of an unforeseen error in a file, and name it; return the exit code of such errors."""
+    text = "".join(traceback.format_exception(error))
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="parkenv-", suffix=".txt", encoding="utf-8", errors="backslashreplace", delete=False
+        ) as file:
+            file.write(f"{sys.argv}\n{text}")
+    except OSError:
+        typer.echo(text, err=True)
+        return 70
+    _complain(f"unforeseen {type(error).__name__}: {error!s:.200}; please report it with {file.name}")
+    return 70  # EX_SOFTWARE

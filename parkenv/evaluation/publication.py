@@ -157,7 +157,8 @@ A policy that {act}, in [Gymnasium](https://gymnasium.farama.org) environments o
 
 {_table(rows)}
 
-{self.episodes:,} episodes in each scenario, in the same worlds for all agents; brackets are 95 % intervals. In this folder,
+{self.episodes:,} episodes in each scenario, in the same worlds for all agents; 95 % intervals in brackets. In this
+folder,
 
 ```sh
 {shlex.join(self.command)}

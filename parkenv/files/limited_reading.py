@@ -34,7 +34,7 @@ _DEEP_KEY = re.compile(r"(?:\.[ \t]*[\w\"'-]+[ \t]*){100}")
 class _Counted(io.RawIOBase):
     """A stream that fails after `most` bytes, such as an unpacked one of unknown size."""
 
-    def __init__(self, stream: IO[bytes], most: int, name: object) -> None:
+    def __init__(self, stream: io.BufferedIOBase, most: int, name: object) -> None:
         self._stream, self._left, self._most, self._name = stream, most, most, name
 
     def readable(self) -> bool:
@@ -65,7 +65,7 @@ def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]
     with file:
         try:
             packed = str(path).endswith((".gz", ".tgz"))
-            stream = gzip.GzipFile(fileobj=file) if packed else file
+            stream: io.BufferedIOBase = gzip.GzipFile(fileobj=file) if packed else file
             yield io.BufferedReader(_Counted(stream, most, path), 1 << 20)
         except (EOFError, gzip.BadGzipFile, zlib.error) as error:
             raise InputError(f"{path}: not a whole gzip file ({error})") from error
@@ -153,7 +153,7 @@ def read_yaml(path: str | Path) -> Any:
 
         def compose_node(self, parent: Any, index: Any) -> Any:
             if self.check_event(yaml.AliasEvent):
-                raise ValueError(f"*{self.peek_event().anchor}: aliases are not read")
+                raise ValueError("aliases (*name) are not read")
             if self.depth == MAX_DEPTH:
                 raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
             self.depth += 1

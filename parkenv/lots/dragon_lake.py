@@ -3,16 +3,59 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
-import yaml
-from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, Strict
 
 from parkenv.errors import InputError
+from parkenv.files.limited_reading import read_yaml
+from parkenv.files.spec_file import Spec
 from parkenv.lots.generators import Slots, bay_row
 from parkenv.world.lot import Lane, ParkingLot
 
-FloatArray = NDArray[np.float64]
+Metres = Annotated[float, Field(ge=-1e6, le=1e6)]
+Point = Annotated[tuple[Metres, Metres], Strict(False)]
+
+
+class _Part(Spec):
+    """A part of the map, which may have further members."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+class _Line(_Part):
+    bounds: Annotated[tuple[Point, Point], Strict(False)]
+
+
+class _Waypoints(_Part):
+    R1L: _Line
+    R1R: _Line
+    R2L: _Line
+    R2R: _Line
+    R3L: _Line
+    R3R: _Line
+    R4L: _Line
+    R4R: _Line
+    C1: _Line
+    C2: _Line
+    EXT: _Line
+
+
+class _Rows(_Part):
+    shape: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=2)], Annotated[int, Field(ge=1, le=1000)]], Strict(False)
+    ]
+
+
+class _Area(_Part):
+    bounds: Annotated[tuple[Point, Point, Point, Point], Strict(False)]
+    areas: Annotated[tuple[_Rows, ...], Strict(False), Field(min_length=1)]
+
+
+class _Map(_Part):
+    PARKING_AREAS: Annotated[dict[str, _Area], Field(min_length=1)]
+    WAYPOINTS: _Waypoints
 
 
 def dragon_lake_lot(path: Path) -> ParkingLot:
@@ -28,48 +71,31 @@ def dragon_lake_lot(path: Path) -> ParkingLot:
     Raises:
         InputError: the file cannot be read or is not a Dragon Lake map.
     """
+    document = _Map.parse(read_yaml(path), str(path))
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except (UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+        return _lot(document)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
-    def bounds(group: str, name: str, points: int) -> FloatArray:
-        try:
-            values = np.array(document[group][name]["bounds"], dtype=np.float64)
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path}: no {group}.{name}.bounds, want {points} points") from error
-        if values.shape != (points, 2) or not np.isfinite(values).all():
-            raise InputError(
-                f"{path}: {group}.{name}.bounds is {values.tolist()!r:.60}, want {points} points"
-            )
-        return values
 
-    rows = [(bounds("WAYPOINTS", f"R{k}L", 2), bounds("WAYPOINTS", f"R{k}R", 2)) for k in (1, 2, 3, 4)]
-    aisle_y = np.array([left[0, 1] for left, _ in rows])
-    c1, c2 = (bounds("WAYPOINTS", name, 2)[0, 0] for name in ("C1", "C2"))
-    outside = bounds("WAYPOINTS", "EXT", 2)[0]
+def _lot(document: _Map) -> ParkingLot:
+    lines = {name: np.array(line.bounds) for name, line in document.WAYPOINTS}
+    aisle_y = np.array([lines[f"R{k}L"][0, 1] for k in (1, 2, 3, 4)])
+    c1, c2 = lines["C1"][0, 0], lines["C2"][0, 0]
+    outside = lines["EXT"][0]
     lanes = [Lane(np.stack([np.full(4, x), aisle_y], axis=1)) for x in (c1, c2)]
-    for k, (y, (_, right)) in enumerate(zip(aisle_y, rows, strict=True)):
-        stops = {c1, c2, right[:, 0].max()} | ({outside[0]} if k == 0 else set())
+    for k, y in enumerate(aisle_y):
+        stops = {c1, c2, lines[f"R{k + 1}R"][:, 0].max()} | ({outside[0]} if k == 0 else set())
         lanes.append(Lane(np.array([[x, y] for x in sorted(stops)])))
     lanes.append(Lane(np.array([outside, [outside[0], aisle_y[0]]])))
 
     parts: list[Slots] = []
     slot_ids: list[str] = []
-    for area in document.get("PARKING_AREAS") or ():
-        west, south = bounds("PARKING_AREAS", area, 4).min(axis=0)
-        east, north = bounds("PARKING_AREAS", area, 4).max(axis=0)
-        try:
-            n_rows, n_columns = document["PARKING_AREAS"][area]["areas"][0]["shape"]
-            size = ((north - south) / n_rows, (east - west) / n_columns)
-        except (KeyError, IndexError, TypeError, ValueError, ZeroDivisionError) as error:
-            raise InputError(
-                f"{path}: no PARKING_AREAS.{area}.areas[0].shape, want [rows, columns]"
-            ) from error
-        if n_rows not in (1, 2):
-            raise InputError(f"{path}: PARKING_AREAS.{area} has {n_rows} rows, want 1 or 2, each on an aisle")
+    for name, area in document.PARKING_AREAS.items():
+        west, south = np.min(area.bounds, axis=0)
+        east, north = np.max(area.bounds, axis=0)
+        n_rows, n_columns = area.areas[0].shape
+        size = ((north - south) / n_rows, (east - west) / n_columns)
         opens_north = np.min(np.abs(aisle_y - north)) < np.min(np.abs(aisle_y - south))
         for row in range(n_rows):
             if n_rows == 2:
@@ -81,9 +107,7 @@ def dragon_lake_lot(path: Path) -> ParkingLot:
                 else bay_row((west, south), 0.0, n_columns, size=size)
             )
             parts.append(line[::-1] if opens_north else line)
-            slot_ids += [f"{area}-{row}-{column}" for column in range(n_columns)]
-    if not parts:
-        raise InputError(f"{path}: no PARKING_AREAS: an empty lot")
+            slot_ids += [f"{name}-{row}-{column}" for column in range(n_columns)]
     return ParkingLot(
         name="dragon-lake",
         slot_ids=tuple(slot_ids),

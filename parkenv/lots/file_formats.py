@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from enum import Enum
 from pathlib import Path
 
+from parkenv.errors import InputError
+from parkenv.files.limited_reading import read_json
 from parkenv.lots.importers.osm_elements import holds_osm
 
 
@@ -31,8 +32,8 @@ def lot_format(path: Path) -> LotFormat | None:
     suffix = path.suffix.lower()
     if suffix in (".json", ".geojson"):
         try:
-            is_osm = holds_osm(json.loads(path.read_text(encoding="utf-8-sig")))
-        except (OSError, ValueError, RecursionError):
+            is_osm = holds_osm(read_json(path))
+        except InputError:
             is_osm = False
         return LotFormat.OSM if is_osm else LotFormat.GEOJSON
     by_suffix = {

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import read_json
 from parkenv.lots.geojson_slots import FARTHEST, SLOT_SHAPE, RawFeature, is_coordinate, read_slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_contents import KINDS, LotContents
@@ -157,15 +158,9 @@ def _load(path: Path) -> Any:
     if path.suffix.lower() not in (".geojson", ".json"):
         raise InputError(f"unknown kind of file {path.suffix!r}, want .geojson, .json or a Dragon Lake .yml")
     try:
-        return json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"not UTF-8 text: {error.reason} at byte {error.start}") from error
-    except json.JSONDecodeError as error:
-        raise InputError(f"not JSON: line {error.lineno}, column {error.colno}: {error.msg}") from error
-    except (RecursionError, ValueError) as error:
-        raise InputError(f"not JSON that a lot needs: {error}") from error
+        return read_json(path)
+    except InputError as error:
+        raise InputError(str(error).removeprefix(f"{path}: ")) from error
 
 
 def _check_head(document: Any, stem: str) -> tuple[str, bool]:

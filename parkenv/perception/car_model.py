@@ -120,7 +120,7 @@ class CarModel:
             parts = read_arrays(name)
         else:
             raise InputError(f"{name}: no such model; want {', '.join(PACKAGED_MODELS)}, or an .npz file")
-        settings = parse_json(parts.get("settings", np.zeros(0)).tobytes(), str(name))
+        settings = parse_json(parts.get("settings", np.zeros(0)).tobytes() or b"0", str(name))
         if "weights" not in parts or not isinstance(settings, dict) or settings.get("format") != _FORMAT:
             raise InputError(f"{name}: not a car model; want an .npz file that parkenv train-detector wrote")
         weights = parts["weights"]

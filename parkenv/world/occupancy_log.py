@@ -5,21 +5,18 @@ in time. Before a day's first observation the first state holds, after its last 
 was not observed on a day has no record of that day.
 """
 
-import csv
-import gzip
 import os
-import zlib
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import date, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self, TextIO
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 
 from parkenv.errors import InputError
+from parkenv.files.limited_reading import csv_rows
 from parkenv.world.occupancy import BoolArray, FloatArray, IntArray
 from parkenv.world.week import DAY_HOURS, DAY_S, HOUR_S
 from sim_sensors.compilation import compiled
@@ -27,6 +24,10 @@ from sim_sensors.compilation import compiled
 DayClass = Literal["weekday", "weekend"]
 
 MAX_GAP_S = 7200.0
+MAX_LOG_BYTES = 512_000_000
+"""Maximum size of a log, unpacked: some 12 million observations."""
+MAX_RECORDS = 5_000_000
+"""Maximum number of slots times days of a log, each of which takes half a kilobyte."""
 
 _KNOWN = ("datetime", "camera", "slot_id", "weather", "occupied")
 
@@ -112,6 +113,11 @@ class OccupancyLog:
             raise InputError(f"{self.source}: no looks, wanted at least one")
         if not slot.shape == day.shape == second.shape == occupied.shape == (slot.size,):
             raise InputError(f"{self.source}: wanted slot, day, second and occupied of one length")
+        if len(self.slot_ids) * len(self.days) > MAX_RECORDS:
+            raise InputError(
+                f"{self.source}: has {len(self.slot_ids):,} slots on {len(self.days):,} days, "
+                f"wanted at most {MAX_RECORDS:,} slots times days"
+            )
         for name, index, size in (("slot", slot, len(self.slot_ids)), ("day", day, len(self.days))):
             if index.min() < 0 or index.max() >= size:
                 raise InputError(f"{self.source}: {name}: wanted indices from 0 to {size - 1}")
@@ -154,26 +160,24 @@ class OccupancyLog:
         moments: dict[str, datetime] = {}  # one image shows many slots: many lines have the same text
         latest: dict[str, datetime] = {}
         looks: list[tuple[int, datetime, bool]] = []
-        with csv_rows(path) as rows:
-            at_time, at_slot, at_occupied = csv_columns(
-                path, rows, _KNOWN, ("datetime", "slot_id", "occupied")
-            )
-            for line, row in rows:
-                text, slot_id, taken = row[at_time], row[at_slot], row[at_occupied]
-                moment = moments.get(text)
-                if moment is None:
-                    moment = moments[text] = _moment(path, line, text)
-                if not slot_id:
-                    raise InputError(f"{path}: line {line}: slot_id: empty, wanted a slot's name")
-                if taken not in ("0", "1"):
-                    raise InputError(f"{path}: line {line}: occupied: got {taken!r}, wanted 0 or 1")
-                if moment < latest.get(slot_id, moment):
-                    raise InputError(
-                        f"{path}: line {line}: datetime: {text} of slot {slot_id} is before its line above,"
-                        f" {latest[slot_id]}; wanted looks in order of time"
-                    )
-                latest[slot_id] = moment
-                looks.append((slots.setdefault(slot_id, len(slots)), moment, taken == "1"))
+        rows = csv_rows(path, MAX_LOG_BYTES)
+        at_time, at_slot, at_occupied = csv_columns(path, rows, _KNOWN, ("datetime", "slot_id", "occupied"))
+        for line, row in rows:
+            text, slot_id, taken = row[at_time], row[at_slot], row[at_occupied]
+            moment = moments.get(text)
+            if moment is None:
+                moment = moments[text] = _moment(path, line, text)
+            if not slot_id:
+                raise InputError(f"{path}: line {line}: slot_id: empty, wanted a slot's name")
+            if taken not in ("0", "1"):
+                raise InputError(f"{path}: line {line}: occupied: got {taken!r}, wanted 0 or 1")
+            if moment < latest.get(slot_id, moment):
+                raise InputError(
+                    f"{path}: line {line}: datetime: {text} of slot {slot_id} is before its line above,"
+                    f" {latest[slot_id]}; wanted looks in order of time"
+                )
+            latest[slot_id] = moment
+            looks.append((slots.setdefault(slot_id, len(slots)), moment, taken == "1"))
         if not looks:
             raise InputError(f"{path}: no looks, wanted at least one line below the header")
         dates = [moment.date().isoformat() for _, moment, _ in looks]
@@ -282,33 +286,6 @@ def _sum_hours(
             if taken[look]:
                 _add_hours(replayed[slot, day], start, end)
                 _add_hours(occupied[slot, day], watched, left)
-
-
-@contextmanager
-def csv_rows(path: Path) -> Iterator[Iterator[tuple[int, list[str]]]]:
-    """Iterate over the rows of a CSV file with their line numbers; read errors become InputError."""
-    width = 0
-
-    def rows(file: TextIO) -> Iterator[tuple[int, list[str]]]:
-        nonlocal width
-        reader = csv.reader(file)
-        for row in reader:
-            width = width or len(row)
-            if row and len(row) != width:
-                raise InputError(f"{path}: line {reader.line_num}: got {len(row)} fields, wanted {width}")
-            if row:
-                yield reader.line_num, row
-
-    opened: Callable[..., Any] = gzip.open if path.suffix == ".gz" else open
-    try:
-        with opened(path, "rt", encoding="utf-8-sig", newline="") as file:
-            yield rows(file)
-    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-        raise InputError(f"{path}: not a whole gzip file ({error}), wanted it complete") from error
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror or error}, wanted a CSV file") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: not CSV text in UTF-8 ({error})") from error
 
 
 def csv_columns(

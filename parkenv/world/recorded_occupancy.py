@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.limited_reading import csv_rows
 from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.world.occupancy import (
     DAY_NAMES,
@@ -29,7 +30,7 @@ from parkenv.world.occupancy_kernel import (
     recorded_forecast,
     recorded_look,
 )
-from parkenv.world.occupancy_log import OccupancyLog, csv_columns, csv_rows, day_class, weekday_of
+from parkenv.world.occupancy_log import OccupancyLog, csv_columns, day_class, weekday_of
 from parkenv.world.pointers import address_of, float64s, int64s, uint8s
 from parkenv.world.week import DAY_S
 
@@ -52,19 +53,19 @@ def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log:
     log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
     lot_index = {slot_id: i for i, slot_id in enumerate(lot_slot_ids)}
     mapping = np.full(len(lot_slot_ids), -1, np.int64)
-    with csv_rows(path) as rows:
-        at_slot, at_log_slot = csv_columns(path, rows, ("slot_id", "log_slot_id"), ("slot_id", "log_slot_id"))
-        for line, row in rows:
-            slot_id, log_slot_id = row[at_slot], row[at_log_slot]
-            if slot_id not in lot_index:
-                raise InputError(f"{path}: line {line}: slot_id: got {slot_id!r}, wanted a slot of the lot")
-            if mapping[lot_index[slot_id]] >= 0:
-                raise InputError(f"{path}: line {line}: slot_id: {slot_id!r} a second time, wanted it once")
-            if log_slot_id not in log_index:
-                raise InputError(
-                    f"{path}: line {line}: log_slot_id: got {log_slot_id!r}, wanted a slot of {log.source}"
-                )
-            mapping[lot_index[slot_id]] = log_index[log_slot_id]
+    rows = csv_rows(path)
+    at_slot, at_log_slot = csv_columns(path, rows, ("slot_id", "log_slot_id"), ("slot_id", "log_slot_id"))
+    for line, row in rows:
+        slot_id, log_slot_id = row[at_slot], row[at_log_slot]
+        if slot_id not in lot_index:
+            raise InputError(f"{path}: line {line}: slot_id: got {slot_id!r}, wanted a slot of the lot")
+        if mapping[lot_index[slot_id]] >= 0:
+            raise InputError(f"{path}: line {line}: slot_id: {slot_id!r} a second time, wanted it once")
+        if log_slot_id not in log_index:
+            raise InputError(
+                f"{path}: line {line}: log_slot_id: got {log_slot_id!r}, wanted a slot of {log.source}"
+            )
+        mapping[lot_index[slot_id]] = log_index[log_slot_id]
     missing = [slot_id for slot_id, i in lot_index.items() if mapping[i] < 0]
     if missing:
         raise InputError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.evaluation.bench.rows import BenchRow, duration, rate, seconds_each
+from parkenv.files.limited_reading import parse_json
 from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.survey import Survey, SurveySettings
 from parkenv.perception.capture import TimedCapture
@@ -135,5 +135,5 @@ def _peers(grey: NDArray[np.uint8], seconds: float) -> dict[str, float]:
             )
         except (OSError, subprocess.CalledProcessError) as error:
             raise InputError(f"{PEERS_PYTHON}={python}: does not run the peers: {error}") from error
-    found: dict[str, float] = json.loads(done.stdout)
+    found: dict[str, float] = parse_json(done.stdout, "opencv")
     return found

@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import jsonschema
 import numpy as np
@@ -22,6 +22,7 @@ from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.compare import Case, at_occupancy, require_distinct, table
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.results import ResultFolder, Row
+from parkenv.files.limited_reading import read_json
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.occupancy import ArrivalWindow
 from parkenv.world.scenario import KMH, Scenario
@@ -102,7 +103,7 @@ class Suite:
         """
         if name not in SUITES:
             raise InputError(f"there is no benchmark suite {name!r}; known: {', '.join(SUITES)}")
-        content = json.loads(_file(f"{name}.json"))
+        content = _packaged(name)
         canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
         first = content["first_seed"]
         return cls(
@@ -171,10 +172,8 @@ def check_result(path: Path) -> Row:
         InputError: the check failed; the message says where, with agent and task.
     """
     try:
-        result: Row = json.loads(path.read_text(encoding="utf-8"))
-        jsonschema.validate(result, json.loads(_file("result.schema.json")))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: no benchmark result ({error})") from error
+        result: Row = read_json(path)
+        jsonschema.validate(result, _packaged("result.schema"))
     except jsonschema.ValidationError as error:
         raise InputError(f"{path}: {error.json_path} {error.message[:200]}") from error
     suite = Suite.named(result["suite"])
@@ -230,5 +229,5 @@ def _mean_score(tasks: Mapping[str, Mapping[str, Sequence[float]]]) -> float:
     return float(np.mean([_score(searches) for searches in tasks.values()]))
 
 
-def _file(name: str) -> str:
-    return (_FOLDER / name).read_text(encoding="utf-8")
+def _packaged(name: str) -> Any:
+    return read_json(_FOLDER / f"{name}.json")

@@ -16,6 +16,7 @@ from typing import Any
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import csv_records, parse_json, read_json
 
 SETTING_COLUMNS = ("scenario", "occupancy_level", "agent", "failure_cost_s", "v_walk_kmh", "v_drive_kmh")
 EPISODE_COLUMNS = (
@@ -69,10 +70,7 @@ def read_settings(folder: Path) -> Row | None:
     file = folder / SETTINGS
     if not file.exists():
         return None
-    try:
-        settings = json.loads(file.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InputError(f"{file}: is torn: {error}") from error
+    settings = read_json(file)
     if not isinstance(settings, dict):
         raise InputError(f"{file}: want the settings of a command, by name, got a {type(settings).__name__}")
     return settings
@@ -102,7 +100,7 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) 
     before = read_settings(folder)
     if before is None:
         raise InputError(f"--resume: {folder} holds no {kind} to go on with")
-    now = json.loads(json.dumps(dict(settings)))
+    now = parse_json(json.dumps(dict(settings)), "settings")
     both = {}
     for name in sorted(before.keys() | now.keys()):
         was, its = before.get(name), now.get(name)
@@ -247,12 +245,14 @@ def _read(path: Path, columns: Sequence[str]) -> list[Row]:
     """Read the complete lines of a file written by `_append`."""
     if not path.exists():
         return []
-    whole, _, _ = path.read_text(encoding="utf-8").rpartition("\n")
     rows = []
-    for raw in csv.DictReader(io.StringIO(whole, newline="")):
-        if tuple(raw) != tuple(columns) or None in raw.values():
+    for line, raw in csv_records(path, whole_lines=True):
+        if tuple(raw) != tuple(columns):
             raise InputError(f"{path}: not written by this version of parkenv; use another folder")
-        rows.append({name: _parse(name, value) for name, value in raw.items()})
+        try:
+            rows.append({name: _parse(name, value) for name, value in raw.items()})
+        except ValueError as error:
+            raise InputError(f"{path}: line {line}: {error}") from error
     return rows
 
 

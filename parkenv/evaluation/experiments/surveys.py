@@ -18,6 +18,7 @@ from parkenv.errors import InputError
 from parkenv.evaluation.experiments.spec import BUSY, SurveySpec
 from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import csv_records
 from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
 from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.odometry import PoseNoise
@@ -311,12 +312,15 @@ def _read_rows(path: Path) -> list[Row]:
     if not path.exists():
         return []
     rows = []
-    for raw in csv.DictReader(path.read_text(encoding="utf-8").splitlines()):
+    whole = ("parked", "found", "detections", "right")
+    words = ("key", "weather", "cars_in_frame", "cars_detected")
+    for line, raw in csv_records(path):
         if tuple(raw) != SESSION_COLUMNS:
             raise InputError(f"{path}: not written by this version of parkenv; use another folder")
-        whole = ("parked", "found", "detections", "right")
-        words = ("key", "weather", "cars_in_frame", "cars_detected")
-        rows.append({k: v if k in words else int(v) if k in whole else float(v) for k, v in raw.items()})
+        try:
+            rows.append({k: v if k in words else int(v) if k in whole else float(v) for k, v in raw.items()})
+        except ValueError as error:
+            raise InputError(f"{path}: line {line}: {error}") from error
     return rows
 
 

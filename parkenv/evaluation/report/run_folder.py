@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +11,7 @@ from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.results import SETTING_COLUMNS, SETTINGS, SUMMARY, SUMMARY_PARTIAL, Row
 from parkenv.evaluation.experiments.spec import SPEC_FILE, SPECS
+from parkenv.files.limited_reading import csv_records, read_json
 from parkenv.files.spec_file import Spec, read_tables
 
 _TEXT = ("scenario", "agent")
@@ -51,10 +50,7 @@ class RunFolder:
                     f"{path}: holds a run that was interrupted; finish it (--resume), then report it"
                 )
             raise InputError(f"{path}: holds no {SUMMARY}; want a folder that a command with --out wrote")
-        try:
-            summary = json.loads(file.read_text(encoding="utf-8"))
-        except (ValueError, UnicodeDecodeError) as error:
-            raise InputError(f"{file}: is torn: {error}") from error
+        summary = read_json(file)
         missing = [
             name
             for name, kind in (("command", list), ("version", str), ("rows", list))
@@ -97,22 +93,20 @@ class RunFolder:
         if not file.exists():
             return {}
         columns = (*SETTING_COLUMNS, "seed")
-        with file.open(encoding="utf-8", newline="") as lines:
+        totals = {}
+        for line, row in csv_records(file):
             try:
-                return {
-                    tuple(_value(c, row[c]) for c in columns): float(row["total_s"])
-                    for row in csv.DictReader(lines)
-                }
-            except (KeyError, TypeError, ValueError) as error:
-                raise InputError(f"{file}: a line of it cannot be read ({error})") from error
+                totals[tuple(_value(c, row[c]) for c in columns)] = float(row["total_s"])
+            except (KeyError, ValueError) as error:
+                raise InputError(f"{file}: line {line}: cannot be read ({error})") from error
+        return totals
 
     def table(self, name: str) -> list[Row]:
         """Read the rows of a CSV file in the folder, with numbers converted; empty without the file."""
         file = self.path / name
         if not file.exists():
             return []
-        with file.open(encoding="utf-8", newline="") as lines:
-            return [{k: _number(v) for k, v in row.items()} for row in csv.DictReader(lines)]
+        return [{k: _number(v) for k, v in row.items()} for _, row in csv_records(file)]
 
 
 def _value(column: str, text: str) -> Any:

@@ -24,6 +24,7 @@ from parkenv.errors import InputError
 from parkenv.evaluation.training.checkpoint import read_checkpoint, restore, save_checkpoint
 from parkenv.evaluation.training.configs import TrainingConfig
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import csv_records
 from planners.model_file import algorithm_class, save_model
 
 TRAINING_SEEDS = 10_000_000
@@ -233,11 +234,12 @@ def read_curve(path: Path) -> list[Row]:
     """
     if not path.exists():
         return []
-    with path.open(encoding="utf-8", newline="") as file:
-        try:
-            return [
-                {name: int(value) if name == "steps" else float(value) for name, value in row.items()}
-                for row in csv.DictReader(file)
-            ]
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{path}: want numbers in every column of every line ({error})") from error
+    try:
+        return [
+            {name: int(value) if name == "steps" else float(value) for name, value in row.items()}
+            for _, row in csv_records(path)
+        ]
+    except InputError:
+        raise
+    except ValueError as error:
+        raise InputError(f"{path}: want numbers in every column of every line ({error})") from error

@@ -32,6 +32,7 @@ from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
 from parkenv.evaluation.trips.executor import EDGE_KINDS, Leg, ParkingAttempt
 from parkenv.evaluation.trips.lot_driver import DrivingStyle
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import parse_json, read_text
 from parkenv.files.versioned_json import JsonFormat
 from parkenv.world.scenario import KMH, Scenario
 
@@ -159,9 +160,11 @@ class TripFolder:
                     f"--out {path}: holds trips; add --resume to continue, or name another folder"
                 )
             require_same_settings(path, settings, "trips")
-            whole, _, _ = self._file.read_text(encoding="utf-8").rpartition("\n")
-            for line in whole.splitlines():
-                row = json.loads(line)
+            whole, _, _ = read_text(self._file).rpartition("\n")
+            for number, line in enumerate(whole.splitlines(), start=1):
+                row = parse_json(line, f"{self._file}: line {number}")
+                if not isinstance(row, dict) or not {"slots", "seed"} <= row.keys():
+                    raise InputError(f"{self._file}: line {number}: {line!r:.40} is no trip")
                 self.rows[row["slots"], row["seed"]] = row
         write_settings(path, settings)
         self.put_in_order()

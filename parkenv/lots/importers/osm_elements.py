@@ -10,7 +10,6 @@ expand into gigabytes or fetch other files.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.limited_reading import read_bytes, read_json
 
 FloatArray = NDArray[np.float64]
 
@@ -66,20 +66,10 @@ def read_elements(path: Path) -> list[OsmElement]:
         InputError: the file cannot be read, is incomplete or has another format; a position is not on the globe; a
             tagged way refers to a node that is not in the file; or an element appears twice with different content.
     """
+    is_xml = path.suffix.lower() in (".osm", ".xml")
+    content = read_bytes(path) if is_xml else read_json(path)
     try:
-        if path.suffix.lower() in (".osm", ".xml"):
-            return _read_xml(path)
-        return elements_of_json(json.loads(path.read_text(encoding="utf-8-sig")))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
-    except json.JSONDecodeError as error:
-        raise InputError(
-            f"{path}: not JSON: line {error.lineno}, column {error.colno}: {error.msg}"
-        ) from error
-    except RecursionError as error:
-        raise InputError(f"{path}: not JSON of a map: nested too deeply") from error
+        return _elements_of_xml(content) if is_xml else elements_of_json(content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
 
@@ -280,13 +270,11 @@ class _XmlReader:
             raise InputError(f"<{element}>: {key} is {values.get(key)!r:.40}, want a whole number") from error
 
 
-def _read_xml(path: Path) -> list[OsmElement]:
+def _elements_of_xml(data: bytes) -> list[OsmElement]:
     reader = _XmlReader()
     parser = ElementTree.XMLParser(target=reader)
     try:
-        with path.open("rb") as file:
-            while block := file.read(1 << 20):
-                parser.feed(block)
+        parser.feed(data)
         parser.close()
     except ElementTree.ParseError as error:
         line, column = error.position

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.limited_reading import csv_rows
 from parkenv.lots.importers.import_options import ImportOptions, points_in_frame
 from parkenv.lots.importers.lot_draft import LeftOut, LotDraft
 from parkenv.lots.importers.osm_rows import NO_SLOTS
@@ -55,15 +55,7 @@ def read_slot_list(path: str | Path) -> SlotList:
             out of range, an id or a position appears twice.
     """
     path = Path(path)
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
-    except csv.Error as error:
-        raise InputError(f"{path}: not CSV: {error}") from error
+    rows = [row for _, row in csv_rows(path) if any(cell.strip() for cell in row)]
     head = [cell.strip().lower() for cell in rows[0]] if rows else []
     unknown = [name for name in head if name not in COLUMNS]
     pairs = [pair for pair in (("x", "y"), ("lat", "lon")) if set(pair) <= set(head)]
@@ -78,8 +70,6 @@ def read_slot_list(path: str | Path) -> SlotList:
     values: dict[str, list[float]] = {name: [] for name in head if name != "id"}
     ids: dict[str, int] = {}
     for number, row in enumerate(rows[1:], start=2):
-        if len(row) != len(head):
-            raise InputError(f"{path}: row {number}: {len(row)} cells, want {len(head)}")
         cells = dict(zip(head, (cell.strip() for cell in row), strict=True))
         name = cells.get("id", str(number))
         if not name or name in ids:
