@@ -7,7 +7,6 @@ trained on. Archives that stable-baselines3 writes itself hold pickled Python ob
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from importlib import import_module
@@ -17,6 +16,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from gymnasium import spaces
 from pydantic import Field, JsonValue
+from pydantic_core import to_jsonable_python
 
 from parkenv import __version__
 from parkenv.errors import InputError
@@ -223,7 +223,7 @@ def save_model(
             "observation_space": {key: BoxSpace.of(space) for key, space in model.observation_space.items()},
             "action_space": int(action.n) if isinstance(action, spaces.Discrete) else BoxSpace.of(action),
             "scenarios": tuple(scenarios), "seed": model.seed, "steps": model.num_timesteps,
-            "settings": json.loads(json.dumps(dict(settings or {}))), "results": found, "command": tuple(command),
+            "settings": to_jsonable_python(dict(settings or {})), "results": found, "command": tuple(command),
         },
         "model",
     )  # fmt: skip

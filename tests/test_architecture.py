@@ -53,7 +53,7 @@ def imports(path):
 # What reads a file of any size and depth, by the modules that may do so within limits.
 READS = {
     "json.load": (),
-    "json.loads": ("planners/learned.py",),
+    "json.loads": (),
     "yaml.load": ("parkenv/files/limited_reading.py",),
     "yaml.safe_load": (),
     "tomllib.load": (),
@@ -61,6 +61,8 @@ READS = {
     "csv.reader": ("parkenv/files/limited_reading.py",),
     "csv.DictReader": (),
     "gzip.open": (),
+    "torch.load": ("parkenv/evaluation/training/checkpoint.py",),  # weights_only
+    "joblib.load": (),
     "np.load": (),
     "np.loadtxt": (),
     "np.genfromtxt": (),
@@ -72,7 +74,7 @@ READS = {
     "zipfile.ZipFile": (
         "parkenv/files/archives.py",
         "parkenv/perception/car_model.py",
-        "planners/learned.py",
+        "parkenv/evaluation/training/checkpoint.py",
     ),
     "pickle.load": (),
     "pickle.loads": ("sim_sensors/compilation.py",),

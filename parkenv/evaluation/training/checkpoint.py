@@ -5,7 +5,6 @@ A checkpoint is a PyTorch file of tensors, numbers and text, read with `weights_
 
 from __future__ import annotations
 
-import json
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -34,7 +33,7 @@ def save_checkpoint(path: Path, model: Any, curve: list[Row]) -> None:
     buffer = getattr(model, "replay_buffer", None)
     state = {
         "format": _FORMAT,
-        "curve": json.dumps(curve),
+        "curve": [{n: int(v) if n == "steps" else float(v) for n, v in row.items()} for row in curve],
         "numbers": _numbers(model),
         "parameters": model.get_parameters(),
         "variables": {name: getattr(model, name).detach() for name in _variables(model)},
@@ -67,7 +66,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Any], list[Row]]:
         state = torch.load(path, map_location="cpu", weights_only=True)
         if state["format"] != _FORMAT:
             raise ValueError(f"its format is {state['format']!r}, want {_FORMAT!r}")
-        return state, json.loads(state["curve"])
+        return state, state["curve"]
     except Exception as error:  # torch raises many types for damaged files
         raise InputError(
             f"{path}: no checkpoint of this version, or a damaged one ({error}); train again with --overwrite"
