@@ -130,7 +130,7 @@ class ModelCard(Spec):
         Raises:
             InputError: the file is missing or damaged, is a pickled archive, or has no card of this version.
         """
-        return cls._of_bytes(read_bytes(path, _MAX_BYTES), path)
+        return cls._of_bytes(read_bytes(Path(path), _MAX_BYTES), path)
 
     @classmethod
     def _of_bytes(cls, data: bytes, path: str | os.PathLike[str]) -> Self:
@@ -256,7 +256,7 @@ def load_model(
     Raises:
         InputError: the file is not a model, or is one of another algorithm, task or observation.
     """
-    data = read_bytes(path, _MAX_BYTES)
+    data = read_bytes(Path(path), _MAX_BYTES)
     card = ModelCard._of_bytes(data, path)
     if card.algorithm != algorithm:
         raise InputError(f"{path}: is a model of {card.algorithm}, not of {algorithm}")

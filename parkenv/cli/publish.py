@@ -107,9 +107,11 @@ def _trained_on(model: Path, names: Sequence[str]) -> list[ScenarioSpec]:
     """Return the scenarios that a model was trained on, if they are packaged ones."""
     from parkenv.scenarios.spec import SCENARIO_NAMES, scenario_spec
 
-    if unknown := [name for name in names if name not in SCENARIO_NAMES] or not names:
-        what = f"was trained on {unknown[0]}, which is not packaged" if names else "names no scenario"
-        raise InputError(f"{model}: {what}; add --scenario")
+    for name in names:
+        if name not in SCENARIO_NAMES:
+            raise InputError(f"{model}: was trained on {name}, which is not packaged; add --scenario")
+    if not names:
+        raise InputError(f"{model}: names no scenario that it was trained on; add --scenario")
     return [scenario_spec(name) for name in names]
 
 

@@ -175,7 +175,7 @@ class DriveTrainingEnv(SharedVecEnv):
             "stood": self._stood,
             "returns": self._returns,
             "lengths": self._lengths,
-            "batch": {n: array for n, array in vars(self.batch).items() if isinstance(array, np.ndarray)},
+            "batch": {name: array for name, array in vars(self.batch).items() if _changes(array)},
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -296,3 +296,8 @@ class DriveTrainingEnv(SharedVecEnv):
             task = self._tasks[key].draw(seed)
             made[seed] = CurriculumTask(PreparedTask(task), planned_path(task) if on_path else None)
         return made[seed]
+
+
+def _changes(value: Any) -> bool:
+    """Whether a part of a batch may change: the car's own arrays are read-only."""
+    return isinstance(value, np.ndarray) and value.flags.writeable
