@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.errors import InputError
+from parkenv.errors import InputError, nearest
 from parkenv.files.user_class import file_of_class, load_class
 from parkenv.world.occupancy import World
 from parkenv.world.scenario import Scenario, SearchProblem
+from planners.names import AGENTS, ALGORITHMS
 
 Observation = Mapping[str, Any]
 Memory = TypeVar("Memory")
@@ -143,35 +144,6 @@ class SearchAgent(ABC, Generic[Memory]):
         return PlanPreview()
 
 
-# Modules are imported when an agent is made: heuristics need no sparse solver, and only trained models need torch.
-_AGENTS: dict[str, tuple[str, str]] = {
-    "mdp": ("planners.thesis.replanning", "ReplanningAgent"),
-    "mdp-static": ("planners.thesis.replanning", "StaticAgent"),
-    "greedy-goal": ("planners.greedy", "GreedyGoalAgent"),
-    "greedy-drive": ("planners.greedy", "GreedyDriveAgent"),
-    "first-free": ("planners.greedy", "FirstFreeAgent"),
-    "random": ("planners.greedy", "RandomAgent"),
-    "oracle": ("planners.bounds.oracle", "OracleAgent"),
-    "belief": ("planners.belief.agent", "BeliefAgent"),
-    "mdp-tuned": ("planners.thesis.tuning", "TunedAgent"),
-    "exact": ("planners.bounds.exact", "ExactAgent"),
-}
-
-ALGORITHMS = {
-    "dqn": ("stable_baselines3", "DQN"),
-    "ppo": ("stable_baselines3", "PPO"),
-    "maskable-ppo": ("sb3_contrib", "MaskablePPO"),
-    "recurrent-ppo": ("sb3_contrib", "RecurrentPPO"),
-    "sac": ("stable_baselines3", "SAC"),
-    "tqc": ("sb3_contrib", "TQC"),
-}
-"""Module and class of each learning algorithm; `ALGORITHM:FILE` names a trained model."""
-SMALL_LOTS_ONLY = ("exact",)
-"""Agents for small lots and sensors without errors only."""
-AGENT_NAMES = tuple(name for name in _AGENTS if name not in SMALL_LOTS_ONLY)
-"""Agents for all lots."""
-
-
 def require_observations(name: str, problem: SearchProblem) -> None:
     """Raise an error if slots can never be observed from the lane.
 
@@ -192,7 +164,7 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
     """Make an agent that knows the scenario's public part: lot, goal, speeds and costs.
 
     Args:
-        name: one of `AGENT_NAMES` or `SMALL_LOTS_ONLY`; `ALGORITHM:FILE` for a model of `parkenv train`, such as
+        name: one of `planners.names.AGENTS`; `ALGORITHM:FILE` for a model of `parkenv train`, such as
             `ppo:ppo.safetensors`; or `MODULE:CLASS` for your own agent, such as `my_agents:Patient`: a class whose
             first argument is the problem. The module may be in the working directory.
         scenario: the scenario; its hidden occupancy is not passed to the agent.
@@ -216,16 +188,18 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
             alternatives=f"; nor is it an algorithm ({', '.join(ALGORITHMS)})",
         )
         scenario = scenario.public() if isinstance(scenario, Scenario) else scenario
-    elif name in _AGENTS:
-        module, class_name = _AGENTS[name]
+    elif name in AGENTS:
+        module, class_name = AGENTS[name]
         agent = getattr(import_module(module), class_name)
     else:
-        others = "ALGORITHM:FILE for a trained model, MODULE:CLASS for your own"
-        raise InputError(f"unknown agent {name!r}; known: {', '.join(_AGENTS)}, {others}")
+        raise InputError(
+            f"unknown agent {name!r}; {nearest(name, AGENTS)}, ALGORITHM:FILE for a trained model, MODULE:CLASS for "
+            "your own"
+        )
     known = [p for p in inspect.signature(agent).parameters if p != "problem"]
     for option in options:
         if option not in known:
-            raise InputError(f"agent {name!r} has no option {option!r}; known: {', '.join(known) or 'none'}")
+            raise InputError(f"agent {name!r} has no option {option!r}; {nearest(option, known)}")
     return agent(scenario, **options)
 
 

@@ -23,7 +23,7 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import parse_json, read_bytes
 from parkenv.files.spec_file import Several, Spec
-from planners.agent import ALGORITHMS
+from planners.names import ALGORITHMS
 
 SUFFIX = ".safetensors"
 OBSERVATION = "local-1"

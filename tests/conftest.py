@@ -1,7 +1,13 @@
-"""How tests are run: by which process, and with which examples."""
+"""How tests are run: by which process, with how many threads, and with which examples."""
+
+import os
 
 import hypothesis
 import pytest
+
+# Each core has a test process already. Threads of several that wait for each other by spinning take 20 times as long.
+if "PYTEST_XDIST_WORKER" in os.environ:
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # The same examples on every machine, however slow it is just now; a test's files may serve all of its examples.
 hypothesis.settings.register_profile(

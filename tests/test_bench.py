@@ -82,9 +82,7 @@ def test_bench_writes_its_rows(tmp_path):
 def test_an_unknown_part_is_named():
     result = CliRunner().invoke(app, ["bench", "engine"])
     assert isinstance(result.exception, InputError)
-    assert "no part 'engine' to measure, want some of sensors, perception, planning, env" in str(
-        result.exception
-    )
+    assert "no part 'engine' to measure; known: sensors, perception, planning, env" in str(result.exception)
 
 
 def test_steps_are_measured_and_peers_that_are_not_there_are_named(monkeypatch):

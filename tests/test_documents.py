@@ -107,7 +107,7 @@ def test_commands_have_options_that_exist(words):
 
 
 def test_agents_in_the_table_are_the_agents_there_are():
-    from planners.agent import AGENT_NAMES, SMALL_LOTS_ONLY
+    from planners.names import AGENTS
 
     listed = re.findall(r"^\| `([a-z-]+)` \|", PAGES["docs/agents.md"], flags=re.MULTILINE)
-    assert sorted(listed) == sorted((*AGENT_NAMES, *SMALL_LOTS_ONLY))
+    assert sorted(listed) == sorted(AGENTS)

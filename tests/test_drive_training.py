@@ -532,7 +532,8 @@ def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algo
     every = steps // 4
     command = [
         "train", algorithm, "--env", "drive", "--lot", "mini", "--steps", str(steps),
-        "--seeds", "2", "--evaluate-every", str(every), "--evaluation-episodes", "4", "--jobs", "2", "--out", str(out),
+        "--trainings", "2", "--evaluate-every", str(every), "--evaluation-episodes", "4", "--jobs", "2", "--out",
+        str(out),
     ]  # fmt: skip
     process = subprocess.Popen(
         [*PARKENV, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True

@@ -19,7 +19,8 @@ from parkenv.evaluation.figures.time_distribution import draw_time_distribution
 from parkenv.evaluation.figures.time_figures import AGENT_COLORS, draw_time_against_occupancy, draw_time_split
 from parkenv.lots import grid_lot
 from parkenv.world.occupancy import OccupancyProcess
-from planners.agent import AGENT_NAMES, make_agent
+from planners.agent import make_agent
+from planners.names import AGENT_NAMES
 
 
 def row(agent="mdp", drive=30.0, failed=5.0, walk=60.0, price=0.0, gave_up=0.0, **more):

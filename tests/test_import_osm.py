@@ -1011,7 +1011,7 @@ def test_the_command_line_imports_draws_and_checks(tmp_path):
     assert run("import", place, "--out", lot, "--disabled").exit_code == 0
     assert read_lot(lot).n_slots == 24
     refused = run("import", place, "--out", lot, "--goal", "48")
-    assert str(refused.exception) == "--goal is '48', want 2 numbers separated by commas"
+    assert str(refused.exception) == "--goal is '48', want 2 numbers separated by commas, e.g. 10,90"
 
 
 def test_the_command_line_draws_what_it_refuses_and_writes_no_lot(tmp_path):

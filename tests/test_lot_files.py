@@ -15,10 +15,11 @@ from typer.testing import CliRunner
 from parkenv.cli import app
 from parkenv.errors import InputError
 from parkenv.evaluation.figures.lot_picture import save_lot_picture
+from parkenv.files.file_names import is_plain
+from parkenv.files.names import PACKAGED_LOTS
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.build import LOTS, build
 from parkenv.lots.checks import check_lot
-from parkenv.lots.lot_files import PACKAGED_LOTS
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
 DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"
@@ -93,7 +94,7 @@ def test_unknown_packaged_lot_lists_the_known_ones():
     aisle=st.floats(3.0, 9.0),
     turn=st.floats(-4.0, 4.0),
     shift=points,
-    name=st.text(),
+    name=st.text().filter(is_plain),
     goal=points,
     walls=st.lists(st.lists(points, min_size=2, max_size=5), max_size=3),
     cost=st.just(0.0) | st.floats(0.0, 1e8),

@@ -10,6 +10,7 @@ import time
 
 import numpy as np
 import pytest
+from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -284,6 +285,83 @@ def test_files_that_are_no_maps_are_refused(mini, tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             MapStore(tmp_path / name, mini, create=False)
+
+
+VIEW = """
+DROP TABLE session;
+CREATE VIEW session AS WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM c)
+    SELECT n AS id, n AS key, 0.0 AS time, '' AS rig, '' AS weather FROM c;
+"""
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("INSERT INTO sighting VALUES (1, 12345, 0.5)", "slot 12345 has p_occupied 0.5, want slots 0 to"),
+        ("INSERT INTO sighting VALUES (1, -1, 0.5)", "slot -1 has p_occupied 0.5"),
+        ("INSERT OR REPLACE INTO sighting VALUES (1, 1, 'often')", "slot 1 has p_occupied 'often'"),
+        ("INSERT OR REPLACE INTO sighting VALUES (1, 1, 7.0)", "want .n_slots,. from 0 to 1"),
+        ("INSERT OR REPLACE INTO sighting VALUES (1, 'x', 0.5)", "slot 'x' has"),
+        ("UPDATE session SET time = 'noon'", "must be real number"),
+        ("UPDATE session SET time = 9e999", "time of session 'a' is inf"),
+        ("UPDATE session SET key = ''", "key of a session is empty"),
+        ("UPDATE car SET x = 'west'", "could not convert"),
+        ("UPDATE car SET x = x'ff'", "could not convert"),
+        ("UPDATE session SET key = CAST(x'ff' AS TEXT)", "Could not decode"),
+        ("DELETE FROM lot", "a table is missing or empty"),
+        ("DROP TABLE car", "a table is missing or empty"),
+        (VIEW, "a table is missing or empty"),
+    ],
+)
+def test_rows_of_a_stranger_are_checked(mini, tmp_path, change, message):
+    file = tmp_path / "m.sqlite"
+    with MapStore(file, mini) as store:
+        store.add(session(mini, "a"))
+    database = sqlite3.connect(file, isolation_level=None)
+    database.executescript("PRAGMA ignore_check_constraints = ON; PRAGMA writable_schema = ON")
+    database.execute("UPDATE sqlite_master SET sql = replace(replace(sql, 'STRICT, ', ''), ' STRICT', '')")
+    database.close()
+    database = sqlite3.connect(file, isolation_level=None)
+    database.executescript(f"PRAGMA ignore_check_constraints = ON; {change}")
+    database.close()
+    with pytest.raises(InputError, match=message), MapStore(file, mini, create=False) as store:
+        store.log()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        "INSERT INTO sighting VALUES (1, -1, 0.5)",
+        "INSERT OR REPLACE INTO sighting VALUES (1, 1, 'often')",
+        "INSERT OR REPLACE INTO sighting VALUES (1, 1, 7.0)",
+        "UPDATE session SET time = 'noon'",
+        "PRAGMA foreign_keys = ON; INSERT INTO sighting VALUES (2, 1, 0.5)",
+    ],
+)
+def test_the_file_itself_refuses_odd_rows(mini, tmp_path, change):
+    with MapStore(tmp_path / "m", mini) as store:
+        store.add(session(mini, "a"))
+    database = sqlite3.connect(tmp_path / "m")
+    with pytest.raises(sqlite3.IntegrityError):
+        database.executescript(change)
+    database.close()
+
+
+def test_reading_changes_and_makes_no_file(mini, tmp_path):
+    with MapStore(tmp_path / "m", mini) as store:
+        store.add(session(mini, "a"))
+    (tmp_path / "empty").touch()
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with MapStore(tmp_path / "m", mini, create=False) as store:
+        assert len(store.sessions()) == 1
+        with pytest.raises(InputError, match="cannot be written"):
+            store.add(session(mini, "b"))
+    with pytest.raises(InputError, match="is empty, no map file"):
+        MapStore(tmp_path / "empty", mini, create=False)
+    for name in ("empty", "m", "none"):
+        asked = parkenv("map", tmp_path / name, "--scenario", "mini")
+        assert asked.returncode == (0 if name == "m" else 2), asked.stderr
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
 def test_a_session_is_written_once(mini, tmp_path):

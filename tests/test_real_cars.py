@@ -62,10 +62,10 @@ def test_training_on_real_crops_generalizes_to_others(tmp_path):
     settings = TrainingSettings(penalty=0.02, jitter=0, misaligned=0, rounds=0)
     scores = cross_validated(
         read_crop_folder(tmp_path),
-        folds=3,
+        folds=2,
         descriptor=Descriptor(128, 128, "blocks"),
         end_on=True,
         settings=settings,
     )
-    assert np.mean([s.auc for s in scores]) > 0.993
-    assert np.mean([s.recall[FALSE_POSITIVES.index(0.01)] for s in scores]) > 0.94
+    assert np.mean([s.auc for s in scores]) > 0.995
+    assert np.mean([s.recall[FALSE_POSITIVES.index(0.01)] for s in scores]) > 0.965

@@ -12,6 +12,7 @@ from command_line import parkenv
 
 from parkenv import InputError, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
+from parkenv.cli.arguments import Machines
 from parkenv.cli.report import make_report
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.results import episode_key
@@ -105,13 +106,13 @@ def test_a_page_is_one_small_file_that_needs_nothing_else(run):
 
 def test_the_same_folder_gives_the_same_page(run, tmp_path):
     made = tmp_path / "again.html"
-    make_report(run, out=made, jobs=2)
+    make_report(run, Machines(jobs=2), out=made)
     assert made.read_bytes() == (run / "report.html").read_bytes()
 
 
 def test_searches_can_be_chosen(run, tmp_path):
     made = tmp_path / "chosen.html"
-    make_report(run, seeds="9,8", agents="belief,oracle", jobs=1, out=made)
+    make_report(run, Machines(jobs=1), replay="9,8", agents="belief,oracle", out=made)
     worlds = data_of(made)["worlds"]
     assert [w["seed"] for w in worlds] == [9, 9, 8, 8]
     assert {s["agent"] for w in worlds for s in w["searches"]} == {"belief", "oracle"}
@@ -120,13 +121,13 @@ def test_searches_can_be_chosen(run, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"seeds": "99"}, "--seeds has 99; this run's are 7 to 10"),
-        ({"agents": "belief,exact"}, "--agents has 'exact'; in this run: mdp, belief, mdp-static, oracle"),
+        ({"replay": "99"}, "--replay has 99; this run's are 7 to 10"),
+        ({"agents": "belief,exact"}, "--agents has 'exact'; known: mdp, belief, mdp-static, oracle"),
     ],
 )
 def test_what_is_not_in_the_run_cannot_be_chosen(run, tmp_path, options, message):
     with pytest.raises(InputError, match=re.escape(message)):
-        make_report(run, out=tmp_path / "x.html", **options)
+        make_report(run, Machines(), out=tmp_path / "x.html", **options)
     assert not list(tmp_path.iterdir())
 
 
@@ -170,7 +171,7 @@ def test_a_total_that_differs_is_told(run, tmp_path, capsys):
     cells = lines[1].split(",")
     cells[column] = "1.0"
     (copy / "episodes.csv").write_text("\n".join([lines[0], ",".join(cells), *lines[2:]]) + "\n")
-    make_report(copy, jobs=1)
+    make_report(copy, Machines(jobs=1))
     assert "episodes.csv says 1.00 s" in " ".join(capsys.readouterr().out.split())
     data = data_of(copy / "report.html")
     assert len(data["run"]["notes"]) == 1
@@ -186,10 +187,10 @@ def test_a_world_that_has_changed_since_is_not_replayed_but_told(tmp_path):
         "--jobs", 1, "--out", out,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    make_report(out, jobs=1)
+    make_report(out, Machines(jobs=1))
     assert len(data_of(out / "report.html")["worlds"]) == 2
     lot.write_text(lot.read_text() + "\n")
-    make_report(out, jobs=1)
+    make_report(out, Machines(jobs=1))
     data = data_of(out / "report.html")
     assert data["run"]["notes"] == [f"There is no replay: {lot} has changed since the run"]
     assert data["worlds"] == []
@@ -202,7 +203,7 @@ def test_other_commands_get_tables_and_figures(tmp_path):
         {"part": "env", "case": "resets", "value": None, "unit": "1/s"},
     ]
     summary_in(tmp_path, rows=rows)
-    make_report(tmp_path, jobs=1)
+    make_report(tmp_path, Machines(jobs=1))
     (table,) = data_of(tmp_path / "report.html")["tables"]
     assert [row[2] for row in table["rows"]] == [3.5, None]
 
@@ -248,7 +249,7 @@ def test_learning_curves_are_those_of_the_training(tmp_path, drives):
 def test_text_in_the_data_cannot_end_its_element(tmp_path):
     nasty = "</script><script>alert(1)</script>"
     summary_in(tmp_path, rows=[{"case": nasty}, {"case": "b"}], command=["parkenv", "bench", nasty])
-    make_report(tmp_path, jobs=1)
+    make_report(tmp_path, Machines(jobs=1))
     assert nasty not in (tmp_path / "report.html").read_text()
     assert data_of(tmp_path / "report.html")["tables"][0]["rows"] == [[nasty], ["b"]]
 
@@ -340,7 +341,7 @@ def test_a_survey_is_driven_again(tmp_path):
     assert (out / "report.html").stat().st_size < 10e6
 
     made = tmp_path / "short.html"
-    make_report(out, frames=6, sessions=2, jobs=1, out=made)
+    make_report(out, Machines(jobs=1), frames=6, sessions=2, out=made)
     assert [len(d["frames"]) <= 4 for d in data_of(made)["drives"]] == [True, True]
 
 

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 
 from parkenv import InputError, make_scenario
-from parkenv.lots import PACKAGED_LOTS, grid_lot, packaged_lot, write_lot
+from parkenv.files.names import SCENARIO_NAMES
+from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.mapping.inference import MapPrior
 from parkenv.mapping.store import MapStore, Session
-from parkenv.scenarios.spec import PACKAGED_LOTS as NAMED_LOTS
-from parkenv.scenarios.spec import SCENARIO_NAMES, ScenarioSpec, scenario_spec
+from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
 from parkenv.world.flat_map import FlatMap
 from parkenv.world.occupancy import Arrival
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -34,7 +34,6 @@ def refusal(folder, text):
 
 
 def test_packaged_scenarios_are_files_like_any_other():
-    assert NAMED_LOTS == PACKAGED_LOTS
     for name in SCENARIO_NAMES:
         assert make_scenario(name).name == name
     jam = make_scenario("jam")

@@ -18,8 +18,8 @@ import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.envs.wrappers import ThesisReward
+from parkenv.files.names import SCENARIO_NAMES
 from parkenv.lots import grid_lot
-from parkenv.scenarios.spec import SCENARIO_NAMES
 from parkenv.world.decay import decay_factor
 from parkenv.world.lot import PARK
 

@@ -38,9 +38,10 @@ from parkenv.evaluation.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH
 from parkenv.evaluation.training.rl_training import TRAINING_SEEDS, read_curve, train_one
 from parkenv.evaluation.training.search_training import SearchTraining, episode_times, search_times
 from parkenv.scenarios.spec import scenario_spec
-from planners.agent import ALGORITHMS, make_agent
+from planners.agent import make_agent
 from planners.learned import LearnedAgent
 from planners.model_file import FIXED_NUMBERS, NUMBERS_PER_SLOT, save_model
+from planners.names import ALGORITHMS
 
 SCENARIO = make_scenario("mini")
 EVALUATED = range(2_000_000, 2_000_020)
@@ -406,8 +407,8 @@ def test_every_algorithm_trains_a_model_that_searches(algorithm, tmp_path, monke
 def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp_path, algorithm):
     out = tmp_path / "out"
     command = [
-        "train", algorithm, "--scenario", "mini", "--steps", "40000", "--seeds", "2", "--evaluate-every",
-        "8000", "--evaluation-episodes", "16", "--planners", "mdp", "--jobs", "2", "--out", str(out),
+        "train", algorithm, "--scenario", "mini", "--steps", "40000", "--trainings", "2", "--evaluate-every",
+        "8000", "--evaluation-episodes", "16", "--agents", "mdp", "--jobs", "2", "--out", str(out),
     ]  # fmt: skip
     process = subprocess.Popen(
         [*PARKENV, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
@@ -430,7 +431,7 @@ def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp
     assert [row["seed"] for row in summary["rows"]] == [0, 1]
     assert all(row["steps"] >= 40_000 for row in summary["rows"])
     beside = [*command[:-1], str(tmp_path / "longer"), "--beside", str(out)]
-    assert parkenv(*beside, "--seeds", 1).returncode == 0
+    assert parkenv(*beside, "--trainings", 1).returncode == 0
     summary = json.loads((tmp_path / "longer" / "summary.json").read_text())
     (means,) = summary["beside"].values()
     assert [row["steps"] for row in means] == [row["steps"] for row in curve]
@@ -453,7 +454,7 @@ def course_of(algorithm="ppo"):
     return SearchTask(
         TrainingSpec(
             algorithm=algorithm, scenarios=(scenario_spec("mini"),), steps=10, evaluate_every=10,
-            evaluation_episodes=16, planners=(),
+            evaluation_episodes=16, agents=(),
         )
     )  # fmt: skip
 
@@ -520,7 +521,7 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
     wrong = (
         ["dqn", "--clone", "mdp", "--overwrite"],
         ["ppo", "--clone", "nobody", "--overwrite"],
-        ["ppo", "--planners", "belif", "--overwrite"],
+        ["ppo", "--agents", "belif", "--overwrite"],
         ["ppo", "--resume", "--overwrite"],
         ["ppo"],
     )
@@ -549,10 +550,10 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
             ["sac", "--env", "drive", "--lot", "nowhere.geojson"],
             "--lot is 'nowhere.geojson', want a file; there is",
         ),
-        (["sac", "--env", "drive", "--planners", "mdp"], "--planners names other agents than planner"),
+        (["sac", "--env", "drive", "--agents", "mdp"], "--agents names other agents than planner"),
         (["ppo", "--resume"], "holds no training to go on with"),
         (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
-        (["ppo", "--planners", "mdp,belif"], "unknown agent 'belif'"),
+        (["ppo", "--agents", "mdp,belif"], "unknown agent 'belif'"),
         (["ppo", "--clone", "oracle"], "oracle cannot be cloned"),
         (["ppo", "--demonstrations", "5"], "demonstrations goes with clone"),
         (["ppo", "--env", "drive", "--demonstrations", "5"], "demonstrations goes with env search"),

@@ -19,7 +19,7 @@ class Mine(FirstFreeAgent):
 EXPERIMENTS = {
     "compare": {"agents": ["mdp", "{module}:Mine"], "grid": {}, "figures": False, "episodes": 2},
     "benchmark": {"agents": ["{module}:Mine"]},
-    "train": {"planners": ["{module}:Mine"]},
+    "train": {"agents": ["{module}:Mine"]},
     "survey": {"detector": "{module}:Mine"},
     "demo": {"detector": "{module}:Mine"},
 }

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import errno
 import io
+import re
 import sys
 import tempfile
 import traceback
 import warnings
+from typing import Annotated
 
 import typer
 
+from parkenv import __version__
 from parkenv.cli import (
     bench,
     benchmark,
@@ -31,55 +34,58 @@ from parkenv.cli import (
     survey,
     train,
 )
+from parkenv.cli.command import add, group
 from parkenv.errors import InputError
 from sim_sensors.errors import SensorError
 
-app = typer.Typer(
-    name="parkenv",
-    help="Search for a free parking space: worlds, planners, and comparisons between them.",
-    epilog="Start with: parkenv demo",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
-    context_settings={"help_option_names": ["-h", "--help"]},
+app = group(
+    "parkenv",
+    """Search for a free parking space: worlds, planners, and comparisons between them.
+
+    Examples:
+      parkenv demo --quick                       the whole story on a small lot
+      parkenv compare --scenario mini -n 20      agents in the same worlds
+      parkenv COMMAND --help                     every command has examples
+    """,
 )
-app.command("compare")(compare.compare)
-app.command("run")(run.run)
-app.command("schema")(schema.schema)
-app.command("plan")(plan.plan)
-app.command("park")(park.park)
-app.command("trip")(calibrate.trip)
-app.command("calibrate")(calibrate.calibrate)
-app.add_typer(lot.app, name="lot")
-app.add_typer(occupancy.app, name="occupancy")
-app.add_typer(sensors.app, name="sensors")
-app.command("demo")(demo.demo)
-app.command("survey")(survey.survey)
-app.command("map")(survey.show_map)
-app.command("fit-sensor-model")(sensor_model.fit_sensor_model)
-app.command("detect")(detect.detect)
-app.command("train-detector")(detect.train_detector)
-app.command("evaluate-detector")(detect.evaluate_detector)
-app.command("train")(train.train)
-app.command("publish")(publish.publish)
-app.command("report")(report.report)
-app.command("bench")(bench.bench)
-app.add_typer(benchmark.app, name="benchmark")
+START, SEARCH, SENSE, DRIVE, DATA = (
+    "Start here", "Search and compare", "Sensors and maps", "Drive", "Lots, logs and files",
+)  # fmt: skip
+add(app, "demo", demo.demo, START)
+add(app, "compare", compare.compare, SEARCH)
+add(app, "report", report.report, SEARCH)
+add(app, "plan", plan.plan, SEARCH)
+add(app, "train", train.train, SEARCH)
+add(app, "publish", publish.publish, SEARCH)
+add(app, "run", run.run, SEARCH)
+app.add_typer(benchmark.app, rich_help_panel=SEARCH)
+add(app, "survey", survey.survey, SENSE)
+add(app, "map", survey.show_map, SENSE)
+app.add_typer(sensors.app, rich_help_panel=SENSE)
+add(app, "fit-sensor-model", sensor_model.fit_sensor_model, SENSE)
+add(app, "detect", detect.detect, SENSE)
+add(app, "train-detector", detect.train_detector, SENSE)
+add(app, "evaluate-detector", detect.evaluate_detector, SENSE)
+add(app, "trip", calibrate.trip, DRIVE)
+add(app, "calibrate", calibrate.calibrate, DRIVE)
+add(app, "park", park.park, DRIVE)
+app.add_typer(lot.app, rich_help_panel=DATA)
+app.add_typer(occupancy.app, rich_help_panel=DATA)
+add(app, "schema", schema.schema, DATA)
+add(app, "bench", bench.bench, DATA)
 
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        from parkenv import __version__
-
         typer.echo(f"parkenv {__version__}")
         raise typer.Exit
 
 
 @app.callback()
 def _global_options(
-    version: bool = typer.Option(
-        False, "--version", help="Print the version.", callback=_show_version, is_eager=True
-    ),
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_show_version, is_eager=True)
+    ] = False,
 ) -> None:
     del version
 
@@ -91,13 +97,15 @@ def main() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
     warnings.formatwarning = lambda message, *_: f"parkenv: warning: {message}\n"
     try:
-        code = app(standalone_mode=False)
+        code = app(standalone_mode=False, prog_name="parkenv")
     except (InputError, SensorError) as error:
         sys.exit(_complain(str(error)))
     except typer.TyperException as error:
-        message = error.format_message().rstrip(".")
+        pattern = r"Invalid value for '([^']+)'(?: / '[^']+')*: (?:Value error, )?"
+        message = re.sub(pattern, r"\1: ", error.format_message()).rstrip(".")
+        path = getattr(getattr(error, "ctx", None), "command_path", "parkenv")
         # Without a command, the help has already been printed.
-        sys.exit(_complain(f"{message}. See parkenv --help, and --help of each command") if message else 2)
+        sys.exit(_complain(f"{message}; see {path} --help") if message else 2)
     except typer.Abort:
         sys.exit(130)
     except OSError as error:

@@ -2,49 +2,37 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
-from rich.console import Console
+from typer import Exit
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
-from parkenv.cli.compare import episode_progress
-from parkenv.cli.tables import make_console, make_table
-from parkenv.cli.trust import TrustModelOption, TrustOption, readable_models, require_trust
+from parkenv.cli.command import add, group
+from parkenv.cli.report import make_report
+from parkenv.cli.tables import command_line, make_console, make_table, progress_bar
+from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from parkenv.evaluation.experiments.spec import BenchmarkSpec
 
 RESULT = "result.json"
 
-app = typer.Typer(
-    help="Run a fixed benchmark suite, and check the results of others.",
-    no_args_is_help=True,
-    rich_markup_mode="markdown",
-)
 
-
-@app.command("run")
 def run(
-    suite: Annotated[str, typer.Argument(help="The suite; `parkenv benchmark show v1` describes it.")] = "v1",
-    agents: args.AgentsOption = None,
-    jobs: args.JobsOption = 0,
-    backend: args.BackendOption = "loky",
-    address: args.AddressOption = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help=f"Folder for {RESULT} and the episodes.  [default: results/SUITE]"),
-    ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Finish the run in --out. It needs no other option.")
-    ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results in --out.")] = False,
-    trust: TrustOption = False,
-    trust_model: TrustModelOption = False,
+    suite: str = "v1",
+    /,
+    agents: str | None = None,
+    out: Path | None = None,
+    *,
+    trust: bool = False,
+    trust_model: bool = False,
+    folder: args.RunFolder,
+    machines: args.Machines,
 ) -> None:
     """Run agents through all episodes of a suite, and write a result that others can check.
 
@@ -52,23 +40,25 @@ def run(
     clairvoyant bound divided by the agent's own; its score in the suite is the mean over the tasks, at most 1.
 
     Examples:
-    * `parkenv benchmark run v1 --agents belief,mdp --out results/v1`
+        parkenv benchmark run v1 --agents belief,mdp --out results/v1
+        parkenv benchmark check results/v1/result.json
 
-    * `parkenv benchmark check results/v1/result.json`
+    Options:
+        suite (SUITE): The suite.  [default: v1]
+        out, -o (DIR): Folder for result.json and the episodes.  [default: results/SUITE]
     """
     from parkenv.evaluation.experiments.agent_spec import split_agents
-    from parkenv.evaluation.experiments.spec import SPEC_FILE, BenchmarkSpec
+    from parkenv.evaluation.experiments.spec import BenchmarkSpec
 
     out = out or Path("results") / suite
-    base = args.saved(out, SPEC_FILE, BenchmarkSpec) if resume else BenchmarkSpec()
+    base = args.saved(out, BenchmarkSpec) if folder.resume else BenchmarkSpec()
     if agents is None:
         require_trust(base, out, trust)
     given = {} if agents is None else {"agents": readable_models(split_agents(agents), trust_model)}
-    spec = base.changed(suite=suite, jobs=jobs, backend=backend, address=address, **given)
-    run_suite(spec, out, resume=resume, overwrite=overwrite)
+    run_suite(base.changed(suite=suite, **given, **machines.given), out, folder)
 
 
-def run_suite(spec: BenchmarkSpec, out: Path, *, resume: bool = False, overwrite: bool = False) -> None:
+def run_suite(spec: BenchmarkSpec, out: Path, folder: args.RunFolder) -> None:
     """Run a suite with a progress bar, write its result and print the scores.
 
     Raises:
@@ -90,81 +80,93 @@ def run_suite(spec: BenchmarkSpec, out: Path, *, resume: bool = False, overwrite
     }
     console = make_console()
     complete = True
-    with (
-        args.workers_of(spec.jobs, spec.backend, spec.address) as workers,
-        episode_progress(console) as progress,
-    ):
-        folder = ResultFolder(out, settings, resume=resume, overwrite=overwrite)
+    with args.workers_of(spec) as workers, progress_bar(console, "episodes") as progress:
+        results = ResultFolder(out, settings, resume=folder.resume, overwrite=folder.overwrite)
         spec.write(out / SPEC_FILE)
         bar = progress.add_task("Searching", total=sum(len(seeds) for _, seeds in cases))
         try:
-            run_cases(cases, folder, workers=workers, on_progress=lambda n: progress.advance(bar, n))
+            run_cases(cases, results, workers=workers, on_progress=lambda n: progress.advance(bar, n))
         except KeyboardInterrupt:
             complete = False
     order = [case.key(seed) for case, seeds in cases for seed in seeds]
-    command = ["parkenv", *sys.argv[1:]]
+    command = command_line()
     if not complete:
-        folder.finish(order, {"command": command, "complete": False}, complete=False)
+        results.finish(order, {"command": command, "complete": False}, complete=False)
         console.print(f"Interrupted. What was finished is in {out}; --resume --out {out} goes on.")
-        raise typer.Exit(130)
-    result = result_of(suite, cases, folder, command)
-    folder.finish(
-        order, {"command": command, "version": __version__, "complete": True, "rows": result["rows"]}
-    )
+        raise Exit(130)
+    result = result_of(suite, cases, results, command)
+    summary = {"command": command, "version": __version__, "complete": True, "rows": result["rows"]}
+    results.finish(order, summary)
     write_summary(out, result, RESULT)
     _print(console, [result])
     console.print(f"Written: {out / RESULT}, and every episode beside it")
+    if folder.report:
+        make_report(out, spec)
 
 
-@app.command("check")
-def check(
-    files: Annotated[list[Path], typer.Argument(help="Result files.")],
-) -> None:
+def check(results: list[Path], /) -> None:
     """Check that results are complete and from the suite's own worlds, and print them side by side.
 
-    Every search must be present. Means, scores and the clairvoyant bounds of all searches are recomputed; the bounds
+    Every episode must be present. Means, scores and the clairvoyant bounds of all episodes are recomputed; the bounds
     differ in other worlds or at other costs and speeds. The times of an agent cannot be verified without running it.
+
+    Examples:
+        parkenv benchmark check results/v1/result.json others.json
+
+    Options:
+        results (FILE): Result files.
     """
     from parkenv.evaluation.experiments.benchmark import check_result
 
     console = make_console()
     with console.status("Checking"):
-        results = [check_result(file) for file in files]
-    if len({result["suite"] for result in results}) > 1:
+        checked = [check_result(file) for file in results]
+    if len({result["suite"] for result in checked}) > 1:
         raise InputError("the results are of different suites; check those of one at a time")
-    _print(console, results)
-    console.print(f"{'Complete and consistent' if len(files) == 1 else 'All complete and consistent'}.")
+    _print(console, checked)
+    console.print(f"{'Complete and consistent' if len(checked) == 1 else 'All complete and consistent'}.")
 
 
-@app.command("show")
-def show(suite: Annotated[str, typer.Argument(help="The suite.")] = "v1") -> None:
-    """Show the tasks and settings of a suite."""
+def show(suite: str = "v1", /) -> None:
+    """Show the tasks and settings of a suite.
+
+    Examples:
+        parkenv benchmark show v1
+
+    Options:
+        suite (SUITE): The suite.  [default: v1]
+    """
     from parkenv.evaluation.experiments.benchmark import Suite
 
     its = Suite.named(suite)
     console = make_console()
     console.print(f"{its.name}: {its.description}")
-    table = make_table(None, ["task", "scenario", "slots", "mean occupancy", "sight", "walking"])
+    cells = []
     for task in its.tasks:
         made = task.made(its.arrival)
         level = "as it comes" if task.occupancy_level is None else f"{task.occupancy_level:.0%}"
-        table.add_row(
-            task.name, task.scenario, str(made.lot.n_slots), level, task.sight, f"{made.v_walk * 3.6:g} km/h"
-        )
-    console.print(table)
+        walk = f"{made.v_walk * 3.6:g} km/h"
+        cells.append((task.name, task.scenario, str(made.lot.n_slots), level, task.sight, walk))
+    headings = ["task", "scenario", "slots", "mean occupancy", "sensor model", "walking"]
+    console.print(make_table(None, headings, cells))
     console.print(
-        f"{len(its.seeds)} searches a task, seeds {its.seeds[0]} to {its.seeds[-1]}; suite {its.fingerprint[:16]}"
+        f"{len(its.seeds)} episodes a task, seeds {its.seeds[0]} to {its.seeds[-1]}; suite {its.fingerprint[:16]}"
     )
 
 
 def _print(console: Console, results: list[dict[str, Any]]) -> None:
     tasks = list(dict.fromkeys(row["task"] for result in results for row in result["rows"]))
-    table = make_table("Mean total time, s, and the score", ["agent", *tasks, "score"])
     lines = []
     for result in results:
         mean = {(row["agent"], row["task"]): row["total_s"] for row in result["rows"]}
         for agent, score in result["scores"].items():
             lines.append((score, agent, [f"{mean[agent, task]:.1f}" for task in tasks]))
-    for score, agent, cells in sorted(lines, key=lambda line: -line[0]):
-        table.add_row(agent, *cells, f"{score:.4f}")
-    console.print(table)
+    lines.sort(key=lambda line: -line[0])
+    cells = ((agent, *times, f"{score:.4f}") for score, agent, times in lines)
+    console.print(make_table("Mean total time, s, and the score", ["agent", *tasks, "score"], cells))
+
+
+app = group("benchmark", "Run a fixed benchmark suite, and check the results of others.")
+add(app, "run", run)
+add(app, "check", check)
+add(app, "show", show)

@@ -2,37 +2,35 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from rich.table import Table
+from typer import Exit
 
 from parkenv.cli import arguments as args
-from parkenv.cli.tables import WIDE, make_console, make_table
-from parkenv.cli.trust import TrustModelOption, TrustOption, readable_models, require_trust
+from parkenv.cli.report import make_report
+from parkenv.cli.tables import (
+    WIDE,
+    command_line,
+    make_console,
+    make_table,
+    print_recorded,
+    progress_bar,
+)
+from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
+from parkenv.files.names import RigName
 
 if TYPE_CHECKING:
+    from rich.progress import TaskID
+    from rich.table import Table
+
     from parkenv.evaluation.experiments.compare import Case
     from parkenv.evaluation.experiments.spec import ExperimentSpec
 
 Row = dict[str, Any]
 
-SWEEP = "sweep"
-"""Keyword of `--failure-cost` for a range of costs."""
 LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Default occupancy levels of a comparison."""
 MOST_TABLES = 12
@@ -40,94 +38,24 @@ MOST_TABLES = 12
 
 
 def compare(
-    scenario: args.ScenariosOption = None,
-    lot: args.LotOption = None,
-    occupancy: args.OccupancyOption = None,
-    mapping: args.MappingOption = None,
-    goal: args.GoalOption = None,
-    arrival: args.ArrivalOption = None,
-    days: args.DaysOption = None,
-    view_range: args.ViewRangeOption = None,
-    sensor_model: args.SensorModelOption = None,
-    rig: args.RigOption = None,
-    agents: args.AgentsOption = None,
-    episodes: Annotated[
-        int | None,
-        typer.Option(
-            "--episodes", "-n", min=1, help="Episodes of each agent in each setting.  [default: 200]"
-        ),
-    ] = None,
-    failure_cost: Annotated[
-        str | None,
-        typer.Option(
-            "--failure-cost",
-            metavar="S[,S...]|sweep",
-            help="Seconds that the world charges for a failed attempt, and that planners expect to be charged unless "
-            "their own options say otherwise: `--agents 'mdp,mdp(failure_s=90)'`. `sweep`: from 0 to 120 s, with and "
-            "without observations of slots before an attempt, drawn as a curve.  [default: the scenario's, 10]",
-            rich_help_panel=args.COSTS,
-        ),
-    ] = None,
-    v_walk_kmh: args.WalkOption = None,
-    v_drive_kmh: args.DriveOption = None,
-    calibrated: Annotated[
-        Path | None,
-        typer.Option(
-            "--calibrated",
-            metavar="FILE",
-            help="Also compare at the failure cost and driving speed that `parkenv calibrate` measured: FILE is its "
-            "calibrated.json. The worlds are the same.",
-            rich_help_panel=args.COSTS,
-        ),
-    ] = None,
-    occupancy_levels: Annotated[
-        str | None,
-        typer.Option(
-            "--occupancy-levels",
-            metavar="P[,P...]|none",
-            help="Also set the lot's mean occupancy to these values, with a third of the episodes each, for the figure "
-            "of time against occupancy. A recorded log cannot be changed: its searches are binned instead.  "
-            f"[default: {','.join(f'{level:g}' for level in LEVELS)}]",
-        ),
-    ] = None,
-    map_says: Annotated[
-        str | None,
-        typer.Option(
-            "--map-says",
-            metavar="P[,P...]",
-            help="Also with wrong maps, which give this probability of being taken for every slot. Draws total time "
-            "against it.",
-            rich_help_panel=args.WORLD,
-        ),
-    ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option("--seed", min=0, help="First seed; episode i uses seed + i.  [default: 0]"),
-    ] = None,
-    jobs: args.JobsOption = 0,
-    backend: args.BackendOption = "loky",
-    address: args.AddressOption = None,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            help="Folder for experiment.json, episodes.csv, summary.json and the figures.  [default: results/compare]",
-        ),
-    ] = None,
-    resume: Annotated[
-        bool,
-        typer.Option(
-            "--resume",
-            help="Finish the run in --out. It needs no other option; those given change it, such as more --episodes.",
-        ),
-    ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the results in --out.")] = False,
-    figures: Annotated[bool | None, typer.Option(help="Draw figures.  [default: figures]")] = None,
-    rerun: args.RerunOption = None,
-    report: args.ReportOption = False,
-    trust: TrustOption = False,
-    trust_model: TrustModelOption = False,
+    agents: str | None = None,
+    scenario: str | None = None,
+    episodes: int | None = None,
+    seed: int | None = None,
+    out: Path = Path("results/compare"),
+    *,
+    costs: args.Costs,
+    calibrated: Path | None = None,
+    world: args.ObservedSearches,
+    occupancy_levels: str | None = None,
+    map_says: str | None = None,
+    rig: RigName | None = None,
+    figures: bool | None = None,
+    rerun: Path | None = None,
+    trust: bool = False,
+    trust_model: bool = False,
+    folder: args.RunFolder,
+    machines: args.Machines,
 ) -> None:
     """Compare agents over failure costs and speeds, all in the same worlds.
 
@@ -136,69 +64,61 @@ def compare(
     regret to the clairvoyant bound. Options are shortcuts for an experiment file, which `parkenv run` takes.
 
     Examples:
-    * `parkenv compare --scenario campus,jam --failure-cost 10,90 --out results`
+        parkenv compare --scenario campus,jam --failure-cost 10,90 --out results
+        parkenv compare --agents "mdp(failure_s=90),belief,oracle" --report
+        parkenv compare --agents mdp,mdp-tuned,oracle --failure-cost sweep
+        parkenv compare --lot lot.geojson --occupancy log.csv.gz -n 300
+        parkenv compare --resume --episodes 1000
 
-    * `parkenv compare --scenario my_lot.toml --agents "mdp(failure_s=90),belief(budget_ms=2),oracle"`
+    Options:
+        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus]
+        episodes, -n (N >= 1): Episodes of each agent in each setting.  [default: 200]
+        seed (N >= 0): First seed; episode i uses seed + i.  [default: 0]
+        out, -o (DIR): Folder for experiment.json, episodes.csv, summary.json and the figures.
 
-    * `parkenv compare --failure-cost sweep --agents mdp,mdp-tuned,belief,oracle`
+    Costs and speeds:
+        calibrated (FILE): Also compare at the failure cost and driving speed in a calibrated.json of `parkenv
+            calibrate`, in the same worlds.
 
-    * `parkenv compare --agents mdp,belief,oracle --calibrated results/calibrate/calibrated.json`
+    World:
+        occupancy_levels (P[,...]|none): Also set the lot's mean occupancy to these values, with a third of the episodes
+            each, for the figure of time against occupancy. Searches in a recorded log are binned instead.  [default:
+            0.5,0.7,0.8,0.9,0.95,0.99; none with --failure-cost sweep]
+        map_says (P[,...]): Also with wrong maps that give every slot this probability of being taken; draws total time
+            against it.
 
-    * `parkenv compare --lot lot.geojson --occupancy log.csv.gz --agents mdp,greedy-goal,oracle -n 300`
+    Results:
+        figures: Draw figures.  [default: figures]
     """
     from parkenv.evaluation.experiments.agent_spec import split_agents
-    from parkenv.evaluation.experiments.spec import FAILURE_COST_SWEEP, SPEC_FILE, ExperimentSpec
+    from parkenv.evaluation.experiments.spec import ExperimentSpec
 
-    out = out or Path("results/compare")
-    if resume:
-        base = args.saved(out, SPEC_FILE, ExperimentSpec)
+    sweep = costs.failure_cost == "sweep"
+    if folder.resume:
+        base = args.saved(out, ExperimentSpec)
         if agents is None:
             require_trust(base, out, trust)
     else:
-        base = ExperimentSpec().changed(grid={"occupancy_levels": list(LEVELS)})
-    grid = base.grid
-    if failure_cost == SWEEP:
-        grid = grid.changed(failure_s=FAILURE_COST_SWEEP, blind=True, occupancy_levels=())
-        failure_cost, occupancy_levels = None, None
+        base = ExperimentSpec().changed(grid={"occupancy_levels": () if sweep else LEVELS})
+    grid = costs.grid(base.grid)
+    if sweep:
+        grid = grid.changed(blind=True)
     if occupancy_levels == "none":
         grid, occupancy_levels = grid.changed(occupancy_levels=()), None
     if calibrated is not None:
         grid = grid.changed("--calibrated", calibrated=calibrated)
-    grid = args.changed_axes(
-        grid,
-        {
-            "--failure-cost": ("failure_s", failure_cost),
-            "--v-walk-kmh": ("v_walk_kmh", v_walk_kmh),
-            "--v-drive-kmh": ("v_drive_kmh", v_drive_kmh),
-            "--occupancy-levels": ("occupancy_levels", occupancy_levels),
-            "--map-says": ("map_says", map_says),
-        },
-    )
-    specs = args.scenario_specs(
-        scenario, lot=lot, occupancy=occupancy, mapping=mapping, goal=goal, arrival=arrival, days=days,
-        sensor_model=sensor_model, view_range=view_range, base=base.scenarios,
-    )  # fmt: skip
-    given = {
-        "agents": None if agents is None else readable_models(split_agents(agents), trust_model),
-        "episodes": episodes, "seed": seed, "rig": rig, "figures": figures,
-    }  # fmt: skip
-    spec = base.changed(
-        scenarios=tuple(specs),
-        grid=grid,
-        jobs=jobs, backend=backend, address=address,
-        **{name: value for name, value in given.items() if value is not None},
-    )  # fmt: skip
-    run_comparison(spec, out, resume=resume, overwrite=overwrite, rerun=rerun, report=report)
+    grid = args.changed_axis(grid, "occupancy_levels", "--occupancy-levels", occupancy_levels)
+    grid = args.changed_axis(grid, "map_says", "--map-says", map_says)
+    given = args.not_none(episodes=episodes, seed=seed, rig=rig, figures=figures)
+    if agents is not None:
+        given["agents"] = readable_models(split_agents(agents), trust_model)
+    scenarios = tuple(world.specs(scenario, base.scenarios))
+    spec = base.changed(scenarios=scenarios, grid=grid, **given, **machines.given)
+    run_comparison(spec, out, folder, rerun)
 
 
 def run_comparison(
-    spec: ExperimentSpec,
-    out: Path,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    rerun: Path | None = None,
-    report: bool = False,
+    spec: ExperimentSpec, out: Path, folder: args.RunFolder, rerun: Path | None = None
 ) -> None:
     """Run an experiment with a progress bar, print its tables and draw its figures.
 
@@ -216,23 +136,23 @@ def run_comparison(
             raise InputError("--rerun records what sensors measure: add --rig laser")
         require_viewer()
     console = make_console()
-    with episode_progress(console) as progress:
+    with progress_bar(console, "episodes") as progress:
         bars: list[TaskID] = []
         result = run_experiment(
             spec,
             out,
-            command=["parkenv", *sys.argv[1:]],
-            resume=resume,
-            overwrite=overwrite,
-            workers=args.workers_of(spec.jobs, spec.backend, spec.address),
+            command=command_line(),
+            resume=folder.resume,
+            overwrite=folder.overwrite,
+            workers=args.workers_of(spec),
             on_start=lambda n: bars.append(progress.add_task("Searching", total=n)),
             on_progress=lambda n: progress.advance(bars[0], n),
         )
-    tables = setting_count(result.rows) <= MOST_TABLES
-    for printed in result_tables(result.rows, console.width) if tables else []:
+    count = setting_count(result.rows)
+    for printed in result_tables(result.rows, console.width) if count <= MOST_TABLES else []:
         console.print(printed)
-    if not tables:
-        console.print(f"{setting_count(result.rows)} settings: their tables are in summary.json")
+    if count > MOST_TABLES:
+        console.print(f"{count} settings: their tables are in summary.json")
     if (measured := result.experiment.calibration) is not None:
         console.print(
             f"Calibrated over {measured.trips} trips: failure cost {measured.failure_s:.4g} s, drive "
@@ -241,19 +161,17 @@ def run_comparison(
         )
     if not result.complete:
         console.print(f"Interrupted. What was finished is in {out}; --resume --out {out} goes on.")
-        raise typer.Exit(130)
+        raise Exit(130)
     if spec.figures:
         with console.status("Drawing figures"):
             draw_figures(result.figure_data(), out)
-    console.print(f"Episodes, summary and figures are in {out}")
+    console.print(f"Episodes{', summary and figures' if spec.figures else ' and summary'} are in {out}")
     if rerun is not None:
-        with console.status(f"Searching the first search once more for {rerun}"):
+        with console.status(f"Running the first episode once more for {rerun}"):
             _record(*result.experiment.cases[0], rerun)
-        console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
-    if report:
-        from parkenv.cli.report import make_report
-
-        make_report(out, jobs=spec.jobs, trust=True)
+        print_recorded(console, rerun)
+    if folder.report:
+        make_report(out, spec)
 
 
 def setting_count(rows: list[Row]) -> int:
@@ -270,19 +188,6 @@ def _record(case: Case, seeds: range, path: Path) -> None:
     env = SearchPerceptionEnv(case.scenario, rig=str(case.rig))
     with sensor_log(path, case.scenario.lot, env.rig) as log:
         record_search(env, make_agent(case.agent, env.scenario, **case.options), seeds[0], log)
-
-
-def episode_progress(console: Console) -> Progress:
-    """Make a progress bar that counts episodes."""
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("searches"),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        console=console,
-    )
 
 
 Column = tuple[str, Callable[[Row], str]]
@@ -318,16 +223,14 @@ def result_tables(rows: list[Row], width: int) -> list[Table]:
             results = (*results, ("over exact", lambda r: f"{r['gap_to_exact']:+.2%}"))
         title = (
             f"{name}: failure cost {failure:g} s, walk {walk:g} km/h, drive {drive:g} km/h, "
-            f"{max(r['episodes'] for r in its_rows)} searches"
+            f"{max(r['episodes'] for r in its_rows)} episodes"
         )
         costs = any(row["parking_cost_s"] for row in its_rows)
         details = tuple(column for column in _DETAILS if costs or column[0] != "parking")
         for columns in [results + details] if width >= WIDE else [results, details]:
             headings = ("agent", *(heading for heading, _ in columns))
-            table = make_table(title if columns is not details else None, headings)
-            for row in its_rows:
-                table.add_row(row["agent"], *(text(row) for _, text in columns))
-            tables.append(table)
+            cells = ((row["agent"], *(text(row) for _, text in columns)) for row in its_rows)
+            tables.append(make_table(title if columns is not details else None, headings, cells))
     return tables
 
 

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from typing import TYPE_CHECKING, Any
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.compare import result_tables
-from parkenv.cli.tables import make_console
+from parkenv.cli.report import make_report
+from parkenv.cli.tables import command_line, make_console, print_recorded
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import DemoSpec
@@ -25,18 +22,17 @@ FIGURES = ("time_split", "time_distribution")
 
 
 def demo(
-    scenario: args.ScenarioOption = None,
-    sessions: Annotated[int, typer.Option("--sessions", min=1, help="Survey drives.")] = 4,
-    episodes: Annotated[int, typer.Option("--episodes", "-n", min=2, help="Searches of each agent.")] = 6,
-    every: Annotated[
-        float, typer.Option("--every", min=0.1, help="Metres between captures of the survey.")
-    ] = 2.5,
-    detector: args.DetectorOption = "hog",
-    seed: args.SeedOption = 0,
-    jobs: args.JobsOption = 0,
-    rerun: args.RerunOption = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for everything.")] = Path("results/demo"),
-    report: args.ReportOption = False,
+    scenario: str | None = None,
+    sessions: int = 4,
+    episodes: int = 6,
+    seed: int = 0,
+    out: Path = Path("results/demo"),
+    *,
+    every: float = 2.5,
+    detector: str = "hog",
+    rerun: Path | None = None,
+    folder: args.RunFolder,
+    machines: args.Machines,
 ) -> None:
     """Survey a lot with simulated sensors, estimate how often each slot is taken, and search there on other days.
 
@@ -48,33 +44,34 @@ def demo(
     3. Searches on other days, with camera, laser and detector: the thesis's planner and three heuristic baselines, all
     with the same map, in the same worlds.
 
-    Example:
-    * `parkenv demo`
+    Examples:
+        parkenv demo
+
+    Options:
+        sessions (N >= 1): Survey drives.
+        episodes, -n (N >= 2): Episodes of each agent.
+        out, -o (DIR): Folder for everything.
+
+    Sensors:
+        every (M >= 0.1): Metres between captures.
     """
     from parkenv.evaluation.experiments.spec import DemoSpec
 
     spec = DemoSpec().changed(
-        scenario=args.one_scenario(args.scenario_specs(scenario)),
-        sessions=sessions, episodes=episodes, every=every, detector=detector, seed=seed, jobs=jobs,
+        scenario=args.World().spec(scenario), sessions=sessions, episodes=episodes, every=every, detector=detector,
+        seed=seed, **machines.given,
     )  # fmt: skip
-    run_demo(spec, out, rerun=rerun, report=report)
+    run_demo(spec, out, folder, rerun)
 
 
-def run_demo(
-    spec: DemoSpec,
-    out: Path,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    rerun: Path | None = None,
-    report: bool = False,
-) -> None:
+def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | None = None) -> None:
     """Run the demo; continue an unfinished one in the folder, replace a finished one.
 
     Raises:
         InputError: the scenario cannot be made, or the folder cannot be used.
     """
-    del overwrite
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
     from parkenv.evaluation.experiments.compare import run_cases, table
     from parkenv.evaluation.experiments.demo import AGENTS, demo_cases, demo_survey
     from parkenv.evaluation.experiments.results import ResultFolder, make_folder
@@ -95,9 +92,10 @@ def run_demo(
     make_folder(out)
     console = make_console()
     map_file = out / "map.sqlite"
-    folder = ResultFolder(out, _settings(spec), resume=resume or _goes_on(out), overwrite=True)
+    resume = folder.resume or (_goes_on(out) and not folder.overwrite)
+    results = ResultFolder(out, _settings(spec), resume=resume, overwrite=True)
     spec.write(out / SPEC_FILE)
-    with args.workers_of(spec.jobs, spec.backend, spec.address) as workers, Progress(
+    with args.workers_of(spec) as workers, Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
         console=console, disable=not console.is_terminal,
     ) as progress:  # fmt: skip
@@ -135,16 +133,16 @@ def run_demo(
         cases = demo_cases(spec, its, log)
         bar = progress.add_task("3/3 searching with simulated sensors", total=len(cases) * spec.episodes)
         run_cases(
-            cases, folder, workers=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n)
+            cases, results, workers=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n)
         )
-    rows = table(cases, folder)
+    rows = table(cases, results)
     surveyed = summarize(its, settings, run, map_file)
     summary = {
-        "command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": spec.seed, "rows": rows,
+        "command": command_line(), "version": __version__, "seed": spec.seed, "rows": rows,
         "survey": surveyed,
     }  # fmt: skip
-    folder.finish([case.key(s) for case, its_seeds in cases for s in its_seeds], summary)
-    draw_figures(ComparisonResults(cases, folder.episodes, rows), out, FIGURES)
+    results.finish([case.key(s) for case, its_seeds in cases for s in its_seeds], summary)
+    draw_figures(ComparisonResults(cases, results.episodes, rows), out, FIGURES)
     console.print(
         f"{spec.sessions} drives past {its.lot.n_slots} slots: {surveyed['car_detection_rate']:.1%} of the parked cars "
         f"were found, {surveyed['slot_accuracy']:.1%} of the slots classified correctly. Mean absolute error of the "
@@ -157,11 +155,9 @@ def run_demo(
         with console.status(f"Running the first session and the first search again for {rerun}"):
             case, seeds = cases[0]
             _record(case.scenario, settings, seeds[0], rerun)
-        console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
-    if report:
-        from parkenv.cli.report import make_report
-
-        make_report(out, jobs=spec.jobs, trust=True)
+        print_recorded(console, rerun)
+    if folder.report:
+        make_report(out, spec)
 
 
 def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:

@@ -2,64 +2,56 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Literal
 
-import typer
-from rich.progress import Progress, track
-from rich.table import Table
-
-from parkenv import __version__
-from parkenv.cli import arguments as args
-from parkenv.cli.tables import make_console, make_table
+from parkenv.cli.tables import make_console, make_table, save_summary
 from parkenv.errors import InputError
+from parkenv.files.file_names import file_name
 
 if TYPE_CHECKING:
-    from parkenv.perception.cross_validation import CropScore
+    from rich.table import Table
 
-_MODEL_HELP = "side, front, or an .npz that train-detector wrote"
+    from parkenv.perception.cross_validation import CropScore
 
 
 def detect(
-    files: Annotated[list[Path], typer.Argument(help="Image files, or folders of them.")],
-    model: Annotated[
-        list[str] | None, typer.Option("--model", help=f"{_MODEL_HELP}; can be repeated.")
-    ] = None,
-    threshold: Annotated[
-        float, typer.Option("--threshold", help="Least probability of a reported car.")
-    ] = 0.5,
-    least_height: Annotated[
-        float | None,
-        typer.Option("--least-height", min=8.0, help="Height of the smallest regions searched, px."),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for pictures and summary.json.")
-    ] = None,
+    images: list[Path],
+    /,
+    model: list[str] | None = None,
+    threshold: float = 0.5,
+    least_height: float | None = None,
+    out: Path | None = None,
 ) -> None:
     """Find cars in image files.
 
     Examples:
-    * `parkenv detect photo.png --out results/cars`
+        parkenv detect photo.png --out results/cars
+        parkenv detect photos --model side --threshold 0.8
 
-    * `parkenv detect photos --model side --threshold 0.8`
+    Options:
+        images (FILE|DIR): Image files, or folders of them.
+        model (NAME|FILE): side, front, or an .npz of `parkenv train-detector`; repeatable.  [default: side and front]
+        threshold (P): Least probability of a reported car.
+        least_height (PX >= 8): Height of the smallest regions searched, px.  [default: the model's]
+        out, -o (DIR): Folder for pictures and summary.json.  [default: none]
     """
     import cv2
+    from rich.progress import track
 
-    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.figures.survey_pictures import draw_detections
     from parkenv.files.atomic_write import atomic_write
     from parkenv.files.images import images_in, read_image
     from parkenv.perception.hog_detector import HogDetector
 
     detector = HogDetector.load(*(model or ()), threshold=threshold, least_height=least_height)
-    chosen = [f for path in files for f in (images_in(path) if path.is_dir() else [path])]
+    chosen = [f for path in images for f in (images_in(path) if path.is_dir() else [path])]
     if out is not None:
         make_folder(out)
     console = make_console()
-    rows = []
-    table = make_table(None, ["file", "left", "top", "right", "bottom", "probability", "view"])
+    rows, cells = [], []
     for file in track(chosen, "Detecting", console=console, disable=not console.is_terminal):
         image = read_image(file)
         found = detector.detect(image)
@@ -68,71 +60,57 @@ def detect(
         ):
             view = "end" if end else "side"
             rows.append({"file": str(file), "box": box, "probability": p, "view": view})
-            table.add_row(str(file), *(f"{v:.0f}" for v in box), f"{p:.2f}", view)
+            cells.append((str(file), *(f"{v:.0f}" for v in box), f"{p:.2f}", view))
         if out is not None:
-            drawn = draw_detections(
-                image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB), found
-            )
-            with atomic_write(out / f"{file.stem}_cars.png") as beside:
+            colored = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+            drawn = draw_detections(colored, found)
+            with atomic_write(out / file_name(f"{file.stem}_cars", ".png")) as beside:
                 beside.write_bytes(cv2.imencode(".png", drawn[..., ::-1])[1].tobytes())
-    console.print(table)
+    headings = ["file", "left", "top", "right", "bottom", "probability", "view"]
+    console.print(make_table(None, headings, cells))
     console.print(f"{len(rows)} cars in {len(chosen)} images")
     if out is not None:
-        write_summary(
-            out, {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": None, "rows": rows}
-        )
+        save_summary(out, None, rows)
         console.print(f"Images are in {out}")
 
 
 def train_detector(
-    out: Annotated[Path, typer.Option("--out", "-o", help="The model file to write, .npz.")],
-    uiuc: Annotated[
-        Path | None,
-        typer.Option("--uiuc", help="UIUC's folder: trains on TrainImages (or TrainImages.tar.gz)."),
-    ] = None,
-    crops: Annotated[
-        Path | None,
-        typer.Option(
-            "--crops", help="A folder with positives/ and negatives/ (or vehicles/ and non-vehicles/)."
-        ),
-    ] = None,
-    front: Annotated[
-        bool, typer.Option("--front", help="Train a model of fronts and rears, with a square window.")
-    ] = False,
-    normalization: Annotated[
-        str, typer.Option("--normalization", help="neighbors, cell (the thesis's), or blocks.")
-    ] = "neighbors",
-    penalty: Annotated[
-        float, typer.Option("--penalty", help="Penalty C of the support vector machine.")
-    ] = 0.01,
-    rounds: Annotated[int, typer.Option("--rounds", min=0, help="Rounds of hard-negative mining.")] = 3,
-    jitter: Annotated[
-        int,
-        typer.Option("--jitter", min=0, help="Shifted copies of each car; 0 if the crops are not aligned."),
-    ] = 2,
-    misaligned: Annotated[
-        int,
-        typer.Option(
-            "--misaligned",
-            min=0,
-            help="Misaligned crops of each car as negatives; 0 if the crops are not aligned.",
-        ),
-    ] = 2,
-    folds: Annotated[
-        int,
-        typer.Option("--folds", min=0, help="Folds of a cross-validation on the crops; 0: none."),
-    ] = 0,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of jitter, solver and folds.")] = 0,
+    out: Path,
+    uiuc: Path | None = None,
+    crops: Path | None = None,
+    front: bool = False,
+    folds: int = 0,
+    seed: int = 0,
+    *,
+    normalization: Literal["neighbors", "cell", "blocks"] = "neighbors",
+    penalty: float = 0.01,
+    rounds: int = 3,
+    jitter: int = 2,
+    misaligned: int = 2,
 ) -> None:
     """Train a car model on photographs: aligned crops of cars, and images without cars.
 
     With `--folds`, 30 blocks of consecutive files are held out in turn: consecutive images often show the same car.
 
     Examples:
-    * `parkenv train-detector --uiuc CarData --out side.npz`
+        parkenv train-detector --uiuc CarData --out side.npz
+        parkenv train-detector --crops kitti --front --folds 3 --out front.npz --penalty 0.02
+            --normalization blocks --jitter 0 --misaligned 0 --rounds 0
 
-    * `parkenv train-detector --crops kitti --front --normalization blocks --penalty 0.02 --jitter 0 --misaligned 0
-    --rounds 0 --folds 3 --out front.npz`
+    Options:
+        out, -o (FILE.npz): The model file to write.
+        uiuc (DIR): UIUC's folder: trains on TrainImages (or TrainImages.tar.gz).
+        crops (DIR): Instead: a folder with positives/, negatives/ (or vehicles/, non-vehicles/).
+        front: Train a model of fronts and rears, with a square window.
+        folds (N >= 0): Folds of a cross-validation on the crops; 0: none.
+        seed (N >= 0): Seed of jitter, solver and folds.
+
+    Training:
+        normalization (NAME): neighbors, cell (the thesis's), or blocks.
+        penalty (C): Penalty of the support vector machine.
+        rounds (N >= 0): Rounds of hard-negative mining.
+        jitter (N >= 0): Shifted copies of each car; 0 if the crops are not aligned.
+        misaligned (N >= 0): Misaligned crops of each car as negatives; 0 if the crops are not aligned.
     """
     from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
     from parkenv.perception.cross_validation import cross_validated
@@ -177,39 +155,32 @@ def train_detector(
 def _cross_validation_table(scores: Sequence[CropScore]) -> Table:
     from parkenv.perception.cross_validation import FALSE_POSITIVES
 
+    def cells(part: str, cars: str, others: str, auc: float, recall: Sequence[float]) -> tuple[str, ...]:
+        return part, cars, others, f"{auc:.4f}", *(f"{r:.3f}" for r in recall)
+
+    n = len(scores)
+    mean = [sum(s.recall[k] for s in scores) / n for k in range(len(FALSE_POSITIVES))]
+    rows = [cells(str(i + 1), str(s.n_cars), str(s.n_others), s.auc, s.recall) for i, s in enumerate(scores)]
     rates = [f"recall at {rate:.1%} false positives" for rate in FALSE_POSITIVES]
-    table = make_table("Held-out crops", ["part", "cars", "others", "AUC", *rates])
-    for i, score in enumerate(scores):
-        table.add_row(
-            str(i + 1),
-            str(score.n_cars),
-            str(score.n_others),
-            f"{score.auc:.4f}",
-            *(f"{r:.3f}" for r in score.recall),
-        )
-    count = len(scores)
-    table.add_row(
-        "mean", "", "", f"{sum(s.auc for s in scores) / count:.4f}",
-        *(f"{sum(s.recall[k] for s in scores) / count:.3f}" for k in range(len(rates))),
-    )  # fmt: skip
-    return table
+    rows.append(cells("mean", "", "", sum(s.auc for s in scores) / n, mean))
+    return make_table("Held-out crops", ["part", "cars", "others", "AUC", *rates], rows)
 
 
-def evaluate_detector(
-    uiuc: Annotated[Path, typer.Option("--uiuc", help="UIUC's folder as published (CarData).")],
-    model: Annotated[str, typer.Option("--model", help=_MODEL_HELP)] = "side",
-    seed: args.SeedOption = 0,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for summary.json and the curves.")] = Path(
-        "results/detector"
-    ),
-) -> None:
+def evaluate_detector(uiuc: Path, model: str = "side", out: Path = Path("results/detector")) -> None:
     """Measure recall and precision of a side model on UIUC's test sets, by their matching rule.
 
-    Example:
-    * `parkenv evaluate-detector --uiuc CarData --model side`
+    Examples:
+        parkenv evaluate-detector --uiuc CarData --model side
+
+    Options:
+        uiuc (DIR): UIUC's folder as published (CarData).
+        model (NAME|FILE): side, front, or an .npz of `parkenv train-detector`.
+        out, -o (DIR): Folder for summary.json and the curves.
     """
+    from rich.progress import Progress
+
     from parkenv.evaluation.experiments.detector_scores import save_curves, score_on_uiuc
-    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.perception.car_model import CarModel
 
     loaded = CarModel.load(model)
@@ -218,13 +189,9 @@ def evaluate_detector(
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
         task = progress.add_task("Detecting", total=None)
         scores = score_on_uiuc(loaded, uiuc, on_image=lambda: progress.advance(task))
-    table = make_table(None, list(scores[0].row))
-    for score in scores:
-        table.add_row(*(f"{v:.4f}" if isinstance(v, float) else str(v) for v in score.row.values()))
-    console.print(table)
+    rows = [score.row for score in scores]
+    cells = ([f"{v:.4f}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows)
+    console.print(make_table(None, list(rows[0]), cells))
     save_curves(scores, f"model {model}", out / "recall_precision.png")
-    rows = [s.row for s in scores]
-    write_summary(
-        out, {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "rows": rows}
-    )
+    save_summary(out, None, rows)
     console.print(f"Written: {out / 'recall_precision.png'}, summary.json")

@@ -8,8 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from parkenv.cli.training_task import (
     EVALUATION_SEED,
     FIGURE,
@@ -25,6 +23,8 @@ from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from parkenv.evaluation.experiments.workers import Workers
     from parkenv.evaluation.training.drive_training import DriveTraining
     from parkenv.world.lot import ParkingLot
@@ -87,9 +87,9 @@ class DriveTask(TrainingTask):
         super().check()
         for lots in (self.lots, self.tested):
             slot_groups(lots)
-        if any(agent.label != PLANNER for agent in self.spec.planners or ()):
+        if any(agent.label != PLANNER for agent in self.spec.agents or ()):
             raise InputError(
-                f"--planners names other agents than {PLANNER}; with --env drive want {PLANNER} or none"
+                f"--agents names other agents than {PLANNER}; with --env drive want {PLANNER} or none"
             )
 
     def settings(self) -> Row:
@@ -145,7 +145,7 @@ class DriveTask(TrainingTask):
         names = " and ".join(lot.name for lot in self.lots)
         lines: dict[str, float] = {}
         tables: list[Row] = []
-        if self.spec.planners is None or self.spec.planners:
+        if self.spec.agents is None or self.spec.agents:
             with console.status("The planner parks in the same tasks"):
                 parkings = parked_on(self.lots, evaluation_seeds, workers, PLANNER)
                 lines = {row["kind"]: row["success"] for row in parking_table(parkings)}

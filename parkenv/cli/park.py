@@ -2,87 +2,64 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-from parkenv import __version__
 from parkenv.cli import arguments as args
-from parkenv.cli.tables import make_console, make_table
-from parkenv.cli.trust import TrustModelOption, readable_models
-from parkenv.errors import InputError
+from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
+from parkenv.cli.trust import readable_models
+from parkenv.errors import InputError, nearest
+from parkenv.files.file_names import file_name
 
 if TYPE_CHECKING:
     from parkenv.evaluation.trips.parking_runs import Parking, ParkingCase
     from planners.agent import Agent
 
+SCENARIOS = "campus,street"
 SHOWN_FAILURES = 6
 SHOWN_ROWS = 20
 
 
 def park(
-    agents: Annotated[
-        str,
-        typer.Option(
-            "--agents",
-            metavar="NAME[,NAME...]",
-            help="Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of "
-            "`parkenv train --env drive`.",
-        ),
-    ] = "planner",
-    scenario: Annotated[
-        str | None,
-        typer.Option(
-            "--scenario",
-            metavar="NAME|FILE[,...]",
-            help="Scenarios in whose lots the car parks: packaged ones, or scenario files.  [default: campus,street]",
-        ),
-    ] = None,
-    lot: args.LotOption = None,
-    kind: Annotated[
-        str,
-        typer.Option(
-            "--kind", help="Kinds of slots, separated by commas: perpendicular, oblique, parallel; or all."
-        ),
-    ] = "all",
-    way: Annotated[
-        str, typer.Option("--way", help="Orientation in the slot: nose-in, back-in; or both.")
-    ] = "both",
-    episodes: Annotated[int, typer.Option("--episodes", "-n", min=1, help="Episodes per lot.")] = 100,
-    occupancy_level: Annotated[
-        float,
-        typer.Option(
-            "--occupancy-level", min=0.0, max=1.0, help="Fraction of the other slots that are occupied."
-        ),
-    ] = 0.85,
-    slack: Annotated[
-        float,
-        typer.Option("--slack", min=0.0, help="Distance around the slot kept clear of parked cars, m."),
-    ] = 0.0,
-    seed: args.SeedOption = 0,
-    jobs: args.JobsOption = 0,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Output folder for pictures, episodes.csv and summary.json.")
-    ] = Path("results/park"),
-    trust_model: TrustModelOption = False,
+    agents: str = "planner",
+    scenario: str | None = None,
+    episodes: int = 100,
+    seed: int = 0,
+    out: Path = Path("results/park"),
+    *,
+    kind: str = "all",
+    way: str = "both",
+    occupied: float = 0.85,
+    slack: float = 0.0,
+    lot: str | None = None,
+    trust_model: bool = False,
+    machines: args.Machines,
 ) -> None:
-    """Evaluate parking agents in `parkenv/Drive-v1`: success rate, planning time, driving time, manoeuvres.
+    """Evaluate agents that drive the car into a slot: success rate, planning time, driving time, manoeuvres.
 
     Writes pictures of one successful episode per kind of slot and orientation, an animation of one, and pictures of
     failures, if any; with several agents, into one folder per agent.
 
     Examples:
-    * `parkenv park --episodes 250 --scenario campus,street,jam`
+        parkenv park --episodes 250 --scenario campus,street,jam
+        parkenv park --agents planner,sac:results/drive-sac/seed_0/model.safetensors
+        parkenv park --lot parking_map.yml --way back-in
 
-    * `parkenv park --agents planner,sac:results/drive-sac/seed_0/model.safetensors`
+    Options:
+        agents (NAME[,...]): Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of
+            `parkenv train --env drive`.
+        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus,street]
+        episodes, -n (N >= 1): Episodes per lot.
+        out, -o (DIR): Folder for pictures, episodes.csv and summary.json.
 
-    * `parkenv park --lot parking_map.yml --way back-in`
+    Parking tasks:
+        kind (NAME[,...]|all): Slots: perpendicular, oblique, parallel.
+        way (NAME|both): Orientation in the slot: nose-in, back-in.
+        occupied (0 <= P <= 1): Fraction of the other slots that are taken.
+        slack (M >= 0): Distance around the slot kept clear of parked cars, m.
     """
     from parkenv.driving.parking_task import KINDS, WAYS
-    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, parking_table, write_parkings
     from parkenv.scenarios.build import build
     from planners.driving.parking_agents import make_parking_agent
@@ -90,24 +67,17 @@ def park(
     kinds = None if kind == "all" else _chosen("--kind", kind, KINDS)
     ways = WAYS if way == "both" else _chosen("--way", way, WAYS)
     cases = []
-    for spec in args.scenario_specs(scenario, lot=lot, default="campus,street"):
-        case = ParkingCase(build(spec).lot, kinds, ways, occupancy_level, slack)
+    for spec in args.World(lot=lot).specs(scenario, default=SCENARIOS):
+        case = ParkingCase(build(spec).lot, kinds, ways, occupied, slack)
         case.environment().close()  # validates the options before the first episode
         cases.append(case)
     labels = _labels(readable_models(args.words("--agents", agents), trust_model))
     parking_agents = {label: make_parking_agent(name) for label, name in labels.items()}
     make_folder(out)
     console = make_console()
-    progress = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=console,
-    )
     seeds = range(seed, seed + episodes)
     parkings: dict[str, list[Parking]] = {label: [] for label in labels}
-    with progress, args.workers_of(jobs, "loky", None) as workers:
+    with progress_bar(console, "episodes") as progress, machines.workers() as workers:
         for label, name in labels.items():
             what = "Parking" if len(labels) == 1 else label
             bar = progress.add_task(what, total=len(cases) * episodes)
@@ -123,11 +93,10 @@ def park(
     ]
     names = [case.lot.name for case in cases]
     write_parkings(rows, out / "episodes.csv")
-    summary = {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": seed, "lots": names}
-    write_summary(out, summary | {"agents": labels, "rows": table})
+    save_summary(out, seed, table, lots=names, agents=labels)
     film = _to_film(next(iter(parkings.values())))
     for label, its in parkings.items():
-        folder = out if len(labels) == 1 else out / label
+        folder = out if len(labels) == 1 else out / file_name(label)
         make_folder(folder)
         _picture(its, cases, parking_agents[label], film, folder)
     _show(console, f"{', '.join(names)}: {episodes} episodes per lot", table)
@@ -188,7 +157,7 @@ def _chosen(option: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
     words = args.words(option, text)
     for word in words:
         if word not in known:
-            raise InputError(f"{option} has {word!r}, want some of {', '.join(known)}")
+            raise InputError(f"{option} has {word!r}; {nearest(word, known)}")
     return tuple(words)
 
 
@@ -197,14 +166,12 @@ def _show(console: Any, title: str, table: list[dict[str, Any]]) -> None:
         "agent", "slot", "parked", "success [95 %]", "contacts", "plan ms (p95)", "drive s (p95)", "changes (p95)",
         "driven m", "turned rad",
     )  # fmt: skip
-    printed = make_table(title, headings)
-    for row in table:
-        low, high = row["success_ci95"]
-        printed.add_row(
+    cells = (
+        (
             row["agent"],
             f"{row['kind']} {row['way']}".strip(),
             f"{row['parked']}/{row['episodes']}",
-            f"{row['success']:.1%} [{low:.1%}, {high:.1%}]",
+            f"{row['success']:.1%} [{row['success_ci95'][0]:.1%}, {row['success_ci95'][1]:.1%}]",
             str(row["contacts"]),
             _pair(row, "planning_ms", 0),
             _pair(row, "time_s", 1),
@@ -212,7 +179,9 @@ def _show(console: Any, title: str, table: list[dict[str, Any]]) -> None:
             _known(row["driven_m"], 1),
             _known(row["turned_rad"], 1),
         )
-    console.print(printed)
+        for row in table
+    )
+    console.print(make_table(title, headings, cells))
 
 
 def _pair(row: dict[str, Any], name: str, digits: int) -> str:

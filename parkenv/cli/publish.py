@@ -5,15 +5,13 @@ from __future__ import annotations
 import shlex
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console
 from parkenv.cli.training_task import FIGURE, TEST_SEED
-from parkenv.cli.trust import TrustOption, require_trust
+from parkenv.cli.trust import require_trust
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,17 +21,15 @@ if TYPE_CHECKING:
 
 
 def publish(
-    source: Annotated[
-        Path, typer.Argument(metavar="DIR|FILE", help="The folder of a finished training, or a model file.")
-    ],
-    out: Annotated[Path, typer.Option("--out", "-o", help="The folder to make.")],
-    scenario: args.ScenariosOption = None,
-    episodes: Annotated[
-        int, typer.Option("--episodes", "-n", min=2, help="Episodes of the evaluation in each scenario.")
-    ] = 500,
-    seed: args.SeedOption = TEST_SEED,
-    jobs: args.JobsOption = 0,
-    trust: TrustOption = False,
+    trained: Path,
+    /,
+    out: Path,
+    scenario: str | None = None,
+    episodes: int = 500,
+    seed: int = TEST_SEED,
+    *,
+    trust: bool = False,
+    machines: args.Machines,
 ) -> None:
     """Make a folder with a trained model that the Hugging Face Hub takes as it is; nothing is uploaded.
 
@@ -42,9 +38,14 @@ def publish(
     and the command that repeats them.
 
     Examples:
-    * `parkenv publish results/maskable-ppo --out hub/maskable-ppo`
+        parkenv publish results/maskable-ppo --out hub/maskable-ppo
+        parkenv publish mine.safetensors --scenario my_lot.toml --out hub/mine
 
-    * `parkenv publish mine.safetensors --scenario my_lot.toml --out hub/mine`
+    Options:
+        trained (DIR|FILE): The folder of a finished training, or a model file.
+        out, -o (DIR): The folder to make.
+        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: those of the training's test]
+        episodes, -n (N >= 2): Episodes of the evaluation in each scenario.
     """
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.publication import CARD, FILM, MODEL, Publication
@@ -53,7 +54,7 @@ def publish(
 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"--out {out}: exists; name a new folder")
-    model, tested = _best(source, trust) if source.is_dir() else (source, None)
+    model, tested = _best(trained, trust) if trained.is_dir() else (trained, None)
     card = ModelCard.of_file(model)
     if scenario is not None:
         tested = args.scenario_specs(scenario)
@@ -61,7 +62,7 @@ def publish(
     published = Publication(model, {name: build(spec) for name, spec in named.items()}, episodes, seed)
     make_folder(out)
     console = make_console()
-    with console.status("Evaluating"), args.workers_of(jobs, "loky", None) as workers:
+    with console.status("Evaluating"), machines.workers() as workers:
         rows = published.evaluate(workers)
     with console.status("Filming"):
         published.film(out / FILM)
@@ -72,7 +73,7 @@ def publish(
             spec.write(out / name)
             if files := spec.files():
                 further += f"\n`{name}` needs files that are not here: {', '.join(f.name for f in files)}.\n"
-    if (curve := source / FIGURE).exists():
+    if (curve := trained / FIGURE).exists():
         shutil.copyfile(curve, out / FIGURE)
         further += f"\n## Training\n\n![Learning curves]({FIGURE})\n"
     published.write_card(rows, out / CARD, further)

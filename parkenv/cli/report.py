@@ -5,22 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
-from parkenv.cli.tables import make_console
-from parkenv.cli.trust import TrustOption, require_trust
-from parkenv.errors import InputError
+from parkenv.cli.tables import make_console, progress_bar
+from parkenv.cli.trust import require_trust
+from parkenv.errors import InputError, nearest
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.compare import Case
-    from parkenv.evaluation.experiments.spec import TrainingSpec
+    from parkenv.evaluation.experiments.spec import TrainingSpec, Workplace
     from parkenv.evaluation.report.run_folder import RunFolder
     from parkenv.files.spec_file import Spec
     from parkenv.mapping.survey import Survey
+
+    Cases = list[tuple[Case, Sequence[int]]]
+    Surveys = tuple[Callable[[], Survey], int]
 
 PAGE = "report.html"
 MAP_FILE = "map.sqlite"
@@ -29,39 +29,19 @@ EPISODES, SENSED = 20, 4
 BESIDE_MODELS = 3
 """Number of planners shown beside a trained model."""
 
-Cases = list[tuple["Case", Sequence[int]]]
-Surveys = tuple[Callable[[], "Survey"], int]
-
 
 def report(
-    folder: Annotated[
-        Path, typer.Argument(metavar="DIR", help="What compare, survey, demo, train or another command left.")
-    ],
-    episodes: Annotated[
-        int | None,
-        typer.Option(
-            "--episodes",
-            "-n",
-            min=0,
-            help=f"About how many searches to replay, all agents together.  [default: {EPISODES}; through sensors "
-            f"{SENSED}]",
-        ),
-    ] = None,
-    seeds: Annotated[
-        str | None, typer.Option("--seeds", metavar="N[,N...]", help="Replay the searches with these seeds.")
-    ] = None,
-    agents: Annotated[
-        str | None, typer.Option("--agents", metavar="NAME[,NAME...]", help="Replay only these agents.")
-    ] = None,
-    sessions: Annotated[int, typer.Option("--sessions", min=0, help="Survey drives to replay.")] = 1,
-    frames: Annotated[
-        int, typer.Option("--frames", min=2, max=250, help="Captures of them to keep, all drives together.")
-    ] = 120,
-    jobs: args.JobsOption = 0,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help=f"The HTML file.  [default: DIR/{PAGE}]")
-    ] = None,
-    trust: TrustOption = False,
+    run: Path,
+    /,
+    episodes: int | None = None,
+    replay: str | None = None,
+    agents: str | None = None,
+    sessions: int = 1,
+    frames: int = 120,
+    out: Path | None = None,
+    *,
+    trust: bool = False,
+    machines: args.Machines,
 ) -> None:
     """Write an HTML page on a run: its settings, sortable tables, figures, and replays of its searches and drives.
 
@@ -69,20 +49,28 @@ def report(
     a search differs from that in the results, the page says so.
 
     Examples:
-    * `parkenv report results/compare`
+        parkenv report results/compare
+        parkenv report results/compare --replay 3,17 --agents mdp,belief --out two.html
+        parkenv report results/survey --sessions 2
 
-    * `parkenv report results/compare --seeds 3,17 --agents mdp,belief --out two_searches.html`
-
-    * `parkenv report results/survey --sessions 2`
+    Options:
+        run (DIR): Folder of compare, survey, demo, train or another command.
+        episodes, -n (N >= 0): About how many episodes to replay, all agents together.  [default: 20; through simulated
+            sensors 4]
+        replay (SEED[,...]): Replay the episodes with these seeds.
+        agents (NAME[,...]): Replay only these agents.
+        sessions (N >= 0): Survey drives to replay.
+        frames (2 <= N <= 250): Captures of them to keep, all drives together.
+        out, -o (FILE.html): The page.  [default: DIR/report.html]
     """
     make_report(
-        folder,
+        run,
+        machines,
         episodes=episodes,
-        seeds=seeds,
+        replay=replay,
         agents=agents,
         sessions=sessions,
         frames=frames,
-        jobs=jobs,
         out=out,
         trust=trust,
     )
@@ -90,15 +78,15 @@ def report(
 
 def make_report(
     folder: Path,
+    machines: args.Machines | Workplace,
     *,
     episodes: int | None = None,
-    seeds: str | None = None,
+    replay: str | None = None,
     agents: str | None = None,
     sessions: int = 1,
     frames: int = 120,
-    jobs: int = 0,
     out: Path | None = None,
-    trust: bool = False,
+    trust: bool = True,
 ) -> None:
     """Write the page; see `report` for the arguments.
 
@@ -115,10 +103,11 @@ def make_report(
     surveys: Surveys | None = None
     cases: Cases = []
     notes: list[str] = []
+    spec = None
     try:
         spec = run.spec()
     except (InputError, OSError) as error:
-        spec, notes = None, [f"There is no replay: {error}"]
+        notes.append(f"There is no replay: {error}")
     if spec is not None:
         require_trust(spec, folder, trust)
     try:
@@ -128,7 +117,7 @@ def make_report(
         notes.append(f"There is no replay: {error}")
     sensed = any(case.rig is not None for case, _ in cases)
     wanted = episodes if episodes is not None else SENSED if sensed else EPISODES
-    cases, too_large = _small_enough(_chosen(cases, seeds, agents))
+    cases, too_large = _small_enough(_chosen(cases, replay, agents))
     notes += too_large
     encounters = choose(cases, wanted) if wanted else []
     drives = range(min(sessions, surveys[1])) if surveys is not None else range(0)
@@ -141,11 +130,7 @@ def make_report(
         tasks += [
             partial(_drive_again, surveys[0], number, frames // max(len(drives), 1)) for number in drives
         ]
-    progress = Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), console=console,
-        disable=not console.is_terminal,
-    )  # fmt: skip
-    with args.workers_of(jobs, "loky", None) as workers, progress:
+    with args.workers_of(machines) as workers, progress_bar(console) as progress:
         bar = progress.add_task("Running again", total=len(tasks))
         done: list[dict[str, Any]] = []
         for recorded in workers.in_order(tasks):
@@ -220,23 +205,23 @@ def _trained(run: RunFolder, spec: TrainingSpec) -> Cases:
     return cases
 
 
-def _chosen(cases: Cases, seeds: str | None, agents: str | None) -> Cases:
-    """Return the searches selected by `--seeds` and `--agents`."""
+def _chosen(cases: Cases, replay: str | None, agents: str | None) -> Cases:
+    """Return the searches selected by `--replay` and `--agents`."""
     if agents is not None:
         from parkenv.evaluation.experiments.agent_spec import split_agents
 
         known = list(dict.fromkeys(case.label for case, _ in cases))
         for name in (names := split_agents(agents)):
             if name not in known:
-                raise InputError(f"--agents has {name!r}; in this run: {', '.join(known) or 'none'}")
+                raise InputError(f"--agents has {name!r}; {nearest(name, known)}")
         cases = [(case, numbers) for case, numbers in cases if case.label in names]
-    if seeds is not None:
+    if replay is not None:
         its_seeds: Sequence[int] = cases[0][1] if cases else range(0)
         theirs = f"{its_seeds[0]} to {its_seeds[-1]}" if its_seeds else "none"
         wanted: list[int] = []
-        for number in args.numbers("--seeds", seeds):
+        for number in args.numbers("--replay", replay):
             if number not in its_seeds:
-                raise InputError(f"--seeds has {number:g}; this run's are {theirs}")
+                raise InputError(f"--replay has {number:g}; this run's are {theirs}")
             wanted.append(int(number))
         cases = [(case, wanted) for case, _ in cases]
     return cases

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
-from pydantic import BaseModel
+from typer import echo
 
-from parkenv.errors import InputError
-from parkenv.files.spec_file import nearest
+from parkenv.errors import InputError, nearest
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+KINDS = ("scenario", "compare", "benchmark", "survey", "demo", "train")
 
 
 def schemas() -> dict[str, dict[str, Any]]:
@@ -18,42 +21,37 @@ def schemas() -> dict[str, dict[str, Any]]:
     from parkenv.evaluation.experiments import spec as specs
     from parkenv.scenarios.spec import ScenarioSpec
 
-    models: dict[str, type[BaseModel]] = {
-        "scenario": ScenarioSpec,
-        "compare": specs.ExperimentSpec,
-        "benchmark": specs.BenchmarkSpec,
-        "survey": specs.SurveySpec,
-        "demo": specs.DemoSpec,
-        "train": specs.TrainingSpec,
-    }
+    models: tuple[type[BaseModel], ...] = (
+        ScenarioSpec,
+        specs.ExperimentSpec,
+        specs.BenchmarkSpec,
+        specs.SurveySpec,
+        specs.DemoSpec,
+        specs.TrainingSpec,
+    )
     draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    return {kind: draft | model.model_json_schema() for kind, model in models.items()}
+    return {kind: draft | model.model_json_schema() for kind, model in zip(KINDS, models, strict=True)}
 
 
-def schema(
-    kind: Annotated[
-        str | None,
-        typer.Argument(help="scenario, compare, benchmark, survey, demo or train; all with --out."),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for all schemas, KIND.schema.json.")
-    ] = None,
-) -> None:
+def schema(kind: str | None = None, /, out: Path | None = None) -> None:
     """Print the JSON schema of a kind of file, or write all schemas; editors use them to check and complete files.
 
     Examples:
-    * `parkenv schema scenario`
+        parkenv schema scenario
+        parkenv schema --out docs/schemas
 
-    * `parkenv schema --out docs/schemas`
+    Options:
+        kind (KIND): scenario, compare, benchmark, survey, demo, train.  [default: scenario; all with --out]
+        out, -o (DIR): Folder for all schemas, KIND.schema.json.  [default: none]
     """
+    if kind is not None and kind not in KINDS:
+        raise InputError(f"KIND is {kind!r}; {nearest(kind, KINDS)}")
     made = schemas()
-    if kind is not None and kind not in made:
-        raise InputError(f"KIND is {kind!r}; {nearest(kind, made)}")
-    if out is not None:
-        from parkenv.evaluation.experiments.results import make_folder
+    if out is None:
+        echo(json.dumps(made[kind or "scenario"], indent=1))
+        return
+    from parkenv.evaluation.experiments.results import make_folder
 
-        make_folder(out)
-        for name, content in made.items():
-            (out / f"{name}.schema.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    else:
-        typer.echo(json.dumps(made[kind or "scenario"], indent=1))
+    make_folder(out)
+    for name, content in made.items():
+        (out / f"{name}.schema.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")

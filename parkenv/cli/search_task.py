@@ -8,8 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-
 from parkenv.cli.training_task import (
     EVALUATION_SEED,
     FIGURE,
@@ -26,6 +24,8 @@ from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from parkenv.evaluation.experiments.workers import Workers
     from parkenv.evaluation.training.search_training import SearchTraining
     from parkenv.world.scenario import Scenario
@@ -95,7 +95,7 @@ class SearchTask(TrainingTask):
     @property
     def compared(self) -> Sequence[AgentSpec]:
         """Planners to draw for comparison."""
-        return PLANNERS if self.spec.planners is None else self.spec.planners
+        return PLANNERS if self.spec.agents is None else self.spec.agents
 
     def check(self) -> None:
         """See `TrainingTask`."""

@@ -3,65 +3,53 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from parkenv.cli import arguments as args
-from parkenv.cli.tables import make_console, make_table
-from parkenv.scenarios.build import build
+from parkenv.cli.tables import make_console, make_table, progress_bar
+from parkenv.files.names import RigName, WeatherName
+
+SCENARIOS = "campus,street"
 
 
 def fit_sensor_model(
-    scenario: Annotated[
-        str,
-        typer.Option("--scenario", metavar="NAME|FILE[,...]", help="Scenarios to search in."),
-    ] = "campus,street",
-    rig: args.SurveyRigOption = None,
-    episodes: Annotated[
-        int,
-        typer.Option("--episodes", "-n", min=1, help="Searches of each of three agents in each scenario."),
-    ] = 20,
-    arrival: args.ArrivalOption = None,
-    days: args.DaysOption = None,
-    weather: args.WeatherOption = None,
-    seed: args.SeedOption = 500_000,
-    jobs: args.JobsOption = 0,
-    backend: args.BackendOption = "loky",
-    address: args.AddressOption = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The JSON file to write.")] = Path(
-        "sensor_model.json"
-    ),
+    scenario: str | None = None,
+    episodes: int = 20,
+    rig: RigName | None = None,
+    seed: int = 500_000,
+    out: Path = Path("sensor_model.json"),
+    *,
+    world: args.Searches,
+    weather: WeatherName | None = None,
+    machines: args.Machines,
 ) -> None:
     """Search with simulated sensors, and count how often slots are observed correctly, by distance and side.
 
     The rates define a sensor model for `parkenv compare --sensor-model FILE`, which makes the same errors as the
     perception pipeline, a thousand times as fast.
 
-    Example:
-    * `parkenv fit-sensor-model --rig stereo --out stereo.json`
+    Examples:
+        parkenv fit-sensor-model --rig stereo --out stereo.json
+        parkenv compare --sensor-model stereo.json
+
+    Options:
+        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus,street]
+        episodes, -n (N >= 1): Episodes of each of three agents in each scenario.
+        rig (laser|stereo|both_sides): Whose errors to measure.  [default: the scenario's, laser]
+        out, -o (FILE.json): The file to write.
     """
     from parkenv.evaluation.experiments.sensor_model_fit import AGENTS, measure_sensors
     from parkenv.evaluation.experiments.spec import BUSY
+    from parkenv.scenarios.build import build
 
-    specs = [
-        spec if spec.traffic else spec.changed(traffic=BUSY)
-        for spec in args.scenario_specs(scenario, arrival=arrival, days=days)
-    ]
+    specs = [args.Traffic().on(spec, BUSY) for spec in world.specs(scenario, default=SCENARIOS)]
     scenarios = [build(spec) for spec in specs]
-    rig = args.rig_of(rig) or specs[0].rig
     console = make_console()
-    with args.workers_of(jobs, backend, address) as workers, Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        console=console, disable=not console.is_terminal,
-    ) as progress:  # fmt: skip
-        bar = progress.add_task(
-            "Searching with simulated sensors", total=episodes * len(AGENTS) * len(scenarios)
-        )
+    with machines.workers() as workers, progress_bar(console, "episodes") as progress:
+        total = episodes * len(AGENTS) * len(scenarios)
+        bar = progress.add_task("Searching with simulated sensors", total=total)
         counts = measure_sensors(
             scenarios,
-            rig,
+            rig or specs[0].rig,
             episodes,
             seed=seed,
             weather=weather,
@@ -70,12 +58,8 @@ def fit_sensor_model(
         )
     model = counts.fitted()
     model.to_file(out)
-    table = make_table(
-        f"Observations of slots, rig {rig}",
-        ["slots up to", "side", "slots in range", "observed", "hit rate", "false-alarm rate"],
-    )
-    for band, in_band in zip(model.bands, counts.counts.reshape(-1, 2, 3), strict=True):
-        table.add_row(
+    cells = (
+        (
             f"{band.up_to:g} m",
             "right" if band.beside else "elsewhere",
             str(in_band.sum()),
@@ -83,5 +67,8 @@ def fit_sensor_model(
             f"{band.hit_rate:.3f}",
             f"{band.false_alarm_rate:.3f}",
         )
-    console.print(table)
+        for band, in_band in zip(model.bands, counts.counts.reshape(-1, 2, 3), strict=True)
+    )
+    headings = ["slots up to", "side", "slots in range", "observed", "hit rate", "false-alarm rate"]
+    console.print(make_table(f"Observations of slots, rig {rig or specs[0].rig}", headings, cells))
     console.print(f"Written: {out}")

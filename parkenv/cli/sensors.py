@@ -2,78 +2,66 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
-from typing import Annotated
-
-import typer
-from rich.progress import track
 
 from parkenv.cli import arguments as args
+from parkenv.cli.command import add, group
 from parkenv.cli.tables import make_console
-from parkenv.errors import InputError
-from parkenv.scenarios.build import build
-
-app = typer.Typer(help="Preview the simulated sensors.", no_args_is_help=True)
-
-
-@app.callback()
-def _sensors() -> None:
-    """Preview the simulated sensors."""
+from parkenv.errors import InputError, nearest
+from parkenv.files.file_names import file_name
+from parkenv.files.names import WEATHERS
 
 
-@app.command()
 def preview(
-    scenario: args.ScenarioOption = None,
-    weather: Annotated[
-        str,
-        typer.Option(
-            "--weather", help="sunny, overcast, low_sun, dusk, rain; or all, or several with commas."
-        ),
-    ] = "all",
-    seed: args.SeedOption = 0,
-    drive: Annotated[
-        float, typer.Option("--drive", min=0.0, help="Length of the video, m; 0 for none.")
-    ] = 20.0,
-    every: Annotated[float, typer.Option("--every", min=0.05, help="Metres between its frames.")] = 0.5,
-    cars: args.CarsOption = None,
-    pedestrians: args.PedestriansOption = None,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the pictures and drive.gif.")] = Path(
-        "results/sensors"
-    ),
+    scenario: str | None = None,
+    weather: str = "all",
+    drive: float = 20.0,
+    every: float = 0.5,
+    seed: int = 0,
+    out: Path = Path("results/sensors"),
+    *,
+    world: args.Searches,
+    traffic: args.Traffic,
 ) -> None:
-    """Draw sensor measurements on the way from the entry to the slot nearest to the goal.
+    """Draw what the sensors measure on the way from the entry to the slot nearest to the goal.
 
     Writes one figure per weather, at the place with the most parked cars: the side camera's image with the true boxes,
     its depth, the stereo camera's disparity, and the laser scan from above. Also writes a short video of the side
     camera.
 
     Examples:
-    * `parkenv sensors preview`
+        parkenv sensors preview
+        parkenv sensors preview --scenario street --weather dusk --drive 40
 
-    * `parkenv sensors preview --scenario street --weather dusk --drive 40`
+    Options:
+        weather (NAME[,...]|all): Some of {weathers}.
+        drive (M >= 0): Length of the video, m; 0 for none.
+        every (M >= 0.05): Metres between its frames.
+        out, -o (DIR): Folder for the pictures and drive.gif.
     """
+    import dataclasses
+
     import numpy as np
+    from rich.progress import track
     from scipy.spatial import cKDTree
 
     from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.experiments.spec import BUSY
     from parkenv.evaluation.figures.picture_files import save_film
     from parkenv.evaluation.figures.sensor_pictures import save_sensor_preview, with_boxes
+    from parkenv.scenarios.build import build
     from parkenv.world.keyed_random import world_key
     from parkenv.world.lot_scene import LotScenes, slot_lot
     from planners.routes import DriveRoutes
-    from sim_sensors.camera.weather import PRESETS, Weather
+    from sim_sensors.camera.weather import Weather
     from sim_sensors.ground_truth import vehicle_boxes
     from sim_sensors.rig import SensorRig, poses_along
 
-    names = list(PRESETS) if weather == "all" else args.words("--weather", weather)
+    names = args.words("--weather", ",".join(WEATHERS) if weather == "all" else weather)
     for name in names:
-        if name not in PRESETS:
-            raise InputError(f"--weather has {name!r}, want all or some of {', '.join(PRESETS)}")
-    specs = args.scenario_specs(scenario, cars=cars, pedestrians=pedestrians, traffic=BUSY)
-    spec = args.one_scenario(specs)
-    its = build(spec if spec.traffic else spec.changed(traffic=BUSY))
+        if name not in WEATHERS:
+            raise InputError(f"--weather has {name!r}; {nearest(name, ('all', *WEATHERS))}")
+    its = build(traffic.on(world.spec(scenario), BUSY))
     make_folder(out)
     console = make_console()
 
@@ -100,7 +88,9 @@ def preview(
         capture = rig.capture(scene, poses[middle], light, seed)
         boxes = vehicle_boxes(camera, scene, eye, capture.images[name])
         title = f"{its.name}, {preset.replace('_', ' ')}"
-        save_sensor_preview(its.lot, rig, capture, boxes, title, out / f"sensors_{its.name}_{preset}.png")
+        save_sensor_preview(
+            its.lot, rig, capture, boxes, title, out / file_name(f"sensors_{its.name}_{preset}", ".png")
+        )
     n = int(drive / every)
     if n:
         frames = []
@@ -113,3 +103,7 @@ def preview(
             frames.append(with_boxes(frame.image, vehicle_boxes(camera, scene, eye, frame)))
         save_film(frames, out / "drive.gif", fps=8.0)
     console.print(f"Images are in {out}")
+
+
+app = group("sensors", "Preview the simulated sensors.")
+add(app, "preview", preview)

@@ -2,105 +2,83 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Literal
 
-import typer
-from rich.progress import Progress
-
-from parkenv import __version__
 from parkenv.cli import arguments as args
-from parkenv.cli.tables import make_console, make_table
-from parkenv.errors import InputError
-from parkenv.scenarios.build import build
+from parkenv.cli.report import MAP_FILE, make_report
+from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
+from parkenv.errors import InputError, nearest
+from parkenv.files.file_names import file_name
+from parkenv.files.names import RigName, WeatherName
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import SurveySpec
 
-MAP_FILE = "map.sqlite"
+MOST_ROWS = 12
+"""Slots in the table of a map; files have all."""
 
 
 def survey(
-    scenario: args.ScenarioOption = None,
-    lot: args.LotOption = None,
-    occupancy: args.OccupancyOption = None,
-    sessions: Annotated[
-        int, typer.Option("--sessions", min=1, help="Number of survey drives; the thesis made 21.")
-    ] = 6,
-    rig: args.SurveyRigOption = None,
-    detector: args.DetectorOption = "hog",
-    hours: Annotated[
-        str | None,
-        typer.Option(
-            "--hours",
-            metavar="HH:MM-HH:MM[,...]",
-            help="When sessions begin; the windows are used in turn.  [default: 08:00-10:00,11:00-14:00,16:00-18:00]",
-        ),
-    ] = None,
-    days: args.DaysOption = None,
-    weather: args.WeatherOption = None,
-    every: Annotated[float, typer.Option("--every", min=0.1, help="Metres between captures.")] = 1.25,
-    pose_noise: Annotated[
-        float, typer.Option("--pose-noise", min=0.0, help="Localisation error of the car, m.")
-    ] = 0.0,
-    cars: args.CarsOption = None,
-    pedestrians: args.PedestriansOption = None,
-    seed: args.SeedOption = 0,
-    jobs: args.JobsOption = 0,
-    backend: args.BackendOption = "loky",
-    address: args.AddressOption = None,
-    rerun: args.RerunOption = None,
-    out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for map.sqlite, pictures, summary.json.")
-    ] = Path("results/survey"),
-    report: args.ReportOption = False,
+    scenario: str | None = None,
+    sessions: int = 6,
+    every: float = 1.25,
+    seed: int = 0,
+    out: Path = Path("results/survey"),
+    *,
+    world: args.World,
+    hours: str | None = None,
+    traffic: args.Traffic,
+    rig: RigName | None = None,
+    detector: str = "hog",
+    weather: WeatherName | None = None,
+    pose_noise: float = 0.0,
+    rerun: Path | None = None,
+    folder: args.RunFolder,
+    machines: args.Machines,
 ) -> None:
-    """Drive past every slot with simulated sensors, detect the parked cars, and write the observations to a map file.
+    """Drive past every slot with simulated sensors, and write which slots are taken to a map file.
 
-    Cars are detected in the camera images and located with the laser (or the stereo camera). A Bayes filter estimates
-    the state of each slot. Every drive is one session of the map. The same command resumes an interrupted survey.
+    Parked cars are detected in the camera images and located with the laser (or the stereo camera). A Bayes filter
+    estimates the state of each slot. Every drive is one session of the map. Sessions are added to the map in --out: the
+    same command goes on with an interrupted survey, with or without --resume.
 
     Examples:
-    * `parkenv survey --sessions 21`
+        parkenv survey --sessions 21
+        parkenv survey --scenario street --rig stereo --weather rain --hours 12:00-13:00
+        parkenv survey --scenario mini --sessions 1 --rerun drive.rrd
 
-    * `parkenv survey --scenario street --rig stereo --weather rain --hours 12:00-13:00`
+    Options:
+        sessions (N >= 1): Survey drives; the thesis made 21.
+        every (M >= 0.1): Metres between captures.
+        out, -o (DIR): Folder for map.sqlite, pictures and summary.json.
 
-    * `parkenv survey --scenario mini --sessions 1 --rerun drive.rrd`
+    World:
+        hours (HH:MM-HH:MM[,...]): When sessions begin; the windows are used in turn.  [default: 08:00-10:00,
+            11:00-14:00,16:00-18:00]
+
+    Sensors:
+        rig (laser|stereo|both_sides): laser: a camera and a 270° laser; stereo: a stereo camera alone; both_sides: a
+            laser and a camera to each side.  [default: the scenario's, laser]
+        pose_noise (M >= 0): Localisation error of the car, m.
     """
     from parkenv.evaluation.experiments.spec import BUSY, SurveySpec
 
-    given = {} if hours is None else {"hours": [window.strip() for window in hours.split(",")]}
+    windows = {} if hours is None else {"hours": [window.strip() for window in hours.split(",")]}
     spec = SurveySpec().changed(
-        scenario=args.one_scenario(
-            args.scenario_specs(
-                scenario, lot=lot, occupancy=occupancy, days=days, cars=cars, pedestrians=pedestrians, traffic=BUSY
-            )
-        ),
-        sessions=sessions, rig=rig, detector=detector, weather=weather, every=every, pose_noise=pose_noise, seed=seed,
-        jobs=jobs, backend=backend, address=address, **given,
+        scenario=traffic.on(world.spec(scenario), BUSY), sessions=sessions, rig=rig, detector=detector,
+        weather=weather, every=every, pose_noise=pose_noise, seed=seed, **windows, **machines.given,
     )  # fmt: skip
-    run_survey_of(spec, out, rerun=rerun, report=report)
+    run_survey_of(spec, out, folder, rerun)
 
 
-def run_survey_of(
-    spec: SurveySpec,
-    out: Path,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    rerun: Path | None = None,
-    report: bool = False,
-) -> None:
+def run_survey_of(spec: SurveySpec, out: Path, folder: args.RunFolder, rerun: Path | None = None) -> None:
     """Drive the sessions that the map in the folder does not hold yet, print errors and draw figures.
 
     Raises:
         InputError: the scenario cannot be made, or the folder cannot be used.
     """
-    del resume
-    if overwrite:
-        raise InputError("--overwrite: a survey adds sessions to its map; name another folder for a new one")
-    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.experiments.surveys import (
         mean_occupancy,
@@ -109,14 +87,7 @@ def run_survey_of(
         summarize,
         survey_of,
     )
-    from parkenv.evaluation.figures.survey_pictures import (
-        save_detection_reach,
-        save_detections,
-        save_found_slots,
-        save_graph,
-        save_map,
-        save_session,
-    )
+    from parkenv.evaluation.figures import survey_pictures as pictures
     from parkenv.evaluation.trips.sensor_log import record_session, require_viewer, sensor_log
     from parkenv.mapping.discovery import score_discovery
     from parkenv.mapping.inference import predict
@@ -127,123 +98,125 @@ def run_survey_of(
         require_viewer()
     its, settings = survey_of(spec)
     make_folder(out)
+    map_file = out / MAP_FILE
+    if folder.overwrite:
+        map_file.unlink(missing_ok=True)
     spec.write(out / SPEC_FILE)
     console = make_console()
     with (
-        args.workers_of(spec.jobs, spec.backend, spec.address) as workers,
-        Progress(console=console, disable=not console.is_terminal) as progress,
+        args.workers_of(spec) as workers,
+        progress_bar(console, "sessions") as progress,
     ):
         task = progress.add_task("Driving (compiles first after an installation)", total=spec.sessions)
         run = run_survey(
             its,
             settings,
             spec.sessions,
-            out / MAP_FILE,
+            map_file,
             workers=workers,
             on_session=lambda _: progress.advance(task),
         )
         progress.update(task, completed=spec.sessions)
-    row = summarize(its, settings, run, out / MAP_FILE)
-    with MapStore(out / MAP_FILE, its.lot, create=False) as store:
+    row = summarize(its, settings, run, map_file)
+    with MapStore(map_file, its.lot, create=False) as store:
         log = store.log()
         found = slots_found(store, len(log.time))
     window = settings.windows[0]
-    time = 86_400.0 * window.weekdays[0] + 0.5 * (window.start_s + window.end_s)
-    predicted = predict(log, time)
-    save_map(
-        its.lot, predicted, mean_occupancy(its.occupancy, window),
-        f"{its.name} after {row['sessions']} sessions", out / f"map_{its.name}.png",
-    )  # fmt: skip
-    title = f"{its.name}, rig {settings.rig}, {row['sessions']} sessions"
+    predicted = predict(log, 86_400.0 * window.weekdays[0] + 0.5 * (window.start_s + window.end_s))
+    true = mean_occupancy(its.occupancy, window)
+    title = f"{its.name} after {row['sessions']} sessions"
+    pictures.save_map(its.lot, predicted, true, title, out / file_name(f"map_{its.name}", ".png"))
     if row["detection_by_distance"]:
-        save_detection_reach(row["detection_by_distance"], title, out / f"reach_{its.name}.png")
+        title = f"{its.name}, rig {settings.rig}, {row['sessions']} sessions"
+        pictures.save_detection_reach(
+            row["detection_by_distance"], title, out / file_name(f"reach_{its.name}", ".png")
+        )
     if run.shown is not None:
-        save_detections(run.shown, out / f"detections_{its.name}.png")
-        save_session(its.lot, run.shown, out / f"session_{its.name}.png")
-        save_graph(its.lot, predicted, run.shown, out / f"graph_{its.name}.png")
-    save_found_slots(its.lot, found, score_discovery(found, its.lot), out / f"slots_found_{its.name}.png")
-    table = make_table(None, ["figure", "value"])
-    for name in (
+        pictures.save_detections(run.shown, out / file_name(f"detections_{its.name}", ".png"))
+        pictures.save_session(its.lot, run.shown, out / file_name(f"session_{its.name}", ".png"))
+        pictures.save_graph(its.lot, predicted, run.shown, out / file_name(f"graph_{its.name}", ".png"))
+    scored = score_discovery(found, its.lot)
+    pictures.save_found_slots(its.lot, found, scored, out / file_name(f"slots_found_{its.name}", ".png"))
+    error, mae = row["range_abs_error_m"], row["occupancy_mae"]
+    rates = (
         "car_detection_rate",
         "detection_precision",
         "slot_accuracy",
         "slot_accuracy_seen",
         "unknown_fraction",
-    ):
-        table.add_row(name, f"{row[name]:.3f}")
-    error = row["range_abs_error_m"]
-    table.add_row("range_abs_error_m", f"median {error['median']:.3f}, p95 {error['p95']:.3f}")
-    table.add_row(
-        "occupancy_mae", f"{row['occupancy_mae']:.3f} (counts alone: {row['occupancy_mae_expected']:.3f})"
     )
-    table.add_row("seconds_per_frame", f"{row['seconds_per_frame']:.4f}")
-    console.print(table)
-    table = make_table(None, ["weather", "sessions", "cars found", "slots right"])
-    for name, its_row in row["by_weather"].items():
-        rates = (f"{its_row[c]:.1%}" for c in ("car_detection_rate", "slot_accuracy"))
-        table.add_row(name, str(its_row["sessions"]), *rates)
-    console.print(table)
-    summary = {
-        "command": ["parkenv", *sys.argv[1:]],
-        "version": __version__,
-        "seed": spec.seed,
-        "rows": [row],
-    }
-    write_summary(out, summary)
-    console.print(f"Written: {out / MAP_FILE}, summary.json, sessions.csv and pictures")
-    if report:
-        from parkenv.cli.report import make_report
-
-        make_report(out, jobs=spec.jobs, trust=True)
+    figures = (
+        *((name, f"{row[name]:.3f}") for name in rates),
+        ("range_abs_error_m", f"median {error['median']:.3f}, p95 {error['p95']:.3f}"),
+        ("occupancy_mae", f"{mae:.3f} (counts alone: {row['occupancy_mae_expected']:.3f})"),
+        ("seconds_per_frame", f"{row['seconds_per_frame']:.4f}"),
+    )
+    console.print(make_table(None, ["figure", "value"], figures))
+    by_weather = (
+        (name, str(r["sessions"]), f"{r['car_detection_rate']:.1%}", f"{r['slot_accuracy']:.1%}")
+        for name, r in row["by_weather"].items()
+    )
+    console.print(make_table(None, ["weather", "sessions", "cars found", "slots right"], by_weather))
+    save_summary(out, spec.seed, [row])
+    console.print(f"Written: {map_file}, summary.json, sessions.csv and pictures")
+    if folder.report:
+        make_report(out, spec)
     if rerun is not None:
         with console.status(f"Driving the first session once more for {rerun}"):
             first = Survey(its, settings)
             with sensor_log(rerun, its.lot, first.pipeline.rig) as recording:
                 record_session(first, 0, recording)
-        console.print(f"Recorded: {rerun}; look at it with: rerun {rerun}")
+        print_recorded(console, rerun)
+
+
+DayName = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
 
 
 def show_map(
-    file: Annotated[Path, typer.Argument(help="A map file that parkenv survey wrote.")],
-    scenario: args.ScenarioOption = None,
-    lot: args.LotOption = None,
-    weekday: Annotated[
-        str | None, typer.Option("--weekday", help="mon to sun; over all sessions where not given.")
-    ] = None,
-    hour: Annotated[
-        float, typer.Option("--hour", min=0.0, max=24.0, help="Hour of the day, e.g. 9.5.")
-    ] = 9.0,
-    slot: Annotated[str | None, typer.Option("--slot", help="Only this slot, by its id.")] = None,
-    confidence: Annotated[float, typer.Option("--confidence", help="Of the interval, 0 to 1.")] = 0.9,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder for map.png, slots.csv, summary.json.")
-    ] = None,
+    map_file: Path,
+    /,
+    scenario: str | None = None,
+    weekday: DayName | None = None,
+    hour: float = 9.0,
+    slot: str | None = None,
+    confidence: float = 0.9,
+    out: Path | None = None,
+    lot: str | None = None,
 ) -> None:
     """Show the predictions of a map file: how often each slot is taken.
 
     Examples:
-    * `parkenv map results/survey/map.sqlite --weekday tue --hour 9.5`
+        parkenv map results/survey/map.sqlite --weekday tue --hour 9.5
+        parkenv map results/survey/map.sqlite --slot A3 --out results/map
 
-    * `parkenv map results/survey/map.sqlite --slot A3 --out results/map`
+    Options:
+        map_file (FILE): A map file that `parkenv survey` wrote.
+        weekday (DAY): mon, tue, ..., sun.  [default: the mean over all sessions]
+        hour (0 <= H <= 24): Hour of the day, with --weekday.
+        slot (ID): Only this slot.  [default: all]
+        confidence (P): Of the interval, 0 to 1.
+        out, -o (DIR): Folder for map.png, slots.csv, summary.json.  [default: none]
     """
     import csv
     import io
 
-    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.figures.survey_pictures import save_map
     from parkenv.files.atomic_write import atomic_write
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
+    from parkenv.scenarios.build import build
     from parkenv.world.occupancy import DAY_NAMES
     from parkenv.world.week import DAY_S, HOUR_S
 
-    its = build(args.one_scenario(args.scenario_specs(scenario, lot=lot)))
-    if weekday is not None and weekday not in DAY_NAMES:
-        raise InputError(f"--weekday is {weekday!r}, want one of {', '.join(DAY_NAMES)}")
+    its = build(args.World(lot=lot).spec(scenario))
     ids = its.lot.slot_ids
     if slot is not None and slot not in ids:
-        raise InputError(f"--slot {slot}: lot {its.name!r} has no such slot; its first is {ids[0]!r}")
-    with MapStore(file, its.lot, create=False) as store:
+        hint = nearest(slot, ids) if len(ids) <= MOST_ROWS else nearest(slot, ids).partition("known:")[0]
+        raise InputError(
+            f"--slot {slot}: lot {its.name!r} has no such slot; {hint or f'its first is {ids[0]!r}'}"
+        )
+    with MapStore(map_file, its.lot, create=False) as store:
         log = store.log()
     time = None if weekday is None else DAY_NAMES.index(weekday) * DAY_S + min(hour * HOUR_S, DAY_S - 1.0)
     found = predict(log, time, confidence=confidence)
@@ -260,19 +233,14 @@ def show_map(
     ]
     console = make_console()
     when = "over all sessions" if weekday is None else f"{weekday} {int(hour):02d}:{int(hour % 1 * 60):02d}"
-    table = make_table(
-        f"{its.name}, {when}, {len(log.time)} sessions", ["slot", "P(taken)", f"{confidence:.0%}", "seen in"]
+    cells = (
+        (str(r["slot"]), f"{r['p_occupied']:.2f}", f"{r['low']:.2f}-{r['high']:.2f}", str(r["sessions"]))
+        for r in sorted(rows, key=lambda r: float(str(r["p_occupied"])))[:MOST_ROWS]
     )
-    for row in sorted(rows, key=lambda r: float(str(r["p_occupied"])))[: None if slot else 12]:
-        table.add_row(
-            str(row["slot"]),
-            f"{row['p_occupied']:.2f}",
-            f"{row['low']:.2f}-{row['high']:.2f}",
-            str(row["sessions"]),
-        )
-    console.print(table)
-    if slot is None and len(rows) > 12:
-        console.print(f"The {12} most likely free of {len(rows)}; --out writes all.")
+    title = f"{its.name}, {when}, {len(log.time)} sessions"
+    console.print(make_table(title, ["slot", "P(taken)", f"{confidence:.0%}", "seen in"], cells))
+    if len(rows) > MOST_ROWS:
+        console.print(f"The {MOST_ROWS} most likely free of {len(rows)}; --out writes all.")
     if out is None:
         return
     make_folder(out)
@@ -283,7 +251,5 @@ def show_map(
     writer.writerows(rows)
     with atomic_write(out / "slots.csv") as beside:
         beside.write_text(text.getvalue(), encoding="utf-8")
-    write_summary(
-        out, {"command": ["parkenv", *sys.argv[1:]], "version": __version__, "seed": None, "rows": rows}
-    )
+    save_summary(out, None, rows)
     console.print(f"Written: {out / 'map.png'}, slots.csv, summary.json")

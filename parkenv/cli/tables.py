@@ -1,28 +1,82 @@
-"""Tables of results on a terminal."""
+"""What commands print and leave: consoles, tables, progress bars, summaries."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from rich import box
-from rich.console import Console
-from rich.table import Table
+from parkenv import __version__
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress
+    from rich.table import Table
 
 WIDE = 200
 """Width assumed if output goes to a file or a pipe, characters."""
 
 
-def make_console() -> Console:
-    """Make a console on standard output, as wide as the terminal."""
-    return Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=WIDE)
+def make_console(*, soft_wrap: bool = False) -> Console:
+    """Make a console on standard output, as wide as the terminal; it prints names as they are, without markup."""
+    from rich.console import Console
+
+    width = None if soft_wrap or sys.stdout.isatty() else WIDE
+    return Console(highlight=False, markup=False, emoji=False, soft_wrap=soft_wrap, width=width)
 
 
-def make_table(title: str | None, headings: Iterable[str]) -> Table:
+def make_table(title: str | None, headings: Iterable[str], rows: Iterable[Sequence[str]] = ()) -> Table:
     """Make a table of numbers; the first column names the rows."""
+    from rich import box
+    from rich.table import Table
+
     table = Table(
         title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0)
     )
     for i, heading in enumerate(headings):
         table.add_column(heading, justify="right" if i else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
     return table
+
+
+def progress_bar(console: Console, unit: str = "") -> Progress:
+    """Make a progress bar that counts, with the time that it took and is left."""
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn(unit),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        console=console,
+        disable=not console.is_terminal,
+    )
+
+
+def command_line() -> list[str]:
+    """Return the command as it was given, for summaries."""
+    return ["parkenv", *sys.argv[1:]]
+
+
+def save_summary(folder: Path, seed: int | None, rows: Any, **more: Any) -> None:
+    """Write the `summary.json` of a command."""
+    from parkenv.evaluation.experiments.results import write_summary
+
+    head = {"command": command_line(), "version": __version__, "seed": seed}
+    write_summary(folder, head | more | {"rows": rows})
+
+
+def print_recorded(console: Console, path: Path) -> None:
+    """Tell where a recording is, and how to look at it."""
+    console.print(f"Recorded: {path}; look at it with: rerun {path}")

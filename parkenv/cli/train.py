@@ -3,139 +3,50 @@
 from __future__ import annotations
 
 import dataclasses
-import sys
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Literal
 
-import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from typer import Exit
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
-from parkenv.cli.drive_task import DriveTask
-from parkenv.cli.report import PAGE
-from parkenv.cli.search_task import SearchTask
-from parkenv.cli.tables import make_console
-from parkenv.cli.training_task import FIGURE, Row, TrainingTask, curves_beside
+from parkenv.cli.report import PAGE, make_report
+from parkenv.cli.tables import command_line, make_console, save_summary
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from parkenv.cli.training_task import Row, TrainingTask
     from parkenv.evaluation.experiments.spec import TrainingSpec
     from parkenv.evaluation.experiments.workers import Workers
     from parkenv.evaluation.training.rl_training import Training
 
-TASKS: Mapping[str, type[TrainingTask]] = {"search": SearchTask, "drive": DriveTask}
-
 
 def train(
-    algorithm: Annotated[
-        str | None,
-        typer.Argument(
-            help="To search: dqn, ppo, maskable-ppo, recurrent-ppo.  [default: maskable-ppo]  "
-            "To drive: sac, tqc, ppo.  [default: ppo]"
-        ),
-    ] = None,
-    env: Annotated[
-        str,
-        typer.Option(
-            "--env",
-            metavar="search|drive",
-            help="What to learn: to search (parkenv/Search-v1), or to drive into slots (parkenv/Drive-v1).",
-            rich_help_panel=args.WORLD,
-        ),
-    ] = "search",
-    scenario: args.ScenariosOption = None,
-    lot: args.LotOption = None,
-    test_on: Annotated[
-        str | None,
-        typer.Option(
-            "--test-on",
-            metavar="NAME|FILE[,...]",
-            help="Scenarios to test in at the end.  [default: those of the training]",
-            rich_help_panel=args.WORLD,
-        ),
-    ] = None,
-    steps: Annotated[
-        int | None,
-        typer.Option(
-            "--steps",
-            min=1,
-            help="Decisions of a training.  [default: 2000000 to search; to drive, the training config's]",
-        ),
-    ] = None,
-    seeds: Annotated[
-        int, typer.Option("--seeds", min=1, help="Trainings, one for each seed from --seed on.")
-    ] = 5,
-    clone: Annotated[
-        str | None,
-        typer.Option(
-            "--clone",
-            metavar="PLANNER",
-            help="Start with behaviour cloning of this planner (search; ppo, maskable-ppo).",
-        ),
-    ] = None,
-    demonstrations: Annotated[
-        int | None,
-        typer.Option("--demonstrations", min=1, help="Searches of the planner to clone.  [default: 2000]"),
-    ] = None,
-    k: Annotated[
-        int | None, typer.Option("--k", min=1, help="Slots in an observation (search).  [default: 5]")
-    ] = None,
-    evaluate_every: Annotated[
-        int | None,
-        typer.Option(
-            "--evaluate-every",
-            min=1,
-            help="Decisions between evaluations.  [default: 100000 to search; to drive, a twentieth of --steps]",
-        ),
-    ] = None,
-    evaluation_episodes: Annotated[
-        int | None,
-        typer.Option(
-            "--evaluation-episodes",
-            min=2,
-            help="Episodes of an evaluation, in held-out worlds; to drive, on each lot for each kind of slot.  "
-            "[default: 256; 64]",
-        ),
-    ] = None,
-    planners: Annotated[
-        str | None,
-        typer.Option(
-            "--planners",
-            metavar="NAME[,NAME...]|none",
-            help="Agents that are drawn for comparison.  [default: belief, mdp-tuned, mdp, first-free, greedy-drive, "
-            "greedy-goal; to drive, planner]",
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="First seed of the trainings.")] = 0,
-    jobs: args.JobsOption = 0,
-    backend: args.BackendOption = "loky",
-    address: args.AddressOption = None,
-    tensorboard: Annotated[
-        bool, typer.Option("--tensorboard", help="Keep logs for TensorBoard in --out.")
-    ] = False,
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            help="Folder for models, curves and figures.  [default: results/ALGORITHM, results/drive-ALGORITHM]",
-        ),
-    ] = None,
-    beside: Annotated[
-        str | None,
-        typer.Option(
-            "--beside",
-            metavar="DIR[,DIR...]",
-            help="Folders of other trainings with the same evaluations, to draw in the same figure.",
-        ),
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue from the checkpoints in --out.")] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the training in --out.")] = False,
-    report: args.ReportOption = False,
+    algorithm: str | None = None,
+    /,
+    env: Literal["search", "drive"] = "search",
+    scenario: str | None = None,
+    steps: int | None = None,
+    trainings: int = 5,
+    seed: int = 0,
+    out: Path | None = None,
+    *,
+    clone: str | None = None,
+    demonstrations: int | None = None,
+    k: int | None = None,
+    evaluate_every: int | None = None,
+    evaluation_episodes: int | None = None,
+    test_on: str | None = None,
+    agents: str | None = None,
+    beside: str | None = None,
+    lot: str | None = None,
+    tensorboard: bool = False,
+    folder: args.RunFolder,
+    machines: args.Machines,
 ) -> None:
     """Train agents by reinforcement learning with several seeds, and draw their learning curves beside the planners.
 
@@ -145,89 +56,102 @@ def train(
     is kept, and tested at the end. Hyperparameters are in parkenv/evaluation/training/configs.py.
 
     Examples:
-    * `parkenv train maskable-ppo --scenario campus`
+        parkenv train maskable-ppo --scenario campus
+        parkenv train maskable-ppo --scenario my_lot.toml --steps 200000 --trainings 1
+        parkenv train ppo --clone mdp-tuned --test-on campus,street,jam --out results/cloned
+        parkenv train ppo --beside results/maskable-ppo,results/dqn
+        parkenv train sac --env drive --scenario campus,street --trainings 3
+        parkenv compare --agents mdp,maskable-ppo:results/maskable-ppo/seed_0/model.safetensors
 
-    * `parkenv train maskable-ppo --scenario my_lot.toml --steps 200000 --seeds 1`
+    Options:
+        algorithm (ALGORITHM): To search: dqn, ppo, maskable-ppo (default), recurrent-ppo. To drive: sac, tqc, ppo
+            (default).
+        env (search|drive): Learn to search (parkenv/Search-v1), or to drive into slots (parkenv/Drive-v1).
+        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus; to drive, campus,street]
+        steps (N >= 1): Decisions of a training.  [default: 2000000; to drive, the training config's]
+        trainings (N >= 1): How many, with one seed each from --seed on.
+        seed (N >= 0): First seed of the trainings.
+        out, -o (DIR): Folder for models, curves and figures.  [default: results/ALGORITHM, results/drive-ALGORITHM]
 
-    * `parkenv train ppo --clone mdp-tuned --test-on campus,street,jam --out results/cloned`
+    Learning:
+        clone (AGENT): Start with behaviour cloning of this planner (search; ppo, maskable-ppo).
+        demonstrations (N >= 1): Episodes of the planner to clone.  [default: 2000]
+        k (N >= 1): Slots in an observation (search).  [default: 5]
 
-    * `parkenv train ppo --beside results/maskable-ppo,results/dqn`
+    Evaluation:
+        evaluate_every (N >= 1): Decisions between evaluations.  [default: 100000; to drive, a twentieth of --steps]
+        evaluation_episodes (N >= 2): Episodes of an evaluation, in held-out worlds; to drive, on each lot for each kind
+            of slot.  [default: 256; to drive, 64]
+        test_on (NAME|FILE[,...]): Scenarios to test in at the end.  [default: those of the training]
+        agents (NAME[,...]|none): Agents that are drawn for comparison.  [default: belief, mdp-tuned, mdp, first-free,
+            greedy-drive, greedy-goal; to drive, planner]
+        beside (DIR[,...]): Folders of other trainings with the same evaluations, to draw in the same figure.
 
-    * `parkenv train sac --env drive --scenario campus,street --seeds 3`
-
-    * `parkenv compare --agents mdp,maskable-ppo:results/maskable-ppo/seed_0/model.safetensors`
+    Results:
+        tensorboard: Keep logs for TensorBoard in --out.
     """
     from parkenv.evaluation.experiments.agent_spec import split_agents
     from parkenv.evaluation.experiments.spec import TrainingSpec
 
     given = {
-        "scenarios": tuple(args.scenario_specs(scenario, lot=lot)) if scenario or lot else None,
+        "scenarios": tuple(args.World(lot=lot).specs(scenario)) if scenario or lot else None,
         "test_on": tuple(args.scenario_specs(test_on)) if test_on else None,
-        "planners": None if planners is None else [] if planners == "none" else split_agents(planners),
+        "agents": None if agents is None else [] if agents == "none" else split_agents(agents),
     }
     spec = TrainingSpec().changed(
-        env=env, algorithm=algorithm, steps=steps, seeds=seeds, seed=seed, clone=clone, demonstrations=demonstrations,
-        k=k, evaluate_every=evaluate_every, evaluation_episodes=evaluation_episodes, tensorboard=tensorboard,
-        jobs=jobs, backend=backend, address=address, **given,
+        env=env, algorithm=algorithm, steps=steps, trainings=trainings, seed=seed, clone=clone,
+        demonstrations=demonstrations, k=k, evaluate_every=evaluate_every, evaluation_episodes=evaluation_episodes,
+        tensorboard=tensorboard, **given, **machines.given,
     )  # fmt: skip
-    others = args.words("--beside", beside) if beside else ()
-    run_training(spec, out, resume=resume, overwrite=overwrite, beside=others, report=report)
+    run_training(spec, out, folder, args.words("--beside", beside) if beside else ())
 
 
 def run_training(
-    spec: TrainingSpec,
-    out: Path | None = None,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    beside: Sequence[str] = (),
-    report: bool = False,
+    spec: TrainingSpec, out: Path | None, folder: args.RunFolder, beside: Sequence[str] = ()
 ) -> None:
     """Train, test and draw; see `train`.
 
     Raises:
         InputError: the training is impossible, or the folder cannot be used.
     """
-    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.cli.drive_task import DriveTask
+    from parkenv.cli.search_task import SearchTask
+    from parkenv.cli.training_task import curves_beside
+    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.training.rl_training import MODEL
 
-    task = TASKS[spec.env](spec)
+    task = {"search": SearchTask, "drive": DriveTask}[spec.env](spec)
     task.check()
     settings = {"version": __version__, **task.settings()}
     out = out or Path("results") / task.folder
     others = curves_beside(beside, out, task)
     make_folder(out)
-    _require_free(out, settings, resume, overwrite)
+    _require_free(out, settings, folder)
     console = make_console()
-    with args.workers_of(spec.jobs, spec.backend, spec.address) as workers:
-        training = dataclasses.replace(task.training(console), command=("parkenv", *sys.argv[1:]))
-        _claim(out, settings, overwrite)
+    with args.workers_of(spec) as workers:
+        training = dataclasses.replace(task.training(console), command=tuple(command_line()))
+        _claim(out, settings, folder.overwrite)
         spec.write(out / SPEC_FILE)
-        numbers = range(spec.seed, spec.seed + spec.seeds)
+        numbers = range(spec.seed, spec.seed + spec.trainings)
         curves = _train_all(console, task, training, numbers, out, workers, spec.tensorboard)
         models = {n: out / f"seed_{n}" / MODEL for n in numbers}
         outcome = task.report(console, workers, curves, models, out, others)
-    command = ["parkenv", *sys.argv[1:]]
-    write_summary(
-        out, {"command": command, "version": __version__, "seed": spec.seed, "settings": settings, **outcome}
-    )
+    save_summary(out, spec.seed, outcome.pop("rows"), settings=settings, **outcome)
     console.print(f"Models, curves, summary and figure are in {out}")
-    if report:
-        from parkenv.cli.report import make_report
-
-        make_report(out, jobs=spec.jobs, trust=True)
+    if folder.report:
+        make_report(out, spec)
 
 
-def _require_free(out: Path, settings: Row, resume: bool, overwrite: bool) -> None:
+def _require_free(out: Path, settings: Row, folder: args.RunFolder) -> None:
     """Check that the folder holds no training, or one to resume or replace."""
     from parkenv.evaluation.experiments.results import read_settings, require_same_settings
 
-    if resume and overwrite:
+    if folder.resume and folder.overwrite:
         raise InputError("--resume and --overwrite exclude each other")
-    if resume:
+    if folder.resume:
         require_same_settings(out, settings, "training")
-    elif not overwrite and read_settings(out) is not None:
+    elif not folder.overwrite and read_settings(out) is not None:
         raise InputError(
             f"--out {out}: holds a training; add --resume to go on with it, --overwrite to replace it, or name "
             "another folder"
@@ -238,6 +162,7 @@ def _claim(out: Path, settings: Row, overwrite: bool) -> None:
     """Write the settings of the new training, and remove the results of the previous one."""
     import shutil
 
+    from parkenv.cli.training_task import FIGURE
     from parkenv.evaluation.experiments.results import SUMMARY, write_settings
 
     # Delete the summary: a folder without one holds an unfinished training.
@@ -260,6 +185,8 @@ def _train_all(
 ) -> list[list[Row]]:
     """Train all seeds, with one progress bar each, updated from the curves that the trainings write."""
     from functools import partial
+
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     from parkenv.evaluation.training.rl_training import CURVE, read_curve, train_one
 
@@ -289,7 +216,7 @@ def _train_all(
                 curves[i] = trained.curve
         except KeyboardInterrupt:
             console.print(f"Interrupted. Checkpoints are in {out}; the same command with --resume goes on.")
-            raise typer.Exit(130) from None
+            raise Exit(130) from None
         finally:
             over.set()
             watcher.join()

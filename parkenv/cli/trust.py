@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -14,17 +14,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from parkenv.files.spec_file import Spec
-
-TrustOption = Annotated[
-    bool, typer.Option("--trust", help="Run the classes (MODULE:CLASS) that the file or folder names.")
-]
-TrustModelOption = Annotated[
-    bool,
-    typer.Option(
-        "--trust-model",
-        help="Convert archives of stable-baselines3 (ALGORITHM:FILE.zip) to model files; this runs the code in them.",
-    ),
-]
 
 
 def require_trust(spec: Spec, source: Path, trust: bool) -> None:
@@ -60,7 +49,7 @@ def readable_models(agents: Sequence[str], trust_model: bool) -> list[str]:
     Raises:
         InputError: an archive cannot be converted.
     """
-    from planners.agent import ALGORITHMS
+    from planners.names import ALGORITHMS
 
     readable = list(agents)
     for i, agent in enumerate(agents if trust_model else ()):

@@ -47,7 +47,7 @@ class OnboardPerception:
     def __init__(
         self,
         scenario: Scenario,
-        rig: str | SensorRig,
+        rig: str | SensorRig | None,
         weather: str | None = None,
         captures: int = 2,
         every: float = 1.25,
@@ -127,7 +127,7 @@ class SearchPerceptionEnv(SearchEnv):
     | Name | Default | Meaning |
     |------|---------|---------|
     | `scenario`, `render_mode`, changes | | as in `parkenv/Search-v1` |
-    | `rig` | `"laser"` | `laser` (the thesis's camera and 270° laser), `stereo`, `both_sides`, or a `SensorRig` |
+    | `rig` | the scenario's | `laser` (the thesis's camera and 270° laser), `stereo`, `both_sides`, or a `SensorRig` |
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 2 | largest number of captures on an edge |
     | `every` | 1.25 | m, least distance between captures on an edge |
@@ -159,7 +159,7 @@ class SearchPerceptionEnv(SearchEnv):
         self,
         scenario: str | Scenario = "campus",
         render_mode: str | None = None,
-        rig: str | SensorRig = "laser",
+        rig: str | SensorRig | None = None,
         weather: str | None = None,
         captures: int = 2,
         every: float = 1.25,

@@ -47,7 +47,7 @@ class SensorSampler:
 
     Args:
         scenario: defines world and traffic.
-        rig: laser, stereo, both_sides, or any `SensorRig`.
+        rig: laser, stereo, both_sides, or any `SensorRig`; None: the scenario's.
         weather: one of `sim_sensors.camera.weather.PRESETS`; None draws one for each world.
         captures: largest number of captures on an edge.
         every: m, least distance between captures on an edge, except for the last one.
@@ -57,8 +57,14 @@ class SensorSampler:
     """
 
     def __init__(
-        self, scenario: Scenario, rig: str | SensorRig, weather: str | None, captures: int, every: float
+        self,
+        scenario: Scenario,
+        rig: str | SensorRig | None,
+        weather: str | None,
+        captures: int,
+        every: float,
     ) -> None:
+        rig = scenario.rig if rig is None else rig
         if isinstance(rig, str):
             if rig not in RIG_NAMES:
                 raise InputError(f"rig is {rig!r}, want a SensorRig or one of {', '.join(RIG_NAMES)}")

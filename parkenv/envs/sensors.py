@@ -72,7 +72,7 @@ class SearchSensorsEnv(SearchEnv):
     | Name | Default | Meaning |
     |------|---------|---------|
     | `scenario`, `render_mode`, changes | | as in `parkenv/Search-v1`; `traffic=Traffic(4, 6)` adds road users |
-    | `rig` | `"laser"` | `laser` (the thesis's camera and 270° laser), `stereo`, `both_sides`, or a `SensorRig` |
+    | `rig` | the scenario's | `laser` (the thesis's camera and 270° laser), `stereo`, `both_sides`, or a `SensorRig` |
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 4 | largest number of captures on an edge |
     | `every` | 1.0 | m, least distance between captures on an edge |
@@ -96,7 +96,7 @@ class SearchSensorsEnv(SearchEnv):
         self,
         scenario: str | Scenario = "campus",
         render_mode: str | None = None,
-        rig: str | SensorRig = "laser",
+        rig: str | SensorRig | None = None,
         weather: str | None = None,
         captures: int = 4,
         every: float = 1.0,

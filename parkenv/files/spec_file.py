@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import difflib
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self, TypeVar, get_args
 
@@ -14,6 +13,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    PrivateAttr,
     Strict,
     ValidationError,
     ValidationInfo,
@@ -22,7 +22,7 @@ from pydantic.annotated_handlers import GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, ErrorDetails
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, nearest
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import MAX_SPEC_BYTES, read_json, read_toml
 
@@ -94,6 +94,12 @@ class Spec(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
 
+    _file: str = PrivateAttr("")
+    """File that the specification was read from, for messages; no part of its value."""
+
+    def __eq__(self, other: object) -> bool:
+        return type(self) is type(other) and self.__dict__ == other.__dict__
+
     @classmethod
     def read(cls, path: str | Path) -> Self:
         """Read a TOML file, or a JSON file (`.json`).
@@ -103,7 +109,11 @@ class Spec(BaseModel):
                 was wanted.
         """
         path = Path(path)
-        return cls.parse(read_tables(path), str(path), path.parent)
+        return cls.parse(read_tables(path), str(path), path.parent)._of_file(path)
+
+    def _of_file(self, path: str | Path) -> Self:
+        self._file = str(path)
+        return self
 
     @classmethod
     def parse(cls, tables: Mapping[str, Any], source: str, folder: str | Path = ".") -> Self:
@@ -133,7 +143,7 @@ class Spec(BaseModel):
             InputError: see `read`.
         """
         fields = {name: getattr(self, name) for name in type(self).model_fields} | changes
-        return type(self).parse(fields, source)
+        return type(self).parse(fields, source)._of_file(self._file)
 
     def write(self, path: Path) -> None:
         """Write the specification as JSON, atomically, including fields at their defaults."""
@@ -167,13 +177,6 @@ def read_tables(path: Path) -> dict[str, Any]:
     if not isinstance(tables, dict):
         raise InputError(f"{path}: is a {type(tables).__name__}, want a JSON object")
     return tables
-
-
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Return a hint for a misspelt name: the closest known name, and all known names."""
-    names = list(known)
-    close = difflib.get_close_matches(name, names, n=1, cutoff=0.6)
-    return (f"did you mean {close[0]!r}? " if close else "") + f"known: {', '.join(names)}"
 
 
 def _message(model: type[BaseModel], error: ValidationError, source: str) -> str:

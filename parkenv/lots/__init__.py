@@ -3,12 +3,13 @@
 `ParkingLot` is independent of file formats; the functions here create it from files and rules.
 """
 
+from parkenv.files.names import PACKAGED_LOTS
 from parkenv.lots.checks import check_lot
 from parkenv.lots.generators import city_lot, grid_lot
 from parkenv.lots.geojson import write_lot
 from parkenv.lots.importers.lot_import import import_lot
 from parkenv.lots.lot_contents import LotProblem
-from parkenv.lots.lot_files import PACKAGED_LOTS, load_lot, packaged_lot, read_lot
+from parkenv.lots.lot_files import load_lot, packaged_lot, read_lot
 
 __all__ = [
     "PACKAGED_LOTS",

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import read_json
 from parkenv.lots.geojson_slots import FARTHEST, SLOT_SHAPE, RawFeature, is_coordinate, read_slots
 from parkenv.lots.local_frame import LocalFrame
@@ -179,8 +180,8 @@ def _check_head(document: Any, stem: str) -> tuple[str, bool]:
     if version > LOT_VERSION:
         raise InputError(f"parkenv.version is {version}, want {LOT_VERSION}: made by a newer parkenv")
     name = document.get("name", stem)
-    if not isinstance(name, str):
-        raise InputError(f"name is {name!r:.40}, want a text")
+    if not isinstance(name, str) or not is_plain(name):
+        raise InputError(f"name is {name!a:.40}, want a text without control characters")
     if document.get("frame", "local") != "local":
         raise InputError(f"frame is {document['frame']!r:.40}, want 'local', or no frame for lon/lat")
     return name, "frame" in document

@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.file_names import is_plain
 from parkenv.lots.generators import Slots
 from parkenv.lots.lot_contents import LotContents
 from parkenv.lots.slot_polygons import slots_from_polygons
@@ -119,7 +120,7 @@ def _slot_id(feature: RawFeature) -> str:
     given = feature.number if feature.given_id is None else feature.given_id
     if type(given) is int:
         return str(given)
-    if not isinstance(given, str) or not given:
+    if not isinstance(given, str) or not given or not is_plain(given):
         raise InputError(f"slot: id is {given!r:.40}, want a text")
     return given
 

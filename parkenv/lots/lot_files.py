@@ -6,15 +6,13 @@ from importlib import resources
 from pathlib import Path
 
 from parkenv.errors import InputError
+from parkenv.files.names import PACKAGED_LOTS
 from parkenv.lots.dragon_lake import dragon_lake_lot
 from parkenv.lots.file_formats import LotFormat, lot_format
 from parkenv.lots.geojson import read_contents
 from parkenv.lots.lot_contents import graph_errors
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.lot import ParkingLot
-
-PACKAGED_LOTS = ("campus", "jam", "street", "mini")
-"""Names of the packaged lots."""
 
 
 def load_lot(name_or_path: str | Path) -> ParkingLot:

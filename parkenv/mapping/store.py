@@ -23,19 +23,24 @@ FloatArray = NDArray[np.float64]
 APPLICATION_ID = 0x7061726B  # "park"
 VERSION = 1
 _PATIENCE_S = 30.0
+MAX_BYTES = 1_000_000_000
+"""Maximum size of a map file."""
+MAX_STATES = 50_000_000
+"""Maximum number of sessions times slots that are read."""
 
 _SCHEMA = """
-CREATE TABLE lot (name TEXT NOT NULL, digest TEXT NOT NULL, n_slots INTEGER NOT NULL);
+CREATE TABLE lot (name TEXT NOT NULL, digest TEXT NOT NULL, n_slots INTEGER NOT NULL) STRICT;
 CREATE TABLE session (
     id INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE, time REAL NOT NULL, rig TEXT NOT NULL, weather TEXT NOT NULL
-);
+) STRICT;
 CREATE TABLE sighting (
-    session INTEGER NOT NULL REFERENCES session(id), slot INTEGER NOT NULL, p_occupied REAL NOT NULL,
+    session INTEGER NOT NULL REFERENCES session(id), slot INTEGER NOT NULL CHECK (slot >= 0),
+    p_occupied REAL NOT NULL CHECK (p_occupied BETWEEN 0 AND 1),
     PRIMARY KEY (session, slot)
-) WITHOUT ROWID;
+) STRICT, WITHOUT ROWID;
 CREATE TABLE car (
     session INTEGER NOT NULL REFERENCES session(id), x REAL NOT NULL, y REAL NOT NULL, yaw REAL NOT NULL
-);
+) STRICT;
 CREATE INDEX car_of_session ON car(session);
 """
 
@@ -82,21 +87,28 @@ class MapStore:
     Args:
         path: the file; created if it does not exist, unless `create` is False.
         lot: the lot that the map describes.
-        create: whether to create a missing file.
+        create: whether to write, and to create a missing file; False opens it for reading only.
 
     Raises:
-        InputError: the file does not exist, is not a map file, belongs to a newer parkenv or to another lot, or cannot
-            be written.
+        InputError: the file does not exist, is not a map file, is too large, belongs to a newer parkenv or to another
+            lot, or cannot be written.
     """
 
     def __init__(self, path: Path, lot: ParkingLot, *, create: bool = True) -> None:
         self.path, self._lot = path, lot
         if not path.exists() and not create:
             raise InputError(f"{path}: no such map file; parkenv survey makes one")
+        if path.exists() and path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: has more than {MAX_BYTES:,} bytes, the most that is read")
+        # The journal of a writer that was killed is rolled back before reading, which takes writing.
+        mode = "rwc" if create else "rw" if path.with_name(f"{path.name}-journal").exists() else "ro"
+        address = f"{path.absolute().as_uri()}?mode={mode}"
         with self._errors_in_words():
-            self._db = sqlite3.connect(path, timeout=_PATIENCE_S, isolation_level=None)
+            self._db = sqlite3.connect(address, timeout=_PATIENCE_S, isolation_level=None, uri=True)
             try:
-                self._open()
+                # Constraints are checked, and a schema of somebody else's calls no functions.
+                self._db.executescript("PRAGMA foreign_keys = ON; PRAGMA trusted_schema = OFF")
+                self._open(create)
             except BaseException:
                 self._db.close()
                 raise
@@ -135,20 +147,34 @@ class MapStore:
                 raise InputError(f"{self.path}: holds a session {session.key!r} already") from error
 
     def sessions(self) -> list[Session]:
-        """Return all sessions, ordered by key."""
+        """Return all sessions, ordered by key.
+
+        Raises:
+            InputError: the file cannot be read, or a row holds what `add` does not write.
+        """
         found = []
         with self._errors_in_words(), self._transaction():
             rows = self._db.execute("SELECT id, key, time, rig, weather FROM session ORDER BY key").fetchall()
-            for number, key, time, rig, weather in rows:
+            if len(rows) * self._lot.n_slots > MAX_STATES:
+                raise InputError(
+                    f"{self.path}: holds {len(rows):,} sessions, want at most {MAX_STATES // self._lot.n_slots:,}"
+                )
+            for number, *head in rows:
                 p = np.full(self._lot.n_slots, np.nan)
                 for slot, value in self._db.execute(
                     "SELECT slot, p_occupied FROM sighting WHERE session = ?", (number,)
                 ):
+                    if not (isinstance(slot, int) and 0 <= slot < len(p) and isinstance(value, float)):
+                        raise InputError(
+                            f"{self.path}: session {head[0]!r:.40}: slot {slot!r:.40} has p_occupied {value!r:.40}, "
+                            f"want slots 0 to {len(p) - 1} with numbers"
+                        )
                     p[slot] = value
                 cars = self._db.execute("SELECT x, y, yaw FROM car WHERE session = ?", (number,)).fetchall()
-                found.append(
-                    Session(key, time, rig, weather, p, np.array(cars, dtype=np.float64).reshape(-1, 3))
-                )
+                try:
+                    found.append(Session(*head, p, np.array(cars, dtype=np.float64).reshape(-1, 3)))
+                except (TypeError, ValueError) as error:
+                    raise InputError(f"{self.path}: {error}") from error
         return found
 
     def log(self) -> SessionLog:
@@ -160,9 +186,7 @@ class MapStore:
 
     def cars(self) -> FloatArray:
         """Return the poses of all cars of all sessions, (n, 3) x, y in m and yaw in rad."""
-        with self._errors_in_words(), self._transaction():
-            rows = self._db.execute("SELECT x, y, yaw FROM car ORDER BY session, rowid").fetchall()
-        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+        return np.concatenate([np.zeros((0, 3)), *(session.cars for session in self.sessions())])
 
     def _insert(self, session: Session, seen: list[int]) -> None:
         head = (session.key, session.time, session.rig, session.weather)
@@ -177,12 +201,14 @@ class MapStore:
             "INSERT INTO car VALUES (?, ?, ?, ?)", ((number, *car) for car in session.cars.tolist())
         )
 
-    def _open(self) -> None:
+    def _open(self, create: bool) -> None:
         # One transaction, so that a file that another process is creating is either empty or complete.
         with self._transaction():
             empty = self._is_empty()
             if not empty:
                 self._check()
+        if empty and not create:
+            raise InputError(f"{self.path}: is empty, no map file; parkenv survey makes one")
         if empty:
             with self._transaction("IMMEDIATE"):
                 # Another process may have been faster.
@@ -198,10 +224,18 @@ class MapStore:
             raise InputError(
                 f"{self.path}: was written by a newer parkenv (schema {version}, want at most {VERSION}): update it"
             )
-        name, digest = self._db.execute("SELECT name, digest FROM lot").fetchone()
+        tables = self._db.execute(
+            "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND sql LIKE 'CREATE TABLE%' "
+            "AND name IN ('lot', 'session', 'sighting', 'car')"
+        ).fetchone()
+        # A view in place of a table could have rows without end.
+        lot = tables == (4,) and self._db.execute("SELECT name, digest FROM lot").fetchone()
+        if not lot:
+            raise InputError(f"{self.path}: is no whole map file: a table is missing or empty")
+        name, digest = lot
         if digest != lot_digest(self._lot):
             raise InputError(
-                f"{self.path}: is a map of lot {name!r}, not of {self._lot.name!r} as it is here"
+                f"{self.path}: is a map of lot {name!r:.80}, not of {self._lot.name!r} as it is here"
             )
 
     def _make(self) -> None:

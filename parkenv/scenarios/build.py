@@ -59,12 +59,7 @@ def make_scenario(source: ScenarioSource, **changes: Any) -> Scenario:
         raise InputError(
             f"scenario is a {type(source).__name__}, want a Scenario, its name or file, a ScenarioSpec or a ParkingLot"
         )
-    spec = scenario_spec(source)
-    try:
-        made = build(spec)
-    except InputError as error:
-        raise InputError(f"{source}: {error}") from error
-    return made.replace(**changes)
+    return build(scenario_spec(source)).replace(**changes)
 
 
 def build(spec: ScenarioSpec) -> Scenario:
@@ -73,19 +68,18 @@ def build(spec: ScenarioSpec) -> Scenario:
     Raises:
         InputError: a file that it names cannot be used or does not fit the lot.
     """
-    lot = _lot(spec.lot)
-    goal = 0
-    if isinstance(spec.goal, tuple):
-        lot = dataclasses.replace(lot, goals=np.array([spec.goal]))
-    else:
-        goal = spec.goal
-    name = spec.title
     try:
+        lot = _lot(spec.lot)
+        goal = 0
+        if isinstance(spec.goal, tuple):
+            lot = dataclasses.replace(lot, goals=np.array([spec.goal]))
+        else:
+            goal = spec.goal
         if not goal < len(lot.goals):
             raise InputError(f"goal is {goal}, want an index from 0 to {len(lot.goals) - 1}")
         occupancy = _occupancy(spec.occupancy, lot, goal)
         return Scenario(
-            name=name,
+            name=spec.title,
             lot=lot,
             goal=goal,
             entry=spec.entry,
@@ -101,9 +95,10 @@ def build(spec: ScenarioSpec) -> Scenario:
             traffic=Traffic()
             if spec.traffic is None
             else Traffic(spec.traffic.cars, spec.traffic.pedestrians),
+            rig=spec.rig,
         )
     except InputError as error:
-        raise InputError(f"scenario {name!r}: {error}") from error
+        raise InputError(f"{spec.source}: {error}") from error
 
 
 def _lot(spec: LotSpec) -> ParkingLot:

@@ -6,20 +6,22 @@ Every table of the file has a class here, which validates it. The published JSON
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from parkenv.errors import InputError
-from parkenv.files.spec_file import FilePath, OrText, Spec, nearest, read_tables
+from parkenv.errors import InputError, nearest
+from parkenv.files.names import (
+    LOT_SUFFIXES,
+    PACKAGED_LOTS,
+    SCENARIO_NAMES,
+    SENSOR_MODELS,
+    PackagedLot,
+    RigName,
+    SensorModelName,
+)
+from parkenv.files.spec_file import FilePath, OrText, Spec, read_tables
 from parkenv.world.occupancy import ArrivalWindow
-
-PackagedLot = Literal["campus", "jam", "street", "mini"]
-PACKAGED_LOTS: tuple[PackagedLot, ...] = ("campus", "jam", "street", "mini")
-LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")
-"""Suffixes of lot files."""
-SENSOR_MODELS = ("perfect", "blind", "laser", "stereo")
-RigName = Literal["laser", "stereo", "both_sides"]
 
 Speed = Annotated[float, Field(ge=0.1, le=300.0)]
 """km/h."""
@@ -240,7 +242,7 @@ def _sensor_tables(value: object) -> object:
 class SensorModelSpec(Spec):
     """How slots are observed from the lane."""
 
-    name: Literal["perfect", "blind", "laser", "stereo"] | None = Field(
+    name: SensorModelName | None = Field(
         None, description="perfect; blind: only by attempts; laser, stereo: as measured with that rig."
     )
     file: FilePath | None = Field(None, description="A sensor model that `parkenv fit-sensor-model` wrote.")
@@ -298,7 +300,7 @@ class ScenarioSpec(Spec):
     sensor_model: Annotated[SensorModelSpec, BeforeValidator(_sensor_tables), OrText()] = SensorModelSpec(
         name="perfect"
     )
-    rig: RigName = Field("laser", description="The sensors of the car in surveys and sensor-model fits.")
+    rig: RigName = Field("laser", description="The sensors of the car, where they are simulated.")
     traffic: TrafficSpec | None = Field(
         None, description="Other road users; none if absent, some in surveys."
     )
@@ -313,11 +315,14 @@ class ScenarioSpec(Spec):
     def read(cls, path: str | Path) -> Self:
         """Read a scenario file; the default name of the scenario is that of the file."""
         path = Path(path)
-        return cls.parse({"name": path.stem, **read_tables(path)}, str(path), path.parent)
+        return cls.parse({"name": path.stem, **read_tables(path)}, str(path), path.parent)._of_file(path)
+
+    @property
+    def source(self) -> str:
+        """The file that the scenario was read from, or its name, for messages."""
+        return self._file or f"scenario {self.title!r}"
 
 
-SCENARIO_NAMES = ("campus", "jam", "street", "mini")
-"""Packaged scenarios."""
 _PACKAGED = Path(__file__).with_name("packaged")
 
 
@@ -335,7 +340,7 @@ def scenario_spec(source: str | Path) -> ScenarioSpec:
         Event(share=0.75, factor=200.0)
     """
     if str(source) in SCENARIO_NAMES:
-        return ScenarioSpec.read(_PACKAGED / f"{source}.toml")
+        return ScenarioSpec.read(_PACKAGED / f"{source}.toml")._of_file("")
     path = Path(source)
     if path.suffix in LOT_SUFFIXES and path.suffix != ".json":
         return ScenarioSpec.parse({"name": path.stem, "lot": str(path)}, str(path))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.file_names import is_plain
 from parkenv.world.drive_graph import NODE_TOLERANCE, GraphError, GraphProblem, build_drive_graph
 
 if TYPE_CHECKING:
@@ -139,6 +140,9 @@ class ParkingLot:
         n = len(self.slot_ids)
         if n == 0:
             raise InputError(f"lot {self.name!r} has no slot")
+        if not is_plain("".join((self.name, *self.slot_ids))):
+            name = next(name for name in (self.name, *self.slot_ids) if not is_plain(name))
+            raise InputError(f"lot: name {name!a:.60} has control characters")
         if len(set(self.slot_ids)) < n:
             seen: set[str] = set()
             twice = next(i for i in self.slot_ids if i in seen or seen.add(i))  # type: ignore[func-returns-value]

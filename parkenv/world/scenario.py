@@ -155,6 +155,7 @@ class Scenario(SearchProblem):
         arrival: when searches start.
         entry: index into `lot.entries`; None draws one for each search.
         traffic: other road users in the lot, visible to simulated sensors and on driven trips.
+        rig: name of the car's sensor rig, where sensors are simulated.
     """
 
     name: str
@@ -163,6 +164,7 @@ class Scenario(SearchProblem):
     arrival: ArrivalWindow = field(default_factory=ArrivalWindow)
     entry: int | None = None
     traffic: Traffic = field(default_factory=Traffic)
+    rig: str = "laser"
 
     def __post_init__(self) -> None:
         super().__post_init__()

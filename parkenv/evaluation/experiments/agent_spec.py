@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, ConfigDict, model_validator
 
 from parkenv.errors import InputError
 from parkenv.files.spec_file import OrText, Spec
-from planners.agent import ALGORITHMS
+from planners.names import ALGORITHMS
 
 OptionValue = bool | int | float | str
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.spec import DemoSpec, SurveySpec
 from parkenv.evaluation.experiments.surveys import survey_of
+from parkenv.files.names import RigName
 from parkenv.mapping.inference import MapPrior, SessionLog
 from parkenv.mapping.survey import SurveySettings
-from parkenv.scenarios.spec import RigName
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 

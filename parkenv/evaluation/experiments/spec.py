@@ -9,13 +9,12 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, mod
 from pydantic_core import PydanticCustomError
 
 from parkenv.evaluation.experiments.agent_spec import AgentItem, AgentSpec
+from parkenv.files.names import SCENARIO_NAMES, BackendName, RigName, WeatherName
 from parkenv.files.spec_file import Axis, FilePath, OrText, Several, Spec
 from parkenv.scenarios.spec import (
-    SCENARIO_NAMES,
     Cost,
     Hours,
     Probability,
-    RigName,
     ScenarioSpec,
     Speed,
     TrafficSpec,
@@ -87,7 +86,7 @@ class Workplace(Spec):
     """Where tasks run; the results do not depend on it."""
 
     jobs: int = Field(0, ge=0, le=10_000, description="Worker processes; 0 for all cores.")
-    backend: Literal["loky", "ray", "dask"] = "loky"
+    backend: BackendName = "loky"
     address: str | None = Field(None, description="Of a Ray or Dask cluster.")
 
 
@@ -155,7 +154,6 @@ class BenchmarkSpec(Workplace):
 
 BUSY = TrafficSpec(cars=3, pedestrians=5)
 """Default traffic of runs with simulated sensors."""
-Weather = Literal["sunny", "overcast", "low_sun", "dusk", "rain"]
 CaptureDistance = Annotated[float, Field(ge=0.1, le=1_000.0)]
 """Distance between captures, m."""
 
@@ -172,7 +170,7 @@ class SurveySpec(Workplace):
         ("08:00-10:00", "11:00-14:00", "16:00-18:00"), min_length=1, max_length=1_000,
         description="When drives begin, one window after the other, on the scenario's days.",
     )  # fmt: skip
-    weather: Weather | None = Field(None, description="Drawn for each session if absent.")
+    weather: WeatherName | None = Field(None, description="Drawn for each session if absent.")
     every: CaptureDistance = 1.25
     pose_noise: float = Field(0.0, ge=0.0, le=100.0, description="Localisation error of the car, m.")
     seed: int = Field(0, ge=0, lt=2**31)
@@ -203,7 +201,7 @@ class TrainingSpec(Workplace):
         None, min_length=1, max_length=1_000, description="Tested on in the end; the same if absent."
     )
     steps: int | None = Field(None, ge=1, le=10**12, description="Decisions of a training.")
-    seeds: int = Field(5, ge=1, le=10_000, description="How many trainings.")
+    trainings: int = Field(5, ge=1, le=10_000, description="How many, one for each seed.")
     seed: int = Field(0, ge=0, lt=2**31, description="Of the first.")
     clone: str | None = Field(
         None, description="Behaviour cloning of this planner first (search; ppo, maskable-ppo)."
@@ -219,7 +217,7 @@ class TrainingSpec(Workplace):
         le=1_000_000,
         description="Episodes of an evaluation; the test in the end has twice as many.",
     )
-    planners: Several[AgentItem] | None = Field(None, max_length=1_000, description="Drawn for comparison.")
+    agents: Several[AgentItem] | None = Field(None, max_length=1_000, description="Drawn for comparison.")
     tensorboard: bool = False
 
     @model_validator(mode="after")

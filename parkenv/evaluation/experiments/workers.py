@@ -10,14 +10,15 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack
 from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, get_args
 from urllib.parse import urlsplit
 
 from joblib import Parallel, delayed
 
 from parkenv.errors import InputError
+from parkenv.files.names import BackendName
 
-BACKENDS = ("loky", "ray", "dask")
+BACKENDS = get_args(BackendName)
 CONNECT_S = 5.0
 """Time for a cluster to answer at its address, s."""
 LOSSES = 3

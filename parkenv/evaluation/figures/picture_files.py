@@ -31,6 +31,7 @@ STYLE: dict[Any, Any] = {
     "xtick.color": "#444444",
     "ytick.color": "#444444",
     "figure.titlesize": 11.0,
+    "text.parse_math": False,  # a $ in a name is a $
 }
 
 INK = "#181b1f"

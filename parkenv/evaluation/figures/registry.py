@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.evaluation.experiments.compare import BLIND, Case
+from parkenv.files.file_names import file_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -132,7 +133,7 @@ def draw_figures(results: ComparisonResults, folder: Path, names: Sequence[str] 
     for kind in FIGURES:
         if names is None or kind.name in names:
             for suffix, figure in kind.draw(results):
-                files.append(folder / f"{kind.name}_{suffix}.png")
+                files.append(folder / file_name(f"{kind.name}_{suffix}", ".png"))
                 save_picture(figure, files[-1])
     return files
 

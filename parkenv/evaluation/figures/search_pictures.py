@@ -11,8 +11,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
+from matplotlib.path import Path as MplPath
 from matplotlib.patheffects import Normal, Stroke
+from matplotlib.textpath import TextPath
+from matplotlib.transforms import Affine2D
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
@@ -163,12 +167,18 @@ def _draw_policy(trace: SearchTrace, ax: Axes, scale: float) -> None:
         ax.plot(
             *lot.vertex_xy[np.flatnonzero(policy == PARK)].T,
             linestyle="none",
-            marker="$\\mathbf{P}$",
+            marker=_text_marker("P"),
             markersize=size,
             color=color,
             markeredgewidth=extra,
             zorder=3.6,
         )
+
+
+def _text_marker(text: str) -> MplPath:
+    """Return bold text as a marker; markers of mathematical text would need it in names, too."""
+    path = TextPath((0, 0), text, prop=FontProperties(weight="bold"))
+    return path.transformed(Affine2D().translate(*-path.get_extents().get_points().mean(axis=0)))
 
 
 def _placed(shape: FloatArray, at: FloatArray, ahead: FloatArray) -> list[FloatArray]:
@@ -249,7 +259,7 @@ def _draw_key(figure: Figure, height: float, zoom: float, *, policy: bool) -> No
         Line2D([], [], color=WALK, linewidth=1.8, linestyle=(0, (3, 2)), label="walk to the goal"),
     ]
     if policy:
-        plan = "$\\mathbf{P}\\rightarrow$"
+        plan = _text_marker("P→")
         handles.append(
             Line2D([], [], linestyle="none", marker=plan, markersize=16 * zoom, color=INK, label="first plan")
         )

@@ -1,0 +1,18 @@
+"""Names that files and commands know, without the modules behind them: help and completion need no more."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+PackagedLot = Literal["campus", "jam", "street", "mini"]
+PACKAGED_LOTS: tuple[PackagedLot, ...] = get_args(PackagedLot)
+SCENARIO_NAMES = PACKAGED_LOTS
+"""Packaged scenarios; each has a lot of the same name."""
+LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")
+"""Suffixes of lot files."""
+SensorModelName = Literal["perfect", "blind", "laser", "stereo"]
+SENSOR_MODELS: tuple[SensorModelName, ...] = get_args(SensorModelName)
+RigName = Literal["laser", "stereo", "both_sides"]
+WeatherName = Literal["sunny", "overcast", "low_sun", "dusk", "rain"]
+WEATHERS: tuple[WeatherName, ...] = get_args(WeatherName)
+BackendName = Literal["loky", "ray", "dask"]

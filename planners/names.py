@@ -1,0 +1,30 @@
+"""Names of the agents that come with the package and of learning algorithms, without the modules behind them."""
+
+from __future__ import annotations
+
+AGENTS: dict[str, tuple[str, str]] = {
+    "mdp": ("planners.thesis.replanning", "ReplanningAgent"),
+    "mdp-static": ("planners.thesis.replanning", "StaticAgent"),
+    "greedy-goal": ("planners.greedy", "GreedyGoalAgent"),
+    "greedy-drive": ("planners.greedy", "GreedyDriveAgent"),
+    "first-free": ("planners.greedy", "FirstFreeAgent"),
+    "random": ("planners.greedy", "RandomAgent"),
+    "oracle": ("planners.bounds.oracle", "OracleAgent"),
+    "belief": ("planners.belief.agent", "BeliefAgent"),
+    "mdp-tuned": ("planners.thesis.tuning", "TunedAgent"),
+    "exact": ("planners.bounds.exact", "ExactAgent"),
+}
+"""Module and class of each agent; modules are imported when an agent is made."""
+ALGORITHMS = {
+    "dqn": ("stable_baselines3", "DQN"),
+    "ppo": ("stable_baselines3", "PPO"),
+    "maskable-ppo": ("sb3_contrib", "MaskablePPO"),
+    "recurrent-ppo": ("sb3_contrib", "RecurrentPPO"),
+    "sac": ("stable_baselines3", "SAC"),
+    "tqc": ("sb3_contrib", "TQC"),
+}
+"""Module and class of each learning algorithm; `ALGORITHM:FILE` names a trained model."""
+SMALL_LOTS_ONLY = ("exact",)
+"""Agents for small lots and sensors without errors only."""
+AGENT_NAMES = tuple(name for name in AGENTS if name not in SMALL_LOTS_ONLY)
+"""Agents for all lots."""
