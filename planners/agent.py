@@ -17,7 +17,7 @@ from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError, nearest
 from parkenv.files.user_class import file_of_class, load_class
 from parkenv.world.occupancy import World
-from parkenv.world.scenario import Scenario, SearchProblem
+from parkenv.world.scenario import SearchProblem
 from planners.names import AGENTS, ALGORITHMS
 
 Observation = Mapping[str, Any]
@@ -28,11 +28,7 @@ class Agent(Protocol):
     """Interface of planners, heuristic baselines and stable-baselines3 models."""
 
     def predict(
-        self,
-        observation: Any,
-        state: Any = None,
-        episode_start: Any = None,
-        deterministic: bool = True,
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
     ) -> tuple[Any, Any]:
         """Return an action for an observation, and the state to pass to the next call."""
         ...
@@ -70,26 +66,15 @@ class SearchAgent(ABC, Generic[Memory]):
 
     def __init__(self, problem: SearchProblem) -> None:
         # From a whole scenario, keep the public part only.
-        self.problem = problem.public() if isinstance(problem, Scenario) else problem
+        self.problem = problem.public()
 
     @abstractmethod
     def begin(self, observation: Observation, belief: SlotBelief) -> Memory:
-        """Return the memory for an episode that starts with this observation.
-
-        Args:
-            observation: from `parkenv/Search-v1`.
-            belief: its belief about the slots.
-        """
+        """Return the memory for an episode that starts with this observation and the belief that it contains."""
 
     @abstractmethod
     def decide(self, observation: Observation, belief: SlotBelief, memory: Memory) -> int:
-        """Choose the action.
-
-        Args:
-            observation: from `parkenv/Search-v1`.
-            belief: its belief about the slots.
-            memory: memory of this episode; may be changed in place.
-        """
+        """Choose the action; `memory`, that of this episode, may be changed in place."""
 
     def predict(
         self,
@@ -132,6 +117,11 @@ class SearchAgent(ABC, Generic[Memory]):
             memory = self.begin(observation, belief)
         return np.asarray(self.decide(observation, belief, memory), dtype=np.int64), memory
 
+    def wait(self, vertex: int) -> int:
+        """Return a move without an edge, which waits; the shortest move if all four have edges."""
+        missing = np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)
+        return int(missing[0]) if len(missing) else int(self.problem.move_s[vertex].argmin())
+
     def plan_preview(self, observation: Observation, action: int, memory: Memory) -> PlanPreview:
         """Return where the agent intends to drive, right after `predict` chose `action`, without side effects.
 
@@ -145,22 +135,14 @@ class SearchAgent(ABC, Generic[Memory]):
 
 
 def require_observations(name: str, problem: SearchProblem) -> None:
-    """Raise an error if slots can never be observed from the lane.
-
-    Args:
-        name: name of the agent, for the message.
-        problem: a problem with its sensor model.
-
-    Raises:
-        InputError: no slot can be observed.
-    """
+    """Raise an `InputError` for the agent `name` if the problem's sensor can never observe a slot from the lane."""
     if not problem.sensor_rates.seen.any():
         raise InputError(
             f"{name} plans on observations from the lane, and this sensor model has none; take mdp"
         )
 
 
-def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) -> Agent:
+def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
     """Make an agent that knows the scenario's public part: lot, goal, speeds and costs.
 
     Args:
@@ -187,7 +169,7 @@ def make_agent(name: str, scenario: Scenario | SearchProblem, **options: Any) ->
             "predict(observation, state, episode_start, deterministic)",
             alternatives=f"; nor is it an algorithm ({', '.join(ALGORITHMS)})",
         )
-        scenario = scenario.public() if isinstance(scenario, Scenario) else scenario
+        scenario = scenario.public()
     elif name in AGENTS:
         module, class_name = AGENTS[name]
         agent = getattr(import_module(module), class_name)

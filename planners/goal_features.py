@@ -6,8 +6,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
-SCALE_M = 8.0
-"""m, the scale of coarse positions."""
+SCALE_M = 8.0  # m, the scale of coarse positions
 N_FEATURES = 17
 
 

@@ -20,16 +20,14 @@ from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent
 from planners.routes import DriveRoutes
 
+Slots = NDArray[np.bool_]  # A set of slots, (n_slots,) bool
+
 
 @dataclass
 class GreedyState:
-    """Memory of a heuristic.
+    """Memory of a heuristic."""
 
-    Attributes:
-        target: the slot to drive to, or -1.
-    """
-
-    target: int = -1
+    target: int = -1  # the slot to drive to, or -1
 
 
 class TargetAgent(SearchAgent[GreedyState]):
@@ -66,27 +64,21 @@ class TargetAgent(SearchAgent[GreedyState]):
         return PlanPreview(self.routes.path(int(observation["vertex"]), memory.target))
 
     @abstractmethod
-    def choose(
-        self,
-        candidates: NDArray[np.bool_],
-        observed_free: NDArray[np.bool_],
-        vertex: int,
-        previous: int,
-    ) -> int:
+    def choose(self, candidates: Slots, observed_free: Slots, vertex: int, previous: int) -> int:
         """Return the slot to drive to, or -1 if no candidate is reachable.
 
         Args:
-            candidates: (n_slots,) bool, slots not recently observed taken.
-            observed_free: (n_slots,) bool, slots that were observed free.
+            candidates: slots not recently observed taken.
+            observed_free: slots that were observed free.
             vertex: where the car is.
             previous: the previous target, or -1 at the start.
         """
 
-    def reachable(self, vertex: int) -> NDArray[np.bool_]:
+    def reachable(self, vertex: int) -> Slots:
         """Return the slots, (n_slots,) bool, that are reachable from a vertex."""
         return np.asarray(np.isfinite(self.routes.seconds_from(vertex)[: self.problem.lot.n_slots]))
 
-    def cheapest(self, candidates: NDArray[np.bool_], vertex: int) -> NDArray[np.bool_]:
+    def cheapest(self, candidates: Slots, vertex: int) -> Slots:
         """Return the reachable candidates, (n_slots,) bool, with the lowest arrival cost; all False if none."""
         cost_s = np.where(candidates, self.problem.arrival_cost_s, np.inf)
         best = np.asarray(candidates & (cost_s == cost_s.min()))
@@ -101,7 +93,7 @@ class TargetAgent(SearchAgent[GreedyState]):
         return False
 
 
-def _decayed(belief: SlotBelief) -> NDArray[np.bool_]:
+def _decayed(belief: SlotBelief) -> Slots:
     """Return the slots, (n_slots,) bool, whose last observation has decayed to the forecast."""
     return np.asarray((belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast))
 
@@ -114,13 +106,7 @@ class GreedyGoalAgent(TargetAgent):
 
     name: ClassVar[str] = "greedy-goal"
 
-    def choose(
-        self,
-        candidates: NDArray[np.bool_],
-        observed_free: NDArray[np.bool_],
-        vertex: int,
-        previous: int,
-    ) -> int:
+    def choose(self, candidates: Slots, observed_free: Slots, vertex: int, previous: int) -> int:
         """Return the slot with the lowest arrival cost; among equals the one with the shortest drive."""
         del observed_free, previous
         slots, _ = self.routes.nearest(vertex, self.cheapest(candidates, vertex))
@@ -132,13 +118,7 @@ class GreedyDriveAgent(TargetAgent):
 
     name: ClassVar[str] = "greedy-drive"
 
-    def choose(
-        self,
-        candidates: NDArray[np.bool_],
-        observed_free: NDArray[np.bool_],
-        vertex: int,
-        previous: int,
-    ) -> int:
+    def choose(self, candidates: Slots, observed_free: Slots, vertex: int, previous: int) -> int:
         """Return the slot with the shortest drive; among equals the one with the lowest arrival cost."""
         del observed_free, previous
         slots, _ = self.routes.nearest(vertex, candidates)
@@ -152,7 +132,7 @@ class FirstFreeAgent(TargetAgent):
     so on, and takes any free slot.
 
     Args:
-        problem: lot, goal, speeds and costs.
+        problem: the problem.
         within_m: maximum distance from the goal, m, at which a free slot is good enough; None: the lot's median. A
             slot's price counts as the distance that one walks in as many seconds.
     """
@@ -168,13 +148,7 @@ class FirstFreeAgent(TargetAgent):
             )
         self._near = arrival_m <= (np.median(arrival_m) if within_m is None else within_m)
 
-    def choose(
-        self,
-        candidates: NDArray[np.bool_],
-        observed_free: NDArray[np.bool_],
-        vertex: int,
-        previous: int,
-    ) -> int:
+    def choose(self, candidates: Slots, observed_free: Slots, vertex: int, previous: int) -> int:
         """Return a near enough slot observed free; else first the slot at the goal, then the nearest candidate."""
         good = candidates & observed_free & self._near
         if good.any():
@@ -194,9 +168,7 @@ class FirstFreeAgent(TargetAgent):
 class RandomAgent(SearchAgent[np.random.Generator]):
     """`random`: chooses any available action, all with equal probability.
 
-    Args:
-        problem: lot, goal, speeds and costs.
-        seed: determines the actions together with the time of arrival.
+    The `seed`, the time of arrival and the entry determine the actions.
     """
 
     name: ClassVar[str] = "random"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.world.scenario import Scenario, SearchProblem
+from parkenv.world.scenario import SearchProblem
 from planners.model_file import OBSERVATION, load_model
 
 
@@ -31,11 +31,9 @@ class LearnedAgent:
         local_k: number of slots in the observation.
     """
 
-    def __init__(
-        self, problem: Scenario | SearchProblem, algorithm: str, path: str | os.PathLike[str]
-    ) -> None:
+    def __init__(self, problem: SearchProblem, algorithm: str, path: str | os.PathLike[str]) -> None:
         self.name = f"{algorithm}:{path}"
-        self.problem = problem.public() if isinstance(problem, Scenario) else problem
+        self.problem = problem.public()
         self.card, self.model = load_model(algorithm, path, "search", OBSERVATION)
         self.local_k = self.card.k
 

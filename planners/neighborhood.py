@@ -29,29 +29,18 @@ _KEPT = 4
 
 @dataclass(frozen=True, eq=False)
 class Neighborhood:
-    """A subgraph of a lot with its own vertex numbers, and all shortest drives within it.
+    """A subgraph of a lot with its own vertex numbers, and all shortest drives within it."""
 
-    Attributes:
-        vertices: (k,) int64, numbers of its vertices in the lot, ascending, so slots come first here, too.
-        n_slots: number of slots among them.
-        whole: whether it is the whole lot.
-        entry: the vertex of the lot from which it was expanded and where the car enters it.
-        table: shortest drives.
-        view_starts: (k + 1,) int64, rows of `views`.
-        views: `VIEW` records, slots of the subgraph in view of each vertex.
-        own_rate: (n_slots,) float64, P(each slot is detected from its own vertex).
-        cost_s: (n_slots,) float64, s, arrival cost.
-    """
-
+    # (k,) int64, numbers of its vertices in the lot, ascending, so slots come first here, too
     vertices: IntArray
-    n_slots: int
-    whole: bool
-    entry: int
-    table: RoadTable
-    view_starts: IntArray
-    views: NDArray[Any]
-    own_rate: FloatArray
-    cost_s: FloatArray
+    n_slots: int  # number of slots among them
+    whole: bool  # whether it is the whole lot
+    entry: int  # the vertex of the lot from which it was expanded and where the car enters it
+    table: RoadTable  # shortest drives
+    view_starts: IntArray  # (k + 1,) int64, rows of `views`
+    views: NDArray[Any]  # `VIEW` records, slots of the subgraph in view of each vertex
+    own_rate: FloatArray  # (n_slots,) float64, P(each slot is detected from its own vertex)
+    cost_s: FloatArray  # (n_slots,) float64, s, arrival cost
 
     @classmethod
     def of(cls, problem: SearchProblem, vertices: IntArray, entry: int) -> Neighborhood:
@@ -92,24 +81,13 @@ class Neighborhood:
         return self.views[self.view_starts[vertex] : self.view_starts[vertex + 1]]
 
     def planning_graph(self, problem: SearchProblem, failure_s: float) -> PlanningGraph:
-        """Return the data of a path search.
-
-        Args:
-            problem: the problem on the whole lot.
-            failure_s: s, cost of finding a slot taken on arrival.
-        """
-        return PlanningGraph(
-            self.table.seconds,
-            self.table.following,
-            self.view_starts,
-            self.views,
-            self.own_rate,
-            self.cost_s,
-            problem.wait_s,
-            problem.give_up_s,
-            failure_s,
-            self.whole,
+        """Return the data of a path search, given the whole problem and the cost, s, of finding a slot taken."""
+        drives, views = (
+            (self.table.seconds, self.table.following),
+            (self.view_starts, self.views, self.own_rate),
         )
+        costs = problem.wait_s, problem.give_up_s, failure_s
+        return PlanningGraph(*drives, *views, self.cost_s, *costs, self.whole)
 
 
 class Neighborhoods:

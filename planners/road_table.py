@@ -19,20 +19,14 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class RoadTable:
-    """Shortest drives between all vertices.
+    """Shortest drives between all vertices."""
 
-    Attributes:
-        seconds: (n_vertices, n_vertices) float64, s, from row to column; inf where unreachable.
-        following: (n_vertices, n_vertices) int16, the next vertex on a shortest route from row to column, -1
-            where unreachable and on the diagonal.
-        neighbors: (n_vertices, 4) int32, target of each move, or -1.
-        move_s: (n_vertices, 4) float64, s, duration of each move.
-    """
-
-    seconds: FloatArray
+    seconds: FloatArray  # (n_vertices, n_vertices) float64, s, from row to column; inf where unreachable
+    # (n_vertices, n_vertices) int16, the next vertex on a shortest route from row to column, -1 where unreachable and
+    # on the diagonal
     following: NDArray[np.int16]
-    neighbors: NDArray[np.int32]
-    move_s: FloatArray
+    neighbors: NDArray[np.int32]  # (n_vertices, 4) int32, target of each move, or -1
+    move_s: FloatArray  # (n_vertices, 4) float64, s, duration of each move
 
     @classmethod
     def of(cls, problem: SearchProblem) -> Self:
@@ -74,10 +68,7 @@ class RoadTable:
 
 @compiled
 def _follow(
-    seconds: FloatArray,
-    neighbors: NDArray[np.int32],
-    move_s: FloatArray,
-    following: NDArray[np.int16],
+    seconds: FloatArray, neighbors: NDArray[np.int32], move_s: FloatArray, following: NDArray[np.int16]
 ) -> None:
     n = len(seconds)
     for v in range(n):

@@ -29,10 +29,8 @@ from numba.core.types.misc import unliteral
 from platformdirs import user_cache_path
 
 _PACKAGES = ("sim_sensors", "parkenv", "planners")
-_HOME = Path(__file__).resolve().parents[1]
-"""The folder that contains these packages."""
-_KEPT_DAYS = 30
-"""Age at which compiled code of other versions of a module is deleted."""
+_HOME = Path(__file__).resolve().parents[1]  # the folder that contains these packages
+_KEPT_DAYS = 30  # age at which compiled code of other versions of a module is deleted
 _LOGGER = logging.getLogger("parkenv")
 
 

@@ -31,25 +31,17 @@ class View(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class VehicleBoxes:
-    """The vehicles that would be visible without occlusion, nearest first.
+    """The vehicles that would be visible without occlusion, nearest first."""
 
-    Attributes:
-        ids: (n,) int32, as in the instances.
-        box: (n, 4) int32, px: left, top, right, bottom (right and bottom exclusive) of the whole vehicle within the
-            image, hidden parts included.
-        visible_box: (n, 4) int32, the box of its visible pixels; zeros if there are none.
-        visible_fraction: (n,) float64, visible pixels divided by the pixels that it would have alone, both within the
-            image.
-        view: (n,) int8, a `View` each.
-        distance: (n,) float64, m, from the camera to the vehicle's origin, in the ground plane.
-    """
-
-    ids: IntArray
+    ids: IntArray  # (n,) int32, as in the instances
+    # (n, 4) int32, px: left, top, right, bottom (right and bottom exclusive) of the whole vehicle within the image,
+    # hidden parts included
     box: IntArray
-    visible_box: IntArray
+    visible_box: IntArray  # (n, 4) int32, the box of its visible pixels; zeros if there are none
+    # (n,) float64, visible pixels divided by the pixels that it would have alone, both within the image
     visible_fraction: FloatArray
-    view: NDArray[np.int8]
-    distance: FloatArray
+    view: NDArray[np.int8]  # (n,) int8, a `View` each
+    distance: FloatArray  # (n,) float64, m, from the camera to the vehicle's origin, in the ground plane
 
 
 def vehicle_boxes(camera: PinholeCamera, scene: Drawable, pose: FloatArray, frame: Frame) -> VehicleBoxes:

@@ -33,21 +33,13 @@ class Material(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles of one object in its own frame: x forward, y left, z up from the ground, m.
+    """Triangles of one object in its own frame: x forward, y left, z up from the ground, m."""
 
-    Attributes:
-        vertices: (v, 3) float32, m. Vertices at creases are duplicated, one for each side.
-        normals: (v, 3) float32, unit, outward.
-        triangles: (t, 3) int32, counter-clockwise seen from outside.
-        material: (t,) uint8, a `Material` each.
-        color: (t, 3) uint8, sRGB albedo.
-    """
-
-    vertices: Float32Array
-    normals: Float32Array
-    triangles: NDArray[np.int32]
-    material: NDArray[np.uint8]
-    color: NDArray[np.uint8]
+    vertices: Float32Array  # (v, 3) float32, m. Vertices at creases are duplicated, one for each side.
+    normals: Float32Array  # (v, 3) float32, unit, outward
+    triangles: NDArray[np.int32]  # (t, 3) int32, counter-clockwise seen from outside
+    material: NDArray[np.uint8]  # (t,) uint8, a `Material` each
+    color: NDArray[np.uint8]  # (t, 3) uint8, sRGB albedo
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,32 +68,22 @@ class MeshPool:
 
 @dataclass(frozen=True, eq=False)
 class Instances:
-    """Poses of copies of meshes.
+    """Poses of copies of meshes."""
 
-    Attributes:
-        mesh: (n,) int32, index into the pool.
-        pose: (n, 4) float64, x, y, z in m and yaw in rad, world frame.
-        ids: (n,) int32, value in the camera's instance image: 0 for scenery, above 0 for vehicles.
-        still: the static instances, which come first, if others move; their shadows are cached as long as this object
-            exists. None: nothing moves.
-    """
-
-    mesh: NDArray[np.int32]
-    pose: NDArray[np.float64]
+    mesh: NDArray[np.int32]  # (n,) int32, index into the pool
+    pose: NDArray[np.float64]  # (n, 4) float64, x, y, z in m and yaw in rad, world frame
+    # (n,) int32, value in the camera's instance image: 0 for scenery, above 0 for vehicles
     ids: NDArray[np.int32]
+    # the static instances, which come first, if others move; their shadows are cached as long as this object exists.
+    # None: nothing moves.
     still: Instances | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Ground:
-    """The plane z = 0.
+    """The plane z = 0."""
 
-    Attributes:
-        paved: polygons, (k, 2) float64 m each, of asphalt; grass or gravel elsewhere.
-        markings: (n, 5) float64: x, y of both ends of a painted line and its width, m.
-        seed: seed of the texture: stains, patches, worn paint.
-    """
-
+    # polygons, (k, 2) float64 m each, of asphalt; grass or gravel elsewhere
     paved: tuple[NDArray[np.float64], ...]
-    markings: NDArray[np.float64]
-    seed: int = 0
+    markings: NDArray[np.float64]  # (n, 5) float64: x, y of both ends of a painted line and its width, m
+    seed: int = 0  # seed of the texture: stains, patches, worn paint

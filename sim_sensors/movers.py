@@ -16,29 +16,24 @@ from sim_sensors.surroundings import floats
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-LOOKS = 12
-"""Number of different pedestrians."""
+LOOKS = 12  # number of different pedestrians
 
 
 @dataclass(frozen=True, eq=False)
 class Movers:
     """Moving vehicles and pedestrians at one moment; world frame.
 
-    Args:
-        vehicle_pose: (m, 3): x, y in m, yaw in rad.
-        vehicle_model: (m,) int, index into the scene's `fleet.models`.
-        walker_pose: (p, 3): x, y in m, yaw in rad.
-        walker_stride: (p,) turns, phase of the stride.
-        walker_look: (p,) int, 0 to `LOOKS` - 1: appearance.
-
     Raises:
         SensorError: a shape is wrong, a value is not finite, or an index is out of range.
     """
 
+    # (m, 3): x, y in m, yaw in rad
     vehicle_pose: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
+    # (m,) int, index into the scene's `fleet.models`
     vehicle_model: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    walker_pose: FloatArray = field(default_factory=lambda: np.empty((0, 3)))
-    walker_stride: FloatArray = field(default_factory=lambda: np.empty(0))
+    walker_pose: FloatArray = field(default_factory=lambda: np.empty((0, 3)))  # (p, 3): x, y in m, yaw in rad
+    walker_stride: FloatArray = field(default_factory=lambda: np.empty(0))  # (p,) turns, phase of the stride
+    # (p,) int, 0 to `LOOKS` - 1: appearance
     walker_look: IntArray = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def __post_init__(self) -> None:

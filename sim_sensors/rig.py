@@ -19,8 +19,7 @@ from sim_sensors.laser.scanner import LaserScanner
 FloatArray = NDArray[np.float64]
 
 RIGHT, LEFT = -math.pi / 2, math.pi / 2
-EYE_M = 1.3
-"""m, height of the rigs' cameras."""
+EYE_M = 1.3  # m, height of the rigs' cameras
 WIDE = PinholeCamera.from_field_of_view(horizontal=math.pi / 2)
 """The rigs' camera: wide enough to see parked cars completely from 1.5 m in front of them."""
 
@@ -33,8 +32,7 @@ class Sensed(Drawable, Protocol):
         """Footprints and walls at knee height."""
 
 
-RIG_NAMES = ("laser", "stereo", "both_sides")
-"""Names of rigs for `SensorRig.named`."""
+RIG_NAMES = ("laser", "stereo", "both_sides")  # names of rigs for `SensorRig.named`
 
 
 @dataclass(frozen=True)
@@ -150,10 +148,7 @@ class SensorRig:
     def both_sides(cls) -> SensorRig:
         """Return the thesis's rig with a second camera, to the left."""
         return cls(
-            cameras=(
-                ("right", WIDE, Mount(z=EYE_M, yaw=RIGHT)),
-                ("left", WIDE, Mount(z=EYE_M, yaw=LEFT)),
-            ),
+            cameras=(("right", WIDE, Mount(z=EYE_M, yaw=RIGHT)), ("left", WIDE, Mount(z=EYE_M, yaw=LEFT))),
             lasers=(("laser", LaserScanner(), Mount(z=0.5)),),
         )
 
@@ -193,12 +188,7 @@ class SensorRig:
         return Capture(vehicle, images, pairs, scans)
 
     def drive(
-        self,
-        scene: Sensed,
-        path: ArrayLike,
-        every: float,
-        weather: Weather | None = None,
-        seed: int = 0,
+        self, scene: Sensed, path: ArrayLike, every: float, weather: Weather | None = None, seed: int = 0
     ) -> Iterator[Capture]:
         """Yield captures along a path (see `poses_along`); the k-th one uses the seed `seed + k`."""
         for k, pose in enumerate(poses_along(path, every)):

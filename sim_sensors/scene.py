@@ -31,21 +31,15 @@ class OverlapWarning(UserWarning):
 
 
 class Footprints(NamedTuple):
-    """The obstacles in a horizontal plane 0.5 m above the ground, for `footprints.ScanPlane`.
+    """The obstacles in a horizontal plane 0.5 m above the ground, for `footprints.ScanPlane`."""
 
-    Attributes:
-        corners: (n, k, 2) float64, m, world frame, counter-clockwise: a row for every vehicle place, then the posts,
-            trunks and people of the surroundings, then moving objects.
-        n_corners: (n,) int64, number of corners used; 0 for an empty place.
-        ids: (n,) int64, as in `Instances.ids`: place + 1 for a vehicle, larger for a moving vehicle, 0 for everything
-            else.
-        walls: (m, 2, 2) float64, m, world frame: ends of line segments.
-    """
-
+    # (n, k, 2) float64, m, world frame, counter-clockwise: a row for every vehicle place, then the posts, trunks and
+    # people of the surroundings, then moving objects
     corners: FloatArray
-    n_corners: IntArray
+    n_corners: IntArray  # (n,) int64, number of corners used; 0 for an empty place
+    # (n,) int64, as in `Instances.ids`: place + 1 for a vehicle, larger for a moving vehicle, 0 for everything else
     ids: IntArray
-    walls: FloatArray
+    walls: FloatArray  # (m, 2, 2) float64, m, world frame: ends of line segments
 
 
 class Fleet:

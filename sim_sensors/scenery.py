@@ -15,12 +15,9 @@ from sim_sensors.mesh import Material, Mesh
 
 FloatArray = NDArray[np.float64]
 
-TRUNK_M = 0.16
-"""Radius of a tree's trunk at knee height, for a tree of 7 m."""
-LAMP_POST_M = 0.08
-"""Radius of a lamp post at knee height."""
-KERB_M = (0.14, 0.12)
-"""Width and height of a kerb."""
+TRUNK_M = 0.16  # radius of a tree's trunk at knee height, for a tree of 7 m
+LAMP_POST_M = 0.08  # radius of a lamp post at knee height
+KERB_M = (0.14, 0.12)  # width and height of a kerb
 
 _STOREY = 3.0
 _BAY = 2.7
@@ -306,8 +303,7 @@ def lamp_post_mesh(height: float = 5.5) -> Mesh:
     return _made(build, {_Part.POST: (96, 100, 102), _Part.LANTERN: (232, 230, 220)})
 
 
-GAITS = 8
-"""Number of phases of a stride for which meshes are shared."""
+GAITS = 8  # number of phases of a stride for which meshes are shared
 
 
 def pedestrian_mesh(phase: float, seed: int) -> Mesh:

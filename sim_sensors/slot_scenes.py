@@ -17,13 +17,10 @@ from sim_sensors.vehicles.vehicle import VehicleModel
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-LINE_M = 0.10
-"""Width of painted slot lines."""
-LIBRARY_MODELS = 100
-"""Number of vehicle models from which cars are drawn."""
+LINE_M = 0.10  # width of painted slot lines
+LIBRARY_MODELS = 100  # number of vehicle models from which cars are drawn
 PAVED_MARGIN_M = 7.0
-KERB_ROOM_M = 0.1
-"""m by which a kerbside slot must be wider than its car."""
+KERB_ROOM_M = 0.1  # m by which a kerbside slot must be wider than its car
 NOSE_GAP_M = 0.05
 """m; least distance between a car and the closed end of its slot, where another row may begin."""
 
@@ -35,21 +32,15 @@ class ParkingManners:
     The offsets of a car are normally distributed with these standard deviations. They are clipped at three standard
     deviations and such that the car's rectangle stays within its slot; a car that is too long extends out of the open
     end. A model is used only in slots that it fits.
-
-    Args:
-        lateral_m: standard deviation across the slot, m.
-        along_m: standard deviation along the slot, m.
-        yaw_rad: standard deviation of the heading, rad.
-        nose_out: fraction of cars that parked in reverse, opposite to the slot's yaw; none in kerbside slots.
-        door_room_m: m by which a slot must be wider than its car, except kerbside slots.
-        overhang_m: m by which a car may be longer than its slot; in a kerbside slot it must be shorter by this.
     """
 
-    lateral_m: float = 0.12
-    along_m: float = 0.20
-    yaw_rad: float = float(np.radians(1.5))
+    lateral_m: float = 0.12  # standard deviation across the slot, m
+    along_m: float = 0.20  # standard deviation along the slot, m
+    yaw_rad: float = float(np.radians(1.5))  # standard deviation of the heading, rad
+    # fraction of cars that parked in reverse, opposite to the slot's yaw; none in kerbside slots
     nose_out: float = 0.25
-    door_room_m: float = 0.40
+    door_room_m: float = 0.40  # m by which a slot must be wider than its car, except kerbside slots
+    # m by which a car may be longer than its slot; in a kerbside slot it must be shorter by this
     overhang_m: float = 0.20
 
     def __post_init__(self) -> None:

@@ -10,21 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sim_sensors import scenery
 from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Ground, Mesh
-from sim_sensors.scenery import (
-    GAITS,
-    LAMP_POST_M,
-    TRUNK_M,
-    building_mesh,
-    kerb_mesh,
-    lamp_post_mesh,
-    pedestrian_footprint,
-    pedestrian_mesh,
-    round_footprint,
-    tree_mesh,
-    wall_mesh,
-)
 
 FloatArray = NDArray[np.float64]
 
@@ -150,33 +138,33 @@ class Surroundings:
             zip(self._outlines, self._table("building_heights"), strict=True)
         ):
             center = outline.mean(axis=0)
-            mesh = building_mesh(outline - center, float(height), self.seed + i)
+            mesh = scenery.building_mesh(outline - center, float(height), self.seed + i)
             things.append(Standing(mesh, (center[0], center[1], 0.0)))
         for i, (x0, y0, x1, y1, height) in enumerate(self._table("walls").tolist()):
             # Walls overlap at corners; with equal heights their tops would flicker.
-            mesh = wall_mesh(
+            mesh = scenery.wall_mesh(
                 [0, 0], [x1 - x0, y1 - y0], height + 0.002 * (i % 4), WALL_THICKNESS_M, self.seed
             )
             things.append(Standing(mesh, (x0, y0, 0.0)))
         for line in self.kerbs:
             start = np.asarray(line)[0]
-            things.append(Standing(kerb_mesh(np.asarray(line) - start), (start[0], start[1], 0.0)))
+            things.append(Standing(scenery.kerb_mesh(np.asarray(line) - start), (start[0], start[1], 0.0)))
         trees = self._table("trees")
         kinds: dict[tuple[float, int], Mesh] = {}
         for i, (x, y, height) in enumerate(trees.tolist()):
             key = (round(height * 2) / 2, i % TREE_KINDS)
             if key not in kinds:
-                kinds[key] = tree_mesh(key[0], self.seed * TREE_KINDS + key[1])
-            trunk = round_footprint(TRUNK_M * key[0] / 7.0)
+                kinds[key] = scenery.tree_mesh(key[0], self.seed * TREE_KINDS + key[1])
+            trunk = scenery.round_footprint(scenery.TRUNK_M * key[0] / 7.0)
             things.append(Standing(kinds[key], (x, y, 2.4 * i), trunk))
-        post = lamp_post_mesh() if len(self._table("lamp_posts")) else None
+        post = scenery.lamp_post_mesh() if len(self._table("lamp_posts")) else None
         for x, y, yaw in self._table("lamp_posts").tolist():
             assert post is not None
-            things.append(Standing(post, (x, y, yaw), round_footprint(LAMP_POST_M)))
+            things.append(Standing(post, (x, y, yaw), scenery.round_footprint(scenery.LAMP_POST_M)))
         for i, (x, y, yaw, phase) in enumerate(self._table("pedestrians").tolist()):
-            gait = round(phase * GAITS) % GAITS / GAITS
-            person = pedestrian_mesh(gait, self.seed * 4096 + i)
-            things.append(Standing(person, (x, y, yaw), pedestrian_footprint(gait)))
+            gait = round(phase * scenery.GAITS) % scenery.GAITS / scenery.GAITS
+            person = scenery.pedestrian_mesh(gait, self.seed * 4096 + i)
+            things.append(Standing(person, (x, y, yaw), scenery.pedestrian_footprint(gait)))
         return tuple(things)
 
     @cached_property

@@ -6,8 +6,8 @@ import numpy as np
 
 from parkenv.world.keyed_random import (
     ENTRY_STREAM,
+    OBSERVATION_STREAM,
     OCCUPANCY_STREAM,
-    SIGHTING_STREAM,
     VIEW_STREAM,
     keyed_uniform,
     world_key,
@@ -138,7 +138,7 @@ class ReferenceSearch:
             if not self.scenario.sensor_model.perfect:
                 if keyed_uniform(self.key, VIEW_STREAM, slot, 0) >= rates.seen[row]:
                     continue
-                error = keyed_uniform(self.key, SIGHTING_STREAM, slot, int(self.time * 1000.0))
+                error = keyed_uniform(self.key, OBSERVATION_STREAM, slot, int(self.time * 1000.0))
                 taken = error < (hit if self.taken(slot) else false_alarm)
             else:
                 taken = self.taken(slot)

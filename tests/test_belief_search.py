@@ -81,7 +81,7 @@ def choices(scenario, monkeypatch, seed=1, **options):
 
     def noted(*arguments):
         choice = best_path(*arguments)
-        made.append((arguments[4], choice))
+        made.append((arguments[3], choice))
         return choice
 
     monkeypatch.setattr("planners.belief.agent.best_path", noted)
@@ -312,11 +312,13 @@ def test_a_path_is_kept_to_until_something_is_seen_unless_another_is_better_than
     """Paths are valued by estimates, which differ by where the car is: it could turn round between two for ever."""
     scenario = at_occupancy(make_scenario("campus"), 0.95)
     made = choices(scenario, monkeypatch, seed=442, budget_ms=10.0)
-    kept = [(promise_s, choice.onward_s) for promise_s, choice in made if promise_s < np.inf]
+    kept = [(remaining_s, choice.onward_s) for remaining_s, choice in made if remaining_s < np.inf]
     assert len(kept) > 10
-    assert all(onward_s <= promise_s for promise_s, onward_s in kept)
-    last = [choice.then_s for _, choice in made]
-    assert all(promise_s in (then_s, np.inf) for (promise_s, _), then_s in zip(made[1:], last, strict=False))
+    assert all(onward_s <= remaining_s for remaining_s, onward_s in kept)
+    last = [choice.remaining_s for _, choice in made]
+    assert all(
+        remaining_s in (last_s, np.inf) for (remaining_s, _), last_s in zip(made[1:], last, strict=False)
+    )
 
 
 def test_views_show_what_worse_ones_missed():

@@ -37,8 +37,8 @@ from parkenv.evaluation.training.drive_replay_buffer import TerminalGoalReplayBu
 from parkenv.evaluation.training.drive_training import DriveTraining, evaluate_parking, parked_on
 from parkenv.evaluation.training.drive_training_env import (
     MASTERED,
-    STOOD,
-    TRIED,
+    RECENT_DRIVES,
+    STANDSTILL_DECISIONS,
     DriveTrainingEnv,
     planned_path,
     slot_groups,
@@ -203,7 +203,7 @@ def test_a_decision_asks_for_a_speed_and_gets_it(asked, reached):
     task = DriveEnv(lot=MINI).tasks.draw(0)
     batch = DriveBatch(1)
     batch.start(0, PreparedTask(task))
-    batch._obstacles[0] = 0  # nothing in the way
+    batch._drives.n_obstacles[0] = 0  # nothing in the way
     batch.state[0, SPEED] = 0.7
     for _ in range(6):
         batch.drive(np.array([[asked, 0.0]], np.float32))
@@ -247,14 +247,14 @@ def test_equal_seeds_give_equal_episodes_and_report_their_ends():
 
 def test_a_level_is_mastered_by_parking_and_by_nothing_else():
     env = training_env("ppo")
-    for _ in range(TRIED):
+    for _ in range(RECENT_DRIVES):
         env._record_outcome("parallel", 0, True)
         env._record_outcome("perpendicular", 5, True)  # of another level
     assert env.levels == {"perpendicular": 0, "parallel": 1}
-    for k in range(3 * TRIED):
+    for k in range(3 * RECENT_DRIVES):
         env._record_outcome("parallel", 1, k % 100 < 100 * MASTERED - 1)
     assert env.levels["parallel"] == 1
-    for _ in range(TRIED * 20):
+    for _ in range(RECENT_DRIVES * 20):
         env._record_outcome("parallel", env.levels["parallel"], True)
     assert env.levels["parallel"] == len(DRIVE_CONFIGS["ppo"].curriculum) - 1
 
@@ -310,16 +310,16 @@ def test_who_stands_for_too_long_is_cut_off():
     env.seed(0)
     env.reset()
     stand, creep = np.zeros((8, 2), np.float32), np.tile(np.float32([0.4, 0.0]), (8, 1))
-    for _ in range(STOOD - 1):
+    for _ in range(STANDSTILL_DECISIONS - 1):
         assert not env.step(stand)[2].any()
     _, _, done, infos = env.step(stand)
     assert done.all()
     assert all(info["TimeLimit.truncated"] and not info["is_success"] for info in infos)
-    for _ in range(STOOD - 1):
+    for _ in range(STANDSTILL_DECISIONS - 1):
         env.step(stand)
     _, _, done, infos = env.step(creep)
     assert not any(info.get("TimeLimit.truncated", False) for info in infos)
-    for _ in range(STOOD - 2):
+    for _ in range(STANDSTILL_DECISIONS - 2):
         assert not any(info.get("TimeLimit.truncated", False) for info in env.step(stand)[3])
 
 

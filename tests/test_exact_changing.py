@@ -8,8 +8,27 @@ from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.lots import grid_lot
 from planners import make_agent
+from planners.agent import SearchAgent
 from planners.bounds.exact import ExactSolution
-from planners.bounds.exact_changing import ChangingAgent, ChangingSolution
+from planners.bounds.exact_changing import WAIT, ChangingSolution
+
+
+class ChangingAgent(SearchAgent[None]):
+    """Follows a `ChangingSolution`, assuming that its forecast and rates are right."""
+
+    name = "exact-changing"
+
+    def __init__(self, solution):
+        super().__init__(solution.problem)
+        self.solution = solution
+
+    def begin(self, observation, belief):
+        """Return no memory: the belief is the state."""
+
+    def decide(self, observation, belief, memory):
+        vertex = int(observation["vertex"])
+        action = self.solution.decide(vertex, self.solution.code(belief))
+        return self.wait(vertex) if action == WAIT else action
 
 
 def busy(n_slots=3, stay_s=20.0, taken=(0.7, 0.85, 0.8), give_up_s=600.0):

@@ -7,7 +7,7 @@ from scipy.optimize import check_grad
 from parkenv.errors import InputError
 from parkenv.world.keyed_random import world_key
 from parkenv.world.occupancy import Arrival, OccupancyProcess
-from parkenv.world.occupancy_fit import fit_constant_rates, fit_process, log_likelihood
+from parkenv.world.occupancy_fit import Intervals, fit_constant_rates, fit_process, log_likelihood
 from parkenv.world.occupancy_log import OccupancyLog
 from parkenv.world.week import DAY_S, HOUR_S
 
@@ -93,19 +93,20 @@ def random_intervals(k, n):
     end = start + rng.uniform(60, 3.5 * HOUR_S, k)
     theta = np.concatenate([rng.normal(-8.5, 1, 96), rng.normal(0, 1, 2 * n)])
     states = rng.random((2, k)) < 0.5
-    return theta, (rng.integers(0, n, k), 24 * rng.integers(0, 2, k), start, end, *states)
+    return theta, Intervals(rng.integers(0, n, k), 24 * rng.integers(0, 2, k), start, end, *states)
 
 
 def test_the_gradient_agrees_with_finite_differences():
     theta, data = random_intervals(200, 4)
-    _, gradient = log_likelihood(theta, *data)
-    error = check_grad(lambda t: log_likelihood(t, *data)[0], lambda t: log_likelihood(t, *data)[1], theta)
+    _, gradient = log_likelihood(theta, data)
+    error = check_grad(lambda t: log_likelihood(t, data)[0], lambda t: log_likelihood(t, data)[1], theta)
     assert error < 1e-5 * np.linalg.norm(gradient)
 
 
 def test_intervals_are_split_exactly_at_full_hours():
     # The forward equation, integrated in small steps, gives the same likelihood.
-    theta, (slot, first_bin, start, end, before, after) = random_intervals(5, 2)
+    theta, intervals = random_intervals(5, 2)
+    slot, first_bin, start, end, before, after = intervals
     rates, value = np.exp(theta), 0.0
     for k in range(5):
         p, steps = float(before[k]), 200_000
@@ -116,9 +117,7 @@ def test_intervals_are_split_exactly_at_full_hours():
         for a, d in zip(arrival, departure, strict=True):
             p += (a * (1 - p) - d * p) * dt
         value += np.log(p if after[k] else 1 - p)
-    assert log_likelihood(theta, slot, first_bin, start, end, before, after)[0] == pytest.approx(
-        value, abs=1e-3
-    )
+    assert log_likelihood(theta, intervals)[0] == pytest.approx(value, abs=1e-3)
 
 
 @pytest.fixture(scope="module")

@@ -24,7 +24,7 @@ from parkenv.evaluation.experiments.workers import Workers
 from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
 from parkenv.lots import packaged_lot, read_lot, write_lot
 from planners.driving.car_path import CarPath
-from planners.driving.clearance import clearance, room_at, stands_free
+from planners.driving.clearance import clearance, is_collision_free, room_at
 from planners.driving.hybrid_astar import SearchSettings, plan_path
 from planners.driving.parking import ParkingAgent
 from planners.driving.path_tracking import PathTracker, TrackingSettings
@@ -66,9 +66,9 @@ def test_the_planners_check_and_pymunk_agree_on_what_is_touched(seed, k):
     for _ in range(20):
         x, y, yaw = (float(v) for v in rng.uniform([-8.0, -8.0, -math.pi], [8.0, 8.0, math.pi]))
         touched = bool(space.touched(x, y, yaw))
-        if stands_free(ours, x, y, yaw, 1e-3):
+        if is_collision_free(ours, x, y, yaw, 1e-3):
             assert not touched
-        elif not stands_free(ours, x, y, yaw, -1e-3):
+        elif not is_collision_free(ours, x, y, yaw, -1e-3):
             assert touched
 
 
@@ -79,7 +79,7 @@ def test_room_is_the_distance_to_what_is_nearest():
     assert room_at(space, 5.0 - ahead - 0.3, 0.0, 0.0, 1.0) == pytest.approx(0.3, abs=1e-3)
     assert room_at(space, 5.0 - 0.5 * CAR.width - 0.2, 0.0, math.pi / 2, 1.0) == pytest.approx(0.2, abs=1e-3)
     assert room_at(space, 4.0, 0.0, 0.0, 1.0) < 0.0
-    assert not stands_free(space, 19.9, 0.0, 0.0, 0.0), "outside the window nothing is known"
+    assert not is_collision_free(space, 19.9, 0.0, 0.0, 0.0), "outside the window nothing is known"
 
 
 @given(seed=st.integers(0, 10**6), lot=st.sampled_from(LOTS))

@@ -11,12 +11,12 @@ from parkenv.driving.vehicle import move_along
 from planners.driving.reeds_shepp import (
     LEFT,
     MOST_WORDS,
-    PIECES,
     RIGHT,
     STRAIGHT,
     reeds_shepp,
     word_cost,
     words_between,
+    words_buffer,
 )
 
 poses = st.tuples(st.floats(-6.0, 6.0), st.floats(-6.0, 6.0), st.floats(-math.pi, math.pi)).map(np.array)
@@ -41,12 +41,12 @@ def same_pose(a, b, tolerance):
 @given(goal=poses)
 @settings(max_examples=300)
 def test_every_word_leads_to_the_goal(goal):
-    pieces, turns = np.zeros((MOST_WORDS, PIECES)), np.zeros((MOST_WORDS, PIECES), dtype=np.int64)
-    counts = np.zeros(MOST_WORDS, dtype=np.int64)
-    n = words_between(*goal, pieces, turns, counts)
+    words = words_buffer()
+    n = words_between(*goal, words)
     assert 1 <= n <= MOST_WORDS
     for k in range(n):
-        same_pose(end_of(pieces[k, : counts[k]], turns[k, : counts[k]]), goal, 1e-6)
+        used = slice(words.count[k])
+        same_pose(end_of(words.piece[k, used], words.turn[k, used]), goal, 1e-6)
 
 
 @pytest.mark.parametrize(

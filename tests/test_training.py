@@ -37,6 +37,7 @@ from parkenv.evaluation.training.cloning import Demonstrations, clone
 from parkenv.evaluation.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
 from parkenv.evaluation.training.rl_training import TRAINING_SEEDS, read_curve, train_one
 from parkenv.evaluation.training.search_training import SearchTraining, episode_times, search_times
+from parkenv.evaluation.trips.driven_search import DrivenSearch
 from parkenv.scenarios.spec import scenario_spec
 from planners.agent import make_agent
 from planners.learned import LearnedAgent
@@ -170,6 +171,8 @@ def test_a_resumed_training_equals_an_unbroken_one(algorithm, tmp_path, monkeypa
     files = [tmp_path / name / "model.safetensors" for name in ("resumed", "whole")]
     assert files[0].read_bytes() == files[1].read_bytes()
     assert {path.name for path in (tmp_path / "resumed").iterdir()} == {"curve.csv", "model.safetensors"}
+    row = search_times(LearnedAgent(SCENARIO, algorithm, files[0]), SCENARIO, EVALUATED[:4])
+    assert row["total_s"] == min(row["total_s"] for row in whole)
     assert training.train(0, tmp_path / "resumed") == resumed, "a finished training is not repeated"
 
 
@@ -224,6 +227,17 @@ def test_a_model_runs_on_lots_that_it_was_not_trained_on(trained):
     campus = make_scenario("campus")
     row = search_times(LearnedAgent(campus, "maskable-ppo", trained / "model.safetensors"), campus, range(4))
     assert row["episodes"] == 4
+
+
+def test_a_model_decides_on_driven_trips(trained):
+    """On the lanes of the same world, it drives as in the search environment, as long as no attempt fails."""
+    name = f"maskable-ppo:{trained / 'model.safetensors'}"
+    search = DrivenSearch(SCENARIO, name)
+    planned = {row["seed"]: row for row in Case(SCENARIO, name).run(range(6))[0]}
+    trips = [search.run(seed) for seed in planned]
+    assert all(trip.parked for trip in trips)
+    same = [trip.slot == planned[trip.seed]["slot"] for trip in trips]
+    assert sum(same) >= 4
 
 
 class Payload:
@@ -389,18 +403,6 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
     assert (tmp_path / "curve.png").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize("algorithm", sorted(SEARCH_CONFIGS))
-def test_every_algorithm_trains_a_model_that_searches(algorithm, tmp_path, monkeypatch):
-    small_config(algorithm, monkeypatch)
-    train_one(SearchTraining(algorithm, 1_000, 1_000, (SCENARIO,), EVALUATED[:4]), 0, tmp_path)
-    curve = read_curve(tmp_path / "curve.csv")
-    assert curve[-1]["steps"] >= 1_000
-    row = search_times(
-        LearnedAgent(SCENARIO, algorithm, tmp_path / "model.safetensors"), SCENARIO, EVALUATED[:4]
-    )
-    assert row["episodes"] == 4
-
-
 # One on-policy algorithm, and one with a replay buffer.
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["maskable-ppo", "dqn"])
@@ -540,7 +542,7 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
         (["sarsa"], "ALGORITHM is 'sarsa', want one of"),
         (["sac"], "ALGORITHM is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn for search"),
         (["dqn", "--env", "drive"], "ALGORITHM is 'dqn', want one of ppo, sac, tqc for drive"),
-        (["ppo", "--env", "fly"], "env is 'fly', want 'search' or 'drive'"),
+        (["ppo", "--env", "fly"], "--env: 'fly' is not one of"),
         (["ppo", "--env", "drive", "--clone", "mdp"], "clone goes with env search"),
         (
             ["sac", "--env", "drive", "--lot", "nowhere"],

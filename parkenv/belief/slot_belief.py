@@ -18,8 +18,7 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 
-UNOBSERVED, OBSERVED_FREE, OBSERVED_TAKEN = 0, 1, 2
-"""Result of a slot's last observation."""
+UNOBSERVED, OBSERVED_FREE, OBSERVED_TAKEN = 0, 1, 2  # result of a slot's last observation
 
 
 @dataclass(eq=False)
@@ -151,7 +150,7 @@ class SlotBelief:
     def update(
         self,
         slots: ArrayLike,
-        looks_taken: ArrayLike,
+        observed_taken: ArrayLike,
         hit_rate: ArrayLike = 1.0,
         false_alarm_rate: ArrayLike = 0.0,
     ) -> Self:
@@ -159,7 +158,7 @@ class SlotBelief:
 
         Args:
             slots: (k,) int, without repeats.
-            looks_taken: (k,) bool, observed states.
+            observed_taken: (k,) bool, observed states.
             hit_rate: (k,) or scalar, P(observed taken | taken).
             false_alarm_rate: (k,) or scalar, P(observed taken | free).
         """
@@ -167,7 +166,7 @@ class SlotBelief:
         reports, hits, false_alarms = (
             np.broadcast_to(np.asarray(values, dtype=kind), observed.shape)
             for values, kind in (
-                (looks_taken, np.bool_),
+                (observed_taken, np.bool_),
                 (hit_rate, np.float64),
                 (false_alarm_rate, np.float64),
             )
@@ -191,21 +190,21 @@ def decay_to_prior(prior: float, rate: float, p_observed: float, elapsed: float)
 
 
 @compiled(error_model="numpy", forceinline=True)
-def bayes_update(p: float, looks_taken: bool, hit_rate: float, false_alarm_rate: float) -> float:
+def bayes_update(p: float, observed_taken: bool, hit_rate: float, false_alarm_rate: float) -> float:
     """P(taken) of a slot after one observation (Bayes' rule).
 
     Args:
         p: P(taken) before the observation.
-        looks_taken: observed state.
+        observed_taken: observed state.
         hit_rate: P(observed taken | taken).
         false_alarm_rate: P(observed taken | free).
     """
-    if_taken = hit_rate if looks_taken else 1.0 - hit_rate
-    if_free = false_alarm_rate if looks_taken else 1.0 - false_alarm_rate
+    if_taken = hit_rate if observed_taken else 1.0 - hit_rate
+    if_free = false_alarm_rate if observed_taken else 1.0 - false_alarm_rate
     evidence = if_taken * p + if_free * (1.0 - p)
     # The observation has probability 0 under the belief: trust the sensor as if it were error-free.
     if evidence <= 0.0:
-        return 1.0 if looks_taken else 0.0
+        return 1.0 if observed_taken else 0.0
     return if_taken * p / evidence
 
 
@@ -227,13 +226,13 @@ def _states(parts: NDArray[np.floating]) -> NDArray[np.int8]:
 def _update_slots(
     p_occupied: FloatArray,
     slots: NDArray[np.int64],
-    looks_taken: BoolArray,
+    observed_taken: BoolArray,
     hit_rate: FloatArray,
     false_alarm_rate: FloatArray,
 ) -> None:
     for i in range(len(slots)):
         s = slots[i]
-        p_occupied[s] = bayes_update(p_occupied[s], looks_taken[i], hit_rate[i], false_alarm_rate[i])
+        p_occupied[s] = bayes_update(p_occupied[s], observed_taken[i], hit_rate[i], false_alarm_rate[i])
 
 
 @compiled

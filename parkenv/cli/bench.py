@@ -39,7 +39,7 @@ def bench(
 
     Options:
         parts (PART): Some of sensors, perception, planning, env, drive.  [default: all]
-        seconds (X >= 0.01): How long each figure is measured.
+        seconds (0.01 <= X <= 3600): How long each figure is measured.
         seed (N >= 0): Of the lots and the noise.
         out, -o (DIR): Folder for summary.json.  [default: none]
     """

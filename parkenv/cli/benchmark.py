@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from typer import Exit
-
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.command import add, group
 from parkenv.cli.report import make_report
+from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import command_line, make_console, make_table, progress_bar
 from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
@@ -55,7 +54,9 @@ def run(
     if agents is None:
         require_trust(base, out, trust)
     given = {} if agents is None else {"agents": readable_models(split_agents(agents), trust_model)}
-    run_suite(base.changed(suite=suite, **given, **machines.given), out, folder)
+    spec = base.changed(suite=suite, **given, **machines.given)
+    with writing_into(out, f"--resume --out {out}"):
+        run_suite(spec, out, folder)
 
 
 def run_suite(spec: BenchmarkSpec, out: Path, folder: args.RunFolder) -> None:
@@ -92,8 +93,7 @@ def run_suite(spec: BenchmarkSpec, out: Path, folder: args.RunFolder) -> None:
     command = command_line()
     if not complete:
         results.finish(order, {"command": command, "complete": False}, complete=False)
-        console.print(f"Interrupted. What was finished is in {out}; --resume --out {out} goes on.")
-        raise Exit(130)
+        raise KeyboardInterrupt
     result = result_of(suite, cases, results, command)
     summary = {"command": command, "version": __version__, "complete": True, "rows": result["rows"]}
     results.finish(order, summary)
@@ -146,7 +146,7 @@ def show(suite: str = "v1", /) -> None:
         made = task.made(its.arrival)
         level = "as it comes" if task.occupancy_level is None else f"{task.occupancy_level:.0%}"
         walk = f"{made.v_walk * 3.6:g} km/h"
-        cells.append((task.name, task.scenario, str(made.lot.n_slots), level, task.sight, walk))
+        cells.append((task.name, task.scenario, str(made.lot.n_slots), level, task.sensor_model, walk))
     headings = ["task", "scenario", "slots", "mean occupancy", "sensor model", "walking"]
     console.print(make_table(None, headings, cells))
     console.print(

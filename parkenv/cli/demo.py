@@ -10,6 +10,7 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.compare import result_tables
 from parkenv.cli.report import make_report
+from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import command_line, make_console, print_recorded
 
 if TYPE_CHECKING:
@@ -61,7 +62,8 @@ def demo(
         scenario=args.World().spec(scenario), sessions=sessions, episodes=episodes, every=every, detector=detector,
         seed=seed, **machines.given,
     )  # fmt: skip
-    run_demo(spec, out, folder, rerun)
+    with writing_into(out, "the same command"):
+        run_demo(spec, out, folder, rerun)
 
 
 def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | None = None) -> None:
@@ -74,7 +76,7 @@ def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | No
 
     from parkenv.evaluation.experiments.compare import run_cases, table
     from parkenv.evaluation.experiments.demo import AGENTS, demo_cases, demo_survey
-    from parkenv.evaluation.experiments.results import ResultFolder, make_folder
+    from parkenv.evaluation.experiments.results import ResultFolder
     from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.experiments.surveys import mean_occupancy, run_survey, summarize
     from parkenv.evaluation.experiments.warm_up import warm_up_tasks
@@ -89,7 +91,6 @@ def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | No
     if rerun is not None:
         require_viewer()
     its, settings = demo_survey(spec)
-    make_folder(out)
     console = make_console()
     map_file = out / "map.sqlite"
     resume = folder.resume or (_goes_on(out) and not folder.overwrite)

@@ -9,6 +9,7 @@ from parkenv.cli import arguments as args
 from parkenv.cli.benchmark import run_suite
 from parkenv.cli.compare import run_comparison
 from parkenv.cli.demo import run_demo
+from parkenv.cli.single_writer import writing_into
 from parkenv.cli.survey import run_survey_of
 from parkenv.cli.train import run_training
 from parkenv.cli.trust import require_trust
@@ -61,4 +62,6 @@ def run(
         raise InputError(f"{file}: kind is {name!r}; {nearest(str(name), KINDS)}")
     spec = specs.SPECS[name].parse(tables, str(file), file.parent)
     require_trust(spec, experiment, trust)
-    KINDS[name](spec.changed(**machines.given), out or Path("results") / file.stem, folder)
+    out = out or Path("results") / file.stem
+    with writing_into(out, f"parkenv run {out} --resume"):
+        KINDS[name](spec.changed(**machines.given), out, folder)

@@ -41,19 +41,15 @@ _EGO = 100
 class Obstacles:
     """Static obstacles around a car; world frame.
 
-    Args:
-        corners: (n, k_max, 2) float64, m: convex outlines; a line has two corners. Outlines with fewer corners are
-            padded with their last corner.
-        n_corners: (n,) int64, 2 to k_max.
-        kind: (n,) int64, an `ObstacleKind` each.
-
     Raises:
         InputError: shapes that do not fit together, or a value that is not finite.
     """
 
+    # (n, k_max, 2) float64, m: convex outlines; a line has two corners. Outlines with fewer corners are padded with
+    # their last corner.
     corners: FloatArray
-    n_corners: IntArray
-    kind: IntArray
+    n_corners: IntArray  # (n,) int64, 2 to k_max
+    kind: IntArray  # (n,) int64, an `ObstacleKind` each
 
     def __post_init__(self) -> None:
         corners = np.array(self.corners, dtype=np.float64)

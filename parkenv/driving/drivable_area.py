@@ -13,14 +13,11 @@ from parkenv.world.lot import ParkingLot, mouth_heading
 
 FloatArray = NDArray[np.float64]
 
-ROAD_HALF_WIDTH = 3.0
-"""From the centre line of a lane without slots to its kerbs, m."""
+ROAD_HALF_WIDTH = 3.0  # from the centre line of a lane without slots to its kerbs, m
 HALF_WIDTHS = (2.0, 4.0)
 """Limits, m, of half the width of a lane with slots, which extends to the slots' mouths."""
-JOINT = 0.6
-"""Gaps between slots of up to twice this width, m, are paved."""
-STRAIGHTENED = 0.03
-"""Tolerance, m, for simplifying kerbs."""
+JOINT = 0.6  # gaps between slots of up to twice this width, m, are paved
+STRAIGHTENED = 0.03  # tolerance, m, for simplifying kerbs
 
 
 _JOINED_WHOLE = 2000  # slots up to which the whole paved area is computed once

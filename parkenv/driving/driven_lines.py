@@ -25,13 +25,9 @@ _LENGTH_TOLERANCE = 1.0  # m, between the length along a line with bends and tha
 
 @dataclass(frozen=True, eq=False)
 class DrivenLine:
-    """One direction of a lane: the line that cars follow, right of the middle on a two-way lane.
+    """One direction of a lane: the line that cars follow, right of the middle on a two-way lane."""
 
-    Args:
-        points: (k, 2) m, in driving order.
-    """
-
-    points: FloatArray
+    points: FloatArray  # (k, 2) m, in driving order
     station: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -72,19 +68,12 @@ class DrivenLine:
 
 @dataclass(frozen=True, eq=False)
 class DrivenEdge:
-    """An edge of the drive graph as part of a driven line.
+    """An edge of the drive graph as part of a driven line."""
 
-    Args:
-        line: index in `DrivenLines.lines` of the line that it follows, or leads to.
-        start: station of its start, m; equal to `end` where the edge crosses the lane.
-        end: station of its end, m.
-        across: whether it crosses a two-way lane to the line of the opposite direction.
-    """
-
-    line: int
-    start: float
-    end: float
-    across: bool
+    line: int  # index in `DrivenLines.lines` of the line that it follows, or leads to
+    start: float  # station of its start, m; equal to `end` where the edge crosses the lane
+    end: float  # station of its end, m
+    across: bool  # whether it crosses a two-way lane to the line of the opposite direction
 
 
 class DrivenLines:

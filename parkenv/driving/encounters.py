@@ -15,10 +15,8 @@ PREDICTION_TIMES_S = np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0])
 """Times, s from now, at which positions are predicted."""
 MOVING_CLEARANCE_M, STANDING_CLEARANCE_M = 0.5, 0.05
 """Clearance, m, to road users that move, and to those that stand and wait."""
-MOVES = 0.1
-"""Speed, m/s, above which a road user counts as moving."""
-START_SPEED = 0.7
-"""Speed, m/s, at which a standing car is assumed to start."""
+MOVES = 0.1  # speed, m/s, above which a road user counts as moving
+START_SPEED = 0.7  # speed, m/s, at which a standing car is assumed to start
 
 _NEAR_M = 20.0
 

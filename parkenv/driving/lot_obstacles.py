@@ -18,10 +18,8 @@ from parkenv.world.scenario import Scenario
 
 FloatArray = NDArray[np.float64]
 
-REACH_M = 25.0
-"""Distance, m along both axes, from the car beyond which obstacles are left out."""
-OVERHANG_M = 0.25
-"""Distance, m, by which parked cars may protrude from their slots at the mouth."""
+REACH_M = 25.0  # distance, m along both axes, from the car beyond which obstacles are left out
+OVERHANG_M = 0.25  # distance, m, by which parked cars may protrude from their slots at the mouth
 
 
 class LotObstacles:

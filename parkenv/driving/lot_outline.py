@@ -14,42 +14,26 @@ from parkenv.world.drive_graph import linestrings
 from parkenv.world.lot import ParkingLot, is_building
 
 FloatArray = NDArray[np.float64]
-Rings = tuple[FloatArray, ...]
-"""A polygon, m: its outer ring, (k, 2) closed, and its holes."""
+Rings = tuple[FloatArray, ...]  # A polygon, m: its outer ring, (k, 2) closed, and its holes
 
-APRON = 0.25
-"""Width of the asphalt beyond the kerbs, m."""
-ARROW_EVERY = 24.0
-"""Approximate distance between two direction arrows on a one-way lane, m."""
+APRON = 0.25  # width of the asphalt beyond the kerbs, m
+ARROW_EVERY = 24.0  # approximate distance between two direction arrows on a one-way lane, m
 
 
 @dataclass(frozen=True, eq=False)
 class LotOutline:
-    """The shapes of a lot, m, in the lot's frame.
+    """The shapes of a lot, m, in the lot's frame."""
 
-    Attributes:
-        buildings: outlines of buildings, (k, 2) each, closed.
-        walls: other walls, (k, 2) each.
-        slots: (n_slots, 4, 2), corners of the slots.
-        slot_lines: (n_slots, 4, 2), painted lines: three sides of each slot, without its mouth.
-        centre_lines: centre lines of the two-way lanes, (k, 2) each.
-        arrows: (a, 3), x, y and yaw of direction arrows on the one-way lanes.
-        entries: (e, 3), x, y and yaw of a car entering.
-        goals: (g, 2), goals.
-        bounds: bounds of the lot, (x0, y0, x1, y1).
-        area: the asphalt.
-    """
-
-    buildings: tuple[FloatArray, ...]
-    walls: tuple[FloatArray, ...]
-    slots: FloatArray
-    slot_lines: FloatArray
-    centre_lines: tuple[FloatArray, ...]
-    arrows: FloatArray
-    entries: FloatArray
-    goals: FloatArray
-    bounds: tuple[float, float, float, float]
-    area: DrivableArea
+    buildings: tuple[FloatArray, ...]  # outlines of buildings, (k, 2) each, closed
+    walls: tuple[FloatArray, ...]  # other walls, (k, 2) each
+    slots: FloatArray  # (n_slots, 4, 2), corners of the slots
+    slot_lines: FloatArray  # (n_slots, 4, 2), painted lines: three sides of each slot, without its mouth
+    centre_lines: tuple[FloatArray, ...]  # centre lines of the two-way lanes, (k, 2) each
+    arrows: FloatArray  # (a, 3), x, y and yaw of direction arrows on the one-way lanes
+    entries: FloatArray  # (e, 3), x, y and yaw of a car entering
+    goals: FloatArray  # (g, 2), goals
+    bounds: tuple[float, float, float, float]  # bounds of the lot, (x0, y0, x1, y1)
+    area: DrivableArea  # the asphalt
 
     @classmethod
     def of(cls, lot: ParkingLot) -> LotOutline:

@@ -22,8 +22,7 @@ from sim_sensors.surroundings import Surroundings
 
 FloatArray = NDArray[np.float64]
 
-KINDS = ("perpendicular", "oblique", "parallel")
-"""Orientation of a slot relative to its lane."""
+KINDS = ("perpendicular", "oblique", "parallel")  # orientation of a slot relative to its lane
 WAYS = ("nose-in", "back-in")
 """Orientation of a car in a perpendicular or oblique slot; in a parallel slot it faces the direction of traffic."""
 STARTS = ("lane", "way-out")
@@ -31,10 +30,8 @@ REACH = 30.0
 """Distance, m along both axes, from the slot's centre beyond which obstacles are not part of a task."""
 AREA = REACH - 3.0
 """Distance, m along both axes, from the slot's centre beyond which the car has left the area of its task."""
-FARTHEST = AREA - 7.0
-"""Greatest `distance` of a start, m."""
-UPRIGHT = math.radians(75.0)
-"""Least angle between a perpendicular slot and its lane, rad."""
+FARTHEST = AREA - 7.0  # greatest `distance` of a start, m
+UPRIGHT = math.radians(75.0)  # least angle between a perpendicular slot and its lane, rad
 
 _ASIDE, _ASKEW = 0.2, math.radians(4.0)  # greatest offsets of a start on the lane
 _TRIES = 64
@@ -47,32 +44,20 @@ _ARRIVALS = 16  # number of different cars and poses per slot
 class ParkingTask:
     """A slot to park in, the obstacles around it, and the start of the car; public to agents.
 
-    Args:
-        vehicle: the car.
-        lot: the lot's name.
-        slot_id: the slot's name.
-        kind: one of `KINDS`.
-        way: one of `WAYS`.
-        slot: (3,) float64, x, y in m and yaw in rad of the slot, world frame.
-        size: length and width of the slot, m.
-        target: (3,) goal of the car's centre, x and y in m, and its yaw, rad.
-        start: (6,) state of the vehicle at the start.
-        obstacles: parked cars, walls and kerbs within `REACH`.
-
     Raises:
         InputError: a slot that the car does not fit into, or a start that is not finite.
     """
 
-    vehicle: VehicleParameters
-    lot: str
-    slot_id: str
-    kind: str
-    way: str
-    slot: FloatArray
-    size: tuple[float, float]
-    target: FloatArray
-    start: FloatArray
-    obstacles: Obstacles
+    vehicle: VehicleParameters  # the car
+    lot: str  # the lot's name
+    slot_id: str  # the slot's name
+    kind: str  # one of `KINDS`
+    way: str  # one of `WAYS`
+    slot: FloatArray  # (3,) float64, x, y in m and yaw in rad of the slot, world frame
+    size: tuple[float, float]  # length and width of the slot, m
+    target: FloatArray  # (3,) goal of the car's centre, x and y in m, and its yaw, rad
+    start: FloatArray  # (6,) state of the vehicle at the start
+    obstacles: Obstacles  # parked cars, walls and kerbs within `REACH`
 
     def __post_init__(self) -> None:
         require_room(self.vehicle, self.size, f"slot {self.slot_id!r} of lot {self.lot!r}")

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-CLEAR_RADIUS_M = 12.0
-"""Radius, m, around the car's centre within which hidden road users do not return."""
+CLEAR_RADIUS_M = 12.0  # radius, m, around the car's centre within which hidden road users do not return
 
 _FAR_AWAY = np.array([1e6, 1e6, 0.0])
 

@@ -15,13 +15,11 @@ from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
-PHYSICS_S = 0.05
-"""Physics time step, s."""
+PHYSICS_S = 0.05  # physics time step, s
 X, Y, YAW, SPEED, STEERING, ACCELERATION = range(6)
 """Columns of a vehicle's state: m, m, rad, m/s, rad, m/s²; x and y are the middle of the rear axle."""
 STATE_SIZE = 6
-STRAIGHT = 1e-6
-"""Turn per step, rad, below which an arc is approximated by its chord."""
+STRAIGHT = 1e-6  # turn per step, rad, below which an arc is approximated by its chord
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ FloatArray = NDArray[np.float64]
 
 LOOK_AHEAD_S = (0.1, 0.6, 1.2)
 """Times ahead, s, at which road users check their own positions for conflicts with the car."""
-GAP_M = 0.4
-"""Clearance to the car, m."""
+GAP_M = 0.4  # clearance to the car, m
 
 _FAR_M = 12.0
 _LATER_S = 4.0

@@ -39,12 +39,9 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-SUBSTEPS = 2
-"""Physics steps per action."""
-CONTROL_S = SUBSTEPS * PHYSICS_S
-"""Control period, s."""
-CONTACT_COST = 200.0
-"""Default cost of a contact, s: more than any drive within the step limit."""
+SUBSTEPS = 2  # physics steps per action
+CONTROL_S = SUBSTEPS * PHYSICS_S  # control period, s
+CONTACT_COST = 200.0  # default cost of a contact, s: more than any drive within the step limit
 REWARD_TERMS = ("time", "approach", "contact")
 
 

@@ -11,12 +11,9 @@ from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
-POSITION_TOLERANCE = 0.25
-"""Largest distance, m, of a parked car's centre from the goal."""
-ANGLE_TOLERANCE = math.radians(5.0)
-"""Largest angle, rad, between a parked car's yaw and the goal's."""
-STANDING = 0.05
-"""Speed, m/s, up to which a car counts as standing."""
+POSITION_TOLERANCE = 0.25  # largest distance, m, of a parked car's centre from the goal
+ANGLE_TOLERANCE = math.radians(5.0)  # largest angle, rad, between a parked car's yaw and the goal's
+STANDING = 0.05  # speed, m/s, up to which a car counts as standing
 
 
 def goal_errors(

@@ -18,14 +18,10 @@ from sim_sensors.laser.scanner import LaserScanner
 
 FloatArray = NDArray[np.float64]
 
-FAR = 1000.0
-"""Coordinate, m, slot frame, that fills unused rows of the obstacle map."""
-MOST_CARS, MOST_LINES = 160, 320
-"""Rows of the obstacle map."""
-CORNERS = 24
-"""Corners of an outline in the obstacle map."""
-BOUND = 2.0 * REACH
-"""Bound of positions in the observation, m."""
+FAR = 1000.0  # coordinate, m, slot frame, that fills unused rows of the obstacle map
+MOST_CARS, MOST_LINES = 160, 320  # rows of the obstacle map
+CORNERS = 24  # corners of an outline in the obstacle map
+BOUND = 2.0 * REACH  # bound of positions in the observation, m
 
 
 def drive_observation_space(

@@ -49,8 +49,7 @@ from parkenv.world.lot import ParkingLot
 
 FloatArray = NDArray[np.float64]
 
-LARGEST_SCALE = 26.0
-"""px/m."""
+LARGEST_SCALE = 26.0  # px/m
 FREE: Color = BELIEF_ANCHORS[0]
 MOVING: Color = (24, 82, 186)
 KERB: Color = (150, 148, 140)

@@ -68,6 +68,8 @@ FloatArray = NDArray[np.float64]
 
 MINUTE = 60.0
 MANY_SLOTS = 20.0
+MAX_SLOTS = 1_000
+"""Maximum number of slots in an observation."""
 N_MOVES = len(MOVES)
 HERE, PER_MOVE, PER_NEAR = 14, 8, 8
 FIRST_NEAR = HERE + N_MOVES * PER_MOVE
@@ -76,35 +78,22 @@ _NOWHERE = -1
 
 
 class Surroundings(NamedTuple):
-    """The surroundings of every vertex of one or several lots; rows are vertices, lot after lot.
+    """The surroundings of every vertex of one or several lots; rows are vertices, lot after lot."""
 
-    Attributes:
-        first: (n_lots,) int64, first row of each lot.
-        fixed: (n, 46 + 8k) float32, the constant part of the observation.
-        starts: (n + 1,) int32, start of each row's slots in `slots`.
-        slots: int32, the near or ahead slots of each row, without repeats.
-        near: (n, k) int32, indices of the nearest ones into the row's slots; -1 past the last.
-        ahead: (n, 4, k) int32, indices of those ahead of each move, least drive plus walk first; -1 past the last.
-        total_s: (n, 4, k) s, drive plus walk via each slot of `ahead`.
-        crow_s: (n, 2) s, coordinates divided by the driving speed.
-        samples: (n_lots, 4, 4) int32, sample slots from each quarter of the lot by walk.
-        first_view: (n_lots,) int64, start of each lot in `view_s`.
-        view_s: s, straight-line drive plus walk for each slot in view of each vertex.
-        columns: int32, scratch space for the columns of a row's slots.
-    """
-
-    first: NDArray[np.int64]
-    fixed: NDArray[np.float32]
-    starts: NDArray[np.int32]
-    slots: NDArray[np.int32]
+    first: NDArray[np.int64]  # (n_lots,) int64, first row of each lot
+    fixed: NDArray[np.float32]  # (n, 46 + 8k) float32, the constant part of the observation
+    starts: NDArray[np.int32]  # (n + 1,) int32, start of each row's slots in `slots`
+    slots: NDArray[np.int32]  # int32, the near or ahead slots of each row, without repeats
+    # (n, k) int32, indices of the nearest ones into the row's slots; -1 past the last
     near: NDArray[np.int32]
+    # (n, 4, k) int32, indices of those ahead of each move, least drive plus walk first; -1 past the last
     ahead: NDArray[np.int32]
-    total_s: FloatArray
-    crow_s: FloatArray
-    samples: NDArray[np.int32]
-    first_view: NDArray[np.int64]
-    view_s: FloatArray
-    columns: NDArray[np.int32]
+    total_s: FloatArray  # (n, 4, k) s, drive plus walk via each slot of `ahead`
+    crow_s: FloatArray  # (n, 2) s, coordinates divided by the driving speed
+    samples: NDArray[np.int32]  # (n_lots, 4, 4) int32, sample slots from each quarter of the lot by walk
+    first_view: NDArray[np.int64]  # (n_lots,) int64, start of each lot in `view_s`
+    view_s: FloatArray  # s, straight-line drive plus walk for each slot in view of each vertex
+    columns: NDArray[np.int32]  # int32, scratch space for the columns of a row's slots
 
     @classmethod
     def of(cls, problems: Sequence[SearchProblem], k: int) -> Surroundings:
@@ -115,10 +104,10 @@ class Surroundings(NamedTuple):
             k: number of slots described, both nearby and ahead of each move.
 
         Raises:
-            InputError: k is not a whole number of at least 1.
+            InputError: k is not a whole number from 1 to `MAX_SLOTS`.
         """
-        if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
-            raise InputError(f"k is {k!r}, want a whole number of at least 1")
+        if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 1 <= k <= MAX_SLOTS:
+            raise InputError(f"k is {k!r}, want a whole number from 1 to {MAX_SLOTS:,}")
         parts = [_around(problem, int(k)) for problem in problems]
         joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
         first = np.concatenate([[0], np.cumsum([p.lot.n_vertices for p in problems])[:-1]])
@@ -164,7 +153,7 @@ class LocalObservation(
 
     Raises:
         TypeError: another environment.
-        InputError: k is not a whole number of at least 1.
+        InputError: k is not a whole number from 1 to `MAX_SLOTS`.
 
     Examples:
         >>> import gymnasium as gym
@@ -187,12 +176,12 @@ class LocalObservation(
         """Return the local observation."""
         local = np.empty(self._surroundings.fixed.shape[1], dtype=np.float32)
         assert isinstance(self.env.unwrapped, SearchEnv)
-        observe_one(self.env.unwrapped.searches.address, self._surroundings, local)
+        observe_surroundings_at(self.env.unwrapped.searches.address, self._surroundings, local)
         return {"local": local, "action_mask": observation["action_mask"]}
 
 
 @kernel
-def observe_one(address: int, around: Surroundings, local: NDArray[np.float32]) -> None:
+def observe_surroundings_at(address: int, around: Surroundings, local: NDArray[np.float32]) -> None:
     """Call `observe_surroundings` for a single search."""
     observe_surroundings(search_at(address, 0), around, 0, local)
 

@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from parkenv.envs.search import SearchEnv
-from parkenv.envs.search_control import SearchControl
-from parkenv.envs.search_state import SearchState
+from parkenv.envs.search_kernel import act_at, apply_observations_at, finish_step_at
 from parkenv.envs.sensor_sampler import SensorSampler
-from parkenv.envs.sensors import with_camera_images
+from parkenv.envs.sensors import SensingSearchEnv
 from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector import Detector
 from parkenv.perception.pipeline import PerceptionPipeline, PerceptionResult
@@ -68,11 +65,11 @@ class OnboardPerception:
         self.results: tuple[PerceptionResult, ...] = ()
         self.observation = SlotObservation.none()
 
-    def update_belief(self, control: SearchControl, vertex: int, captures: Sequence[TimedCapture]) -> None:
+    def update_belief(self, address: int, vertex: int, captures: Sequence[TimedCapture]) -> None:
         """Run the pipeline on the captures of a step, and update the belief with the observed slots.
 
         Args:
-            control: step control of a search in this scenario.
+            address: address of the record of a search in this scenario.
             vertex: current vertex of the car.
             captures: captures on the way there, oldest first.
         """
@@ -82,10 +79,10 @@ class OnboardPerception:
         in_range, rates = self._view_slots[rows], self._rates.of(rows)
         rated, used = np.isin(in_range, observed.slots), np.isin(observed.slots, in_range)
         self.observation = SlotObservation(observed.slots[used], observed.taken[used])
-        control.apply_observations(*self.observation, rates.hit[rated], rates.false_alarm[rated])
+        apply_observations_at(address, *self.observation, rates.hit[rated], rates.false_alarm[rated])
 
 
-class SearchPerceptionEnv(SearchEnv):
+class SearchPerceptionEnv(SensingSearchEnv):
     """`parkenv/Search-v1` with the real perception pipeline in the loop: the belief comes from simulated sensors.
 
     ## Description
@@ -96,23 +93,10 @@ class SearchPerceptionEnv(SearchEnv):
     decides which slots are observed.
 
     ## Action space
-    `Discrete(5)`, as in `parkenv/Search-v1`:
-
-    | Num | Action | Effect |
-    |-----|--------|--------|
-    | 0-3 | up, down, left, right | drive along that edge of the graph; wait `wait_s` if there is none |
-    | 4 | park | park and walk to the goal if the slot here is free; lose `failure_s` if it is taken |
+    `Discrete(5)`, as in `parkenv/Search-v1`: up, down, left, right, park.
 
     ## Observation space
-    The `Dict` of `parkenv/Search-v1`:
-
-    | Key | Space | Meaning |
-    |-----|-------|---------|
-    | `vertex` | `Discrete(n_vertices)` | position of the car; vertex i < n_slots is in front of slot i |
-    | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
-    | `p_occupied` | `Box(0, 1, (n_slots,), float32)` | current belief that each slot is taken |
-    | `belief` | `Box((4 * n_slots,), float32)` | forecast, decay rate, p at the last observation, time of it |
-    | `action_mask` | `Box(0, 1, (5,), int8)` | the actions that the graph has here |
+    The `Dict` of `parkenv/Search-v1`: `vertex`, `time`, `p_occupied`, `belief`, `action_mask`.
 
     ## Rewards
     Minus the seconds of the step, as in `parkenv/Search-v1`.
@@ -169,37 +153,25 @@ class SearchPerceptionEnv(SearchEnv):
         world = make_scenario(scenario, **changes)
         self.perception = OnboardPerception(world, rig, weather, captures, every, detector)
         super().__init__(self.perception.scenario, render_mode)
-        self._before: tuple[int, float] | None = None
-
-    @property
-    def rig(self) -> SensorRig:
-        """The sensors, their poses on the car, and their models."""
-        return self.perception.sampler.rig
+        self._sampler = self.perception.sampler
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode; see the class."""
-        self._before = None
         self.perception.reset()
         return super().reset(seed=seed, options=options)
 
-    def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drive along an edge, or attempt to park; see the class."""
-        self._before = (self.state.vertex, self.state.time)
-        return super().step(action)
-
     def _advance(self, action: int) -> tuple[Any, ...]:
         """Apply the action, measure on the way, and update the belief from the measurements."""
-        control, state = self._control, self._state
-        control.drive_or_park(action)
+        state = self._state
+        act_at(self._address, action)
         state.extend_path()
         if not state.parked:
-            captures = self.perception.sampler.sample_step(state, self._before)
-            self.perception.update_belief(control, state.vertex, captures)
-        return control.finish_step()
+            captures = self._sampler.sample_step(state, self._before)
+            self.perception.update_belief(self._address, state.vertex, captures)
+        result: tuple[Any, ...] = finish_step_at(self._address)
+        return result
 
-    def _frame(self, state: SearchState) -> NDArray[np.uint8]:
-        """Return the lot from above, with the newest camera images beside it."""
-        newest = self.perception.results[-1].captured if self.perception.results else None
-        return with_camera_images(super()._frame(state), newest, self.rig)
+    def _newest(self) -> TimedCapture | None:
+        return self.perception.results[-1].captured if self.perception.results else None

@@ -11,21 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.driving.lot_outline import APRON, LotOutline
-from parkenv.envs.drawing import (
-    SUBPIXEL_BITS,
-    Color,
-    FloatArray,
-    Image,
-    draw_dashes,
-    fill_disc,
-    fill_polygon,
-    fixed_point,
-    mixed_color,
-    rotation,
-    text_width,
-    write_label,
-    write_text,
-)
+from parkenv.envs import drawing
+from parkenv.envs.drawing import Color, FloatArray, Image
 from parkenv.envs.search_state import SearchState
 from parkenv.envs.window import Window
 from parkenv.world.lot import ParkingLot
@@ -35,19 +22,14 @@ from parkenv.world.week import DAY_S
 from sim_sensors.compilation import compiled
 
 WIDTH, HEIGHT = 640, 480
-HUD = 34
-"""Height, px, of the line of text below the map."""
+HUD = 34  # height, px, of the line of text below the map
 HUD_MARGIN = 14
-KEY_WIDTH = 172
-"""Width, px, of the colour key at the right of that line."""
-MARGIN = 8
-"""Margin, px, around the lot."""
+KEY_WIDTH = 172  # width, px, of the colour key at the right of that line
+MARGIN = 8  # margin, px, around the lot
 SMALLEST_SLOT = 4.0
 """Slot width, px, below which a frame shows a window around the car instead of the whole lot."""
-WINDOW_SLOT = 9.0
-"""Width, px, of a slot in such a window."""
-LARGEST_SCALE = 22.0
-"""Largest scale, px/m, so that a small lot does not fill the frame."""
+WINDOW_SLOT = 9.0  # width, px, of a slot in such a window
+LARGEST_SCALE = 22.0  # largest scale, px/m, so that a small lot does not fill the frame
 SUPERSAMPLING = 4
 
 BELIEF_ANCHORS: tuple[Color, ...] = (
@@ -115,17 +97,11 @@ def clock(time: float) -> str:
 
 @dataclass(frozen=True, eq=False)
 class MapView:
-    """Maps the lot's coordinates to pixels: `pixels = xy @ turn * scale + shift`.
+    """Maps the lot's coordinates to pixels: `pixels = xy @ turn * scale + shift`."""
 
-    Attributes:
-        turn: (2, 2), north up, or north to the right.
-        scale: px/m.
-        shift: (2,) px.
-    """
-
-    turn: FloatArray
-    scale: float
-    shift: FloatArray
+    turn: FloatArray  # (2, 2), north up, or north to the right
+    scale: float  # px/m
+    shift: FloatArray  # (2,) px
 
     @classmethod
     def fit(cls, xy: FloatArray, size: tuple[float, float], largest_scale: float = np.inf) -> Self:
@@ -155,27 +131,16 @@ class MapView:
 
 @dataclass(frozen=True, eq=False)
 class StillLayer:
-    """The static background of the frames, and the pixels of the slots.
+    """The static background of the frames, and the pixels of the slots."""
 
-    Attributes:
-        view: map view of the frame.
-        image: (HEIGHT, WIDTH, 3) uint8, the image without slots.
-        slots: (m,) int64, the slots in the image.
-        pixel: (k,) int64, index of each pixel that shows a slot, in the flattened image.
-        slot: (k,) int64, index into `slots` of the slot it shows.
-        cover: (k,) float32, fraction of the pixel covered by the slot; the rest is paint.
-        car: (k, 3) float32, colour of a parked car there, multiplied by `car_cover`.
-        car_cover: (k,) float32, fraction of the pixel covered by the car.
-    """
-
-    view: MapView
-    image: Image
-    slots: NDArray[np.int64]
-    pixel: NDArray[np.int64]
-    slot: NDArray[np.int64]
-    cover: NDArray[np.float32]
-    car: NDArray[np.float32]
-    car_cover: NDArray[np.float32]
+    view: MapView  # map view of the frame
+    image: Image  # (HEIGHT, WIDTH, 3) uint8, the image without slots
+    slots: NDArray[np.int64]  # (m,) int64, the slots in the image
+    pixel: NDArray[np.int64]  # (k,) int64, index of each pixel that shows a slot, in the flattened image
+    slot: NDArray[np.int64]  # (k,) int64, index into `slots` of the slot it shows
+    cover: NDArray[np.float32]  # (k,) float32, fraction of the pixel covered by the slot; the rest is paint
+    car: NDArray[np.float32]  # (k, 3) float32, colour of a parked car there, multiplied by `car_cover`
+    car_cover: NDArray[np.float32]  # (k,) float32, fraction of the pixel covered by the car
 
 
 @compiled
@@ -346,49 +311,49 @@ class SearchRenderer:
         xy = self.scenario.lot.vertex_xy[state.path]
         if state.parked:
             xy = np.vstack([xy, self.scenario.lot.slot_xy[state.vertex]])
-        points = fixed_point(view(xy))
+        points = drawing.fixed_point(view(xy))
         ages = np.linspace(0, len(points) - 1, min(len(points), 25)).astype(int)
         thickness = min(max(2, round(0.5 * view.scale)), 5)
         for i, (first, last) in enumerate(pairwise(ages)):
             fresh = 0.35 + 0.65 * (i + 1) / (len(ages) - 1)
-            color = mixed_color(ASPHALT, CAR, fresh)
+            color = drawing.mixed_color(ASPHALT, CAR, fresh)
             cv2.polylines(
-                image, [points[first : last + 1]], False, color, thickness, cv2.LINE_AA, SUBPIXEL_BITS
+                image, [points[first : last + 1]], False, color, thickness, cv2.LINE_AA, drawing.SUBPIXEL_BITS
             )
 
     def _draw_goal(self, image: Image, view: MapView, state: SearchState) -> None:
         lot = self.scenario.lot
         goal = view(lot.goals[self.scenario.goal])
         if state.parked:
-            draw_dashes(image, view(lot.slot_xy[state.vertex]), goal, WALK)
+            drawing.draw_dashes(image, view(lot.slot_xy[state.vertex]), goal, WALK)
         low, high = np.full(2, 14.0), np.array(self._size) - 14.0
         if (goal >= low).all() and (goal <= high).all():
-            fill_disc(image, goal, 11.0, WHITE)
-            fill_disc(image, goal, 9.5, WALK)
-            write_label(image, "G", goal, WHITE, 13, 700)
+            drawing.fill_disc(image, goal, 11.0, WHITE)
+            drawing.fill_disc(image, goal, 9.5, WALK)
+            drawing.write_label(image, "G", goal, WHITE, 13, 700)
             return
         middle = np.array(self._size) / 2
         away = goal - middle
         edge = middle + away * np.min((high - low) / 2 / np.maximum(np.abs(away), 1e-9))
         yaw = float(np.arctan2(away[1], away[0]))
-        tip = np.array([[10.0, 0.0], [-8.0, 7.0], [-8.0, -7.0]]) @ rotation(yaw)
-        fill_polygon(image, edge + 1.35 * tip, WHITE)
-        fill_polygon(image, edge + tip, WALK)
+        tip = np.array([[10.0, 0.0], [-8.0, 7.0], [-8.0, -7.0]]) @ drawing.rotation(yaw)
+        drawing.fill_polygon(image, edge + 1.35 * tip, WHITE)
+        drawing.fill_polygon(image, edge + tip, WALK)
         away_m = float(np.hypot(*(lot.goals[self.scenario.goal] - lot.vertex_xy[state.vertex])))
         text = f"goal {away_m:.0f} m"
         ahead = away / np.hypot(*away)
-        room = np.abs(ahead) @ [text_width(text, 13, 700) / 2, 6.0] + 16.0
-        write_label(image, text, edge - room * ahead, WALK, 13, 700, halo=True)
+        room = np.abs(ahead) @ [drawing.text_width(text, 13, 700) / 2, 6.0] + 16.0
+        drawing.write_label(image, text, edge - room * ahead, WALK, 13, 700, halo=True)
 
     def _draw_car(self, image: Image, view: MapView, state: SearchState) -> None:
         xy, yaw = self._pose(state)
         at = view(xy)
         if not state.parked:
-            center = fixed_point(at)
-            radius = round(self.scenario.sensor_model.view_range * view.scale * 2**SUBPIXEL_BITS)
-            cv2.circle(image, tuple(center), radius, WHITE, 1, cv2.LINE_AA, SUBPIXEL_BITS)
+            center = drawing.fixed_point(at)
+            radius = round(self.scenario.sensor_model.view_range * view.scale * 2**drawing.SUBPIXEL_BITS)
+            cv2.circle(image, tuple(center), radius, WHITE, 1, cv2.LINE_AA, drawing.SUBPIXEL_BITS)
         heading = np.array([np.cos(yaw), np.sin(yaw)]) @ view.turn
-        turn = rotation(float(np.arctan2(heading[1], heading[0])))
+        turn = drawing.rotation(float(np.arctan2(heading[1], heading[0])))
         # A small car is drawn larger than to scale, to stay visible.
         length = max(4.4 * view.scale, 17.0)
         for part, color, swell in (
@@ -397,7 +362,7 @@ class SearchRenderer:
             (_WINDSCREEN, INK, 0.0),
             (_REAR, INK, 0.0),
         ):
-            fill_polygon(image, at + part * (np.array([length, 0.44 * length]) + swell) @ turn, color)
+            drawing.fill_polygon(image, at + part * (np.array([length, 0.44 * length]) + swell) @ turn, color)
 
     def _draw_hud(self, image: Image, state: SearchState) -> None:
         parts = [
@@ -407,15 +372,15 @@ class SearchRenderer:
         ]
         x, baseline = HUD_MARGIN, HEIGHT - HUD // 2 + 5
         for part in parts:
-            x = write_text(image, part, (x, baseline), WHITE, 15, 500) + 18
+            x = drawing.write_text(image, part, (x, baseline), WHITE, 15, 500) + 18
         if state.parked:
             place = f"parked in {self.scenario.lot.slot_ids[state.vertex]}"
             for verdict in (f"{place}, {state.walk_s:.0f} s to walk", place, "parked"):
-                if x + text_width(verdict, 15, 600) <= WIDTH - KEY_WIDTH:
-                    write_text(image, verdict, (x, baseline), CAR, 15, 600)
+                if x + drawing.text_width(verdict, 15, 600) <= WIDTH - KEY_WIDTH:
+                    drawing.write_text(image, verdict, (x, baseline), CAR, 15, 600)
                     break
         elif state.over:
-            write_text(image, "lot is full", (x, baseline), GAVE_UP, 15, 600)
+            drawing.write_text(image, "lot is full", (x, baseline), GAVE_UP, 15, 600)
 
 
 def _fitting(words: list[str], width: int) -> str:
@@ -462,13 +427,17 @@ def draw_outline(
         apron: m, width of the asphalt beyond the kerbs.
     """
     for building in outline.buildings:
-        cv2.fillPoly(image, [fixed_point(view(building))], BUILDING, cv2.LINE_8, SUBPIXEL_BITS)
+        cv2.fillPoly(
+            image, [drawing.fixed_point(view(building))], BUILDING, cv2.LINE_8, drawing.SUBPIXEL_BITS
+        )
     for rings in outline.paved(center, reach, apron=apron):
-        pixels = [fixed_point(view(ring)) for ring in rings]
-        cv2.fillPoly(image, pixels, ASPHALT, cv2.LINE_8, SUBPIXEL_BITS)
+        pixels = [drawing.fixed_point(view(ring)) for ring in rings]
+        cv2.fillPoly(image, pixels, ASPHALT, cv2.LINE_8, drawing.SUBPIXEL_BITS)
     thickness = max(SUPERSAMPLING, round(0.3 * view.scale))
     for wall in (*outline.buildings, *outline.walls):
-        cv2.polylines(image, [fixed_point(view(wall))], False, WALL, thickness, 8, SUBPIXEL_BITS)
+        cv2.polylines(
+            image, [drawing.fixed_point(view(wall))], False, WALL, thickness, 8, drawing.SUBPIXEL_BITS
+        )
 
 
 def draw_still_layer(lot: ParkingLot, outline: LotOutline, view: MapView) -> StillLayer:
@@ -486,15 +455,15 @@ def draw_still_layer(lot: ParkingLot, outline: LotOutline, view: MapView) -> Sti
     def placed(part: FloatArray, long: FloatArray, wide: FloatArray) -> NDArray[np.int32]:
         """Place a unit-size shape, (k, 2), in every slot; returns (m, k, 2) fixed-point pixels."""
         xy = lot.slot_xy[slots, None] + part[:, :1] * long * along + part[:, 1:] * wide * left
-        return fixed_point(fine(xy))
+        return drawing.fixed_point(fine(xy))
 
     image = np.full((*shape, 3), GROUND, dtype=np.uint8)
     center = (np.array([WIDTH, HEIGHT - HUD]) / 2 - view.shift) @ view.turn.T / view.scale
     draw_outline(image, fine, outline, center, max(WIDTH, HEIGHT) / 2 / view.scale)
     for x, y, yaw in outline.entries:
         onward = np.array([np.cos(yaw), np.sin(yaw)]) @ view.turn
-        arrow = SUPERSAMPLING * _ENTRY_MARK @ rotation(float(np.arctan2(onward[1], onward[0])))
-        fill_polygon(image, fine(np.array([x, y])) + arrow, WHITE)
+        arrow = SUPERSAMPLING * _ENTRY_MARK @ drawing.rotation(float(np.arctan2(onward[1], onward[0])))
+        drawing.fill_polygon(image, fine(np.array([x, y])) + arrow, WHITE)
 
     label = np.full(shape, -1, dtype=np.int32)
     cars = np.zeros((*shape, 3), dtype=np.uint8)
@@ -505,12 +474,12 @@ def draw_still_layer(lot: ParkingLot, outline: LotOutline, view: MapView) -> Sti
     bodies = placed(_BODY, long, wide)
     glass = np.stack([placed(_WINDSCREEN, long, wide), placed(_REAR, long, wide)])
     for i in range(len(slots)):
-        cv2.fillConvexPoly(image, boxes[i], WHITE, 8, SUBPIXEL_BITS)
-        cv2.fillConvexPoly(label, boxes[i], i, 8, SUBPIXEL_BITS)
-        cv2.fillConvexPoly(cars, bodies[i], PARKED_CAR, 8, SUBPIXEL_BITS)
-        cv2.fillConvexPoly(has_car, bodies[i], 1, 8, SUBPIXEL_BITS)
+        cv2.fillConvexPoly(image, boxes[i], WHITE, 8, drawing.SUBPIXEL_BITS)
+        cv2.fillConvexPoly(label, boxes[i], i, 8, drawing.SUBPIXEL_BITS)
+        cv2.fillConvexPoly(cars, bodies[i], PARKED_CAR, 8, drawing.SUBPIXEL_BITS)
+        cv2.fillConvexPoly(has_car, bodies[i], 1, 8, drawing.SUBPIXEL_BITS)
         for pane in glass[:, i]:
-            cv2.fillConvexPoly(cars, pane, GLASS, 8, SUBPIXEL_BITS)
+            cv2.fillConvexPoly(cars, pane, GLASS, 8, drawing.SUBPIXEL_BITS)
 
     blocks = _blocks(label)
     owner = blocks.max(axis=-1)
@@ -544,16 +513,18 @@ def _with_key(image: Image, view: MapView) -> Image:
     """Add the colour key and the north arrow."""
     top = HEIGHT - HUD // 2 - 6
     right = WIDTH - HUD_MARGIN
-    write_label(image, "taken", np.array([right - 18.0, top + 6.0]), WHITE, 13, 400)
+    drawing.write_label(image, "taken", np.array([right - 18.0, top + 6.0]), WHITE, 13, 400)
     bar = np.linspace(0, 255, 72).astype(int)
     image[top : top + 6, right - 116 : right - 44] = _BELIEF_SCALE[0, bar]
     image[top + 6 : top + 12, right - 116 : right - 44] = _BELIEF_SCALE[1, bar]
-    write_label(image, "free", np.array([right - 132.0, top + 6.0]), WHITE, 13, 400)
+    drawing.write_label(image, "free", np.array([right - 132.0, top + 6.0]), WHITE, 13, 400)
     north = np.array([0.0, 1.0]) @ view.turn
     at = np.array([float(WIDTH - 22), 24.0])
-    turn = rotation(float(np.arctan2(north[1], north[0])))
-    fill_polygon(image, at + np.array([[11.0, 0.0], [-3.0, 5.0], [-1.0, 0.0], [-3.0, -5.0]]) @ turn, INK)
-    write_label(image, "N", at - 12.0 * north, INK, 12, 600)
+    turn = drawing.rotation(float(np.arctan2(north[1], north[0])))
+    drawing.fill_polygon(
+        image, at + np.array([[11.0, 0.0], [-3.0, 5.0], [-1.0, 0.0], [-3.0, -5.0]]) @ turn, INK
+    )
+    drawing.write_label(image, "N", at - 12.0 * north, INK, 12, 600)
     return image
 
 

@@ -10,8 +10,12 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.envs.search_control import SearchControl
-from parkenv.envs.search_kernel import begin_search, init_external_prior, step_exact, step_noisy
+from parkenv.envs.search_kernel import (
+    begin_search_at,
+    init_external_forecast_at,
+    step_exact_at,
+    step_noisy_at,
+)
 from parkenv.envs.search_records import NEVER_OBSERVED, ScenarioRecords, Searches
 from parkenv.envs.search_state import SearchState
 from parkenv.errors import InputError
@@ -23,22 +27,10 @@ from parkenv.world.scenario import Scenario
 if TYPE_CHECKING:
     from parkenv.envs.rendering import SearchRenderer
 
-LATEST = 1e8
-"""Bound, s, of the observed times: Gymnasium requires one, and no search takes three years."""
-MAX_DECAY_RATE = 1e6
-"""Bound, 1/s, of `decay_rate`."""
-_REBUILT = (
-    "searches",
-    "_state",
-    "_control",
-    "_address",
-    "_copy_time",
-    "_copy_p_occupied",
-    "_copy_belief",
-    "_seeded_with",
-    "_begun",
-    "_over",
-)
+LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no search takes three years
+MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
+_REBUILT = {"searches", "_state", "_address", "_copy_time", "_copy_p_occupied", "_copy_belief"}
+_REBUILT |= {"_seeded_with", "_begun", "_over"}
 REWARD_TERMS = ("drive", "failed", "walk", "parking", "gave_up")
 
 
@@ -156,7 +148,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self.action_space = spaces.Discrete(len(ACTIONS))
         self.observation_space = search_space(lot.n_slots, lot.n_vertices)
         self._masks = list(self.scenario.action_masks)
-        self._step = step_exact if self.scenario.sensor_model.perfect else step_noisy
+        self._step = step_exact_at if self.scenario.sensor_model.perfect else step_noisy_at
         self._vertices = list(np.arange(lot.n_vertices))
         self._renderer: SearchRenderer | None = None
         self._make_search()
@@ -167,7 +159,6 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         )
         self._address = self.searches.address
         self._state = SearchState(self.scenario, self.searches)
-        self._control = SearchControl(self.searches)
         # Bound methods that copy the observation: looking them up takes a tenth of a step.
         self._copy_time = self.searches.records["clock"][0].copy
         self._copy_p_occupied = self.searches.p_occupied[0].copy
@@ -222,11 +213,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if seed is not None or self._seeded_with != self.np_random_seed:
             self._seeded_with = self.np_random_seed
             record["seed_state"] = seed_state(self.np_random_seed)
-        begin_search(self._address)
-        if len(self.searches.external_prior):
+        begin_search_at(self._address)
+        if len(self.searches.external_forecast):
             forecast = self.scenario.forecast(self._state.arrival)
-            self.searches.external_prior[0] = forecast.p_occupied, forecast.decay_rate
-            init_external_prior(self._address)
+            self.searches.external_forecast[0] = forecast.p_occupied, forecast.decay_rate
+            init_external_forecast_at(self._address)
         self._begun, self._over = True, False
         self._state.path = [self._state.vertex]
         if self.render_mode == "human":

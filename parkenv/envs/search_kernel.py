@@ -3,7 +3,7 @@
 `parkenv/Search-v1` and its batch both run this code, so they agree to the bit. The cost of a step does not grow with
 the lot: only slots that a search has observed or queried get a column in its tables.
 
-Functions that take an address are called from Python; it is the address of a record of `Searches`.
+Functions named `..._at` take an address: that of a record of `Searches`, where they are called from Python.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from parkenv.envs.search_records import (
     BLOCK_BITS,
     BLOCK_SIZE,
     DECAY_RATE,
-    EXTERNAL_PRIOR,
+    EXTERNAL_KIND,
     FORECAST,
     LOG_KIND,
     N_ACTIONS,
@@ -31,30 +31,18 @@ from parkenv.envs.search_records import (
     search_at,
     slot_at,
 )
+from parkenv.world import occupancy_kernel as worlds
 from parkenv.world.keyed_random import (
     ARRIVAL_STREAM,
     ENTRY_STREAM,
-    SIGHTING_STREAM,
+    OBSERVATION_STREAM,
     VIEW_STREAM,
     episode_key,
     keyed_uniform,
 )
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy import BoolArray, FloatArray, IntArray
-from parkenv.world.occupancy_kernel import (
-    MAX_PROBABILITY,
-    MIN_PROBABILITY,
-    inlined,
-    keep_hourly_marginals,
-    kernel,
-    marginal_later,
-    process_at,
-    process_forecast,
-    process_state,
-    recorded_day_at,
-    recorded_forecast,
-    recorded_state,
-)
+from parkenv.world.occupancy_kernel import inlined, kernel
 from parkenv.world.pointers import float32s, float64s, int32s, int64s
 from parkenv.world.week import DAY_S, WEEK_HOURS, hour_of_week
 
@@ -62,18 +50,18 @@ from parkenv.world.week import DAY_S, WEEK_HOURS, hour_of_week
 
 
 @kernel
-def begin_search(address: int) -> None:
+def begin_search_at(address: int) -> None:
     """Begin the next episode; an external prior must then be queried and `init_prior` called."""
     search = search_at(address, 0)
     arrive(search)
-    if scenario_at(search.scenario, 0).prior_kind != EXTERNAL_PRIOR:
+    if scenario_at(search.scenario, 0).prior_kind != EXTERNAL_KIND:
         init_prior(search)
-    tell_time(search)
+    write_clock(search)
 
 
 @kernel
-def init_external_prior(address: int) -> None:
-    """Initialise the belief with the forecast in `Searches.external_prior`."""
+def init_external_forecast_at(address: int) -> None:
+    """Initialise the belief with the forecast in `Searches.external_forecast`."""
     init_prior(search_at(address, 0))
 
 
@@ -81,7 +69,7 @@ def init_external_prior(address: int) -> None:
 
 
 @kernel
-def step_exact(address: int, action: int) -> tuple[Any, ...]:
+def step_exact_at(address: int, action: int) -> tuple[Any, ...]:
     """Take a valid action with an exact sensor; returns as `step_result`."""
     search = search_at(address, 0)
     drive_or_park(search, action)
@@ -92,7 +80,7 @@ def step_exact(address: int, action: int) -> tuple[Any, ...]:
 
 
 @kernel
-def step_noisy(address: int, action: int) -> tuple[Any, ...]:
+def step_noisy_at(address: int, action: int) -> tuple[Any, ...]:
     """Take a valid action with a noisy sensor; returns as `step_result`."""
     search = search_at(address, 0)
     drive_or_park(search, action)
@@ -106,13 +94,13 @@ def step_noisy(address: int, action: int) -> tuple[Any, ...]:
 
 
 @kernel
-def act_in(address: int, action: int) -> None:
+def act_at(address: int, action: int) -> None:
     """Move along the graph or attempt to park, without observing yet."""
     drive_or_park(search_at(address, 0), action)
 
 
 @kernel
-def set_step_time(address: int, begin: float, drive_s: float, failed_s: float) -> None:
+def set_step_time_at(address: int, begin: float, drive_s: float, failed_s: float) -> None:
     """Set the times, s, for driving and for failed attempts, of the step that began at `begin`."""
     search = search_at(address, 0)
     search.time = begin + (drive_s + failed_s)
@@ -120,8 +108,8 @@ def set_step_time(address: int, begin: float, drive_s: float, failed_s: float) -
 
 
 @kernel
-def fail_attempt_in(address: int) -> None:
-    """Count a failed attempt at a free slot; `set_step_time` sets its time."""
+def fail_attempt_at(address: int) -> None:
+    """Count a failed attempt at a free slot; `set_step_time_at` sets its time."""
     search = search_at(address, 0)
     search.failed_parks += 1
     search.n_steps += 1
@@ -129,16 +117,16 @@ def fail_attempt_in(address: int) -> None:
 
 
 @kernel
-def observe_in(address: int) -> None:
+def observe_at(address: int) -> None:
     """Observe the slots in view with the scenario's sensor model."""
     observe(search_at(address, 0))
 
 
 @kernel
-def apply_observations_in(
+def apply_observations_at(
     address: int, slots: IntArray, taken: BoolArray, hit_rate: FloatArray, false_alarm_rate: FloatArray
 ) -> None:
-    """Update the belief from external observations, (k,) each, instead of `observe_in`."""
+    """Update the belief from observations of some slots, (k,) contiguous each, instead of `observe_at`."""
     search = search_at(address, 0)
     mark_passed(search)
     for i in range(slots.size):
@@ -146,21 +134,21 @@ def apply_observations_in(
 
 
 @kernel
-def set_taken_in(address: int, slot: int) -> None:
-    """Set the belief that a slot is taken to certainty."""
+def set_taken_at(address: int, slot: int) -> None:
+    """Set P(taken) of a slot to 1, as after a failed attempt."""
     search = search_at(address, 0)
     set_belief(search, column_of(search, slot), True, 1.0)
 
 
 @kernel
-def finish_step_in(address: int) -> tuple[Any, ...]:
+def finish_step_at(address: int) -> tuple[Any, ...]:
     """Add the step to the episode and update the full belief; returns as `step_result`."""
     result: tuple[Any, ...] = complete_step(search_at(address, 0))
     return result
 
 
 @kernel
-def read_belief(
+def read_belief_at(
     address: int, p_occupied: FloatArray, p_observed: FloatArray, observed_at: FloatArray
 ) -> None:
     """Overwrite arrays that hold the forecast, (n_slots,) each, with the belief in observed slots."""
@@ -182,7 +170,7 @@ def complete_step(search: Any) -> tuple[Any, ...]:
     """Add the step to the episode, update belief and observed time; returns as `step_result`."""
     finish_step(search)
     refresh_belief(search)
-    tell_time(search)
+    write_clock(search)
     result: tuple[Any, ...] = step_result(search)
     return result
 
@@ -253,7 +241,7 @@ def take_step(search: Any, action: int) -> None:
 
 
 @inlined
-def tell_time(search: Any) -> None:
+def write_clock(search: Any) -> None:
     """Write the observed time: s since Monday 00:00, and since the search began."""
     search.clock[0], search.clock[1] = search.time, search.time - search.arrival
 
@@ -360,7 +348,7 @@ def observe_noisy(search: Any) -> None:
             continue
         column = column_of(search, slot)
         rate = hit_rate[i] if is_taken(search, column, time) else false_alarm_rate[i]
-        taken = keyed_uniform(key, SIGHTING_STREAM, slot, millisecond) < rate
+        taken = keyed_uniform(key, OBSERVATION_STREAM, slot, millisecond) < rate
         apply_observation(search, column, taken, hit_rate[i], false_alarm_rate[i])
 
 
@@ -481,10 +469,10 @@ def find_state(search: Any, record: Any, time: float) -> None:
     """Compute whether a slot is taken at a time beyond the known part of its sojourn."""
     scenario, slot = scenario_at(search.scenario, 0), np.int64(record.slot)
     if scenario.world_kind == LOG_KIND:
-        recorded_state(recorded_day_at(scenario.world, search.day), slot, record, time)
+        worlds.recorded_state(worlds.recorded_day_at(scenario.world, search.day), slot, record, time)
     else:
-        process_state(
-            process_at(scenario.world, 0), search.key, search.arrival, search.hour, search.second_of_hour,
+        worlds.process_state(
+            worlds.process_at(scenario.world, 0), search.key, search.arrival, search.hour, search.second_of_hour,
             slot, record, time,
         )  # fmt: skip
 
@@ -493,15 +481,17 @@ def find_state(search: Any, record: Any, time: float) -> None:
 def forecast_of(search: Any, slot: int) -> tuple[float, float]:
     """Return the forecast P(taken) of a slot, and its decay rate, 1/s."""
     scenario = scenario_at(search.scenario, 0)
-    if scenario.prior_kind == EXTERNAL_PRIOR:
-        external = float64s(search.external_prior)
+    if scenario.prior_kind == EXTERNAL_KIND:
+        external = float64s(search.external_forecast)
         return external[slot], external[search.width + slot]
     if scenario.prior_kind == LOG_KIND:
-        day = recorded_day_at(scenario.prior, search.day)
-        p, rate = recorded_forecast(day, slot, search.second_of_day), day.decay_rate
+        day = worlds.recorded_day_at(scenario.prior, search.day)
+        p, rate = worlds.recorded_forecast(day, slot, search.second_of_day), day.decay_rate
     else:
-        p, rate = process_forecast(process_at(scenario.prior, 0), search.hour, search.second_of_hour, slot)
-    return min(max(p, MIN_PROBABILITY), MAX_PROBABILITY), rate
+        p, rate = worlds.process_forecast(
+            worlds.process_at(scenario.prior, 0), search.hour, search.second_of_hour, slot
+        )
+    return min(max(p, worlds.MIN_PROBABILITY), worlds.MAX_PROBABILITY), rate
 
 
 @kernel
@@ -525,14 +515,14 @@ def _init_process_prior(search: Any) -> None:
     scenario, width, hour, second = (
         scenario_at(search.scenario, 0), search.width, search.hour, search.second_of_hour,
     )  # fmt: skip
-    process, n = process_at(scenario.prior, 0), scenario.n_slots
-    keep_hourly_marginals(process, hour)
+    process, n = worlds.process_at(scenario.prior, 0), scenario.n_slots
+    worlds.keep_hourly_marginals(process, hour)
     factors, profiles = float64s(process.factors), float64s(process.profiles)
     start, belief = float64s(process.hourly_marginals), float32s(search.belief)
     arriving, leaving = profiles[hour], profiles[WEEK_HOURS + hour]
     for slot in range(n):
         arrival = factors[slot] * arriving
         rate = arrival + factors[n + slot] * leaving
-        p = marginal_later(start[hour * n + slot], arrival, rate, second)
-        belief[FORECAST * width + slot] = min(max(p, MIN_PROBABILITY), MAX_PROBABILITY)
+        p = worlds.marginal_later(start[hour * n + slot], arrival, rate, second)
+        belief[FORECAST * width + slot] = min(max(p, worlds.MIN_PROBABILITY), worlds.MAX_PROBABILITY)
         belief[DECAY_RATE * width + slot] = rate

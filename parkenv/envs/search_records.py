@@ -18,7 +18,7 @@ from parkenv.world.recorded_occupancy import RecordedOccupancy
 from parkenv.world.scenario import Scenario
 
 N_ACTIONS = PARK + 1
-PROCESS_KIND, LOG_KIND, EXTERNAL_PRIOR = range(3)
+PROCESS_KIND, LOG_KIND, EXTERNAL_KIND = range(3)
 """Kinds of world and prior: a generating process; a replayed log; a forecast computed in Python at every arrival."""
 
 SCENARIO = np.dtype(
@@ -126,7 +126,7 @@ SEARCH = np.dtype(
         ("blocks", ADDRESS),
         ("slots", ADDRESS),
         ("columns", ADDRESS),
-        ("external_prior", ADDRESS),
+        ("external_forecast", ADDRESS),
         # Number of slots of the largest lot; (width,) float32 current belief and (4, width) float32 `belief` of the
         # observation, or 0 if these are not kept.
         ("width", np.int64),
@@ -137,8 +137,7 @@ SEARCH = np.dtype(
 )
 """A running search."""
 
-SENTINEL = 0
-"""Column shared by all slots without their own: they were not observed."""
+SENTINEL = 0  # column shared by all slots without their own: they were not observed
 
 SLOT = np.dtype(
     [
@@ -166,10 +165,8 @@ BLOCK = np.dtype(
 A few vector instructions update a block, and the data of a search stay close together in memory.
 """
 
-FORECAST, DECAY_RATE, P_OBSERVED, OBSERVED_AT = range(4)
-"""The parts of the observation's `belief`."""
-NEVER_OBSERVED = -1.0
-"""`observed_at` of a slot not observed in this search."""
+FORECAST, DECAY_RATE, P_OBSERVED, OBSERVED_AT = range(4)  # the parts of the observation's `belief`
+NEVER_OBSERVED = -1.0  # `observed_at` of a slot not observed in this search
 
 scenario_at, search_at = record_at(SCENARIO), record_at(SEARCH)
 slot_at, block_at = record_at(SLOT), record_at(BLOCK)
@@ -243,7 +240,7 @@ class ScenarioRecords:
             weekdays = list(scenario.arrival.weekdays)
         record["weekdays"], record["n_weekdays"] = self._keep(weekdays, np.int64), len(weekdays)
         record["world_kind"], record["world"] = self._kind_and_address(occupancy, scenario)
-        if record["world_kind"] == EXTERNAL_PRIOR:
+        if record["world_kind"] == EXTERNAL_KIND:
             raise InputError(
                 f"occupancy is a {type(occupancy).__name__}, want an OccupancyProcess or a RecordedOccupancy"
             )
@@ -252,7 +249,7 @@ class ScenarioRecords:
         elif isinstance(prior, OccupancyProcess):
             record["prior_kind"], record["prior"] = self._kind_and_address(prior, scenario)
         else:
-            record["prior_kind"] = EXTERNAL_PRIOR
+            record["prior_kind"] = EXTERNAL_KIND
 
     def _kind_and_address(self, model: OccupancyModel | PriorModel, scenario: Scenario) -> tuple[int, int]:
         if isinstance(model, OccupancyProcess):
@@ -261,7 +258,7 @@ class ScenarioRecords:
         if isinstance(model, RecordedOccupancy):
             self._kept += [model, days := model.day_records(model.days_in(scenario.arrival))]
             return LOG_KIND, address_of(days, RECORDED_DAY)
-        return EXTERNAL_PRIOR, 0
+        return EXTERNAL_KIND, 0
 
 
 class Searches:
@@ -276,7 +273,7 @@ class Searches:
         records: (n,) of the dtype SEARCH.
         slots: (n, m + 1) of the dtype SLOT, a column for each slot that a search has observed or queried, in order of
             first use; the first column is the sentinel. m is the number of slots of the largest lot.
-        external_prior: (n, 2, m) float64, forecast and decay rate of priors that only Python can compute; else
+        external_forecast: (n, 2, m) float64, forecast and decay rate of priors that only Python can compute; else
             (0, 2, 0).
         p_occupied: (n, m) float32, current belief in every slot; (0, 0) if not kept.
         belief: (n, 4, m) float32: forecast, decay rate, belief after the last observation, and its time; (0, 4, 0) if
@@ -285,14 +282,14 @@ class Searches:
 
     def __init__(self, scenarios: ScenarioRecords, scenario_of: IntArray, full_belief: bool) -> None:
         n, m = len(scenario_of), int(scenarios.records["n_slots"].max())
-        external = bool((scenarios.records["prior_kind"] == EXTERNAL_PRIOR).any())
+        external = bool((scenarios.records["prior_kind"] == EXTERNAL_KIND).any())
         self.scenarios = scenarios
         self.records = np.zeros(n, SEARCH)
         self.slots = np.zeros((n, m + 1), SLOT)
         self._blocks = np.zeros((n, (m + BLOCK_SIZE) >> BLOCK_BITS), BLOCK)
         # Zeros stand for the sentinel; the system allocates no memory for pages that are never written.
         self._columns = np.zeros((n, m), np.int32)
-        self.external_prior = np.zeros((n, 2, m) if external else (0, 2, 0))
+        self.external_forecast = np.zeros((n, 2, m) if external else (0, 2, 0))
         # Padding past the last slot of a smaller lot: taken, constant, never observed.
         self.p_occupied = np.ones((n, m) if full_belief else (0, 0), np.float32)
         self.belief = np.zeros((n, 4, m) if full_belief else (0, 4, 0), np.float32)
@@ -310,7 +307,7 @@ class Searches:
             "slots": self.slots,
             "blocks": self._blocks,
             "columns": self._columns,
-            "external_prior": self.external_prior,
+            "external_forecast": self.external_forecast,
             "p_occupied": self.p_occupied,
             "belief": self.belief,
         }

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.envs.search_kernel import read_belief
+from parkenv.envs.search_kernel import read_belief_at
 from parkenv.envs.search_records import Searches
 from parkenv.world.occupancy import Arrival, World
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -53,7 +53,7 @@ class SearchState:
         forecast = self._scenario.forecast(self.arrival)
         belief = SlotBelief.of_forecast(forecast.p_occupied, forecast.decay_rate)
         belief.time = self.time - self.arrival.time
-        read_belief(self._searches.address, belief.p_occupied, belief.p_observed, belief.observed_at)
+        read_belief_at(self._searches.address, belief.p_occupied, belief.p_observed, belief.observed_at)
         return belief
 
     @property

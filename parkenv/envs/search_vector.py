@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from parkenv.envs.local_observation import Surroundings, local_space, observe_surroundings
 from parkenv.envs.search import REWARD_TERMS, search_space
-from parkenv.envs.search_kernel import arrive, init_prior, refresh_belief, take_step, tell_time
+from parkenv.envs.search_kernel import arrive, init_prior, refresh_belief, take_step, write_clock
 from parkenv.envs.search_records import N_ACTIONS, ScenarioRecords, Searches, scenario_at, search_at
 from parkenv.envs.search_state import arrival_of
 from parkenv.errors import InputError
@@ -27,6 +27,8 @@ from parkenv.world.pointers import uint8s
 from parkenv.world.scenario import Scenario
 
 OBSERVATIONS = ("full", "occupancy", "local")
+MAX_ENVS = 1_000_000
+"""Maximum number of environments."""
 TIME_METRICS = (
     "drive_s",
     "failed_s",
@@ -107,7 +109,7 @@ def step_full(
             take_step(search, actions[e])
             refresh_belief(search)
         _report(search, e, fresh[e], limit, steps, mask)
-        tell_time(search)
+        write_clock(search)
         vertex[e], time[e, 0], time[e, 1] = search.vertex, search.clock[0], search.clock[1]
 
 
@@ -252,9 +254,9 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         render_mode: str | None = None,
         **changes: Any,
     ) -> None:
-        _require_count("num_envs", num_envs)
+        _require_count("num_envs", num_envs, MAX_ENVS)
         if max_episode_steps is not None:
-            _require_count("max_episode_steps", max_episode_steps)
+            _require_count("max_episode_steps", max_episode_steps, 2**31 - 1)
         if observation not in OBSERVATIONS:
             raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")
         if render_mode is not None:
@@ -425,13 +427,13 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         """Put the selected cars at the entries of their next worlds."""
         searches = self._searches
         arrive_all(searches.address, which)
-        if not len(searches.external_prior):
+        if not len(searches.external_forecast):
             return
         for i in np.flatnonzero(which):
             scenario = self.scenarios[i % len(self.scenarios)]
             forecast = scenario.forecast(arrival_of(scenario, searches.records[i]))
             n = len(forecast.p_occupied)
-            searches.external_prior[i, :, :n] = forecast.p_occupied, forecast.decay_rate
+            searches.external_forecast[i, :, :n] = forecast.p_occupied, forecast.decay_rate
 
     def _observations(self) -> dict[str, NDArray[Any]]:
         return {name: a.copy() for name, a in self._seen.items()} if self._copy else dict(self._seen)
@@ -469,6 +471,6 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return mask
 
 
-def _require_count(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise InputError(f"{name} is {value!r}, want a whole number of at least 1")
+def _require_count(name: str, value: Any, most: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 1 <= value <= most:
+        raise InputError(f"{name} is {value!r}, want a whole number from 1 to {most:,}")

@@ -26,16 +26,11 @@ _SEEDS = 1 << 31
 
 
 class Station(NamedTuple):
-    """A time and a pose at which to measure.
+    """A time and a pose at which to measure."""
 
-    Attributes:
-        time: s since Monday 00:00.
-        pose: (3,) x, y in m, yaw in rad, of the vehicle.
-        movers: moving cars and pedestrians around it; None: the scenario's traffic at this time, undisturbed.
-    """
-
-    time: float
-    pose: FloatArray
+    time: float  # s since Monday 00:00
+    pose: FloatArray  # (3,) x, y in m, yaw in rad, of the vehicle
+    # moving cars and pedestrians around it; None: the scenario's traffic at this time, undisturbed
     movers: Movers | None = None
 
 

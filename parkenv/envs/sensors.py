@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Any
 
 import cv2
@@ -16,13 +17,44 @@ from parkenv.perception.capture import TimedCapture
 from parkenv.world.scenario import Scenario
 from sim_sensors.rig import SensorRig
 
-FARTHEST = 1e7
-"""Bound, m, of the observed positions: Gymnasium requires one, and every lot is smaller."""
+FARTHEST = 1e7  # bound, m, of the observed positions: Gymnasium requires one, and every lot is smaller
 
 _NOT_SENSED = ("p_occupied", "belief")
 
 
-class SearchSensorsEnv(SearchEnv):
+class SensingSearchEnv(SearchEnv):
+    """Base class of the searches with simulated sensors; subclasses set `_sampler`."""
+
+    _sampler: SensorSampler
+    _before: tuple[int, float] | None = None
+
+    @property
+    def rig(self) -> SensorRig:
+        """The sensors, their poses on the car, and their models."""
+        return self._sampler.rig
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode; see the class."""
+        self._before = None
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """Drive along an edge, or attempt to park; see the class."""
+        self._before = (self.state.vertex, self.state.time)
+        return super().step(action)
+
+    @abstractmethod
+    def _newest(self) -> TimedCapture | None:
+        """Return the newest capture, if any."""
+
+    def _frame(self, state: SearchState) -> NDArray[np.uint8]:
+        """Return the lot from above, with the newest camera images beside it."""
+        return with_camera_images(super()._frame(state), self._newest(), self.rig)
+
+
+class SearchSensorsEnv(SensingSearchEnv):
     """`parkenv/Search-v1` with raw sensor data instead of a belief: images, laser scans and poses.
 
     ## Description
@@ -34,12 +66,7 @@ class SearchSensorsEnv(SearchEnv):
     Observations do not contain the forecast; the first observation of `parkenv/Search-v1` with the same seed has it.
 
     ## Action space
-    `Discrete(5)`, as in `parkenv/Search-v1`:
-
-    | Num | Action | Effect |
-    |-----|--------|--------|
-    | 0-3 | up, down, left, right | drive along that edge of the graph; wait `wait_s` if there is none |
-    | 4 | park | park and walk to the goal if the slot here is free; lose `failure_s` if it is taken |
+    `Discrete(5)`, as in `parkenv/Search-v1`: up, down, left, right, park.
 
     ## Observation space
     A `Dict`. K = `captures`; the newest capture is the last of `count`; rows from `count` on are 0.
@@ -104,7 +131,6 @@ class SearchSensorsEnv(SearchEnv):
     ) -> None:
         super().__init__(scenario, render_mode, **changes)
         self._sampler = SensorSampler(self.scenario, rig, weather, captures, every)
-        self._before: tuple[int, float] | None = None
         self._captures: list[TimedCapture] = []
         k = self._sampler.captures
         seen: dict[str, spaces.Space[Any]] = {
@@ -121,23 +147,6 @@ class SearchSensorsEnv(SearchEnv):
         for name, laser, _ in self.rig.lasers:
             seen[f"scan.{name}"] = spaces.Box(0.0, laser.max_range, (k, laser.n_beams), np.float32)
         self.observation_space = spaces.Dict(seen)
-
-    @property
-    def rig(self) -> SensorRig:
-        """The sensors, their poses on the car, and their models."""
-        return self._sampler.rig
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode; see the class."""
-        self._before = None
-        return super().reset(seed=seed, options=options)
-
-    def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Drive along an edge, or attempt to park; see the class."""
-        self._before = (self.state.vertex, self.state.time)
-        return super().step(action)
 
     def _observation(self, state: SearchState) -> dict[str, Any]:
         self._captures = [] if state.parked else self._sampler.sample_step(state, self._before)
@@ -159,10 +168,8 @@ class SearchSensorsEnv(SearchEnv):
                 observation[f"scan.{name}"][i] = np.minimum(capture.scans[name], laser.max_range)
         return observation
 
-    def _frame(self, state: SearchState) -> NDArray[np.uint8]:
-        """Return the lot from above, with the newest camera images beside it."""
-        newest = self._captures[-1] if self._captures else None
-        return with_camera_images(super()._frame(state), newest, self.rig)
+    def _newest(self) -> TimedCapture | None:
+        return self._captures[-1] if self._captures else None
 
 
 def with_camera_images(

@@ -19,46 +19,28 @@ STEP_LIMIT = 2000
 
 
 class Step(NamedTuple):
-    """One decision and its outcome.
+    """One decision and its outcome."""
 
-    Attributes:
-        observation: observation before the decision.
-        action: action chosen by the agent.
-        memory: the agent's state after the decision; it may change with the next decision.
-        reward: reward of the step.
-        next_observation: observation after the step.
-        terminated: whether the episode reached a terminal state.
-        truncated: whether the step limit ended the episode.
-        info: `info` of the step.
-    """
-
-    observation: Any
-    action: Any
-    memory: Any
-    reward: float
-    next_observation: Any
-    terminated: bool
-    truncated: bool
-    info: dict[str, Any]
+    observation: Any  # observation before the decision
+    action: Any  # action chosen by the agent
+    memory: Any  # the agent's state after the decision; it may change with the next decision
+    reward: float  # reward of the step
+    next_observation: Any  # observation after the step
+    terminated: bool  # whether the episode reached a terminal state
+    truncated: bool  # whether the step limit ended the episode
+    info: dict[str, Any]  # `info` of the step
 
 
 @dataclass(frozen=True)
 class EpisodeResult:
-    """The outcome of one episode.
+    """The outcome of one episode."""
 
-    Attributes:
-        seed: seed of the world.
-        info: `info` of the last step. A truncated search is charged the give-up penalty, see `charge_truncation`.
-        truncated: whether the step limit ended the episode.
-        decision_s: wall time of each decision, s, excluding compiling and loading of compiled code.
-        memory: the agent's state at the end.
-    """
-
-    seed: int
+    seed: int  # seed of the world
+    # `info` of the last step. A truncated search is charged the give-up penalty, see `charge_truncation`.
     info: dict[str, Any]
-    truncated: bool
-    decision_s: list[float]
-    memory: Any
+    truncated: bool  # whether the step limit ended the episode
+    decision_s: list[float]  # wall time of each decision, s, excluding compiling and loading of compiled code
+    memory: Any  # the agent's state at the end
 
     @property
     def steps(self) -> int:

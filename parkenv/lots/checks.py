@@ -23,8 +23,7 @@ LANE_GAP = 1.0
 """Distance, m: a lane that ends closer to another one without a common point was probably meant to join it."""
 SLOT_OVERLAP = 0.1
 """Smallest depth, m, of a reported overlap of two slots; smaller ones are drawing inaccuracies."""
-GOAL_REACH = 50.0
-"""Distance, m, from the nearest lane beyond which a goal is reported."""
+GOAL_REACH = 50.0  # distance, m, from the nearest lane beyond which a goal is reported
 
 
 def check_lot(path: str | Path) -> list[LotProblem]:

@@ -18,14 +18,10 @@ from parkenv.world.lot import Lane, Mouth, ParkingLot
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
-BAY_SIZE = (5.0, 2.5)
-"""Length and width, m, of a perpendicular or angled slot."""
-KERB_SIZE = (6.0, 2.1)
-"""Length and width, m, of a kerbside slot."""
-TWO_WAY_HALF_WIDTH = 3.0
-"""Distance from the centre line of a two-way street to its parked cars, m."""
-ONE_WAY_HALF_WIDTH = 2.0
-"""Distance from the centre line of a one-way street to its parked cars, m."""
+BAY_SIZE = (5.0, 2.5)  # length and width, m, of a perpendicular or angled slot
+KERB_SIZE = (6.0, 2.1)  # length and width, m, of a kerbside slot
+TWO_WAY_HALF_WIDTH = 3.0  # distance from the centre line of a two-way street to its parked cars, m
+ONE_WAY_HALF_WIDTH = 2.0  # distance from the centre line of a one-way street to its parked cars, m
 CROSSING_CLEARANCE = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 5.0
 """Distance from the centre of a crossing to the first parked car, m: no parking within 5 m of the kerbs' corner."""
 BUILDING_SETBACK = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 2.9
@@ -139,13 +135,7 @@ def kerb_rows(
 
 
 def grid_lot(
-    rows: int,
-    columns: int,
-    *,
-    name: str = "grid",
-    pitch: float = 2.5,
-    depth: float = 5.0,
-    aisle: float = 6.0,
+    rows: int, columns: int, *, name: str = "grid", pitch: float = 2.5, depth: float = 5.0, aisle: float = 6.0
 ) -> ParkingLot:
     """Create rows of perpendicular slots along parallel two-way aisles, connected by a road at either end.
 
@@ -253,16 +243,12 @@ def _random_streets(n_blocks: int, rng: np.random.Generator) -> StreetGrid:
 
 @dataclass(frozen=True, eq=False)
 class StreetGrid:
-    """A grid of streets, `along` from west to east and `across` from south to north.
+    """A grid of streets, `along` from west to east and `across` from south to north."""
 
-    Args:
-        crossings: (n_along, n_across, 2) m, crossing of street i along and street j across.
-        along: (n_along,) int: 0 for a two-way street, 1 for a one-way street eastward, -1 westward.
-        across: (n_across,) int: 0 for a two-way street, 1 for a one-way street northward, -1 southward.
-    """
-
-    crossings: FloatArray
+    crossings: FloatArray  # (n_along, n_across, 2) m, crossing of street i along and street j across
+    # (n_along,) int: 0 for a two-way street, 1 for a one-way street eastward, -1 westward
     along: NDArray[np.int64]
+    # (n_across,) int: 0 for a two-way street, 1 for a one-way street northward, -1 southward
     across: NDArray[np.int64]
 
     def lanes(self) -> list[Lane]:

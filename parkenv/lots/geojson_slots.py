@@ -19,13 +19,10 @@ from parkenv.world.lot import SLOT_SIDE, Mouth, corner_points
 
 FloatArray = NDArray[np.float64]
 
-SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")
-"""The properties that define a slot exactly."""
+SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")  # the properties that define a slot exactly
 MOUTHS = {mouth.name.lower(): mouth for mouth in Mouth}
-FARTHEST = 1e8
-"""Largest coordinate, m: enough for any map grid, and small enough for millimetres in float64."""
-SLOT_AGREEMENT = 0.01
-"""Largest distance, m, between a slot's polygon and the rectangle of its properties."""
+FARTHEST = 1e8  # largest coordinate, m: enough for any map grid, and small enough for millimetres in float64
+SLOT_AGREEMENT = 0.01  # largest distance, m, between a slot's polygon and the rectangle of its properties
 
 
 @dataclass(frozen=True)

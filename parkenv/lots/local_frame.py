@@ -21,10 +21,6 @@ FloatArray = NDArray[np.float64]
 class LocalFrame:
     """An azimuthal equidistant projection: distances and bearings from its centre are exact.
 
-    Args:
-        lon: longitude of the centre, degrees, WGS 84.
-        lat: latitude of the centre, degrees.
-
     Raises:
         InputError: an invalid longitude or latitude.
 
@@ -34,8 +30,8 @@ class LocalFrame:
         [[0.0, 0.0]]
     """
 
-    lon: float
-    lat: float
+    lon: float  # longitude of the centre, degrees, WGS 84
+    lat: float  # latitude of the centre, degrees
 
     def __post_init__(self) -> None:
         if not (abs(self.lon) <= 360.0 and abs(self.lat) <= 90.0):

@@ -20,33 +20,20 @@ _ROOM = (4.2, 1.9)  # m, least distance between slot centres along and across a 
 
 
 class FoundSlots(NamedTuple):
-    """Discovered slots.
+    """Discovered slots."""
 
-    Attributes:
-        xy: (n, 2) m, centres.
-        yaw: (n,) rad, along the slot, in [0, π).
-        cars: (n,) int64, number of cars detected there.
-    """
-
-    xy: FloatArray
-    yaw: FloatArray
-    cars: NDArray[np.int64]
+    xy: FloatArray  # (n, 2) m, centres
+    yaw: FloatArray  # (n,) rad, along the slot, in [0, π)
+    cars: NDArray[np.int64]  # (n,) int64, number of cars detected there
 
 
 class DiscoveryScore(NamedTuple):
-    """Errors of discovered slots.
+    """Errors of discovered slots."""
 
-    Attributes:
-        precision: fraction of the discovered slots that are true slots.
-        recall: fraction of the true slots that were discovered.
-        error: m, mean distance of matched slots.
-        yaw_error: rad, mean.
-    """
-
-    precision: float
-    recall: float
-    error: float
-    yaw_error: float
+    precision: float  # fraction of the discovered slots that are true slots
+    recall: float  # fraction of the true slots that were discovered
+    error: float  # m, mean distance of matched slots
+    yaw_error: float  # rad, mean
 
 
 def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSlots:

@@ -14,8 +14,7 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
-MOST_LOG_ODDS = 12.0
-"""Bound of the log-odds, so that later observations can still change the estimate."""
+MOST_LOG_ODDS = 12.0  # bound of the log-odds, so that later observations can still change the estimate
 _UNOBSERVED, _FREE, _OCCUPIED = 0, 1, 2
 
 

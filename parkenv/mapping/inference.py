@@ -30,17 +30,11 @@ _HOUR_WIDTH = 1.0
 
 @dataclass(frozen=True, eq=False)
 class SessionLog:
-    """The observed state of every slot in each session.
+    """The observed state of every slot in each session."""
 
-    Args:
-        time: (k,) s since Monday 00:00.
-        occupied: (k, n_slots) bool.
-        known: (k, n_slots) bool, whether the slot was observed.
-    """
-
-    time: FloatArray
-    occupied: NDArray[np.bool_]
-    known: NDArray[np.bool_]
+    time: FloatArray  # (k,) s since Monday 00:00
+    occupied: NDArray[np.bool_]  # (k, n_slots) bool
+    known: NDArray[np.bool_]  # (k, n_slots) bool, whether the slot was observed
 
     def __post_init__(self) -> None:
         if (

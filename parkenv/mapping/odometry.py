@@ -20,18 +20,13 @@ class PoseNoise:
     The errors of position and heading are Ornstein-Uhlenbeck processes over the distance driven: a fused filter
     follows its odometry from metre to metre and its fixes from minute to minute.
 
-    Args:
-        position: m, stationary standard deviation of each coordinate.
-        heading: rad, stationary standard deviation.
-        length: m driven, over which the autocorrelation falls to 1/e.
-
     Raises:
         InputError: a number below 0, or a length of 0.
     """
 
-    position: float = 0.0
-    heading: float = 0.0
-    length: float = 30.0
+    position: float = 0.0  # m, stationary standard deviation of each coordinate
+    heading: float = 0.0  # rad, stationary standard deviation
+    length: float = 30.0  # m driven, over which the autocorrelation falls to 1/e
 
     def __post_init__(self) -> None:
         for name in ("position", "heading"):

@@ -18,19 +18,13 @@ _MILLIMETRES = 1000.0
 
 
 class SurveyRoute(NamedTuple):
-    """A closed drive.
+    """A closed drive."""
 
-    Attributes:
-        vertices: (k,) int64, in driving order.
-        path: (k, 2) float64, m, lot frame.
-        against: number of slots passed against the direction of a one-way lane, because they are on its left.
-        length: m.
-    """
-
-    vertices: NDArray[np.int64]
-    path: FloatArray
+    vertices: NDArray[np.int64]  # (k,) int64, in driving order
+    path: FloatArray  # (k, 2) float64, m, lot frame
+    # number of slots passed against the direction of a one-way lane, because they are on its left
     against: int
-    length: float
+    length: float  # m
 
 
 class _Pass(NamedTuple):

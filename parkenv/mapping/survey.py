@@ -37,26 +37,20 @@ _SEEDS = 1 << 31
 class SurveySettings:
     """Settings of a survey.
 
-    Args:
-        rig: `laser`: the thesis's camera and 270° laser; `stereo`: only a stereo camera; `both_sides`: a laser, a
-            camera to the right and one to the left, so that aisles with slots on both sides are driven once.
-        every: distance between captures, m.
-        weather: one of `sim_sensors.camera.weather.PRESETS`; None draws one for each session.
-        windows: arrival windows of the sessions; the k-th session uses the k-th window, cyclically.
-        pose_noise: the vehicle's localisation error.
-        seed: seed of worlds, weather and noise.
-        detector: as `make_detector` takes it: `hog`, `side`, `front`, a model file or `MODULE:CLASS`.
-
     Raises:
         InputError: an unknown rig or weather, no window, or a distance that is not positive.
     """
 
+    # `laser`: the thesis's camera and 270° laser; `stereo`: only a stereo camera; `both_sides`: a laser, a camera to
+    # the right and one to the left, so that aisles with slots on both sides are driven once
     rig: str = "laser"
-    every: float = 1.25
-    weather: str | None = None
+    every: float = 1.25  # distance between captures, m
+    weather: str | None = None  # one of `sim_sensors.camera.weather.PRESETS`; None draws one for each session
+    # arrival windows of the sessions; the k-th session uses the k-th window, cyclically
     windows: tuple[ArrivalWindow, ...] = (ArrivalWindow(),)
-    pose_noise: PoseNoise = field(default_factory=PoseNoise)
-    seed: int = 0
+    pose_noise: PoseNoise = field(default_factory=PoseNoise)  # the vehicle's localisation error
+    seed: int = 0  # seed of worlds, weather and noise
+    # as `make_detector` takes it: `hog`, `side`, `front`, a model file or `MODULE:CLASS`
     detector: str = DEFAULT_DETECTOR
 
     def __post_init__(self) -> None:
@@ -72,30 +66,19 @@ class SurveySettings:
 
 @dataclass(frozen=True, eq=False)
 class SessionResult:
-    """A session, its estimates, and their errors.
+    """A session, its estimates, and their errors."""
 
-    Attributes:
-        session: the record for the map file.
-        arrival: start of the session.
-        states: the filter's final estimate.
-        truth: (n_slots,) bool, taken when the slot was last observed, or at the start if it was never observed.
-        parked: number of cars in slots then; `found`: how many of them were detected.
-        score: errors of detection and localisation.
-        frame_s: (f,) s, processing time of each capture.
-        grid: the occupancy grid of the session.
-        shown: results of some captures with many cars, for figures.
-    """
-
-    session: Session
-    arrival: Arrival
-    states: SlotStates
+    session: Session  # the record for the map file
+    arrival: Arrival  # start of the session
+    states: SlotStates  # the filter's final estimate
+    # (n_slots,) bool, taken when the slot was last observed, or at the start if it was never observed
     truth: BoolArray
-    parked: int
+    parked: int  # number of cars in slots then; `found`: how many of them were detected
     found: int
-    score: SurveyScore
-    frame_s: FloatArray
-    grid: OccupancyGrid
-    shown: tuple[PerceptionResult, ...]
+    score: SurveyScore  # errors of detection and localisation
+    frame_s: FloatArray  # (f,) s, processing time of each capture
+    grid: OccupancyGrid  # the occupancy grid of the session
+    shown: tuple[PerceptionResult, ...]  # results of some captures with many cars, for figures
 
     @property
     def slot_accuracy(self) -> float:
@@ -113,18 +96,12 @@ class SurveyFrame(NamedTuple):
     """The state of a session after one capture.
 
     Grid and slots are shared with the session, which keeps updating them: copy them to keep them.
-
-    Attributes:
-        result: pipeline result for the capture.
-        grid: the occupancy grid so far.
-        slots: the slot filter so far.
-        truth: (n_slots,) bool, true current states; only for figures and scores.
     """
 
-    result: PerceptionResult
-    grid: OccupancyGrid
-    slots: SlotFilter
-    truth: BoolArray
+    result: PerceptionResult  # pipeline result for the capture
+    grid: OccupancyGrid  # the occupancy grid so far
+    slots: SlotFilter  # the slot filter so far
+    truth: BoolArray  # (n_slots,) bool, true current states; only for figures and scores
 
 
 class Survey:

@@ -17,12 +17,10 @@ from sim_sensors.scene import Scene
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-MATCH = 0.3
-"""Intersection over union from which a detection matches a car."""
+MATCH = 0.3  # intersection over union from which a detection matches a car
 DISTANCE_ENDS = (4.0, 6.0, 8.0, 10.0, 12.0, 15.0)
 """m, from the camera to a car's centre: upper ends of the bins in which detections are counted."""
-CLEAR = 0.6
-"""Visible fraction of a car in an image from which a frame without its detection counts as a miss."""
+CLEAR = 0.6  # visible fraction of a car in an image from which a frame without its detection counts as a miss
 METHODS = ("fitted", "thesis")
 """Localisation methods: `localize_cars`, and the median range as in the thesis (`localize_as_thesis`)."""
 _TRUTH = LaserScanner()

@@ -13,10 +13,8 @@ from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
-CAR_LENGTH, CAR_WIDTH = 4.4, 1.8
-"""Assumed length and width, m, of sides that are not visible."""
-LONG_SIDE = 2.3
-"""Length, m, from which a side is a flank: no car is this wide."""
+CAR_LENGTH, CAR_WIDTH = 4.4, 1.8  # assumed length and width, m, of sides that are not visible
+LONG_SIDE = 2.3  # length, m, from which a side is a flank: no car is this wide
 _SIDE_SEEN = 0.6  # m, visible length from which a side counts as seen
 _NEAREST = 0.02  # m; points closer to a side than this all count the same
 _CUT = 0.1  # m; an end of the run this close to a side counts as on it

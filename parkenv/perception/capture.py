@@ -8,12 +8,7 @@ from sim_sensors.rig import Capture
 
 
 class TimedCapture(NamedTuple):
-    """Measurements of a rig at one moment.
+    """Measurements of a rig at one moment."""
 
-    Attributes:
-        time: s since Monday 00:00.
-        capture: images, stereo pairs and laser scans, with the true pose of the vehicle.
-    """
-
-    time: float
-    capture: Capture
+    time: float  # s since Monday 00:00
+    capture: Capture  # images, stereo pairs and laser scans, with the true pose of the vehicle

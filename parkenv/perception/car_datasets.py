@@ -18,8 +18,7 @@ from parkenv.perception.hog_detector import as_grey
 Image = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
 
-UIUC_SIZE = (100, 40)
-"""Width and height, px, of UIUC's training crops and of its true boxes at scale 1."""
+UIUC_SIZE = (100, 40)  # width and height, px, of UIUC's training crops and of its true boxes at scale 1
 UIUC_TESTS = {
     "single": ("TestImages", "trueLocations.txt"),
     "multi": ("TestImages_Scale", "trueLocations_Scale.txt"),
@@ -29,30 +28,19 @@ _POSITIVE, _NEGATIVE = ("positives", "vehicles", "pos"), ("negatives", "non-vehi
 
 @dataclass(frozen=True, eq=False)
 class Crops:
-    """Aligned images of cars, and images without cars.
+    """Aligned images of cars, and images without cars."""
 
-    Attributes:
-        positives: grey, uint8, with the car at the same position in each.
-        negatives: grey, uint8, of any size.
-    """
-
-    positives: list[Image]
-    negatives: list[Image]
+    positives: list[Image]  # grey, uint8, with the car at the same position in each
+    negatives: list[Image]  # grey, uint8, of any size
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledImage:
-    """A photograph with the boxes of its cars.
+    """A photograph with the boxes of its cars."""
 
-    Attributes:
-        name: name of the file.
-        image: (h, w) uint8.
-        boxes: (n, 4) float64 px, left, top, right, bottom.
-    """
-
-    name: str
-    image: Image
-    boxes: FloatArray
+    name: str  # name of the file
+    image: Image  # (h, w) uint8
+    boxes: FloatArray  # (n, 4) float64 px, left, top, right, bottom
 
 
 def read_uiuc_training(folder: Path) -> Crops:

@@ -22,8 +22,7 @@ from parkenv.perception.hog import Descriptor
 
 Float32Array = NDArray[np.float32]
 
-PACKAGED_MODELS = ("side", "front")
-"""Packaged models, trained only on simulated images."""
+PACKAGED_MODELS = ("side", "front")  # packaged models, trained only on simulated images
 _FORMAT = "parkenv-car-model"
 _VERSION = 2  # version 1 did not take the square root of the grey values
 _EPOCH = (1980, 1, 1, 0, 0, 0)  # equal models are equal files
@@ -33,28 +32,20 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)  # equal models are equal files
 class CarModel:
     """A linear classifier (support vector machine) of image windows on HOG features (T §3.2.1).
 
-    Args:
-        descriptor: the features of a window.
-        weights: `descriptor.shape` float32.
-        bias: added to the weighted sum; a score above 0 means car.
-        region_aspect: width over height of the image region that is resized to the window.
-        car: left, top, right, bottom of the car within the window, as fractions of its width and height.
-        calibration: slope and offset; the probability of a score s is 1/(1 + exp(-(slope·s + offset))).
-        end_on: whether it was trained on fronts and rears rather than on sides.
-        trained_on: one line that describes the training data.
-
     Raises:
         InputError: weights of another shape, or a number outside its range.
     """
 
-    descriptor: Descriptor
-    weights: Float32Array
-    bias: float
-    region_aspect: float
+    descriptor: Descriptor  # the features of a window
+    weights: Float32Array  # `descriptor.shape` float32
+    bias: float  # added to the weighted sum; a score above 0 means car
+    region_aspect: float  # width over height of the image region that is resized to the window
+    # left, top, right, bottom of the car within the window, as fractions of its width and height
     car: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
+    # slope and offset; the probability of a score s is 1/(1 + exp(-(slope·s + offset)))
     calibration: tuple[float, float] = (1.0, 0.0)
-    end_on: bool = False
-    trained_on: str = ""
+    end_on: bool = False  # whether it was trained on fronts and rears rather than on sides
+    trained_on: str = ""  # one line that describes the training data
 
     def __post_init__(self) -> None:
         weights = np.ascontiguousarray(self.weights, dtype=np.float32)

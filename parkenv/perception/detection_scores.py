@@ -16,17 +16,11 @@ REACH = 0.25
 
 @dataclass(frozen=True, eq=False)
 class RecallPrecision:
-    """A recall-precision curve with one point per threshold, strictest first.
+    """A recall-precision curve with one point per threshold, strictest first."""
 
-    Attributes:
-        threshold: (k,) float64.
-        recall: (k,) float64, fraction of the cars that are found.
-        precision: (k,) float64, fraction of the detections that are cars.
-    """
-
-    threshold: FloatArray
-    recall: FloatArray
-    precision: FloatArray
+    threshold: FloatArray  # (k,) float64
+    recall: FloatArray  # (k,) float64, fraction of the cars that are found
+    precision: FloatArray  # (k,) float64, fraction of the detections that are cars
 
     @property
     def equal_error(self) -> float:

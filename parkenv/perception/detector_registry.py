@@ -11,8 +11,7 @@ from parkenv.perception.car_model import PACKAGED_MODELS
 from parkenv.perception.detector import LEAST_PROBABILITY, Detector
 from parkenv.perception.hog_detector import HogDetector
 
-DEFAULT_DETECTOR = "hog"
-"""Both packaged models, `side` and `front`."""
+DEFAULT_DETECTOR = "hog"  # both packaged models, `side` and `front`
 
 
 def make_detector(name: str | Detector | None = None) -> Detector:

@@ -23,10 +23,8 @@ from sim_sensors.compilation import compiled
 Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
-CELL = 8
-"""Pixels along each side of a cell."""
-ORIENTATIONS = 9
-"""Bins over half a turn; opposite gradients count as one."""
+CELL = 8  # pixels along each side of a cell
+ORIENTATIONS = 9  # bins over half a turn; opposite gradients count as one
 NORMALIZATIONS = ("neighbors", "cell", "blocks")
 
 _NOISE = 25.0  # energy of a cell with sensor noise only; weaker cells are not amplified
@@ -206,27 +204,16 @@ def _bin_rows(
     f0, f1, f2, f3 = first, first + step, first + step + step, first + step + step + step
     m0, m1, m2, m3 = m[0], m[1], m[2], m[3]
     q0, q1, q2, q3 = q[0], q[1], q[2], q[3]
-    for k in range(ORIENTATIONS):
-        a = upper[k]
-        b = lower[k]
-        center = np.float32(k)
-        for x in range(len(m0)):
-            v0 = _share(m0[x], q0[x], center)
-            v1 = _share(m1[x], q1[x], center)
-            v2 = _share(m2[x], q2[x], center)
-            v3 = _share(m3[x], q3[x], center)
-            down = f0 * v0 + f1 * v1 + f2 * v2 + f3 * v3
-            a[_HALF + x] += v0 + v1 + v2 + v3 - down
-            b[_HALF + x] += down
     # Orientations wrap at half a turn: the first and the last bin are neighbours.
-    for k, center in ((0, np.float32(ORIENTATIONS)), (ORIENTATIONS - 1, np.float32(-1.0))):
-        a = upper[k]
-        b = lower[k]
+    for i in range(ORIENTATIONS + 2):
+        center = i if i <= ORIENTATIONS else -1
+        a, b = upper[center % ORIENTATIONS], lower[center % ORIENTATIONS]
+        bin_ = np.float32(center)
         for x in range(len(m0)):
-            v0 = _share(m0[x], q0[x], center)
-            v1 = _share(m1[x], q1[x], center)
-            v2 = _share(m2[x], q2[x], center)
-            v3 = _share(m3[x], q3[x], center)
+            v0 = _share(m0[x], q0[x], bin_)
+            v1 = _share(m1[x], q1[x], bin_)
+            v2 = _share(m2[x], q2[x], bin_)
+            v3 = _share(m3[x], q3[x], bin_)
             down = f0 * v0 + f1 * v1 + f2 * v2 + f3 * v3
             a[_HALF + x] += v0 + v1 + v2 + v3 - down
             b[_HALF + x] += down

@@ -22,8 +22,7 @@ from sim_sensors.rig import Capture, Mount, SensorRig
 
 FloatArray = NDArray[np.float64]
 
-PROBABILITY = 0.25
-"""Least probability of a detection; a located one needs only `LEAST_PROBABILITY`."""
+PROBABILITY = 0.25  # least probability of a detection; a located one needs only `LEAST_PROBABILITY`
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,19 +53,12 @@ class CameraView:
 
 @dataclass(frozen=True, eq=False)
 class PerceptionResult:
-    """The pipeline's result for one capture.
+    """The pipeline's result for one capture."""
 
-    Attributes:
-        captured: the capture and its time.
-        vehicle: (3,) estimated x, y in m and yaw in rad of the vehicle, world frame.
-        views: one for each camera and stereo camera of the rig.
-        scans: one for each laser and stereo camera of the rig.
-    """
-
-    captured: TimedCapture
-    vehicle: FloatArray
-    views: tuple[CameraView, ...]
-    scans: tuple[RangeScan, ...]
+    captured: TimedCapture  # the capture and its time
+    vehicle: FloatArray  # (3,) estimated x, y in m and yaw in rad of the vehicle, world frame
+    views: tuple[CameraView, ...]  # one for each camera and stereo camera of the rig
+    scans: tuple[RangeScan, ...]  # one for each laser and stereo camera of the rig
 
     @property
     def n_cars(self) -> int:

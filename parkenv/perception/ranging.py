@@ -28,14 +28,10 @@ if TYPE_CHECKING:
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
-GAP = 0.5
-"""m; neighbouring beams whose end points are farther apart belong to different objects."""
-WHOLE_END = 1.2
-"""m; a visible edge of this length is the front or rear of a car, not a part of its side."""
-OFF_GROUND = 0.7
-"""m; tolerance of the height of a box's lower edge above or below the ground."""
-CAR_HEIGHT = (0.8, 3.2)
-"""m; range of the height of a box's upper edge."""
+GAP = 0.5  # m; neighbouring beams whose end points are farther apart belong to different objects
+WHOLE_END = 1.2  # m; a visible edge of this length is the front or rear of a car, not a part of its side
+OFF_GROUND = 0.7  # m; tolerance of the height of a box's lower edge above or below the ground
+CAR_HEIGHT = (0.8, 3.2)  # m; range of the height of a box's upper edge
 _LEAST_BEAMS = 3
 _MARGIN = 0.02  # of an image's width; boxes that come this close to its border count as clipped by it
 _SAME_AXIS = 0.1  # m, largest distance between a camera and its ranging sensor
@@ -45,23 +41,16 @@ _SAME_AXIS = 0.1  # m, largest distance between a camera and its ranging sensor
 class LocatedCars:
     """Detected cars in the world frame.
 
-    Args:
-        xy: (n, 2) float64, m, centres, world frame.
-        yaw: (n,) float64, rad, along the car, in [0, π): front and rear are not distinguished.
-        size: (n, 2) float64, m, length and width.
-        distance: (n,) float64, m, from the sensor to the visible surface of the car.
-        probability: (n,) float32, of the detection.
-        detection: (n,) int64, index of the detection of each car; detections that could not be located have no row.
-
     Raises:
         InputError: columns of different lengths, or numbers that are not finite.
     """
 
-    xy: FloatArray
-    yaw: FloatArray
-    size: FloatArray
-    distance: FloatArray
-    probability: Float32Array
+    xy: FloatArray  # (n, 2) float64, m, centres, world frame
+    yaw: FloatArray  # (n,) float64, rad, along the car, in [0, π): front and rear are not distinguished
+    size: FloatArray  # (n, 2) float64, m, length and width
+    distance: FloatArray  # (n,) float64, m, from the sensor to the visible surface of the car
+    probability: Float32Array  # (n,) float32, of the detection
+    # (n,) int64, index of the detection of each car; detections that could not be located have no row
     detection: NDArray[np.int64]
 
     def __post_init__(self) -> None:
@@ -112,15 +101,11 @@ def median_distance(scan: RangeScan, beams: NDArray[np.int64]) -> float:
 
 
 class CarBeams(NamedTuple):
-    """The beams that end on a car.
+    """The beams that end on a car."""
 
-    Attributes:
-        beams: (k,) int64, counter-clockwise; empty if none ends on a car.
-        cut: whether the car extends beyond the first and beyond the last of them, where it is occluded or outside the
-            sensor's field of view.
-    """
-
-    beams: NDArray[np.int64]
+    beams: NDArray[np.int64]  # (k,) int64, counter-clockwise; empty if none ends on a car
+    # whether the car extends beyond the first and beyond the last of them, where it is occluded or outside the
+    # sensor's field of view
     cut: tuple[bool, bool]
 
 

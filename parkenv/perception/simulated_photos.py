@@ -24,8 +24,7 @@ FloatArray = NDArray[np.float64]
 SIDE_CAR = (0.08, 0.22, 0.92, 0.885)
 """Left, top, right, bottom of the car in a side view's region, as fractions; as in UIUC's crops."""
 SIDE_ASPECT = 2.5
-END_CAR = (0.08, 0.12, 0.92, 0.92)
-"""The same for a front or rear view."""
+END_CAR = (0.08, 0.12, 0.92, 0.92)  # the same for a front or rear view
 END_ASPECT = 1.0
 
 _CLEAR = 0.8  # visible fraction from which a car is a positive
@@ -37,23 +36,16 @@ _AFAR_SIZE = (400, 300)  # px
 _TEXTURED = 0.9  # fraction of images with a backdrop
 _SEEDS = 1 << 20
 
-FRAMES = 20
-"""Number of images per street."""
+FRAMES = 20  # number of images per street
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedPhoto:
-    """An image, its cars, and crops of them.
+    """An image, its cars, and crops of them."""
 
-    Attributes:
-        labelled: the grey image with the boxes of all its cars.
-        sides: aligned crops of cars seen from the side.
-        ends: aligned crops of fronts and rears.
-    """
-
-    labelled: LabelledImage
-    sides: list[Image]
-    ends: list[Image]
+    labelled: LabelledImage  # the grey image with the boxes of all its cars
+    sides: list[Image]  # aligned crops of cars seen from the side
+    ends: list[Image]  # aligned crops of fronts and rears
 
 
 def simulated_photos(n_scenes: int, seed: int = 0) -> Iterator[SimulatedPhoto]:

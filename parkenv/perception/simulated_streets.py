@@ -25,21 +25,13 @@ _SEEDS = 1 << 20
 
 @dataclass(frozen=True, eq=False)
 class Street:
-    """Cars in rows along the x axis; cameras are on the negative y side.
+    """Cars in rows along the x axis; cameras are on the negative y side."""
 
-    Attributes:
-        kind: `along`: the sides of the first row are visible; `across` or `aslant`: its ends.
-        pose: (n, 3) float64: x, y in m, yaw in rad; cars of the first row come first.
-        first: number of cars in the first row.
-        front: m, y of the first row's mouth.
-        fleet: vehicle model of every car, in order, and the surroundings.
-    """
-
-    kind: str
-    pose: FloatArray
-    first: int
-    front: float
-    fleet: Fleet
+    kind: str  # `along`: the sides of the first row are visible; `across` or `aslant`: its ends
+    pose: FloatArray  # (n, 3) float64: x, y in m, yaw in rad; cars of the first row come first
+    first: int  # number of cars in the first row
+    front: float  # m, y of the first row's mouth
+    fleet: Fleet  # vehicle model of every car, in order, and the surroundings
 
     @classmethod
     def draw(cls, rng: np.random.Generator) -> Street:

@@ -18,12 +18,9 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-P_FREE, P_OCCUPIED, P_PRIOR = 0.45, 0.95, 0.5
-"""The observation model of eq. 3.9."""
-CORE = (0.8, 0.45)
-"""Half the length and width, m, of the core of a slot, which every parked car covers."""
-MARGIN = 0.35
-"""m; a parked car may extend out of its slot towards the lane by this much."""
+P_FREE, P_OCCUPIED, P_PRIOR = 0.45, 0.95, 0.5  # the observation model of eq. 3.9.
+CORE = (0.8, 0.45)  # half the length and width, m, of the core of a slot, which every parked car covers
+MARGIN = 0.35  # m; a parked car may extend out of its slot towards the lane by this much
 INSET = 0.1
 """m; beams must end this far inside the lines to the neighbours, whose cars may stand close to them."""
 SCAN_LOG_ODDS = 1.2
@@ -36,15 +33,10 @@ _CLEAR = 0.6
 
 @dataclass(frozen=True, eq=False)
 class SlotStates:
-    """The estimated occupancy of every slot.
+    """The estimated occupancy of every slot."""
 
-    Attributes:
-        p_occupied: (n_slots,) float64; 0.5 where nothing was observed.
-        in_view: (n_slots,) bool, whether there was any evidence about the slot.
-    """
-
-    p_occupied: FloatArray
-    in_view: NDArray[np.bool_]
+    p_occupied: FloatArray  # (n_slots,) float64; 0.5 where nothing was observed
+    in_view: NDArray[np.bool_]  # (n_slots,) bool, whether there was any evidence about the slot
 
     @property
     def occupied(self) -> NDArray[np.bool_]:
@@ -53,15 +45,10 @@ class SlotStates:
 
 
 class SlotObservation(NamedTuple):
-    """The slots that were observed, and their observed states.
+    """The slots that were observed, and their observed states."""
 
-    Attributes:
-        slots: (k,) int64, ascending.
-        taken: (k,) bool.
-    """
-
-    slots: IntArray
-    taken: NDArray[np.bool_]
+    slots: IntArray  # (k,) int64, ascending
+    taken: NDArray[np.bool_]  # (k,) bool
 
     @classmethod
     def none(cls) -> SlotObservation:

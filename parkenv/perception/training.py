@@ -27,29 +27,17 @@ _NO_CARS = np.empty((0, 4))
 
 @dataclass(frozen=True)
 class TrainingSettings:
-    """Parameters of the training.
+    """Parameters of the training."""
 
-    Args:
-        penalty: C of the support vector machine.
-        rounds: rounds of hard-negative mining, each on another part of the images.
-        jitter: number of shifted and scaled copies of each positive.
-        shift: largest shift of a copy, as a fraction of the window.
-        resize: largest change of a copy's size, as a fraction.
-        misaligned: number of misaligned crops of each positive that become negatives.
-        per_image: largest number of hard negatives from one image per round.
-        positives_weight: weight of a positive relative to a negative.
-        seed: seed of the jitter and the solver.
-    """
-
-    penalty: float = 0.01
-    rounds: int = 3
-    jitter: int = 2
-    shift: float = 0.03
-    resize: float = 0.05
-    misaligned: int = 2
-    per_image: int = 5
-    positives_weight: float = 1.0
-    seed: int = 0
+    penalty: float = 0.01  # C of the support vector machine
+    rounds: int = 3  # rounds of hard-negative mining, each on another part of the images
+    jitter: int = 2  # number of shifted and scaled copies of each positive
+    shift: float = 0.03  # largest shift of a copy, as a fraction of the window
+    resize: float = 0.05  # largest change of a copy's size, as a fraction
+    misaligned: int = 2  # number of misaligned crops of each positive that become negatives
+    per_image: int = 5  # largest number of hard negatives from one image per round
+    positives_weight: float = 1.0  # weight of a positive relative to a negative
+    seed: int = 0  # seed of the jitter and the solver
 
     def __post_init__(self) -> None:
         for name in ("penalty", "positives_weight"):

@@ -29,8 +29,7 @@ Cost = Annotated[float, Field(ge=0.0, le=86_400.0)]
 """s, at most a day."""
 Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=0, le=1_000)]
-Size = Annotated[float, Field(ge=1.0, le=100.0)]
-"""m."""
+Size = Annotated[float, Field(ge=1.0, le=100.0)]  # m
 MAX_SLOTS = 1_000_000
 
 
@@ -188,8 +187,7 @@ def _hours(value: str) -> str:
     return value
 
 
-Hours = Annotated[str, AfterValidator(_hours)]
-"""HH:MM-HH:MM."""
+Hours = Annotated[str, AfterValidator(_hours)]  # HH:MM-HH:MM
 
 
 def _days(value: object) -> object:

@@ -23,16 +23,12 @@ from parkenv.errors import InputError
 
 LANE_OFFSET = 1.5
 """Distance, m, of a slot's vertex from the centre line of a two-way lane, to the right of travel."""
-SLOT_REACH = 8.0
-"""Greatest distance, m, of a slot's mouth from the centre line of its lane."""
-ENTRY_REACH = 15.0
-"""Greatest distance, m, of an entry from a lane."""
+SLOT_REACH = 8.0  # greatest distance, m, of a slot's mouth from the centre line of its lane
+ENTRY_REACH = 15.0  # greatest distance, m, of an entry from a lane
 VERTEX_SPACING = 1.0
 """Least distance, m, between two slot vertices of one chain, so that every move takes time."""
-CROSSING_REACH = 3.0
-"""Greatest distance, m along the lane, of a move across to a slot on the other side."""
-NODE_TOLERANCE = 1e-3
-"""Lane points closer than this, m, are one node."""
+CROSSING_REACH = 3.0  # greatest distance, m along the lane, of a move across to a slot on the other side
+NODE_TOLERANCE = 1e-3  # lane points closer than this, m, are one node
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -60,21 +56,14 @@ class GraphError(InputError):
 
 @dataclass(frozen=True, eq=False)
 class DriveGraph:
-    """A drive graph; vertices 0..n_slots-1 belong to the slots in order, the others are junctions and lane ends.
+    """A drive graph; vertices 0..n_slots-1 belong to the slots in order, the others are junctions and lane ends."""
 
-    Attributes:
-        vertex_xy: (n_vertices, 2) float64, m, lot frame.
-        vertex_yaw: (n_vertices,) float64, rad, direction of travel at a slot's vertex; 0 elsewhere.
-        neighbors: (n_vertices, 4) int32, columns up, down, left, right; -1 where there is no edge.
-        edge_length: (n_vertices, 4) float64, m; 0 where there is no edge.
-        entry_vertices: (n_entries,) int64, the vertex of each entry.
-    """
-
-    vertex_xy: FloatArray
-    vertex_yaw: FloatArray
+    vertex_xy: FloatArray  # (n_vertices, 2) float64, m, lot frame
+    vertex_yaw: FloatArray  # (n_vertices,) float64, rad, direction of travel at a slot's vertex; 0 elsewhere
+    # (n_vertices, 4) int32, columns up, down, left, right; -1 where there is no edge
     neighbors: NDArray[np.int32]
-    edge_length: FloatArray
-    entry_vertices: IntArray
+    edge_length: FloatArray  # (n_vertices, 4) float64, m; 0 where there is no edge
+    entry_vertices: IntArray  # (n_entries,) int64, the vertex of each entry
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,9 +94,7 @@ class _Centrelines:
 
 
 def build_drive_graph(
-    lanes: Sequence[tuple[FloatArray, bool]],
-    mouth_xy: FloatArray,
-    entry_xy: FloatArray,
+    lanes: Sequence[tuple[FloatArray, bool]], mouth_xy: FloatArray, entry_xy: FloatArray
 ) -> DriveGraph:
     """Build the drive graph: assign slots and entries to lanes, and connect vertices by moves.
 

@@ -15,10 +15,6 @@ from parkenv.world.occupancy_kernel import MAX_PROBABILITY, MIN_PROBABILITY
 class FlatMap:
     """A `prior` of a `Scenario` with the same occupancy probability for every slot.
 
-    Args:
-        p_occupied: the probability, 0 to 1; clipped to the range of forecasts.
-        true: provides the decay rates, which remain correct.
-
     Raises:
         InputError: `p_occupied` is not a probability.
 
@@ -29,8 +25,8 @@ class FlatMap:
         [0.999, 0.999]
     """
 
-    p_occupied: float
-    true: PriorModel
+    p_occupied: float  # the probability, 0 to 1; clipped to the range of forecasts
+    true: PriorModel  # provides the decay rates, which remain correct
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.p_occupied <= 1.0:

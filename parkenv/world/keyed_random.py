@@ -17,7 +17,7 @@ from sim_sensors.compilation import compiled
 ARRIVAL_STREAM = 0
 OCCUPANCY_STREAM = 1
 ENTRY_STREAM = 2
-SIGHTING_STREAM = 3
+OBSERVATION_STREAM = 3
 VIEW_STREAM = 4
 
 _WORD_BITS = 64

@@ -20,11 +20,9 @@ FloatArray = NDArray[np.float64]
 
 MOVES = ("up", "down", "left", "right")
 """The names of the four columns of `ParkingLot.neighbors`, in order (eq. 3.13)."""
-PARK = len(MOVES)
-"""The action "park" (eq. 3.14); lower actions are the moves."""
+PARK = len(MOVES)  # the action "park" (eq. 3.14); lower actions are the moves.
 ACTIONS = (*MOVES, "park")
-SLOT_SIDE = 0.1
-"""Least length and width of a slot, m."""
+SLOT_SIDE = 0.1  # least length and width of a slot, m
 
 
 class Mouth(IntEnum):

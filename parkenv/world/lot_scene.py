@@ -19,8 +19,7 @@ from sim_sensors.slot_scenes import SlotLot, slot_surroundings
 
 FloatArray = NDArray[np.float64]
 
-WALL_HEIGHT = 1.8
-"""Height, m, of walls given as open lines; closed lines are buildings."""
+WALL_HEIGHT = 1.8  # height, m, of walls given as open lines; closed lines are buildings
 
 _CARS_APART = 1 << 31
 _KEPT_LOTS = 4

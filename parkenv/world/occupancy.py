@@ -15,19 +15,9 @@ from scipy.optimize import brentq
 
 from parkenv.errors import InputError
 from parkenv.files.versioned_json import JsonFormat
+from parkenv.world import occupancy_kernel as kernels
 from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform
-from parkenv.world.occupancy_kernel import (
-    CURSOR,
-    MAX_PROBABILITY,
-    MIN_PROBABILITY,
-    PROCESS,
-    cursor_at,
-    find_sojourn_end,
-    kernel,
-    process_at,
-    process_forecast,
-    process_state,
-)
+from parkenv.world.occupancy_kernel import kernel
 from parkenv.world.pointers import address_of
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_HOURS, hour_of_week
 
@@ -102,27 +92,18 @@ class ArrivalWindow:
 
 @dataclass(frozen=True)
 class Arrival:
-    """The moment at which a search begins.
+    """The moment at which a search begins."""
 
-    Args:
-        time: s since Monday 00:00.
-        day: ISO date of the recorded day that the world replays; empty without a replay.
-    """
-
-    time: float
-    day: str = ""
+    time: float  # s since Monday 00:00
+    day: str = ""  # ISO date of the recorded day that the world replays; empty without a replay
 
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """Occupancy forecast of a lot, before any observation.
+    """Occupancy forecast of a lot, before any observation."""
 
-    Args:
-        p_occupied: (n,) float64, P(taken) at the arrival.
-        decay_rate: (n,) float64, 1/s, arrival rate plus departure rate: how fast an observation loses its value.
-    """
-
-    p_occupied: FloatArray
+    p_occupied: FloatArray  # (n,) float64, P(taken) at the arrival
+    # (n,) float64, 1/s, arrival rate plus departure rate: how fast an observation loses its value
     decay_rate: FloatArray
 
 
@@ -174,21 +155,21 @@ def _seek(
     ends: FloatArray,
 ) -> None:
     """Write the state of each of `slots` at `time` and, if `ends` has room, when its sojourn ends."""
-    of_all = process_at(process, 0)
+    of_all = kernels.process_at(process, 0)
     for i in range(slots.size):
-        slot, cursor = slots[i], cursor_at(cursors, slots[i])
+        slot, cursor = slots[i], kernels.cursor_at(cursors, slots[i])
         if time < cursor.since:
             cursor.sojourn, cursor.valid_until = 0, 0.0
-        occupied[i] = process_state(of_all, key, arrival, hour, second, slot, cursor, time)
+        occupied[i] = kernels.process_state(of_all, key, arrival, hour, second, slot, cursor, time)
         if ends.size > 0:
-            find_sojourn_end(of_all, key, slot, cursor)
+            kernels.find_sojourn_end(of_all, key, slot, cursor)
             ends[i] = cursor.valid_until
 
 
 @kernel
 def _marginals(process: int, hour: int, second: float, marginals: FloatArray) -> None:
     for slot in range(marginals.size):
-        marginals[slot] = process_forecast(process_at(process, 0), hour, second, slot)[0]
+        marginals[slot] = kernels.process_forecast(kernels.process_at(process, 0), hour, second, slot)[0]
 
 
 class ProcessWorld:
@@ -202,7 +183,7 @@ class ProcessWorld:
         if not math.isfinite(arrival.time):
             raise InputError(f"Arrival.time: got {arrival.time}, wanted finite seconds")
         # np.zeros does not touch its memory, so a million slots cost nothing until they are queried.
-        self._cursors = np.zeros(process.n_slots, CURSOR)
+        self._cursors = np.zeros(process.n_slots, kernels.CURSOR)
         _, self._hour, self._second = hour_of_week(float(arrival.time))
         self.process = process
         self.key = np.uint64(key)
@@ -236,7 +217,7 @@ class ProcessWorld:
         if not arrival <= time < math.inf:
             raise InputError(f"time: got {time}, wanted finite seconds at or after the arrival at {arrival}")
         occupied = np.empty(slots.size, np.bool_)
-        cursors = address_of(self._cursors, CURSOR)
+        cursors = address_of(self._cursors, kernels.CURSOR)
         _seek(
             self.process.address, self.key, arrival, self._hour, self._second,
             slots, float(time), cursors, occupied, ends,
@@ -296,7 +277,7 @@ class OccupancyProcess:
         marginals = np.zeros((WEEK_HOURS, arrival.size))
         addresses = (address_of(a, np.float64) for a in (factors, profiles, hazards, marginals))
         object.__setattr__(self, "hourly_marginals", marginals)
-        object.__setattr__(self, "record", np.array([(arrival.size, *addresses)], PROCESS))
+        object.__setattr__(self, "record", np.array([(arrival.size, *addresses)], kernels.PROCESS))
         for name, row in zip(_FIELDS, (factors[0], profiles[0], factors[1], profiles[1]), strict=True):
             object.__setattr__(self, name, row)
 
@@ -355,7 +336,7 @@ class OccupancyProcess:
     @property
     def address(self) -> int:
         """Address of the PROCESS record, for compiled code; valid while this process lives."""
-        return address_of(self.record, PROCESS)
+        return address_of(self.record, kernels.PROCESS)
 
     def take(self, slots: ArrayLike) -> "OccupancyProcess":
         """Return a process whose slot i has the rates of this process's slot `slots[i]`; (n,) int64."""
@@ -420,7 +401,8 @@ class OccupancyProcess:
         _, hour, _ = hour_of_week(float(arrival.time))
         rates = self.factors * self.profiles[:, hour, None]
         return Forecast(
-            np.clip(self.marginal(arrival.time), MIN_PROBABILITY, MAX_PROBABILITY), rates[0] + rates[1]
+            np.clip(self.marginal(arrival.time), kernels.MIN_PROBABILITY, kernels.MAX_PROBABILITY),
+            rates[0] + rates[1],
         )
 
 

@@ -7,7 +7,7 @@ data under a Markov assumption", JASA 1985), so the estimated rates do not depen
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -35,27 +35,18 @@ _MAX_SCORES = 2 * _MAX_PIECES + 2
 
 @dataclass(frozen=True, eq=False)
 class FittedProcess:
-    """A process fitted to a log, with standard errors and log-likelihood.
+    """A process fitted to a log, with standard errors and log-likelihood."""
 
-    Args:
-        process: the process; its slot i is slot_ids[i], and each kind of factor has the geometric mean 1.
-        slot_ids: the log's slots.
-        log_likelihood: log-likelihood of all intervals, without the prior.
-        n_intervals: number of pairs of consecutive observations used.
-        arrival_factor_se: (n,) float64, standard error of the factor's natural logarithm.
-        arrival_profile_se: (168,) float64, the same for the profile; NaN in hours that were never observed.
-        departure_factor_se: (n,) float64, as for arrivals.
-        departure_profile_se: (168,) float64, as for arrivals.
-    """
-
+    # the process; its slot i is slot_ids[i], and each kind of factor has the geometric mean 1
     process: OccupancyProcess
-    slot_ids: tuple[str, ...]
-    log_likelihood: float
-    n_intervals: int
-    arrival_factor_se: FloatArray
+    slot_ids: tuple[str, ...]  # the log's slots
+    log_likelihood: float  # log-likelihood of all intervals, without the prior
+    n_intervals: int  # number of pairs of consecutive observations used
+    arrival_factor_se: FloatArray  # (n,) float64, standard error of the factor's natural logarithm
+    # (168,) float64, the same for the profile; NaN in hours that were never observed
     arrival_profile_se: FloatArray
-    departure_factor_se: FloatArray
-    departure_profile_se: FloatArray
+    departure_factor_se: FloatArray  # (n,) float64, as for arrivals
+    departure_profile_se: FloatArray  # (168,) float64, as for arrivals
 
 
 def fit_constant_rates(dt: ArrayLike, start: ArrayLike, end: ArrayLike) -> tuple[float, float]:
@@ -106,28 +97,36 @@ def fit_constant_rates(dt: ArrayLike, start: ArrayLike, end: ArrayLike) -> tuple
     return float(arrival), float(departure)
 
 
+class Intervals(NamedTuple):
+    """Pairs of consecutive observations of a slot on one day, (k,) each."""
+
+    slot: IntArray
+    first_bin: IntArray  # 0 on a weekday, 24 on a weekend day
+    start: FloatArray  # s of the day
+    end: FloatArray  # s of the day, > start
+    before: BoolArray  # taken at start
+    after: BoolArray  # taken at end
+
+
 @compiled
 def _score(
-    slot: int,
-    first_bin: int,
-    start: float,
-    end: float,
-    before: bool,
-    after: bool,
-    rates: FloatArray,
-    n: int,
-    index: IntArray,
-    score: FloatArray,
+    intervals: Intervals, k: int, rates: FloatArray, n: int, index: IntArray, score: FloatArray
 ) -> tuple[float, int]:
-    """Return the log-probability of one interval, and m; derivatives by `theta[index[:m]]` go to `score[:m]`.
+    """Return the log-probability of interval k, and m; derivatives by `theta[index[:m]]` go to `score[:m]`.
 
     The forward pass propagates p = P(occupied) through the pieces of constant rates, the backward pass its adjoint.
     """
     begun = np.empty(_MAX_PIECES)
+    slot, first_bin, start, end = (
+        intervals.slot[k],
+        intervals.first_bin[k],
+        intervals.start[k],
+        intervals.end[k],
+    )
     hour = int(start // HOUR_S)
     at_arrival, at_departure = 2 * _N_BINS + slot, 2 * _N_BINS + n + slot
     pieces = 0
-    p = 1.0 if before else 0.0
+    p = 1.0 if intervals.before[k] else 0.0
     while start < end:
         stop = min((hour + pieces + 1) * HOUR_S, end)
         bin_ = first_bin + hour + pieces
@@ -139,8 +138,8 @@ def _score(
         score[2 * pieces] = stop - start
         start = stop
         pieces += 1
-    seen = p if after else 1.0 - p
-    seen = max(seen, _TINY)
+    after = intervals.after[k]
+    seen = max(p if after else 1.0 - p, _TINY)
     adjoint = 1.0 / seen if after else -1.0 / seen
     score[2 * pieces] = 0.0
     score[2 * pieces + 1] = 0.0
@@ -169,35 +168,20 @@ def _score(
 
 
 @compiled
-def log_likelihood(
-    theta: FloatArray,
-    slot: IntArray,
-    first_bin: IntArray,
-    start: FloatArray,
-    end: FloatArray,
-    before: BoolArray,
-    after: BoolArray,
-) -> tuple[float, FloatArray]:
+def log_likelihood(theta: FloatArray, intervals: Intervals) -> tuple[float, FloatArray]:
     """Return the log-likelihood of intervals between observations, and its gradient (compiled).
 
     Args:
         theta: (96 + 2n,) float64, natural logarithms: arrival profile in 1/s (24 hours of a weekday, 24 of a
             weekend day), departure profile in the same order, arrival factors (n,), departure factors (n,).
-        slot: (k,) int64.
-        first_bin: (k,) int64, 0 on a weekday, 24 on a weekend day.
-        start: (k,) float64, s of the day.
-        end: (k,) float64, s of the day, > start.
-        before: (k,) bool, taken at start.
-        after: (k,) bool, taken at end.
+        intervals: the intervals.
     """
     rates = np.exp(theta)
     n = (theta.size - 2 * _N_BINS) // 2
     index, score = np.empty(_MAX_SCORES, np.int64), np.empty(_MAX_SCORES)
     value, gradient = 0.0, np.zeros(theta.size)
-    for k in range(slot.size):
-        log_p, m = _score(
-            slot[k], first_bin[k], start[k], end[k], before[k], after[k], rates, n, index, score
-        )
+    for k in range(intervals.slot.size):
+        log_p, m = _score(intervals, k, rates, n, index, score)
         value += log_p
         for i in range(m):
             gradient[index[i]] += score[i]
@@ -205,22 +189,14 @@ def log_likelihood(
 
 
 @compiled
-def _information(
-    theta: FloatArray,
-    slot: IntArray,
-    first_bin: IntArray,
-    start: FloatArray,
-    end: FloatArray,
-    before: BoolArray,
-    after: BoolArray,
-) -> FloatArray:
+def _information(theta: FloatArray, intervals: Intervals) -> FloatArray:
     """Return the empirical Fisher information: the sum of the outer products of the intervals' scores."""
     rates = np.exp(theta)
     n = (theta.size - 2 * _N_BINS) // 2
     index, score = np.empty(_MAX_SCORES, np.int64), np.empty(_MAX_SCORES)
     information = np.zeros((theta.size, theta.size))
-    for k in range(slot.size):
-        _, m = _score(slot[k], first_bin[k], start[k], end[k], before[k], after[k], rates, n, index, score)
+    for k in range(intervals.slot.size):
+        _, m = _score(intervals, k, rates, n, index, score)
         for i in range(m):
             for j in range(m):
                 information[index[i], index[j]] += score[i] * score[j]
@@ -256,7 +232,7 @@ def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float 
         raise InputError(f"{log.source}: no two looks at a slot on one day within {max_gap_s:g} s")
     n = len(log.slot_ids)
     kind = log.weekend[looks.day].astype(np.int64)
-    data = (looks.slot, kind * _DAY_HOURS, looks.start, looks.end, looks.before, looks.after)
+    data = Intervals(looks.slot, kind * _DAY_HOURS, looks.start, looks.end, looks.before, looks.after)
 
     constant = np.zeros((2, 2))  # log rates: arrival and departure, on weekdays and weekend days
     for k in np.unique(kind):
@@ -266,21 +242,16 @@ def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float 
     centre = np.concatenate([np.repeat(constant.ravel(), _DAY_HOURS), np.zeros(2 * n)])
 
     def loss(theta: FloatArray) -> tuple[float, FloatArray]:
-        value, gradient = log_likelihood(theta, *data)
+        value, gradient = log_likelihood(theta, data)
         off = (theta - centre) / prior_sd
         return 0.5 * off @ off - value, off / prior_sd - gradient
 
     bounds = [_LOG_RATE_BOUNDS] * (2 * _N_BINS) + [_LOG_FACTOR_BOUNDS] * (2 * n)
     theta: FloatArray = minimize(
-        loss,
-        centre,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=bounds,
-        options={"maxiter": 1000, "ftol": 1e-10},
+        loss, centre, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 1000, "ftol": 1e-10}
     ).x
-    covariance = np.linalg.inv(_information(theta, *data) + np.eye(theta.size) / prior_sd**2)
-    value, _ = log_likelihood(theta, *data)
+    covariance = np.linalg.inv(_information(theta, data) + np.eye(theta.size) / prior_sd**2)
+    value, _ = log_likelihood(theta, data)
 
     centred = _centring(n)
     profile, factor = _split(centred @ theta)
@@ -297,16 +268,8 @@ def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float 
             profile[:, 1 - k] = profile[:, k]
     week, week_se = _week(np.exp(profile)), _week(profile_se)
     process = OccupancyProcess(np.exp(factor[0]), week[0], np.exp(factor[1]), week[1])
-    return FittedProcess(
-        process,
-        log.slot_ids,
-        float(value),
-        looks.slot.size,
-        factor_se[0],
-        week_se[0],
-        factor_se[1],
-        week_se[1],
-    )
+    errors = factor_se[0], week_se[0], factor_se[1], week_se[1]
+    return FittedProcess(process, log.slot_ids, float(value), looks.slot.size, *errors)
 
 
 def _split(theta: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -25,8 +25,7 @@ from sim_sensors.compilation import compiled
 MIN_PROBABILITY = 0.001
 MAX_PROBABILITY = 0.999
 
-PRIOR_DAYS = 1.0
-"""Weight, in days, of the lot's mean in a slot's forecast from a log."""
+PRIOR_DAYS = 1.0  # weight, in days, of the lot's mean in a slot's forecast from a log
 
 _NEVER_WEEKS = 1e9
 _FORGOTTEN = 1e-17
@@ -262,12 +261,11 @@ def keep_hourly_marginals(process: Any, hour: int) -> None:
 
 
 @inlined
-def recorded_look(day: Any, slot: int, second: float) -> int:
+def recorded_index(day: Any, slot: int, second: float) -> int:
     """Return the index of the log's observation that defines a slot's state at a second of a recorded day."""
     record = int64s(day.record)[slot]
     begin, end = int64s(day.first)[record], int64s(day.first)[record + 1]
-    look: int = begin + _count_below(day.from_s, begin, end, second, True) - 1
-    return look
+    return int(begin + _count_below(day.from_s, begin, end, second, True) - 1)
 
 
 @kernel
@@ -280,11 +278,11 @@ def recorded_state(day: Any, slot: int, cursor: Any, time: float) -> bool:
         cursor: its cursor, changed in place; sojourns are not counted.
         time: s since Monday 00:00.
     """
-    look = recorded_look(day, slot, time - day.midnight)
+    k = recorded_index(day, slot, time - day.midnight)
     record = int64s(day.record)[slot]
-    last = look + 1 >= int64s(day.first)[record + 1]
-    cursor.occupied = uint8s(day.occupied)[look] != 0
-    cursor.valid_until = np.inf if last else float64s(day.from_s)[look + 1] + day.midnight - _MOMENT_S
+    last = k + 1 >= int64s(day.first)[record + 1]
+    cursor.occupied = uint8s(day.occupied)[k] != 0
+    cursor.valid_until = np.inf if last else float64s(day.from_s)[k + 1] + day.midnight - _MOMENT_S
     return bool(cursor.occupied)
 
 

@@ -14,8 +14,7 @@ from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-ADDRESS = np.int64
-"""Type of the fields of a record that hold addresses."""
+ADDRESS = np.int64  # type of the fields of a record that hold addresses
 
 
 def address_of(array: NDArray[Any], dtype: Any) -> int:

@@ -28,7 +28,7 @@ from parkenv.world.occupancy_kernel import (
     kernel,
     recorded_day_at,
     recorded_forecast,
-    recorded_look,
+    recorded_index,
 )
 from parkenv.world.occupancy_log import OccupancyLog, csv_columns, day_class, weekday_of
 from parkenv.world.pointers import address_of, float64s, int64s, uint8s
@@ -79,7 +79,7 @@ def _occupied(days: int, slots: IntArray, second: float, occupied: BoolArray) ->
     """Write whether each slot is taken at a second of the day."""
     day = recorded_day_at(days, 0)
     for i in range(slots.size):
-        occupied[i] = uint8s(day.occupied)[recorded_look(day, slots[i], second)] != 0
+        occupied[i] = uint8s(day.occupied)[recorded_index(day, slots[i], second)] != 0
 
 
 @kernel
@@ -87,11 +87,11 @@ def _next_free(days: int, slots: IntArray, second: float, free_from: FloatArray)
     """Write the first second >= `second` at which each slot is free; inf if never."""
     day = recorded_day_at(days, 0)
     for i in range(slots.size):
-        look, end = recorded_look(day, slots[i], second), int64s(day.first)[int64s(day.record)[slots[i]] + 1]
+        k, end = recorded_index(day, slots[i], second), int64s(day.first)[int64s(day.record)[slots[i]] + 1]
         free_from[i] = second
-        while look < end and uint8s(day.occupied)[look] != 0:
-            look += 1
-            free_from[i] = float64s(day.from_s)[look] if look < end else np.inf
+        while k < end and uint8s(day.occupied)[k] != 0:
+            k += 1
+            free_from[i] = float64s(day.from_s)[k] if k < end else np.inf
 
 
 @kernel
@@ -102,8 +102,8 @@ def _changes(days: int, slots: IntArray, second: float, count: IntArray) -> None
     for i in range(slots.size):
         first = int64s(day.first)[int64s(day.record)[slots[i]]]
         count[i] = 0
-        for look in range(first + 1, recorded_look(day, slots[i], second) + 1):
-            count[i] += taken[look] != taken[look - 1]
+        for k in range(first + 1, recorded_index(day, slots[i], second) + 1):
+            count[i] += taken[k] != taken[k - 1]
 
 
 @kernel

@@ -14,20 +14,13 @@ from scipy.spatial import cKDTree
 
 from parkenv.errors import InputError
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
-from parkenv.world.occupancy import (
-    Arrival,
-    ArrivalWindow,
-    Forecast,
-    OccupancyModel,
-    PriorModel,
-)
+from parkenv.world.occupancy import Arrival, ArrivalWindow, Forecast, OccupancyModel, PriorModel
 from parkenv.world.sensor_model import SensorModel, SensorRates
 from parkenv.world.traffic import Traffic
 
 FloatArray = NDArray[np.float64]
 
-KMH = 1 / 3.6
-"""1 km/h in m/s."""
+KMH = 1 / 3.6  # 1 km/h in m/s
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -110,6 +103,11 @@ class SearchProblem:
         starts = np.searchsorted(viewer[order], np.arange(self.lot.n_vertices + 1))
         return _read_only(starts.astype(np.int64)), _read_only(slot[order].astype(np.int64))
 
+    def in_view(self, vertex: int) -> NDArray[np.int64]:
+        """Return the slots in view of a vertex, ascending."""
+        starts, slots = self.slots_in_view
+        return slots[starts[vertex] : starts[vertex + 1]]
+
     @cached_property
     def sight_lines(self) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Distance, m, of each of `slots_in_view`, and whether it is beside the car.
@@ -129,6 +127,10 @@ class SearchProblem:
     def sensor_rates(self) -> SensorRates:
         """Sensor rates for each of `slots_in_view`."""
         return SensorRates(*map(_read_only, self.sensor_model.rates(*self.sight_lines)))
+
+    def public(self) -> SearchProblem:
+        """Return the part that agents may know."""
+        return self
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed and validated.
@@ -180,7 +182,7 @@ class Scenario(SearchProblem):
                 )
 
     def public(self) -> SearchProblem:
-        """The public part, for agents."""
+        """Return the part that agents may know: without the occupancy, its forecast model and the traffic."""
         return SearchProblem(**{f.name: getattr(self, f.name) for f in dataclasses.fields(SearchProblem)})
 
     def forecast(self, arrival: Arrival) -> Forecast:

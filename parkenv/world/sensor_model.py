@@ -16,24 +16,17 @@ from parkenv.files.versioned_json import JsonFormat
 
 FloatArray = NDArray[np.float64]
 
-SENSOR_MODEL_NAMES = ("laser", "stereo")
-"""Rigs with a packaged fitted sensor model."""
+SENSOR_MODEL_NAMES = ("laser", "stereo")  # rigs with a packaged fitted sensor model
 _FOLDER = Path(__file__).parent / "sensor_models"
 _FORMAT = JsonFormat("parkenv-sensor-model", 1, "a sighting model")
 
 
 class SensorRates(NamedTuple):
-    """Sensor rates for k slots.
+    """Sensor rates for k slots."""
 
-    Attributes:
-        seen: (k,) float64, P(a slot in view is observed).
-        hit: (k,) float64, P(observed taken | taken, observed).
-        false_alarm: (k,) float64, P(observed taken | free, observed).
-    """
-
-    seen: FloatArray
-    hit: FloatArray
-    false_alarm: FloatArray
+    seen: FloatArray  # (k,) float64, P(a slot in view is observed)
+    hit: FloatArray  # (k,) float64, P(observed taken | taken, observed)
+    false_alarm: FloatArray  # (k,) float64, P(observed taken | free, observed)
 
     def of(self, rows: slice) -> SensorRates:
         """The rates of some of the slots."""

@@ -17,12 +17,9 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-CAR_SPEEDS = (2.0, 4.0)
-"""Range of car speeds, m/s."""
-WALK_SPEEDS = (0.9, 1.5)
-"""Range of walking speeds, m/s."""
-STRIDE_M = 1.4
-"""Length of a stride (two steps), m."""
+CAR_SPEEDS = (2.0, 4.0)  # range of car speeds, m/s
+WALK_SPEEDS = (0.9, 1.5)  # range of walking speeds, m/s
+STRIDE_M = 1.4  # length of a stride (two steps), m
 
 _CARS, _PEOPLE = 0, 1
 _STOPS = 3

@@ -17,13 +17,7 @@ from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
 from planners.belief.best_path import ATTEMPT, NOWHERE, Budget, best_path
-from planners.belief.planning_graph import (
-    SLOT,
-    BeliefSnapshot,
-    IntArray,
-    PathBuffer,
-    path_buffer,
-)
+from planners.belief.planning_graph import SLOT, BeliefSnapshot, IntArray, PathBuffer, path_buffer
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.routes import DriveRoutes
 
@@ -31,59 +25,41 @@ FloatArray = NDArray[np.float64]
 
 FAILURE_COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """s, failure costs of the thesis's planner for the initial paths of the search."""
-DEPTH = 3
-"""Maximum number of targets before a path follows the thesis's planner."""
-WORK_PER_MS = 50_000
-"""Steps of the path search per millisecond, approximately."""
+DEPTH = 3  # maximum number of targets before a path follows the thesis's planner
+WORK_PER_MS = 50_000  # steps of the path search per millisecond, approximately
 WORTH_PASSING_S = 1.0
 """s by which driving on must be better than a known free slot, unless the forecast is trusted.
 
 If the forecast is right, stopping for a smaller gain costs next to nothing; if it is wrong, the slot that was passed
 may have been the last one for a long time.
 """
-STALE_S = 60.0
-"""s without a newly observed slot after which the search moves on to another part of the lot."""
-PREVIEW_S = 60.0
-"""s, horizon of the plan preview."""
+STALE_S = 60.0  # s without a newly observed slot after which the search moves on to another part of the lot
+PREVIEW_S = 60.0  # s, horizon of the plan preview
 
 
 @dataclass
 class BeliefSearch:
-    """Memory of an episode.
+    """Memory of an episode."""
 
-    Attributes:
-        near: the part of the lot that is planned for. The arrays below cover its slots, in its numbering.
-        n_unobserved: number of its slots that were unobserved when it was chosen.
-        day: belief about how much the day differs from the forecast.
-        state: (n_slots,) int8, `SlotBelief.state` at the last decision.
-        missed_rate: (n_slots,) float64, the highest detection rate among the views from which a slot was not detected.
-        time: s since the search began, at the last decision.
-        news_at: s, the last time at which an unobserved slot of the part was observed, or the part was chosen.
-        targets: (DEPTH,) int64, the vertices that the path of the last decision passes first.
-        path: buffer for one path.
-        entry: vertex to drive to before planning, or -1.
-        n_targets: number of targets.
-        failure_s: s, failure cost of the thesis's planner on that path.
-        promise_s: s, time that was expected to remain on that path by now; inf if something has been observed since.
-        replans: number of times that the path ahead has changed.
-        expected_s: s, expected time of the search from here.
-    """
-
+    # the part of the lot that is planned for. The arrays below cover its slots, in its numbering.
     near: Neighborhood
-    n_unobserved: int
-    day: DayBelief
-    state: NDArray[np.int8]
+    n_unobserved: int  # number of its slots that were unobserved when it was chosen
+    day: DayBelief  # belief about how much the day differs from the forecast
+    state: NDArray[np.int8]  # (n_slots,) int8, `SlotBelief.state` at the last decision
+    # (n_slots,) float64, the highest detection rate among the views from which a slot was not detected
     missed_rate: FloatArray
-    time: float
+    time: float  # s since the search began, at the last decision
+    # s, the last time at which an unobserved slot of the part was observed, or the part was chosen
     news_at: float
+    # (k,) int64, the vertices that the path of the last decision passes first; up to `DEPTH`
     targets: IntArray
-    path: PathBuffer
-    entry: int = -1
-    n_targets: int = 0
-    failure_s: float = FAILURE_COSTS[1]
-    promise_s: float = math.inf
-    replans: int = 0
-    expected_s: float = math.nan
+    path: PathBuffer  # buffer for one path
+    entry: int = -1  # vertex to drive to before planning, or -1
+    failure_s: float = FAILURE_COSTS[1]  # s, failure cost of the thesis's planner on that path
+    # s, time that was expected to remain on that path by now; inf if something has been observed since
+    remaining_s: float = math.inf
+    replans: int = 0  # number of times that the path ahead has changed
+    expected_s: float = math.nan  # s, expected time of the search from here
 
 
 class BeliefAgent(SearchAgent[BeliefSearch]):
@@ -172,7 +148,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             missed_rate=np.zeros(n),
             time=belief.time,
             news_at=belief.time,
-            targets=np.zeros(DEPTH, dtype=np.int64),
+            targets=np.zeros(0, dtype=np.int64),
             path=path_buffer(n, len(near.vertices)),
         )
 
@@ -194,7 +170,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             if memory.entry >= 0:
                 return self._routes.move_toward(vertex, memory.entry)
             action = self._follow_best_path(vertex, memory.near.index(vertex), known, memory)
-        return self._wait(vertex) if action is None else action
+        return self.wait(vertex) if action is None else action
 
     def _update(self, belief: SlotBelief, vertex: int, memory: BeliefSearch) -> SlotBelief:
         """Update the memory from the observation; return the belief about the slots of its part."""
@@ -206,7 +182,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             memory.news_at = belief.time
             memory.day.update(first, state[first] == OBSERVED_TAKEN)
         if (state != memory.state).any():
-            memory.promise_s = math.inf
+            memory.remaining_s = math.inf
         memory.state = state
         here = near.index(vertex)
         # Nothing is observed at the moment of arrival.
@@ -222,31 +198,30 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
     ) -> int | None:
         """Return the first action of the best path, or None where there is no path."""
         near = memory.near
-        before = memory.targets[: memory.n_targets].tolist(), memory.failure_s
         choice = best_path(
             here,
             memory.targets,
-            memory.n_targets,
             memory.failure_s,
-            memory.promise_s,
+            memory.remaining_s,
             self._budget,
             near.planning_graph(self.problem, self._failure_s),
             _snapshot(here, known, memory),
             memory.path,
         )
-        memory.n_targets, memory.failure_s = choice.n_targets, choice.failure_s
-        memory.promise_s = choice.then_s
+        kept = choice.failure_s == memory.failure_s and np.array_equal(choice.targets, memory.targets)
+        memory.replans += not kept
+        memory.targets, memory.failure_s = choice.targets, choice.failure_s
+        memory.remaining_s = choice.remaining_s
         memory.expected_s = min(choice.onward_s, choice.at_hand_s)
-        memory.replans += before != (memory.targets[: memory.n_targets].tolist(), memory.failure_s)
         if choice.slot >= 0 and choice.at_hand_s <= choice.onward_s + self._worth_passing_s:
-            memory.promise_s = math.inf
+            memory.remaining_s = math.inf
             return PARK if choice.slot == here else near.table.move(here, choice.slot)
         if choice.next_vertex == ATTEMPT:
             return PARK
         if choice.next_vertex == NOWHERE:
             return None
         if choice.next_vertex == here:
-            return self._wait(vertex)
+            return self.wait(vertex)
         return near.table.move_to(here, choice.next_vertex)
 
     def _change_part(self, belief: SlotBelief, vertex: int, memory: BeliefSearch) -> SlotBelief:
@@ -270,7 +245,6 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         # The lot does not change, so it need not be copied.
         imagined = copy.deepcopy(memory, {id(memory.near): memory.near})
         problem, vertex, path = self.problem, int(observation["vertex"]), list[int]()
-        starts, slots = problem.slots_in_view
         end = belief.time + PREVIEW_S
         while action != PARK:
             following = int(problem.lot.neighbors[vertex, action])
@@ -279,16 +253,11 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             belief = belief.decay(float(problem.move_s[vertex, action]))
             vertex = following
             path.append(vertex)
-            shown = slots[starts[vertex] : starts[vertex + 1]]
+            shown = problem.in_view(vertex)
             shown = shown[~belief.observed_free[shown]]
             belief = belief.update(shown, np.full(len(shown), True))
             action = self.decide({"vertex": vertex}, belief, imagined)
         return PlanPreview(tuple(path))
-
-    def _wait(self, vertex: int) -> int:
-        """Return a move without an edge, which waits; the shortest move if all four have edges."""
-        missing = np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)
-        return int(missing[0]) if len(missing) else int(self.problem.move_s[vertex].argmin())
 
 
 def _snapshot(here: int, known: SlotBelief, memory: BeliefSearch) -> BeliefSnapshot:

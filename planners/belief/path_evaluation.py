@@ -24,8 +24,7 @@ from planners.belief.planning_graph import (
 )
 from sim_sensors.compilation import compiled
 
-KEPT_IN_MIND = 32
-"""Number of stops for which a passed free slot is remembered."""
+KEPT_IN_MIND = 32  # number of stops for which a passed free slot is remembered
 
 
 @compiled(error_model="numpy")
@@ -63,7 +62,6 @@ def evaluate_path(
     n_stops: int,
     left_s: float,
     options: IntArray,
-    n_options: int,
     fallback_s: FloatArray,
     graph: PlanningGraph,
     belief: BeliefSnapshot,
@@ -79,8 +77,7 @@ def evaluate_path(
     Args:
         n_stops: number of stops of the path.
         left_s: s, expected time after its end if nothing was found.
-        options: slots that are known to be free now.
-        n_options: number of such slots.
+        options: (k,) int64, slots that are known to be free now.
         fallback_s: (n_slots,) float64, s, remaining time of the search if the slot is gone on arrival.
         graph: the lot.
         belief: the belief.
@@ -97,7 +94,7 @@ def evaluate_path(
     value, then_s = np.inf, np.inf
     for _ in range(2 if len(belief.weights) > 1 else 1):
         _set_first_observations(n_stops, belief, path)
-        value, then_s = _stop_optimally(n_stops, left_s, options, n_options, fallback_s, graph, belief, path)
+        value, then_s = _stop_optimally(n_stops, left_s, options, fallback_s, graph, belief, path)
     return value, then_s
 
 
@@ -118,7 +115,6 @@ def _stop_optimally(
     n_stops: int,
     left_s: float,
     options: IntArray,
-    n_options: int,
     fallback_s: FloatArray,
     graph: PlanningGraph,
     belief: BeliefSnapshot,
@@ -148,8 +144,7 @@ def _stop_optimally(
         vertex, first, last = stops[k].vertex, stops[k].first, stops[k + 1].first
         oldest = stops[max(k - KEPT_IN_MIND, 1)].first
         stop_s = np.inf
-        for i in range(n_options):
-            s = options[i]
+        for s in options:
             stop_s = min(
                 stop_s,
                 expected_cost_to_slot(

@@ -34,7 +34,6 @@ OBSERVE_AGAIN_S = 10.0
 def rollout_path(
     vertex: int,
     targets: IntArray,
-    n_targets: int,
     failure_s: float,
     graph: PlanningGraph,
     belief: BeliefSnapshot,
@@ -46,8 +45,7 @@ def rollout_path(
 
     Args:
         vertex: where the car is.
-        targets: vertices to pass first, in order.
-        n_targets: number of targets.
+        targets: (k,) int64, vertices to pass first, in order.
         failure_s: s, failure cost of the thesis's planner.
         graph: the lot.
         belief: the belief.
@@ -73,10 +71,10 @@ def rollout_path(
     choose, target = True, -1
     weights = copy_weights(belief, path)
     while k + 3 < len(stops) and n_observations < len(observations):
-        while n_passed < n_targets and _is_settled(targets[n_passed], vertex, time, graph, belief, path):
+        while n_passed < len(targets) and _is_settled(targets[n_passed], vertex, time, graph, belief, path):
             n_passed += 1
             choose = True
-        if n_passed < n_targets:
+        if n_passed < len(targets):
             target = targets[n_passed]
         elif choose or target == vertex:
             target, value = _next_target(vertex, time, failure_s, graph, belief, path)
@@ -271,12 +269,7 @@ def _p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnap
 
 @compiled(error_model="numpy")
 def _next_target(
-    vertex: int,
-    time: float,
-    failure_s: float,
-    graph: PlanningGraph,
-    belief: BeliefSnapshot,
-    path: PathBuffer,
+    vertex: int, time: float, failure_s: float, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> tuple[int, float]:
     """Return the slot that the thesis's planner would drive to at a given time of a path, and its expected time, s.
 

@@ -21,10 +21,8 @@ IntArray = NDArray[np.int64]
 Records = NDArray[Any]
 """A structured array. One array of records compiles several times faster than one array per field."""
 
-MOST_HYPOTHESES = 64
-"""Maximum number of hypotheses of the forecast error model."""
-MOST_STOPS = 400
-"""Maximum number of vertices of a path."""
+MOST_HYPOTHESES = 64  # maximum number of hypotheses of the forecast error model
+MOST_STOPS = 400  # maximum number of vertices of a path
 
 VIEW = np.dtype([("slot", np.int64), ("rate", np.float64)])
 """A slot in view of a vertex, and P(the slot can be detected from there)."""
@@ -71,61 +69,36 @@ MARK = np.dtype([("observed_at", np.float64), ("scratch", np.float64)])
 
 
 class PlanningGraph(NamedTuple):
-    """The part of the planning problem that does not change during a search.
+    """The part of the planning problem that does not change during a search."""
 
-    Attributes:
-        drive_s: (n_vertices, n_vertices) float64, s, drive times.
-        next_vertex: (n_vertices, n_vertices) int16, the next vertex of a shortest route.
-        view_starts: (n_vertices + 1,) int64, rows of `views`.
-        views: `VIEW` records, the slots in view of each vertex.
-        own_rate: (n_slots,) float64, P(the slot is detected from its own vertex).
-        cost_s: (n_slots,) float64, s, arrival cost (`SearchProblem.arrival_cost_s`).
-        wait_s: s, time of an observation without moving.
-        give_up_s: s, cost of giving up a lot that is proven full.
-        failure_s: s, expected cost of finding a slot taken on arrival; 0 if that is observed before the attempt.
-        whole: whether these are all slots of the lot; only then can it be proven full.
-    """
-
-    drive_s: FloatArray
-    next_vertex: NDArray[np.int16]
-    view_starts: IntArray
-    views: Records
-    own_rate: FloatArray
-    cost_s: FloatArray
-    wait_s: float
-    give_up_s: float
+    drive_s: FloatArray  # (n_vertices, n_vertices) float64, s, drive times
+    next_vertex: NDArray[np.int16]  # (n_vertices, n_vertices) int16, the next vertex of a shortest route
+    view_starts: IntArray  # (n_vertices + 1,) int64, rows of `views`
+    views: Records  # `VIEW` records, the slots in view of each vertex
+    own_rate: FloatArray  # (n_slots,) float64, P(the slot is detected from its own vertex)
+    cost_s: FloatArray  # (n_slots,) float64, s, arrival cost (`SearchProblem.arrival_cost_s`)
+    wait_s: float  # s, time of an observation without moving
+    give_up_s: float  # s, cost of giving up a lot that is proven full
+    # s, expected cost of finding a slot taken on arrival; 0 if that is observed before the attempt
     failure_s: float
-    whole: bool
+    whole: bool  # whether these are all slots of the lot; only then can it be proven full
 
 
 class BeliefSnapshot(NamedTuple):
-    """The belief about the slots at one decision.
+    """The belief about the slots at one decision."""
 
-    Attributes:
-        slots: (n_slots,) `SLOT` records.
-        weights: (k,) float64, probabilities of the hypotheses of the forecast error model.
-        p_free_if: (n_slots, k) float64, P(free) of an unobserved slot under each of them.
-    """
-
-    slots: Records
-    weights: FloatArray
-    p_free_if: FloatArray
+    slots: Records  # (n_slots,) `SLOT` records
+    weights: FloatArray  # (k,) float64, probabilities of the hypotheses of the forecast error model
+    p_free_if: FloatArray  # (n_slots, k) float64, P(free) of an unobserved slot under each of them
 
 
 class PathBuffer(NamedTuple):
-    """Buffer for one path, reused by all rollouts.
+    """Buffer for one path, reused by all rollouts."""
 
-    Attributes:
-        stops: `STOP` records, one more than there are stops.
-        observations: `OBSERVATION` records in order.
-        marks: (n_slots,) `MARK` records.
-        weights: float64, scratch: probabilities of the hypotheses along the path.
-    """
-
-    stops: Records
-    observations: Records
-    marks: Records
-    weights: FloatArray
+    stops: Records  # `STOP` records, one more than there are stops
+    observations: Records  # `OBSERVATION` records in order
+    marks: Records  # (n_slots,) `MARK` records
+    weights: FloatArray  # float64, scratch: probabilities of the hypotheses along the path
 
 
 def path_buffer(n_slots: int, n_vertices: int) -> PathBuffer:

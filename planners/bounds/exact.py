@@ -19,14 +19,14 @@ between two slots):
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
-from parkenv.world.lot import MOVES, PARK
+from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
 from planners.road_table import RoadTable
@@ -35,24 +35,22 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-MOST_SLOTS = 25
-"""Maximum number of slots; the key of a belief state has room for no more."""
-MOST_STATES = 8_000_000
-"""Default maximum number of belief states: about 200 MB, and twice that while solving."""
+MOST_SLOTS = 25  # maximum number of slots; the key of a belief state has room for no more
+MOST_STATES = 8_000_000  # default maximum number of belief states: about 200 MB, and twice that while solving
 
 _POSITION_BITS = 10
 _SEARCH_ENDS = -1
+_UNDECIDED = -2
 _CHUNK = 20_000
 
 
-@dataclass(frozen=True, eq=False)
-class _LotMasks:
+class _SmallLot(NamedTuple):
     """Data of a small lot for the dynamic program; sets of slots are bit masks."""
 
     shows: IntArray  # (n_vertices,) the slots in view of each vertex
     neighbors: NDArray[np.int32]
     move_s: FloatArray
-    seconds: FloatArray  # (n_vertices, n_vertices)
+    drive_s: FloatArray  # (n_vertices, n_vertices) shortest drives
     cost_s: FloatArray  # (n_slots,) arrival cost
     dominated_by: IntArray  # (n_slots,) the slots that are at least as good as each one
     p_free: FloatArray
@@ -70,6 +68,7 @@ class ExactSolution:
         seen: (n_slots,) bool, slots that were observed; None: no slot.
         free: (n_slots,) bool, slots that were observed free.
         most_states: maximum number of belief states.
+        table: shortest drives of the lot; None: compute them.
 
     Attributes:
         expected_s: s, the least expected time from here to the goal.
@@ -103,13 +102,15 @@ class ExactSolution:
         p = np.asarray(p_occupied, dtype=np.float64)
         if p.shape != (n,) or not ((p >= 0.0) & (p <= 1.0)).all():
             raise InputError(f"p_occupied: want {n} probabilities, got shape {p.shape}")
-        self._masks = _lot_masks(problem, p, table or RoadTable.of(problem))
-        seen_bits = bits_of(np.zeros(n, np.bool_) if seen is None else seen)
-        free_bits = bits_of(np.zeros(n, np.bool_) if free is None else free) & seen_bits
-        self._n = n
-        root = _key(seen_bits, vertex, _without_dominated(free_bits, self._masks.dominated_by), n)
+        self._lot = _small_lot(problem, p, table or RoadTable.of(problem))
+        seen_bits = 0 if seen is None else bits_of(seen)
+        free_bits = 0 if free is None else bits_of(free) & seen_bits
+        root = _key(seen_bits, vertex, _without_dominated(free_bits, self._lot.dominated_by), n)
         self._enumerate(root, most_states)
-        self._solve()
+        self._values = np.empty(len(self._keys))
+        self._choices = np.empty(len(self._keys), dtype=np.int16)
+        for level in range(n, -1, -1):
+            _back_up(self._keys, self._levels, level, self._values, self._choices, self._lot)
         self.n_states = len(self._keys)
         self.expected_s = float(self._values[0])
 
@@ -124,19 +125,22 @@ class ExactSolution:
             vertex: the start vertex, or a vertex that showed something new.
             free: slots observed free, as a bit mask.
         """
-        free = _without_dominated(free, self._masks.dominated_by)
         level = _popcount(seen)
         low, high = self._levels[level], self._levels[level + 1]
-        key = _key(seen, vertex, free, self._n)
+        key = _key(seen, vertex, _without_dominated(free, self._lot.dominated_by), len(self._lot.cost_s))
         at = low + int(np.searchsorted(self._keys[low:high], key))
         if at >= high or self._keys[at] != key:
             return None
         return float(self._values[at]), int(self._choices[at])
 
+    def drives(self, vertex: int, seen: int) -> tuple[FloatArray, IntArray]:
+        """Return times, (n_vertices,) s, of drives that show nothing new, and the vertex before each on its drive."""
+        reach, came_from = _drive_within_known(vertex, seen, self._lot)
+        return reach, came_from
+
     def _enumerate(self, root: int, most_states: int) -> None:
         """Find all states that can follow from the first one, in the order of the number of observed slots."""
-        n = self._n
-        masks = self._masks
+        n = len(self._lot.cost_s)
         pending: list[list[IntArray]] = [[] for _ in range(n + 1)]
         pending[_popcount(root >> (n + _POSITION_BITS))].append(np.array([root], dtype=np.int64))
         found, total = [], 0
@@ -148,8 +152,8 @@ class ExactSolution:
             for start in range(0, len(keys), _CHUNK):
                 if total > most_states:
                     break
-                new = np.unique(_successors(keys[start : start + _CHUNK], n, *_graph(masks)))
-                levels = _popcounts(new >> (n + _POSITION_BITS))
+                new = np.unique(_successors(keys[start : start + _CHUNK], self._lot))
+                levels = np.bitwise_count(new >> (n + _POSITION_BITS))
                 for more in np.unique(levels):
                     pending[more].append(new[levels == more])
                     if len(pending[more]) > 32:
@@ -162,30 +166,9 @@ class ExactSolution:
         self._keys = np.concatenate(found)
         self._levels = np.concatenate([[0], np.cumsum([len(keys) for keys in found])]).astype(np.int64)
 
-    def _solve(self) -> None:
-        masks = self._masks
-        self._values = np.empty(len(self._keys))
-        self._choices = np.empty(len(self._keys), dtype=np.int16)
-        for level in range(self._n, -1, -1):
-            _back_up(
-                self._keys,
-                self._levels,
-                level,
-                self._values,
-                self._choices,
-                self._n,
-                *_graph(masks),
-                masks.p_free,
-                masks.give_up_s,
-            )
-
 
 def require_small(problem: SearchProblem) -> None:
-    """Raise an error if the exact planner cannot solve the problem.
-
-    Raises:
-        InputError: too many slots or vertices, or a sensor that errs.
-    """
+    """Raise an `InputError` if the lot is too large for the exact planner, or the sensor errs."""
     lot = problem.lot
     if lot.n_slots > MOST_SLOTS or lot.n_vertices > 1 << _POSITION_BITS:
         raise InputError(
@@ -201,49 +184,32 @@ def bits_of(slots: NDArray[np.bool_]) -> int:
     return int(sum(1 << int(s) for s in np.flatnonzero(slots)))
 
 
-def _lot_masks(problem: SearchProblem, p_occupied: FloatArray, table: RoadTable) -> _LotMasks:
+def _small_lot(problem: SearchProblem, p_occupied: FloatArray, table: RoadTable) -> _SmallLot:
     lot = problem.lot
     starts, slots = problem.slots_in_view
     shows = np.zeros(lot.n_vertices, dtype=np.int64)
     np.bitwise_or.at(shows, np.repeat(np.arange(lot.n_vertices), np.diff(starts)), 1 << slots)
     n, cost = lot.n_slots, problem.arrival_cost_s
-    from_slot = table.seconds[:n, :n]
-    gain = cost[:, None] - (cost[None, :] + from_slot)
+    gain = cost[:, None] - (cost[None, :] + table.seconds[:n, :n])
     as_good = (gain > 1e-9) | ((np.abs(gain) <= 1e-9) & (np.arange(n)[None, :] < np.arange(n)[:, None]))
     np.fill_diagonal(as_good, val=False)
     # Of two equally good slots keep the one with the lower number; else each would remove the other.
     dominated_by = np.array([bits_of(row) for row in as_good], dtype=np.int64)
-    missing = (lot.neighbors < 0).any(axis=1)
-    return _LotMasks(
-        shows,
-        lot.neighbors,
-        problem.move_s,
-        table.seconds,
-        cost,
-        dominated_by,
-        1.0 - p_occupied,
-        problem.give_up_s,
-        np.where(missing, problem.wait_s, np.inf),
-    )
-
-
-def _graph(
-    masks: _LotMasks,
-) -> tuple[IntArray, NDArray[np.int32], FloatArray, FloatArray, FloatArray, IntArray, FloatArray]:
-    return (
-        masks.shows,
-        masks.neighbors,
-        masks.move_s,
-        masks.seconds,
-        masks.cost_s,
-        masks.dominated_by,
-        masks.stay_s,
-    )
+    stay_s = np.where((lot.neighbors < 0).any(axis=1), problem.wait_s, np.inf)
+    edges = lot.neighbors, problem.move_s, table.seconds
+    return _SmallLot(shows, *edges, cost, dominated_by, 1.0 - p_occupied, problem.give_up_s, stay_s)
 
 
 @compiled
 def _key(seen: int, vertex: int, free: int, n: int) -> int:
     return (((seen << _POSITION_BITS) | vertex) << n) | free
+
+
+@compiled
+def _state(key: int, n: int) -> tuple[int, int, int]:
+    """Return the slots seen, the vertex and the slots observed free of a key."""
+    group = key >> n
+    return group >> _POSITION_BITS, group & ((1 << _POSITION_BITS) - 1), key & ((1 << n) - 1)
 
 
 @compiled
@@ -253,14 +219,6 @@ def _popcount(bits: int) -> int:
         bits &= bits - 1
         count += 1
     return count
-
-
-@compiled
-def _popcounts(bits: IntArray) -> IntArray:
-    counts = np.empty(len(bits), np.int64)
-    for i in range(len(bits)):
-        counts[i] = _popcount(bits[i])
-    return counts
 
 
 @compiled
@@ -274,110 +232,76 @@ def _without_dominated(free: int, dominated_by: IntArray) -> int:
 
 
 @compiled
-def _drive_within_known(
-    vertex: int,
-    seen: int,
-    shows: IntArray,
-    neighbors: NDArray[np.int32],
-    move_s: FloatArray,
-    stay_s: FloatArray,
-    reach: FloatArray,
-    came_from: IntArray,
-    done: NDArray[np.uint8],
-) -> None:
-    """Compute drive times, s, through vertices that show nothing new, to these vertices and to the frontier.
+def _drive_within_known(vertex: int, seen: int, lot: _SmallLot) -> tuple[FloatArray, IntArray]:
+    """Return drive times, s, through vertices that show nothing new, to these vertices and to the frontier.
 
     If the car has not observed from its start vertex yet, the time to that vertex is that of the shortest step that
-    ends there: a wait or a round trip.
+    ends there: a wait or a round trip. Also return the vertex before each on its drive, or -1.
     """
-    reach[:] = np.inf
-    came_from[:] = -1
-    done[:] = 0
+    n_vertices = len(lot.shows)
+    reach, came_from = np.full(n_vertices, np.inf), np.full(n_vertices, -1)
+    done = np.zeros(n_vertices, np.bool_)
     reach[vertex] = 0.0
-    again = stay_s[vertex]
+    again = lot.stay_s[vertex]
     while True:
         best, v = np.inf, -1
-        for u in range(len(reach)):
-            if done[u] == 0 and reach[u] < best:
+        for u in range(n_vertices):
+            if not done[u] and reach[u] < best:
                 best, v = reach[u], u
         if v < 0:
             break
-        done[v] = 1
-        if shows[v] & ~seen and v != vertex:
+        done[v] = True
+        if lot.shows[v] & ~seen and v != vertex:
             continue
-        for m in range(neighbors.shape[1]):
-            u = neighbors[v, m]
+        for m in range(lot.neighbors.shape[1]):
+            u = lot.neighbors[v, m]
             if u < 0:
                 continue
-            seconds = best + move_s[v, m]
+            seconds = best + lot.move_s[v, m]
             if u == vertex:
                 again = min(again, seconds)
             elif seconds < reach[u]:
                 reach[u] = seconds
                 came_from[u] = v
-    if shows[vertex] & ~seen:
+    if lot.shows[vertex] & ~seen:
         reach[vertex] = again
+    return reach, came_from
 
 
 @compiled
-def _best_known(free: int, reach: FloatArray, cost_s: FloatArray) -> float:
-    best = np.inf
-    for s in range(len(cost_s)):
-        if (free >> s) & 1:
-            best = min(best, reach[s] + cost_s[s])
-    return best
-
-
-@compiled
-def _least_unseen(vertex: int, seen: int, seconds: FloatArray, cost_s: FloatArray) -> float:
+def _least_cost(slots: int, drive_s: FloatArray, cost_s: FloatArray) -> float:
+    """Return the least drive plus arrival cost, s, over a set of slots; inf if it is empty."""
     least = np.inf
     for s in range(len(cost_s)):
-        if not (seen >> s) & 1:
-            least = min(least, seconds[vertex, s] + cost_s[s])
+        if (slots >> s) & 1:
+            least = min(least, drive_s[s] + cost_s[s])
     return least
 
 
 @compiled
-def _successors(
-    keys: IntArray,
-    n: int,
-    shows: IntArray,
-    neighbors: NDArray[np.int32],
-    move_s: FloatArray,
-    seconds: FloatArray,
-    cost_s: FloatArray,
-    dominated_by: IntArray,
-    stay_s: FloatArray,
-) -> IntArray:
+def _successors(keys: IntArray, lot: _SmallLot) -> IntArray:
     """List the states after one more observation, with duplicates."""
-    n_vertices = len(shows)
-    reach, came_from = np.empty(n_vertices), np.empty(n_vertices, np.int64)
-    done = np.empty(n_vertices, np.uint8)
-    found = np.empty(1024, np.int64)
-    count = 0
-    all_slots, positions = (1 << n) - 1, (1 << _POSITION_BITS) - 1
-    previous, least = -1, np.inf
+    n, n_vertices = len(lot.cost_s), len(lot.shows)
+    found, count = np.empty(1024, np.int64), 0
+    previous, least, reach = -1, np.inf, np.empty(0)
     for i in range(len(keys)):
-        free, group = keys[i] & all_slots, keys[i] >> n
-        vertex, seen = group & positions, group >> _POSITION_BITS
-        if group != previous:
-            _drive_within_known(vertex, seen, shows, neighbors, move_s, stay_s, reach, came_from, done)
-            least = _least_unseen(vertex, seen, seconds, cost_s)
-            previous = group
-        best = _best_known(free, reach, cost_s)
-        if best <= min(least, _best_known(free, seconds[vertex], cost_s)):
+        seen, vertex, free = _state(keys[i], n)
+        if keys[i] >> n != previous:
+            previous = keys[i] >> n
+            reach, _ = _drive_within_known(vertex, seen, lot)
+            least = _least_cost(~seen, lot.drive_s[vertex], lot.cost_s)
+        best = _least_cost(free, reach, lot.cost_s)
+        if best <= min(least, _least_cost(free, lot.drive_s[vertex], lot.cost_s)):
             continue
         for v in range(n_vertices):
-            new = shows[v] & ~seen
+            new = lot.shows[v] & ~seen
             if new == 0 or not reach[v] < best:
                 continue
             revealed = new
             while True:
                 if count == len(found):
-                    larger = np.empty(2 * count, np.int64)
-                    larger[:count] = found
-                    found = larger
-                found[count] = _key(seen | new, v, _without_dominated(free | revealed, dominated_by), n)
+                    found = np.concatenate((found, np.empty(count, np.int64)))
+                found[count] = _key(seen | new, v, _without_dominated(free | revealed, lot.dominated_by), n)
                 count += 1
                 if revealed == 0:
                     break
@@ -392,44 +316,31 @@ def _back_up(
     level: int,
     values: FloatArray,
     choices: NDArray[np.int16],
-    n: int,
-    shows: IntArray,
-    neighbors: NDArray[np.int32],
-    move_s: FloatArray,
-    seconds: FloatArray,
-    cost_s: FloatArray,
-    dominated_by: IntArray,
-    stay_s: FloatArray,
-    p_free: FloatArray,
-    give_up_s: float,
+    lot: _SmallLot,
 ) -> None:
     """Apply Bellman's equation to the states with `level` observed slots; states with more are already solved."""
-    n_vertices = len(shows)
-    reach, came_from = np.empty(n_vertices), np.empty(n_vertices, np.int64)
-    done = np.empty(n_vertices, np.uint8)
+    n, n_vertices = len(lot.cost_s), len(lot.shows)
     low, high = np.empty(n_vertices, np.int64), np.empty(n_vertices, np.int64)
-    all_slots, positions = (1 << n) - 1, (1 << _POSITION_BITS) - 1
-    previous, least = -1, np.inf
+    all_slots = (1 << n) - 1
+    previous, least, reach = -1, np.inf, np.empty(0)
     for i in range(levels[level], levels[level + 1]):
-        free, group = keys[i] & all_slots, keys[i] >> n
-        vertex, seen = group & positions, group >> _POSITION_BITS
-        if group != previous:
-            _drive_within_known(vertex, seen, shows, neighbors, move_s, stay_s, reach, came_from, done)
-            least = _least_unseen(vertex, seen, seconds, cost_s)
-            previous = group
-            for v in range(n_vertices):
-                low[v] = -1
-        best = _best_known(free, reach, cost_s)
+        seen, vertex, free = _state(keys[i], n)
+        if keys[i] >> n != previous:
+            previous = keys[i] >> n
+            reach, _ = _drive_within_known(vertex, seen, lot)
+            least = _least_cost(~seen, lot.drive_s[vertex], lot.cost_s)
+            low[:] = -1
+        best = _least_cost(free, reach, lot.cost_s)
         choice = _SEARCH_ENDS
         if best == np.inf and seen == all_slots:
-            best = give_up_s
-        elif best > min(least, _best_known(free, seconds[vertex], cost_s)):
+            best = lot.give_up_s
+        elif best > min(least, _least_cost(free, lot.drive_s[vertex], lot.cost_s)):
             limit = best
             if best == np.inf:
                 # With unreachable slots the lot is never proven full; the step limit then costs the same.
-                best = give_up_s
+                best = lot.give_up_s
             for v in range(n_vertices):
-                new = shows[v] & ~seen
+                new = lot.shows[v] & ~seen
                 if new == 0 or not reach[v] < limit:
                     continue
                 after = seen | new
@@ -443,9 +354,9 @@ def _back_up(
                     chance = 1.0
                     for s in range(n):
                         if (new >> s) & 1:
-                            chance *= p_free[s] if (revealed >> s) & 1 else 1.0 - p_free[s]
+                            chance *= lot.p_free[s] if (revealed >> s) & 1 else 1.0 - lot.p_free[s]
                     if chance > 0.0:
-                        key = _key(after, v, _without_dominated(free | revealed, dominated_by), n)
+                        key = _key(after, v, _without_dominated(free | revealed, lot.dominated_by), n)
                         at = low[v] + np.searchsorted(keys[low[v] : high[v]], key)
                         expected += chance * values[at]
                     if revealed == 0:
@@ -460,21 +371,14 @@ def _back_up(
 
 @dataclass
 class ExactState:
-    """Memory of the exact agent.
+    """Memory of the exact agent."""
 
-    Attributes:
-        forecast: (n_slots,) float, P(taken) before the first observation.
-        solution: the most recent solution.
-        seen: slots observed, as a bit mask.
-        free: slots that were free when last observed, as a bit mask.
-        target: the next vertex to observe from; -1 to park at a slot observed free; -2 before a decision.
-    """
-
-    forecast: NDArray[np.floating]
-    solution: ExactSolution
-    seen: int = 0
-    free: int = 0
-    target: int = -2
+    forecast: NDArray[np.floating]  # (n_slots,) float, P(taken) before the first observation
+    solution: ExactSolution  # the most recent solution
+    seen: int = 0  # slots observed, as a bit mask
+    free: int = 0  # slots that were free when last observed, as a bit mask
+    # the next vertex to observe from; -1 to park at a slot observed free; -2 before a decision
+    target: int = _UNDECIDED
 
 
 class ExactAgent(SearchAgent[ExactState]):
@@ -501,68 +405,39 @@ class ExactAgent(SearchAgent[ExactState]):
 
     def begin(self, observation: Observation, belief: SlotBelief) -> ExactState:
         """Solve from the forecast."""
-        forecast = belief.forecast
-        return ExactState(forecast, self._solution(forecast, int(observation["vertex"]), 0, 0))
+        return ExactState(belief.forecast, self._solve(belief.forecast, int(observation["vertex"])))
+
+    def _solve(
+        self, forecast: NDArray[np.floating], vertex: int, *observed: NDArray[np.bool_]
+    ) -> ExactSolution:
+        return ExactSolution(
+            self.problem, forecast, vertex, *observed, most_states=self.most_states, table=self.table
+        )
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: ExactState) -> int:
         """Drive to the next vertex to observe from, or to the chosen slot, and park there."""
         vertex = int(observation["vertex"])
         seen, free = bits_of(belief.observed), bits_of(belief.observed_free)
-        if (seen, free) != (memory.seen, memory.free) or memory.target == -2 or vertex == memory.target:
+        undecided = memory.target == _UNDECIDED or vertex == memory.target
+        if (seen, free) != (memory.seen, memory.free) or undecided:
             memory.seen, memory.free = seen, free
             decision = memory.solution.decide(seen, vertex, free)
             if decision is None:
-                memory.solution = self._solution(memory.forecast, vertex, seen, free)
+                memory.solution = self._solve(memory.forecast, vertex, belief.observed, belief.observed_free)
                 decision = memory.solution.decide(seen, vertex, free)
                 assert decision is not None
             memory.target = decision[1]
-        return self._move_on(vertex, memory)
-
-    def _solution(self, forecast: NDArray[np.floating], vertex: int, seen: int, free: int) -> ExactSolution:
-        slots = np.arange(len(forecast))
-        as_bool = [((bits >> slots) & 1).astype(np.bool_) for bits in (seen, free)]
-        return ExactSolution(
-            self.problem,
-            forecast,
-            vertex,
-            as_bool[0],
-            as_bool[1],
-            most_states=self.most_states,
-            table=self.table,
-        )
-
-    def _move_on(self, vertex: int, memory: ExactState) -> int:
-        n_vertices, lot = self.problem.lot.n_vertices, self.problem.lot
-        masks = memory.solution._masks
-        reach, came_from = np.empty(n_vertices), np.empty(n_vertices, np.int64)
-        _drive_within_known(
-            vertex,
-            memory.seen,
-            masks.shows,
-            lot.neighbors,
-            self.problem.move_s,
-            masks.stay_s,
-            reach,
-            came_from,
-            np.empty(n_vertices, np.uint8),
-        )
+        reach, came_from = memory.solution.drives(vertex, memory.seen)
         target = memory.target
-        if target < 0:
-            free = (memory.free >> np.arange(lot.n_slots)) & 1 == 1
-            if not free.any():
-                return self._wait(vertex)
-            total_s = np.where(free, reach[: lot.n_slots] + self.problem.arrival_cost_s, np.inf)
-            target = int(total_s.argmin())
+        if target == _SEARCH_ENDS:
+            if not free:
+                return self.wait(vertex)
+            arrival_s = reach[: self.problem.lot.n_slots] + self.problem.arrival_cost_s
+            target = int(np.where(belief.observed_free, arrival_s, np.inf).argmin())
             if target == vertex:
                 return PARK
         elif target == vertex:
-            return self._wait(vertex)
-        step = target
-        while came_from[step] != vertex:
-            step = int(came_from[step])
-        return self.table.move_to(vertex, step)
-
-    def _wait(self, vertex: int) -> int:
-        """Return a move without an edge, which waits; any move if all four have edges."""
-        missing = np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)
-        return int(missing[0]) if len(missing) else int(len(MOVES) - 1)
+            return self.wait(vertex)
+        while came_from[target] != vertex:
+            target = int(came_from[target])
+        return self.table.move_to(vertex, target)

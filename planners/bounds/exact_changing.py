@@ -12,7 +12,6 @@ observation is rounded to whole steps, and ages of `memory_steps` and more are n
 from __future__ import annotations
 
 import math
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,17 +20,16 @@ from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
-from planners.agent import Observation, SearchAgent
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-MOST_STATES = 20_000_000
-"""Maximum number of belief states: 180 MB."""
+MOST_STATES = 20_000_000  # maximum number of belief states: 180 MB
 _TOLERANCE = 1e-4
 _MOST_SWEEPS = 20_000
-_WAIT = 4
+_STAY, _PARK = 4, 5
+WAIT = 5  # the action of waiting where the car is
 
 
 class ChangingSolution:
@@ -64,12 +62,7 @@ class ChangingSolution:
     """
 
     def __init__(
-        self,
-        problem: SearchProblem,
-        p_occupied: ArrayLike,
-        rate: ArrayLike,
-        step_s: float,
-        memory_steps: int,
+        self, problem: SearchProblem, p_occupied: ArrayLike, rate: ArrayLike, step_s: float, memory_steps: int
     ) -> None:
         lot, n = problem.lot, problem.lot.n_slots
         p, r = np.asarray(p_occupied, dtype=np.float64), np.asarray(rate, dtype=np.float64)
@@ -100,7 +93,7 @@ class ChangingSolution:
         self._free = np.concatenate([usual, usual + (1.0 - usual) * decayed, usual * (1.0 - decayed)], axis=1)
         moves = np.concatenate([lot.neighbors, np.arange(lot.n_vertices)[:, None]], axis=1).astype(np.int64)
         waits = (lot.neighbors < 0).any(axis=1)
-        moves[~waits, _WAIT] = -1
+        moves[~waits, _STAY] = -1
         seconds = np.concatenate([problem.move_s, np.full((lot.n_vertices, 1), problem.wait_s)], axis=1)
         steps = np.maximum(np.rint(seconds / step_s), 1).astype(np.int64)
         made = moves >= 0
@@ -131,9 +124,9 @@ class ChangingSolution:
         return float(self.values[vertex, self._index(codes)])
 
     def decide(self, vertex: int, codes: IntArray) -> int:
-        """Return the optimal action: a move, `PARK`, or 5 to wait and observe again."""
+        """Return the optimal action: a move, `PARK`, or `WAIT` to observe again."""
         choice = int(self._choices[vertex, self._index(codes)])
-        return {_WAIT: 5, 5: PARK}.get(choice, choice)
+        return {_STAY: WAIT, _PARK: PARK}.get(choice, choice)
 
     def code(self, belief: SlotBelief) -> IntArray:
         """Return the codes, (n_slots,), of the belief about each slot."""
@@ -192,7 +185,7 @@ def _iterate(
                     continue
                 best, choice = np.inf, -1
                 if v < n and codes[v] == 1:
-                    best, choice = cost_s[v], 5
+                    best, choice = cost_s[v], _PARK
                 for m in range(moves.shape[1]):
                     u = moves[v, m]
                     if u < 0:
@@ -228,29 +221,3 @@ def _iterate(
         if worst < _TOLERANCE:
             break
     return sweep
-
-
-class ChangingAgent(SearchAgent[None]):
-    """Follows a `ChangingSolution`, assuming that its forecast and rates are right.
-
-    Args:
-        solution: the optimum.
-    """
-
-    name: ClassVar[str] = "exact-changing"
-
-    def __init__(self, solution: ChangingSolution) -> None:
-        super().__init__(solution.problem)
-        self.solution = solution
-
-    def begin(self, observation: Observation, belief: SlotBelief) -> None:
-        """Return no memory: the belief is the state."""
-
-    def decide(self, observation: Observation, belief: SlotBelief, memory: None) -> int:
-        """Choose the optimal action for the belief."""
-        del memory
-        vertex = int(observation["vertex"])
-        action = self.solution.decide(vertex, self.solution.code(belief))
-        if action > PARK:
-            return int(np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)[0])
-        return action

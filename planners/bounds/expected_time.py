@@ -7,7 +7,7 @@ import itertools
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
@@ -15,8 +15,7 @@ from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Agent
 
-MOST_STEPS = 2000
-"""Decisions after which a search is truncated at a cost of `give_up_s`, as in comparisons."""
+MOST_STEPS = 2000  # decisions after which a search is truncated at a cost of `give_up_s`, as in comparisons
 
 
 def expected_time(agent: Agent, problem: SearchProblem, p_occupied: ArrayLike, vertex: int) -> float:
@@ -84,12 +83,12 @@ class _Histories:
             else:
                 belief = belief.decay(float(problem.move_s[vertex, chosen]))
                 vertex = int(problem.lot.neighbors[vertex, chosen])
-            if not belief.observed[self._in_view(vertex)].all():
+            if not belief.observed[self.problem.in_view(vertex)].all():
                 return belief.time - begun + self._observe(vertex, belief, steps, memory)
 
     def _observe(self, vertex: int, belief: SlotBelief, steps: int, memory: Any) -> float:
         """Return the expected time, s, from the moment of an observation at a vertex."""
-        in_view = self._in_view(vertex)
+        in_view = self.problem.in_view(vertex)
         new = in_view[~belief.observed[in_view]]
         total = 0.0
         for outcome in itertools.product((False, True), repeat=len(new)):
@@ -103,10 +102,6 @@ class _Histories:
             else:
                 total += chance * self.mean(vertex, after, steps, copy.deepcopy(memory))
         return total
-
-    def _in_view(self, vertex: int) -> NDArray[np.int64]:
-        starts, slots = self.problem.slots_in_view
-        return slots[starts[vertex] : starts[vertex + 1]]
 
     def _observation(self, vertex: int, belief: SlotBelief) -> dict[str, Any]:
         return {

@@ -19,26 +19,15 @@ from planners.routes import DriveRoutes
 
 @dataclass(frozen=True)
 class BestSlot:
-    """The best slot of an episode.
+    """The best slot of an episode."""
 
-    Attributes:
-        slot: its index; -1 if no slot ever becomes free.
-        wait_s: s between the earliest possible arrival and parking.
-        total_s: s, drive, wait and arrival cost; inf if there is none.
-    """
-
-    slot: int
-    wait_s: float
-    total_s: float
+    slot: int  # its index; -1 if no slot ever becomes free
+    wait_s: float  # s between the earliest possible arrival and parking
+    total_s: float  # s, drive, wait and arrival cost; inf if there is none
 
 
 def best_slot(
-    problem: SearchProblem,
-    routes: DriveRoutes,
-    world: World,
-    vertex: int,
-    time: float,
-    wait_s: float = 0.0,
+    problem: SearchProblem, routes: DriveRoutes, world: World, vertex: int, time: float, wait_s: float = 0.0
 ) -> BestSlot:
     """Find the slot that minimises drive, wait and arrival cost.
 
@@ -85,16 +74,11 @@ def _first_free(world: World, slot: int, arrival: float, wait_s: float, latest: 
 
 @dataclass
 class OracleState:
-    """Memory of the oracle.
+    """Memory of the oracle."""
 
-    Attributes:
-        slot: the target; -1 if it proves the lot full, or if no slot ever becomes free.
-        waits: number of waits before it drives there.
-        unobserved: (n_slots,) bool, slots still to be observed to prove the lot full; None if it parks.
-    """
-
-    slot: int
-    waits: int
+    slot: int  # the target; -1 if it proves the lot full, or if no slot ever becomes free
+    waits: int  # number of waits before it drives there
+    # (n_slots,) bool, slots still to be observed to prove the lot full; None if it parks
     unobserved: NDArray[np.bool_] | None = None
 
 
@@ -138,10 +122,10 @@ class OracleAgent(SearchAgent[OracleState]):
         """Wait, drive to the slot and park when it is free; or continue the tour."""
         assert self._world is not None
         vertex, now = int(observation["vertex"]), self._time + belief.time
-        missing = np.flatnonzero(observation["action_mask"][: len(MOVES)] == 0)
-        wait = int(missing[0]) if len(missing) else 0
+        can_wait = not observation["action_mask"][: len(MOVES)].all()
+        wait = self.wait(vertex)
         if memory.unobserved is not None:
-            memory.unobserved[self._in_view(vertex)] = False
+            memory.unobserved[self.problem.in_view(vertex)] = False
             target, seconds = self._nearest_unobserved(vertex, memory.unobserved)
             if math.isfinite(seconds):
                 return self.routes.move_toward(vertex, target)
@@ -150,7 +134,7 @@ class OracleAgent(SearchAgent[OracleState]):
             vars(memory).update(vars(self._bound_for(best, vertex)))
         if memory.slot < 0:
             return wait
-        if memory.waits > 0 and len(missing):
+        if memory.waits > 0 and can_wait:
             memory.waits -= 1
             return wait
         if vertex != memory.slot:
@@ -170,13 +154,13 @@ class OracleAgent(SearchAgent[OracleState]):
         """
         assert self._world is not None
         shown = np.zeros(self.problem.lot.n_slots, dtype=np.bool_)
-        shown[self._in_view(vertex)] = True
+        shown[self.problem.in_view(vertex)] = True
         driven = 0.0
         in_view_after = 0.0 if shown[slot] else np.inf
         for move, following in self.routes.hops(vertex, slot):
             driven += float(self.problem.move_s[vertex, move])
             vertex = following
-            shown[self._in_view(vertex)] = True
+            shown[self.problem.in_view(vertex)] = True
             if shown[slot]:
                 in_view_after = min(in_view_after, driven)
         if not shown.all():
@@ -189,10 +173,6 @@ class OracleAgent(SearchAgent[OracleState]):
                 return more
         return 0
 
-    def _in_view(self, vertex: int) -> NDArray[np.int64]:
-        starts, slots = self.problem.slots_in_view
-        return slots[starts[vertex] : starts[vertex + 1]]
-
     def _nearest_unobserved(self, vertex: int, unobserved: NDArray[np.bool_]) -> tuple[int, float]:
         """Return the next slot of the tour and the drive time to it, s; -1 and inf if none is reachable."""
         slots, seconds = self.routes.nearest(vertex, unobserved)
@@ -201,7 +181,7 @@ class OracleAgent(SearchAgent[OracleState]):
     def _tour_s(self, vertex: int, at_most: float) -> float:
         """Return the time, s, to observe every slot; inf if it exceeds `at_most` or a slot is unreachable."""
         unobserved = np.ones(self.problem.lot.n_slots, dtype=np.bool_)
-        unobserved[self._in_view(vertex)] = False
+        unobserved[self.problem.in_view(vertex)] = False
         total = 0.0
         while unobserved.any():
             target, seconds = self._nearest_unobserved(vertex, unobserved)
@@ -210,5 +190,5 @@ class OracleAgent(SearchAgent[OracleState]):
                 return np.inf
             # Slots observed on the way are ignored: an upper bound is enough.
             vertex = target
-            unobserved[self._in_view(vertex)] = False
+            unobserved[self.problem.in_view(vertex)] = False
         return total

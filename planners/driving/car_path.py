@@ -12,27 +12,18 @@ from parkenv.driving.vehicle import move_along
 
 FloatArray = NDArray[np.float64]
 
-SHORTEST_ARC = 1e-6
-"""Arcs shorter than this, m, are ignored."""
+SHORTEST_ARC = 1e-6  # arcs shorter than this, m, are ignored
 
 
 @dataclass(frozen=True, eq=False)
 class CarPath:
-    """A sequence of arcs driven forward or backward.
+    """A sequence of arcs driven forward or backward."""
 
-    Args:
-        start: (3,) x, y in m and yaw in rad of the rear axle.
-        length: (k,) length of each arc, m, negative backward.
-        curvature: (k,) 1/m, positive to the left.
-        expansions: nodes that the search expanded.
-        margin: clearance to obstacles, m.
-    """
-
-    start: FloatArray
-    length: FloatArray
-    curvature: FloatArray
-    expansions: int = 0
-    margin: float = 0.0
+    start: FloatArray  # (3,) x, y in m and yaw in rad of the rear axle
+    length: FloatArray  # (k,) length of each arc, m, negative backward
+    curvature: FloatArray  # (k,) 1/m, positive to the left
+    expansions: int = 0  # nodes that the search expanded
+    margin: float = 0.0  # clearance to obstacles, m
 
     @property
     def driven_m(self) -> float:

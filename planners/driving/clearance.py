@@ -15,10 +15,8 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-CELL_M = 0.1
-"""Cell of the distance field, m."""
-DISCS = 4
-"""Number of discs in a row that cover the footprint."""
+CELL_M = 0.1  # cell of the distance field, m
+DISCS = 4  # number of discs in a row that cover the footprint
 
 _SAMPLE_M = 0.5 * CELL_M
 # Error of a distance in the field: half a cell's diagonal at either end and half a sample.
@@ -26,25 +24,17 @@ _UNSURE = math.sqrt(2.0) * CELL_M + 0.5 * _SAMPLE_M
 
 
 class Clearance(NamedTuple):
-    """Obstacles and distance field for compiled collision checks.
+    """Obstacles and distance field for compiled collision checks."""
 
-    Attributes:
-        corners: (n, k_max, 2) float64, m: convex outlines in either orientation; lines have two corners.
-        n_corners: (n,) int64.
-        circle: (n, 3) float64, m: centre x, y and radius of a circle around each outline.
-        field: (rows, columns) float32, m: approximate distance of each cell to the nearest outline.
-        low: (2,) float64, m: lower corner of the field's first cell.
-        half: (2,) float64, m: half the car's length and width.
-        middle: m, distance from the rear axle to the footprint's middle.
-    """
-
+    # (n, k_max, 2) float64, m: convex outlines in either orientation; lines have two corners
     corners: FloatArray
-    n_corners: IntArray
-    circle: FloatArray
+    n_corners: IntArray  # (n,) int64
+    circle: FloatArray  # (n, 3) float64, m: centre x, y and radius of a circle around each outline
+    # (rows, columns) float32, m: approximate distance of each cell to the nearest outline
     field: NDArray[np.float32]
-    low: FloatArray
-    half: FloatArray
-    middle: float
+    low: FloatArray  # (2,) float64, m: lower corner of the field's first cell
+    half: FloatArray  # (2,) float64, m: half the car's length and width
+    middle: float  # m, distance from the rear axle to the footprint's middle
 
 
 def clearance(
@@ -125,7 +115,7 @@ def _draw(outlines: FloatArray, n_corners: IntArray, low: FloatArray, taken: NDA
 
 
 @compiled(error_model="numpy")
-def stands_free(space: Clearance, x: float, y: float, yaw: float, margin: float) -> bool:
+def is_collision_free(space: Clearance, x: float, y: float, yaw: float, margin: float) -> bool:
     """Return whether the car, grown by `margin` m on all sides, is free of obstacles with its rear axle at a pose."""
     rows, columns = space.field.shape
     half_length, half_width = space.half[0] + margin, space.half[1] + margin
@@ -200,12 +190,12 @@ def _overlap(
 @compiled(error_model="numpy")
 def room_at(space: Clearance, x: float, y: float, yaw: float, most: float) -> float:
     """Return the largest margin, m, up to `most`, with which the car is collision-free at a pose; below 0 if none."""
-    if not stands_free(space, x, y, yaw, 0.0):
+    if not is_collision_free(space, x, y, yaw, 0.0):
         return -1.0
     low, high = 0.0, most
     for _ in range(12):
         middle = 0.5 * (low + high)
-        if stands_free(space, x, y, yaw, middle):
+        if is_collision_free(space, x, y, yaw, middle):
             low = middle
         else:
             high = middle

@@ -13,8 +13,7 @@ from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
-GRID_CELLS = 2
-"""Cells of the distance field per cell of the grid."""
+GRID_CELLS = 2  # cells of the distance field per cell of the grid
 
 
 @compiled(error_model="numpy")

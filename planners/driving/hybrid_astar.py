@@ -20,8 +20,8 @@ from planners.driving.car_path import CarPath
 from planners.driving.clearance import CELL_M, Clearance, clearance, room_at
 from planners.driving.grid_distances import GRID_CELLS, grid_distances
 from planners.driving.path_shortening import shorten_path
-from planners.driving.reeds_shepp import MOST_WORDS, PIECES, distance_between
-from planners.driving.reeds_shepp_shots import arc_is_free, cheapest_shot
+from planners.driving.reeds_shepp import PIECES, distance_between, words_buffer
+from planners.driving.reeds_shepp_shots import DriveCosts, arc_is_free, cheapest_shot
 from planners.thesis.heap import pop, push
 from sim_sensors.compilation import compiled
 
@@ -120,7 +120,7 @@ def plan_path(
     if ends_room < -0.01:
         return None
     radius = vehicle.turning_radius * (1.0 + settings.reserve)
-    tried = (-1.0, 0.0)
+    tried, origin = (-1.0, 0.0), np.asarray(target, dtype=np.float64)
     expansions = 0
     for wanted, move in settings.attempts:
         margin = max(min(wanted, ends_room), 0.0)
@@ -128,32 +128,13 @@ def plan_path(
             continue
         tried = (margin, move)
         left = grid_distances(space, start[0], start[1], space.half[1] + margin)
-        lengths, curvatures, opened = _search(
-            space,
-            left,
-            np.asarray(target, dtype=np.float64),
-            np.asarray(start, dtype=np.float64),
-            radius,
-            margin,
-            move,
-            settings.change_m,
-            settings.steer_m,
-            settings.greed,
-            settings.most_expansions,
-            settings.patience,
-        )
+        costs = DriveCosts(radius, margin, settings.change_m, settings.steer_m)
+        goal = np.asarray(start, dtype=np.float64)
+        limits = settings.greed, settings.most_expansions, settings.patience
+        lengths, curvatures, opened = _search(space, left, origin, goal, costs, move, *limits)
         expansions += opened
         if len(lengths):
-            lengths, curvatures = shorten_path(
-                space,
-                np.asarray(target),
-                lengths,
-                curvatures,
-                radius,
-                margin,
-                settings.change_m,
-                settings.steer_m,
-            )
+            lengths, curvatures = shorten_path(space, origin, lengths, curvatures, costs)
             # Planned from the target outward, driven in reverse.
             return CarPath(np.array(start), -lengths[::-1], curvatures[::-1], expansions, margin)
     return None
@@ -165,11 +146,8 @@ def _search(
     left: FloatArray,
     start: FloatArray,
     end: FloatArray,
-    radius: float,
-    margin: float,
+    costs: DriveCosts,
     move: float,
-    change_m: float,
-    steer_m: float,
     greed: float,
     most_expansions: int,
     patience: float,
@@ -184,13 +162,11 @@ def _search(
     narrow = int(2.0 * _NARROW_M / _NARROW_CELL_M) if move < _SHORT_MOVE_M else 0
     node_of = np.full((n_wide + narrow * narrow * _NARROW_YAW_CELLS, 2), -1, np.int32)
     pose, cost = np.empty((_MOST_NODES, 3)), np.empty(_MOST_NODES)
-    parent, way, steering = (
-        np.empty(_MOST_NODES, np.int32), np.empty(_MOST_NODES), np.empty(_MOST_NODES),
-    )  # fmt: skip
+    parent = np.empty(_MOST_NODES, np.int32)
+    way, steering = np.empty(_MOST_NODES), np.empty(_MOST_NODES)
     closed = np.zeros(_MOST_NODES, np.bool_)
     keys, queue = np.empty(_MOST_NODES + 1), np.empty(_MOST_NODES + 1, np.int32)
-    pieces, turns = np.zeros((MOST_WORDS, PIECES)), np.zeros((MOST_WORDS, PIECES), np.int64)
-    counts, costs = np.zeros(MOST_WORDS, np.int64), np.empty(MOST_WORDS)
+    words, radius = words_buffer(), costs.radius
     shot_piece, shot_turn = np.zeros(PIECES), np.zeros(PIECES, np.int64)
     shot_count, shot_node, best = 0, -1, math.inf
     coarse = CELL_M * GRID_CELLS
@@ -209,21 +185,19 @@ def _search(
         opened += 1
         x, y, yaw = pose[node]
         if opened <= 64 or opened % 4 == 0:
-            word, more = cheapest_shot(
-                space, x, y, yaw, end, radius, margin, change_m, steer_m, way[node], steering[node], best - cost[node],
-                pieces, turns, counts, costs,
-            )  # fmt: skip
+            below = best - cost[node]
+            word, more = cheapest_shot(space, x, y, yaw, end, costs, way[node], steering[node], below, words)
             if word >= 0:
                 if shot_node < 0:
                     last = min(last, opened + int(patience * opened) + 32)
-                best, shot_node, shot_count = cost[node] + more, node, counts[word]
-                shot_piece[:], shot_turn[:] = pieces[word], turns[word]
+                best, shot_node, shot_count = cost[node] + more, node, words.count[word]
+                shot_piece[:], shot_turn[:] = words.piece[word], words.turn[word]
         for direction in (1.0, -1.0):
             for share in _STEERINGS:
                 curvature, length = share / radius, direction * move
-                g = cost[node] + move + steer_m * abs(share - steering[node])
+                g = cost[node] + move + costs.steer_m * abs(share - steering[node])
                 if way[node] * direction < 0.0:
-                    g += change_m
+                    g += costs.change_m
                 nx, ny, nyaw = move_along(x, y, yaw, curvature, length)
                 row, column = int((ny - space.low[1]) / cell), int((nx - space.low[0]) / cell)
                 r, c = int((ny - space.low[1]) / coarse), int((nx - space.low[0]) / coarse)
@@ -245,20 +219,12 @@ def _search(
                 old = node_of[place, heading]
                 if old >= 0 and (closed[old] or cost[old] <= g):
                     continue
-                if not arc_is_free(space, x, y, yaw, curvature, length, margin):
+                if not arc_is_free(space, x, y, yaw, curvature, length, costs.margin):
                     continue
                 cs, sn = math.cos(nyaw), math.sin(nyaw)
                 dx, dy = end[0] - nx, end[1] - ny
-                h = distance_between(
-                    cs * dx + sn * dy,
-                    cs * dy - sn * dx,
-                    end[2] - nyaw,
-                    radius,
-                    change_m,
-                    pieces,
-                    turns,
-                    counts,
-                )
+                along, across = cs * dx + sn * dy, cs * dy - sn * dx
+                h = distance_between(along, across, end[2] - nyaw, radius, costs.change_m, words)
                 if left[r, c] < math.inf:
                     h = max(h, left[r, c])
                 if g + h >= best:

@@ -12,15 +12,8 @@ from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import ACCELERATION, SPEED, STATE_SIZE, STEERING, YAW, VehicleParameters
 from parkenv.errors import InputError
-from planners.driving.policy_interface import (
-    ACTION_REPEAT,
-    INTERFACE,
-    OBSERVATION_SIZE,
-    Outlines,
-    PolicyInterface,
-    encode_observation,
-    pedal_command,
-)
+from planners.driving import policy_interface as interface
+from planners.driving.policy_interface import Outlines, PolicyInterface
 from planners.model_file import load_model
 
 Observation = Mapping[str, Any]
@@ -28,17 +21,12 @@ Observation = Mapping[str, Any]
 
 @dataclass
 class LearnedParkingMemory:
-    """State of the agent within an episode.
+    """State of the agent within an episode."""
 
-    Attributes:
-        outlines: the obstacles.
-        action: (2,) float32, the current decision.
-        left: number of steps for which the action still holds.
-    """
-
-    outlines: Outlines
+    outlines: Outlines  # the obstacles
+    # (2,) float32, the current decision
     action: NDArray[np.float32] = field(default_factory=lambda: np.zeros(2, dtype=np.float32))
-    left: int = 0
+    left: int = 0  # number of steps for which the action still holds
 
 
 class LearnedParkingAgent:
@@ -61,7 +49,7 @@ class LearnedParkingAgent:
         self, algorithm: str, path: str | os.PathLike[str], vehicle: VehicleParameters | None = None
     ) -> None:
         self.name = f"{algorithm}:{path}"
-        self.card, self.model = load_model(algorithm, path, "drive", INTERFACE)
+        self.card, self.model = load_model(algorithm, path, "drive", interface.INTERFACE)
         self.view = PolicyInterface(vehicle or VehicleParameters())
 
     def predict(
@@ -117,10 +105,12 @@ class LearnedParkingAgent:
             )
             decided, _ = self.model.predict(seen, deterministic=deterministic)
             for i, action in zip(due, decided, strict=True):
-                memories[i].action, memories[i].left = action, ACTION_REPEAT
+                memories[i].action, memories[i].left = action, interface.ACTION_REPEAT
         actions = np.empty((n, 2), dtype=np.float32)
         for i, memory in enumerate(memories):
-            pedal = pedal_command(memory.action, float(observation["observation"][i][4]), self.view.pedals)
+            pedal = interface.pedal_command(
+                memory.action, float(observation["observation"][i][4]), self.view.pedals
+            )
             actions[i] = pedal, memory.action[1]
             memory.left -= 1
         return actions, memories
@@ -131,6 +121,6 @@ class LearnedParkingAgent:
         state = np.zeros(STATE_SIZE)
         state[[SPEED, STEERING, ACCELERATION]] = values[4:7]
         state[YAW] = np.arctan2(values[3], values[2])
-        seen = np.empty(OBSERVATION_SIZE, dtype=np.float32)
-        encode_observation(values[:2], state, tuple(outlines), self.view.body, values[7:12], seen)
+        seen = np.empty(interface.OBSERVATION_SIZE, dtype=np.float32)
+        interface.encode_observation(values[:2], state, tuple(outlines), self.view.body, values[7:12], seen)
         return seen

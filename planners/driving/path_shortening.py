@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from parkenv.driving.vehicle import move_along
 from planners.driving.car_path import SHORTEST_ARC
 from planners.driving.clearance import Clearance
-from planners.driving.reeds_shepp import MOST_WORDS, PIECES
-from planners.driving.reeds_shepp_shots import cheapest_shot
+from planners.driving.reeds_shepp import words_buffer
+from planners.driving.reeds_shepp_shots import DriveCosts, cheapest_shot
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
@@ -21,14 +21,10 @@ def shorten_path(
     start: FloatArray,
     lengths: FloatArray,
     curvatures: FloatArray,
-    radius: float,
-    margin: float,
-    change_m: float,
-    steer_m: float,
+    costs: DriveCosts,
 ) -> tuple[FloatArray, FloatArray]:
     """Replace parts of a path by collision-free Reeds-Shepp words where that lowers its cost."""
-    pieces, turns = np.zeros((MOST_WORDS, PIECES)), np.zeros((MOST_WORDS, PIECES), np.int64)
-    counts, costs = np.zeros(MOST_WORDS, np.int64), np.empty(MOST_WORDS)
+    words, radius = words_buffer(), costs.radius
     for _ in range(3):
         better = False
         first = 0
@@ -39,23 +35,26 @@ def shorten_path(
             for i in range(n):
                 x, y, yaw = move_along(poses[i, 0], poses[i, 1], poses[i, 2], curvatures[i], lengths[i])
                 poses[i + 1, 0], poses[i + 1, 1], poses[i + 1, 2] = x, y, yaw
-            whole = _path_cost(lengths, curvatures, radius, change_m, steer_m)
+            whole = _path_cost(lengths, curvatures, costs)
             for end in range(n, first + 1, -1):
-                part = _path_cost(lengths[first:end], curvatures[first:end], radius, change_m, steer_m)
+                part = _path_cost(lengths[first:end], curvatures[first:end], costs)
+                x, y, yaw = poses[first]
+                direction = lengths[first - 1] if first > 0 else 0.0
+                steering = curvatures[first - 1] * radius if first > 0 else 0.0
+                below = part + 2.0 * costs.change_m
                 word, _ = cheapest_shot(
-                    space, poses[first, 0], poses[first, 1], poses[first, 2], poses[end], radius, margin, change_m,
-                    steer_m, lengths[first - 1] if first > 0 else 0.0,
-                    curvatures[first - 1] * radius if first > 0 else 0.0,
-                    part + 2.0 * change_m, pieces, turns, counts, costs,
-                )  # fmt: skip
+                    space, x, y, yaw, poses[end], costs, direction, steering, below, words
+                )
                 if word < 0:
                     continue
-                count = counts[word]
-                new_lengths = np.concatenate((lengths[:first], pieces[word, :count] * radius, lengths[end:]))
-                new_curvatures = np.concatenate(
-                    (curvatures[:first], turns[word, :count] / radius, curvatures[end:])
+                count = words.count[word]
+                new_lengths = np.concatenate(
+                    (lengths[:first], words.piece[word, :count] * radius, lengths[end:])
                 )
-                if _path_cost(new_lengths, new_curvatures, radius, change_m, steer_m) < whole - 1e-3:
+                new_curvatures = np.concatenate(
+                    (curvatures[:first], words.turn[word, :count] / radius, curvatures[end:])
+                )
+                if _path_cost(new_lengths, new_curvatures, costs) < whole - 1e-3:
                     lengths, curvatures = new_lengths, new_curvatures
                     better = True
                     break
@@ -82,15 +81,13 @@ def shorten_path(
 
 
 @compiled(error_model="numpy")
-def _path_cost(
-    lengths: FloatArray, curvatures: FloatArray, radius: float, change_m: float, steer_m: float
-) -> float:
+def _path_cost(lengths: FloatArray, curvatures: FloatArray, costs: DriveCosts) -> float:
     cost, before, bend = 0.0, 0.0, 0.0
     for i in range(len(lengths)):
         if abs(lengths[i]) < SHORTEST_ARC:
             continue
-        cost += abs(lengths[i]) + steer_m * radius * abs(curvatures[i] - bend)
+        cost += abs(lengths[i]) + costs.steer_m * costs.radius * abs(curvatures[i] - bend)
         if lengths[i] * before < 0.0:
-            cost += change_m
+            cost += costs.change_m
         before, bend = lengths[i], curvatures[i]
     return cost

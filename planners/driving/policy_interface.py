@@ -23,18 +23,12 @@ IntArray = NDArray[np.int64]
 
 INTERFACE = "drive-1"
 """Version of the layout of observation and action; models of another version are refused."""
-ACTION_REPEAT = 4
-"""Environment steps per decision."""
-BEAMS = 48
-"""Number of directions in which free distance is measured, all around, the first one ahead."""
-FARTHEST_M = 10.0
-"""Maximum measured free distance, m."""
-SPEEDS = (2.0, 1.5)
-"""Maximum commanded speed forward and backward, m/s: about that of the planner."""
-STAND = 0.2
-"""Dead band of the speed command, within which the car stands."""
-OBSERVATION_SIZE = 8 + BEAMS
-"""Length of the observation vector."""
+ACTION_REPEAT = 4  # environment steps per decision
+BEAMS = 48  # number of directions in which free distance is measured, all around, the first one ahead
+FARTHEST_M = 10.0  # maximum measured free distance, m
+SPEEDS = (2.0, 1.5)  # maximum commanded speed forward and backward, m/s: about that of the planner
+STAND = 0.2  # dead band of the speed command, within which the car stands
+OBSERVATION_SIZE = 8 + BEAMS  # length of the observation vector
 
 _CONTROL_S = 0.1
 _NOWHERE = 999.0  # m; unused rows of the obstacle map are farther away
@@ -42,17 +36,11 @@ _CIRCLE = 2.0 * math.pi / BEAMS
 
 
 class Outlines(NamedTuple):
-    """Obstacles in the slot's frame, as arrays for compiled code.
+    """Obstacles in the slot's frame, as arrays for compiled code."""
 
-    Attributes:
-        edges: (n_edges, 4) float64, m: x, y of both ends; edges of one obstacle are consecutive.
-        first: (n + 1,) int64: index of the first edge of each obstacle.
-        circle: (n, 3) float64, m: centre x, y and radius of a circle around each obstacle.
-    """
-
-    edges: FloatArray
-    first: IntArray
-    circle: FloatArray
+    edges: FloatArray  # (n_edges, 4) float64, m: x, y of both ends; edges of one obstacle are consecutive
+    first: IntArray  # (n + 1,) int64: index of the first edge of each obstacle
+    circle: FloatArray  # (n, 3) float64, m: centre x, y and radius of a circle around each obstacle
 
     @classmethod
     def of_map(cls, cars: Float32Array, lines: Float32Array) -> Outlines:
@@ -79,13 +67,9 @@ class Outlines(NamedTuple):
 
 @dataclass(frozen=True)
 class PolicyInterface:
-    """Constants of the interface for one car.
+    """Constants of the interface for one car."""
 
-    Args:
-        vehicle: the car.
-    """
-
-    vehicle: VehicleParameters
+    vehicle: VehicleParameters  # the car
 
     @cached_property
     def half(self) -> FloatArray:

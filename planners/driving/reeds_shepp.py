@@ -9,6 +9,7 @@ right, and reversing the order of the pieces.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,26 @@ PIECES = 5
 MOST_WORDS = 96
 """Rows needed for all words between two poses: some of the 48 words have two versions."""
 
+
+class Words(NamedTuple):
+    """Buffer for all words between two poses, a row each."""
+
+    piece: FloatArray  # (MOST_WORDS, 5) signed length of each piece, negative backward
+    turn: IntArray  # (MOST_WORDS, 5) `LEFT`, `STRAIGHT` or `RIGHT`
+    count: IntArray  # (MOST_WORDS,) number of pieces
+    cost: FloatArray  # (MOST_WORDS,) scratch for the caller
+
+
 _EDGE = 1e-9
 _HALF = 0.5 * math.pi
+
+
+@compiled(error_model="numpy")
+def words_buffer() -> Words:
+    """Allocate a buffer."""
+    shape = (MOST_WORDS, PIECES)
+    count, cost = np.zeros(MOST_WORDS, np.int64), np.zeros(MOST_WORDS)
+    return Words(np.zeros(shape), np.zeros(shape, np.int64), count, cost)
 
 
 @compiled(error_model="numpy")
@@ -149,23 +168,9 @@ def _formula(number: int, x: float, y: float, phi: float, piece: FloatArray, tur
 
 
 @compiled(error_model="numpy")
-def words_between(
-    x: float, y: float, phi: float, pieces: FloatArray, turns: IntArray, counts: IntArray
-) -> int:
-    """Find all words from the origin to a pose, in turning radii.
-
-    Args:
-        x: turning radii.
-        y: turning radii.
-        phi: rad.
-        pieces: (MOST_WORDS, 5), output: the signed length of each piece, negative backward.
-        turns: (MOST_WORDS, 5), output: `LEFT`, `STRAIGHT` or `RIGHT`.
-        counts: (MOST_WORDS,), output: the number of pieces of each word.
-
-    Returns:
-        The number of words, at least one.
-    """
-    n = 0
+def words_between(x: float, y: float, phi: float, words: Words) -> int:
+    """Fill the buffer with all words from the origin to a pose, in turning radii; return their number, at least 1."""
+    n, pieces, turns = 0, words.piece, words.turn
     back_x, back_y = x * math.cos(phi) + y * math.sin(phi), x * math.sin(phi) - y * math.cos(phi)
     for number in range(8):
         # Reversing the order gives a new word only for these.
@@ -190,7 +195,7 @@ def words_between(
                             pieces[n, i] = -pieces[n, i]
                         if mirror:
                             turns[n, i] = -turns[n, i]
-                    counts[n] = count
+                    words.count[n] = count
                     n += 1
     return n
 
@@ -210,21 +215,11 @@ def word_cost(piece: FloatArray, count: int, radius: float, change_m: float) -> 
 
 
 @compiled(error_model="numpy")
-def distance_between(
-    x: float,
-    y: float,
-    phi: float,
-    radius: float,
-    change_m: float,
-    pieces: FloatArray,
-    turns: IntArray,
-    counts: IntArray,
-) -> float:
-    """Return the lowest `word_cost` of all words to a pose, m; the arrays are buffers for `words_between`."""
-    n = words_between(x / radius, y / radius, phi, pieces, turns, counts)
+def distance_between(x: float, y: float, phi: float, radius: float, change_m: float, words: Words) -> float:
+    """Return the lowest `word_cost` of all words to a pose, m."""
     best = math.inf
-    for k in range(n):
-        best = min(best, word_cost(pieces[k], counts[k], radius, change_m))
+    for k in range(words_between(x / radius, y / radius, phi, words)):
+        best = min(best, word_cost(words.piece[k], words.count[k], radius, change_m))
     return best
 
 
@@ -250,10 +245,9 @@ def reeds_shepp(
     step = np.asarray(end, dtype=np.float64) - start
     c, s = math.cos(start[2]), math.sin(start[2])
     x, y = (c * step[0] + s * step[1]) / radius, (c * step[1] - s * step[0]) / radius
-    pieces, turns = np.zeros((MOST_WORDS, PIECES)), np.zeros((MOST_WORDS, PIECES), dtype=np.int64)
-    counts = np.zeros(MOST_WORDS, dtype=np.int64)
-    n = words_between(float(x), float(y), float(step[2]), pieces, turns, counts)
-    costs = [word_cost(pieces[k], int(counts[k]), radius, change_m) for k in range(n)]
+    words = words_buffer()
+    n = words_between(float(x), float(y), float(step[2]), words)
+    costs = [word_cost(words.piece[k], int(words.count[k]), radius, change_m) for k in range(n)]
     best = int(np.argmin(costs))
-    kept = np.flatnonzero(np.abs(pieces[best, : counts[best]]) > _EDGE)
-    return pieces[best, kept] * radius, turns[best, kept]
+    kept = np.flatnonzero(np.abs(words.piece[best, : words.count[best]]) > _EDGE)
+    return words.piece[best, kept] * radius, words.turn[best, kept]

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import move_along
-from planners.driving.clearance import Clearance, stands_free
-from planners.driving.reeds_shepp import word_cost, words_between
+from planners.driving.clearance import Clearance, is_collision_free
+from planners.driving.reeds_shepp import Words, word_cost, words_between
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
-CHECK_M = 0.15
-"""Maximum distance, m, between checked poses."""
+CHECK_M = 0.15  # maximum distance, m, between checked poses
 
 
 @compiled(error_model="numpy")
@@ -27,39 +26,33 @@ def arc_is_free(
     n = max(1, math.ceil(abs(way) / CHECK_M))
     for i in range(1, n + 1):
         px, py, pyaw = move_along(x, y, yaw, curvature, way * i / n)
-        if not stands_free(space, px, py, pyaw, margin):
+        if not is_collision_free(space, px, py, pyaw, margin):
             return False
     return True
+
+
+class DriveCosts(NamedTuple):
+    """How the car drives: radius of its turns and clearance to obstacles; costs of changes of direction and steering.
+
+    All in m; the cost of steering is that of turning the wheel from straight to its stop.
+    """
+
+    radius: float
+    margin: float
+    change_m: float
+    steer_m: float
 
 
 @compiled(error_model="numpy")
 def _word_is_free(
-    space: Clearance,
-    x: float,
-    y: float,
-    yaw: float,
-    piece: FloatArray,
-    turn: IntArray,
-    count: int,
-    radius: float,
-    margin: float,
+    space: Clearance, x: float, y: float, yaw: float, words: Words, word: int, costs: DriveCosts
 ) -> bool:
-    for i in range(count):
-        curvature, way = turn[i] / radius, piece[i] * radius
-        if not arc_is_free(space, x, y, yaw, curvature, way, margin):
+    for i in range(words.count[word]):
+        curvature, way = words.turn[word, i] / costs.radius, words.piece[word, i] * costs.radius
+        if not arc_is_free(space, x, y, yaw, curvature, way, costs.margin):
             return False
         x, y, yaw = move_along(x, y, yaw, curvature, way)
     return True
-
-
-@compiled(error_model="numpy")
-def _steering_cost(turn: IntArray, count: int, before: float, steer_m: float) -> float:
-    """Return the cost, m, of turning the wheel along a word, after a curvature of `before` times the maximum."""
-    cost = 0.0
-    for i in range(count):
-        cost += steer_m * abs(turn[i] - before)
-        before = float(turn[i])
-    return cost
 
 
 @compiled(error_model="numpy")
@@ -69,36 +62,35 @@ def cheapest_shot(
     y: float,
     yaw: float,
     end: FloatArray,
-    radius: float,
-    margin: float,
-    change_m: float,
-    steer_m: float,
+    costs: DriveCosts,
     direction: float,
     steering: float,
     below: float,
-    pieces: FloatArray,
-    turns: IntArray,
-    counts: IntArray,
-    costs: FloatArray,
+    words: Words,
 ) -> tuple[int, float]:
-    """Return the row, or -1, and cost, m, of the cheapest collision-free word to `end` that costs less than `below`."""
+    """Return the row, or -1, and cost, m, of the cheapest collision-free word to `end` that costs less than `below`.
+
+    The car arrives with a direction, 1 or -1 (0 at a standstill), and a curvature of `steering` times the maximum.
+    """
     dx, dy = end[0] - x, end[1] - y
     c, s = math.cos(yaw), math.sin(yaw)
-    n = words_between(
-        (c * dx + s * dy) / radius, (c * dy - s * dx) / radius, end[2] - yaw, pieces, turns, counts
-    )
+    along, across = (c * dx + s * dy) / costs.radius, (c * dy - s * dx) / costs.radius
+    n = words_between(along, across, end[2] - yaw, words)
     for k in range(n):
-        costs[k] = word_cost(pieces[k], counts[k], radius, change_m)
-        costs[k] += _steering_cost(turns[k], counts[k], steering, steer_m)
-        if pieces[k, 0] * direction < 0.0:
-            costs[k] += change_m
+        turned, before = 0.0, steering
+        for i in range(words.count[k]):
+            turned += costs.steer_m * abs(words.turn[k, i] - before)
+            before = float(words.turn[k, i])
+        words.cost[k] = word_cost(words.piece[k], words.count[k], costs.radius, costs.change_m) + turned
+        if words.piece[k, 0] * direction < 0.0:
+            words.cost[k] += costs.change_m
     while True:
         best = -1
         for k in range(n):
-            if costs[k] < below and (best < 0 or costs[k] < costs[best]):
+            if words.cost[k] < below and (best < 0 or words.cost[k] < words.cost[best]):
                 best = k
         if best < 0:
             return -1, math.inf
-        if _word_is_free(space, x, y, yaw, pieces[best], turns[best], counts[best], radius, margin):
-            return best, costs[best]
-        costs[best] = math.inf
+        if _word_is_free(space, x, y, yaw, words, best, costs):
+            return best, words.cost[best]
+        words.cost[best] = math.inf

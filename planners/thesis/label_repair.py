@@ -11,22 +11,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from planners.thesis import label_setting
 from planners.thesis.heap import push
-from planners.thesis.label_setting import (
-    STOP,
-    FloatArray,
-    Labels,
-    StoppingGraph,
-    spread,
-    stop_cost,
-    update_labels,
-)
+from planners.thesis.label_setting import FloatArray, Labels, StoppingGraph
 from sim_sensors.compilation import compiled
 
-REACH = 0.1
-"""Fraction of the lot's vertices that a repair may change; above it the plan is made from scratch."""
+REACH = 0.1  # fraction of the lot's vertices that a repair may change; above it the plan is made from scratch
 _LEAST_REACH = 64
-_AFFECTED = STOP + 1
+_AFFECTED = label_setting.STOP + 1
 
 
 def repair(graph: StoppingGraph, labels: Labels, vertices: NDArray[np.int64], p_free: FloatArray) -> int:
@@ -47,7 +39,7 @@ def repair(graph: StoppingGraph, labels: Labels, vertices: NDArray[np.int64], p_
     if labels.settled and len(vertices) <= reach:
         touched = _repair(graph, vertices, labels.p_free, labels.cost, labels.move, reach)
     if touched < 0:
-        update_labels(graph, labels)
+        label_setting.update_labels(graph, labels)
     return touched
 
 
@@ -65,7 +57,7 @@ def _repair(
     keys, queued, size = np.empty(2 * reach), np.empty(2 * reach, dtype=np.int32), 0
     for i in range(len(vertices)):
         s = vertices[i]
-        if move[s] == STOP and stop_cost(graph, p_free, s) > cost[s]:
+        if move[s] == label_setting.STOP and label_setting.stop_cost(graph, p_free, s) > cost[s]:
             affected[n_affected], move[s] = s, _AFFECTED
             n_affected += 1
     tail = 0
@@ -81,7 +73,7 @@ def _repair(
                 n_affected += 1
     for i in range(n_affected):
         u = affected[i]
-        cost[u], best = stop_cost(graph, p_free, u), STOP
+        cost[u], best = label_setting.stop_cost(graph, p_free, u), label_setting.STOP
         for a in range(graph.neighbors.shape[1]):
             v = graph.neighbors[u, a]
             if v >= 0 and move[v] != _AFFECTED:
@@ -94,10 +86,10 @@ def _repair(
     n_set = n_affected
     for i in range(len(vertices)):
         s = vertices[i]
-        own = stop_cost(graph, p_free, s)
+        own = label_setting.stop_cost(graph, p_free, s)
         if own < cost[s]:
-            cost[s], move[s] = own, STOP
+            cost[s], move[s] = own, label_setting.STOP
             size = push(keys, queued, size, own, s)
             n_set += 1
-    n_spread = spread(graph, cost, move, keys, queued, size)
+    n_spread = label_setting.spread(graph, cost, move, keys, queued, size)
     return n_set + n_spread if n_spread >= 0 else -1

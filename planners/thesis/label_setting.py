@@ -39,82 +39,49 @@ from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 
-STOP = PARK
-"""The move of a vertex at which to stay: to park, or because nothing is reachable."""
-TIE_S = 1e-7
-"""s: actions whose values differ by less are equally good; solvers agree to well within it."""
-_BUCKETS_PER_VERTEX = 2
-"""Maximum number of buckets per vertex, so that skipping empty ones costs little."""
-_REFILLS = 64
-"""Maximum number of refills of all buckets; beyond it a heap is faster."""
+STOP = PARK  # the move of a vertex at which to stay: to park, or because nothing is reachable
+TIE_S = 1e-7  # s: actions whose values differ by less are equally good; solvers agree to well within it
+_BUCKETS_PER_VERTEX = 2  # maximum number of buckets per vertex, so that skipping empty ones costs little
+_REFILLS = 64  # maximum number of refills of all buckets; beyond it a heap is faster
 
 
 class StoppingGraph(NamedTuple):
-    """The part of the stopping problem that does not depend on the belief.
+    """The part of the stopping problem that does not depend on the belief."""
 
-    Attributes:
-        neighbors: (n, 4) int32, the vertex that up, down, left, right lead to, or -1.
-        move_s: (n, 4) float64, s, drive time of each edge.
-        in_start: (n + 1,) int32; the edges to v are rows in_start[v] to in_start[v + 1] of the next three arrays.
-        in_source: (m,) int32, source of the edge.
-        in_move: (m,) int8, move at the source.
-        in_s: (m,) float64, s, drive time.
-        park_reward: (n,) float64, s, r_max - r_u.
-        never_s: (n,) float64, s, least discounted cost of waiting or shuttling along one edge for ever; inf at γ = 1.
-        failure_s: s, the planner's cost of a failed attempt.
-        wait_s: s, cost of a move without an edge.
-        gamma: discount per decision.
-    """
-
-    neighbors: NDArray[np.int32]
-    move_s: FloatArray
+    neighbors: NDArray[np.int32]  # (n, 4) int32, the vertex that up, down, left, right lead to, or -1
+    move_s: FloatArray  # (n, 4) float64, s, drive time of each edge
+    # (n + 1,) int32; the edges to v are rows in_start[v] to in_start[v + 1] of the next three arrays
     in_start: NDArray[np.int32]
-    in_source: NDArray[np.int32]
-    in_move: NDArray[np.int8]
-    in_s: FloatArray
-    park_reward: FloatArray
+    in_source: NDArray[np.int32]  # (m,) int32, source of the edge
+    in_move: NDArray[np.int8]  # (m,) int8, move at the source
+    in_s: FloatArray  # (m,) float64, s, drive time
+    park_reward: FloatArray  # (n,) float64, s, r_max - r_u
+    # (n,) float64, s, least discounted cost of waiting or shuttling along one edge for ever; inf at γ = 1
     never_s: FloatArray
-    failure_s: float
-    wait_s: float
-    gamma: float
+    failure_s: float  # s, the planner's cost of a failed attempt
+    wait_s: float  # s, cost of a move without an edge
+    gamma: float  # discount per decision
 
     @classmethod
     def of(cls, mdp: ParkingMDP) -> StoppingGraph:
         """Make the graph of a decision process, without its probabilities."""
         # Copies: numba would compile every function again for read-only arrays.
         neighbors, move_s = mdp.neighbors.astype(np.int32), np.array(mdp.move_s, order="C")
-        in_start, in_source, in_move, in_s = edges_in(neighbors, move_s)
         never_s = _never(neighbors, move_s, mdp.wait_s, mdp.gamma)
-        return cls(
-            neighbors,
-            move_s,
-            in_start,
-            in_source,
-            in_move,
-            in_s,
-            np.ascontiguousarray(mdp.park_reward),
-            never_s,
-            float(mdp.failure_s),
-            float(mdp.wait_s),
-            float(mdp.gamma),
-        )
+        park_reward = np.ascontiguousarray(mdp.park_reward)
+        costs = float(mdp.failure_s), float(mdp.wait_s), float(mdp.gamma)
+        return cls(neighbors, move_s, *edges_in(neighbors, move_s), park_reward, never_s, *costs)
 
 
 @dataclass
 class Labels:
-    """A plan: cost and action of each vertex. `label_repair.repair` changes it in place.
+    """A plan: cost and action of each vertex. `label_repair.repair` changes it in place."""
 
-    Attributes:
-        cost: (n,) float64, s, -V of each vertex.
-        move: (n,) int8, the move that gave the label, or `STOP`.
-        p_free: (n,) float64, the probabilities of the plan.
-        settled: whether `move` leads from every vertex to a stop, along edges on which the labels are exact; False if
-            another solver made the plan.
-    """
-
-    cost: FloatArray
-    move: NDArray[np.int8]
-    p_free: FloatArray
+    cost: FloatArray  # (n,) float64, s, -V of each vertex
+    move: NDArray[np.int8]  # (n,) int8, the move that gave the label, or `STOP`
+    p_free: FloatArray  # (n,) float64, the probabilities of the plan
+    # whether `move` leads from every vertex to a stop, along edges on which the labels are exact; False if another
+    # solver made the plan
     settled: bool
 
 

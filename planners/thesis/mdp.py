@@ -49,7 +49,7 @@ class ParkingMDP:
         >>> mdp = ParkingMDP([[-1, -1, -1, 1], [-1, -1, 0, -1]], [[0, 0, 0, 2.0], [0, 0, 2.0, 0]],
         ...                  p_free=[0.5, 0.0], arrival_cost_s=[30.0, 10.0], failure_s=10.0, gamma=0.99)
         >>> from planners import policy_iteration
-        >>> [mdp.action_name(a) for a in policy_iteration(mdp).policy]
+        >>> [ACTIONS[action] for action in policy_iteration(mdp).policy]
         ['park', 'left']
     """
 
@@ -128,11 +128,6 @@ class ParkingMDP:
     def n_states(self) -> int:
         """Number of vertices; the goal is not counted."""
         return len(self.neighbors)
-
-    @staticmethod
-    def action_name(action: int) -> str:
-        """Return the name of an action."""
-        return ACTIONS[action]
 
     def successors(self) -> NDArray[np.int64]:
         """Return the state after each action that does not reach the goal, (n, 5); missing moves and parking stay."""

@@ -18,17 +18,11 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Result of a solver.
+    """Result of a solver."""
 
-    Attributes:
-        values: (n,) float64, s, the utility of each state (eq. 3.26); the goal's is 0.
-        policy: (n,) int64, an optimal action of each state (eq. 3.27).
-        iterations: number of rounds of the solver.
-    """
-
-    values: FloatArray
-    policy: NDArray[np.int64]
-    iterations: int
+    values: FloatArray  # (n,) float64, s, the utility of each state (eq. 3.26); the goal's is 0.
+    policy: NDArray[np.int64]  # (n,) int64, an optimal action of each state (eq. 3.27).
+    iterations: int  # number of rounds of the solver
 
 
 def policy_iteration(

@@ -26,27 +26,19 @@ from planners.thesis.label_setting import (
 from planners.thesis.mdp import ParkingMDP
 from sim_sensors.compilation import compiled
 
-RELEVANT_CHANGE = 0.01
-"""Replan once a probability differs by more than this from that of the plan."""
+RELEVANT_CHANGE = 0.01  # replan once a probability differs by more than this from that of the plan
 SOLVERS = ("label_setting", "policy_iteration")
 """How plans are made: exactly in near-linear time, or as in the thesis. They lead to the same actions."""
-MOST_HOPS = 400
-"""Maximum number of vertices of a plan preview."""
+MOST_HOPS = 400  # maximum number of vertices of a plan preview
 
 
 @dataclass
 class Plan:
-    """Memory of an agent that plans.
+    """Memory of an agent that plans."""
 
-    Attributes:
-        graph: the stopping problem.
-        labels: cost and move of each vertex, and the probabilities of the plan.
-        replans: number of times that the agent has replanned in this episode.
-    """
-
-    graph: StoppingGraph
-    labels: Labels
-    replans: int = 0
+    graph: StoppingGraph  # the stopping problem
+    labels: Labels  # cost and move of each vertex, and the probabilities of the plan
+    replans: int = 0  # number of times that the agent has replanned in this episode
 
     @property
     def policy(self) -> NDArray[np.int64]:

@@ -36,15 +36,10 @@ _KEPT = 256
 
 @dataclass(frozen=True, eq=False)
 class Tuning:
-    """Result of the simulation.
+    """Result of the simulation."""
 
-    Attributes:
-        costs: (k,) float64, s, the failure costs compared.
-        mean_s: (k,) float64, s, mean total time of the planner at each cost, in the same worlds.
-    """
-
-    costs: FloatArray
-    mean_s: FloatArray
+    costs: FloatArray  # (k,) float64, s, the failure costs compared
+    mean_s: FloatArray  # (k,) float64, s, mean total time of the planner at each cost, in the same worlds
 
     @property
     def best(self) -> float:
@@ -172,17 +167,11 @@ def _best_target(vertex: int, cost: float, graph: PlanningGraph, odds: FloatArra
 
 @dataclass
 class TunedPlan:
-    """Memory of the tuned planner.
+    """Memory of the tuned planner."""
 
-    Attributes:
-        failure_s: s, the chosen failure cost.
-        entry: the vertex to drive to before following the plan, or -1.
-        plan: memory of the thesis's planner.
-    """
-
-    failure_s: float
-    entry: int
-    plan: Plan
+    failure_s: float  # s, the chosen failure cost
+    entry: int  # the vertex to drive to before following the plan, or -1
+    plan: Plan  # memory of the thesis's planner
 
     @property
     def replans(self) -> int:

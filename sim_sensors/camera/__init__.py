@@ -20,15 +20,7 @@ _MODULES = {
     "camera_pose": "models",
 }
 
-__all__ = [
-    "Frame",
-    "ImageSensor",
-    "PinholeCamera",
-    "StereoCamera",
-    "StereoFrame",
-    "Weather",
-    "camera_pose",
-]
+__all__ = ["Frame", "ImageSensor", "PinholeCamera", "StereoCamera", "StereoFrame", "Weather", "camera_pose"]
 
 
 def __getattr__(name: str) -> Any:

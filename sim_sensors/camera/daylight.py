@@ -16,9 +16,9 @@ from sim_sensors.compilation import compiled
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 Color = tuple[float, float, float]
+Vector = tuple[float, float, float]
 
-SHADOW_BIAS = 0.05
-"""m, offset towards the sun, against self-shadowing."""
+SHADOW_BIAS = 0.05  # m, offset towards the sun, against self-shadowing
 
 _GROUND_TONE = 0.12  # albedo of the ground in reflections and for bounced light
 
@@ -50,18 +50,10 @@ def daylight(weather: Weather) -> Light:
     """Return the light of a weather."""
     background, mirrored = sky_domes(weather)
     sun, sky = np.array(weather.sun), np.array(weather.sky)
-    return Light(
-        np.array(weather.sun_direction),
-        sun,
-        sky,
-        np.array(weather.horizon),
-        weather.haze,
-        weather.wetness,
-        weather.lit_windows,
-        background,
-        mirrored,
-        _GROUND_TONE * (1.0 - 0.5 * weather.wetness) * (sun * weather.sun_direction[2] + sky),
-    )
+    ground = _GROUND_TONE * (1.0 - 0.5 * weather.wetness) * (sun * weather.sun_direction[2] + sky)
+    strengths = weather.haze, weather.wetness, weather.lit_windows
+    direction, horizon = np.array(weather.sun_direction), np.array(weather.horizon)
+    return Light(direction, sun, sky, horizon, *strengths, background, mirrored, ground)
 
 
 @compiled(**LEAF)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from sim_sensors.camera.daylight import SHADOW_BIAS, Color, Light
+from sim_sensors.camera.daylight import SHADOW_BIAS, Color, Light, Vector
 from sim_sensors.camera.ground_texture import GroundTexture, sample_ground, sample_water
 from sim_sensors.camera.light_maps import LightMaps, open_sky, sunlit
 from sim_sensors.camera.sky import look_up
@@ -32,9 +32,7 @@ def ground_level(row_z: float, height: float, focal: float, texel: float) -> flo
 def ground_radiance(
     px: float,
     py: float,
-    dx: float,
-    dy: float,
-    dz: float,
+    ray: Vector,
     level: int,
     grain_level: int,
     light: Light,
@@ -42,7 +40,7 @@ def ground_radiance(
     maps: LightMaps,
     grain_of_asphalt: Tile,
 ) -> Color:
-    """Return the radiance, linear RGB, of the ground at (px, py), m, seen along the unit vector (dx, dy, dz).
+    """Return the radiance, linear RGB, of the ground at (px, py), m, seen along the unit vector `ray`.
 
     `level` and `grain_level` are the levels of the pyramids of the ground and of the asphalt's grain.
     """
@@ -64,6 +62,7 @@ def ground_radiance(
     blue = albedo * (0.95 - 0.45 * grass) * (light.sun[2] * sun + light.sky[2] * sky)
     if wet > 0.0:
         # Water reflects the sky, or a dark car where the sky is occluded.
+        dx, dy, dz = ray
         mirror = 1.0 + dz
         mirror = (0.025 + 0.975 * mirror * mirror * mirror * mirror * mirror) * wet
         mirror *= min(1.0, 0.3 + 1.1 * wettable)

@@ -81,14 +81,8 @@ def _draw(pool: MeshPool, instances: Instances, weather: Weather, x: float, y: f
         shadow = _shadow_map(pool, instances, near, to_shadow)
     else:
         shadow = np.zeros((2, 2), dtype=np.float32)
-    return LightMaps(
-        shadow,
-        to_shadow,
-        _contact_map(pool, instances, near, x, y),
-        x - _WINDOW / 2,
-        y - _WINDOW / 2,
-        _CONTACT_TEXELS / _WINDOW,
-    )
+    contact, corner = _contact_map(pool, instances, near, x, y), (x - _WINDOW / 2, y - _WINDOW / 2)
+    return LightMaps(shadow, to_shadow, contact, *corner, _CONTACT_TEXELS / _WINDOW)
 
 
 def _with_moving(
@@ -154,14 +148,7 @@ def _seen_from_the_sun(
     to_shadow: FloatArray,
     glass: int,
     n: int,
-) -> tuple[
-    Float32Array,
-    FloatArray,
-    Float32Array,
-    NDArray[np.uint8],
-    NDArray[np.uint8],
-    NDArray[np.int32],
-]:
+) -> tuple[Float32Array, FloatArray, Float32Array, NDArray[np.uint8], NDArray[np.uint8], NDArray[np.int32]]:
     capacity = 0
     for q in near:
         capacity += triangle_start[mesh[q] + 1] - triangle_start[mesh[q]]

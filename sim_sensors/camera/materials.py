@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_sensors.camera.daylight import SHADOW_BIAS, Color, Light, mirrored
+from sim_sensors.camera.daylight import SHADOW_BIAS, Color, Light, Vector, mirrored
 from sim_sensors.camera.light_maps import LightMaps, open_sky, sunlit
 from sim_sensors.camera.projection import ScreenTriangles
 from sim_sensors.camera.textures import LEAF, Tile, pixel_level, sample_tile
@@ -69,24 +69,21 @@ class Materials(NamedTuple):
 def surface_radiance(
     t: int,
     triangles: ScreenTriangles,
-    px: float,
-    py: float,
-    pz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    nx: float,
-    ny: float,
-    nz: float,
+    point: Vector,
+    ray: Vector,
+    normal: Vector,
     footprint: float,
     light: Light,
     maps: LightMaps,
     materials: Materials,
 ) -> Color:
-    """Return the radiance, linear RGB, of a point of triangle `t` seen along the unit vector (dx, dy, dz).
+    """Return the radiance, linear RGB, of a point of triangle `t` seen along a ray.
 
-    The point (px, py, pz), m, and the unit normal (nx, ny, nz) are in the world frame; a pixel spans `footprint`, m.
+    The point, m, and the unit vectors `ray` and `normal` are in the world frame; a pixel spans `footprint`, m.
     """
+    px, py, pz = point
+    nx, ny, nz = normal
+    dx, dy, dz = ray
     material = triangles.material[t]
     response = materials.response[material]
     cosine = -(nx * dx + ny * dy + nz * dz)
@@ -173,23 +170,11 @@ def surface_radiance(
 
 @compiled(**LEAF)
 def through_glass(
-    red: float,
-    green: float,
-    blue: float,
-    n_panes: int,
-    px: float,
-    py: float,
-    pz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    nx: float,
-    ny: float,
-    nz: float,
-    light: Light,
-    maps: LightMaps,
+    color: Color, n_panes: int, point: Vector, ray: Vector, normal: Vector, light: Light, maps: LightMaps
 ) -> Color:
-    """Return the radiance, linear RGB, through panes of glass, plus the reflection of the nearest at (px, py, pz)."""
+    """Return the radiance, linear RGB, of a color through panes of glass, plus the reflection of the nearest one."""
+    nx, ny, nz = normal
+    dx, dy, dz = ray
     tint = _GLASS_TINT
     for _ in range(1, min(n_panes, 4)):
         tint *= _GLASS_TINT
@@ -200,12 +185,11 @@ def through_glass(
     grazing *= grazing * grazing * grazing * grazing
     mirror = 0.08 + 0.85 * grazing
     twice = 2.0 * cosine
-    m_red, m_green, m_blue = mirrored(
-        px, py, pz, dx + twice * nx, dy + twice * ny, dz + twice * nz, light, maps
-    )
+    rx, ry, rz = dx + twice * nx, dy + twice * ny, dz + twice * nz
+    m_red, m_green, m_blue = mirrored(point[0], point[1], point[2], rx, ry, rz, light, maps)
     through = tint * (1.0 - mirror)
     return (
-        red * through * 0.96 + m_red * mirror,
-        green * through + m_green * mirror,
-        blue * through * 0.97 + m_blue * mirror,
+        color[0] * through * 0.96 + m_red * mirror,
+        color[1] * through + m_green * mirror,
+        color[2] * through * 0.97 + m_blue * mirror,
     )

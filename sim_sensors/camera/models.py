@@ -199,14 +199,10 @@ class StereoFrame:
     """A rectified image pair.
 
     A point is in the same row of both images; its disparity, left minus right, is fx · baseline / depth.
-
-    Attributes:
-        left: frame of the left camera, with depth and ids.
-        right: frame of the right camera.
     """
 
-    left: Frame
-    right: Frame
+    left: Frame  # frame of the left camera, with depth and ids
+    right: Frame  # frame of the right camera
 
 
 @dataclass(frozen=True)

@@ -31,25 +31,17 @@ _CLOSED[[Material.RUBBER, Material.FACADE, Material.BARK, Material.STONE, Materi
 
 
 class ScreenTriangles(NamedTuple):
-    """The visible triangles of a scene, projected into the image.
+    """The visible triangles of a scene, projected into the image."""
 
-    Attributes:
-        corners: (n, 6) float32, px: x, y of the three corners; pixel (row, column) has its centre at
-            (column + 0.5, row + 0.5).
-        inverse_depth: (n, 3) float64: 1/depth in 1/m at (x, y) px is a·x + b·y + c.
-        normal: (n, 9) float32: row-major 3×3 matrix from the ray (u, v, 1) in the camera frame to the
-            interpolated outward normal in the world frame, times a positive factor.
-        material: (n,) uint8.
-        color: (n, 3) uint8, sRGB.
-        instance: (n,) int32, index into the instances, ascending.
-    """
-
+    # (n, 6) float32, px: x, y of the three corners; pixel (row, column) has its centre at (column + 0.5, row + 0.5)
     corners: Float32Array
-    inverse_depth: FloatArray
+    inverse_depth: FloatArray  # (n, 3) float64: 1/depth in 1/m at (x, y) px is a·x + b·y + c
+    # (n, 9) float32: row-major 3×3 matrix from the ray (u, v, 1) in the camera frame to the interpolated outward
+    # normal in the world frame, times a positive factor
     normal: Float32Array
-    material: NDArray[np.uint8]
-    color: NDArray[np.uint8]
-    instance: IntArray
+    material: NDArray[np.uint8]  # (n,) uint8
+    color: NDArray[np.uint8]  # (n, 3) uint8, sRGB
+    instance: IntArray  # (n,) int32, index into the instances, ascending
 
 
 def project(
@@ -130,12 +122,7 @@ def _visible_instances(
     reach = radius[instances.mesh].astype(np.float64)
     seen = center[:, 2] > NEAR - reach
     # The four side planes of the frustum pass through the camera; their normals point outwards.
-    for plane in (
-        (fx, 0.0, cx - size[0]),
-        (-fx, 0.0, -cx),
-        (0.0, fy, cy - size[1]),
-        (0.0, -fy, -cy),
-    ):
+    for plane in ((fx, 0.0, cx - size[0]), (-fx, 0.0, -cx), (0.0, fy, cy - size[1]), (0.0, -fy, -cy)):
         normal = np.array(plane) / np.linalg.norm(plane)
         seen &= center @ normal < reach
     return np.flatnonzero(seen).astype(np.int32)

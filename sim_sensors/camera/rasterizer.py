@@ -29,21 +29,15 @@ _GLASS = int(Material.GLASS)
 
 
 class Visibility(NamedTuple):
-    """The contents of the z-buffer, (h, w) each.
+    """The contents of the z-buffer, (h, w) each."""
 
-    Attributes:
-        inverse_depth: float32, 1/m along the optical axis, of the first opaque surface; 0 for the sky.
-        triangle: int32, of that surface; -1 for ground or sky.
-        pane_inverse_depth: float32, 1/m, of the nearest pane of glass in front of it; 0 where there is none.
-        pane: int32, that pane's triangle; -1 where there is none.
-        n_panes: uint8, number of panes in front of it.
-    """
-
+    # float32, 1/m along the optical axis, of the first opaque surface; 0 for the sky
     inverse_depth: Float32Array
-    triangle: IntArray
+    triangle: IntArray  # int32, of that surface; -1 for ground or sky
+    # float32, 1/m, of the nearest pane of glass in front of it; 0 where there is none
     pane_inverse_depth: Float32Array
-    pane: IntArray
-    n_panes: NDArray[np.uint8]
+    pane: IntArray  # int32, that pane's triangle; -1 where there is none
+    n_panes: NDArray[np.uint8]  # uint8, number of panes in front of it
 
 
 def rasterize(

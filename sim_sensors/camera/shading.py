@@ -12,7 +12,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from sim_sensors.camera.daylight import Color, Light, daylight
+from sim_sensors.camera.daylight import Light, Vector, daylight
 from sim_sensors.camera.ground_shading import ground_level, ground_radiance
 from sim_sensors.camera.ground_texture import GroundTexture
 from sim_sensors.camera.light_maps import LightMaps
@@ -123,51 +123,22 @@ def _shade_row(
         inverse_length = 1.0 / math.sqrt(u * u + v * v + 1.0)
         inverse_depth = visibility.inverse_depth[y, x]
         t = visibility.triangle[y, x]
+        ray = (dx * inverse_length, dy * inverse_length, dz * inverse_length)
         if inverse_depth <= 0.0:
-            red, green, blue = look_up(
-                light.background,
-                dx * inverse_length,
-                dy * inverse_length,
-                max(dz * inverse_length, 0.0),
-            )
+            red, green, blue = look_up(light.background, ray[0], ray[1], max(ray[2], 0.0))
         else:
             depth = 1.0 / inverse_depth
-            px = view.position[0] + dx * depth
-            py = view.position[1] + dy * depth
-            pz = view.position[2] + dz * depth
+            point = _along(view, dx, dy, dz, depth)
             if t < 0:
                 dither = hash_unit(x, y)
+                levels = int(level + dither), int(grain_level + dither)
                 red, green, blue = ground_radiance(
-                    px,
-                    py,
-                    dx * inverse_length,
-                    dy * inverse_length,
-                    dz * inverse_length,
-                    int(level + dither),
-                    int(grain_level + dither),
-                    light,
-                    ground,
-                    maps,
-                    materials.grain,
+                    point[0], point[1], ray, levels[0], levels[1], light, ground, maps, materials.grain
                 )
             else:
-                nx, ny, nz = _normal(triangles.normal[t], u, v)
+                normal = _normal(triangles.normal[t], u, v)
                 red, green, blue = surface_radiance(
-                    t,
-                    triangles,
-                    px,
-                    py,
-                    pz,
-                    dx * inverse_length,
-                    dy * inverse_length,
-                    dz * inverse_length,
-                    nx,
-                    ny,
-                    nz,
-                    depth / view.fx,
-                    light,
-                    maps,
-                    materials,
+                    t, triangles, point, ray, normal, depth / view.fx, light, maps, materials
                 )
             # 1 - exp(-k) to three decimals, for the k of usual road scenes.
             k = light.haze * depth / inverse_length
@@ -177,24 +148,10 @@ def _shade_row(
             blue += (light.horizon[2] - blue) * fog
         pane = visibility.pane[y, x]
         if pane >= 0:
-            nx, ny, nz = _normal(triangles.normal[pane], u, v)
-            depth = 1.0 / visibility.pane_inverse_depth[y, x]
+            normal = _normal(triangles.normal[pane], u, v)
+            point = _along(view, dx, dy, dz, 1.0 / visibility.pane_inverse_depth[y, x])
             red, green, blue = through_glass(
-                red,
-                green,
-                blue,
-                visibility.n_panes[y, x],
-                view.position[0] + dx * depth,
-                view.position[1] + dy * depth,
-                view.position[2] + dz * depth,
-                dx * inverse_length,
-                dy * inverse_length,
-                dz * inverse_length,
-                nx,
-                ny,
-                nz,
-                light,
-                maps,
+                (red, green, blue), visibility.n_panes[y, x], point, ray, normal, light, maps
             )
         image[y, x, 0] = red
         image[y, x, 1] = green
@@ -202,7 +159,14 @@ def _shade_row(
 
 
 @compiled(**LEAF)
-def _normal(matrix: Float32Array, u: float, v: float) -> Color:
+def _along(view: _View, dx: float, dy: float, dz: float, depth: float) -> Vector:
+    """Return the point, world frame, at a depth along a ray."""
+    at = view.position
+    return at[0] + dx * depth, at[1] + dy * depth, at[2] + dz * depth
+
+
+@compiled(**LEAF)
+def _normal(matrix: Float32Array, u: float, v: float) -> Vector:
     x = matrix[0] * u + matrix[1] * v + matrix[2]
     y = matrix[3] * u + matrix[4] * v + matrix[5]
     z = matrix[6] * u + matrix[7] * v + matrix[8]

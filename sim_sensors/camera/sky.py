@@ -13,6 +13,7 @@ from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
+FloatArray = NDArray[np.float64]
 
 _SHARP = 1536  # texels across the hemisphere: one is about 0.1°
 _BLURRED = 160
@@ -28,7 +29,7 @@ def sky_domes(weather: Weather) -> tuple[Float32Array, Float32Array]:
     Returns:
         two arrays (n, n, 3) float32, linear RGB radiance.
     """
-    generator = np.random.default_rng([weather.seed, 7])
+    rng = np.random.default_rng([weather.seed, 7])
     side = (np.arange(_SHARP) + 0.5) / _SHARP * 2.0 - 1.0
     u, v = np.meshgrid(side, side)
     square = u * u + v * v
@@ -42,32 +43,25 @@ def sky_domes(weather: Weather) -> tuple[Float32Array, Float32Array]:
     toward_horizon = ((1.0 - z) ** 2.2)[..., None]
     dome = np.array(weather.zenith) * (1.0 - toward_horizon) + np.array(weather.horizon) * toward_horizon
     dome *= (1.0 + 0.35 * (1 - weather.clouds) * _glow(weather, x, y, z))[..., None]
-    dome = _with_clouds(dome, weather, generator, x, y, z)
-    dome = _with_skyline(dome, weather, generator, x, y, z)
+    dome = _with_clouds(dome, weather, rng, x, y, z)
+    dome = _with_skyline(dome, weather, rng, x, y, z)
     sharp = np.ascontiguousarray(dome, dtype=np.float32)
     blurred = cv2.resize(sharp, (_BLURRED, _BLURRED), interpolation=cv2.INTER_AREA)
     return sharp, np.ascontiguousarray(blurred, dtype=np.float32)
 
 
-def _glow(
-    weather: Weather, x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _glow(weather: Weather, x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
     """Return the brightness of the sky around the sun."""
     sun = weather.sun_direction
     cosine = np.clip(x * sun[0] + y * sun[1] + z * sun[2], 0.0, 1.0)
-    glow: NDArray[np.float64] = cosine**6 + 3.0 * cosine**60 + 12.0 * cosine**1500
+    glow: FloatArray = cosine**6 + 3.0 * cosine**60 + 12.0 * cosine**1500
     return glow
 
 
 def _with_clouds(
-    dome: NDArray[np.float64],
-    weather: Weather,
-    generator: np.random.Generator,
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    z: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    noise = (0.5 + 0.2 * fractal_noise(256, generator, 1.5)).astype(np.float32)
+    dome: FloatArray, weather: Weather, rng: np.random.Generator, x: FloatArray, y: FloatArray, z: FloatArray
+) -> FloatArray:
+    noise = (0.5 + 0.2 * fractal_noise(256, rng, 1.5)).astype(np.float32)
     # A layer of clouds at unit height, stretched towards the horizon but not infinitely.
     column = (x / (z + 0.2) * 0.17 * 256) % 256
     row = (y / (z + 0.2) * 0.17 * 256) % 256
@@ -78,24 +72,19 @@ def _with_clouds(
     cover = np.clip((sheet - threshold + 0.06) * 4.0, 0.0, 1.0)[..., None]
     brightness = 0.75 + 0.5 * np.clip(sheet, 0.0, 1.0)[..., None]
     white = np.array(weather.sky) * 0.95 + np.array(weather.sun) * 0.12
-    blended: NDArray[np.float64] = dome * (1.0 - cover) + white * brightness * cover
+    blended: FloatArray = dome * (1.0 - cover) + white * brightness * cover
     return blended
 
 
 def _with_skyline(
-    dome: NDArray[np.float64],
-    weather: Weather,
-    generator: np.random.Generator,
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    z: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    dome: FloatArray, weather: Weather, rng: np.random.Generator, x: FloatArray, y: FloatArray, z: FloatArray
+) -> FloatArray:
     """Draw distant trees and roofs, up to about 8° high, in haze."""
     azimuth = np.mod(np.arctan2(y, x) / (2.0 * np.pi), 1.0)
     bins = 1024
-    crowns = 0.05 + 0.022 * fractal_noise(bins, generator, 0.9)[0]
-    roofs = np.repeat(generator.uniform(0.02, 0.13, 64), bins // 64)
-    is_roof = np.repeat(generator.random(64) < 0.3, bins // 64)
+    crowns = 0.05 + 0.022 * fractal_noise(bins, rng, 0.9)[0]
+    roofs = np.repeat(rng.uniform(0.02, 0.13, 64), bins // 64)
+    is_roof = np.repeat(rng.random(64) < 0.3, bins // 64)
     top = np.where(is_roof, roofs, np.clip(crowns, 0.012, 0.16))
     height = top[np.minimum((azimuth * bins).astype(np.int64), bins - 1)]
     built = is_roof[np.minimum((azimuth * bins).astype(np.int64), bins - 1)]
@@ -109,7 +98,7 @@ def _with_skyline(
     veil = min(0.85, 0.12 + weather.haze * 120.0)
     far = far * (1.0 - veil) + np.array(weather.horizon) * veil
     mask = np.clip((height - z) * 400.0 + 0.5, 0.0, 1.0)[..., None]
-    blended: NDArray[np.float64] = dome * (1.0 - mask) + far * mask
+    blended: FloatArray = dome * (1.0 - mask) + far * mask
     return blended
 
 
@@ -124,26 +113,21 @@ def look_up(dome: Float32Array, x: float, y: float, z: float) -> tuple[float, fl
     row = min(max(int(v), 0), n - 2)
     a = min(max(u - column, 0.0), 1.0)
     b = min(max(v - row, 0.0), 1.0)
-    w00 = (1 - a) * (1 - b)
-    w01 = a * (1 - b)
-    w10 = (1 - a) * b
-    w11 = a * b
-    red = (
-        dome[row, column, 0] * w00
-        + dome[row, column + 1, 0] * w01
-        + dome[row + 1, column, 0] * w10
-        + dome[row + 1, column + 1, 0] * w11
+    weights = ((1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b)
+    return (
+        _mixed(dome, row, column, 0, weights),
+        _mixed(dome, row, column, 1, weights),
+        _mixed(dome, row, column, 2, weights),
     )
-    green = (
-        dome[row, column, 1] * w00
-        + dome[row, column + 1, 1] * w01
-        + dome[row + 1, column, 1] * w10
-        + dome[row + 1, column + 1, 1] * w11
+
+
+@compiled(**LEAF)
+def _mixed(
+    dome: Float32Array, row: int, column: int, channel: int, weights: tuple[float, float, float, float]
+) -> float:
+    return (
+        dome[row, column, channel] * weights[0]
+        + dome[row, column + 1, channel] * weights[1]
+        + dome[row + 1, column, channel] * weights[2]
+        + dome[row + 1, column + 1, channel] * weights[3]
     )
-    blue = (
-        dome[row, column, 2] * w00
-        + dome[row, column + 1, 2] * w01
-        + dome[row + 1, column, 2] * w10
-        + dome[row + 1, column + 1, 2] * w11
-    )
-    return red, green, blue

@@ -32,19 +32,12 @@ _BOX_FACES = {
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A mesh whose triangles have finishes instead of colours.
+    """A mesh whose triangles have finishes instead of colours."""
 
-    Attributes:
-        vertices: (v, 3) float32, m.
-        normals: (v, 3) float32, unit, outward.
-        triangles: (t, 3) int32, counter-clockwise seen from outside.
-        finish: (t,) uint8, row of the palette.
-    """
-
-    vertices: NDArray[np.float32]
-    normals: NDArray[np.float32]
-    triangles: NDArray[np.int32]
-    finish: NDArray[np.uint8]
+    vertices: NDArray[np.float32]  # (v, 3) float32, m
+    normals: NDArray[np.float32]  # (v, 3) float32, unit, outward
+    triangles: NDArray[np.int32]  # (t, 3) int32, counter-clockwise seen from outside
+    finish: NDArray[np.uint8]  # (t,) uint8, row of the palette
 
     def dyed(self, material: NDArray[np.uint8], color: NDArray[np.uint8]) -> Mesh:
         """Return the mesh with materials and colours from a palette.

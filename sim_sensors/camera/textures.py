@@ -20,17 +20,12 @@ LEAF = {"fastmath": FAST, "_nrt": False, "forceinline": True}
 
 
 class Tile(NamedTuple):
-    """A square, tileable grey texture with its image pyramid.
+    """A square, tileable grey texture with its image pyramid."""
 
-    Attributes:
-        levels: (total,) float32, 0 to 1, level after level, each row-major and half as wide as the previous one.
-        start: (n_levels,) int64, start of each level.
-        size: texels along a side of the finest level, a power of two.
-    """
-
+    # (total,) float32, 0 to 1, level after level, each row-major and half as wide as the previous one
     levels: Float32Array
-    start: NDArray[np.int64]
-    size: int
+    start: NDArray[np.int64]  # (n_levels,) int64, start of each level
+    size: int  # texels along a side of the finest level, a power of two
 
 
 def fractal_noise(size: int, generator: np.random.Generator, slope: float) -> NDArray[np.float64]:

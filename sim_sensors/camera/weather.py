@@ -82,8 +82,7 @@ _PRESETS: dict[str, dict[str, _Drawn | float | Color]] = {
     },
 }
 
-PRESETS = tuple(_PRESETS)
-"""Names of the weather presets."""
+PRESETS = tuple(_PRESETS)  # names of the weather presets
 
 
 @dataclass(frozen=True)

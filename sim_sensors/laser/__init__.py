@@ -9,15 +9,9 @@ if TYPE_CHECKING:
     from sim_sensors.laser.footprints import ScanPlane
     from sim_sensors.laser.scanner import LaserScanner
 
-_MODULES = {
-    "LaserScanner": "scanner",
-    "ScanPlane": "footprints",
-}
+_MODULES = {"LaserScanner": "scanner", "ScanPlane": "footprints"}
 
-__all__ = [
-    "LaserScanner",
-    "ScanPlane",
-]
+__all__ = ["LaserScanner", "ScanPlane"]
 
 
 def __getattr__(name: str) -> Any:

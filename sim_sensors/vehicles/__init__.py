@@ -8,13 +8,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sim_sensors.vehicles.vehicle import VehicleModel
 
-_MODULES = {
-    "VehicleModel": "vehicle",
-}
+_MODULES = {"VehicleModel": "vehicle"}
 
-__all__ = [
-    "VehicleModel",
-]
+__all__ = ["VehicleModel"]
 
 
 def __getattr__(name: str) -> Any:

@@ -24,8 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-BODIES = ("hatchback", "sedan", "estate", "suv", "van", "pickup")
-"""Body types."""
+BODIES = ("hatchback", "sedan", "estate", "suv", "van", "pickup")  # body types
 
 BODY_SHARE = (0.37, 0.11, 0.16, 0.24, 0.10, 0.02)
 """How common each of `BODIES` is in a lot: a European fleet of about 2020, hatchbacks first, SUVs rising."""

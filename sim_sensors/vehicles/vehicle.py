@@ -11,39 +11,17 @@ from numpy.typing import NDArray
 from sim_sensors.camera.surfaces import Shape, ShapeBuilder
 from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Material, Mesh
-from sim_sensors.vehicles.bodies import (
-    N_FINISHES,
-    Finish,
-    Skin,
-    add_bonnet,
-    add_flanks,
-    add_tail_top,
-    add_underside,
-)
+from sim_sensors.vehicles import bodies, parts
+from sim_sensors.vehicles.bodies import Finish, Skin
 from sim_sensors.vehicles.cabins import Glasshouse, add_cabin, add_seats
 from sim_sensors.vehicles.classes import BODIES, draw_body, draw_paint, draw_size
 from sim_sensors.vehicles.forms import Form, draw_form
-from sim_sensors.vehicles.parts import (
-    PLATE_M,
-    add_cladding,
-    add_handles,
-    add_mirrors,
-    add_plates,
-    add_rails,
-    add_reflectors,
-    add_slats,
-    add_wheels,
-    plate_places,
-)
 
 FloatArray = NDArray[np.float64]
 
-KNEE_M = 0.5
-"""Height of the laser plane above ground, m (T §3.3.2)."""
-FOOTPRINT_CORNERS = 24
-"""Maximum number of corners of a footprint."""
-DETAILED, COARSE = 0, 1
-"""Levels of detail of a mesh."""
+KNEE_M = 0.5  # height of the laser plane above ground, m (T §3.3.2)
+FOOTPRINT_CORNERS = 24  # maximum number of corners of a footprint
+DETAILED, COARSE = 0, 1  # levels of detail of a mesh
 
 _DUST = np.array([128.0, 116.0, 98.0])
 _SHAPES_KEPT = 1024
@@ -207,8 +185,8 @@ class VehicleModel:
             Finish.RAIL: (Material.CHROME, bright),
             Finish.PILLAR: (Material.TRIM, (20, 20, 21)),
         }
-        material = np.zeros(N_FINISHES, dtype=np.uint8)
-        color = np.zeros((N_FINISHES, 3), dtype=np.uint8)
+        material = np.zeros(bodies.N_FINISHES, dtype=np.uint8)
+        color = np.zeros((bodies.N_FINISHES, 3), dtype=np.uint8)
         for finish, (kind, rgb) in table.items():
             material[finish] = kind
             color[finish] = np.clip(np.round(rgb), 0, 255)
@@ -226,26 +204,26 @@ def _shape(model: VehicleModel, level: int) -> Shape:
     coarse = level == COARSE
     form, skin, build = model.form, _skin(model, coarse), ShapeBuilder()
     house = Glasshouse(skin)
-    add_flanks(build, skin)
-    add_underside(build, skin)
-    add_bonnet(build, skin)
-    add_tail_top(build, skin)
+    bodies.add_flanks(build, skin)
+    bodies.add_underside(build, skin)
+    bodies.add_bonnet(build, skin)
+    bodies.add_tail_top(build, skin)
     house.add_shell(build, coarse=coarse)
     add_cabin(build, skin)
-    add_wheels(build, form, coarse=coarse)
+    parts.add_wheels(build, form, coarse=coarse)
     if coarse:
         return build.build()
     add_seats(build, skin)
-    add_plates(build, skin, np.random.default_rng([model.seed, 4]).integers(0, 12, 7))
-    add_reflectors(build, skin)
-    add_mirrors(build, skin)
-    add_handles(build, skin)
+    parts.add_plates(build, skin, np.random.default_rng([model.seed, 4]).integers(0, 12, 7))
+    parts.add_reflectors(build, skin)
+    parts.add_mirrors(build, skin)
+    parts.add_handles(build, skin)
     if form.variety[2] < 0.7:
-        add_slats(build, skin)
+        parts.add_slats(build, skin)
     if form.body in ("suv", "estate") and form.variety[4] < 0.6:
-        add_rails(build, house)
+        parts.add_rails(build, house)
     if form.body in ("suv", "pickup"):
-        add_cladding(build, skin)
+        parts.add_cladding(build, skin)
     return build.build()
 
 
@@ -253,9 +231,9 @@ def _shape(model: VehicleModel, level: int) -> Shape:
 def _footprint(model: VehicleModel) -> FloatArray:
     skin = _skin(model, False)
     left = skin.section(KNEE_M)
-    for at, _ in plate_places(skin):  # flat plates protrude from a round bumper
-        if abs(at[2] - KNEE_M) < PLATE_M[1] / 2:
-            left = np.vstack([left, [at[0], PLATE_M[0] / 2]])
+    for at, _ in parts.plate_places(skin):  # flat plates protrude from a round bumper
+        if abs(at[2] - KNEE_M) < parts.PLATE_M[1] / 2:
+            left = np.vstack([left, [at[0], parts.PLATE_M[0] / 2]])
     hull = _convex_hull(np.vstack([left, left * [1.0, -1.0]]))
     while len(hull) > FOOTPRINT_CORNERS:
         before, after = np.roll(hull, 1, axis=0), np.roll(hull, -1, axis=0)

@@ -19,8 +19,7 @@ from parkenv.evaluation.bench.rows import BenchRow, absent, duration, rate, seco
 from parkenv.lots import packaged_lot
 from planners.driving.parking import ParkingAgent
 
-STEPS = 100
-"""Steps of an environment between two resets."""
+STEPS = 100  # steps of an environment between two resets
 
 
 def drive_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:

@@ -25,8 +25,7 @@ NEAREST = 5
 _BLOCK = 200
 _DRAWN = 100
 
-Stepper = Callable[[], int]
-"""Runs some steps and returns their number."""
+Stepper = Callable[[], int]  # runs some steps and returns their number
 
 
 def env_rows(

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from importlib import import_module
 from importlib.util import find_spec
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from typing import Any
 
 import gymnasium as gym
@@ -18,38 +18,28 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
 
 from parkenv.evaluation.bench.rows import BenchRow, duration, seconds_each
+from parkenv.evaluation.experiments.workers import worker_start
 from parkenv.evaluation.simulate import simulate
 from parkenv.lots import city_lot, packaged_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.lot import PARK, ParkingLot
 from planners.agent import make_agent
+from planners.thesis import label_setting
 from planners.thesis.label_repair import repair
-from planners.thesis.label_setting import (
-    Labels,
-    StoppingGraph,
-    best_move,
-    by_policy_iteration,
-    set_labels,
-    with_p_free,
-)
+from planners.thesis.label_setting import Labels, StoppingGraph
 from planners.thesis.mdp import ParkingMDP
 from planners.thesis.policy_iteration import policy_iteration
 
 Solver = Callable[[], NDArray[np.int64]]
 
 SIZES = (200, 2_000, 20_000, 200_000, 2_000_000)
-CITY = 1_000_000
-"""Number of slots of the city in which agents search."""
-CITY_SEARCHES = 3
-"""Number of searches of each agent in the city."""
-PATIENCE_S = 60.0
-"""Peers are not measured on lots where they are expected to take longer, s."""
+CITY = 1_000_000  # number of slots of the city in which agents search
+CITY_SEARCHES = 3  # number of searches of each agent in the city
+PATIENCE_S = 60.0  # peers are not measured on lots where they are expected to take longer, s
 MDPTOOLBOX_STATES = 5_000
 """Maximum number of states for pymdptoolbox, which checks its input with a dense matrix of states by states."""
-LONG_S = 2.0
-"""Solvers that take longer are timed only once, s."""
-EPSILON = 0.01
-"""Tolerance of the values of iterative peers, s."""
+LONG_S = 2.0  # solvers that take longer are timed only once, s
+EPSILON = 0.01  # tolerance of the values of iterative peers, s
 
 
 def planning_rows(
@@ -84,8 +74,8 @@ def solving_rows(sizes: list[int], seed: int, seconds: float) -> list[BenchRow]:
     for n_slots in sizes:
         mdp = forecast_process(city_lot(n_slots, seed), seed)
         graph, n = StoppingGraph.of(mdp), mdp.n_states
-        labels = set_labels(graph, mdp.p_free)
-        ours = seconds_each(lambda _, g=graph, p=mdp.p_free: set_labels(g, p), seconds)  # type: ignore[misc]
+        labels = label_setting.set_labels(graph, mdp.p_free)
+        ours = seconds_each(lambda _, g=graph, p=mdp.p_free: label_setting.set_labels(g, p), seconds)  # type: ignore[misc]
         vertices.append(n)
         own.append(ours)
         theirs = {}
@@ -111,22 +101,22 @@ def repair_rows(lot: ParkingLot, seed: int, seconds: float) -> list[BenchRow]:
     """Measure replanning after each observed slot; peers plan from scratch, or by policy iteration."""
     mdp = forecast_process(lot, seed)
     graph = StoppingGraph.of(mdp)
-    repair(graph, set_labels(graph, mdp.p_free.copy()), np.array([0]), np.ones(1))
+    repair(graph, label_setting.set_labels(graph, mdp.p_free.copy()), np.array([0]), np.ones(1))
     times = []
     end = time.perf_counter() + max(seconds, 0.1)
     rng = np.random.default_rng(seed)
     while time.perf_counter() < end:
-        labels = set_labels(graph, mdp.p_free.copy())
+        labels = label_setting.set_labels(graph, mdp.p_free.copy())
         for slot, p_free in drive(graph, labels, lot.n_slots, rng):
             start = time.perf_counter()
             repair(graph, labels, slot, p_free)
             times.append(time.perf_counter() - start)
-    fresh = 1e6 * seconds_each(lambda _: set_labels(graph, mdp.p_free), seconds)
-    known, _ = by_policy_iteration(mdp)
+    fresh = 1e6 * seconds_each(lambda _: label_setting.set_labels(graph, mdp.p_free), seconds)
+    known, _ = label_setting.by_policy_iteration(mdp)
     seen = mdp.p_free.copy()
     seen[: lot.n_slots // 20] = 0.0
-    after = with_p_free(mdp, seen)
-    warm = 1e6 * seconds_each(lambda _: by_policy_iteration(after, known), seconds)
+    after = label_setting.with_p_free(mdp, seen)
+    warm = 1e6 * seconds_each(lambda _: label_setting.by_policy_iteration(after, known), seconds)
     peers = {"plan from scratch": fresh, "policy iteration from the last plan": warm}
     case = f"after an observation; {lot.name}, {lot.n_vertices} vertices"
     return [
@@ -137,8 +127,13 @@ def repair_rows(lot: ParkingLot, seed: int, seconds: float) -> list[BenchRow]:
 
 def city_rows_apart(n_slots: int, seed: int) -> list[BenchRow]:
     """Run `city_rows` in a separate process, to measure its peak memory alone."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as apart:
-        return apart.submit(city_rows, n_slots, seed).result()
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), **worker_start()) as apart:
+        try:
+            return apart.submit(city_rows, n_slots, seed).result()
+        except KeyboardInterrupt:
+            for process in active_children():
+                process.kill()
+            raise
 
 
 def city_rows(
@@ -192,7 +187,7 @@ def drive(
             seen.add(vertex)
             free = rng.random() < labels.p_free[vertex] / 3.0
             yield np.array([vertex]), np.array([1.0 if free else 0.0])
-        move = best_move(graph, labels.p_free, labels.cost, vertex)
+        move = label_setting.best_move(graph, labels.p_free, labels.cost, vertex)
         if move == PARK or graph.neighbors[vertex, move] < 0:
             return
         vertex = int(graph.neighbors[vertex, move])

@@ -30,14 +30,11 @@ from sim_sensors.scene import Scene
 from sim_sensors.slot_scenes import scene_of_slots
 
 FloatArray = NDArray[np.float64]
-Scans = Callable[[FloatArray], NDArray[Any]]
-"""Maps poses, (n, 3), to ranges, (n, n_beams), m."""
+Scans = Callable[[FloatArray], NDArray[Any]]  # maps poses, (n, 3), to ranges, (n, n_beams), m
 
 SLOT_WIDTH, SLOT_LENGTH, MODULE, MARGIN = 2.5, 5.0, 16.0, 6.0
-GRID_CELL = 0.05
-"""Cell size of the grid for ray marching, m."""
-LIT_AHEAD = 12.0
-"""Distance of the light maps' centre in front of the camera, m, when shading is timed alone."""
+GRID_CELL = 0.05  # cell size of the grid for ray marching, m
+LIT_AHEAD = 12.0  # distance of the light maps' centre in front of the camera, m, when shading is timed alone
 
 
 def sensor_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:

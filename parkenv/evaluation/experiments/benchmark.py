@@ -43,27 +43,20 @@ _FOLDER = Path(__file__).parent / "suites"
 
 @dataclass(frozen=True)
 class Task:
-    """One scenario of a suite.
+    """One scenario of a suite."""
 
-    Args:
-        name: name of the task.
-        scenario: a packaged scenario.
-        occupancy_level: mean occupancy of the world; None for the scenario's own.
-        sight: `perfect`, or the rig whose fitted sensor model is used.
-        v_walk_kmh: walking speed; None for the scenario's own.
-    """
-
-    name: str
-    scenario: str
-    occupancy_level: float | None = None
-    sight: str = "perfect"
-    v_walk_kmh: float | None = None
+    name: str  # name of the task
+    scenario: str  # a packaged scenario
+    occupancy_level: float | None = None  # mean occupancy of the world; None for the scenario's own
+    # `perfect`, or the rig whose fitted sensor model is used; `sight` in the suite's file
+    sensor_model: str = "perfect"
+    v_walk_kmh: float | None = None  # walking speed; None for the scenario's own
 
     def made(self, arrival: ArrivalWindow) -> Scenario:
         """Make the scenario, named after the task."""
         made = make_scenario(self.scenario).replace(name=self.name, arrival=arrival)
-        if self.sight != "perfect":
-            made = made.replace(sensor_model=SensorModel.named(self.sight))
+        if self.sensor_model != "perfect":
+            made = made.replace(sensor_model=SensorModel.named(self.sensor_model))
         if self.v_walk_kmh is not None:
             made = made.replace(v_walk=self.v_walk_kmh * KMH)
         return made if self.occupancy_level is None else at_occupancy(made, self.occupancy_level)
@@ -71,23 +64,14 @@ class Task:
 
 @dataclass(frozen=True)
 class Suite:
-    """A benchmark suite.
+    """A benchmark suite."""
 
-    Args:
-        name: name, such as v1.
-        description: one sentence.
-        arrival: when searches begin.
-        seeds: seeds; every task has one search per seed.
-        tasks: the tasks.
-        fingerprint: SHA-256 of the suite's file, as JSON without white space.
-    """
-
-    name: str
-    description: str
-    arrival: ArrivalWindow
-    seeds: range
-    tasks: tuple[Task, ...]
-    fingerprint: str
+    name: str  # name, such as v1
+    description: str  # one sentence
+    arrival: ArrivalWindow  # when searches begin
+    seeds: range  # seeds; every task has one search per seed
+    tasks: tuple[Task, ...]  # the tasks
+    fingerprint: str  # SHA-256 of the suite's file, as JSON without white space
 
     @classmethod
     def named(cls, name: str) -> Self:
@@ -111,7 +95,7 @@ class Suite:
             content["description"],
             ArrivalWindow.parse(content["arrival"], content["days"]),
             range(first, first + content["episodes"]),
-            tuple(Task(**task) for task in content["tasks"]),
+            tuple(Task(sensor_model=task.pop("sight", "perfect"), **task) for task in content["tasks"]),
             hashlib.sha256(canonical.encode()).hexdigest(),
         )
 

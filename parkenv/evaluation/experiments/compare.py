@@ -25,30 +25,21 @@ from parkenv.world.sensor_model import SensorModel
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
 
-BLIND = "-blind"
-"""Suffix of the names of scenarios whose slots are not observed before an attempt."""
-BLOCK = 10
-"""Episodes per task: a crash loses few of them, and the overhead of starting a task stays small."""
+BLIND = "-blind"  # suffix of the names of scenarios whose slots are not observed before an attempt
+BLOCK = 10  # episodes per task: a crash loses few of them, and the overhead of starting a task stays small
 
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One agent in one scenario, with the costs and speeds of one setting.
+    """One agent in one scenario, with the costs and speeds of one setting."""
 
-    Attributes:
-        scenario: the scenario, with the setting's costs and speeds.
-        agent: name of the agent.
-        occupancy_level: mean occupancy of the world; None for the scenario's own.
-        options: options of the agent, for `make_agent`.
-        rig: simulated sensors that observe the slots; None to use the scenario's sensor model.
-        detector: detector for the rig's images, for `make_detector`; None for the packaged one.
-    """
-
-    scenario: Scenario
-    agent: str
-    occupancy_level: float | None = None
+    scenario: Scenario  # the scenario, with the setting's costs and speeds
+    agent: str  # name of the agent
+    occupancy_level: float | None = None  # mean occupancy of the world; None for the scenario's own
+    # simulated sensors that observe the slots; None to use the scenario's sensor model
     rig: str | None = None
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = field(default_factory=dict)  # options of the agent, for `make_agent`
+    # detector for the rig's images, for `make_detector`; None for the packaged one
     detector: str | None = None
 
     @property

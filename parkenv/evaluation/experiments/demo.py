@@ -14,8 +14,7 @@ from parkenv.world.sensor_model import SensorModel
 AGENTS = ("mdp", "greedy-goal", "greedy-drive", "first-free")
 RIG: RigName = "laser"
 _HOURS = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
-_APART = 1_000_000
-"""Offset between the seeds of survey and searches, so that their worlds differ."""
+_APART = 1_000_000  # offset between the seeds of survey and searches, so that their worlds differ
 
 
 def demo_survey(spec: DemoSpec) -> tuple[Scenario, SurveySettings]:

@@ -20,40 +20,26 @@ from planners.routes import DriveRoutes
 
 @dataclass
 class SearchTrace:
-    """Trace of one search, for pictures.
+    """Trace of one search, for pictures."""
 
-    Attributes:
-        scenario: the scenario.
-        agent: name of the agent.
-        path: vertices in the order driven, the entry first.
-        occupied: (n_slots,) bool, the true occupancy at the arrival.
-        forecast: (n_slots,) float64, the occupancy forecast at the arrival.
-        policy: (n_vertices,) int64, the plan at the first decision; None for agents without a policy.
-        metrics: `info` at the end of the episode.
-    """
-
-    scenario: Scenario
-    agent: str
-    path: list[int]
-    occupied: NDArray[np.bool_]
-    forecast: NDArray[np.float64]
+    scenario: Scenario  # the scenario
+    agent: str  # name of the agent
+    path: list[int]  # vertices in the order driven, the entry first
+    occupied: NDArray[np.bool_]  # (n_slots,) bool, the true occupancy at the arrival
+    forecast: NDArray[np.float64]  # (n_slots,) float64, the occupancy forecast at the arrival
+    # (n_vertices,) int64, the plan at the first decision; None for agents without a policy
     policy: NDArray[np.int64] | None
-    metrics: dict[str, Any]
+    metrics: dict[str, Any]  # `info` at the end of the episode
 
 
 @dataclass
 class Episode:
-    """The outcome of one search.
+    """The outcome of one search."""
 
-    Attributes:
-        row: row of `episodes.csv`, without the columns that identify agent and setting.
-        decision_s: wall time of each decision, s; not in the row because it differs from run to run.
-        trace: trace for pictures.
-    """
-
-    row: dict[str, Any]
+    row: dict[str, Any]  # row of `episodes.csv`, without the columns that identify agent and setting
+    # wall time of each decision, s; not in the row because it differs from run to run
     decision_s: list[float]
-    trace: SearchTrace
+    trace: SearchTrace  # trace for pictures
 
 
 class FirstPlan(Observer):

@@ -39,22 +39,18 @@ from planners.agent import agent_file, make_agent
 
 NEEDS_OBSERVATIONS = ("belief", "mdp-tuned", "exact")
 """Agents that require observations of slots before an attempt."""
-MAP_SAYS = "-map-says-"
-"""Separator between the name of a scenario and the constant probability of its map."""
+MAP_SAYS = "-map-says-"  # separator between the name of a scenario and the constant probability of its map
 
 
 @dataclass(frozen=True, eq=False)
 class Experiment:
     """An experiment with its scenarios made and its agents checked.
 
-    Args:
-        spec: specification of the experiment.
-
     Raises:
         InputError: a scenario or an agent cannot be made, or parts of the specification do not fit together.
     """
 
-    spec: ExperimentSpec
+    spec: ExperimentSpec  # specification of the experiment
 
     def __post_init__(self) -> None:
         for scenario in self._base_scenarios:
@@ -213,21 +209,13 @@ def agent_fingerprints(names: Iterable[str]) -> dict[str, str]:
 
 @dataclass(frozen=True, eq=False)
 class ExperimentResult:
-    """Result of an experiment.
+    """Result of an experiment."""
 
-    Attributes:
-        experiment: the experiment.
-        folder: its result folder, with every finished episode.
-        rows: one row per case with finished episodes, as in `summary.json`.
-        occupancy_rows: the same at the occupancy levels.
-        complete: whether all episodes are finished.
-    """
-
-    experiment: Experiment
-    folder: ResultFolder
-    rows: list[Row]
-    occupancy_rows: list[Row]
-    complete: bool
+    experiment: Experiment  # the experiment
+    folder: ResultFolder  # its result folder, with every finished episode
+    rows: list[Row]  # one row per case with finished episodes, as in `summary.json`
+    occupancy_rows: list[Row]  # the same at the occupancy levels
+    complete: bool  # whether all episodes are finished
 
     def figure_data(self) -> ComparisonResults:
         """Return the data for the figures of a comparison."""

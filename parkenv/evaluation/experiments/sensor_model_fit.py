@@ -31,13 +31,10 @@ _ASSUMED = SensorModel(BAND_ENDS[-1], 0.98, 0.02)
 
 @dataclass(frozen=True, eq=False)
 class ObservationCounts:
-    """Counts of the slots in view after each step, by true and observed state.
+    """Counts of the slots in view after each step, by true and observed state."""
 
-    Attributes:
-        counts: (bands, 2, 2, 3) int64, by distance, by whether the slot lies beside the car, by whether it is taken,
-            and by observed state: none, free, taken.
-    """
-
+    # (bands, 2, 2, 3) int64, by distance, by whether the slot lies beside the car, by whether it is taken, and by
+    # observed state: none, free, taken
     counts: IntArray
 
     @classmethod

@@ -23,8 +23,7 @@ from parkenv.scenarios.spec import (
 
 MAX_EPISODES = 10_000_000
 """Maximum number of episodes of an experiment, over all agents, scenarios and settings."""
-SPEC_FILE = "experiment.json"
-"""File in a run folder with the specification of its experiment."""
+SPEC_FILE = "experiment.json"  # file in a run folder with the specification of its experiment
 DEFAULT_AGENTS = (
     "mdp", "mdp-static", "mdp-tuned", "belief", "greedy-goal", "greedy-drive", "first-free", "random", "oracle",
 )  # fmt: skip
@@ -51,8 +50,7 @@ def _listed(value: object) -> object:
 
 
 Level = Annotated[float, Field(gt=0.0, lt=1.0)]
-Values = Annotated[Axis[T], BeforeValidator(_listed)]
-"""An axis of the grid; a single value needs no list."""
+Values = Annotated[Axis[T], BeforeValidator(_listed)]  # an axis of the grid; a single value needs no list
 
 
 class Grid(Spec):

@@ -46,14 +46,10 @@ SESSION_COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class SurveyRun:
-    """A completed survey.
+    """A completed survey."""
 
-    Attributes:
-        rows: one row per session, in order.
-        shown: the first session, with results for figures; None if all sessions already existed.
-    """
-
-    rows: list[Row]
+    rows: list[Row]  # one row per session, in order
+    # the first session, with results for figures; None if all sessions already existed
     shown: SessionResult | None
 
 

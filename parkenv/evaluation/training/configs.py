@@ -8,26 +8,18 @@ from typing import Any, TypeVar
 
 from parkenv.errors import InputError
 
-REWARD_SCALE = 0.01
-"""Scales returns of about -100 s to about -1."""
-MAX_STEPS = 500
-"""Step limit of training episodes: longer searches only drive in circles."""
+REWARD_SCALE = 0.01  # scales returns of about -100 s to about -1
+MAX_STEPS = 500  # step limit of training episodes: longer searches only drive in circles
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Settings of one algorithm.
+    """Settings of one algorithm."""
 
-    Args:
-        n_envs: number of parallel environments.
-        policy: stable-baselines3's name of the policy class.
-        settings: arguments of the algorithm's constructor.
-        final_learning_rate: fraction of the learning rate at the end of training; it falls linearly.
-    """
-
-    n_envs: int
-    policy: str
-    settings: Mapping[str, Any]
+    n_envs: int  # number of parallel environments
+    policy: str  # stable-baselines3's name of the policy class
+    settings: Mapping[str, Any]  # arguments of the algorithm's constructor
+    # fraction of the learning rate at the end of training; it falls linearly
     final_learning_rate: float = 1.0
 
 
@@ -74,23 +66,16 @@ SEARCH_CONFIGS: dict[str, TrainingConfig] = {
 """Config of each algorithm for search."""
 
 
-WAY_IN = "way-in"
-"""Start on the planned path into the slot."""
+WAY_IN = "way-in"  # start on the planned path into the slot
 
 
 @dataclass(frozen=True)
 class CurriculumLevel:
-    """Difficulty of the tasks at one level; see `parkenv.driving.parking_task.ParkingTasks`.
+    """Difficulty of the tasks at one level; see `parkenv.driving.parking_task.ParkingTasks`."""
 
-    Args:
-        starts: `way-out`, `lane`, or `way-in` (on the planned path from the lane into the slot).
-        distance: minimum and maximum, m; for `way-in`, of the remaining path length.
-        slack: free space around the slot, m.
-    """
-
-    starts: str
-    distance: tuple[float, float]
-    slack: float
+    starts: str  # `way-out`, `lane`, or `way-in` (on the planned path from the lane into the slot)
+    distance: tuple[float, float]  # minimum and maximum, m; for `way-in`, of the remaining path length
+    slack: float  # free space around the slot, m
 
 
 CURRICULUM = (
@@ -114,21 +99,13 @@ The part between slot and lane is learned along the planned path, backwards from
 
 @dataclass(frozen=True, kw_only=True)
 class DriveTrainingConfig(TrainingConfig):
-    """Settings of one algorithm for driving into slots.
+    """Settings of one algorithm for driving into slots."""
 
-    Args:
-        reward: `sparse`, with hindsight experience replay, or `dense`.
-        reward_scale: factor from seconds to rewards.
-        contact_cost: cost of a contact in training, s.
-        steps: default number of decisions.
-        curriculum: levels, from the easiest to the full task.
-    """
-
-    reward: str
-    reward_scale: float
-    contact_cost: float
-    steps: int
-    curriculum: tuple[CurriculumLevel, ...] = CURRICULUM
+    reward: str  # `sparse`, with hindsight experience replay, or `dense`
+    reward_scale: float  # factor from seconds to rewards
+    contact_cost: float  # cost of a contact in training, s
+    steps: int  # default number of decisions
+    curriculum: tuple[CurriculumLevel, ...] = CURRICULUM  # levels, from the easiest to the full task
 
 
 _OFF_POLICY: dict[str, Any] = {

@@ -7,6 +7,7 @@ not a collision in pymunk, so grazing contacts may differ. Trained models are te
 from __future__ import annotations
 
 import math
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,25 +17,55 @@ from parkenv.driving.vehicle import SPEED, YAW, VehicleParameters, advance
 from parkenv.envs.drive import CONTROL_S, SUBSTEPS
 from parkenv.envs.drive_goals import goal_error
 from parkenv.envs.drive_observation import MOST_CARS, MOST_LINES, obstacle_map
-from planners.driving.policy_interface import (
-    ACTION_REPEAT,
-    OBSERVATION_SIZE,
-    Outlines,
-    PolicyInterface,
-    encode_observation,
-    pedal_command,
-)
+from planners.driving import policy_interface as interface
+from planners.driving.policy_interface import Outlines, PolicyInterface
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int64]
 
-RUNNING, PARKED, CONTACT, LEFT_AREA = range(4)
-"""Status of a drive."""
+RUNNING, PARKED, CONTACT, LEFT_AREA = range(4)  # status of a drive
 
 _MAX_OBSTACLES = MOST_CARS + MOST_LINES
 _MAX_EDGES = 24 * MOST_CARS + MOST_LINES  # as many as the obstacle map holds
+
+
+class _Drives(NamedTuple):
+    """The drives of a batch, a row each; positions in the slots' frames."""
+
+    state: FloatArray  # (n, 6) vehicle states
+    time: FloatArray
+    status: IntArray
+    approach: FloatArray
+    took: FloatArray
+    desired: Float32Array  # (n, 7) goals
+    about: FloatArray  # (n, 5) see `encode_observation`
+    slot_yaw: FloatArray
+    edges: FloatArray  # (n, e, 4), (n, o + 1) and (n, o, 3): obstacles as in `Outlines`
+    first: IntArray
+    circle: FloatArray
+    n_obstacles: IntArray
+
+    @classmethod
+    def of(cls, n: int) -> Self:
+        """Allocate n drives."""
+        state, about, circle = np.zeros((n, 6)), np.zeros((n, 5)), np.zeros((n, _MAX_OBSTACLES, 3))
+        status, obstacles = np.zeros(n, np.int64), np.zeros(n, np.int64)
+        edges, first = np.zeros((n, _MAX_EDGES, 4)), np.zeros((n, _MAX_OBSTACLES + 1), np.int64)
+        desired = np.zeros((n, 7), np.float32)
+        time, approach, took, yaw = np.zeros((4, n))
+        return cls(state, time, status, approach, took, desired, about, yaw, edges, first, circle, obstacles)
+
+
+class _Car(NamedTuple):
+    """The car: its limits; half its length and width; `PolicyInterface.body` and `pedals`; rear axle to middle, m."""
+
+    limits: FloatArray
+    half: FloatArray
+    body: FloatArray
+    pedals: FloatArray
+    middle: float
 
 
 class DriveBatch:
@@ -55,43 +86,28 @@ class DriveBatch:
     def __init__(self, n: int, vehicle: VehicleParameters | None = None) -> None:
         vehicle = vehicle or VehicleParameters()
         self.view = PolicyInterface(vehicle)
-        self.state = np.zeros((n, 6))
-        self.time, self.approach, self.took = np.zeros(n), np.zeros(n), np.zeros(n)
-        self.status = np.zeros(n, dtype=np.int64)
-        self._desired = np.zeros((n, 7), dtype=np.float32)
-        self._about = np.zeros((n, 5))
-        self._slot_yaw = np.zeros(n)
-        self._edges = np.zeros((n, _MAX_EDGES, 4))
-        self._first = np.zeros((n, _MAX_OBSTACLES + 1), dtype=np.int64)
-        self._circle = np.zeros((n, _MAX_OBSTACLES, 3))
-        self._obstacles = np.zeros(n, dtype=np.int64)
-        self._limits, self._half, self._body = vehicle.limits, self.view.half, self.view.body
+        self._drives = drives = _Drives.of(n)
+        self.state, self.time, self.status = drives.state, drives.time, drives.status
+        self.approach, self.took = drives.approach, drives.took
+        view = self.view
+        self._car = _Car(vehicle.limits, view.half, view.body, view.pedals, vehicle.middle)
 
     def start(self, i: int, task: PreparedTask, pose: FloatArray | None = None) -> None:
         """Restart drive i with a task, at the task's start or at `pose`, (3,) of the rear axle, slot frame."""
-        outlines = task.outlines
-        self.state[i], self._desired[i], self._about[i] = task.start, task.desired, task.about
+        outlines, drives = task.outlines, self._drives
+        drives.state[i], drives.desired[i], drives.about[i] = task.start, task.desired, task.about
         if pose is not None:
-            self.state[i, :3] = pose
-        self._slot_yaw[i] = task.slot_yaw
-        self._edges[i, : len(outlines.edges)] = outlines.edges
-        self._first[i, : len(outlines.first)] = outlines.first
-        self._circle[i, : len(outlines.circle)] = outlines.circle
-        self._obstacles[i] = len(outlines.circle)
-        self.time[i], self.status[i] = 0.0, RUNNING
+            drives.state[i, :3] = pose
+        drives.slot_yaw[i] = task.slot_yaw
+        drives.edges[i, : len(outlines.edges)] = outlines.edges
+        drives.first[i, : len(outlines.first)] = outlines.first
+        drives.circle[i, : len(outlines.circle)] = outlines.circle
+        drives.n_obstacles[i] = len(outlines.circle)
+        drives.time[i], drives.status[i] = 0.0, RUNNING
 
     def drive(self, actions: Float32Array) -> None:
-        """Apply one decision to each running drive.
-
-        Args:
-            actions: (n, 2) float32; see `planners.driving.policy_interface`.
-        """
-        _drive(
-            np.ascontiguousarray(actions, dtype=np.float32),
-            self.state, self.time, self.status, self.approach, self.took,
-            self._desired, self._about, self._slot_yaw, self._edges, self._first, self._circle, self._obstacles,
-            self._limits, self._half, self.view.pedals, self.view.vehicle.middle,
-        )  # fmt: skip
+        """Apply one decision, see `planners.driving.policy_interface`, to each running drive; (n, 2) float32."""
+        _drive(np.ascontiguousarray(actions, dtype=np.float32), self._drives, self._car)
 
     def observation(self, rows: IntArray | None = None) -> dict[str, Float32Array]:
         """Observations of the drives.
@@ -104,15 +120,10 @@ class DriveBatch:
                 achieved_goal and desired_goal (k, 7); float32.
         """
         rows = np.arange(len(self.state)) if rows is None else rows
-        seen, achieved = (
-            np.empty((len(rows), OBSERVATION_SIZE), np.float32),
-            np.empty((len(rows), 7), np.float32),
-        )
-        _observe(
-            rows, self.state, self._about, self._edges, self._first, self._circle, self._obstacles, self._body,
-            self.view.vehicle.middle, seen, achieved,
-        )  # fmt: skip
-        return {"observation": seen, "achieved_goal": achieved, "desired_goal": self._desired[rows]}
+        seen = np.empty((len(rows), interface.OBSERVATION_SIZE), np.float32)
+        achieved = np.empty((len(rows), 7), np.float32)
+        _observe(rows, self._drives, self._car, seen, achieved)
+        return {"observation": seen, "achieved_goal": achieved, "desired_goal": self._drives.desired[rows]}
 
 
 class PreparedTask:
@@ -133,43 +144,26 @@ class PreparedTask:
 
 
 @compiled(error_model="numpy")
-def _drive(
-    actions: Float32Array,
-    states: FloatArray,
-    time: FloatArray,
-    status: IntArray,
-    approach: FloatArray,
-    took: FloatArray,
-    desired: Float32Array,
-    about: FloatArray,
-    slot_yaw: FloatArray,
-    edges: FloatArray,
-    first: IntArray,
-    circle: FloatArray,
-    obstacles: IntArray,
-    limits: FloatArray,
-    half: FloatArray,
-    pedals: FloatArray,
-    middle: float,
-) -> None:
+def _drive(actions: Float32Array, drives: _Drives, car: _Car) -> None:
     achieved = np.empty(7, np.float32)
-    for i in range(len(states)):
-        state = states[i]
+    status, approach, took = drives.status, drives.approach, drives.took
+    for i in range(len(actions)):
+        state = drives.state[i]
         approach[i] = took[i] = 0.0
         steering = min(max(float(actions[i, 1]), -1.0), 1.0)
-        for _ in range(ACTION_REPEAT):
+        for _ in range(interface.ACTION_REPEAT):
             if status[i] != RUNNING:
                 break
-            pedal = pedal_command(actions[i], state[SPEED], pedals)
+            pedal = interface.pedal_command(actions[i], state[SPEED], car.pedals)
             for _ in range(SUBSTEPS):
-                advance(state, pedal, steering, limits)
-                time[i] += 0.5 * CONTROL_S
-                if _touches(state, edges[i], first[i], circle[i], obstacles[i], half, middle):
+                advance(state, pedal, steering, car.limits)
+                drives.time[i] += 0.5 * CONTROL_S
+                if _touches(drives, i, car):
                     status[i] = CONTACT
                     break
-            _achieved_goal(state, about[i], middle, achieved)
-            distance, angle, success = goal_error(achieved, desired[i], half)
-            c, s = math.cos(slot_yaw[i]), math.sin(slot_yaw[i])
+            _achieved_goal(drives, i, car, achieved)
+            distance, angle, success = goal_error(achieved, drives.desired[i], car.half)
+            c, s = math.cos(drives.slot_yaw[i]), math.sin(drives.slot_yaw[i])
             east, north = c * achieved[0] - s * achieved[1], s * achieved[0] + c * achieved[1]
             if status[i] == RUNNING and max(abs(east), abs(north)) > AREA:
                 status[i] = LEFT_AREA
@@ -181,59 +175,40 @@ def _drive(
 
 
 @compiled(error_model="numpy")
-def _observe(
-    rows: IntArray,
-    states: FloatArray,
-    about: FloatArray,
-    edges: FloatArray,
-    first: IntArray,
-    circle: FloatArray,
-    obstacles: IntArray,
-    body: FloatArray,
-    middle: float,
-    seen: Float32Array,
-    achieved: Float32Array,
-) -> None:
+def _observe(rows: IntArray, drives: _Drives, car: _Car, seen: Float32Array, achieved: Float32Array) -> None:
     for k in range(len(rows)):
         i = rows[k]
-        _achieved_goal(states[i], about[i], middle, achieved[k])
+        _achieved_goal(drives, i, car, achieved[k])
         at = np.array([float(achieved[k, 0]), float(achieved[k, 1])])
-        m = obstacles[i]
-        encode_observation(
-            at, states[i], (edges[i], first[i, : m + 1], circle[i, :m]), body, about[i], seen[k]
-        )
+        m = drives.n_obstacles[i]
+        outlines = drives.edges[i], drives.first[i, : m + 1], drives.circle[i, :m]
+        interface.encode_observation(at, drives.state[i], outlines, car.body, drives.about[i], seen[k])
 
 
 @compiled(error_model="numpy")
-def _achieved_goal(state: FloatArray, about: FloatArray, middle: float, achieved: Float32Array) -> None:
+def _achieved_goal(drives: _Drives, i: int, car: _Car, achieved: Float32Array) -> None:
+    state = drives.state[i]
     c, s = math.cos(state[YAW]), math.sin(state[YAW])
-    achieved[0], achieved[1] = state[0] + middle * c, state[1] + middle * s
+    achieved[0], achieved[1] = state[0] + car.middle * c, state[1] + car.middle * s
     achieved[2], achieved[3], achieved[4] = c, s, state[SPEED]
-    achieved[5], achieved[6] = about[0], about[1]
+    achieved[5], achieved[6] = drives.about[i, 0], drives.about[i, 1]
 
 
 @compiled(error_model="numpy")
-def _touches(
-    state: FloatArray,
-    edges: FloatArray,
-    first: IntArray,
-    circle: FloatArray,
-    obstacles: int,
-    half: FloatArray,
-    middle: float,
-) -> bool:
+def _touches(drives: _Drives, i: int, car: _Car) -> bool:
     """Return whether an edge intersects the car's outline."""
+    state, edges, circle = drives.state[i], drives.edges[i], drives.circle[i]
     c, s = math.cos(state[YAW]), math.sin(state[YAW])
-    x, y = state[0] + middle * c, state[1] + middle * s
-    own = math.hypot(half[0], half[1])
-    for i in range(obstacles):
-        dx, dy = circle[i, 0] - x, circle[i, 1] - y
-        if dx * dx + dy * dy > (own + circle[i, 2]) ** 2:
+    x, y = state[0] + car.middle * c, state[1] + car.middle * s
+    own = math.hypot(car.half[0], car.half[1])
+    for j in range(drives.n_obstacles[i]):
+        dx, dy = circle[j, 0] - x, circle[j, 1] - y
+        if dx * dx + dy * dy > (own + circle[j, 2]) ** 2:
             continue
-        for k in range(first[i], first[i + 1]):
+        for k in range(drives.first[i, j], drives.first[i, j + 1]):
             px, py = edges[k, 0] - x, edges[k, 1] - y
             qx, qy = edges[k, 2] - x, edges[k, 3] - y
-            if _crosses(c * px + s * py, c * py - s * px, c * qx + s * qy, c * qy - s * qx, half):
+            if _crosses(c * px + s * py, c * py - s * px, c * qx + s * qy, c * qy - s * qx, car.half):
                 return True
     return False
 

@@ -26,22 +26,16 @@ from planners.driving.policy_interface import ACTION_REPEAT, OBSERVATION_SIZE
 FloatArray = NDArray[np.float64]
 Observations = dict[str, NDArray[np.float32]]
 
-DECISION_S = ACTION_REPEAT * CONTROL_S
-"""Time between decisions, s."""
-MOST_DECISIONS = 80
-"""Step limit of a drive: half a minute, enough for a trained agent from any start."""
-STOOD = 5
+DECISION_S = ACTION_REPEAT * CONTROL_S  # time between decisions, s
+MOST_DECISIONS = 80  # step limit of a drive: half a minute, enough for a trained agent from any start
+STANDSTILL_DECISIONS = 5
 """Truncate a drive after this many consecutive decisions at a standstill: an untrained agent would not move again."""
-TRIED = 100
-"""Number of most recent drives at a level that decide whether it is mastered."""
-MASTERED = 0.7
-"""Fraction of these drives that must end parked."""
+RECENT_DRIVES = 100  # number of recent drives at a level that decide whether it is mastered
+MASTERED = 0.7  # fraction of these drives that must end parked
 SHARES = (0.5, 0.25, 0.25)
 """Probabilities that a drive uses the current level, a random level up to it, or the last level."""
-TIMES_DRIVEN = 20
-"""Mean number of drives per drawn task: drawing a task takes as long as a few drives."""
-KEPT = 128
-"""Number of cached tasks per kind, lot and level."""
+TIMES_DRIVEN = 20  # mean number of drives per drawn task: drawing a task takes as long as a few drives
+CACHED_TASKS = 128  # number of cached tasks per kind, lot and level
 
 _STEP_M = 0.1
 
@@ -76,15 +70,11 @@ def slot_groups(lots: Sequence[ParkingLot]) -> tuple[SlotGroup, ...]:
 
 
 class CurriculumTask(NamedTuple):
-    """A task and its possible start poses.
+    """A task and its possible start poses."""
 
-    Attributes:
-        task: in the slot's frame.
-        path: (n, 3) x, y in m and yaw in rad of the rear axle, slot frame: along the planned path into the slot, from
-            its end backwards, at most 0.1 m apart; None to start at the task's own start.
-    """
-
-    task: PreparedTask
+    task: PreparedTask  # in the slot's frame
+    # (n, 3) x, y in m and yaw in rad of the rear axle, slot frame: along the planned path into the slot, from its end
+    # backwards, at most 0.1 m apart; None to start at the task's own start
     path: FloatArray | None
 
 
@@ -102,10 +92,10 @@ class DriveTrainingEnv(SharedVecEnv):
     """A batch of drives with the decisions of `planners.driving.policy_interface` and a curriculum.
 
     Each kind of slot has its own level, which starts at the first. A level is mastered when a fraction `MASTERED` of
-    its last `TRIED` drives ended parked. `SHARES` gives the fractions of drives at the current level, at a random level
-    up to it, and at the last level, which is the task of `parkenv/Drive-v1` itself. Kinds with more levels left are
-    drawn more often. A drive is truncated after `MOST_DECISIONS`, or after `STOOD` consecutive decisions at a
-    standstill.
+    its last `RECENT_DRIVES` drives ended parked. `SHARES` gives the fractions of drives at the current level, at a
+    random level up to it, and at the last level, which is the task of `parkenv/Drive-v1` itself. Kinds with more levels
+    left are drawn more often. A drive is truncated after `MOST_DECISIONS`, or after `STANDSTILL_DECISIONS` consecutive
+    decisions at a standstill.
 
     With the `sparse` reward, a decision costs 0.4 s unless it ends in the slot, so `compute_reward` needs only goals
     and contacts. The `dense` reward is that of the environment.
@@ -139,7 +129,7 @@ class DriveTrainingEnv(SharedVecEnv):
         for kind, level in self.levels.items():
             if not 0 <= level <= self._last:
                 raise InputError(f"level of {kind} slots is {level}, want 0 to {self._last}")
-        self._recent: dict[str, deque[bool]] = {kind: deque(maxlen=TRIED) for kind in self._groups}
+        self._recent: dict[str, deque[bool]] = {kind: deque(maxlen=RECENT_DRIVES) for kind in self._groups}
         self._tasks: dict[tuple[SlotGroup, int], ParkingTasks] = {}
         # By group and level: seeds of the tasks drawn so far, and the tasks that they make.
         self._seeds_of = {(group, level): list[int]() for group in groups for level in range(self._last + 1)}
@@ -210,7 +200,7 @@ class DriveTrainingEnv(SharedVecEnv):
         self._count(rewards)
         self._stood = np.where(np.abs(batch.state[:, SPEED]) <= STANDING, self._stood + 1, 0)
         over = batch.status != RUNNING
-        done = over | (self._lengths >= MOST_DECISIONS) | (self._stood >= STOOD)
+        done = over | (self._lengths >= MOST_DECISIONS) | (self._stood >= STANDSTILL_DECISIONS)
         parked = batch.status == PARKED
 
         def final(i: int) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -253,7 +243,7 @@ class DriveTrainingEnv(SharedVecEnv):
             return
         recent = self._recent[kind]
         recent.append(parked)
-        if len(recent) == TRIED and sum(recent) >= MASTERED * TRIED:
+        if len(recent) == RECENT_DRIVES and sum(recent) >= MASTERED * RECENT_DRIVES:
             self.levels[kind] += 1
             recent.clear()
 
@@ -281,10 +271,10 @@ class DriveTrainingEnv(SharedVecEnv):
             seed = seeds[rng.integers(len(seeds))]
         else:
             seed = int(rng.integers(1 << 62))
-            if len(seeds) < KEPT:
+            if len(seeds) < CACHED_TASKS:
                 seeds.append(seed)
             else:
-                i = rng.integers(KEPT)
+                i = rng.integers(CACHED_TASKS)
                 made.pop(seeds[i], None)
                 seeds[i] = seed
         if seed not in made:

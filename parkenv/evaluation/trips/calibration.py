@@ -31,7 +31,7 @@ from parkenv.evaluation.figures.picture_files import INK, STYLE, save_picture
 from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
 from parkenv.evaluation.trips.executor import EDGE_KINDS, Leg, ParkingAttempt
 from parkenv.evaluation.trips.lot_driver import DrivingStyle
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import append_text, atomic_write
 from parkenv.files.limited_reading import parse_json, read_text
 from parkenv.files.versioned_json import JsonFormat
 from parkenv.world.scenario import KMH, Scenario
@@ -39,10 +39,8 @@ from parkenv.world.scenario import KMH, Scenario
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
 
-OBSERVED, UNOBSERVED = "observed", "unobserved"
-"""Whether the agent observes slots from the lane."""
-BLOCK = 5
-"""Trips per task."""
+OBSERVED, UNOBSERVED = "observed", "unobserved"  # whether the agent observes slots from the lane
+BLOCK = 5  # trips per task
 _FORMAT = JsonFormat("parkenv-calibration", 1, "a calibration of `parkenv calibrate`")
 
 
@@ -50,25 +48,19 @@ _FORMAT = JsonFormat("parkenv-calibration", 1, "a calibration of `parkenv calibr
 class Calibration:
     """Values measured in a scenario, which may replace the assumed ones.
 
-    Args:
-        scenario: name of the scenario.
-        v_drive: m/s, distance on the drive graph divided by the time on the lanes.
-        failure_s: s, time of an attempt at a taken slot, less the time for the part of the onward route that it covers.
-        manoeuvre_s: s, from the decision to park until the car stands in the slot. The drive graph does not charge it,
-            so it adds to the total time of every agent that parks.
-        trips: number of trips.
-        speed_limit: speed limit on the lanes, m/s.
-
     Raises:
         InputError: a value is out of range; the message names it.
     """
 
-    scenario: str
-    v_drive: float
+    scenario: str  # name of the scenario
+    v_drive: float  # m/s, distance on the drive graph divided by the time on the lanes
+    # s, time of an attempt at a taken slot, less the time for the part of the onward route that it covers
     failure_s: float
+    # s, from the decision to park until the car stands in the slot. The drive graph does not charge it, so it adds to
+    # the total time of every agent that parks.
     manoeuvre_s: float
-    trips: int
-    speed_limit: float
+    trips: int  # number of trips
+    speed_limit: float  # speed limit on the lanes, m/s
 
     def __post_init__(self) -> None:
         for name in ("v_drive", "failure_s", "manoeuvre_s", "trips", "speed_limit"):
@@ -102,19 +94,12 @@ class Calibration:
 
 @dataclass(frozen=True, eq=False)
 class TripPlan:
-    """Which trips to drive.
+    """Which trips to drive."""
 
-    Args:
-        scenario: the scenario.
-        agent: name of the agent.
-        style: driving style.
-        rig: name of the sensor rig; None for the scenario's sensor model.
-    """
-
-    scenario: Scenario
-    agent: str
-    style: DrivingStyle
-    rig: str | None = None
+    scenario: Scenario  # the scenario
+    agent: str  # name of the agent
+    style: DrivingStyle  # driving style
+    rig: str | None = None  # name of the sensor rig; None for the scenario's sensor model
 
     def run(self, slots: str, seeds: Sequence[int]) -> list[Row]:
         """Drive the trips; return the `trip_row` of each."""
@@ -171,8 +156,7 @@ class TripFolder:
 
     def add(self, rows: Sequence[Row]) -> None:
         """Append finished trips."""
-        with self._file.open("a", encoding="utf-8") as file:
-            file.writelines(json.dumps(row) + "\n" for row in rows)
+        append_text(self._file, "".join(json.dumps(row) + "\n" for row in rows))
         self.rows |= {(row["slots"], row["seed"]): row for row in rows}
 
     def put_in_order(self) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium.wrappers import TimeLimit
 
 from parkenv.driving.vehicle import VehicleParameters
+from parkenv.envs import search_kernel as kernel
 from parkenv.envs.perception import OnboardPerception
 from parkenv.envs.search import SearchEnv
 from parkenv.envs.sensor_sampler import Station
@@ -61,30 +62,31 @@ class DrivenSearchEnv(SearchEnv):
 
     def _advance(self, action: int) -> tuple[Any, ...]:
         """Execute the action, and advance the world by the time it took."""
-        state, control = self._state, self._control
+        state, address = self._state, self._address
         vertex, begin = state.vertex, state.time
         possible = self.scenario.action_masks[vertex, action] == 1
         if possible and action == PARK:
             self._park(vertex, begin)
         elif possible:
             seconds = self.executor.drive(vertex, action)
-            control.drive_or_park(action)
-            control.set_step_time(begin, drive_s=seconds)
+            kernel.act_at(address, action)
+            kernel.set_step_time_at(address, begin, seconds, 0.0)
         else:
             self.executor.wait(self.scenario.wait_s)
-            control.drive_or_park(action)
+            kernel.act_at(address, action)
         if not state.parked:
             self._observe(moved=possible and action != PARK)
             for slot in self._refused:
                 # The slot looks free, but this car does not fit.
-                control.set_taken(slot)
-        return control.finish_step()
+                kernel.set_taken_at(address, slot)
+        result: tuple[Any, ...] = kernel.finish_step_at(address)
+        return result
 
     def _observe(self, *, moved: bool) -> None:
         """Update the belief from the observations along the driven path and at its end."""
         perception = self.perception
         if perception is None:
-            self._control.observe()
+            kernel.observe_at(self._address)
             return
         # After an attempt or a wait, the car observes once; captures within a manoeuvre are useless.
         track = self.executor.track if moved else self.executor.track[-1:]
@@ -94,69 +96,46 @@ class DrivenSearchEnv(SearchEnv):
             points = [track[i] for i in chosen.tolist()]
             stations = [Station(s.time, s.pose, self.executor.movers_at(s)) for s in points]
         captures = perception.sampler.sample(self._state, stations)
-        perception.update_belief(self._control, self._state.vertex, captures)
+        perception.update_belief(self._address, self._state.vertex, captures)
 
     def _park(self, slot: int, begin: float) -> None:
         taken = bool(self._state.world.occupied(np.array([slot]), begin)[0])
         outcome = self.executor.park(slot, taken)
         if taken or not outcome.reason:
-            self._control.drive_or_park(PARK)
+            kernel.act_at(self._address, PARK)
         else:
             self._refused.add(slot)
-            self._control.fail_attempt()
+            kernel.fail_attempt_at(self._address)
         if not outcome.reason:
             self.manoeuvre = outcome
         lost = outcome.seconds if outcome.reason else 0.0
-        self._control.set_step_time(begin, drive_s=outcome.seconds - lost, failed_s=lost)
+        kernel.set_step_time_at(self._address, begin, outcome.seconds - lost, lost)
 
 
 @dataclass(frozen=True)
 class Trip:
-    """One trip from the entry to the goal.
+    """One trip from the entry to the goal."""
 
-    Attributes:
-        seed: seed of the world.
-        agent: name of the agent.
-        total_s: sum of the next six.
-        lanes_s: driving on the lanes, waiting included.
-        manoeuvre_s: from the decision to park until the car stood in the slot.
-        failed_s: failed attempts.
-        walk_s: walk to the goal.
-        parking_cost_s: parking cost of the slot, as time.
-        gave_up_s: give-up penalty.
-        parked: whether the car was parked.
-        slot: name of the slot; empty if not parked.
-        slot_kind: orientation of the slot to the lane.
-        graph_m: length of the driven edges in the graph, m.
-        driven_m: distance driven, forward and backward, m.
-        contacts: number of collisions.
-        strays: how often the car left its path.
-        rescues: how often the car was stuck and was put back on the lane.
-        waited_s: time spent braking and standing for other road users, s.
-        legs: the driven edges, in order.
-        attempts: the parking attempts, in order.
-    """
-
-    seed: int
-    agent: str
-    total_s: float
-    lanes_s: float
-    manoeuvre_s: float
-    failed_s: float
-    walk_s: float
-    parking_cost_s: float
-    gave_up_s: float
-    parked: bool
-    slot: str
-    slot_kind: str
-    graph_m: float
-    driven_m: float
-    contacts: int
-    strays: int
-    rescues: int
-    waited_s: float
-    legs: tuple[Leg, ...]
-    attempts: tuple[ParkingAttempt, ...]
+    seed: int  # seed of the world
+    agent: str  # name of the agent
+    total_s: float  # sum of the next six
+    lanes_s: float  # driving on the lanes, waiting included
+    manoeuvre_s: float  # from the decision to park until the car stood in the slot
+    failed_s: float  # failed attempts
+    walk_s: float  # walk to the goal
+    parking_cost_s: float  # parking cost of the slot, as time
+    gave_up_s: float  # give-up penalty
+    parked: bool  # whether the car was parked
+    slot: str  # name of the slot; empty if not parked
+    slot_kind: str  # orientation of the slot to the lane
+    graph_m: float  # length of the driven edges in the graph, m
+    driven_m: float  # distance driven, forward and backward, m
+    contacts: int  # number of collisions
+    strays: int  # how often the car left its path
+    rescues: int  # how often the car was stuck and was put back on the lane
+    waited_s: float  # time spent braking and standing for other road users, s
+    legs: tuple[Leg, ...]  # the driven edges, in order
+    attempts: tuple[ParkingAttempt, ...]  # the parking attempts, in order
 
 
 class DrivenSearch:

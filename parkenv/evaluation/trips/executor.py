@@ -18,8 +18,7 @@ ALONG, TURN, ROUND, ACROSS = "along", "turn", "round", "across"
 EDGE_KINDS = (ALONG, TURN, ROUND, ACROSS)
 """Kinds of edges: straight on; with a turn into another lane; with a U-turn; across a two-way lane, where the car turns
 round only if it drives on afterwards, not if it parks."""
-TAKEN, NO_ROOM, NO_WAY = "taken", "too narrow", "no way in"
-"""Reasons of failed attempts."""
+TAKEN, NO_ROOM, NO_WAY = "taken", "too narrow", "no way in"  # reasons of failed attempts
 
 
 class Leg(NamedTuple):
@@ -31,40 +30,25 @@ class Leg(NamedTuple):
 
 
 class ParkingAttempt(NamedTuple):
-    """An attempt to park.
+    """An attempt to park."""
 
-    Attributes:
-        slot: name of the slot.
-        kind: orientation of the slot to its lane.
-        way: nose-in or back-in; empty for parallel slots and if no path was found.
-        seconds: from the decision until the car stands in the slot, or is back on the lane.
-        reason: reason of the failure; empty if the car parked.
-        onward_m: distance of the car on the lane beyond the slot's vertex after a failed attempt, m; this part of the
-            next edges is already driven.
-    """
-
-    slot: str
-    kind: str
-    way: str
-    seconds: float
-    reason: str
+    slot: str  # name of the slot
+    kind: str  # orientation of the slot to its lane
+    way: str  # nose-in or back-in; empty for parallel slots and if no path was found
+    seconds: float  # from the decision until the car stands in the slot, or is back on the lane
+    reason: str  # reason of the failure; empty if the car parked
+    # distance of the car on the lane beyond the slot's vertex after a failed attempt, m; this part of the next edges
+    # is already driven
     onward_m: float = 0.0
 
 
 class TrackPoint(NamedTuple):
-    """Positions of the car and all road users at one time.
+    """Positions of the car and all road users at one time."""
 
-    Attributes:
-        time: s since Monday 00:00.
-        driven_m: distance driven so far, m.
-        pose: (3,) x, y in m, yaw in rad, of the middle of the car's footprint.
-        clocks: (n,) s, clocks of the moving road users, see `RoadUsers`.
-    """
-
-    time: float
-    driven_m: float
-    pose: FloatArray
-    clocks: FloatArray
+    time: float  # s since Monday 00:00
+    driven_m: float  # distance driven so far, m
+    pose: FloatArray  # (3,) x, y in m, yaw in rad, of the middle of the car's footprint
+    clocks: FloatArray  # (n,) s, clocks of the moving road users, see `RoadUsers`
 
 
 class MotionExecutor(Protocol):

@@ -22,18 +22,8 @@ from parkenv.driving.yielding_traffic import YieldingTraffic
 from parkenv.envs.drive import CONTROL_S, SUBSTEPS
 from parkenv.envs.drive_goals import ANGLE_TOLERANCE, POSITION_TOLERANCE
 from parkenv.errors import InputError
-from parkenv.evaluation.trips.executor import (
-    ACROSS,
-    ALONG,
-    NO_ROOM,
-    NO_WAY,
-    ROUND,
-    TAKEN,
-    TURN,
-    Leg,
-    ParkingAttempt,
-    TrackPoint,
-)
+from parkenv.evaluation.trips import executor
+from parkenv.evaluation.trips.executor import Leg, ParkingAttempt, TrackPoint
 from parkenv.world.occupancy import World
 from parkenv.world.scenario import Scenario
 from planners.driving.car_path import CarPath
@@ -47,12 +37,9 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-RESCUE_S = 60.0
-"""Time until a stuck car is back on the lane, s."""
-PATIENCE_S = 3.0
-"""Time for which the car and a waiting road user both stand until the other gives way, s."""
-TURN_IN_M = 9.0
-"""Distance from the rear axle to the middle of a junction at which the turn begins, m."""
+RESCUE_S = 60.0  # time until a stuck car is back on the lane, s
+PATIENCE_S = 3.0  # time for which the car and a waiting road user both stand until the other gives way, s
+TURN_IN_M = 9.0  # distance from the rear axle to the middle of a junction at which the turn begins, m
 
 _LEAD_M = 1.5
 _LANE = SearchSettings(change_m=8.0, attempts=((0.25, 0.5), (0.15, 0.5), (0.08, 0.5), (0.03, 0.25)))
@@ -78,12 +65,6 @@ _NOBODY: NDArray[np.float64] = np.empty(0)
 class DrivingStyle:
     """Parameters of driving.
 
-    Args:
-        speed: maximum on the lanes, m/s; None for the scenario's `v_drive`.
-        acceleration: acceleration, and deceleration before turns, m/s².
-        braking: deceleration before parking, m/s².
-        notice_m: distance along the path, m, at which the car notices at the latest that a slot is taken.
-
     Raises:
         InputError: a value is not a finite number above 0, or the notice distance is too short to stop.
 
@@ -94,9 +75,10 @@ class DrivingStyle:
         parkenv.errors.InputError: driving notice_m is 0.1 m, want at least 0.8, or the car could not stop in time
     """
 
-    speed: float | None = None
-    acceleration: float = 1.2
-    braking: float = 2.0
+    speed: float | None = None  # maximum on the lanes, m/s; None for the scenario's `v_drive`
+    acceleration: float = 1.2  # acceleration, and deceleration before turns, m/s²
+    braking: float = 2.0  # deceleration before parking, m/s²
+    # distance along the path, m, at which the car notices at the latest that a slot is taken
     notice_m: float = 2.0
 
     def __post_init__(self) -> None:
@@ -115,25 +97,15 @@ class DrivingStyle:
 
 @dataclass
 class DriveLog:
-    """Record of a drive.
+    """Record of a drive."""
 
-    Attributes:
-        legs: driven edges.
-        attempts: parking attempts.
-        driven_m: distance driven, forward and backward, m.
-        contacts: kinds of obstacles touched, one per collision.
-        strays: how often the car left its path and planned another.
-        rescues: how often no path was found and the car was put back on the lane.
-        waited_s: time spent braking and standing for other road users, s.
-    """
-
-    legs: list[Leg] = field(default_factory=list)
-    attempts: list[ParkingAttempt] = field(default_factory=list)
-    driven_m: float = 0.0
-    contacts: list[str] = field(default_factory=list)
-    strays: int = 0
-    rescues: int = 0
-    waited_s: float = 0.0
+    legs: list[Leg] = field(default_factory=list)  # driven edges
+    attempts: list[ParkingAttempt] = field(default_factory=list)  # parking attempts
+    driven_m: float = 0.0  # distance driven, forward and backward, m
+    contacts: list[str] = field(default_factory=list)  # kinds of obstacles touched, one per collision
+    strays: int = 0  # how often the car left its path and planned another
+    rescues: int = 0  # how often no path was found and the car was put back on the lane
+    waited_s: float = 0.0  # time spent braking and standing for other road users, s
 
 
 class LotDriver:
@@ -217,7 +189,7 @@ class LotDriver:
         if not self._placed:
             self._place(edge)
         self.doing = "searching"
-        kind = ACROSS
+        kind = executor.ACROSS
         if not edge.across:
             kind = self._plan_edge(edge)
             self._refresh()
@@ -248,7 +220,7 @@ class LotDriver:
         targets = {"nose-in": pose, "back-in": pose + np.array([0.0, 0.0, math.pi])}
         if kind == KINDS[2]:
             targets = {"": pose}
-        way, reason, onward = "", NO_ROOM, 0.0
+        way, reason, onward = "", executor.NO_ROOM, 0.0
         if lot.slot_length[slot] >= vehicle.length and lot.slot_width[slot] >= vehicle.width:
             way, reason = self._drive_in(targets, there, inside)
         if reason:
@@ -283,13 +255,13 @@ class LotDriver:
     def _plan_edge(self, edge: DrivenEdge) -> str:
         """Plan the path along an edge from the car's pose; return the edge's kind."""
         if self._line == edge.line and self._keeper is not None and not self._keeper.done:
-            return ALONG
+            return executor.ALONG
         line = self._lines.lines[edge.line]
         here = self._lines.lines[self._line] if self._line is not None else None
         before, self._line = self._line, edge.line
         if self._is_on(line):
             self._follow_line(line)
-            return ALONG
+            return executor.ALONG
         if here is not None and self._is_on(here):
             joint = line.pose(edge.start)
             at = here.station_of(joint[:2])
@@ -298,12 +270,12 @@ class LotDriver:
                 first = here.between(now, at) if at > now + 0.1 else self.state[None, :2]
                 points = np.concatenate([first, line.between(max(edge.start, 0.1), line.length)])
                 self._keeper = LaneKeeper(self.vehicle, rounded(points, _BEND_M), self._on_lane)
-                return ALONG
+                return executor.ALONG
             if _askew(here.pose(at), joint) < _AROUND:
                 turn = self._turn(before or 0, edge, at)
                 if turn is not None:
                     self._keeper = LaneKeeper(self.vehicle, turn, self._on_lane)
-                    return TURN
+                    return executor.TURN
         return self._turn_onto(line)
 
     def _follow_line(self, line: DrivenLine) -> None:
@@ -354,7 +326,7 @@ class LotDriver:
         if not self._is_on(line):
             self._rescue(line)
         self._follow_line(line)
-        return TURN if askew < _AROUND else ROUND
+        return executor.TURN if askew < _AROUND else executor.ROUND
 
     def _planned_onto(
         self,
@@ -432,13 +404,13 @@ class LotDriver:
         for _ in range(_MOST_PLANS):
             paths = {way: path for way in ways if (path := self._planned_to(targets[way], there)) is not None}
             if not paths:
-                return ways[0] if len(ways) == 1 else "", NO_WAY
+                return ways[0] if len(ways) == 1 else "", executor.NO_WAY
             way = min(paths, key=lambda w: _seconds_of(paths[w]))
             ways = [way]
             tracker = PathTracker(self.vehicle, paths[way])
             notices = None if inside is None else self._noticing(tracker, inside)
             if not self._follow(tracker, notices):
-                return way, TAKEN
+                return way, executor.TAKEN
             own = self.vehicle.at_middle(self.state[:3])
             if (
                 tracker.done
@@ -447,7 +419,7 @@ class LotDriver:
             ):
                 return way, ""
             self.log.strays += 1
-        return way, NO_WAY
+        return way, executor.NO_WAY
 
     def _noticing(self, tracker: PathTracker, inside: FloatArray) -> Callable[[], bool]:
         """Return a function that checks whether the path meets an outline within `notice_m`."""

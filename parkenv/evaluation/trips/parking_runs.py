@@ -24,27 +24,18 @@ from planners.agent import Agent
 from planners.driving.parking import ParkingMemory
 from planners.driving.parking_agents import PLANNER, make_parking_agent
 
-CHUNK = 25
-"""Episodes per task of a worker."""
+CHUNK = 25  # episodes per task of a worker
 
 
 @dataclass(frozen=True)
 class ParkingCase:
-    """A parking task distribution on one lot.
+    """A parking task distribution on one lot."""
 
-    Args:
-        lot: the lot.
-        kinds: kinds of slots; None for all kinds on the lot.
-        ways: orientations in perpendicular and oblique slots.
-        occupancy: fraction of the other slots that are occupied.
-        slack: distance around the slot kept clear of parked cars, m.
-    """
-
-    lot: ParkingLot
-    kinds: tuple[str, ...] | None = None
-    ways: tuple[str, ...] = ("nose-in", "back-in")
-    occupancy: float = 0.85
-    slack: float = 0.0
+    lot: ParkingLot  # the lot
+    kinds: tuple[str, ...] | None = None  # kinds of slots; None for all kinds on the lot
+    ways: tuple[str, ...] = ("nose-in", "back-in")  # orientations in perpendicular and oblique slots
+    occupancy: float = 0.85  # fraction of the other slots that are occupied
+    slack: float = 0.0  # distance around the slot kept clear of parked cars, m
 
     def environment(self, render_mode: str | None = None) -> gym.Env[Any, Any]:
         """Make `parkenv/Drive-v1` with the obstacle map."""
@@ -63,17 +54,11 @@ class ParkingCase:
 
 @dataclass
 class Parking:
-    """Result of one parking episode.
+    """Result of one parking episode."""
 
-    Attributes:
-        row: metrics of the episode.
-        state: final state of the episode, with the driven trail.
-        frames: rendered frames, if requested.
-    """
-
-    row: dict[str, Any]
-    state: DriveState
-    frames: list[Any] = field(default_factory=list)
+    row: dict[str, Any]  # metrics of the episode
+    state: DriveState  # final state of the episode, with the driven trail
+    frames: list[Any] = field(default_factory=list)  # rendered frames, if requested
 
 
 class _ParkingRecorder(Observer):

@@ -33,12 +33,9 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
-TIMELINE = "drive"
-"""Seconds since the first drive began."""
-PAUSE_S = 5.0
-"""Pause between two drives, s."""
-GRID_EVERY = 10
-"""Record the grid at every this many captures only: it is large and changes little."""
+TIMELINE = "drive"  # seconds since the first drive began
+PAUSE_S = 5.0  # pause between two drives, s
+GRID_EVERY = 10  # record the grid at every this many captures only: it is large and changes little
 JPEG_QUALITY = 80
 UNOBSERVED_GREY = 40
 SIDE, END, UNRANGED = (255, 208, 0), (86, 180, 233), (150, 150, 150)

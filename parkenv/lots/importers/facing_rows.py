@@ -11,8 +11,7 @@ from parkenv.lots.importers.slot_rows import PARALLEL_ROWS, STRAIGHT, AmbiguousL
 
 FloatArray = NDArray[np.float64]
 
-AISLE = (2.8, 10.0)
-"""Least and greatest width, m, of an aisle between two rows."""
+AISLE = (2.8, 10.0)  # least and greatest width, m, of an aisle between two rows
 
 
 class FacingRows:

@@ -20,21 +20,17 @@ NEAR_ON_GLOBE = 1.0
 class ImportOptions:
     """Goals, entries and bounds that complete or replace those of a file.
 
-    Args:
-        goals: walking destinations as pairs of numbers: metres east and north in the lot's frame or, for a file with
-            latitudes and longitudes, a latitude and a longitude (any pair within a degree of the lot).
-        entries: places where cars enter, in the same form.
-        bounds: two corners, in the same form; elements outside are not read.
-        with_disabled: whether slots for disabled drivers count as slots.
-
     Raises:
         InputError: a pair that is not two finite numbers.
     """
 
+    # walking destinations as pairs of numbers: metres east and north in the lot's frame or, for a file with latitudes
+    # and longitudes, a latitude and a longitude (any pair within a degree of the lot)
     goals: tuple[tuple[float, float], ...] = ()
-    entries: tuple[tuple[float, float], ...] = ()
+    entries: tuple[tuple[float, float], ...] = ()  # places where cars enter, in the same form
+    # two corners, in the same form; elements outside are not read
     bounds: tuple[tuple[float, float], tuple[float, float]] | None = None
-    with_disabled: bool = False
+    with_disabled: bool = False  # whether slots for disabled drivers count as slots
 
     def __post_init__(self) -> None:
         for what, points in (("goal", self.goals), ("entry", self.entries), ("bounds", self.bounds or ())):

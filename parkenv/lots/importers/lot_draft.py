@@ -31,38 +31,22 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class LotDraft:
-    """Slots, lanes, entries and goals found in a file; any may be missing.
+    """Slots, lanes, entries and goals found in a file; any may be missing."""
 
-    Args:
-        name: the lot's name.
-        slot_ids: n_slots names.
-        slots: their geometry, lot frame.
-        slot_source: n_slots names of the source of each slot.
-        lanes: centre lines.
-        entries: (n_entries, 2) m.
-        goals: (n_goals, 2) m.
-        walls: (k, 2) m each.
-        outlines: (k, 2) m each, parking areas in the file; for figures.
-        found: one line per finding.
-        left_out: elements that were not used.
-        missing: one sentence per missing part that a search needs, with how to provide it.
-        frame: geographic frame of the lot; None if the file has none.
-        loose: (k, 2) m, centres of slots whose shape is unknown; for figures.
-    """
-
-    name: str
-    slot_ids: tuple[str, ...]
-    slots: Slots
-    slot_source: tuple[str, ...]
-    lanes: tuple[Lane, ...]
-    entries: FloatArray
-    goals: FloatArray
-    walls: tuple[FloatArray, ...] = ()
-    outlines: tuple[FloatArray, ...] = ()
-    found: tuple[str, ...] = ()
-    left_out: tuple[LeftOut, ...] = ()
-    missing: tuple[str, ...] = ()
-    frame: LocalFrame | None = None
+    name: str  # the lot's name
+    slot_ids: tuple[str, ...]  # n_slots names
+    slots: Slots  # their geometry, lot frame
+    slot_source: tuple[str, ...]  # n_slots names of the source of each slot
+    lanes: tuple[Lane, ...]  # centre lines
+    entries: FloatArray  # (n_entries, 2) m
+    goals: FloatArray  # (n_goals, 2) m
+    walls: tuple[FloatArray, ...] = ()  # (k, 2) m each
+    outlines: tuple[FloatArray, ...] = ()  # (k, 2) m each, parking areas in the file; for figures
+    found: tuple[str, ...] = ()  # one line per finding
+    left_out: tuple[LeftOut, ...] = ()  # elements that were not used
+    missing: tuple[str, ...] = ()  # one sentence per missing part that a search needs, with how to provide it
+    frame: LocalFrame | None = None  # geographic frame of the lot; None if the file has none
+    # (k, 2) m, centres of slots whose shape is unknown; for figures
     loose: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
 
     @classmethod

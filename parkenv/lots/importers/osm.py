@@ -32,21 +32,13 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.lots.generators import Slots
+from parkenv.lots.importers import osm_network as network
 from parkenv.lots.importers.import_options import ImportOptions, points_in_frame
 from parkenv.lots.importers.lot_draft import LeftOut, LotDraft
 from parkenv.lots.importers.osm_buildings import BUILDING_REACH, ENTRANCE_REACH, Area, find_goals, split_walls
 from parkenv.lots.importers.osm_elements import OsmElement, read_elements
 from parkenv.lots.importers.osm_junctions import limit_junctions
 from parkenv.lots.importers.osm_kerbs import Junctions, kerb_of, kerb_slots
-from parkenv.lots.importers.osm_network import (
-    clipped_road,
-    components_with_slots,
-    dead_ends,
-    lanes_of,
-    open_ends,
-    street_junctions,
-    used_roads,
-)
 from parkenv.lots.importers.osm_outlines import CORRIDOR, fill_outline
 from parkenv.lots.importers.osm_roads import Rank, Road, closed_to_cars, off_the_ground, road_of, whole_number
 from parkenv.lots.importers.osm_rows import ARRANGEMENTS, NO_SLOTS, boxes_of, without_overlaps
@@ -60,10 +52,8 @@ FloatArray = NDArray[np.float64]
 
 OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "garage_boxes", "sheds")
 """Values of `parking` for slots that are not in the open at ground level."""
-FARTHEST = 100_000.0
-"""Largest distance of parking and roads from the centre of a map, m."""
-STREETS_AROUND = 60.0
-"""Distance beyond the slots, m, within which streets are lanes if no bounds are given."""
+FARTHEST = 100_000.0  # largest distance of parking and roads from the centre of a map, m
+STREETS_AROUND = 60.0  # distance beyond the slots, m, within which streets are lanes if no bounds are given
 MAPPED_OVERLAP, RULE_OVERLAP = 0.4, 0.1
 """Largest allowed overlap, m, of slots drawn by hand, and of slots created by rule."""
 
@@ -164,7 +154,7 @@ class _OsmImporter:
             if isinstance(road, str):
                 self._leave_out(road, element.id)
             elif road is not None:
-                roads += [road] if box is None else clipped_road(road, box)
+                roads += [road] if box is None else network.clipped_road(road, box)
         return roads
 
     def _polygon(self, element: OsmElement) -> shapely.Geometry:
@@ -200,7 +190,7 @@ class _OsmImporter:
         owners: list[str] = []
         names: list[str] = []
         polygons: list[shapely.Geometry] = []
-        lanes = lanes_of(self.roads)
+        lanes = network.lanes_of(self.roads)
         for area in kept:
             capacity = whole_number(area.element.tags.get("capacity")) or 1
             parts = split_space(squared(area.polygon), capacity, lanes)
@@ -217,7 +207,7 @@ class _OsmImporter:
         left = np.arange(len(polygons))
         array = np.array(polygons, dtype=np.object_)
         for rank in Rank:
-            near = lanes_of([road for road in self.roads if road.rank <= rank])
+            near = network.lanes_of([road for road in self.roads if road.rank <= rank])
             if not len(left) or not near:
                 continue
             slots = slots_from_polygons(array[left], near)
@@ -319,20 +309,22 @@ class _OsmImporter:
         roads = self.roads
         if len(slots) and not lanes_of_streets:
             service = [road for road in roads if road.rank < Rank.STREET]
-            lanes_of_streets = len(components_with_slots(service, slots)) > 1
+            lanes_of_streets = len(network.components_with_slots(service, slots)) > 1
         streets = [road for road in roads if road.rank is Rank.STREET]
         edge = None
         if lanes_of_streets:
             edge = self._edge(slots)
-            roads = [part for road in roads for part in clipped_road(road, edge)]
+            roads = [part for road in roads for part in network.clipped_road(road, edge)]
             lanes_around: list[Road] = []
         else:
             roads = [road for road in roads if road.rank < Rank.STREET]
             lanes_around = streets
-        roads = used_roads(roads, lanes_around, slots)
+        roads = network.used_roads(roads, lanes_around, slots)
         entries = points_in_frame(self.frame, self.options.entries)
         if not len(entries) and roads:
-            entries = street_junctions(roads, streets) if edge is None else self._open_ends(roads, edge)
+            entries = (
+                network.street_junctions(roads, streets) if edge is None else self._open_ends(roads, edge)
+            )
         goals, goal_note = points_in_frame(self.frame, self.options.goals), None
         if not len(goals):
             goals, goal_note = find_goals(slots, self.nodes, self.buildings, self.frame)
@@ -340,7 +332,7 @@ class _OsmImporter:
         for name in passages:
             self._leave_out("buildings over slots or lanes, which are no walls", name)
 
-        lanes = limit_junctions(lanes_of(roads))
+        lanes = limit_junctions(network.lanes_of(roads))
         draft = LotDraft(
             name=self.path.stem,
             slot_ids=tuple(names),
@@ -360,9 +352,7 @@ class _OsmImporter:
         ).searchable()
         left_out = [LeftOut(reason, tuple(ids)) for reason, ids in self.left_out.items()]
         return replace(
-            draft,
-            found=tuple(self._found(draft, roads, goal_note)),
-            left_out=(*left_out, *draft.left_out),
+            draft, found=tuple(self._found(draft, roads, goal_note)), left_out=(*left_out, *draft.left_out)
         )
 
     def _all_slots(self) -> tuple[list[str], list[str], Slots, NDArray[np.int64]]:
@@ -391,7 +381,7 @@ class _OsmImporter:
 
     def _open_ends(self, roads: Sequence[Road], edge: shapely.Geometry) -> FloatArray:
         blind = [e.lines[0] for e in self.nodes if _is_blind_end(e)]
-        return open_ends(roads, edge, self.frame.to_xy(np.concatenate([np.empty((0, 2)), *blind])))
+        return network.open_ends(roads, edge, self.frame.to_xy(np.concatenate([np.empty((0, 2)), *blind])))
 
     def _missing(
         self, slots: Slots, roads: Sequence[Road], entries: FloatArray, goals: FloatArray
@@ -401,7 +391,7 @@ class _OsmImporter:
         elif not len(slots):
             yield "no slot: nothing that the file calls parking could be used"
         if len(slots) and roads and not len(entries):
-            ends = self.frame.to_lonlat(dead_ends(roads))[:3, ::-1].tolist()
+            ends = self.frame.to_lonlat(network.dead_ends(roads))[:3, ::-1].tolist()
             where = (
                 "; lanes end at " + " and ".join(f"{lat:.6f},{lon:.6f}" for lat, lon in ends) if ends else ""
             )

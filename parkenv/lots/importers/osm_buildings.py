@@ -17,12 +17,9 @@ from parkenv.lots.local_frame import LocalFrame
 
 FloatArray = NDArray[np.float64]
 
-ENTRANCE_REACH = 100.0
-"""Largest distance, m, from the nearest slot of a building entrance that is a goal."""
-BUILDING_REACH = 200.0
-"""The same for the nearest building if there is no entrance."""
-NOT_GOALS = ("no", "garage", "emergency", "exit", "service")
-"""Values of `entrance` that are not goals."""
+ENTRANCE_REACH = 100.0  # largest distance, m, from the nearest slot of a building entrance that is a goal
+BUILDING_REACH = 200.0  # the same for the nearest building if there is no entrance
+NOT_GOALS = ("no", "garage", "emergency", "exit", "service")  # values of `entrance` that are not goals
 NOT_WALKED_TO = ("garage", "garages", "carport", "roof", "shed", "parking", "hut", "no", "transformer_tower")
 """Values of `building` that are not goals."""
 

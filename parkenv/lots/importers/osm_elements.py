@@ -33,20 +33,14 @@ MAPPED_KEYS = ("amenity", "highway", "building", "entrance")
 
 @dataclass(frozen=True, eq=False)
 class OsmElement:
-    """A node, way or multipolygon.
+    """A node, way or multipolygon."""
 
-    Attributes:
-        id: such as `way/123`, as in OpenStreetMap URLs.
-        tags: its keys and values.
-        lines: (k, 2) degrees, longitude first: the single position of a node, the line of a way, the outer rings of a
-            multipolygon. A closed line ends where it starts.
-        holes: a multipolygon's inner rings.
-    """
-
-    id: str
-    tags: Mapping[str, str]
+    id: str  # such as `way/123`, as in OpenStreetMap URLs
+    tags: Mapping[str, str]  # its keys and values
+    # (k, 2) degrees, longitude first: the single position of a node, the line of a way, the outer rings of a
+    # multipolygon. A closed line ends where it starts.
     lines: tuple[FloatArray, ...]
-    holes: tuple[FloatArray, ...] = ()
+    holes: tuple[FloatArray, ...] = ()  # a multipolygon's inner rings
 
     @property
     def is_node(self) -> bool:

@@ -39,8 +39,7 @@ OLD_ORIENTATIONS = {
 }
 CORNER_CLEARANCE = 5.0
 """Distance from the kerbs' corner at a junction, and from a pedestrian crossing, to the first car, m."""
-DRIVEWAY_CLEARANCE = 1.0
-"""Distance from the edge of a joining service road to the first car, m."""
+DRIVEWAY_CLEARANCE = 1.0  # distance from the edge of a joining service road to the first car, m
 SHORTEST_KERB_SLOT = 5.0
 """Smallest slot length, m, if a tagged capacity needs more slots than fit at the usual length."""
 STRAIGHT_ON = np.radians(30.0)
@@ -49,17 +48,11 @@ STRAIGHT_ON = np.radians(30.0)
 
 @dataclass(frozen=True)
 class Kerb:
-    """Parking along one side of a street.
+    """Parking along one side of a street."""
 
-    Args:
-        orientation: a key of `ARRANGEMENTS`.
-        capacity: number of slots; None if not tagged.
-        on_carriageway: whether parked cars are within `width`.
-    """
-
-    orientation: str
-    capacity: int | None
-    on_carriageway: bool
+    orientation: str  # a key of `ARRANGEMENTS`
+    capacity: int | None  # number of slots; None if not tagged
+    on_carriageway: bool  # whether parked cars are within `width`
 
 
 def kerb_of(tags: Mapping[str, str], side: Side) -> Kerb | str | None:

@@ -26,12 +26,10 @@ from parkenv.world.lot import mouth_heading, mouth_points
 
 FloatArray = NDArray[np.float64]
 
-OUTLINE_TOLERANCE = 0.4
-"""Largest overhang, m, of a slot beyond the outline: the accuracy of mapped outlines."""
+OUTLINE_TOLERANCE = 0.4  # largest overhang, m, of a slot beyond the outline: the accuracy of mapped outlines
 PHASES = (0.0, 0.25, 0.5, 0.75)
 """Trial offsets of a row along its aisle, as fractions of a slot's width; the one with the most slots is used."""
-CORRIDOR = 0.8
-"""Fraction of a road's half width that must be clear of slots of other roads."""
+CORRIDOR = 0.8  # fraction of a road's half width that must be clear of slots of other roads
 
 
 def fill_outline(
@@ -117,11 +115,7 @@ def _row(
 
 
 def _fitting(
-    slots: Slots,
-    roomy: shapely.Geometry,
-    taken: shapely.Geometry,
-    lines: NDArray[np.object_],
-    own: int,
+    slots: Slots, roomy: shapely.Geometry, taken: shapely.Geometry, lines: NDArray[np.object_], own: int
 ) -> Slots:
     """Return the slots that are inside the outline, clear of everything else, and open to their own road."""
     if not len(slots):

@@ -26,10 +26,8 @@ STREET_WIDTH = {
     "service": 5.0,
 }
 """Carriageway width, m, without parked cars, of two-way roads without the tags `width` and `lanes`."""
-AISLE_WIDTH = 6.0
-"""The same for a `service=parking_aisle`."""
-LANE_WIDTH = 3.0
-"""Width of each of the tagged `lanes`, m."""
+AISLE_WIDTH = 6.0  # the same for a `service=parking_aisle`
+LANE_WIDTH = 3.0  # width of each of the tagged `lanes`, m
 NOT_FOR_PARKING = ("drive-through", "emergency_access", "bus")
 """Kinds of `highway=service` that are not lanes."""
 
@@ -44,22 +42,14 @@ class Rank(IntEnum):
 
 @dataclass(frozen=True, eq=False)
 class Road:
-    """A way open to cars.
+    """A way open to cars."""
 
-    Args:
-        id: such as `way/123`.
-        tags: tags of the way.
-        points: (k, 2) m, in the direction of traffic if one-way.
-        rank: kind of road.
-        oneway: whether cars may drive only in the order of the points.
-        turned: whether the points are in reverse order of the way, which swaps its tags for left and right.
-    """
-
-    id: str
-    tags: Mapping[str, str]
-    points: FloatArray
-    rank: Rank
-    oneway: bool
+    id: str  # such as `way/123`
+    tags: Mapping[str, str]  # tags of the way
+    points: FloatArray  # (k, 2) m, in the direction of traffic if one-way
+    rank: Rank  # kind of road
+    oneway: bool  # whether cars may drive only in the order of the points
+    # whether the points are in reverse order of the way, which swaps its tags for left and right
     turned: bool
 
     @property

@@ -18,17 +18,11 @@ Side = Literal["left", "right"]
 
 @dataclass(frozen=True)
 class Arrangement:
-    """Arrangement of parked cars along a road.
+    """Arrangement of parked cars along a road."""
 
-    Args:
-        angle: angle between the road and the cars, rad, from 0 (along it) to π/2 (across).
-        length: length of a slot, m.
-        width: width of a slot, m.
-    """
-
-    angle: float
-    length: float
-    width: float
+    angle: float  # angle between the road and the cars, rad, from 0 (along it) to π/2 (across)
+    length: float  # length of a slot, m
+    width: float  # width of a slot, m
 
     @property
     def pitch(self) -> float:
@@ -42,24 +36,17 @@ ARRANGEMENTS = {
     "perpendicular": Arrangement(np.pi / 2, *BAY_SIZE),
 }
 """Arrangement for each value of OpenStreetMap's `orientation`; diagonal cars park at 60°."""
-DRAWN = 0.05
-"""Tolerance, m, of the length of a row: OpenStreetMap's seven digits round to a centimetre."""
+DRAWN = 0.05  # tolerance, m, of the length of a row: OpenStreetMap's seven digits round to a centimetre
 NO_SLOTS = bay_row((0.0, 0.0), 0.0, 0)
 
 
 @dataclass(frozen=True, eq=False)
 class RowAnchors:
-    """Anchors of a row's slots: n points on the road's centre line.
+    """Anchors of a row's slots: n points on the road's centre line."""
 
-    Args:
-        xy: (n, 2) m.
-        along: (n, 2) unit vectors in the order of the road's points.
-        outward: (n, 2) unit vectors toward the slots.
-    """
-
-    xy: FloatArray
-    along: FloatArray
-    outward: FloatArray
+    xy: FloatArray  # (n, 2) m
+    along: FloatArray  # (n, 2) unit vectors in the order of the road's points
+    outward: FloatArray  # (n, 2) unit vectors toward the slots
 
 
 def row_anchors(points: FloatArray, stations: FloatArray, pitch: float, side: Side) -> RowAnchors:

@@ -18,17 +18,12 @@ FloatArray = NDArray[np.float64]
 
 OPEN_AISLE = TWO_WAY_HALF_WIDTH
 """Distance from a row without a facing row to the middle of its aisle, and from an aisle's last slot to its end, m."""
-ACROSS_GAP = 15.0
-"""Widest gap, m, in the rows across which an aisle continues."""
-LEAST_GAP = 4.5
-"""Least width, m, of a gap in a row through which a road may lead."""
-SAME_AISLE = 1.5
-"""Largest offset, m, between the lines of two pieces of one aisle."""
-SAME_STOP = 1.5
-"""Distance, m, within which roads that meet an aisle share one junction."""
+ACROSS_GAP = 15.0  # widest gap, m, in the rows across which an aisle continues
+LEAST_GAP = 4.5  # least width, m, of a gap in a row through which a road may lead
+SAME_AISLE = 1.5  # largest offset, m, between the lines of two pieces of one aisle
+SAME_STOP = 1.5  # distance, m, within which roads that meet an aisle share one junction
 ROAD_HALF_WIDTH = 1.25
-LONGEST_LINK = 60.0
-"""Longest road, m, between two aisles."""
+LONGEST_LINK = 60.0  # longest road, m, between two aisles
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,27 +37,18 @@ from parkenv.world.lot import Lane, corner_points, mouth_points
 
 FloatArray = NDArray[np.float64]
 
-MOST_STRAYS = 0.1
-"""Largest allowed fraction of slots in no row."""
+MOST_STRAYS = 0.1  # largest allowed fraction of slots in no row
 
 
 @dataclass(frozen=True, eq=False)
 class SlotLayout:
-    """Slots and lanes inferred from slot centres.
+    """Slots and lanes inferred from slot centres."""
 
-    Args:
-        index: indices, in the list, of the slots that are part of a row.
-        slots: these slots.
-        lanes: aisles and the roads that connect them, all two-way.
-        strays: indices of the slots in no row.
-        found: one line per finding.
-    """
-
-    index: tuple[int, ...]
-    slots: Slots
-    lanes: tuple[Lane, ...]
-    strays: tuple[int, ...]
-    found: tuple[str, ...]
+    index: tuple[int, ...]  # indices, in the list, of the slots that are part of a row
+    slots: Slots  # these slots
+    lanes: tuple[Lane, ...]  # aisles and the roads that connect them, all two-way
+    strays: tuple[int, ...]  # indices of the slots in no row
+    found: tuple[str, ...]  # one line per finding
 
 
 def infer_layout(xy: FloatArray, yaw: FloatArray | None, names: Sequence[str]) -> SlotLayout:

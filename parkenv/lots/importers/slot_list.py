@@ -20,27 +20,18 @@ from parkenv.lots.local_frame import LocalFrame
 FloatArray = NDArray[np.float64]
 
 COLUMNS = ("x", "y", "lat", "lon", "yaw", "id", "parking_cost_s")
-SAME_PLACE = 0.1
-"""Distance, m, within which two slot centres are one slot listed twice."""
+SAME_PLACE = 0.1  # distance, m, within which two slot centres are one slot listed twice
 
 
 @dataclass(frozen=True, eq=False)
 class SlotList:
-    """Slots given by their centres.
+    """Slots given by their centres."""
 
-    Args:
-        ids: n_slots names.
-        xy: (n_slots, 2) m.
-        yaw: (n_slots,) rad, heading of a car parked nose-in; None without the column.
-        parking_cost_s: (n_slots,) s, at least 0.
-        frame: geographic frame of the lot; None for a file in metres.
-    """
-
-    ids: tuple[str, ...]
-    xy: FloatArray
-    yaw: FloatArray | None
-    parking_cost_s: FloatArray
-    frame: LocalFrame | None
+    ids: tuple[str, ...]  # n_slots names
+    xy: FloatArray  # (n_slots, 2) m
+    yaw: FloatArray | None  # (n_slots,) rad, heading of a car parked nose-in; None without the column
+    parking_cost_s: FloatArray  # (n_slots,) s, at least 0
+    frame: LocalFrame | None  # geographic frame of the lot; None for a file in metres
 
 
 def read_slot_list(path: str | Path) -> SlotList:

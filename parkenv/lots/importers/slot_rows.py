@@ -18,19 +18,15 @@ from parkenv.world.lot import Mouth
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
-SPACING = (1.8, 8.0)
-"""Least and greatest distance, m, from a slot to the next in its row."""
+SPACING = (1.8, 8.0)  # least and greatest distance, m, from a slot to the next in its row
 SAME_SPACING = 1.3
 """Largest distance of neighbours in a row, as a multiple of the nearest neighbour's distance."""
-SAME_WAY = np.radians(15.0)
-"""Largest angle between a slot's row and the direction to a neighbour in it."""
-STRAIGHT = 0.6
-"""Largest distance, m, of a slot's centre from the line of its row."""
+SAME_WAY = np.radians(15.0)  # largest angle between a slot's row and the direction to a neighbour in it
+STRAIGHT = 0.6  # largest distance, m, of a slot's centre from the line of its row
 PARALLEL_ROWS = np.radians(10.0)
 WIDEST_BAY, SHORTEST_KERB = 3.7, 4.8
 """Spacing, m, up to which a row without yaw is perpendicular, and from which it is parallel."""
-GAP_IN_ROW = 4.5
-"""Largest distance, in spacings, at which single slots and pairs join a row."""
+GAP_IN_ROW = 4.5  # largest distance, in spacings, at which single slots and pairs join a row
 
 
 class AmbiguousLayoutError(InputError):
@@ -49,29 +45,17 @@ class AmbiguousLayoutError(InputError):
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Slots in a straight line.
+    """Slots in a straight line."""
 
-    Args:
-        members: (k,) indices, in order along the row.
-        middle: (2,) m.
-        along: (2,) unit vector.
-        low: position along the row of the outer edge of its first slot, m from its middle.
-        high: the same for its last slot.
-        spacing: distance from slot to slot, m.
-        angle: angle between row and cars, rad, 0 to π/2.
-        length: length of a slot, m.
-        width: width of a slot, m.
-    """
-
-    members: IntArray
-    middle: FloatArray
-    along: FloatArray
-    low: float
-    high: float
-    spacing: float
-    angle: float = 0.0
-    length: float = 0.0
-    width: float = 0.0
+    members: IntArray  # (k,) indices, in order along the row
+    middle: FloatArray  # (2,) m
+    along: FloatArray  # (2,) unit vector
+    low: float  # position along the row of the outer edge of its first slot, m from its middle
+    high: float  # the same for its last slot
+    spacing: float  # distance from slot to slot, m
+    angle: float = 0.0  # angle between row and cars, rad, 0 to π/2
+    length: float = 0.0  # length of a slot, m
+    width: float = 0.0  # width of a slot, m
 
     @property
     def left(self) -> FloatArray:
