@@ -50,7 +50,7 @@ def report(
 
     Examples:
         parkenv report results/compare
-        parkenv report results/compare --replay 3,17 --agents mdp,belief --out two.html
+        parkenv report results/compare --replay 3,17 --agents mdp --out two.html
         parkenv report results/survey --sessions 2
 
     Options:
@@ -86,9 +86,14 @@ def make_report(
     sessions: int = 1,
     frames: int = 120,
     out: Path | None = None,
+    drives: Sequence[dict[str, Any]] | None = None,
+    stage: str = "Running again",
     trust: bool = True,
-) -> None:
-    """Write the page; see `report` for the arguments.
+) -> Path:
+    """Write the page, and return its path.
+
+    The arguments are those of `report`; `drives` are survey drives that are already recorded (None: `sessions` of them
+    are driven again), and `stage` describes the progress bar.
 
     Raises:
         InputError: the folder holds no finished run of this version, not the chosen searches, or names classes that
@@ -120,18 +125,16 @@ def make_report(
     cases, too_large = _small_enough(_chosen(cases, replay, agents))
     notes += too_large
     encounters = choose(cases, wanted) if wanted else []
-    drives = range(min(sessions, surveys[1])) if surveys is not None else range(0)
+    again = range(min(sessions, surveys[1])) if surveys is not None and drives is None else range(0)
     counted = run.totals()
     tasks: list[Callable[[], dict[str, Any]]] = []
     for encounter in encounters:
         keys = [case.key(encounter.seed) for case in encounter.cases]
         tasks.append(partial(record, encounter, {k: counted[k] for k in keys if k in counted}))
     if surveys is not None:
-        tasks += [
-            partial(_drive_again, surveys[0], number, frames // max(len(drives), 1)) for number in drives
-        ]
+        tasks += [partial(_drive_again, surveys[0], number, frames // max(len(again), 1)) for number in again]
     with args.workers_of(machines) as workers, progress_bar(console) as progress:
-        bar = progress.add_task("Running again", total=len(tasks))
+        bar = progress.add_task(stage, total=len(tasks))
         done: list[dict[str, Any]] = []
         for recorded in workers.in_order(tasks):
             done.append(recorded)
@@ -139,10 +142,12 @@ def make_report(
     watched = done[: len(encounters)]
     notes += _differing(watched)
     path = out or folder / PAGE
-    write_page(run, page_data(run, watched, done[len(encounters) :], notes), path)
+    recorded = done[len(encounters) :] if drives is None else drives
+    write_page(page_data(run, watched, recorded, notes), path, run.figures)
     for note in notes:
         console.print(f"Note: {note}")
     console.print(f"Written: {path}, {path.stat().st_size / 1e6:.1f} MB")
+    return path
 
 
 def _run_again(run: RunFolder, spec: Spec | None) -> tuple[Surveys | None, Cases]:
@@ -263,4 +268,4 @@ def _survey(scenario: Any, settings: Any) -> Survey:
 def _drive_again(survey: Callable[[], Survey], number: int, frames: int) -> dict[str, Any]:
     from parkenv.evaluation.report.drive_recording import record_drive
 
-    return record_drive(survey(), number, frames)
+    return record_drive(survey(), number, most_frames=frames)[1]

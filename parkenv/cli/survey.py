@@ -46,7 +46,8 @@ def survey(
 
     Examples:
         parkenv survey --sessions 21
-        parkenv survey --scenario street --rig stereo --weather rain --hours 12:00-13:00
+        parkenv survey --scenario street --rig stereo --weather rain
+        parkenv survey --hours 12:00-13:00 --days weekend
         parkenv survey --scenario mini --sessions 1 --rerun drive.rrd
 
     Options:

@@ -56,11 +56,11 @@ def train(
 
     Examples:
         parkenv train maskable-ppo --scenario campus
-        parkenv train maskable-ppo --scenario my_lot.toml --steps 200000 --trainings 1
-        parkenv train ppo --clone mdp-tuned --test-on campus,street,jam --out results/cloned
+        parkenv train ppo --scenario my_lot.toml --steps 200000 --trainings 1
+        parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
         parkenv train ppo --beside results/maskable-ppo,results/dqn
         parkenv train sac --env drive --scenario campus,street --trainings 3
-        parkenv compare --agents mdp,maskable-ppo:results/maskable-ppo/seed_0/model.safetensors
+        parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
 
     Options:
         algorithm (ALGORITHM): To search: dqn, ppo, maskable-ppo (default), recurrent-ppo. To drive: sac, tqc, ppo

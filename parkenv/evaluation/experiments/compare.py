@@ -41,6 +41,7 @@ class Case:
     options: Mapping[str, Any] = field(default_factory=dict)  # options of the agent, for `make_agent`
     # detector for the rig's images, for `make_detector`; None for the packaged one
     detector: str | None = None
+    every: float | None = None  # least distance between the rig's captures, m; None for the environment's
 
     @property
     def label(self) -> str:
@@ -65,7 +66,7 @@ class Case:
 
     def run(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row]]:
         """Run one episode per seed; return rows of `episodes.csv` and of `timings.csv`."""
-        runner = self._runner()
+        runner = self.runner()
         rows, timings = [], []
         for seed in seeds:
             episode = runner.run(seed)
@@ -83,11 +84,12 @@ class Case:
 
     def trace(self, seed: int) -> SearchTrace:
         """Run one episode, and return its trace for a picture."""
-        return self._runner().run(seed).trace
+        return self.runner().run(seed).trace
 
-    def _runner(self) -> EpisodeRunner:
+    def runner(self) -> EpisodeRunner:
+        """Return a runner of this case's episodes."""
         agent = make_agent(self.agent, self.scenario, **self.options)
-        return EpisodeRunner(self.scenario, self.label, agent, self.rig, self.detector)
+        return EpisodeRunner(self.scenario, self.label, agent, self.rig, self.detector, self.every)
 
 
 def require_distinct(cases: Iterable[Case]) -> None:
