@@ -117,7 +117,7 @@ def test_survey_and_map_on_the_command_line(tmp_path):
             ["survey", "--rig", "sonar", "--out", tmp_path / "x"],
             "--rig: 'sonar' is not one of 'laser', 'stereo', 'both_sides'",
         ),
-        (["survey", "--weather", "snow", "--out", tmp_path / "x"], "weather is 'snow'"),
+        (["survey", "--weather", "snow", "--out", tmp_path / "x"], "--weather: 'snow' is not one of"),
     ):
         bad = parkenv(*words)
         assert bad.returncode == 2

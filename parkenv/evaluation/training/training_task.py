@@ -82,7 +82,7 @@ class TrainingTask(ABC):
         Raises:
             InputError: an invalid option, or a missing package.
         """
-        from planners.learned import algorithm_class
+        from planners.model_file import algorithm_class
 
         algorithm_class(self.algorithm)
 
