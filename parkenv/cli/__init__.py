@@ -25,6 +25,7 @@ from parkenv.cli import (
     occupancy,
     park,
     plan,
+    publish,
     report,
     run,
     schema,
@@ -56,6 +57,7 @@ add(app, "compare", compare.compare, SEARCH)
 add(app, "report", report.report, SEARCH)
 add(app, "plan", plan.plan, SEARCH)
 add(app, "train", train.train, SEARCH)
+add(app, "publish", publish.publish, SEARCH)
 add(app, "run", run.run, SEARCH)
 app.add_typer(benchmark.app, rich_help_panel=SEARCH)
 add(app, "survey", survey.survey, SENSE)

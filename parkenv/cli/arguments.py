@@ -8,6 +8,10 @@ Options:
         trained model; MODULE:CLASS for your own. Differences are to the first.  [default: all but exact]
     seed (N >= 0): First seed; episode i uses seed + i.
 
+Code of others:
+    trust: Run the classes (MODULE:CLASS) that the file or the folder of the run names.
+    trust_model: Convert archives of stable-baselines3 (ALGORITHM:FILE.zip) to model files; this runs the code in them.
+
 Sensors:
     rig (laser|stereo|both_sides): Observe slots through simulated sensors, detector and all, instead of the sensor
         model: about a second a step. laser: a camera and a 270° laser; stereo: a stereo camera; both_sides: a laser and

@@ -11,6 +11,7 @@ from parkenv.cli.command import add, group
 from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import command_line, make_console, make_table, progress_bar
+from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,6 +29,8 @@ def run(
     out: Path | None = None,
     *,
     by: str | None = None,
+    trust: bool = False,
+    trust_model: bool = False,
     folder: args.RunFolder,
     machines: args.Machines,
 ) -> None:
@@ -50,7 +53,10 @@ def run(
 
     out = out or Path("results") / suite
     base = args.saved(out, BenchmarkSpec) if folder.resume else BenchmarkSpec()
-    given = args.not_none(by=by, agents=None if agents is None else split_agents(agents))
+    if agents is None:
+        require_trust(base, out, trust)
+    named = None if agents is None else readable_models(split_agents(agents), trust_model)
+    given = args.not_none(by=by, agents=named)
     spec = base.changed(suite=suite, **given, **machines.given)
     with writing_into(out, f"--resume --out {out}"):
         run_suite(spec, out, folder)
@@ -131,7 +137,7 @@ def page(results: list[Path], /, out: Path = Path("results/benchmark.html")) -> 
     `parkenv benchmark check` is refused, and no page is written.
 
     Examples:
-        parkenv benchmark page results/v1 results/yours/result.json --out results/benchmark.html
+        parkenv benchmark page results/v1 yours/result.json --out v1.html
 
     Options:
         results (FILE|DIR): Result files, or folders with result.json files in them.

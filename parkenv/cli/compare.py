@@ -17,6 +17,7 @@ from parkenv.cli.tables import (
     print_recorded,
     progress_bar,
 )
+from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
 from parkenv.files.names import RigName
 
@@ -50,6 +51,8 @@ def compare(
     rig: RigName | None = None,
     figures: bool | None = None,
     rerun: Path | None = None,
+    trust: bool = False,
+    trust_model: bool = False,
     folder: args.RunFolder,
     machines: args.Machines,
 ) -> None:
@@ -92,6 +95,8 @@ def compare(
     sweep = costs.failure_cost == "sweep"
     if folder.resume:
         base = args.saved(out, ExperimentSpec)
+        if agents is None:
+            require_trust(base, out, trust)
     else:
         base = ExperimentSpec().changed(grid={"occupancy_levels": () if sweep else LEVELS})
     grid = costs.grid(base.grid)
@@ -107,7 +112,7 @@ def compare(
     grid = args.changed_axis(grid, "map_says", "--map-says", map_says)
     given = args.not_none(episodes=episodes, seed=seed, rig=rig, figures=figures)
     if agents is not None:
-        given["agents"] = split_agents(agents)
+        given["agents"] = readable_models(split_agents(agents), trust_model)
     scenarios = tuple(world.specs(scenario, base.scenarios))
     spec = base.changed(scenarios=scenarios, grid=grid, **given, **machines.given)
     with writing_into(out, f"--resume --out {out}"):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from parkenv.cli import arguments as args
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
+from parkenv.cli.trust import readable_models
 from parkenv.errors import InputError, nearest
 from parkenv.files.file_names import file_name
 
@@ -32,6 +33,7 @@ def park(
     occupied: float = 0.85,
     slack: float = 0.0,
     lot: str | None = None,
+    trust_model: bool = False,
     machines: args.Machines,
 ) -> None:
     """Evaluate agents that drive the car into a slot: success rate, planning time, driving time, manoeuvres.
@@ -41,7 +43,7 @@ def park(
 
     Examples:
         parkenv park --episodes 250 --scenario campus,street,jam
-        parkenv park --agents planner,sac:results/drive-sac/seed_0/model.zip
+        parkenv park --agents planner,sac:results/drive-sac/seed_0/model.safetensors
         parkenv park --lot parking_map.yml --way back-in
 
     Options:
@@ -70,7 +72,7 @@ def park(
         case = ParkingCase(build(spec).lot, kinds, ways, occupied, slack)
         case.environment().close()  # validates the options before the first episode
         cases.append(case)
-    labels = _labels(args.words("--agents", agents))
+    labels = _labels(readable_models(args.words("--agents", agents), trust_model))
     parking_agents = {label: make_parking_agent(name) for label, name in labels.items()}
     with writing_into(out):
         console = make_console()

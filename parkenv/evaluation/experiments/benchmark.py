@@ -21,7 +21,7 @@ import numpy as np
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
-from parkenv.evaluation.experiments.compare import Case, at_occupancy, table
+from parkenv.evaluation.experiments.compare import Case, at_occupancy, require_distinct, table
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.results import ResultFolder, Row
 from parkenv.files.limited_reading import read_json
@@ -112,11 +112,9 @@ class Suite:
         for world in worlds:
             for agent in agents:
                 make_agent(agent.name, world, **agent.options)
-        return [
-            (Case(world, agent.name, options=agent.options), self.seeds)
-            for world in worlds
-            for agent in agents
-        ]
+        cases = [Case(world, agent.name, options=agent.options) for world in worlds for agent in agents]
+        require_distinct(cases)
+        return [(case, self.seeds) for case in cases]
 
 
 def result_of(

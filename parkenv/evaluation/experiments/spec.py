@@ -228,3 +228,13 @@ class TrainingSpec(Workplace):
         if self.demonstrations is not None and self.clone is None:
             raise PydanticCustomError("whole", "demonstrations goes with clone")
         return self
+
+
+SPECS: dict[str, type[Workplace]] = {
+    "compare": ExperimentSpec,
+    "benchmark": BenchmarkSpec,
+    "survey": SurveySpec,
+    "demo": DemoSpec,
+    "train": TrainingSpec,
+}
+"""Specifications by the key `kind` of a file."""
