@@ -108,7 +108,7 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) 
         for part, old, new in _parts(name, was, its):
             if old != new:
                 raise InputError(
-                    f"--resume: {part} was {old!r} in {folder}, now it is {new!r}; "
+                    f"--resume: {part:.80} was {old!r:.200} in {folder}, now it is {new!r:.200}; "
                     "use the same settings, or another folder"
                 )
     return both
@@ -235,10 +235,13 @@ def _csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]], *, head
 
 
 def _append(path: Path, text: str) -> None:
-    with path.open("a", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
+    try:
+        with path.open("a", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror}; --resume goes on") from error
 
 
 def _read(path: Path, columns: Sequence[str]) -> list[Row]:
