@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from typer import Exit
-
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.report import PAGE, make_report
-from parkenv.cli.tables import make_console, save_summary
+from parkenv.cli.single_writer import writing_into
+from parkenv.cli.tables import command_line, make_console, make_table, save_summary
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.cli.training_task import Row, TrainingTask
     from parkenv.evaluation.experiments.spec import TrainingSpec
     from parkenv.evaluation.experiments.workers import Workers
     from parkenv.evaluation.training.rl_training import Training
+    from parkenv.evaluation.training.training_task import Row, TrainingTask
 
 
 def train(
@@ -56,11 +56,11 @@ def train(
 
     Examples:
         parkenv train maskable-ppo --scenario campus
-        parkenv train maskable-ppo --scenario my_lot.toml --steps 200000 --trainings 1
-        parkenv train ppo --clone mdp-tuned --test-on campus,street,jam --out results/cloned
+        parkenv train ppo --scenario my_lot.toml --steps 200000 --trainings 1
+        parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
         parkenv train ppo --beside results/maskable-ppo,results/dqn
         parkenv train sac --env drive --scenario campus,street --trainings 3
-        parkenv compare --agents mdp,maskable-ppo:results/maskable-ppo/seed_0/model.zip
+        parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
 
     Options:
         algorithm (ALGORITHM): To search: dqn, ppo, maskable-ppo (default), recurrent-ppo. To drive: sac, tqc, ppo
@@ -87,6 +87,7 @@ def train(
         beside (DIR[,...]): Folders of other trainings with the same evaluations, to draw in the same figure.
 
     Results:
+        resume: Continue from the checkpoints in --out; the models equal those of an unbroken training.
         tensorboard: Keep logs for TensorBoard in --out.
     """
     from parkenv.evaluation.experiments.agent_spec import split_agents
@@ -102,40 +103,43 @@ def train(
         demonstrations=demonstrations, k=k, evaluate_every=evaluate_every, evaluation_episodes=evaluation_episodes,
         tensorboard=tensorboard, **given, **machines.given,
     )  # fmt: skip
-    run_training(spec, out, folder, args.words("--beside", beside) if beside else ())
+    out = out or Path("results") / _task_of(spec).folder
+    with writing_into(out, "the same command with --resume"):
+        run_training(spec, out, folder, args.words("--beside", beside) if beside else ())
 
 
-def run_training(
-    spec: TrainingSpec, out: Path | None, folder: args.RunFolder, beside: Sequence[str] = ()
-) -> None:
+def _task_of(spec: TrainingSpec) -> TrainingTask:
+    from parkenv.evaluation.training.drive_task import DriveTask
+    from parkenv.evaluation.training.search_task import SearchTask
+
+    return DriveTask(spec) if spec.env == "drive" else SearchTask(spec)
+
+
+def run_training(spec: TrainingSpec, out: Path, folder: args.RunFolder, beside: Sequence[str] = ()) -> None:
     """Train, test and draw; see `train`.
 
     Raises:
         InputError: the training is impossible, or the folder cannot be used.
     """
-    from parkenv.cli.drive_task import DriveTask
-    from parkenv.cli.search_task import SearchTask
-    from parkenv.cli.training_task import curves_beside
-    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.training.rl_training import MODEL
+    from parkenv.evaluation.training.training_task import FIGURE, Trained, curves_beside
 
-    task = {"search": SearchTask, "drive": DriveTask}[spec.env](spec)
+    task = _task_of(spec)
     task.check()
     settings = {"version": __version__, **task.settings()}
-    out = out or Path("results") / task.folder
     others = curves_beside(beside, out, task)
-    make_folder(out)
     _require_free(out, settings, folder)
     console = make_console()
     with args.workers_of(spec) as workers:
-        training = task.training(console)
+        training = dataclasses.replace(task.training(console.status), command=tuple(command_line()))
         _claim(out, settings, folder.overwrite)
         spec.write(out / SPEC_FILE)
         numbers = range(spec.seed, spec.seed + spec.trainings)
         curves = _train_all(console, task, training, numbers, out, workers, spec.tensorboard)
         models = {n: out / f"seed_{n}" / MODEL for n in numbers}
-        outcome = task.report(console, workers, curves, models, out, others)
+        outcome, table = task.report(console.status, workers, Trained(curves, models, others), out / FIGURE)
+    console.print(make_table(*table))
     save_summary(out, spec.seed, outcome.pop("rows"), settings=settings, **outcome)
     console.print(f"Models, curves, summary and figure are in {out}")
     if folder.report:
@@ -161,8 +165,8 @@ def _claim(out: Path, settings: Row, overwrite: bool) -> None:
     """Write the settings of the new training, and remove the results of the previous one."""
     import shutil
 
-    from parkenv.cli.training_task import FIGURE
     from parkenv.evaluation.experiments.results import SUMMARY, write_settings
+    from parkenv.evaluation.training.training_task import FIGURE
 
     # Delete the summary: a folder without one holds an unfinished training.
     for outcome in (SUMMARY, PAGE, FIGURE):
@@ -213,9 +217,6 @@ def _train_all(
             for i, trained in workers.results(tasks):
                 trained.save(out / f"seed_{seeds[i]}")
                 curves[i] = trained.curve
-        except KeyboardInterrupt:
-            console.print(f"Interrupted. Checkpoints are in {out}; the same command with --resume goes on.")
-            raise Exit(130) from None
         finally:
             over.set()
             watcher.join()

@@ -358,6 +358,15 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._done = self._done & ~which
         return self._observations(), {}
 
+    def get_state(self) -> tuple[NDArray[Any], ...]:
+        """Return a copy of the state of all searches, for `set_state`."""
+        return self._searches.save()
+
+    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
+        """Continue from a state that `get_state` returned for the same scenarios; no search in it may be over."""
+        self._searches.restore(state)
+        self._begun, self._done = True, self._nobody
+
     def step(
         self, actions: IntArray
     ) -> tuple[dict[str, NDArray[Any]], FloatArray, BoolArray, BoolArray, dict[str, Any]]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import traceback
 from importlib import import_module
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,12 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
     if not isinstance(found, type) or not callable(getattr(found, method.partition("(")[0], None)):
         raise InputError(f"{kind} {name!r}: has no method {method}")
     return found
+
+
+def find_module(name: str) -> str | None:
+    """Return where the module of `MODULE:CLASS` would be imported from, without importing it; None if nowhere."""
+    found = PathFinder.find_spec(name.partition(":")[0].partition(".")[0], [str(Path.cwd()), *sys.path])
+    return None if found is None else found.origin
 
 
 def file_of_class(name: str) -> Path | None:
