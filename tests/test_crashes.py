@@ -8,9 +8,6 @@ from pathlib import Path
 import pytest
 from command_line import PARKENV, parkenv
 
-from parkenv.errors import InputError
-from parkenv.evaluation.experiments.results import TIMING_COLUMNS, ResultFolder
-
 
 def failing(error):
     def fail(*_, **__):
@@ -36,15 +33,6 @@ def test_a_full_disk_is_no_error_of_ours(monkeypatch):
     monkeypatch.setattr("parkenv.lots.load_lot", failing(OSError(errno.ENOSPC, "No space left on device")))
     ended = parkenv("lot", "show", "mini")
     assert (ended.returncode, ended.stderr) == (2, "parkenv: error: No space left on device\n")
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a full device")
-def test_a_disk_that_fills_up_while_episodes_are_appended_is_named(tmp_path):
-    folder = ResultFolder(tmp_path, {})
-    (tmp_path / "timings.csv").unlink()
-    (tmp_path / "timings.csv").symlink_to("/dev/full")
-    with pytest.raises(InputError, match=r"timings.csv: cannot be written: No space left on device"):
-        folder.add([], [dict.fromkeys(TIMING_COLUMNS, "1")])
 
 
 def test_a_reader_that_ends_is_not_complained_about():

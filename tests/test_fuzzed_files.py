@@ -95,7 +95,7 @@ def resumed_trips(path):
 def reported(path):
     run = RunFolder.read(path.parent)
     run.totals()
-    write_page(run, page_data(run, [], []), path.with_name("report.html"))
+    write_page(page_data(run), path.with_name("report.html"), run.figures)
 
 
 def benchmark(path):
