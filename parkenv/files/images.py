@@ -59,6 +59,13 @@ def decode_image(data: bytes, name: str) -> Image:
         raise InputError(f"{name}: is no image that can be read whole; want {', '.join(SUFFIXES)}") from error
 
 
+def image_text(path: Path, key: str) -> str | None:
+    """Return a text that a PNG file carries beside its image (of one that `read_image` has read), or None."""
+    with PillowImage.open(io.BytesIO(read_bytes(path)), formats=_FORMATS) as opened:
+        text = opened.info.get(key)
+    return text if isinstance(text, str) else None
+
+
 def images_in(folder: Path) -> list[Path]:
     """Return the image files in a folder and its subfolders, in natural order of their names.
 
