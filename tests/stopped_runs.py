@@ -22,7 +22,7 @@ from parkenv.evaluation.training.rl_training import CHECKPOINT
 COMMANDS = {
     "compare": "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --occupancy-levels none --no-figures",
     "survey": "survey --scenario mini --sessions 3 --every 6",
-    "calibrate": "calibrate --scenario mini -n 6",
+    "calibrate": "calibrate --scenario mini -n 3",
     "benchmark": "benchmark run v1 --agents first-free",
     "train": "train ppo --scenario mini --steps 16000 --trainings 2 --evaluate-every 4000 --evaluation-episodes 16 "
     "--agents none",
@@ -38,7 +38,7 @@ class Run:
 
     def __init__(self, name, out, *options):
         script = out.with_name("parkenv")
-        script.write_text("from parkenv.cli import main\nmain()\n")
+        script.write_text("from parkenv.cli import main\nif __name__ == '__main__':\n    main()\n")
         self.mark = f"PARKENV_STOPPED_RUN={uuid.uuid4()}"
         self.started = time.monotonic()
         self.process = subprocess.Popen(
