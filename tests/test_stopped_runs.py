@@ -15,7 +15,7 @@ from pathlib import Path
 import killed_once
 import pytest
 from command_line import parkenv
-from stopped_runs import COMMANDS, Run, finished, result_of, resumed, trials
+from stopped_runs import COMMANDS, Run, finished, result_of, resume, trials
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments import workers
@@ -56,7 +56,7 @@ def test_a_stopped_run_leaves_no_process_and_is_resumed_to_the_same_result(
         assert code == -signal.SIGKILL
     kept = (out / file).read_text().splitlines()
     assert len(kept) > lines
-    assert resumed(name, out)
+    resume(name, out)
     assert set(kept[1:-1]) <= set((out / file).read_text().splitlines())
     finished(name, tmp_path / "whole")
     assert result_of(name, out) == result_of(name, tmp_path / "whole")
