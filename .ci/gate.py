@@ -142,6 +142,8 @@ class Run:
             "SCRATCH": str(self.scratch),
             "PYTHONWARNINGS": "default",
             "NUMBA_CACHE_DIR": str(self.scratch / "compiled"),
+            # Stages share the cores; torch's threads would wait for each other by spinning.
+            "OMP_NUM_THREADS": "1",
         }
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(

@@ -5,8 +5,18 @@ Importing this package registers the environments; heavy modules are loaded on f
 
 from __future__ import annotations
 
+import signal
+import sys
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+# Ctrl-C ends the command without a traceback, also while it imports its modules.
+if (
+    ("parkenv" in [Path(name).stem for name in sys.argv[:1]] or sys.orig_argv[1:3] == ["-m", "parkenv"])
+    and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+):  # fmt: skip
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 from gymnasium.envs.registration import register, registry
 

@@ -18,8 +18,7 @@ from parkenv.errors import InputError, nearest
 from parkenv.files.user_class import file_of_class, load_class
 from parkenv.world.occupancy import World
 from parkenv.world.scenario import SearchProblem
-from planners.learned import ALGORITHMS
-from planners.names import AGENTS
+from planners.names import AGENTS, ALGORITHMS
 
 Observation = Mapping[str, Any]
 Memory = TypeVar("Memory")
@@ -148,8 +147,8 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
 
     Args:
         name: one of `planners.names.AGENTS`; `ALGORITHM:FILE` for a model of `parkenv train`, such as
-            `ppo:models/ppo.zip`; or `MODULE:CLASS` for your own agent, such as `my_agents:Patient`: a class whose first
-            argument is the problem. The module may be in the working directory.
+            `ppo:ppo.safetensors`; or `MODULE:CLASS` for your own agent, such as `my_agents:Patient`: a class whose
+            first argument is the problem. The module may be in the working directory.
         scenario: the scenario; its hidden occupancy is not passed to the agent.
         options: options of the agent, such as `failure_s=5.0` for "mdp".
 
@@ -184,6 +183,19 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
         if option not in known:
             raise InputError(f"agent {name!r} has no option {option!r}; {nearest(option, known)}")
     return agent(scenario, **options)
+
+
+def shown_name(name: str) -> str:
+    """Return the name of an agent for tables: the attribute `name` of a user's class, if it has one.
+
+    Args:
+        name: a name that `make_agent` accepts.
+    """
+    before, colon, _ = name.partition(":")
+    if not colon or before in ALGORITHMS:
+        return name
+    own = getattr(load_class(name, "agent", "predict"), "name", None)
+    return own if isinstance(own, str) and own else name
 
 
 def agent_file(name: str) -> Path | None:

@@ -1,4 +1,4 @@
-"""Names of the agents that come with the package, without the modules behind them."""
+"""Names of the agents that come with the package and of learning algorithms, without the modules behind them."""
 
 from __future__ import annotations
 
@@ -15,6 +15,15 @@ AGENTS: dict[str, tuple[str, str]] = {
     "exact": ("planners.bounds.exact", "ExactAgent"),
 }
 """Module and class of each agent; modules are imported when an agent is made."""
+ALGORITHMS = {
+    "dqn": ("stable_baselines3", "DQN"),
+    "ppo": ("stable_baselines3", "PPO"),
+    "maskable-ppo": ("sb3_contrib", "MaskablePPO"),
+    "recurrent-ppo": ("sb3_contrib", "RecurrentPPO"),
+    "sac": ("stable_baselines3", "SAC"),
+    "tqc": ("sb3_contrib", "TQC"),
+}
+"""Module and class of each learning algorithm; `ALGORITHM:FILE` names a trained model."""
 SMALL_LOTS_ONLY = ("exact",)
 """Agents for small lots and sensors without errors only."""
 AGENT_NAMES = tuple(name for name in AGENTS if name not in SMALL_LOTS_ONLY)

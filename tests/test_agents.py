@@ -80,6 +80,28 @@ def test_an_agent_of_your_own_is_named_by_module_and_class(tmp_path, monkeypatch
             make_agent(name, scenario, **options)
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        (":X", "want MODULE:CLASS; nor is it"),
+        ("..odd:X", "want MODULE:CLASS"),
+        ("odd_agents:", "want MODULE:CLASS"),
+        ("odd_agents:X", r"its module fails: SyntaxError: .*odd_agents.py, line 1"),
+        ("failing_agents:X", r"its module fails: ZeroDivisionError: .*failing_agents.py, line 1\)"),
+        ("needy_agents:X", "its module needs 'no_such_package', which is not installed"),
+    ],
+)
+def test_modules_of_agents_that_cannot_be_imported_are_named(tmp_path, monkeypatch, name, message):
+    (tmp_path / "odd_agents.py").write_text("def x(:\n")
+    (tmp_path / "failing_agents.py").write_text("1 / 0\n")
+    (tmp_path / "needy_agents.py").write_text("import no_such_package\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.path", list(sys.path))
+    with pytest.raises(InputError, match=message) as caught:
+        make_agent(name, make_scenario("mini"))
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("name", AGENT_NAMES)
 def test_agents_get_the_public_part_of_a_scenario_only(name):
     agent = make_agent(name, make_scenario("campus"))

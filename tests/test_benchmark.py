@@ -1,8 +1,10 @@
 """Benchmark suites: results can be checked, and altered ones are rejected."""
 
 import json
+import re
 from dataclasses import replace
 
+import jsonschema
 import pytest
 from command_line import parkenv
 
@@ -12,6 +14,7 @@ from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.benchmark import Suite, check_result, result_of
 from parkenv.evaluation.experiments.compare import run_cases
 from parkenv.evaluation.experiments.results import ResultFolder, write_summary
+from parkenv.evaluation.report.page import SCHEMA
 
 AGENTS = ("first-free", "greedy-goal")
 
@@ -80,6 +83,33 @@ def test_what_was_altered_or_left_out_is_found(result, small, tmp_path, monkeypa
     change(altered)
     with pytest.raises(InputError, match=wanted):
         checked(altered, small, tmp_path, monkeypatch)
+
+
+def test_results_are_compared_on_a_page_and_a_bad_one_is_refused(result, small, tmp_path, monkeypatch):
+    monkeypatch.setattr(benchmark.Suite, "named", classmethod(lambda cls, name: small))
+    theirs = json.loads(json.dumps(result)) | {"by": "</script><b>", "command": ["parkenv", "run", "a b"]}
+    for name, content in (("ours", result), ("theirs", theirs)):
+        (tmp_path / name).mkdir()
+        write_summary(tmp_path / name, content, "result.json")
+    page = tmp_path / "page.html"
+    made = parkenv("benchmark", "page", tmp_path, "--out", page)
+    assert (made.returncode, "4 agents in 2 results" in made.stdout) == (0, True), made.stderr
+    data = json.loads(re.search(r'id="report-data">(.*?)</script>', page.read_text(), flags=re.DOTALL)[1])
+    jsonschema.validate(data, json.loads(SCHEMA.read_text()))
+    scores, commands, tasks = data["tables"]
+    rows = [dict(zip([c["key"] for c in scores["columns"]], row, strict=True)) for row in scores["rows"]]
+    assert {row["agent"]: row["score"][0] for row in rows} == pytest.approx(result["scores"])
+    assert [row["score"] for row in rows] == sorted((row["score"] for row in rows), reverse=True)
+    assert all(low < score < high for score, low, high in (row["score"] for row in rows))
+    assert {row["by"] for row in rows} == {"", "</script><b>"}
+    assert {row["date"] for row in rows} == {result["date"]}
+    assert "parkenv run 'a b'" in [row[1] for row in commands["rows"]]
+    assert len(tasks["rows"]) == 2 * len(result["rows"])
+    page.unlink()
+    write_summary(tmp_path / "theirs", theirs | {"suite_sha256": "0" * 64}, "result.json")
+    bad = parkenv("benchmark", "page", tmp_path, "--out", page)
+    assert (bad.returncode, bad.stderr.count("\n"), page.exists()) == (2, 1, False)
+    assert "theirs" in bad.stderr
 
 
 def test_suites_do_not_change():

@@ -115,30 +115,6 @@ def test_a_killed_run_leaves_what_was_done_and_resumes(tmp_path):
     assert "mini.arrivals.days was 'weekdays'" in other.stderr
 
 
-def test_interrupting_writes_what_is_done(tmp_path):
-    out = tmp_path / "interrupted"
-    process = subprocess.Popen(
-        [*PARKENV, *map(str, small(out, "--jobs", "1", agents="mdp", episodes=5000))],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        # A shell's background jobs, and what they start, ignore the signal.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
-    deadline = time.monotonic() + 300
-    while time.monotonic() < deadline:
-        if (out / "episodes.csv").exists() and len((out / "episodes.csv").read_text().splitlines()) > 20:
-            break
-        time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=300)
-    assert process.returncode == 130, errors
-    assert f"--resume --out {out} goes on" in " ".join(output.split())
-    summary = json.loads((out / "summary.partial.json").read_text())
-    assert summary["complete"] is False
-    assert summary["rows"][0]["episodes"] == len(episodes_of(out)) >= 20
-
-
 def test_figures_and_occupancy_levels(tmp_path):
     done = parkenv(
         "compare", "--scenario", "mini", "--agents", "greedy-goal,oracle", "-n", 12,
@@ -172,6 +148,11 @@ def test_the_sweep_over_failure_costs_tells_seen_slots_from_unseen_ones(tmp_path
     blind = [tries["mini-blind", cost]["total_s"] for cost in (0.0, 8.0, 30.0, 120.0)]
     assert blind == sorted(blind)
     assert tries["mini-blind", 120.0]["failed_parks"] > 0.0
+    # Other costs replace the whole sweep, with its searches without observations.
+    done = parkenv("compare", "--resume", "--failure-cost", 5, "--no-figures", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "summary.json").read_text())["rows"]
+    assert [(r["scenario"], r["failure_cost_s"]) for r in rows] == [("mini", 5.0), ("mini", 5.0)]
 
 
 def test_agents_may_be_given_maps_that_are_wrong(tmp_path):
@@ -458,7 +439,7 @@ def test_words_for_sight_are_checked(tmp_path):
             "--sensor-model is 'keen', want perfect, blind, laser, stereo or a file (.json)",
         ),
         (("--sensor-model", tmp_path / "odd.json"), "odd.json: want a sighting model, a JSON object"),
-        (("--rig", "radar"), "rig is 'radar', want 'laser', 'stereo' or 'both_sides'"),
+        (("--rig", "radar"), "--rig: 'radar' is not one of 'laser', 'stereo', 'both_sides'"),
         (("--agents", "mdp(solver=guess)"), "solver is 'guess', want one of"),
         (("--agents", "belief(budget_ms=-1)"), "budget_ms is -1"),
     ):

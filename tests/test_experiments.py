@@ -79,7 +79,7 @@ def test_a_file_is_run_and_its_folder_says_what_was_run(tmp_path, sweep):
     assert (out / "episodes.csv").read_text() == episodes
     assert parkenv("compare", "--resume", "-n", 5, "--out", out).returncode == 0
     assert {row["episodes"] for row in summary_of(out)["rows"]} == {5}
-    assert ExperimentSpec.read(out / SPEC_FILE) == kept.changed(episodes=5, jobs=0)
+    assert ExperimentSpec.read(out / SPEC_FILE) == kept.changed(episodes=5)
 
     # A changed file of the experiment is detected.
     (tmp_path / "own.toml").write_text('lot = "mini"\ncosts = { give_up_s = 70 }\n')

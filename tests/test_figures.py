@@ -4,14 +4,15 @@ import pytest
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
+from PIL import Image
 
 from parkenv import make_scenario
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.episodes import EpisodeRunner, SearchTrace
 from parkenv.evaluation.experiments.results import episode_key
-from parkenv.evaluation.figures import time_figures
-from parkenv.evaluation.figures.picture_files import INK, save_picture
+from parkenv.evaluation.figures import search_pictures, time_figures
+from parkenv.evaluation.figures.picture_files import CAPTION, INK, save_picture
 from parkenv.evaluation.figures.rates_picture import save_rates
 from parkenv.evaluation.figures.registry import FIGURES, ComparisonResults, draw_figures, remove_figures
 from parkenv.evaluation.figures.search_pictures import BELIEF_MAP, draw_search, draw_searches
@@ -296,13 +297,39 @@ def test_every_registered_figure_can_be_drawn_and_only_those_are_removed(tmp_pat
     assert [file.name for file in tmp_path.iterdir()] == ["map.png"]
 
 
+def test_the_fastest_agent_and_belief_are_among_the_searches_drawn(monkeypatch):
+    names = ["greedy-goal", "random", "mdp-static", "first-free", "mdp-tuned", "belief", "oracle"]
+    mini = make_scenario("mini")
+    cases = [(Case(mini, name), range(1)) for name in names]
+    table = [row(name, scenario="mini", drive=10.0 if name == "mdp-tuned" else 30.0) for name in names]
+    monkeypatch.setattr(Case, "trace", lambda self, seed: self.agent)
+    monkeypatch.setattr(search_pictures, "draw_searches", lambda traces: traces)
+    drawn = search_pictures.searches(ComparisonResults(cases, {}, table))
+    assert [traces for *_, traces in drawn] == [["greedy-goal", "mdp-tuned", "belief", "oracle"]]
+
+
+def test_a_single_search_has_no_band():
+    ax = axes()
+    rows = [
+        row("mdp", occupancy=o) | {"total_s_ci95": ci}
+        for o, ci in ((0.5, [None, None]), (0.8, [80.0, 110.0]))
+    ]
+    time_figures._draw_lines(
+        ax, [*rows, row("mdp", occupancy=0.9)], 200.0, lambda row: 100.0 * row["occupancy"]
+    )
+    (band,) = ax.collections
+    assert min(path.vertices[:, 0].min() for path in band.get_paths()) == 80.0
+
+
 def test_only_asked_for_figures_are_drawn(tmp_path):
-    flat = {"mini-map-says-0.5": ("mini", 0.5)}
-    table = [row(name, scenario=s) for name in ("mdp", "oracle") for s in ("mini", *flat)]
+    flat = {"my_lot-map-says-0.5": ("my_lot", 0.5)}
+    table = [row(name, scenario=s) for name in ("mdp", "oracle") for s in ("my_lot", *flat)]
     files = draw_figures(
         ComparisonResults([], {}, table, (), flat), tmp_path, ("time_split", "time_against_map")
     )
-    assert [file.name for file in files] == ["time_split_mini.png", "time_against_map_mini.png"]
+    assert [file.name for file in files] == ["time_split_my_lot.png", "time_against_map_my_lot.png"]
+    with Image.open(files[0]) as opened:
+        assert opened.info[CAPTION] == "Where the time goes: my_lot"
 
 
 def test_a_parking_cost_is_in_the_key_only_where_slots_have_one():

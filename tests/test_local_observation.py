@@ -171,6 +171,6 @@ def test_a_lot_smaller_than_k_is_told_of_as_far_as_it_goes():
 def test_wrong_use_is_refused():
     with pytest.raises(TypeError, match="wraps parkenv/Search-v1, not CartPoleEnv"):
         LocalObservation(gym.make("CartPole-v1"))
-    for wrong in (0, -1, 2.5, True):
+    for wrong in (0, -1, 2.5, True, 10**9):
         with pytest.raises(InputError, match=f"k is {wrong}"):
             LocalObservation(gym.make("parkenv/Search-v1", scenario="mini"), wrong)

@@ -5,13 +5,13 @@ from types import SimpleNamespace
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 import parkenv  # noqa: F401  (registers the environments)
 from parkenv import make_scenario
 from parkenv.envs import rendering
 from parkenv.envs.rendering import SearchRenderer, belief_colors, clock
 from parkenv.envs.window import Window
-from parkenv.errors import InputError
 from parkenv.lots import city_lot
 from parkenv.world.lot import PARK, Lane, ParkingLot
 from parkenv.world.occupancy import Arrival, OccupancyProcess
@@ -241,6 +241,5 @@ def test_window(monkeypatch):
 
 def test_a_window_without_pygame_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    window = Window("a title")
-    with pytest.raises(InputError, match=r'pip install "parkenv\[human\]"'):
-        window.show(np.zeros((480, 640, 3), dtype=np.uint8), 8)
+    with pytest.raises(gym.error.DependencyNotInstalled, match=r'pip install "parkenv\[human\]"'):
+        check_env(gym.make("parkenv/Search-v1", scenario="mini").unwrapped)

@@ -134,6 +134,22 @@ def test_tables_sort_by_click_and_by_enter(page):
     assert heading.get_attribute("aria-sort") == "none"
 
 
+def test_a_table_that_does_not_fit_says_so_and_keeps_its_agents_in_sight(page):
+    box, hint = one(page, "#tables .scroll"), one(page, "#tables .more")
+    assert page.execute_script("return arguments[0].scrollWidth > arguments[0].clientWidth", box)
+    assert hint.is_displayed()
+    left = one(page, 'td[data-key="agent"]').rect["x"]
+    page.execute_script("arguments[0].scrollLeft = 300", box)
+    assert one(page, 'td[data-key="agent"]').rect["x"] <= left
+    assert one(page, 'td[data-key="agent"]').rect["x"] >= box.rect["x"]
+
+
+def test_it_says_which_worlds_it_replays(page):
+    data = json.loads(one(page, "#report-data").get_attribute("textContent"))
+    seeds = sorted({world["seed"] for world in data["worlds"]})
+    assert f"Seeds {', '.join(map(str, seeds))} of this run" in one(page, "#search-replay .quiet").text
+
+
 def test_a_setting_can_be_looked_at_alone(page):
     chips = every(page, "#tables .chips button")
     assert len(chips) == 3
@@ -165,6 +181,8 @@ def test_the_keyboard_plays_and_steps(page, run):
         assert seconds(page) == pytest.approx(expected, abs=0.006)
     keys.send_keys(Keys.ARROW_LEFT).perform()
     assert seconds(page) == pytest.approx(moments[4], abs=0.006)
+    keys.send_keys(Keys.HOME).perform()
+    assert seconds(page) == 0.0
     keys.send_keys(Keys.SPACE).perform()
     assert one(page, "#replay .play").get_attribute("aria-label") == "Pause"
     keys.send_keys(Keys.SPACE).perform()

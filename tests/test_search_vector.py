@@ -304,7 +304,8 @@ def test_a_lot_of_ten_thousand_slots_touches_only_what_is_near():
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"num_envs": 0}, "num_envs is 0, want a whole number of at least 1"),
+        ({"num_envs": 0}, "num_envs is 0, want a whole number from 1 to 1,000,000"),
+        ({"num_envs": 10**9}, "num_envs is 1000000000, want a whole number from 1 to 1,000,000"),
         ({"num_envs": -3}, "num_envs is -3"),
         ({"num_envs": 2.5}, "num_envs is 2.5"),
         ({"num_envs": True}, "num_envs is True"),

@@ -58,7 +58,7 @@ def test_a_killed_worker_loses_its_own_task_which_is_run_again(tmp_path, backend
 
 def test_workers_that_die_again_and_again_end_the_run_with_a_word():
     with Workers(2) as workers, pytest.raises(RuntimeError, match="3 times in a row a loky worker died"):
-        list(workers.results([killed_once.die]))
+        list(workers.results([killed_once.die] * 2))
 
 
 def wrapped_interruption():

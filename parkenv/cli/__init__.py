@@ -25,6 +25,7 @@ from parkenv.cli import (
     occupancy,
     park,
     plan,
+    publish,
     report,
     run,
     schema,
@@ -34,6 +35,7 @@ from parkenv.cli import (
     train,
 )
 from parkenv.cli.command import add, group
+from parkenv.cli.stop_signals import stop_signals
 from parkenv.errors import InputError
 from sim_sensors.errors import SensorError
 
@@ -55,6 +57,7 @@ add(app, "compare", compare.compare, SEARCH)
 add(app, "report", report.report, SEARCH)
 add(app, "plan", plan.plan, SEARCH)
 add(app, "train", train.train, SEARCH)
+add(app, "publish", publish.publish, SEARCH)
 add(app, "run", run.run, SEARCH)
 app.add_typer(benchmark.app, rich_help_panel=SEARCH)
 add(app, "survey", survey.survey, SENSE)
@@ -89,30 +92,42 @@ def _global_options(
 
 
 def main() -> None:
-    """Entry point; invalid input gives one line on standard error and exit code 2, an error of parkenv's own 70."""
+    """Entry point; exit codes: 2 for invalid input, 70 for an error of parkenv's own, 128 + n after signal n."""
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Names may hold what the terminal cannot show.
         sys.stdout.reconfigure(errors="backslashreplace")
     warnings.formatwarning = lambda message, *_: f"parkenv: warning: {message}\n"
-    try:
-        code = app(standalone_mode=False, prog_name="parkenv")
-    except (InputError, SensorError) as error:
-        sys.exit(_complain(str(error)))
-    except typer.TyperException as error:
-        pattern = r"Invalid value for '([^']+)'(?: / '[^']+')*: (?:Value error, )?"
-        message = re.sub(pattern, r"\1: ", error.format_message()).rstrip(".")
-        path = getattr(getattr(error, "ctx", None), "command_path", "parkenv")
-        # Without a command, the help has already been printed.
-        sys.exit(_complain(f"{message}; see {path} --help") if message else 2)
-    except typer.Abort:
-        sys.exit(130)
-    except OSError as error:
-        if error.filename is None and error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-            sys.exit(_report_crash(error))
-        sys.exit(_complain(": ".join(str(part) for part in (error.filename, error.strerror) if part)))
-    except Exception as error:
-        sys.exit(_report_crash(error))
+    with stop_signals() as received:
+        try:
+            code = app(standalone_mode=False, prog_name="parkenv")
+        except (Exception, KeyboardInterrupt) as error:
+            # Libraries turn an interruption into errors of their own, such as failed imports.
+            code = None if received else _report(error)
+    if received:
+        code = 128 + received[0]
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _report(error: BaseException) -> int:
+    """Print an error in a line; return the exit code."""
+    match error:
+        case InputError() | SensorError():
+            return _complain(str(error))
+        case typer.TyperException():
+            pattern = r"Invalid value for '([^']+)'(?: / '[^']+')*: (?:Value error, )?"
+            message = re.sub(pattern, r"\1: ", error.format_message()).rstrip(".")
+            path = getattr(getattr(error, "ctx", None), "command_path", "parkenv")
+            # Without a command, the help has already been printed.
+            return _complain(f"{message}; see {path} --help") if message else 2
+        case typer.Abort() | KeyboardInterrupt():
+            return 130
+        case OSError() if error.filename is not None or error.errno in (
+            errno.ENOSPC,
+            errno.EDQUOT,
+            errno.EFBIG,
+        ):
+            return _complain(": ".join(str(part) for part in (error.filename, error.strerror) if part))
+    return _report_crash(error)
 
 
 def _complain(message: str) -> int:
@@ -121,7 +136,7 @@ def _complain(message: str) -> int:
     return 2
 
 
-def _report_crash(error: Exception) -> int:
+def _report_crash(error: BaseException) -> int:
     """Keep the traceback of an unforeseen error in a file, and name it; return the exit code of such errors."""
     text = "".join(traceback.format_exception(error))
     try:

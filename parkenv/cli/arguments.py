@@ -8,6 +8,10 @@ Options:
         trained model; MODULE:CLASS for your own. Differences are to the first.  [default: all but exact]
     seed (N >= 0): First seed; episode i uses seed + i.
 
+Code of others:
+    trust: Run the classes (MODULE:CLASS) that the file or the folder of the run names.
+    trust_model: Convert archives of stable-baselines3 (ALGORITHM:FILE.zip) to model files; this runs the code in them.
+
 Sensors:
     rig (laser|stereo|both_sides): Observe slots through simulated sensors, detector and all, instead of the sensor
         model: about a second a step. laser: a camera and a 270° laser; stereo: a stereo camera; both_sides: a laser and
@@ -217,7 +221,7 @@ class Machines:
     """Where tasks run; the results do not depend on it.
 
     Machines:
-        jobs, -j (N >= 0): Worker processes.  [default: all cores]
+        jobs, -j (N >= 0): Worker processes, at most one per core and per task.  [default: 0, all cores]
         backend (loky|ray|dask): Run workers on this machine (loky), or on a Ray or Dask cluster (extras ray, dask).
             [default: loky]
         address (HOST:PORT): Of the cluster: Ray's head, HOST:6379 or ray://HOST:10001; Dask's scheduler,
@@ -230,8 +234,8 @@ class Machines:
 
     @property
     def given(self) -> dict[str, Any]:
-        """The options that are given, as fields of a specification."""
-        return not_none(**asdict(self))
+        """The options that are given, as fields of a specification; another backend does not keep a saved address."""
+        return not_none(**asdict(self)) | ({"address": self.address} if self.backend else {})
 
     def workers(self) -> Workers:
         """Return the workers, a context manager; see `workers_of`."""

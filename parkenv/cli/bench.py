@@ -39,9 +39,9 @@ def bench(
 
     Options:
         parts (PART): Some of sensors, perception, planning, env, drive.  [default: all]
-        seconds (X >= 0.01): How long each figure is measured.
+        seconds (0.01 <= X <= 3600): How long each figure is measured.
         seed (N >= 0): Of the lots and the noise.
-        out, -o (DIR): Folder for summary.json.  [default: none]
+        out, -o (DIR): Folder for summary.json, and a table of each part for a page.  [default: none]
     """
     from parkenv.evaluation.experiments.results import make_folder
 
@@ -56,8 +56,11 @@ def bench(
     rows: list[BenchRow] = []
     for part in chosen:
         with console.status(f"Measuring {part}"):
-            measured = getattr(import_module(f"parkenv.evaluation.bench.{part}"), PARTS[part])
-            rows += measured(seed, seconds)
+            measure = getattr(import_module(f"parkenv.evaluation.bench.{part}"), PARTS[part])
+            measured = measure(seed, seconds)
+        rows += measured
+        if out is not None:
+            (out / f"{part}.md").write_text(_markdown(measured), encoding="utf-8")
     cells = []
     before = None
     for row in rows:
@@ -68,7 +71,21 @@ def bench(
     console.print(make_table(None, ["part", "case", "value", "unit", "peer", "peer's", "ratio"], cells))
     if out is not None:
         save_summary(out, seed, rows)
-        console.print(f"Written: {out / 'summary.json'}")
+        console.print(f"Written: {out / 'summary.json'}, and a table of each part, PART.md")
+
+
+def _markdown(rows: list[BenchRow]) -> str:
+    """Return the rows of one part as a table for a page: a line a case, with all of its peers."""
+    lines = ["| | ours | peers | ratio |", "|---|---|---|---|"]
+    cases = dict.fromkeys(
+        (row["case"], row["value"], row["unit"]) for row in rows if row["value"] is not None
+    )
+    for case, value, unit in cases:
+        peers = [row for row in rows if row["case"] == case and row["unit"] == unit and row["peer"]]
+        theirs = "; ".join(f"{row['peer']}: {_figure(row['peer_value'])}" for row in peers)
+        ratios = "; ".join(_figure(row["ratio"]) for row in peers)
+        lines.append(f"| {case} | {_figure(value)} {unit} | {theirs} | {ratios} |")
+    return "\n".join(lines) + "\n"
 
 
 def _figure(value: float | None) -> str:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from typer import Exit
-
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.command import add, group
 from parkenv.cli.report import make_report
+from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import command_line, make_console, make_table, progress_bar
+from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
@@ -28,6 +28,9 @@ def run(
     agents: str | None = None,
     out: Path | None = None,
     *,
+    by: str | None = None,
+    trust: bool = False,
+    trust_model: bool = False,
     folder: args.RunFolder,
     machines: args.Machines,
 ) -> None:
@@ -43,14 +46,20 @@ def run(
     Options:
         suite (SUITE): The suite.  [default: v1]
         out, -o (DIR): Folder for result.json and the episodes.  [default: results/SUITE]
+        by (TEXT): Who submits the result: a name, an address of the code.  [default: nobody]
     """
     from parkenv.evaluation.experiments.agent_spec import split_agents
     from parkenv.evaluation.experiments.spec import BenchmarkSpec
 
     out = out or Path("results") / suite
     base = args.saved(out, BenchmarkSpec) if folder.resume else BenchmarkSpec()
-    given = {} if agents is None else {"agents": split_agents(agents)}
-    run_suite(base.changed(suite=suite, **given, **machines.given), out, folder)
+    if agents is None:
+        require_trust(base, out, trust)
+    named = None if agents is None else readable_models(split_agents(agents), trust_model)
+    given = args.not_none(by=by, agents=named)
+    spec = base.changed(suite=suite, **given, **machines.given)
+    with writing_into(out, f"--resume --out {out}"):
+        run_suite(spec, out, folder)
 
 
 def run_suite(spec: BenchmarkSpec, out: Path, folder: args.RunFolder) -> None:
@@ -87,9 +96,8 @@ def run_suite(spec: BenchmarkSpec, out: Path, folder: args.RunFolder) -> None:
     command = command_line()
     if not complete:
         results.finish(order, {"command": command, "complete": False}, complete=False)
-        console.print(f"Interrupted. What was finished is in {out}; --resume --out {out} goes on.")
-        raise Exit(130)
-    result = result_of(suite, cases, results, command)
+        raise KeyboardInterrupt
+    result = result_of(suite, cases, results, command, spec.by)
     summary = {"command": command, "version": __version__, "complete": True, "rows": result["rows"]}
     results.finish(order, summary)
     write_summary(out, result, RESULT)
@@ -120,6 +128,36 @@ def check(results: list[Path], /) -> None:
         raise InputError("the results are of different suites; check those of one at a time")
     _print(console, checked)
     console.print(f"{'Complete and consistent' if len(checked) == 1 else 'All complete and consistent'}.")
+
+
+def page(results: list[Path], /, out: Path = Path("results/benchmark.html")) -> None:
+    """Check submitted results of a suite, and write a page that compares them.
+
+    The page needs no network and no other file. Its tables sort by a click on a heading. A result that fails
+    `parkenv benchmark check` is refused, and no page is written.
+
+    Examples:
+        parkenv benchmark page results/v1 results/yours/result.json --out results/benchmark.html
+
+    Options:
+        results (FILE|DIR): Result files, or folders with result.json files in them.
+        out, -o (FILE.html): The page.
+    """
+    from parkenv.evaluation.experiments.benchmark import check_result
+    from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.evaluation.report.benchmark_page import benchmark_data
+    from parkenv.evaluation.report.page import write_page
+
+    files = [each for path in results for each in (sorted(path.rglob(RESULT)) if path.is_dir() else [path])]
+    if not files:
+        raise InputError(f"{results[0]}: no {RESULT} below it")
+    make_folder(out.parent)
+    console = make_console()
+    with console.status("Checking"):
+        checked = [check_result(file) for file in files]
+    write_page(benchmark_data(checked, command_line()), out)
+    agents = sum(len(result["scores"]) for result in checked)
+    console.print(f"Written: {out}, {agents} agents in {len(checked)} results")
 
 
 def show(suite: str = "v1", /) -> None:
@@ -164,4 +202,5 @@ def _print(console: Console, results: list[dict[str, Any]]) -> None:
 app = group("benchmark", "Run a fixed benchmark suite, and check the results of others.")
 add(app, "run", run)
 add(app, "check", check)
+add(app, "page", page)
 add(app, "show", show)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
+from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
@@ -43,7 +44,7 @@ def calibrate(
         parkenv compare --calibrated results/calibrate/calibrated.json
 
     Options:
-        episodes, -n (N >= 1): Trips with observations, and as many without.
+        episodes, -n (1 <= N <= 1000000): Trips with observations, and as many without.
         agents (NAME): The agent that searches, with any options in brackets: mdp(failure_s=90).
         out, -o (DIR): Folder for calibrated.json, trips.jsonl, summary.json and the figure.
 
@@ -56,7 +57,6 @@ def calibrate(
     """
     from parkenv.evaluation.experiments.agent_spec import AgentSpec
     from parkenv.evaluation.experiments.experiment import agent_fingerprints, fingerprints, flat_tables
-    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.trips import calibration
     from parkenv.evaluation.trips.driven_search import DrivenSearch
     from parkenv.evaluation.trips.lot_driver import DrivingStyle
@@ -68,43 +68,43 @@ def calibrate(
     speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
     style = DrivingStyle(speed=speed, notice_m=notice)
     DrivenSearch(its, agents, style=style, rig=rig)  # raises an error before anything is driven
-    make_folder(out)
-    settings = {
-        "version": __version__, "scenario": its.name,
-        "scenarios": {its.name: flat_tables(spec.model_dump(mode="json"))},
-        "files": fingerprints(spec.files()), "agent": agents, "style": dataclasses.asdict(style), "rig": rig,
-        "traffic": dataclasses.asdict(its.traffic), "agent files": agent_fingerprints([AgentSpec.of(agents).name]),
-    }  # fmt: skip
-    folder = calibration.TripFolder(out, settings, resume=resume)
-    console = make_console()
-    with progress_bar(console, "trips") as progress, machines.workers() as workers:
-        bar = progress.add_task("Driving", total=2 * episodes)
-        trips = calibration.TripPlan(its, agents, style, rig)
-        seeds = range(seed, seed + episodes)
-        rows = calibration.drive_trips(trips, seeds, folder, workers, lambda n: progress.advance(bar, n))
-    made, table = calibration.calibrate(rows, its, speed)
-    made.to_file(out / "calibrated.json")
-    touched, stuck = (sum(row[name] for row in rows) for name in ("contacts", "rescues"))
-    counts = {"trips": len(rows), "contacts": touched, "rescues": stuck}
-    save_summary(out, seed, table, **settings | counts, calibrated=dataclasses.asdict(made))
-    title = f"{its.name}: {episodes} trips with and {episodes} without observations of slots, by {agents}"
-    calibration.save_distributions(rows, speed, title, out / file_name(f"calibration_{its.name}", ".png"))
-    cells = (
-        (
-            row["what"],
-            str(row["n"]),
-            f"{row['mean']:.2f} [{row['mean_ci95'][0]:.2f}, {row['mean_ci95'][1]:.2f}]",
-            *(f"{row[name]:.2f}" if name in row else "" for name in ("median", "p95")),
+    with writing_into(out, "the same command with --resume"):
+        settings = {
+            "version": __version__, "scenario": its.name,
+            "scenarios": {its.name: flat_tables(spec.model_dump(mode="json"))},
+            "files": fingerprints(spec.files()), "agent": agents, "style": dataclasses.asdict(style), "rig": rig,
+            "traffic": dataclasses.asdict(its.traffic), "agent files": agent_fingerprints([AgentSpec.of(agents).name]),
+        }  # fmt: skip
+        folder = calibration.TripFolder(out, settings, resume=resume)
+        console = make_console()
+        with progress_bar(console, "trips") as progress, machines.workers() as workers:
+            bar = progress.add_task("Driving", total=2 * episodes)
+            trips = calibration.TripPlan(its, agents, style, rig)
+            seeds = range(seed, seed + episodes)
+            rows = calibration.drive_trips(trips, seeds, folder, workers, lambda n: progress.advance(bar, n))
+        made, table = calibration.calibrate(rows, its, speed)
+        made.to_file(out / "calibrated.json")
+        touched, stuck = (sum(row[name] for row in rows) for name in ("contacts", "rescues"))
+        counts = {"trips": len(rows), "contacts": touched, "rescues": stuck}
+        save_summary(out, seed, table, **settings | counts, calibrated=dataclasses.asdict(made))
+        title = f"{its.name}: {episodes} trips with and {episodes} without observations of slots, by {agents}"
+        calibration.save_distributions(rows, speed, title, out / file_name(f"calibration_{its.name}", ".png"))
+        cells = (
+            (
+                row["what"],
+                str(row["n"]),
+                f"{row['mean']:.2f} [{row['mean_ci95'][0]:.2f}, {row['mean_ci95'][1]:.2f}]",
+                *(f"{row[name]:.2f}" if name in row else "" for name in ("median", "p95")),
+            )
+            for row in table
         )
-        for row in table
-    )
-    console.print(make_table(title, ("what", "n", "mean [95 %]", "median", "p95"), cells))
-    console.print(
-        f"Calibrated: driving at {made.v_drive / KMH:.2f} km/h, a failed attempt costs {made.failure_s:.1f} s, and "
-        f"parking takes {made.manoeuvre_s:.1f} s that the drive graph leaves out. In {len(rows)} trips: "
-        f"{touched} contacts, {stuck} times stuck."
-    )
-    console.print(f"Calibration, trips, summary and figure are in {out}")
+        console.print(make_table(title, ("what", "n", "mean [95 %]", "median", "p95"), cells))
+        console.print(
+            f"Calibrated: driving at {made.v_drive / KMH:.2f} km/h, a failed attempt costs {made.failure_s:.1f} s, and "
+            f"parking takes {made.manoeuvre_s:.1f} s that the drive graph leaves out. In {len(rows)} trips: "
+            f"{touched} contacts, {stuck} times stuck."
+        )
+        console.print(f"Calibration, trips, summary and figure are in {out}")
 
 
 def trip(

@@ -68,9 +68,16 @@ class _Page:
     help: str | None
     params: list[Any]
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse arguments; for a completion leave them text, since converting them loads pydantic."""
+        if ctx.resilient_parsing:
+            for param in self.get_params(ctx):  # type: ignore[attr-defined]
+                param.process_value = lambda _, value: value
+        return super().parse_args(ctx, args)  # type: ignore[misc, no-any-return]
+
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the words after the command, without the braces of required arguments."""
-        return [piece.strip("{}") for piece in super().collect_usage_pieces(ctx)]  # type: ignore[misc]
+        return [re.sub("[{}]", "", piece) for piece in super().collect_usage_pieces(ctx)]  # type: ignore[misc]
 
     def format_help_text(self, ctx: Any, formatter: Any) -> None:
         """Write the text, and the examples as they are."""
@@ -113,6 +120,11 @@ class Command(_Page, TyperCommand):
         try:
             return super().parse_args(ctx, args)
         except typer.TyperException as error:
+            option = getattr(error, "param", None)
+            if isinstance(option, TyperOption) and "Input should be" in str(error):
+                raise InputError(
+                    f"{option.opts[0]}: want {option.metavar}; see {ctx.command_path} --help"
+                ) from None
             if not hasattr(error, "possibilities"):
                 raise
             known = [name for p in self.params for name in (*p.opts, *p.secondary_opts) if name[:2] == "--"]
@@ -126,6 +138,13 @@ class Command(_Page, TyperCommand):
 class Group(_Page, TyperGroup):
     """A group of commands."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse arguments; without any, print the help page."""
+        if args or ctx.resilient_parsing:
+            return super().parse_args(ctx, args)
+        typer.echo(ctx.get_help())
+        raise typer.Exit(2)
+
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Find the command; an unknown one is answered by the nearest known one."""
         if args[0] not in self.commands and not ctx.resilient_parsing and args[0][:1] != "-":
@@ -137,9 +156,7 @@ class Group(_Page, TyperGroup):
 
 def group(name: str, text: str) -> typer.Typer:
     """Make a group of commands."""
-    return typer.Typer(
-        name=name, help=text, cls=Group, no_args_is_help=True, rich_markup_mode=None, context_settings=CONTEXT
-    )
+    return typer.Typer(name=name, help=text, cls=Group, rich_markup_mode=None, context_settings=CONTEXT)
 
 
 def add(app: typer.Typer, name: str, function: Callable[..., None], heading: str | None = None) -> None:

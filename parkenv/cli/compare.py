@@ -6,10 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from typer import Exit
-
 from parkenv.cli import arguments as args
 from parkenv.cli.report import make_report
+from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import (
     WIDE,
     command_line,
@@ -18,6 +17,7 @@ from parkenv.cli.tables import (
     print_recorded,
     progress_bar,
 )
+from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
 from parkenv.files.names import RigName
 
@@ -51,6 +51,8 @@ def compare(
     rig: RigName | None = None,
     figures: bool | None = None,
     rerun: Path | None = None,
+    trust: bool = False,
+    trust_model: bool = False,
     folder: args.RunFolder,
     machines: args.Machines,
 ) -> None:
@@ -88,16 +90,20 @@ def compare(
         figures: Draw figures.  [default: figures]
     """
     from parkenv.evaluation.experiments.agent_spec import split_agents
-    from parkenv.evaluation.experiments.spec import ExperimentSpec
+    from parkenv.evaluation.experiments.spec import FAILURE_COST_SWEEP, ExperimentSpec
 
     sweep = costs.failure_cost == "sweep"
     if folder.resume:
         base = args.saved(out, ExperimentSpec)
+        if agents is None:
+            require_trust(base, out, trust)
     else:
         base = ExperimentSpec().changed(grid={"occupancy_levels": () if sweep else LEVELS})
     grid = costs.grid(base.grid)
     if sweep:
         grid = grid.changed(blind=True)
+    elif costs.failure_cost is not None and base.grid.failure_s == FAILURE_COST_SWEEP:
+        grid = grid.changed(blind=False)
     if occupancy_levels == "none":
         grid, occupancy_levels = grid.changed(occupancy_levels=()), None
     if calibrated is not None:
@@ -106,10 +112,11 @@ def compare(
     grid = args.changed_axis(grid, "map_says", "--map-says", map_says)
     given = args.not_none(episodes=episodes, seed=seed, rig=rig, figures=figures)
     if agents is not None:
-        given["agents"] = split_agents(agents)
+        given["agents"] = readable_models(split_agents(agents), trust_model)
     scenarios = tuple(world.specs(scenario, base.scenarios))
     spec = base.changed(scenarios=scenarios, grid=grid, **given, **machines.given)
-    run_comparison(spec, out, folder, rerun)
+    with writing_into(out, f"--resume --out {out}"):
+        run_comparison(spec, out, folder, rerun)
 
 
 def run_comparison(
@@ -119,6 +126,7 @@ def run_comparison(
 
     Raises:
         InputError: the experiment cannot be run, or the folder cannot be used.
+        KeyboardInterrupt: the run was interrupted; the results of finished episodes are printed and in the folder.
     """
     from parkenv.evaluation.experiments.experiment import run_experiment
     from parkenv.evaluation.figures.registry import draw_figures
@@ -155,8 +163,7 @@ def run_comparison(
             "into the slot, under either cost; the tables leave that out."
         )
     if not result.complete:
-        console.print(f"Interrupted. What was finished is in {out}; --resume --out {out} goes on.")
-        raise Exit(130)
+        raise KeyboardInterrupt
     if spec.figures:
         with console.status("Drawing figures"):
             draw_figures(result.figure_data(), out)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,25 +12,42 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.compare import result_tables
 from parkenv.cli.report import make_report
-from parkenv.cli.tables import command_line, make_console, print_recorded
+from parkenv.cli.single_writer import writing_into
+from parkenv.cli.tables import command_line, make_console, print_recorded, progress_bar
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import DemoSpec
+    from parkenv.evaluation.experiments.workers import Workers
+    from parkenv.mapping.inference import SessionLog
     from parkenv.mapping.survey import SurveySettings
     from parkenv.world.scenario import Scenario
 
 FIGURES = ("time_split", "time_distribution")
 """Names of figures in `parkenv.evaluation.figures.registry`."""
+FILM = "search.gif"
+NEXT = (
+    (
+        "parkenv compare --scenario jam --agents mdp,belief,oracle --episodes 40 --report",
+        "another lot, where the forecast is wrong; many more searches, without images",
+    ),
+    (
+        "parkenv trip --scenario campus --out results/trip.gif",
+        "a trip with steering and manoeuvres, as a film",
+    ),
+    ("parkenv plan --scenario jam --failure-cost 10,90", "what the thesis's planner intends, in a picture"),
+)
+"""Commands to try after the demo, and what they do."""
 
 
 def demo(
     scenario: str | None = None,
-    sessions: int = 4,
-    episodes: int = 6,
+    quick: bool = False,
+    sessions: int | None = None,
+    episodes: int | None = None,
     seed: int = 0,
     out: Path = Path("results/demo"),
     *,
-    every: float = 2.5,
+    every: float | None = None,
     detector: str = "hog",
     rerun: Path | None = None,
     folder: args.RunFolder,
@@ -41,27 +60,33 @@ def demo(
 
     2. Map: the probability that each slot is taken at the hour of the search, from these sessions alone.
 
-    3. Searches on other days, with camera, laser and detector: the thesis's planner and three heuristic baselines, all
-    with the same map, in the same worlds.
+    3. Searches on other days, with camera, laser and detector: the thesis's planner, the planner in belief space and
+    two heuristic baselines, all with the same map, in the same worlds; and the clairvoyant lower bound.
+
+    4. A report with replays, and a film of one search.
 
     Examples:
         parkenv demo
+        parkenv demo --quick --out results/quick
 
     Options:
-        sessions (N >= 1): Survey drives.
-        episodes, -n (N >= 2): Episodes of each agent.
+        quick: A shorter demo: fewer drives and episodes, captures farther apart.
+        sessions (N >= 1): Survey drives.  [default: 4]
+        episodes, -n (N >= 2): Episodes of each agent.  [default: 6]
         out, -o (DIR): Folder for everything.
 
     Sensors:
-        every (M >= 0.1): Metres between captures.
+        every (M >= 0.1): Metres between captures.  [default: 2.5]
     """
+    from parkenv.evaluation.experiments.demo import QUICK
     from parkenv.evaluation.experiments.spec import DemoSpec
 
+    settings = (QUICK if quick else {}) | args.not_none(sessions=sessions, episodes=episodes, every=every)
     spec = DemoSpec().changed(
-        scenario=args.World().spec(scenario), sessions=sessions, episodes=episodes, every=every, detector=detector,
-        seed=seed, **machines.given,
-    )  # fmt: skip
-    run_demo(spec, out, folder, rerun)
+        scenario=args.World().spec(scenario), detector=detector, seed=seed, **settings, **machines.given
+    )
+    with writing_into(out, "the same command"):
+        run_demo(spec, out, folder, rerun)
 
 
 def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | None = None) -> None:
@@ -70,79 +95,74 @@ def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | No
     Raises:
         InputError: the scenario cannot be made, or the folder cannot be used.
     """
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from parkenv.evaluation.experiments.compare import run_cases, table
-    from parkenv.evaluation.experiments.demo import AGENTS, demo_cases, demo_survey
-    from parkenv.evaluation.experiments.results import ResultFolder, make_folder
+    from parkenv.evaluation.experiments.demo import AGENTS, FILMED, demo_cases, demo_survey
+    from parkenv.evaluation.experiments.results import ResultFolder
     from parkenv.evaluation.experiments.spec import SPEC_FILE
-    from parkenv.evaluation.experiments.surveys import mean_occupancy, run_survey, summarize
+    from parkenv.evaluation.experiments.surveys import run_survey, summarize
     from parkenv.evaluation.experiments.warm_up import warm_up_tasks
     from parkenv.evaluation.figures.registry import ComparisonResults, draw_figures
-    from parkenv.evaluation.figures.survey_pictures import save_detections, save_map, save_session
+    from parkenv.evaluation.figures.search_film import film_search
+    from parkenv.evaluation.figures.survey_pictures import save_detections, save_session
+    from parkenv.evaluation.report.drive_recording import record_drive
     from parkenv.evaluation.trips.sensor_log import require_viewer
-    from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
-    from parkenv.world.occupancy import DAY_NAMES
-    from parkenv.world.week import DAY_S
 
     if rerun is not None:
         require_viewer()
     its, settings = demo_survey(spec)
-    make_folder(out)
     console = make_console()
     map_file = out / "map.sqlite"
     resume = folder.resume or (_goes_on(out) and not folder.overwrite)
     results = ResultFolder(out, _settings(spec), resume=resume, overwrite=True)
     spec.write(out / SPEC_FILE)
-    with args.workers_of(spec) as workers, Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        console=console, disable=not console.is_terminal,
-    ) as progress:  # fmt: skip
-        tasks = warm_up_tasks(settings, AGENTS)
-        bar = progress.add_task("compiling, once after an installation", total=len(tasks))
-        for _ in workers.results(tasks):
-            progress.advance(bar)
-        bar = progress.add_task("1/3 surveying", total=spec.sessions)
-        run = run_survey(
-            its,
-            settings,
-            spec.sessions,
-            map_file,
-            workers=workers,
-            on_session=lambda _: progress.advance(bar),
-        )
-        progress.update(bar, completed=spec.sessions)
+    with (
+        args.workers_of(spec) as workers,
+        # Only processes of this machine write files.
+        args.Machines(spec.jobs).workers() as here,
+        progress_bar(console) as progress,
+    ):
 
-        bar = progress.add_task("2/3 drawing the map", total=1)
+        def run_all(description: str, tasks: Sequence[Callable[[], object]], where: Workers) -> None:
+            bar = progress.add_task(description, total=len(tasks))
+            for _ in where.results(tasks):
+                progress.advance(bar)
+
+        run_all("compiling, once after an installation", warm_up_tasks(settings, AGENTS), workers)
+        bar = progress.add_task("1/4 survey drives", total=spec.sessions)
+        run = run_survey(
+            its, settings, spec.sessions, map_file, workers=workers, record=record_drive,
+            on_session=lambda _: progress.advance(bar),
+        )  # fmt: skip
+        progress.update(bar, completed=spec.sessions)
+        surveyed = summarize(its, settings, run, map_file)
         with MapStore(map_file, its.lot, create=False) as store:
             log = store.log()
-        shown = replace(its.arrival, weekdays=its.arrival.weekdays[:2][-1:])
-        time = DAY_S * shown.weekdays[0] + 0.5 * (shown.start_s + shown.end_s)
-        hour, minute = divmod(int(time % DAY_S // 60), 60)
-        title = (
-            f"{its.name}, {DAY_NAMES[shown.weekdays[0]]} {hour:02d}:{minute:02d}, {spec.sessions} sessions"
-        )
-        true = mean_occupancy(its.occupancy, shown)
-        save_map(its.lot, predict(log, time), true, title, out / "map.png")
-        if run.shown is not None:
-            save_detections(run.shown, out / "detections.png")
-            save_session(its.lot, run.shown, out / "session.png")
-        progress.advance(bar)
 
         cases = demo_cases(spec, its, log)
-        bar = progress.add_task("3/3 searching with simulated sensors", total=len(cases) * spec.episodes)
+        bar = progress.add_task("2/4 searches through the sensors", total=len(cases) * spec.episodes)
         run_cases(
             cases, results, workers=workers, block_size=1, on_progress=lambda n: progress.advance(bar, n)
         )
-    rows = table(cases, results)
-    surveyed = summarize(its, settings, run, map_file)
-    summary = {
-        "command": command_line(), "version": __version__, "seed": spec.seed, "rows": rows,
-        "survey": surveyed,
-    }  # fmt: skip
-    results.finish([case.key(s) for case, its_seeds in cases for s in its_seeds], summary)
-    draw_figures(ComparisonResults(cases, results.episodes, rows), out, FIGURES)
+        rows = table(cases, results)
+        filmed = next(case for case, _ in cases if case.agent == FILMED)
+        tasks: list[Callable[[], object]] = [
+            partial(film_search, filmed, cases[0][1][0], out / FILM),
+            partial(_draw_map, its, log, spec.sessions, out / "map.png"),
+            partial(draw_figures, ComparisonResults(cases, results.episodes, rows), out, FIGURES),
+        ]
+        if run.shown is not None:
+            tasks += [
+                partial(save_detections, run.shown, out / "detections.png"),
+                partial(save_session, its.lot, run.shown, out / "session.png"),
+            ]
+        run_all("3/4 pictures and film", tasks, here)
+        summary = {
+            "command": command_line(), "version": __version__, "seed": spec.seed, "rows": rows,
+            "survey": surveyed,
+        }  # fmt: skip
+        results.finish([case.key(s) for case, its_seeds in cases for s in its_seeds], summary)
+    page = make_report(out, spec, drives=None if run.recorded is None else [run.recorded], stage="4/4 report")
     console.print(
         f"{spec.sessions} drives past {its.lot.n_slots} slots: {surveyed['car_detection_rate']:.1%} of the parked cars "
         f"were found, {surveyed['slot_accuracy']:.1%} of the slots classified correctly. Mean absolute error of the "
@@ -150,14 +170,33 @@ def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | No
     )
     for printed in result_tables(rows, console.width):
         console.print(printed)
-    console.print(f"Pictures, the map, episodes.csv and summary.json are in {out}")
     if rerun is not None:
         with console.status(f"Running the first session and the first search again for {rerun}"):
             case, seeds = cases[0]
             _record(case.scenario, settings, seeds[0], rerun)
         print_recorded(console, rerun)
-    if folder.report:
-        make_report(out, spec)
+    console = make_console(soft_wrap=True)
+    console.print("\nOpen")
+    console.print(f"  {page}\n    the results on one page, with replays, in a browser")
+    console.print(f"  {out / FILM}\n    a film of one search")
+    console.print("\nTry next")
+    for command, explained in NEXT:
+        console.print(f"  {command}\n    {explained}")
+
+
+def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) -> None:
+    """Draw the map at the middle of the arrival window, and the true probabilities."""
+    from parkenv.evaluation.experiments.surveys import mean_occupancy
+    from parkenv.evaluation.figures.survey_pictures import save_map
+    from parkenv.mapping.inference import predict
+    from parkenv.world.occupancy import DAY_NAMES
+    from parkenv.world.week import DAY_S
+
+    shown = replace(scenario.arrival, weekdays=scenario.arrival.weekdays[:2][-1:])
+    time = DAY_S * shown.weekdays[0] + 0.5 * (shown.start_s + shown.end_s)
+    hour, minute = divmod(int(time % DAY_S // 60), 60)
+    title = f"{scenario.name}, {DAY_NAMES[shown.weekdays[0]]} {hour:02d}:{minute:02d}, {sessions} sessions"
+    save_map(scenario.lot, predict(log, time), mean_occupancy(scenario.occupancy, shown), title, path)
 
 
 def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:

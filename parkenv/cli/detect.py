@@ -88,14 +88,14 @@ def train_detector(
     jitter: int = 2,
     misaligned: int = 2,
 ) -> None:
-    """Train a car model on photographs: aligned crops of cars, and images without cars.
+    r"""Train a car model on photographs: aligned crops of cars, and images without cars.
 
     With `--folds`, 30 blocks of consecutive files are held out in turn: consecutive images often show the same car.
 
     Examples:
         parkenv train-detector --uiuc CarData --out side.npz
-        parkenv train-detector --crops kitti --front --folds 3 --out front.npz --penalty 0.02
-            --normalization blocks --jitter 0 --misaligned 0 --rounds 0
+        parkenv train-detector --crops kitti --front --out front.npz \
+            --normalization blocks --penalty 0.02 --jitter 0 --misaligned 0
 
     Options:
         out, -o (FILE.npz): The model file to write.

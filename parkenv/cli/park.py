@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
+from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
+from parkenv.cli.trust import readable_models
 from parkenv.errors import InputError, nearest
 from parkenv.files.file_names import file_name
 
@@ -31,6 +33,7 @@ def park(
     occupied: float = 0.85,
     slack: float = 0.0,
     lot: str | None = None,
+    trust_model: bool = False,
     machines: args.Machines,
 ) -> None:
     """Evaluate agents that drive the car into a slot: success rate, planning time, driving time, manoeuvres.
@@ -40,14 +43,14 @@ def park(
 
     Examples:
         parkenv park --episodes 250 --scenario campus,street,jam
-        parkenv park --agents planner,sac:results/drive-sac/seed_0/model.zip
+        parkenv park --agents planner,sac:results/drive-sac/seed_0/model.safetensors
         parkenv park --lot parking_map.yml --way back-in
 
     Options:
         agents (NAME[,...]): Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of
             `parkenv train --env drive`.
         scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus,street]
-        episodes, -n (N >= 1): Episodes per lot.
+        episodes, -n (1 <= N <= 1000000): Episodes per lot.
         out, -o (DIR): Folder for pictures, episodes.csv and summary.json.
 
     Parking tasks:
@@ -69,41 +72,41 @@ def park(
         case = ParkingCase(build(spec).lot, kinds, ways, occupied, slack)
         case.environment().close()  # validates the options before the first episode
         cases.append(case)
-    labels = _labels(args.words("--agents", agents))
+    labels = _labels(readable_models(args.words("--agents", agents), trust_model))
     parking_agents = {label: make_parking_agent(name) for label, name in labels.items()}
-    make_folder(out)
-    console = make_console()
-    seeds = range(seed, seed + episodes)
-    parkings: dict[str, list[Parking]] = {label: [] for label in labels}
-    with progress_bar(console, "episodes") as progress, machines.workers() as workers:
-        for label, name in labels.items():
-            what = "Parking" if len(labels) == 1 else label
-            bar = progress.add_task(what, total=len(cases) * episodes)
-            for some in park_all(cases, seeds, workers, name):
-                parkings[label] += some
-                progress.advance(bar, len(some))
+    with writing_into(out):
+        console = make_console()
+        seeds = range(seed, seed + episodes)
+        parkings: dict[str, list[Parking]] = {label: [] for label in labels}
+        with progress_bar(console, "episodes") as progress, machines.workers() as workers:
+            for label, name in labels.items():
+                what = "Parking" if len(labels) == 1 else label
+                bar = progress.add_task(what, total=len(cases) * episodes)
+                for some in park_all(cases, seeds, workers, name):
+                    parkings[label] += some
+                    progress.advance(bar, len(some))
 
-    rows = [{"agent": label, **p.row} for label, its in parkings.items() for p in its]
-    table = [
-        {"agent": label, **row}
-        for label, its in parkings.items()
-        for row in parking_table([p.row for p in its])
-    ]
-    names = [case.lot.name for case in cases]
-    write_parkings(rows, out / "episodes.csv")
-    save_summary(out, seed, table, lots=names, agents=labels)
-    film = _to_film(next(iter(parkings.values())))
-    for label, its in parkings.items():
-        folder = out if len(labels) == 1 else out / file_name(label)
-        make_folder(folder)
-        _picture(its, cases, parking_agents[label], film, folder)
-    _show(console, f"{', '.join(names)}: {episodes} episodes per lot", table)
-    for row in [row for row in rows if not row["parked"]][:SHOWN_ROWS]:
-        who = f"{row['agent']}, " if len(labels) > 1 else ""
-        console.print(
-            f"failed: {who}{row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
-        )
-    console.print(f"Episodes, summary and pictures are in {out}")
+        rows = [{"agent": label, **p.row} for label, its in parkings.items() for p in its]
+        table = [
+            {"agent": label, **row}
+            for label, its in parkings.items()
+            for row in parking_table([p.row for p in its])
+        ]
+        names = [case.lot.name for case in cases]
+        write_parkings(rows, out / "episodes.csv")
+        save_summary(out, seed, table, lots=names, agents=labels)
+        film = _to_film(next(iter(parkings.values())))
+        for label, its in parkings.items():
+            folder = out if len(labels) == 1 else out / file_name(label)
+            make_folder(folder)
+            _picture(its, cases, parking_agents[label], film, folder)
+        _show(console, f"{', '.join(names)}: {episodes} episodes per lot", table)
+        for row in [row for row in rows if not row["parked"]][:SHOWN_ROWS]:
+            who = f"{row['agent']}, " if len(labels) > 1 else ""
+            console.print(
+                f"failed: {who}{row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
+            )
+        console.print(f"Episodes, summary and pictures are in {out}")
 
 
 def _labels(names: list[str]) -> dict[str, str]:

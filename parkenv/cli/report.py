@@ -9,12 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, progress_bar
+from parkenv.cli.trust import require_trust
 from parkenv.errors import InputError, nearest
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.compare import Case
-    from parkenv.evaluation.experiments.spec import Workplace
+    from parkenv.evaluation.experiments.spec import TrainingSpec, Workplace
     from parkenv.evaluation.report.run_folder import RunFolder
+    from parkenv.files.spec_file import Spec
     from parkenv.mapping.survey import Survey
 
     Cases = list[tuple[Case, Sequence[int]]]
@@ -38,6 +40,7 @@ def report(
     frames: int = 120,
     out: Path | None = None,
     *,
+    trust: bool = False,
     machines: args.Machines,
 ) -> None:
     """Write an HTML page on a run: its settings, sortable tables, figures, and replays of its searches and drives.
@@ -47,7 +50,7 @@ def report(
 
     Examples:
         parkenv report results/compare
-        parkenv report results/compare --replay 3,17 --agents mdp,belief --out two.html
+        parkenv report results/compare --replay 3,17 --agents mdp --out two.html
         parkenv report results/survey --sessions 2
 
     Options:
@@ -69,6 +72,7 @@ def report(
         sessions=sessions,
         frames=frames,
         out=out,
+        trust=trust,
     )
 
 
@@ -82,11 +86,18 @@ def make_report(
     sessions: int = 1,
     frames: int = 120,
     out: Path | None = None,
-) -> None:
-    """Write the page; see `report` for the arguments.
+    drives: Sequence[dict[str, Any]] | None = None,
+    stage: str = "Running again",
+    trust: bool = True,
+) -> Path:
+    """Write the page, and return its path.
+
+    The arguments are those of `report`; `drives` are survey drives that are already recorded (None: `sessions` of them
+    are driven again), and `stage` describes the progress bar.
 
     Raises:
-        InputError: the folder holds no finished run of this version, or not the chosen searches.
+        InputError: the folder holds no finished run of this version, not the chosen searches, or names classes that
+            are not trusted.
     """
     from parkenv.evaluation.report.page import page_data, write_page
     from parkenv.evaluation.report.run_folder import RunFolder
@@ -97,8 +108,15 @@ def make_report(
     surveys: Surveys | None = None
     cases: Cases = []
     notes: list[str] = []
+    spec = None
     try:
-        surveys, cases = _run_again(run)
+        spec = run.spec()
+    except (InputError, OSError) as error:
+        notes.append(f"There is no replay: {error}")
+    if spec is not None:
+        require_trust(spec, folder, trust)
+    try:
+        surveys, cases = _run_again(run, spec)
     except (InputError, OSError) as error:
         # The page still has tables and figures.
         notes.append(f"There is no replay: {error}")
@@ -107,18 +125,16 @@ def make_report(
     cases, too_large = _small_enough(_chosen(cases, replay, agents))
     notes += too_large
     encounters = choose(cases, wanted) if wanted else []
-    drives = range(min(sessions, surveys[1])) if surveys is not None else range(0)
+    again = range(min(sessions, surveys[1])) if surveys is not None and drives is None else range(0)
     counted = run.totals()
     tasks: list[Callable[[], dict[str, Any]]] = []
     for encounter in encounters:
         keys = [case.key(encounter.seed) for case in encounter.cases]
         tasks.append(partial(record, encounter, {k: counted[k] for k in keys if k in counted}))
     if surveys is not None:
-        tasks += [
-            partial(_drive_again, surveys[0], number, frames // max(len(drives), 1)) for number in drives
-        ]
+        tasks += [partial(_drive_again, surveys[0], number, frames // max(len(again), 1)) for number in again]
     with args.workers_of(machines) as workers, progress_bar(console) as progress:
-        bar = progress.add_task("Running again", total=len(tasks))
+        bar = progress.add_task(stage, total=len(tasks))
         done: list[dict[str, Any]] = []
         for recorded in workers.in_order(tasks):
             done.append(recorded)
@@ -126,13 +142,15 @@ def make_report(
     watched = done[: len(encounters)]
     notes += _differing(watched)
     path = out or folder / PAGE
-    write_page(run, page_data(run, watched, done[len(encounters) :], notes), path)
+    recorded = done[len(encounters) :] if drives is None else drives
+    write_page(page_data(run, watched, recorded, notes), path, run.figures)
     for note in notes:
         console.print(f"Note: {note}")
     console.print(f"Written: {path}, {path.stat().st_size / 1e6:.1f} MB")
+    return path
 
 
-def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
+def _run_again(run: RunFolder, spec: Spec | None) -> tuple[Surveys | None, Cases]:
     """Return the survey of a run, with its number of drives, and its searches, from its specification.
 
     Raises:
@@ -142,57 +160,53 @@ def _run_again(run: RunFolder) -> tuple[Surveys | None, Cases]:
     from parkenv.evaluation.experiments.experiment import Experiment, require_unchanged
     from parkenv.evaluation.experiments.results import read_settings
 
-    file = run.path / specs.SPEC_FILE
-    if run.kind == "compare":
-        spec = specs.ExperimentSpec.read(file)
-        require_unchanged(spec, read_settings(run.path) or {})
-        return None, [*Experiment(spec).cases]
-    if run.kind == "benchmark":
-        from parkenv.evaluation.experiments.benchmark import Suite
+    match spec:
+        case specs.ExperimentSpec():
+            require_unchanged(spec, read_settings(run.path) or {})
+            return None, [*Experiment(spec).cases]
+        case specs.BenchmarkSpec():
+            from parkenv.evaluation.experiments.benchmark import Suite
 
-        benchmark = specs.BenchmarkSpec.read(file)
-        return None, [*Suite.named(benchmark.suite).cases(benchmark.agents)]
-    if run.kind == "survey":
-        from parkenv.evaluation.experiments.surveys import survey_of
+            return None, [*Suite.named(spec.suite).cases(spec.agents)]
+        case specs.SurveySpec():
+            from parkenv.evaluation.experiments.surveys import survey_of
 
-        return (partial(_survey, *survey_of(specs.SurveySpec.read(file))), len(run.table("sessions.csv"))), []
-    if run.kind == "demo":
-        from parkenv.evaluation.experiments.demo import demo_cases, demo_survey
-        from parkenv.mapping.store import MapStore
+            return (partial(_survey, *survey_of(spec)), len(run.table("sessions.csv"))), []
+        case specs.DemoSpec():
+            from parkenv.evaluation.experiments.demo import demo_cases, demo_survey
+            from parkenv.mapping.store import MapStore
 
-        demo = specs.DemoSpec.read(file)
-        its, settings = demo_survey(demo)
-        with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:
-            log = store.log()
-        return (partial(_survey, its, settings), len(log.time)), [*demo_cases(demo, its, log)]
-    if run.kind == "train":
-        return None, _trained(run)
+            its, settings = demo_survey(spec)
+            with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:
+                log = store.log()
+            return (partial(_survey, its, settings), len(log.time)), [*demo_cases(spec, its, log)]
+        case specs.TrainingSpec():
+            return None, _trained(run, spec)
     return None, []
 
 
-def _trained(run: RunFolder) -> Cases:
+def _trained(run: RunFolder, spec: TrainingSpec) -> Cases:
     """Return the best model and the best planners in the test scenarios; none for driving, or without a test."""
-    from parkenv.evaluation.experiments.compare import Case
-    from parkenv.evaluation.experiments.spec import SPEC_FILE, TrainingSpec
-
-    spec = TrainingSpec.read(run.path / SPEC_FILE)
     if spec.env != "search" or not run.summary.get("transfer"):
         return []
     from parkenv.cli.search_task import SearchTask
     from parkenv.cli.training_task import TEST_SEED
+    from parkenv.evaluation.experiments.compare import Case
+    from parkenv.evaluation.training.rl_training import MODEL
 
     best = min(run.summary["rows"], key=lambda row: float(row["total_s"]))
-    model = run.path / f"seed_{best['seed']}" / "model.zip"
+    model = run.path / f"seed_{int(best['seed'])}" / MODEL
     task = SearchTask(spec)
-    agents = {agent.label: agent for agent in task.compared}
     seeds = range(TEST_SEED, TEST_SEED + int(run.summary["transfer"][0]["episodes"]))
     cases: Cases = []
     for scenario in task.tested:
         planners = [row for row in run.summary.get("planners", []) if row["scenario"] == scenario.name]
         beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
-        cases.append((Case(scenario, f"{best['agent']}:{model}"), seeds))
-        shown = [agents[row["agent"]] for row in beside if row["agent"] in agents]
-        cases += [(Case(scenario, agent.name, options=agent.options), seeds) for agent in shown]
+        cases.append((Case(scenario, f"{task.algorithm}:{model}"), seeds))
+        made = {
+            case.label: case for case in (Case(scenario, a.name, options=a.options) for a in task.compared)
+        }
+        cases += [(made[row["agent"]], seeds) for row in beside if row["agent"] in made]
     return cases
 
 
@@ -254,4 +268,4 @@ def _survey(scenario: Any, settings: Any) -> Survey:
 def _drive_again(survey: Callable[[], Survey], number: int, frames: int) -> dict[str, Any]:
     from parkenv.evaluation.report.drive_recording import record_drive
 
-    return record_drive(survey(), number, frames)
+    return record_drive(survey(), number, most_frames=frames)[1]

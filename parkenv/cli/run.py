@@ -4,28 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 from parkenv.cli import arguments as args
 from parkenv.cli.benchmark import run_suite
 from parkenv.cli.compare import run_comparison
 from parkenv.cli.demo import run_demo
+from parkenv.cli.single_writer import writing_into
 from parkenv.cli.survey import run_survey_of
 from parkenv.cli.train import run_training
+from parkenv.cli.trust import require_trust
 from parkenv.errors import InputError, nearest
 
-KINDS: Mapping[str, tuple[str, Callable[..., None]]] = {
-    "compare": ("ExperimentSpec", run_comparison),
-    "benchmark": ("BenchmarkSpec", run_suite),
-    "survey": ("SurveySpec", run_survey_of),
-    "demo": ("DemoSpec", run_demo),
-    "train": ("TrainingSpec", run_training),
+KINDS: Mapping[str, Callable[..., None]] = {
+    "compare": run_comparison,
+    "benchmark": run_suite,
+    "survey": run_survey_of,
+    "demo": run_demo,
+    "train": run_training,
 }
-"""Class of the specification of each kind of file, and the function that runs it."""
+"""Function that runs each kind of file."""
 
 
 def run(
-    experiment: Path, /, out: Path | None = None, *, folder: args.RunFolder, machines: args.Machines
+    experiment: Path,
+    /,
+    out: Path | None = None,
+    *,
+    trust: bool = False,
+    folder: args.RunFolder,
+    machines: args.Machines,
 ) -> None:
     """Run an experiment file: agents, scenarios, and a grid of settings.
 
@@ -53,6 +60,8 @@ def run(
     name = tables.get("kind", "compare")
     if name not in KINDS:
         raise InputError(f"{file}: kind is {name!r}; {nearest(str(name), KINDS)}")
-    kind, run_kind = KINDS[name]
-    spec: Any = getattr(specs, kind).parse(tables, str(file), file.parent)
-    run_kind(spec.changed(**machines.given), out or Path("results") / file.stem, folder)
+    spec = specs.SPECS[name].parse(tables, str(file), file.parent)
+    require_trust(spec, experiment, trust)
+    out = out or Path("results") / file.stem
+    with writing_into(out, f"parkenv run {out} --resume"):
+        KINDS[name](spec.changed(**machines.given), out, folder)

@@ -33,7 +33,7 @@ def fit_sensor_model(
 
     Options:
         scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus,street]
-        episodes, -n (N >= 1): Episodes of each of three agents in each scenario.
+        episodes, -n (1 <= N <= 1000000): Episodes of each of three agents in each scenario.
         rig (laser|stereo|both_sides): Whose errors to measure.  [default: the scenario's, laser]
         out, -o (FILE.json): The file to write.
     """

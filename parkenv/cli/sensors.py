@@ -35,7 +35,7 @@ def preview(
 
     Options:
         weather (NAME[,...]|all): Some of {weathers}.
-        drive (M >= 0): Length of the video, m; 0 for none.
+        drive (0 <= M <= 10000): Length of the video, m; 0 for none.
         every (M >= 0.05): Metres between its frames.
         out, -o (DIR): Folder for the pictures and drive.gif.
     """

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from parkenv.cli import arguments as args
 from parkenv.cli.report import MAP_FILE, make_report
+from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError, nearest
 from parkenv.files.file_names import file_name
@@ -45,7 +46,8 @@ def survey(
 
     Examples:
         parkenv survey --sessions 21
-        parkenv survey --scenario street --rig stereo --weather rain --hours 12:00-13:00
+        parkenv survey --scenario street --rig stereo --weather rain
+        parkenv survey --hours 12:00-13:00 --days weekend
         parkenv survey --scenario mini --sessions 1 --rerun drive.rrd
 
     Options:
@@ -69,7 +71,8 @@ def survey(
         scenario=traffic.on(world.spec(scenario), BUSY), sessions=sessions, rig=rig, detector=detector,
         weather=weather, every=every, pose_noise=pose_noise, seed=seed, **windows, **machines.given,
     )  # fmt: skip
-    run_survey_of(spec, out, folder, rerun)
+    with writing_into(out, "the same command"):
+        run_survey_of(spec, out, folder, rerun)
 
 
 def run_survey_of(spec: SurveySpec, out: Path, folder: args.RunFolder, rerun: Path | None = None) -> None:
@@ -78,7 +81,6 @@ def run_survey_of(spec: SurveySpec, out: Path, folder: args.RunFolder, rerun: Pa
     Raises:
         InputError: the scenario cannot be made, or the folder cannot be used.
     """
-    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.experiments.surveys import (
         mean_occupancy,
@@ -97,7 +99,6 @@ def run_survey_of(spec: SurveySpec, out: Path, folder: args.RunFolder, rerun: Pa
     if rerun is not None:
         require_viewer()
     its, settings = survey_of(spec)
-    make_folder(out)
     map_file = out / MAP_FILE
     if folder.overwrite:
         map_file.unlink(missing_ok=True)

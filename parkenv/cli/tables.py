@@ -47,12 +47,21 @@ def progress_bar(console: Console, unit: str = "") -> Progress:
         BarColumn,
         MofNCompleteColumn,
         Progress,
+        TaskID,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
 
-    return Progress(
+    class Stages(Progress):
+        """Progress bars, or a line per stage where nothing can be redrawn."""
+
+        def add_task(self, description: str, *args: Any, **options: Any) -> TaskID:
+            if self.disable:
+                self.console.print(f"{description} ...")
+            return super().add_task(description, *args, **options)
+
+    return Stages(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
@@ -60,7 +69,7 @@ def progress_bar(console: Console, unit: str = "") -> Progress:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         console=console,
-        disable=not console.is_terminal,
+        disable=not console.is_terminal or console.is_dumb_terminal,
     )
 
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from typer import Exit
-
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.report import PAGE, make_report
-from parkenv.cli.tables import make_console, save_summary
+from parkenv.cli.single_writer import writing_into
+from parkenv.cli.tables import command_line, make_console, save_summary
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
@@ -56,11 +56,11 @@ def train(
 
     Examples:
         parkenv train maskable-ppo --scenario campus
-        parkenv train maskable-ppo --scenario my_lot.toml --steps 200000 --trainings 1
-        parkenv train ppo --clone mdp-tuned --test-on campus,street,jam --out results/cloned
+        parkenv train ppo --scenario my_lot.toml --steps 200000 --trainings 1
+        parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
         parkenv train ppo --beside results/maskable-ppo,results/dqn
         parkenv train sac --env drive --scenario campus,street --trainings 3
-        parkenv compare --agents mdp,maskable-ppo:results/maskable-ppo/seed_0/model.zip
+        parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
 
     Options:
         algorithm (ALGORITHM): To search: dqn, ppo, maskable-ppo (default), recurrent-ppo. To drive: sac, tqc, ppo
@@ -87,6 +87,7 @@ def train(
         beside (DIR[,...]): Folders of other trainings with the same evaluations, to draw in the same figure.
 
     Results:
+        resume: Continue from the checkpoints in --out; the models equal those of an unbroken training.
         tensorboard: Keep logs for TensorBoard in --out.
     """
     from parkenv.evaluation.experiments.agent_spec import split_agents
@@ -102,34 +103,36 @@ def train(
         demonstrations=demonstrations, k=k, evaluate_every=evaluate_every, evaluation_episodes=evaluation_episodes,
         tensorboard=tensorboard, **given, **machines.given,
     )  # fmt: skip
-    run_training(spec, out, folder, args.words("--beside", beside) if beside else ())
+    out = out or Path("results") / _task_of(spec).folder
+    with writing_into(out, "the same command with --resume"):
+        run_training(spec, out, folder, args.words("--beside", beside) if beside else ())
 
 
-def run_training(
-    spec: TrainingSpec, out: Path | None, folder: args.RunFolder, beside: Sequence[str] = ()
-) -> None:
+def _task_of(spec: TrainingSpec) -> TrainingTask:
+    from parkenv.cli.drive_task import DriveTask
+    from parkenv.cli.search_task import SearchTask
+
+    return DriveTask(spec) if spec.env == "drive" else SearchTask(spec)
+
+
+def run_training(spec: TrainingSpec, out: Path, folder: args.RunFolder, beside: Sequence[str] = ()) -> None:
     """Train, test and draw; see `train`.
 
     Raises:
         InputError: the training is impossible, or the folder cannot be used.
     """
-    from parkenv.cli.drive_task import DriveTask
-    from parkenv.cli.search_task import SearchTask
     from parkenv.cli.training_task import curves_beside
-    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.training.rl_training import MODEL
 
-    task = {"search": SearchTask, "drive": DriveTask}[spec.env](spec)
+    task = _task_of(spec)
     task.check()
     settings = {"version": __version__, **task.settings()}
-    out = out or Path("results") / task.folder
     others = curves_beside(beside, out, task)
-    make_folder(out)
     _require_free(out, settings, folder)
     console = make_console()
     with args.workers_of(spec) as workers:
-        training = task.training(console)
+        training = dataclasses.replace(task.training(console), command=tuple(command_line()))
         _claim(out, settings, folder.overwrite)
         spec.write(out / SPEC_FILE)
         numbers = range(spec.seed, spec.seed + spec.trainings)
@@ -213,9 +216,6 @@ def _train_all(
             for i, trained in workers.results(tasks):
                 trained.save(out / f"seed_{seeds[i]}")
                 curves[i] = trained.curve
-        except KeyboardInterrupt:
-            console.print(f"Interrupted. Checkpoints are in {out}; the same command with --resume goes on.")
-            raise Exit(130) from None
         finally:
             over.set()
             watcher.join()

@@ -61,7 +61,7 @@ class TrainingTask(ABC):
         Raises:
             InputError: an invalid option, or a missing package.
         """
-        from planners.learned import algorithm_class
+        from planners.model_file import algorithm_class
 
         self.config()
         algorithm_class(self.algorithm)

@@ -56,6 +56,14 @@ def write_text(image: Image, text: str, at: tuple[int, int], color: Color, size:
     return int(right)
 
 
+def write_tag(image: Image, text: str, at: tuple[int, int], color: Color) -> None:
+    """Write dark text on a coloured ground with its upper left corner at a point."""
+    left, top = at
+    end = left + 8 + text_width(text, 13, 600)
+    cv2.rectangle(image, at, (end, top + 20), color, cv2.FILLED)
+    write_text(image, text, (left + 4, top + 15), (16, 16, 16), 13, 600)
+
+
 def text_width(text: str, size: int, weight: int) -> int:
     """Return the width of a text, px."""
     _, _, width, _ = cv2.getTextSize((1 << 14, 1 << 14), text, (0, 0), FONT, size, weight)

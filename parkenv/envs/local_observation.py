@@ -68,6 +68,8 @@ FloatArray = NDArray[np.float64]
 
 MINUTE = 60.0
 MANY_SLOTS = 20.0
+MAX_SLOTS = 1_000
+"""Maximum number of slots in an observation."""
 N_MOVES = len(MOVES)
 HERE, PER_MOVE, PER_NEAR = 14, 8, 8
 FIRST_NEAR = HERE + N_MOVES * PER_MOVE
@@ -102,10 +104,10 @@ class Surroundings(NamedTuple):
             k: number of slots described, both nearby and ahead of each move.
 
         Raises:
-            InputError: k is not a whole number of at least 1.
+            InputError: k is not a whole number from 1 to `MAX_SLOTS`.
         """
-        if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or k < 1:
-            raise InputError(f"k is {k!r}, want a whole number of at least 1")
+        if isinstance(k, bool) or not isinstance(k, (int, np.integer)) or not 1 <= k <= MAX_SLOTS:
+            raise InputError(f"k is {k!r}, want a whole number from 1 to {MAX_SLOTS:,}")
         parts = [_around(problem, int(k)) for problem in problems]
         joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
         first = np.concatenate([[0], np.cumsum([p.lot.n_vertices for p in problems])[:-1]])
@@ -151,7 +153,7 @@ class LocalObservation(
 
     Raises:
         TypeError: another environment.
-        InputError: k is not a whole number of at least 1.
+        InputError: k is not a whole number from 1 to `MAX_SLOTS`.
 
     Examples:
         >>> import gymnasium as gym

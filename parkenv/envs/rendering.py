@@ -172,19 +172,24 @@ class SearchRenderer:
 
     Args:
         scenario: the scenario.
+        size: width and height of the map, px.
+        hud: height of the line of text below it, px.
 
     Attributes:
         outline: the lot's shapes.
         window: shows frames on the screen.
     """
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(
+        self, scenario: Scenario, size: tuple[int, int] = (WIDTH, HEIGHT - HUD), hud: int = HUD
+    ) -> None:
         self.scenario = scenario
+        self._map_size, self._hud = size, hud
         self.outline = LotOutline.of(scenario.lot)
         self._still: StillLayer | None = None
         self._window_at: tuple[int, int] | None = None
         self.window = Window(f"parkenv: {scenario.name}")
-        self._size = (float(WIDTH), float(HEIGHT - HUD))
+        self._size = (float(size[0]), float(size[1]))
         lot = scenario.lot
         room = (self._size[0] - 2 * MARGIN, self._size[1] - 2 * MARGIN)
         fitted = MapView.fit(_corners(lot), room, LARGEST_SCALE)
@@ -203,6 +208,16 @@ class SearchRenderer:
             state: state of an environment with the renderer's scenario.
             occupied: (n_slots,) bool, the true occupancy.
         """
+        image = self.draw_slots(state, occupied)
+        view = self.still_layer(state).view
+        self._draw_trail(image, view, state)
+        self._draw_goal(image, view, state)
+        self._draw_car(image, view, state)
+        self._draw_hud(image, state)
+        return image
+
+    def draw_slots(self, state: SearchState, occupied: NDArray[np.bool_]) -> Image:
+        """Render lot, beliefs and parked cars; see `frame`."""
         ground = self.still_layer(state)
         image = ground.image.copy()
         slots = ground.slots
@@ -216,10 +231,6 @@ class SearchRenderer:
             belief_colors(state.belief.p_occupied[slots], state.belief.observed[slots]),
             occupied[slots],
         )
-        self._draw_trail(image, ground.view, state)
-        self._draw_goal(image, ground.view, state)
-        self._draw_car(image, ground.view, state)
-        self._draw_hud(image, state)
         return image
 
     def text(self, state: SearchState) -> str:
@@ -246,7 +257,7 @@ class SearchRenderer:
         """Return the static layer for the part of the lot that a frame shows."""
         if self._whole is not None:
             if self._still is None:
-                self._still = draw_still_layer(self.scenario.lot, self.outline, self._whole)
+                self._still = self._draw_still_layer(self._whole)
             return self._still
         return self._window(self.scenario.lot.vertex_xy[state.vertex], WINDOW_SLOT, 2)
 
@@ -259,8 +270,11 @@ class SearchRenderer:
         if self._still is None or self._window_at != (column, row):
             self._window_at = column, row
             view = MapView.around(np.array([column, row]) * stride, self._size, scale)
-            self._still = draw_still_layer(self.scenario.lot, self.outline, view)
+            self._still = self._draw_still_layer(view)
         return self._still
+
+    def _draw_still_layer(self, view: MapView) -> StillLayer:
+        return draw_still_layer(self.scenario.lot, self.outline, view, self._map_size, self._hud)
 
     def _pose(self, state: SearchState) -> tuple[FloatArray, float]:
         """Return the car's position, (2,) m, and yaw."""
@@ -440,17 +454,28 @@ def draw_outline(
         )
 
 
-def draw_still_layer(lot: ParkingLot, outline: LotOutline, view: MapView) -> StillLayer:
-    """Draw everything static at `SUPERSAMPLING` times the resolution, and average it down."""
+def draw_still_layer(
+    lot: ParkingLot, outline: LotOutline, view: MapView, size: tuple[int, int], hud: int
+) -> StillLayer:
+    """Draw everything static at `SUPERSAMPLING` times the resolution, and average it down.
+
+    Args:
+        lot: the lot.
+        outline: its shapes.
+        view: map view of the frame.
+        size: width and height of the map, px.
+        hud: height of the line of text below it, px; it is left out if 0.
+    """
+    width, height = size
     fine = MapView(view.turn, view.scale * SUPERSAMPLING, view.shift * SUPERSAMPLING)
-    shape = ((HEIGHT - HUD) * SUPERSAMPLING, WIDTH * SUPERSAMPLING)
+    shape = (height * SUPERSAMPLING, width * SUPERSAMPLING)
     at = view(lot.slot_xy)
     reach = view.scale * float(np.hypot(lot.slot_length, lot.slot_width).max()) / 2
-    inside = (at > -reach).all(axis=1) & (at < np.array([WIDTH, HEIGHT - HUD]) + reach).all(axis=1)
+    inside = (at > -reach).all(axis=1) & (at < np.array(size) + reach).all(axis=1)
     slots = np.flatnonzero(inside)
     along = np.stack([np.cos(lot.slot_yaw), np.sin(lot.slot_yaw)], axis=1)[slots, None]
     left = np.stack([-along[..., 1], along[..., 0]], axis=-1)
-    length, width = lot.slot_length[slots, None, None], lot.slot_width[slots, None, None]
+    slot_length, slot_width = lot.slot_length[slots, None, None], lot.slot_width[slots, None, None]
 
     def placed(part: FloatArray, long: FloatArray, wide: FloatArray) -> NDArray[np.int32]:
         """Place a unit-size shape, (k, 2), in every slot; returns (m, k, 2) fixed-point pixels."""
@@ -458,8 +483,8 @@ def draw_still_layer(lot: ParkingLot, outline: LotOutline, view: MapView) -> Sti
         return drawing.fixed_point(fine(xy))
 
     image = np.full((*shape, 3), GROUND, dtype=np.uint8)
-    center = (np.array([WIDTH, HEIGHT - HUD]) / 2 - view.shift) @ view.turn.T / view.scale
-    draw_outline(image, fine, outline, center, max(WIDTH, HEIGHT) / 2 / view.scale)
+    center = (np.array(size) / 2 - view.shift) @ view.turn.T / view.scale
+    draw_outline(image, fine, outline, center, max(size) / 2 / view.scale)
     for x, y, yaw in outline.entries:
         onward = np.array([np.cos(yaw), np.sin(yaw)]) @ view.turn
         arrow = SUPERSAMPLING * _ENTRY_MARK @ drawing.rotation(float(np.arctan2(onward[1], onward[0])))
@@ -469,8 +494,8 @@ def draw_still_layer(lot: ParkingLot, outline: LotOutline, view: MapView) -> Sti
     cars = np.zeros((*shape, 3), dtype=np.uint8)
     has_car = np.zeros(shape, dtype=np.uint8)
     line = max(_LINE_WIDTH, 0.8 / view.scale)
-    boxes = placed(_BOX, length - line, width - line)
-    long, wide = np.minimum(0.8 * length, 4.4), np.minimum(0.62 * width, 1.75)
+    boxes = placed(_BOX, slot_length - line, slot_width - line)
+    long, wide = np.minimum(0.8 * slot_length, 4.4), np.minimum(0.62 * slot_width, 1.75)
     bodies = placed(_BODY, long, wide)
     glass = np.stack([placed(_WINDSCREEN, long, wide), placed(_REAR, long, wide)])
     for i in range(len(slots)):
@@ -485,14 +510,15 @@ def draw_still_layer(lot: ParkingLot, outline: LotOutline, view: MapView) -> Sti
     owner = blocks.max(axis=-1)
     pixel = np.flatnonzero(owner >= 0)
     owner = owner.ravel()[pixel]
-    blocks = blocks.reshape(len(blocks) * WIDTH, -1)[pixel]
+    blocks = blocks.reshape(height * width, -1)[pixel]
     own = blocks == owner[:, None]
     cars_here = _blocks(has_car).reshape(-1, SUPERSAMPLING**2)[pixel]
     colors = np.stack([_blocks(cars[..., c]).reshape(-1, SUPERSAMPLING**2)[pixel] for c in range(3)], axis=-1)
-    small = cv2.resize(image, (WIDTH, HEIGHT - HUD), interpolation=cv2.INTER_AREA)
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    _draw_north(small, view)
     return StillLayer(
         view=view,
-        image=_with_key(np.vstack([small, np.full((HUD, WIDTH, 3), INK, np.uint8)]), view),
+        image=np.vstack([small, _hud_strip(width, hud)]) if hud else small,
         slots=slots,
         pixel=pixel,
         slot=owner.astype(np.int64),
@@ -509,23 +535,36 @@ def _blocks(fine: NDArray[Any]) -> NDArray[Any]:
     return split.swapaxes(1, 2).reshape(rows, columns, SUPERSAMPLING**2)
 
 
-def _with_key(image: Image, view: MapView) -> Image:
-    """Add the colour key and the north arrow."""
-    top = HEIGHT - HUD // 2 - 6
-    right = WIDTH - HUD_MARGIN
+def _hud_strip(width: int, height: int) -> Image:
+    """Return the background of the line of text, with the colour key."""
+    image = np.full((height, width, 3), INK, np.uint8)
+    top, right = height - height // 2 - 6, width - HUD_MARGIN
     drawing.write_label(image, "taken", np.array([right - 18.0, top + 6.0]), WHITE, 13, 400)
-    bar = np.linspace(0, 255, 72).astype(int)
-    image[top : top + 6, right - 116 : right - 44] = _BELIEF_SCALE[0, bar]
-    image[top + 6 : top + 12, right - 116 : right - 44] = _BELIEF_SCALE[1, bar]
+    draw_belief_key(image, (right - 116, top), (72, 12))
     drawing.write_label(image, "free", np.array([right - 132.0, top + 6.0]), WHITE, 13, 400)
+    return image
+
+
+def draw_belief_key(image: Image, at: tuple[int, int], size: tuple[int, int]) -> None:
+    """Draw the colours of beliefs from free to taken, with the upper left corner `at` and a size in px.
+
+    The upper half shows slots that have not been observed, the lower half those that have.
+    """
+    (left, top), (width, height) = at, size
+    bar = np.linspace(0, 255, width).astype(int)
+    for half in (0, 1):
+        rows = slice(top + half * height // 2, top + (half + 1) * height // 2)
+        image[rows, left : left + width] = _BELIEF_SCALE[half, bar]
+
+
+def _draw_north(image: Image, view: MapView) -> None:
     north = np.array([0.0, 1.0]) @ view.turn
-    at = np.array([float(WIDTH - 22), 24.0])
+    at = np.array([float(image.shape[1] - 22), 24.0])
     turn = drawing.rotation(float(np.arctan2(north[1], north[0])))
     drawing.fill_polygon(
         image, at + np.array([[11.0, 0.0], [-3.0, 5.0], [-1.0, 0.0], [-3.0, -5.0]]) @ turn, INK
     )
     drawing.write_label(image, "N", at - 12.0 * north, INK, 12, 600)
-    return image
 
 
 _BOX = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])

@@ -327,16 +327,17 @@ class Searches:
         return (self.records.copy(), *(array.copy() for array in self._arrays().values()))
 
     def restore(self, saved: tuple[NDArray[Any], ...]) -> None:
-        """Restore a copy returned by `save` of searches in the same scenarios.
+        """Restore a copy returned by `save` of searches in the same scenarios; records may be given as bytes, uint8.
 
         Raises:
             InputError: the number of slots differs.
         """
         records, *arrays = saved
+        records = records.view(SEARCH)
         width = int(records["width"][0])
         if width != self.records["width"][0]:
             raise InputError(f"state is of a lot with {width} slots, this one has {self.records['width'][0]}")
         for name in PROGRESS_FIELDS:
             self.records[name] = records[name]
         for mine, array in zip(self._arrays().values(), arrays, strict=True):
-            mine[...] = array
+            mine[...] = array.view(mine.dtype)

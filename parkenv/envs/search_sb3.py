@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -94,6 +94,21 @@ class SearchVecEnv(SharedVecEnv):
 
         infos = self._end_episodes(done, truncated & ~terminated, final)
         return observations, (rewards * self.reward_scale).astype(np.float32), done, infos
+
+    def get_state(self) -> dict[str, Any]:
+        """Return a copy of the running searches as plain arrays, for `set_state`."""
+        return {
+            "searches": [a.view(np.uint8) if a.dtype.names else a for a in self.batch.get_state()],
+            "masks": self._masks,
+            "returns": self._returns,
+            "lengths": self._lengths,
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that `get_state` returned for the same scenarios."""
+        self.reset()
+        self.batch.set_state(state["searches"])
+        self._masks, self._returns, self._lengths = state["masks"], state["returns"], state["lengths"]
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the action masks, (n_envs, 5) bool."""

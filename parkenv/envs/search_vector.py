@@ -27,6 +27,8 @@ from parkenv.world.pointers import uint8s
 from parkenv.world.scenario import Scenario
 
 OBSERVATIONS = ("full", "occupancy", "local")
+MAX_ENVS = 1_000_000
+"""Maximum number of environments."""
 TIME_METRICS = (
     "drive_s",
     "failed_s",
@@ -252,9 +254,9 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         render_mode: str | None = None,
         **changes: Any,
     ) -> None:
-        _require_count("num_envs", num_envs)
+        _require_count("num_envs", num_envs, MAX_ENVS)
         if max_episode_steps is not None:
-            _require_count("max_episode_steps", max_episode_steps)
+            _require_count("max_episode_steps", max_episode_steps, 2**31 - 1)
         if observation not in OBSERVATIONS:
             raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")
         if render_mode is not None:
@@ -355,6 +357,15 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._step(np.zeros(self.num_envs, dtype=np.int64), which, ~which)
         self._done = self._done & ~which
         return self._observations(), {}
+
+    def get_state(self) -> tuple[NDArray[Any], ...]:
+        """Return a copy of the state of all searches, for `set_state`."""
+        return self._searches.save()
+
+    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
+        """Continue from a state that `get_state` returned for the same scenarios; no search in it may be over."""
+        self._searches.restore(state)
+        self._begun, self._done = True, self._nobody
 
     def step(
         self, actions: IntArray
@@ -460,6 +471,6 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return mask
 
 
-def _require_count(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise InputError(f"{name} is {value!r}, want a whole number of at least 1")
+def _require_count(name: str, value: Any, most: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 1 <= value <= most:
+        raise InputError(f"{name} is {value!r}, want a whole number from 1 to {most:,}")

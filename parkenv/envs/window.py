@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
-
-from parkenv.errors import InputError
 
 
 class Window:
@@ -26,12 +25,12 @@ class Window:
         """Show a frame, (h, w, 3), at most `fps` frames per second.
 
         Raises:
-            InputError: pygame is not installed.
+            gymnasium.error.DependencyNotInstalled: pygame is not installed.
         """
         try:
             import pygame
         except ImportError as error:
-            raise InputError(
+            raise DependencyNotInstalled(
                 'render_mode "human" needs pygame, which is not installed: pip install "parkenv[human]"'
             ) from error
         if self._screen is None:

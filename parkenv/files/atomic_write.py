@@ -1,4 +1,4 @@
-"""Write files atomically: complete or not at all."""
+"""Write files atomically, and append to files: complete or not at all."""
 
 from __future__ import annotations
 
@@ -28,3 +28,30 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
         beside.unlink(missing_ok=True)
+
+
+def append_text(path: Path, text: str) -> None:
+    """Append to a file, and flush it to disk; on failure, restore the file.
+
+    Raises:
+        InputError: the file cannot be written, e.g. because the disk is full; the message names it.
+    """
+    try:
+        size = path.stat().st_size
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError:
+            os.truncate(path, size)
+            raise
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def remove_torn(folder: Path) -> None:
+    """Remove the temporary files of killed processes from a folder and its subfolders, which nobody else writes."""
+    for pattern in (".*.[0-9]*.part", "*/.*.[0-9]*.part"):
+        for torn in folder.glob(pattern):
+            torn.unlink(missing_ok=True)

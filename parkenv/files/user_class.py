@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+import traceback
 from importlib import import_module
+from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
@@ -27,19 +29,34 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
     # Search the working directory, as `python -m` does; an installed command would search its own folder instead.
     if here not in sys.path:
         sys.path.insert(0, here)
+    if not all(part.isidentifier() for part in (*module.split("."), class_name)):
+        raise InputError(f"{kind} {name!r}: want MODULE:CLASS{alternatives}")
     try:
         found = getattr(import_module(module), class_name)
     except ModuleNotFoundError as error:
         if error.name != module.partition(".")[0]:
-            raise
+            raise InputError(
+                f"{kind} {name!r}: its module needs {error.name!r}, which is not installed"
+            ) from error
         raise InputError(
             f"{kind} {name!r}: no module {module!r} in {here} or on Python's path{alternatives}"
         ) from None
-    except AttributeError:
-        raise InputError(f"{kind} {name!r}: module {module!r} has no {class_name!r}") from None
-    if not callable(getattr(found, method.partition("(")[0], None)):
+    except Exception as error:
+        if isinstance(error, AttributeError) and module in sys.modules:
+            raise InputError(f"{kind} {name!r}: module {module!r} has no {class_name!r}") from None
+        at = traceback.extract_tb(error.__traceback__)[-1]
+        raise InputError(
+            f"{kind} {name!r}: its module fails: {type(error).__name__}: {error} ({at.filename}, line {at.lineno})"
+        ) from error
+    if not isinstance(found, type) or not callable(getattr(found, method.partition("(")[0], None)):
         raise InputError(f"{kind} {name!r}: has no method {method}")
     return found
+
+
+def find_module(name: str) -> str | None:
+    """Return where the module of `MODULE:CLASS` would be imported from, without importing it; None if nowhere."""
+    found = PathFinder.find_spec(name.partition(":")[0].partition(".")[0], [str(Path.cwd()), *sys.path])
+    return None if found is None else found.origin
 
 
 def file_of_class(name: str) -> Path | None:

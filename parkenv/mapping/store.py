@@ -159,20 +159,21 @@ class MapStore:
                 raise InputError(
                     f"{self.path}: holds {len(rows):,} sessions, want at most {MAX_STATES // self._lot.n_slots:,}"
                 )
-            for number, *head in rows:
+            for number, key, time, rig, weather in rows:
                 p = np.full(self._lot.n_slots, np.nan)
                 for slot, value in self._db.execute(
                     "SELECT slot, p_occupied FROM sighting WHERE session = ?", (number,)
                 ):
                     if not (isinstance(slot, int) and 0 <= slot < len(p) and isinstance(value, float)):
                         raise InputError(
-                            f"{self.path}: session {head[0]!r:.40}: slot {slot!r:.40} has p_occupied {value!r:.40}, "
+                            f"{self.path}: session {key!r:.40}: slot {slot!r:.40} has p_occupied {value!r:.40}, "
                             f"want slots 0 to {len(p) - 1} with numbers"
                         )
                     p[slot] = value
                 cars = self._db.execute("SELECT x, y, yaw FROM car WHERE session = ?", (number,)).fetchall()
                 try:
-                    found.append(Session(*head, p, np.array(cars, dtype=np.float64).reshape(-1, 3)))
+                    poses = np.array(cars, dtype=np.float64).reshape(-1, 3)
+                    found.append(Session(key, time, rig, weather, p, poses))
                 except (TypeError, ValueError) as error:
                     raise InputError(f"{self.path}: {error}") from error
         return found

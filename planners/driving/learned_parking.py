@@ -14,7 +14,7 @@ from parkenv.driving.vehicle import ACCELERATION, SPEED, STATE_SIZE, STEERING, Y
 from parkenv.errors import InputError
 from planners.driving import policy_interface as interface
 from planners.driving.policy_interface import Outlines, PolicyInterface
-from planners.learned import load_model
+from planners.model_file import load_model
 
 Observation = Mapping[str, Any]
 
@@ -42,8 +42,7 @@ class LearnedParkingAgent:
 
     Attributes:
         card: metadata of the model file.
-        model: a model of stable-baselines3 or sb3-contrib; its observation is that of
-            `planners.driving.policy_interface`.
+        model: the policy; its observation is that of `planners.driving.policy_interface`.
     """
 
     def __init__(

@@ -17,7 +17,7 @@ def make_parking_agent(name: str, vehicle: VehicleParameters | None = None) -> A
 
     Args:
         name: `planner`, or `ALGORITHM:FILE` for a model trained by `parkenv train --env drive`, such as
-            `sac:models/sac.zip`.
+            `sac:models/sac.safetensors`.
         vehicle: the car.
 
     Raises:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from importlib import import_module
 from importlib.util import find_spec
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from typing import Any
 
 import gymnasium as gym
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
 
 from parkenv.evaluation.bench.rows import BenchRow, duration, seconds_each
+from parkenv.evaluation.experiments.workers import worker_start
 from parkenv.evaluation.simulate import simulate
 from parkenv.lots import city_lot, packaged_lot
 from parkenv.scenarios.build import make_scenario
@@ -126,8 +127,13 @@ def repair_rows(lot: ParkingLot, seed: int, seconds: float) -> list[BenchRow]:
 
 def city_rows_apart(n_slots: int, seed: int) -> list[BenchRow]:
     """Run `city_rows` in a separate process, to measure its peak memory alone."""
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as apart:
-        return apart.submit(city_rows, n_slots, seed).result()
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn"), **worker_start()) as apart:
+        try:
+            return apart.submit(city_rows, n_slots, seed).result()
+        except KeyboardInterrupt:
+            for process in active_children():
+                process.kill()
+            raise
 
 
 def city_rows(

@@ -8,6 +8,7 @@ from pydantic import BeforeValidator, ConfigDict, model_validator
 
 from parkenv.errors import InputError
 from parkenv.files.spec_file import OrText, Spec
+from planners.names import ALGORITHMS
 
 OptionValue = bool | int | float | str
 
@@ -114,6 +115,23 @@ def split_agents(text: str) -> list[str]:
         else:
             words[-1] += character
     return [word.strip() for word in words if word.strip()]
+
+
+def classes_in(spec: Spec) -> list[str]:
+    """Return the classes `MODULE:CLASS` that a specification names: agents and detectors of a user's own."""
+    found: list[str] = []
+    for field in type(spec).model_fields:
+        value = getattr(spec, field)
+        for part in value if isinstance(value, tuple) else (value,):
+            name = (
+                part.name if isinstance(part, AgentSpec) else part if field in ("clone", "detector") else None
+            )
+            if isinstance(name, str):
+                before, colon, _ = name.partition(":")
+                found += [name] if colon and (field == "detector" or before not in ALGORITHMS) else []
+            elif isinstance(part, Spec):
+                found += classes_in(part)
+    return list(dict.fromkeys(found))
 
 
 def _tables(value: object) -> object:

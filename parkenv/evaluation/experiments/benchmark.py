@@ -6,10 +6,12 @@ result file names its suite, contains the total time of every search, and can be
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self
 
@@ -19,7 +21,7 @@ import numpy as np
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
-from parkenv.evaluation.experiments.compare import Case, at_occupancy, table
+from parkenv.evaluation.experiments.compare import Case, at_occupancy, require_distinct, table
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.results import ResultFolder, Row
 from parkenv.files.limited_reading import read_json
@@ -37,6 +39,7 @@ METRICS = (
     "decision_ms", "decision_ms_p99",
 )  # fmt: skip
 """Metrics of an agent in a task, named as in `parkenv compare`; a result also has the score."""
+RESAMPLES = 2000
 _ROUNDING = 1e-6
 _FOLDER = Path(__file__).parent / "suites"
 
@@ -109,17 +112,27 @@ class Suite:
         for world in worlds:
             for agent in agents:
                 make_agent(agent.name, world, **agent.options)
-        return [
-            (Case(world, agent.name, options=agent.options), self.seeds)
-            for world in worlds
-            for agent in agents
-        ]
+        cases = [Case(world, agent.name, options=agent.options) for world in worlds for agent in agents]
+        require_distinct(cases)
+        return [(case, self.seeds) for case in cases]
 
 
 def result_of(
-    suite: Suite, cases: Sequence[tuple[Case, range]], folder: ResultFolder, command: Sequence[str]
+    suite: Suite,
+    cases: Sequence[tuple[Case, range]],
+    folder: ResultFolder,
+    command: Sequence[str],
+    by: str = "",
 ) -> Row:
-    """Build the content of a result file from a folder in which all cases are finished."""
+    """Build the content of a result file from a folder in which all cases are finished.
+
+    Args:
+        suite: the suite.
+        cases: all cases.
+        folder: their finished episodes.
+        command: the command that ran them.
+        by: who submits the result; dated today.
+    """
     episodes: dict[str, dict[str, dict[str, list[float]]]] = {}
     for case, seeds in cases:
         rows = [folder.episodes[case.key(s)] for s in seeds]
@@ -142,6 +155,8 @@ def result_of(
         "suite_sha256": suite.fingerprint,
         "parkenv": __version__,
         "command": list(command),
+        "by": by,
+        "date": datetime.now(UTC).date().isoformat(),
         "rows": rows,
         "scores": {agent: _mean_score(tasks) for agent, tasks in episodes.items()},
         "episodes": episodes,
@@ -201,6 +216,7 @@ def _check_task(
         raise InputError(f"{where}: its row is not what its searches come to")
 
 
+@functools.cache
 def _bounds(task: Task, suite: Suite) -> list[float]:
     scenario = task.made(suite.arrival)
     runner = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario))
@@ -209,6 +225,18 @@ def _bounds(task: Task, suite: Suite) -> list[float]:
 
 def _score(searches: Mapping[str, Sequence[float]]) -> float:
     return float(np.mean(searches["bound_s"]) / np.mean(searches["total_s"]))
+
+
+def score_interval(tasks: Mapping[str, Mapping[str, Sequence[float]]]) -> tuple[float, float, float]:
+    """Return an agent's score and its 95 % bootstrap interval; equal searches have equal intervals."""
+    rng = np.random.default_rng(0)
+    resampled = np.zeros(RESAMPLES)
+    for searches in tasks.values():
+        bound, total = np.array(searches["bound_s"]), np.array(searches["total_s"])
+        drawn = rng.integers(len(total), size=(RESAMPLES, len(total)))
+        resampled += bound[drawn].mean(axis=1) / total[drawn].mean(axis=1) / len(tasks)
+    low, high = np.quantile(resampled, (0.025, 0.975))
+    return _mean_score(tasks), float(low), float(high)
 
 
 def _mean_score(tasks: Mapping[str, Mapping[str, Sequence[float]]]) -> float:

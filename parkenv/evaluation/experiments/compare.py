@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import warnings
-from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -23,7 +23,7 @@ from parkenv.world.occupancy import ArrivalWindow, OccupancyProcess
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
 from parkenv.world.week import DAY_S
-from planners.agent import make_agent
+from planners.agent import make_agent, shown_name
 
 BLIND = "-blind"  # suffix of the names of scenarios whose slots are not observed before an attempt
 BLOCK = 10  # episodes per task: a crash loses few of them, and the overhead of starting a task stays small
@@ -41,11 +41,12 @@ class Case:
     options: Mapping[str, Any] = field(default_factory=dict)  # options of the agent, for `make_agent`
     # detector for the rig's images, for `make_detector`; None for the packaged one
     detector: str | None = None
+    every: float | None = None  # least distance between the rig's captures, m; None for the environment's
 
     @property
     def label(self) -> str:
         """Name of the agent with its options, for tables."""
-        return label_of(self.agent, dict(self.options))
+        return label_of(shown_name(self.agent), dict(self.options))
 
     @property
     def columns(self) -> Row:
@@ -65,7 +66,7 @@ class Case:
 
     def run(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row]]:
         """Run one episode per seed; return rows of `episodes.csv` and of `timings.csv`."""
-        runner = self._runner()
+        runner = self.runner()
         rows, timings = [], []
         for seed in seeds:
             episode = runner.run(seed)
@@ -83,11 +84,23 @@ class Case:
 
     def trace(self, seed: int) -> SearchTrace:
         """Run one episode, and return its trace for a picture."""
-        return self._runner().run(seed).trace
+        return self.runner().run(seed).trace
 
-    def _runner(self) -> EpisodeRunner:
+    def runner(self) -> EpisodeRunner:
+        """Return a runner of this case's episodes."""
         agent = make_agent(self.agent, self.scenario, **self.options)
-        return EpisodeRunner(self.scenario, self.label, agent, self.rig, self.detector)
+        return EpisodeRunner(self.scenario, self.label, agent, self.rig, self.detector, self.every)
+
+
+def require_distinct(cases: Iterable[Case]) -> None:
+    """Check that no two cases would share their rows, as two of a user's agents with the same `name` would.
+
+    Raises:
+        InputError: two agents are called the same.
+    """
+    counts = Counter(tuple(case.columns.values()) for case in cases)
+    if counts and (most := counts.most_common(1)[0])[1] > 1:
+        raise InputError(f"two agents are called {most[0][2]!r}, want different names")
 
 
 def settings_of(
@@ -181,6 +194,7 @@ def rows_of(
 ) -> list[Row]:
     """Run searches without saving them, and return the `table` row of each agent."""
     cases = [Case(scenario, agent.name, options=agent.options) for agent in agents]
+    require_distinct(cases)
     blocks = [(case, block) for case in cases for block in _blocks(seeds, 5 * BLOCK)]
     episodes: dict[str, list[Row]] = {case.label: [] for case in cases}
     for number, (rows, _) in workers.results([partial(case.run, block) for case, block in blocks]):

@@ -11,7 +11,10 @@ from parkenv.mapping.survey import SurveySettings
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 
-AGENTS = ("mdp", "greedy-goal", "greedy-drive", "first-free")
+AGENTS = ("mdp", "belief", "first-free", "greedy-drive", "oracle")
+FILMED = "belief"
+QUICK = {"sessions": 2, "episodes": 2, "every": 4.0}
+"""Settings of a shorter demo."""
 RIG: RigName = "laser"
 _HOURS = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
 _APART = 1_000_000  # offset between the seeds of survey and searches, so that their worlds differ
@@ -38,6 +41,8 @@ def demo_survey(spec: DemoSpec) -> tuple[Scenario, SurveySettings]:
 def demo_cases(spec: DemoSpec, scenario: Scenario, log: SessionLog) -> list[tuple[Case, range]]:
     """Return the cases: every agent with the surveyed map and simulated sensors, with the seeds of its searches.
 
+    The oracle knows which slots are taken, so it needs no sensors.
+
     Args:
         spec: specification of the demo.
         scenario: scenario from `demo_survey`.
@@ -45,4 +50,5 @@ def demo_cases(spec: DemoSpec, scenario: Scenario, log: SessionLog) -> list[tupl
     """
     known = scenario.replace(prior=MapPrior(log), sensor_model=SensorModel.named(RIG))
     seeds = range(spec.seed + _APART, spec.seed + _APART + spec.episodes)
-    return [(Case(known, name, rig=RIG, detector=spec.detector), seeds) for name in AGENTS]
+    sensors = {"rig": RIG, "detector": spec.detector, "every": spec.every}
+    return [(Case(known, name, **({} if name == "oracle" else sensors)), seeds) for name in AGENTS]

@@ -70,20 +70,28 @@ class EpisodeRunner:
         name: name of the agent, for the trace.
         agent: the agent.
         rig: sensor rig for `parkenv/SearchPerception-v1`; None for `parkenv/Search-v1`.
-        detector: detector for `parkenv/SearchPerception-v1`.
+        detector, every: detector and distance between captures, m, for `parkenv/SearchPerception-v1`; None for its own.
     """
 
     def __init__(
-        self, scenario: Scenario, name: str, agent: Agent, rig: str | None = None, detector: str | None = None
+        self,
+        scenario: Scenario,
+        name: str,
+        agent: Agent,
+        rig: str | None = None,
+        detector: str | None = None,
+        every: float | None = None,
     ) -> None:
         self.scenario = scenario
         self.name = name
         self.agent = agent
-        env = (
-            gym.make("parkenv/Search-v1", scenario=scenario)
-            if rig is None
-            else gym.make("parkenv/SearchPerception-v1", scenario=scenario, rig=rig, detector=detector)
-        )
+        if rig is None:
+            env = gym.make("parkenv/Search-v1", scenario=scenario)
+        else:
+            spacing = {} if every is None else {"every": every}
+            env = gym.make(
+                "parkenv/SearchPerception-v1", scenario=scenario, rig=rig, detector=detector, **spacing
+            )
         self.env = adapt_to_agent(env, agent)
         self._routes = DriveRoutes(scenario)
 

@@ -18,6 +18,7 @@ from parkenv.evaluation.experiments.compare import (
     at_occupancy,
     blind_scenario,
     check_worlds,
+    require_distinct,
     run_cases,
     settings_of,
     table,
@@ -70,6 +71,7 @@ class Experiment:
                 f"{self.spec.grid.calibrated} was measured on {measured.scenario!r}, here are {', '.join(names)}; "
                 "compare that scenario alone, neither blind nor with wrong maps"
             )
+        require_distinct(case for case, _ in self.cases)
 
     @cached_property
     def _base_scenarios(self) -> list[Scenario]:

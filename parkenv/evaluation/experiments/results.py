@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import append_text, atomic_write
 from parkenv.files.limited_reading import csv_records, parse_json, read_json
 
 SETTING_COLUMNS = ("scenario", "occupancy_level", "agent", "failure_cost_s", "v_walk_kmh", "v_drive_kmh")
@@ -196,8 +196,8 @@ class ResultFolder:
         self._timings |= {episode_key(r): r for r in timings}
         self.episodes |= {episode_key(r): r for r in rows}
         # Timings before episodes: an episode in `episodes.csv` is finished, and would not run again for its timing.
-        _append(self.path / "timings.csv", _csv_text(TIMING_COLUMNS, timings))
-        _append(self.path / "episodes.csv", _csv_text(EPISODE_COLUMNS, rows))
+        append_text(self.path / "timings.csv", _csv_text(TIMING_COLUMNS, timings))
+        append_text(self.path / "episodes.csv", _csv_text(EPISODE_COLUMNS, rows))
 
     def decision_s(self, key: Key) -> list[float]:
         """Return the wall times of an episode's decisions, s; empty if a crash lost them."""
@@ -234,15 +234,8 @@ def _csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]], *, head
     return text.getvalue()
 
 
-def _append(path: Path, text: str) -> None:
-    with path.open("a", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-
-
 def _read(path: Path, columns: Sequence[str]) -> list[Row]:
-    """Read the complete lines of a file written by `_append`."""
+    """Read the complete lines of a file written by `append_text`."""
     if not path.exists():
         return []
     rows = []

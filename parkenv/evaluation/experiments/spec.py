@@ -140,6 +140,7 @@ class BenchmarkSpec(Workplace):
 
     kind: Literal["benchmark"] = "benchmark"
     suite: str = "v1"
+    by: str = Field("", max_length=200, description="Who submits the result.")
     agents: Several[AgentItem] = Field(
         tuple(
             AgentSpec(name=name)
@@ -181,7 +182,7 @@ class DemoSpec(Workplace):
     scenario: ScenarioItem = scenario_spec("campus")
     sessions: int = Field(4, ge=1, le=100_000)
     episodes: int = Field(6, ge=2, le=MAX_EPISODES, description="Searches of each agent.")
-    every: CaptureDistance = 2.5
+    every: CaptureDistance = Field(2.5, description="Between captures, m, in the survey and in the searches.")
     detector: str = "hog"
     seed: int = Field(0, ge=0, lt=2**31)
 
@@ -227,3 +228,13 @@ class TrainingSpec(Workplace):
         if self.demonstrations is not None and self.clone is None:
             raise PydanticCustomError("whole", "demonstrations goes with clone")
         return self
+
+
+SPECS: dict[str, type[Workplace]] = {
+    "compare": ExperimentSpec,
+    "benchmark": BenchmarkSpec,
+    "survey": SurveySpec,
+    "demo": DemoSpec,
+    "train": TrainingSpec,
+}
+"""Specifications by the key `kind` of a file."""

@@ -34,6 +34,11 @@ from parkenv.world.week import DAY_S
 
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
+Recorder = Callable[[Survey, int, int], tuple[SessionResult, Any]]
+"""Drives a session, given its number and the number of perception results to keep, and records it."""
+
+PICTURES = 4
+"""Number of perception results of the first session that are kept for figures."""
 
 ERROR_COLUMNS = ("range_error_m", "range_error_p95_m", "place_error_m", "heading_error_deg")
 SESSION_COLUMNS = (
@@ -51,6 +56,7 @@ class SurveyRun:
     rows: list[Row]  # one row per session, in order
     # the first session, with results for figures; None if all sessions already existed
     shown: SessionResult | None
+    recorded: Any = None  # what `record` of `run_survey` made of it
 
 
 def survey_of(spec: SurveySpec) -> tuple[Scenario, SurveySettings]:
@@ -108,7 +114,7 @@ def run_survey(
     map_file: Path,
     *,
     workers: Workers = HERE,
-    pictures: int = 4,
+    record: Recorder | None = None,
     on_session: Callable[[Row], None] = lambda _: None,
 ) -> SurveyRun:
     """Drive the sessions that the map file does not hold yet, and write each in one transaction.
@@ -119,7 +125,7 @@ def run_survey(
         sessions: number of sessions.
         map_file: created if it does not exist. `sessions.csv` beside it holds the errors of each session.
         workers: where the sessions run; results do not depend on it.
-        pictures: number of perception results to keep of the first session, for figures.
+        record: drives the first session, and records it; None not to record it.
         on_session: called with the row of each completed session.
 
     Raises:
@@ -134,17 +140,19 @@ def run_survey(
         rows = {r["key"]: r for r in _read_rows(table) if store.has(r["key"])}
         wanted = [survey.key_of(k) for k in range(sessions)]
         missing = [k for k, key in enumerate(wanted) if not store.has(key) or key not in rows]
-        shown = None
-        for number, result in zip(missing, _driven(survey, missing, workers, pictures), strict=True):
+        shown = recorded = None
+        for number, (result, recording) in zip(
+            missing, _driven(survey, missing, workers, record), strict=True
+        ):
             row = session_row(result)
             rows[row["key"]] = row
             _write_rows(table, list(rows.values()))
             if not store.has(row["key"]):
                 store.add(result.session)
             if number == 0:
-                shown = result
+                shown, recorded = result, recording
             on_session(row)
-    return SurveyRun([rows[key] for key in wanted], shown)
+    return SurveyRun([rows[key] for key in wanted], shown, recorded)
 
 
 def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_file: Path) -> Row:
@@ -274,28 +282,37 @@ def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: Session
 
 
 def _driven(
-    survey: Survey, numbers: Sequence[int], workers: Workers, pictures: int
-) -> Iterator[SessionResult]:
-    """Yield the sessions in order."""
+    survey: Survey, numbers: Sequence[int], workers: Workers, record: Recorder | None
+) -> Iterator[tuple[SessionResult, Any]]:
+    """Yield the sessions in order, each with its recording."""
     if workers.in_process or len(numbers) < 2:
         for k in numbers:
-            yield survey.drive(k, pictures=pictures if k == 0 else 0)
+            yield _drive(survey, k, record)
         return
     yield from workers.in_order(
-        [partial(_drive, survey.scenario, survey.settings, k, pictures if k == 0 else 0) for k in numbers]
+        [partial(_drive_apart, survey.scenario, survey.settings, k, record) for k in numbers]
     )
+
+
+def _drive(survey: Survey, number: int, record: Recorder | None) -> tuple[SessionResult, Any]:
+    """Drive a session; the first one with results for figures, and recorded."""
+    if number == 0 and record is not None:
+        return record(survey, number, PICTURES)
+    return survey.drive(number, pictures=PICTURES if number == 0 else 0), None
 
 
 _KEPT: dict[str, Survey] = {}
 
 
-def _drive(scenario: Scenario, settings: SurveySettings, number: int, pictures: int) -> SessionResult:
+def _drive_apart(
+    scenario: Scenario, settings: SurveySettings, number: int, record: Recorder | None
+) -> tuple[SessionResult, Any]:
     """Drive a session in a worker process, which keeps the survey for the next session."""
     name = repr((scenario.name, settings))
     if name not in _KEPT:
         _KEPT.clear()
         _KEPT[name] = Survey(scenario, settings)
-    return _KEPT[name].drive(number, pictures=pictures)
+    return _drive(_KEPT[name], number, record)
 
 
 def _mean(rows: Sequence[Row], column: str) -> float:

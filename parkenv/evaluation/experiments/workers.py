@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import importlib
+import multiprocessing.resource_tracker
 import os
+import signal
 import socket
-from collections.abc import Callable, Iterator, Sequence
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack
+from contextlib import ExitStack, closing, contextmanager
 from types import TracebackType
 from typing import Any, Self, TypeVar, get_args
 from urllib.parse import urlsplit
 
-from joblib import Parallel, delayed
+from joblib import Parallel, cpu_count, delayed
+from joblib.externals.loky import process_executor
+from joblib.externals.loky.backend import resource_tracker
 
 from parkenv.errors import InputError
 from parkenv.files.names import BackendName
@@ -21,6 +30,8 @@ from parkenv.files.names import BackendName
 BACKENDS = get_args(BackendName)
 CONNECT_S = 5.0
 """Time for a cluster to answer at its address, s."""
+PR_SET_PDEATHSIG = 1
+"""Option of Linux's prctl(2): the signal that a process gets when its parent ends."""
 LOSSES = 3
 """Maximum number of workers that may die in a row without finishing a task."""
 
@@ -31,11 +42,12 @@ Task = Callable[[], Result]
 class Workers:
     """Runs independent tasks; the results do not depend on where they run.
 
-    If a worker dies, e.g. because its machine went down, only its current task is lost, and is run again.
+    If a worker dies, e.g. because its machine went down, only its current task is lost, and is run again. Workers of
+    this machine end with this process, and when the block ends by an exception.
 
     Args:
-        jobs: number of processes; 1 with loky runs everything in this process; None uses all cores. Ignored for a
-            cluster at an address.
+        jobs: number of processes, at most one per core and per task; None uses all cores. A single loky process is
+            this one. Ignored for a cluster at an address.
         backend: `loky` for processes of this machine, through joblib; or `ray` or `dask`.
         address: address of a cluster (dask: `tcp://HOST:8786`; ray: `HOST:6379` or `ray://HOST:10001`). Without one,
             ray and dask start a cluster on this machine and stop it at the end.
@@ -56,31 +68,38 @@ class Workers:
             raise InputError("address goes with the backend ray or dask; loky works on this machine alone")
         if jobs is not None and jobs < 1:
             raise InputError(f"jobs is {jobs}, want at least 1, or None for all cores")
-        self.jobs, self.backend, self.address = jobs, backend, address
+        self.jobs, self.backend, self.address = min(jobs or cpu_count(), cpu_count()), backend, address
         self._open = ExitStack()
-        self._run: Callable[[dict[int, Task[Any]]], Iterator[tuple[int, Any]]] = self._run_by_loky
+        self._run: Callable[[dict[int, Task[Any]]], Generator[tuple[int, Any]]] = self._run_by_loky
+        self._results: Generator[tuple[int, Any]] | None = None
         self._lost: type[BaseException] | tuple[type[BaseException], ...] = BrokenProcessPool
 
     def __enter__(self) -> Self:
         with ExitStack() as opened:
             if self.address is not None:
                 _require_listener(self.address)
-            if self.backend == "ray":
-                self._start_ray(opened)
-            elif self.backend == "dask":
-                self._start_dask(opened)
+            with _interrupts_blocked():
+                if self.backend == "ray":
+                    self._start_ray(opened)
+                elif self.backend == "dask":
+                    self._start_dask(opened)
             self._open = opened.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._results is not None:
+            with warnings.catch_warnings():
+                # joblib tells how many results are lost.
+                warnings.simplefilter("ignore")
+                self._results.close()
         self._open.close()
 
     @property
     def in_process(self) -> bool:
         """Whether tasks run in this process."""
-        return self.backend == "loky" and (self.jobs or core_count()) == 1
+        return self.backend == "loky" and self.jobs == 1
 
     def results(self, tasks: Sequence[Task[Result]]) -> Iterator[tuple[int, Result]]:
         """Run all tasks; yield index and result of each as it finishes, in any order.
@@ -88,20 +107,25 @@ class Workers:
         Raises:
             RuntimeError: workers die repeatedly without finishing a task.
         """
+        self._results = self._run_all(tasks)
+        return self._results
+
+    def _run_all(self, tasks: Sequence[Task[Result]]) -> Generator[tuple[int, Result]]:
         left = dict(enumerate(tasks))
         losses = 0
         while left:
             try:
-                for number, result in self._run(dict(left)):
-                    del left[number]
-                    losses = 0
-                    yield number, result
+                with closing(self._run(dict(left))) as run:
+                    for number, result in run:
+                        del left[number]
+                        losses = 0
+                        yield number, result
             except self._lost as error:
                 losses += 1
                 if losses == LOSSES:
                     raise RuntimeError(
                         f"{LOSSES} times in a row a {self.backend} worker died before anything was finished; "
-                        f"{len(left)} tasks are left. Is there memory enough for --jobs {self.jobs or 'all'}?"
+                        f"{len(left)} tasks are left. Is there memory enough for --jobs {self.jobs}?"
                     ) from error
 
     def in_order(self, tasks: Sequence[Task[Result]]) -> Iterator[Result]:
@@ -114,14 +138,22 @@ class Workers:
                 yield ready.pop(due)
                 due += 1
 
-    def _run_by_loky(self, tasks: dict[int, Task[Result]]) -> Iterator[tuple[int, Result]]:
+    def _run_by_loky(self, tasks: dict[int, Task[Result]]) -> Generator[tuple[int, Result]]:
+        jobs = min(self.jobs, len(tasks))
+        if jobs == 1:
+            yield from (_numbered(i, task) for i, task in tasks.items())
+            return
         parallel = Parallel(
-            n_jobs=self.jobs or core_count(),
+            n_jobs=jobs,
             return_as="generator_unordered",
             batch_size=1,
             pre_dispatch="2*n_jobs",
+            **worker_start(),
         )
-        yield from parallel(delayed(_numbered)(i, task) for i, task in tasks.items())
+        with _interrupts_blocked():
+            results = parallel(delayed(_numbered)(i, task) for i, task in tasks.items())
+        with closing(results):
+            yield from results
 
     # joblib's Ray backend returns no result before all tasks are done, and its Dask backend does not say which task
     # failed: a crash would lose finished tasks. So use the queues of Ray and Dask themselves.
@@ -132,7 +164,7 @@ class Workers:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         ray = _required("ray", "ray")
-        local = {"num_cpus": self.jobs or core_count(), "include_dashboard": False}
+        local = {"num_cpus": self.jobs, "include_dashboard": False}
         try:
             ray.init(
                 address=self.address or "local",
@@ -151,7 +183,7 @@ class Workers:
         address = self.address
         if address is None:
             cluster = distributed.LocalCluster(
-                n_workers=self.jobs or core_count(), threads_per_worker=1, dashboard_address=None
+                n_workers=self.jobs, threads_per_worker=1, dashboard_address=None
             )
             address = opened.enter_context(cluster).scheduler_address
         try:
@@ -163,7 +195,7 @@ class Workers:
         self._lost = distributed.scheduler.KilledWorker
 
 
-def _run_by_ray(tasks: dict[int, Task[Result]]) -> Iterator[tuple[int, Result]]:
+def _run_by_ray(tasks: dict[int, Task[Result]]) -> Generator[tuple[int, Result]]:
     ray = importlib.import_module("ray")
     remote = ray.remote(num_cpus=1, max_retries=LOSSES)(_numbered)
     ahead = 2 * int(ray.cluster_resources().get("CPU", 1))
@@ -176,7 +208,7 @@ def _run_by_ray(tasks: dict[int, Task[Result]]) -> Iterator[tuple[int, Result]]:
         yield from ray.get(finished)
 
 
-def _run_by_dask(client: Any, tasks: dict[int, Task[Result]]) -> Iterator[tuple[int, Result]]:
+def _run_by_dask(client: Any, tasks: dict[int, Task[Result]]) -> Generator[tuple[int, Result]]:
     distributed = importlib.import_module("distributed")
     # Not pure: equal tasks of two comparisons must both run.
     futures = [client.submit(_numbered, i, task, pure=False) for i, task in tasks.items()]
@@ -189,9 +221,47 @@ HERE = Workers(1)
 """Runs everything in this process."""
 
 
-def core_count() -> int:
-    """Return the number of cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def worker_start() -> dict[str, Any]:
+    """Return `initializer` and `initargs` of a pool whose processes end with this one, even if it is killed."""
+    # Linux sends the signal when the thread ends that started the worker.
+    by_signal = sys.platform == "linux" and threading.current_thread() is threading.main_thread()
+    return {"initializer": _start_worker, "initargs": (os.getpid(), by_signal)}
+
+
+def _start_worker(parent: int, by_signal: bool) -> None:
+    # loky takes compiled code for a memory leak, and would replace the worker.
+    process_executor._MAX_MEMORY_LEAK_SIZE = sys.maxsize
+    if by_signal:
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    else:
+        threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    if os.getppid() != parent:  # it has ended before
+        os._exit(1)
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1.0)
+    os._exit(1)
+
+
+@contextmanager
+def _interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT during the block: processes and threads that start there never get it, this thread gets it later.
+
+    Ctrl-C in a terminal goes to all processes; this one stops its workers.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    # These processes unblock the signal when they start.
+    multiprocessing.resource_tracker.ensure_running()
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _numbered(number: int, task: Task[Result]) -> tuple[int, Result]:

@@ -89,7 +89,7 @@ def save_learning_curves(
             axes.legend(loc="upper right", frameon=True, facecolor="white", edgecolor="none", framealpha=1.0)
         else:
             figure.legend(loc="outside lower left", ncols=2, frameon=False)
-        save_picture(figure, path)
+        save_picture(figure, path, "Learning curves, and planners in the same worlds")
 
 
 def save_success_curves(

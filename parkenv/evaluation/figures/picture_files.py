@@ -15,6 +15,8 @@ from PIL import Image
 from parkenv.files.atomic_write import atomic_write
 
 DPI = 150
+CAPTION = "Description"
+"""Key of the caption in the metadata of a PNG."""
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 9.0,
@@ -47,14 +49,19 @@ OPTIONAL_TIMES = ("parking_cost_s", "gave_up_s")
 """Parts that are shown only if they are not 0."""
 
 
-def save_picture(figure: Figure, path: str | Path) -> None:
+def save_picture(figure: Figure, path: str | Path, caption: str = "") -> None:
     """Write a PNG atomically.
+
+    Args:
+        figure: the figure.
+        path: the file to write.
+        caption: caption in reports, kept in the file.
 
     Raises:
         InputError: the file cannot be written.
     """
     with mpl.rc_context(STYLE), atomic_write(path) as beside:
-        figure.savefig(beside, format="png", dpi=DPI)
+        figure.savefig(beside, format="png", dpi=DPI, metadata={CAPTION: caption} if caption else None)
 
 
 def save_film(
@@ -85,5 +92,5 @@ def save_film(
             append_images=pictures[1:],
             duration=round(1000 / fps),
             loop=0,
-            optimize=False,
+            optimize=colors is not None,  # store only what changes
         )

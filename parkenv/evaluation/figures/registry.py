@@ -1,7 +1,7 @@
 """Registry of the figures of a comparison.
 
-To add one, write a function that takes `ComparisonResults` and yields (suffix, figure) pairs, and add a line to
-`FIGURES`. `parkenv compare` draws it into `NAME_SUFFIX.png`, and the report shows it under its caption.
+To add one, write a function that takes `ComparisonResults` and yields (scenario, setting, figure), and add a line to
+`FIGURES`. `parkenv compare` writes it to `NAME_SCENARIO_SETTING.png`, and the report shows it under its caption.
 """
 
 from __future__ import annotations
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Row = Mapping[str, Any]
+Setting = tuple[float, float, float]
+"""Failure cost, s, walking and driving speed, km/h."""
+Drawn = tuple[str, Setting | None, "Figure"]
+"""What a figure shows: a scenario, or \"\" for several; a setting, or None for several; and the figure."""
 
 
 @dataclass(frozen=True)
@@ -78,37 +82,42 @@ class ComparisonFigure:
     caption: str
     function: str
 
-    def draw(self, results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
-        """Yield (file name suffix, figure) pairs; none if the figure does not apply."""
+    def draw(self, results: ComparisonResults) -> Iterator[tuple[str, str, Figure]]:
+        """Yield file name (without suffix), caption and figure; none if the figure does not apply."""
         module, _, function = self.function.partition(":")
-        draw: Callable[[ComparisonResults], Iterator[tuple[str, Figure]]] = getattr(
-            import_module(module), function
-        )
-        yield from draw(results)
+        draw: Callable[[ComparisonResults], Iterator[Drawn]] = getattr(import_module(module), function)
+        for scenario, setting, figure in draw(results):
+            names, words = [scenario] * bool(scenario), [scenario] * bool(scenario)
+            if setting is not None:
+                names.append("failure{:g}_walk{:g}_drive{:g}".format(*setting))
+                words.append("failure cost {:g} s, walk {:g} km/h, drive {:g} km/h".format(*setting))
+            yield "_".join([self.name, *names]), f"{self.caption}: {', '.join(words)}", figure
 
 
 _HERE = "parkenv.evaluation.figures"
 FIGURES = (
-    ComparisonFigure("time_split", "Mean total time by its parts", f"{_HERE}.time_figures:time_splits"),
+    ComparisonFigure("time_split", "Where the time goes", f"{_HERE}.time_figures:time_splits"),
     ComparisonFigure(
         "time_distribution",
-        "Cumulative distribution of the total time",
+        "How many searches took at most how long",
         f"{_HERE}.time_distribution:time_distributions",
     ),
     ComparisonFigure(
         "time_against_occupancy",
-        "Total time against occupancy",
+        "The fuller the lot, the longer it takes",
         f"{_HERE}.time_figures:times_against_occupancy",
     ),
     ComparisonFigure(
         "time_against_failure_cost",
-        "Total time against the failure cost",
+        "What failed attempts cost",
         f"{_HERE}.time_figures:times_against_failure_cost",
     ),
     ComparisonFigure(
-        "time_against_map", "Total time against a flat forecast", f"{_HERE}.time_figures:times_against_map"
+        "time_against_map",
+        "If the forecast is the same for every slot",
+        f"{_HERE}.time_figures:times_against_map",
     ),
-    ComparisonFigure("searches", "Searches in one world", f"{_HERE}.search_pictures:searches"),
+    ComparisonFigure("searches", "Searches on the same day", f"{_HERE}.search_pictures:searches"),
 )
 """All figures, in the order of reports."""
 
@@ -132,9 +141,9 @@ def draw_figures(results: ComparisonResults, folder: Path, names: Sequence[str] 
     files = []
     for kind in FIGURES:
         if names is None or kind.name in names:
-            for suffix, figure in kind.draw(results):
-                files.append(folder / file_name(f"{kind.name}_{suffix}", ".png"))
-                save_picture(figure, files[-1])
+            for name, caption, figure in kind.draw(results):
+                files.append(folder / file_name(name, ".png"))
+                save_picture(figure, files[-1], caption)
     return files
 
 

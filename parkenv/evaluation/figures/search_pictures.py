@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -24,15 +24,16 @@ from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.episodes import SearchTrace
 from parkenv.evaluation.figures.lot_picture import BELIEF_MAP, draw_discs, draw_lot, points_per_m
 from parkenv.evaluation.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
-from parkenv.evaluation.figures.registry import ComparisonResults
+from parkenv.evaluation.figures.registry import ComparisonResults, Drawn, Setting
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import KMH
 
 FloatArray = NDArray[np.float64]
 
 PATH, WALK = "#ffd000", "#1852ba"
-PICTURED = ("greedy-goal", "first-free", "oracle")
-"""Agents whose paths are drawn beside the first agent's."""
+PICTURED = ("belief", "oracle", "first-free", "greedy-goal")
+"""Agents whose paths are drawn beside those of the first and of the fastest agent, the most interesting first."""
+MOST_PICTURED = 4
 POLICY_SCALE = 2.2
 """Least scale, points per metre, at which arrows at every vertex are legible."""
 
@@ -187,19 +188,33 @@ def _placed(shape: FloatArray, at: FloatArray, ahead: FloatArray) -> list[FloatA
     return list(at[:, None] + shape @ turn)
 
 
-def searches(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
-    """Yield `draw_searches` for each scenario and setting: the first agent and some others in the same world."""
-    settings: dict[str, list[Case]] = {}
+def searches(results: ComparisonResults) -> Iterator[Drawn]:
+    """Yield `draw_searches` for each scenario and setting: some agents in the same world.
+
+    These are the first agent, the fastest one, and those in `PICTURED`; at most `MOST_PICTURED`.
+    """
+    settings: dict[tuple[str, Setting], list[Case]] = {}
     for case, _ in results.cases:
         if case.scenario.name in results.scenarios:
             c = case.columns
-            name = "{}_failure{:g}_walk{:g}_drive{:g}".format(
-                c["scenario"], c["failure_cost_s"], c["v_walk_kmh"], c["v_drive_kmh"]
-            )
-            settings.setdefault(name, []).append(case)
-    for name, cases in settings.items():
-        drawn = [cases[0], *(case for case in cases[1:] if case.agent in PICTURED)]
-        yield name, draw_searches([case.trace(results.seed) for case in drawn])
+            setting = c["failure_cost_s"], c["v_walk_kmh"], c["v_drive_kmh"]
+            settings.setdefault((c["scenario"], setting), []).append(case)
+    totals = {(*_setting_of(row), row["agent"]): row["total_s"] for row in results.rows}
+    for (name, setting), cases in settings.items():
+        acting = [case for case in cases if case.agent != "oracle"]
+        fastest = min(
+            acting,
+            key=lambda case: totals.get((*_setting_of(case.columns), case.label), np.inf),
+            default=cases[0],
+        )
+        wanted = [cases[0], fastest, *(c for word in PICTURED for c in cases if c.agent == word)]
+        labels = list(dict.fromkeys(case.label for case in wanted))[:MOST_PICTURED]
+        drawn = [case for case in cases if case.label in labels]
+        yield name, setting, draw_searches([case.trace(results.seed) for case in drawn])
+
+
+def _setting_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in ("scenario", "failure_cost_s", "v_walk_kmh", "v_drive_kmh"))
 
 
 def draw_searches(traces: Sequence[SearchTrace]) -> Figure:

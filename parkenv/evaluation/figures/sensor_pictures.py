@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from parkenv.envs.drawing import write_text
+from parkenv.envs.drawing import write_tag
 from parkenv.evaluation.figures.lot_picture import draw_lot
 from parkenv.evaluation.figures.picture_files import STYLE, save_picture
 from parkenv.perception.range_scan import disparity
@@ -38,9 +38,7 @@ def with_boxes(image: Image, boxes: VehicleBoxes) -> Image:
         view = View(boxes.view[i])
         cv2.rectangle(drawn, (left, top), (right - 1, bottom - 1), BOX_COLORS[view], 2, cv2.LINE_AA)
         label = f"{view.name.lower()} {boxes.distance[i]:.0f} m {boxes.visible_fraction[i]:.0%}"
-        end = write_text(drawn, label, (left + 4, top + 15), BOX_COLORS[view], 13, 600)
-        cv2.rectangle(drawn, (left, top), (end + 4, top + 20), BOX_COLORS[view], cv2.FILLED)
-        write_text(drawn, label, (left + 4, top + 15), (16, 16, 16), 13, 600)
+        write_tag(drawn, label, (left, top), BOX_COLORS[view])
     return drawn
 
 

@@ -11,13 +11,15 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import to_rgb
+from matplotlib.colors import Colormap, to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from parkenv.envs.drawing import write_tag
 from parkenv.evaluation.figures.lot_picture import BELIEF_MAP, draw_discs, draw_lot
-from parkenv.evaluation.figures.picture_files import STYLE, save_picture
+from parkenv.evaluation.figures.picture_files import INK, STYLE, save_picture
 from parkenv.mapping.discovery import DiscoveryScore, FoundSlots
 from parkenv.mapping.inference import Prediction
 from parkenv.mapping.survey import SessionResult
@@ -27,7 +29,7 @@ from parkenv.world.lot import ParkingLot
 FloatArray = NDArray[np.float64]
 
 SIDE_COLOR, END_COLOR, UNRANGED_COLOR = (255, 208, 0), (86, 180, 233), (200, 200, 200)
-TAKEN, FREE, UNKNOWN = "#d1495b", "#2a9d8f", "#9aa0a6"
+TAKEN, FREE, UNKNOWN = BELIEF_MAP(1.0), BELIEF_MAP(0.0), "#b9bec4"
 WRONG = "#ffd000"
 WEATHER_COLORS = {
     "sunny": "#e69f00",
@@ -56,34 +58,41 @@ def draw_detections(
             continue
         color = END_COLOR if end else SIDE_COLOR
         cv2.rectangle(drawn, (left, top), (right, bottom), color, 2, cv2.LINE_AA)
-        cv2.putText(drawn, f"{p:.2f}", (left + 4, max(top, 0) + 16), color, cv2.FontFace("sans"), 14, 700)
+        write_tag(drawn, f"{p:.2f}", (left, max(top, 0)), color)
     return drawn
 
 
 def save_detections(result: SessionResult, path: Path) -> None:
-    """Draw some frames of a session with their detections (T Fig. 4.4).
-
-    Sides are yellow, fronts and rears blue, detections that could not be ranged thin and grey.
-    """
+    """Draw some frames of a session with their detections (T Fig. 4.4)."""
     with mpl.rc_context(STYLE):
         n = len(result.shown)
-        figure = Figure(figsize=(4.2 * n, 3.5))
-        figure.suptitle(
-            f"Detections, {result.session.weather.replace('_', ' ')}", x=0.01, ha="left", weight="bold"
-        )
+        figure = Figure(figsize=(4.2 * n, 3.7))
+        weather = result.session.weather.replace("_", " ")
+        figure.suptitle(f"Detected cars, {weather}", x=0.01, ha="left", weight="bold")
         for i, shown in enumerate(result.shown):
             ax = figure.add_subplot(1, n, i + 1)
             view = shown.views[0]
             ax.imshow(draw_detections(view.image, view.detections, view.cars.detection))
             ax.set_axis_off()
-        figure.subplots_adjust(0.01, 0.01, 0.99, 0.9, wspace=0.02)
-        save_picture(figure, path)
+        kinds = (
+            ("a car's side", SIDE_COLOR, 2.0), ("front or rear", END_COLOR, 2.0), ("no distance", UNRANGED_COLOR, 1.0),
+        )  # fmt: skip
+        handles = [
+            Patch(fill=False, edgecolor=np.array(color) / 255, linewidth=width, label=name)
+            for name, color, width in kinds
+        ]
+        note = Line2D(
+            [], [], linestyle="none", marker="$0.97$", markersize=18, color=INK, label="probability"
+        )
+        figure.legend(handles=[*handles, note], loc="lower left", ncols=4)
+        figure.subplots_adjust(0.01, 0.08, 0.99, 0.91, wspace=0.02)
+        save_picture(figure, path, "Camera frames of a survey drive, with the cars that were detected")
 
 
 def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
     """Draw a session from above (T Fig. 4.5): grid, detected cars and slots."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(11.0, _height(lot, 11.0, 3)))
+        figure = Figure(figsize=(11.0, _height(lot, 11.0, 3)), layout="constrained")
         axes = figure.subplots(3, 1)
         for ax in axes:
             draw_lot(lot, ax)
@@ -93,18 +102,28 @@ def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
         extent = (low_x, low_x + columns * grid.cell, low_y, low_y + rows * grid.cell)
         shown = np.ma.masked_where(~grid.seen, grid.probability)
         axes[0].imshow(
-            shown, origin="lower", extent=extent, cmap="cividis", vmin=0, vmax=1, alpha=0.85, zorder=3
+            shown, origin="lower", extent=extent, cmap=BELIEF_MAP, vmin=0, vmax=1, alpha=0.8, zorder=3
         )
-        axes[0].set_title("occupancy grid: P(occupied)")
+        axes[0].set_title("occupancy grid: where cars were detected")
+        scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(0, 1), BELIEF_MAP)
+        inset = axes[0].inset_axes((0.76, 0.1, 0.2, 0.025))
+        figure.colorbar(
+            scale, cax=inset, orientation="horizontal", label="P(a car is here)", ticks=[0, 0.5, 1]
+        )
         cars = result.session.cars
         axes[1].quiver(
             cars[:, 0], cars[:, 1], np.cos(cars[:, 2]), np.sin(cars[:, 2]), pivot="mid", headwidth=1, headlength=0,
-            headaxislength=0, scale=60, width=0.0016, color="#ffb000", zorder=3,
+            headaxislength=0, scale=60, width=0.0016, color=WRONG, zorder=3,
         )  # fmt: skip
-        axes[1].set_title(f"{len(cars)} detected cars, each with the heading fitted to its beams")
+        axes[1].set_title(f"{len(cars)} detections of cars, frame by frame")
+        heading = Line2D(
+            [], [], color=WRONG, linewidth=2.0, label="a car's middle and heading, from the laser"
+        )
+        _draw_key(axes[1], [heading])
         _draw_states(lot, result, axes[2])
-        figure.tight_layout()
-        save_picture(figure, path)
+        save_picture(
+            figure, path, "One survey drive: occupancy grid, detected cars, and the states of the slots"
+        )
 
 
 def save_graph(lot: ParkingLot, predicted: Prediction, result: SessionResult, path: Path) -> None:
@@ -121,9 +140,8 @@ def save_graph(lot: ParkingLot, predicted: Prediction, result: SessionResult, pa
             f"{lot.name}: the drive graph; ring: map, disc: one session "
             f"({result.session.weather.replace('_', ' ')})"
         )
-        scale = mpl.cm.ScalarMappable(mpl.colors.Normalize(0, 1), BELIEF_MAP)
-        figure.colorbar(scale, ax=ax, fraction=0.02, label="P(taken)")
-        save_picture(figure, path)
+        _draw_scale(figure, ax, BELIEF_MAP, "P(taken)")
+        save_picture(figure, path, "The map's P(taken) on the drive graph, and what one drive saw")
 
 
 def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, path: Path) -> None:
@@ -141,7 +159,11 @@ def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, 
             f"{lot.name}: {len(found.xy)} slots discovered without a map; precision {score.precision:.0%}, "
             f"recall {score.recall:.0%} of {lot.n_slots}{off}"
         )
-        save_picture(figure, path)
+        found_slot = Line2D(
+            [], [], color=WRONG, marker="o", markersize=3, label="a discovered slot and its heading"
+        )
+        _draw_key(ax, [found_slot])
+        save_picture(figure, path, "Slots discovered from detected cars, without a map of the lot")
 
 
 def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
@@ -161,35 +183,32 @@ def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Pa
             )
             ax.vlines(x, low, high, color=color, linewidth=1.2, alpha=0.7)
         ax.set(
-            xlabel="distance from the camera to the car's middle, m",
-            ylabel="detection rate in frames without occlusion",
+            xlabel="distance from the camera to the middle of the car, m",
+            ylabel="share of unoccluded cars that are detected",
             ylim=(0.0, 1.03),
         )
         ax.grid(axis="y")
         ax.legend(loc="lower left", ncols=2)
         ax.set_title(title)
-        save_picture(figure, path)
+        save_picture(figure, path, "How often a car in the frame is detected, by weather and distance")
 
 
 def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, title: str, path: Path) -> None:
     """Draw the map's prediction for every slot (T Fig. 4.6), and the true probabilities if known."""
     with mpl.rc_context(STYLE):
-        panels = [("predicted", predicted.p_occupied)] + (
-            [("true probability", true)] if true is not None else []
-        )
-        panels.append(("uncertainty: width of the 95 % interval", predicted.high - predicted.low))
-        figure = Figure(figsize=(11.0, _height(lot, 11.0, len(panels))))
+        panels = [("what the map says", "P(taken)", BELIEF_MAP, predicted.p_occupied)]
+        if true is not None:
+            panels.append(("the truth", "P(taken)", BELIEF_MAP, true))
+        width = predicted.high - predicted.low
+        # Neither colour map passes through the grey of the asphalt.
+        panels.append(("how unsure it is", "width of the 95 % interval", mpl.colormaps["plasma"], width))
+        figure = Figure(figsize=(11.0, _height(lot, 11.0, len(panels))), layout="constrained")
         axes = np.atleast_1d(figure.subplots(len(panels), 1))
-        for ax, (name, values) in zip(axes, panels, strict=True):
-            # cividis looks the same with any colour vision.
-            draw_lot(lot, ax, slot_color=mpl.colormaps["cividis"](values))
+        for ax, (name, label, colors, values) in zip(axes, panels, strict=True):
+            draw_lot(lot, ax, slot_color=colors(values))
             ax.set_title(f"{title}: {name}")
-            bar = figure.colorbar(
-                mpl.cm.ScalarMappable(mpl.colors.Normalize(0, 1), "cividis"), ax=ax, fraction=0.02
-            )
-            bar.ax.set_ylim(0, 1)
-        figure.tight_layout()
-        save_picture(figure, path)
+            _draw_scale(figure, ax, colors, label)
+        save_picture(figure, path, "The map: how likely each slot is taken, and how sure the map is")
 
 
 def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:
@@ -203,8 +222,18 @@ def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:
     names = {"taken": TAKEN, "free": FREE, "never in view": UNKNOWN}
     handles = [Patch(color=c, label=name) for name, c in names.items()]
     handles.append(Patch(fill=False, edgecolor=WRONG, linewidth=2.0, label=f"wrong ({wrong.sum()})"))
-    ax.legend(handles=handles, loc="lower right", ncols=4, fontsize=8)
-    ax.set_title(f"slots: {result.slot_accuracy:.1%} correct")
+    _draw_key(ax, handles)
+    ax.set_title(f"slots: {result.slot_accuracy:.1%} classified correctly")
+
+
+def _draw_key(ax: Axes, handles: Sequence[Patch | Line2D]) -> None:
+    ax.legend(handles=handles, loc="lower right", ncols=len(handles), fontsize=8)
+
+
+def _draw_scale(figure: Figure, ax: Axes, colors: Colormap, label: str) -> None:
+    figure.colorbar(
+        mpl.cm.ScalarMappable(mpl.colors.Normalize(0, 1), colors), ax=ax, fraction=0.02, label=label
+    )
 
 
 def _height(lot: ParkingLot, width: float, panels: int) -> float:

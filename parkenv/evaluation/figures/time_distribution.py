@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.evaluation.figures.picture_files import INK, STYLE
-from parkenv.evaluation.figures.registry import ComparisonResults
+from parkenv.evaluation.figures.registry import ComparisonResults, Drawn, Setting
 from parkenv.evaluation.figures.time_figures import AGENT_COLORS, OTHER_AGENT
 
 FloatArray = NDArray[np.float64]
@@ -26,12 +26,12 @@ OFF_SCALE = 2.5
 _DASHED = ("oracle", BOUND)
 
 
-def time_distributions(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
+def time_distributions(results: ComparisonResults) -> Iterator[Drawn]:
     """Yield a figure for each setting of costs and speeds, with a panel per scenario.
 
     The clairvoyant lower bound is added if the oracle is not among the agents.
     """
-    settings: dict[tuple[float, float, float], dict[str, dict[str, FloatArray]]] = {}
+    settings: dict[Setting, dict[str, dict[str, FloatArray]]] = {}
     for case, seeds in results.cases:
         episodes = results.episodes_of(case, seeds)
         c = case.columns
@@ -46,7 +46,7 @@ def time_distributions(results: ComparisonResults) -> Iterator[tuple[str, Figure
             bound = totals.pop(BOUND)
             if "oracle" not in totals:
                 totals[BOUND] = bound
-        yield "failure{:g}_walk{:g}_drive{:g}".format(*setting), draw_time_distribution(panels)
+        yield "", setting, draw_time_distribution(panels)
 
 
 def draw_time_distribution(panels: Mapping[str, Totals]) -> Figure:
@@ -77,7 +77,7 @@ def draw_time_distribution(panels: Mapping[str, Totals]) -> Figure:
             ax.remove()
         for i, ax in enumerate(axes.flat[: len(panels)]):
             if i % columns == 0:
-                ax.set_ylabel("searches done by then, %")
+                ax.set_ylabel("searches that took at most this long, %")
         handles = [
             Line2D([], [], color=_color(name), linestyle=_dashes(name) or "-", linewidth=2.0, label=name)
             for name in names

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import BLIND, against_occupancy
 from parkenv.evaluation.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
-from parkenv.evaluation.figures.registry import ComparisonResults
+from parkenv.evaluation.figures.registry import ComparisonResults, Drawn
 
 FloatArray = NDArray[np.float64]
 Row = Mapping[str, Any]
@@ -44,13 +44,13 @@ OFF_SCALE = 3.0
 """Totals above this multiple of the median are cut off, so that they do not compress the rest."""
 
 
-def time_splits(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
+def time_splits(results: ComparisonResults) -> Iterator[Drawn]:
     """Yield `draw_time_split` of each scenario."""
     for name in results.scenarios:
-        yield name, draw_time_split(results.rows_of(name))
+        yield name, None, draw_time_split(results.rows_of(name))
 
 
-def times_against_occupancy(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
+def times_against_occupancy(results: ComparisonResults) -> Iterator[Drawn]:
     """Yield `draw_time_against_occupancy` of each scenario, at the first speeds."""
     for name in results.scenarios:
         rows = [
@@ -69,16 +69,16 @@ def times_against_occupancy(results: ComparisonResults) -> Iterator[tuple[str, F
             ]
             rows = against_occupancy(episodes, OCCUPANCY_BINS)
         if rows:
-            yield name, draw_time_against_occupancy(rows)
+            yield name, None, draw_time_against_occupancy(rows)
 
 
-def times_against_failure_cost(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
+def times_against_failure_cost(results: ComparisonResults) -> Iterator[Drawn]:
     """Yield `draw_time_against_failure_cost` of each scenario of a sweep."""
     for name in results.failure_cost_sweeps:
-        yield name, draw_time_against_failure_cost(results.rows_of(name), results.rows_of(name + BLIND))
+        yield name, None, draw_time_against_failure_cost(results.rows_of(name), results.rows_of(name + BLIND))
 
 
-def times_against_map(results: ComparisonResults) -> Iterator[tuple[str, Figure]]:
+def times_against_map(results: ComparisonResults) -> Iterator[Drawn]:
     """Yield `draw_time_against_map` of each scenario with flat forecasts, at the first cost and speeds."""
     forecasts = results.flat_forecasts
     if not forecasts:
@@ -89,7 +89,7 @@ def times_against_map(results: ComparisonResults) -> Iterator[tuple[str, Figure]
         probability = {flat: p for flat, (varied, p) in forecasts.items() if varied == name}
         flat = [row for row in rows if row["scenario"] in probability]
         own = [row for row in rows if row["scenario"] == name]
-        yield name, draw_time_against_map(flat, own, probability)
+        yield name, None, draw_time_against_map(flat, own, probability)
 
 
 def draw_time_split(rows: Sequence[Row]) -> Figure:
@@ -287,7 +287,8 @@ def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Ro
         color = AGENT_COLORS.get(agent, OTHER_AGENT)
         x = np.array([along(row) for row in own])
         total = np.array([row["total_s"] for row in own])
-        low, high = np.array([_interval(row) for row in own]).T
+        # NaN where there is no interval, e.g. of a single search: no band there.
+        low, high = np.array([row["total_s_ci95"] for row in own], dtype=np.float64).T
         dashes = (0, (4, 2)) if agent == "oracle" else "-"
         # The interval of a line beyond the limit would only cover the others.
         ax.fill_between(x, low, high, where=total <= limit, color=color, alpha=0.15, linewidth=0)

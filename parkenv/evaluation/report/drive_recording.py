@@ -14,7 +14,7 @@ from PIL import Image as PillowImage
 
 from parkenv.evaluation.report.lot_data import describe_lot
 from parkenv.mapping.grid import OccupancyGrid
-from parkenv.mapping.survey import Survey, SurveyFrame
+from parkenv.mapping.survey import SessionResult, Survey, SurveyFrame
 from parkenv.perception.pipeline import CameraView, PerceptionResult
 from sim_sensors.rig import poses_along
 
@@ -23,19 +23,23 @@ PICTURE_WIDTH = 480
 JPEG_QUALITY = 68
 SCAN_REACH = 16.0
 """Maximum length of recorded beams, m."""
+MOST_FRAMES = 120
 LEVELS = 15
 """Shades of the occupancy grid."""
 
 Recording = dict[str, Any]
 
 
-def record_drive(survey: Survey, number: int, most_frames: int) -> Recording:
-    """Repeat a session of a survey, and record it.
+def record_drive(
+    survey: Survey, number: int, pictures: int = 0, most_frames: int = MOST_FRAMES
+) -> tuple[SessionResult, Recording]:
+    """Drive a session of a survey, and record it.
 
     Args:
         survey: the survey.
         number: number of the session.
-        most_frames: maximum number of captures to keep, evenly spaced, the last one included.
+        pictures: number of perception results to keep for figures.
+        most_frames: maximum number of captures to record, evenly spaced, the last one included.
     """
     captures = len(poses_along(survey.route.path, survey.settings.every))
     step = max(1, math.ceil(captures / most_frames))
@@ -60,10 +64,10 @@ def record_drive(survey: Survey, number: int, most_frames: int) -> Recording:
             known, taken = now, frame.truth.copy()
         count += 1
 
-    result = survey.drive(number, on_frame=watch)
+    result = survey.drive(number, pictures=pictures, on_frame=watch)
     grid = result.grid
     rows, columns = grid.log_odds.shape
-    return {
+    return result, {
         "lot": describe_lot(survey.scenario.lot),
         "drive": {
             "key": result.session.key,

@@ -264,6 +264,25 @@ class LotView {
     context.restore();
   }
 
+  /** Write a name beside a slot. */
+  drawName({ x, y }, name) {
+    const context = this.context;
+    const { scale } = this.at;
+    context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
+    const at = [this.width / 2 + scale * (x - this.at.x), this.height / 2 - scale * (y - this.at.y) - Math.max(12, 3.4 * scale)];
+    context.font = "600 12px system-ui, sans-serif";
+    const width = context.measureText(name).width + 10;
+    const left = Math.min(Math.max(at[0] - width / 2, 2), this.width - width - 2);
+    const top = Math.max(at[1] - 16, 2);
+    context.fillStyle = palette.ink;
+    context.beginPath();
+    context.roundRect(left, top, width, 17, 4);
+    context.fill();
+    context.fillStyle = palette.card;
+    context.fillText(name, left + 5, top + 12.5);
+    this.toMetres(context);
+  }
+
   drawView(x, y, radius) {
     const context = this.context;
     context.fillStyle = palette.view;

@@ -49,6 +49,7 @@ for (const figure of figures) {
     const image = figure.querySelector("img");
     dialog.querySelector("img").src = image.src;
     dialog.querySelector("img").alt = image.alt;
+    dialog.classList.toggle("plotted", figure.classList.contains("plotted"));
     dialog.showModal();
   });
 }

@@ -11,9 +11,11 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+import numpy as np
 from PIL import Image as PillowImage
 
 from parkenv.evaluation.experiments.results import Row
+from parkenv.evaluation.figures.picture_files import CAPTION
 from parkenv.evaluation.figures.registry import FIGURES
 from parkenv.evaluation.report.drive_recording import data_uri
 from parkenv.evaluation.report.learning import learning_of
@@ -36,16 +38,12 @@ LOSSLESS = 150_000
 """Bytes above which a figure is compressed lossily."""
 _QUALITY = 86
 _HERE = Path(__file__).parent
-_FIGURES = (
-    *((f"{kind.name}_", kind.caption) for kind in FIGURES),
-    ("session", "One survey drive: occupancy grid, detected cars, slot states"),
-    ("detections", "Camera frames with detections"),
-    ("slots_found_", "Slots discovered without a map"),
-    ("reach_", "Detection rate by weather and distance"),
-    ("graph_", "Drive graph with the map's P(taken)"),
-    ("map", "The map: P(taken) of every slot"),
-    ("learning_curve", "Learning curves, and planners in the same worlds"),
-)
+_ORDER = (
+    *(kind.name for kind in FIGURES), "session", "detections", "slots_found", "reach", "graph", "map", "learning_curve",
+)  # fmt: skip
+"""The first figures of a page: prefixes of their file names."""
+_WHITE = 0.5
+"""Least white share of a chart, which is inverted in dark mode; pictures of lots and photographs are not."""
 
 
 def page_data(
@@ -90,13 +88,13 @@ def page_data(
     }
 
 
-def write_page(run: RunFolder, data: Mapping[str, Any], path: Path) -> None:
+def write_page(data: Mapping[str, Any], path: Path, figures: Sequence[Path] = ()) -> None:
     """Write the page atomically.
 
     Args:
-        run: the run, with its figures.
         data: data from `page_data`.
         path: the HTML file to write.
+        figures: PNG files to show.
 
     Raises:
         InputError: the file cannot be written.
@@ -106,7 +104,7 @@ def write_page(run: RunFolder, data: Mapping[str, Any], path: Path) -> None:
     text = Template((_HERE / "page.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(data["run"]["title"]),
         style=(_HERE / "style.css").read_text(encoding="utf-8"),
-        figures="\n".join(_figure(f) for f in _in_order(run.figures)),
+        figures="\n".join(_figure(f) for f in sorted(figures, key=_rank)),
         data=embedded,
         program="\n".join((_HERE / name).read_text(encoding="utf-8") for name in SCRIPTS),
     )
@@ -114,23 +112,20 @@ def write_page(run: RunFolder, data: Mapping[str, Any], path: Path) -> None:
         beside.write_text(text, encoding="utf-8")
 
 
-def _in_order(figures: Sequence[Path]) -> list[Path]:
-    ranks = [prefix for prefix, _ in _FIGURES]
-
-    def rank(path: Path) -> int:
-        return next((i for i, prefix in enumerate(ranks) if path.name.startswith(prefix)), len(ranks))
-
-    return sorted(figures, key=rank)
+def _rank(path: Path) -> int:
+    return next((i for i, prefix in enumerate(_ORDER) if path.name.startswith(prefix)), len(_ORDER))
 
 
 def _figure(path: Path) -> str:
-    caption = html.escape(_caption(path))
     picture = PillowImage.fromarray(read_image(path)).convert("RGB")
+    with PillowImage.open(path) as opened:
+        caption = html.escape(opened.info.get(CAPTION) or path.stem.replace("_", " "))
     if picture.width > MOST_WIDTH:
         picture = picture.resize((MOST_WIDTH, round(picture.height * MOST_WIDTH / picture.width)))
     source, (width, height) = _webp(picture), picture.size
+    white = bool((np.asarray(picture).min(axis=2) > 250).mean() > _WHITE)
     return (
-        f'<figure><button type="button" class="enlarge" aria-label="Enlarge: {caption}">'
+        f'<figure{" class=plotted" * white}><button type="button" class="enlarge" aria-label="Enlarge: {caption}">'
         f'<img src="{source}" width="{width}" height="{height}" alt="{caption}"></button>'
         f"<figcaption>{caption}</figcaption></figure>"
     )
@@ -144,27 +139,6 @@ def _webp(picture: PillowImage.Image) -> str:
         content = io.BytesIO()
         picture.save(content, "WEBP", quality=_QUALITY)
     return data_uri("image/webp", content.getvalue())
-
-
-def _caption(path: Path) -> str:
-    """Derive a figure's caption from its file name."""
-    for prefix, title in _FIGURES:
-        if path.name.startswith(prefix):
-            rest = path.stem.removeprefix(prefix).strip("_")
-            words = [_setting(word) for word in rest.split("_")] if rest else []
-            return f"{title}: {', '.join(words)}" if words else title
-    return path.stem.replace("_", " ")
-
-
-def _setting(word: str) -> str:
-    for name, label, unit in (
-        ("failure", "failure cost", "s"),
-        ("walk", "walk", "km/h"),
-        ("drive", "drive", "km/h"),
-    ):
-        if word.startswith(name) and (number := word.removeprefix(name)):
-            return f"{label} {number} {unit}"
-    return word
 
 
 def _title(kind: str, summary: Mapping[str, Any]) -> str:

@@ -105,7 +105,8 @@ document.addEventListener("keydown", (event) => {
   if (event.key === " " && !pressed) active.toggle();
   else if (event.key === "ArrowRight") active.step(1);
   else if (event.key === "ArrowLeft") active.step(-1);
-  else if (event.key === "Home" && target.type === "range") active.goTo(0);
+  // At the start, Home scrolls to the top of the page as usual.
+  else if (event.key === "Home" && (active.seconds > 0 || target.type === "range")) { active.pause(); active.goTo(0); }
   else return;
   event.preventDefault();
 });

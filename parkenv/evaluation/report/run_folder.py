@@ -10,9 +10,9 @@ from typing import Any, Self
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.results import SETTING_COLUMNS, SETTINGS, SUMMARY, SUMMARY_PARTIAL, Row
-from parkenv.evaluation.experiments.spec import SPEC_FILE
+from parkenv.evaluation.experiments.spec import SPEC_FILE, SPECS
 from parkenv.files.limited_reading import csv_records, read_json
-from parkenv.files.spec_file import read_tables
+from parkenv.files.spec_file import Spec, read_tables
 
 _TEXT = ("scenario", "agent")
 
@@ -68,6 +68,15 @@ class RunFolder:
         spec = path / SPEC_FILE
         kind = read_tables(spec).get("kind") if spec.exists() else None
         return cls(path, summary, tuple(sorted(path.glob("*.png"))), str(kind or summary["command"][1]))
+
+    def spec(self) -> Spec | None:
+        """Read the specification that the run kept; None for a command that keeps none.
+
+        Raises:
+            InputError: the file is missing or damaged.
+        """
+        kind = SPECS.get(self.kind)
+        return None if kind is None else kind.read(self.path / SPEC_FILE)
 
     @property
     def arguments(self) -> list[str]:

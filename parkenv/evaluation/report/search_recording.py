@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 
 from parkenv.envs.search_state import SearchState
 from parkenv.evaluation.experiments.compare import Case
-from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.figures.picture_files import TIME_COLORS
 from parkenv.evaluation.report.lot_data import describe_lot
 from parkenv.evaluation.simulate import EpisodeResult, Observer, Step
 from parkenv.world.occupancy import World
-from planners.agent import Agent, make_agent
+from planners.agent import Agent
 
 MOST_SLOTS = 20_000
 """Lots with more slots are not replayed: the page would not load."""
@@ -77,11 +76,9 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
     searches, moments = [], {0.0}
     state: SearchState | None = None
     for case in encounter.cases:
-        agent = make_agent(case.agent, case.scenario, **case.options)
-        recorder = SearchRecorder(case.label, agent)
-        EpisodeRunner(case.scenario, case.label, agent, case.rig, case.detector).run(
-            encounter.seed, (recorder,)
-        )
+        runner = case.runner()
+        recorder = SearchRecorder(case.label, runner.agent)
+        runner.run(encounter.seed, (recorder,))
         state, search = recorder.state, recorder.recording
         before = counted.get(case.key(encounter.seed))
         search["counted_s"] = before

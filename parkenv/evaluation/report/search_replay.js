@@ -107,7 +107,7 @@ class Track {
 
   status(seconds, k) {
     const { search, lot } = this;
-    const name = (slot) => lot.slot_ids[slot];
+    const name = (slot) => `slot ${lot.slot_ids[slot]}`;
     if (seconds >= search.total_s - 0.005) return search.parked ? `at the goal; parked in ${name(search.slot)}` : search.truncated ? "truncated" : "lot full, gave up";
     if (seconds >= this.end) return search.parked ? `parked in ${name(search.slot)}, walking` : search.truncated ? "truncated" : "lot is full: giving up";
     const here = search.vertex[k];
@@ -146,8 +146,10 @@ class SearchReplay {
     });
     transport.append(this.strips, this.player.keys);
     const world = make("label", {}, "World ", this.worldChoice);
+    const seeds = [...new Set(worlds.map((its) => its.seed))].sort((a, b) => a - b);
+    const which = `${seeds.length > 1 ? "Seeds" : "Seed"} ${seeds.join(", ")} of this run, simulated again: `;
     root.append(
-      make("p", { class: "quiet" }, "The searches are simulated again: every agent meets the same cars at the same times. Slot colours show the agent's belief, dark cars the true occupancy, which agents observe only nearby."),
+      make("p", { class: "quiet" }, `${which}under one seed every agent meets the same cars at the same times. Slot colours show the agent's belief, dark cars the true occupancy, which agents observe only nearby.`),
       make("div", { class: "controls" }, world, this.chips, this.followKey),
       this.panels, transport, lotLegend(),
     );
@@ -319,6 +321,9 @@ class SearchReplay {
         view.drawCar(slot.x, slot.y, slot.yaw);
         if (!over) view.drawDot(...walker, 5, palette.goal);
       } else view.drawCar(x, y, yaw);
+      const plan = track.plans[k] ?? [];
+      const aim = parked ? search.slot : plan[plan.length - 1];
+      if (aim < view.slots.length) view.drawName(view.slots[aim], this.lot.slot_ids[aim]);
       view.drawScale();
 
       const parts = track.split(seconds, k);

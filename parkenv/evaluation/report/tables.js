@@ -58,7 +58,7 @@ function factsTable(table) {
 function sortableTable(table) {
   const { columns, rows } = table;
   const body = make("tbody");
-  const classOf = (k) => [isWord[k] ? "word" : "", k === lead || k === agent ? "lead" : "", settings.includes(k) ? "setting" : ""].join(" ").trim() || null;
+  const classOf = (k) => [isWord[k] ? "word" : "", k === lead || k === agent ? "lead" : "", settings.includes(k) ? "setting" : "", k === agent ? "agent" : ""].join(" ").trim() || null;
   const isWord = columns.map((_, i) => rows.every((row) => row[i] === null || typeof row[i] === "string"));
   const lead = columns.findIndex((column) => column.key === "total_s");
   const settings = columns.map((column, i) => (SETTING.includes(column.key) ? i : -1)).filter((i) => i >= 0);
@@ -140,6 +140,9 @@ function showTables(root, tables) {
     if (same) root.append(make("p", { class: "quiet" }, `In all rows: ${same}.`));
     const [element, chips] = table.facts ? [factsTable(table), null] : sortableTable(table);
     if (chips) root.append(chips);
-    root.append(make("div", { class: "card scroll", tabindex: 0, role: "region", "aria-label": table.title }, element));
+    const box = make("div", { class: "card scroll", tabindex: 0, role: "region", "aria-label": table.title }, element);
+    const hint = make("p", { class: "more", hidden: true }, "Scroll the table sideways for more columns →");
+    root.append(hint, box);
+    new ResizeObserver(() => { hint.hidden = box.scrollWidth <= box.clientWidth + 1; }).observe(box);
   }
 }

@@ -66,6 +66,10 @@ _KNOWN = {
         Column("steps", "decisions in training", digits=0),
         Column("steps_per_s", "decisions/s", digits=0),
         Column("model", "model"),
+        Column("task", "task"),
+        Column("score", "score", share=True, help="Mean time of the clairvoyant bound over the agent's"),
+        Column("by", "submitted by"),
+        Column("parkenv", "parkenv", help="Version that made the result"),
         Column("sessions", "drives", digits=0),
         Column("slots", "slots", digits=0),
         Column("car_detection_rate", "parked cars found", share=True, help="Detected at least once"),
@@ -151,14 +155,19 @@ def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False)
         "name": name,
         "title": title,
         "facts": facts,
-        "columns": [_described(key) for key in shown],
+        "columns": [described(column_of(key)) for key in shown],
         "rows": [[values[key][i] for key in shown] for i in range(len(rows))],
-        "same": [{**_described(key), "value": values[key][0]} for key in same if values[key][0] is not None],
+        "same": [
+            {**described(column_of(key)), "value": values[key][0]}
+            for key in same
+            if values[key][0] is not None
+        ],
     }
 
 
-def _described(key: str) -> dict[str, Any]:
-    return {k: v for k, v in column_of(key)._asdict().items() if v != "" and v is not False}
+def described(column: Column) -> dict[str, Any]:
+    """Return a column for the page's data, without empty entries."""
+    return {k: v for k, v in column._asdict().items() if v != "" and v is not False}
 
 
 def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Cell]:

@@ -125,11 +125,12 @@ def clone(
 
     policy, rng = model.policy, np.random.default_rng(seed)
     optimizer = torch.optim.Adam(policy.parameters(), lr=LEARNING_RATE)
-    returns = torch.as_tensor(-REWARD_SCALE * demonstrations.times, dtype=torch.float32)
-    actions = torch.as_tensor(demonstrations.actions)
+    # Copies: a worker process has the arrays in shared memory, which PyTorch must not write.
+    returns = torch.tensor(-REWARD_SCALE * demonstrations.times, dtype=torch.float32)
+    actions = torch.tensor(demonstrations.actions)
     observed = {
-        "local": torch.as_tensor(demonstrations.local),
-        "action_mask": torch.as_tensor(demonstrations.masks),
+        "local": torch.tensor(demonstrations.local),
+        "action_mask": torch.tensor(demonstrations.masks),
     }
     for _ in range(updates):
         batch = torch.as_tensor(rng.integers(len(actions), size=BATCH))

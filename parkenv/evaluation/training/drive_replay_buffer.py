@@ -18,6 +18,15 @@ class TerminalGoalReplayBuffer(HerReplayBuffer):  # type: ignore[misc]
     Moreover, most relabelled goals cannot be held: the car passes through them at speed.
     """
 
+    @property
+    def contacts(self) -> NDArray[np.bool_]:
+        """Whether each transition ended in a contact, (size, n_envs): the part of `info` that rewards depend on."""
+        return np.array([[bool(info.get("contact")) for info in row] for row in self.infos])
+
+    @contacts.setter
+    def contacts(self, values: NDArray[np.bool_]) -> None:
+        self.infos = np.array([[{"contact": value} for value in row] for row in values.tolist()])
+
     def _get_virtual_samples(
         self, batch_indices: NDArray[np.int64], env_indices: NDArray[np.int64], env: Any = None
     ) -> DictReplayBufferSamples:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from parkenv import __version__
 from parkenv.evaluation.experiments.workers import Workers
 from parkenv.evaluation.training.configs import DRIVE_CONFIGS, DriveTrainingConfig, config_of
 from parkenv.evaluation.training.drive_batch import CONTACT, PARKED, RUNNING, DriveBatch, PreparedTask
@@ -27,8 +26,6 @@ from parkenv.evaluation.training.rl_training import Row, Training
 from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all
 from parkenv.world.keyed_random import world_key
 from parkenv.world.lot import ParkingLot
-from planners.driving.policy_interface import INTERFACE
-from planners.learned import ModelCard
 
 _MOST_DECISIONS = round(60.0 / DECISION_S)  # a minute, as in the environment
 
@@ -76,15 +73,12 @@ class DriveTraining(Training):
         of_kind = ("success", "low", "high", "contacts", "time_s", "level")
         return ("success", "time_s", *(f"{kind}_{name}" for kind in self.kinds for name in of_kind))
 
-    def make_env(self, seed: int, curve: Sequence[Row]) -> DriveTrainingEnv:
-        """Make a batch of drives, each kind at the curriculum level reached so far."""
-        levels = {kind: int(curve[-1][f"{kind}_level"]) for kind in self.kinds} if curve else None
-        env = DriveTrainingEnv(self.config.n_envs, self.groups, self.config, levels)
-        env.seed(seed)
-        return env
+    def make_env(self) -> DriveTrainingEnv:
+        """Make a batch of drives, at the first level of the curriculum."""
+        return DriveTrainingEnv(self.config.n_envs, self.groups, self.config)
 
-    def evaluate(self, model: Any, env: VecEnv) -> Row:
-        """Evaluate a model on the held-out tasks.
+    def evaluate(self, policy: Any, env: VecEnv) -> Row:
+        """Evaluate a policy on the held-out tasks.
 
         Returns:
             Per kind: success rate with 95 % interval (Wilson), fraction of contacts (including leaving the area), mean
@@ -93,7 +87,7 @@ class DriveTraining(Training):
         """
         row: Row = {}
         for kind in self.kinds:
-            status, time = evaluate_parking(model, self._tasks[kind])
+            status, time = evaluate_parking(policy, self._tasks[kind])
             parked = status == PARKED
             interval = binomtest(int(parked.sum()), len(parked)).proportion_ci(0.95, "wilson")
             row |= {
@@ -132,11 +126,9 @@ class DriveTraining(Training):
             settings["replay_buffer_kwargs"] = settings["replay_buffer_kwargs"] | {"copy_info_dict": True}
         return settings
 
-    def model_card(self, seed: int, steps: int) -> ModelCard:
-        """Return the metadata of the model file."""
-        settings = dataclasses.asdict(self.config)
-        names = tuple(lot.name for lot in self.lots)
-        return ModelCard(self.algorithm, names, 0, INTERFACE, seed, steps, settings, __version__, "drive")
+    def description(self) -> dict[str, Any]:
+        """Return lots and settings for the model file."""
+        return {"scenarios": [lot.name for lot in self.lots], "settings": dataclasses.asdict(self.config)}
 
     @cached_property
     def _tasks(self) -> dict[str, list[PreparedTask]]:

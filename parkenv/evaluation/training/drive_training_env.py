@@ -131,7 +131,11 @@ class DriveTrainingEnv(SharedVecEnv):
                 raise InputError(f"level of {kind} slots is {level}, want 0 to {self._last}")
         self._recent: dict[str, deque[bool]] = {kind: deque(maxlen=RECENT_DRIVES) for kind in self._groups}
         self._tasks: dict[tuple[SlotGroup, int], ParkingTasks] = {}
-        self._cached: dict[tuple[SlotGroup, int], list[CurriculumTask]] = {}
+        # By group and level: seeds of the tasks drawn so far, and the tasks that they make.
+        self._seeds_of = {(group, level): list[int]() for group in groups for level in range(self._last + 1)}
+        self._made: dict[tuple[SlotGroup, int], dict[int, CurriculumTask]] = {
+            key: {} for key in self._seeds_of
+        }
         self.batch = DriveBatch(num_envs)
         goal = spaces.Box(-np.inf, np.inf, (7,), np.float32)
         seen = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
@@ -149,6 +153,32 @@ class DriveTrainingEnv(SharedVecEnv):
         """Seed the drawing of tasks."""
         self._rng = np.random.default_rng(seed)
         return [seed] * self.num_envs
+
+    def get_state(self) -> dict[str, Any]:
+        """Return the drives under way, the levels and the drawn tasks as plain values, for `set_state`."""
+        return {
+            "rng": self._rng.bit_generator.state,
+            "levels": self.levels,
+            "recent": {kind: list(outcomes) for kind, outcomes in self._recent.items()},
+            "seeds": list(self._seeds_of.values()),
+            "at": self._at,
+            "stood": self._stood,
+            "returns": self._returns,
+            "lengths": self._lengths,
+            "batch": {name: array for name, array in vars(self.batch).items() if _changes(array)},
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that `get_state` returned for the same groups and config."""
+        self._start_all()
+        self._rng.bit_generator.state = state["rng"]
+        self.levels = dict(state["levels"])
+        for kind, outcomes in self._recent.items():
+            outcomes.extend(state["recent"][kind])
+        self._seeds_of = dict(zip(self._seeds_of, map(list, state["seeds"]), strict=True))
+        self._at, self._stood = list(state["at"]), state["stood"]
+        self._returns, self._lengths = state["returns"], state["lengths"]
+        vars(self.batch).update(state["batch"])
 
     def reset(self) -> Observations:
         """Start a new episode in every drive; keep the levels."""
@@ -236,22 +266,28 @@ class DriveTrainingEnv(SharedVecEnv):
 
     def _draw_task(self, group: SlotGroup, level: int) -> CurriculumTask:
         key, rng = (group, level), self._rng
-        stage = self.config.curriculum[level]
-        on_path = stage.starts == WAY_IN
-        if key not in self._tasks:
-            self._tasks[key] = (
-                group.tasks(stage.slack)
-                if on_path
-                else group.tasks(stage.slack, stage.distance, stage.starts)
-            )
-            self._cached[key] = []
-        cached = self._cached[key]
-        if cached and rng.random() * TIMES_DRIVEN >= 1.0:
-            return cached[rng.integers(len(cached))]
-        task = self._tasks[key].draw(int(rng.integers(1 << 62)))
-        drawn = CurriculumTask(PreparedTask(task), planned_path(task) if on_path else None)
-        if len(cached) < CACHED_TASKS:
-            cached.append(drawn)
+        seeds, made = self._seeds_of[key], self._made[key]
+        if seeds and rng.random() * TIMES_DRIVEN >= 1.0:
+            seed = seeds[rng.integers(len(seeds))]
         else:
-            cached[rng.integers(CACHED_TASKS)] = drawn
-        return drawn
+            seed = int(rng.integers(1 << 62))
+            if len(seeds) < CACHED_TASKS:
+                seeds.append(seed)
+            else:
+                i = rng.integers(CACHED_TASKS)
+                made.pop(seeds[i], None)
+                seeds[i] = seed
+        if seed not in made:
+            stage = self.config.curriculum[level]
+            on_path = stage.starts == WAY_IN
+            if key not in self._tasks:
+                ends = () if on_path else (stage.distance, stage.starts)
+                self._tasks[key] = group.tasks(stage.slack, *ends)
+            task = self._tasks[key].draw(seed)
+            made[seed] = CurriculumTask(PreparedTask(task), planned_path(task) if on_path else None)
+        return made[seed]
+
+
+def _changes(value: Any) -> bool:
+    """Whether a part of a batch may change: the car's own arrays are read-only."""
+    return isinstance(value, np.ndarray) and value.flags.writeable

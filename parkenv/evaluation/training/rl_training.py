@@ -9,10 +9,9 @@ from __future__ import annotations
 import csv
 import io
 import time
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +21,15 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from parkenv.errors import InputError
+from parkenv.evaluation.training.checkpoint import read_checkpoint, restore, save_checkpoint
 from parkenv.evaluation.training.configs import TrainingConfig
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import csv_records
-from planners.learned import ModelCard, algorithm_class
+from planners.model_file import algorithm_class, save_model
 
 TRAINING_SEEDS = 10_000_000
 """World seeds of training seed s start at (s + 1) times this, far from those of evaluations and benchmark suites."""
-MODEL, CHECKPOINT, REPLAY, CURVE = "model.zip", "checkpoint.zip", "replay.pkl", "curve.csv"
+MODEL, CHECKPOINT, CURVE = "model.safetensors", "checkpoint.pt", "curve.csv"
 
 Row = dict[str, Any]
 
@@ -42,6 +42,7 @@ class Training(ABC):
         algorithm: name of an algorithm with a training config.
         steps: decisions in total.
         evaluate_every: decisions between evaluations.
+        command: command line of the training, for the model's card.
 
     Raises:
         InputError: an unknown algorithm, or a number out of range.
@@ -50,6 +51,7 @@ class Training(ABC):
     algorithm: str
     steps: int
     evaluate_every: int
+    command: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
         _ = self.config
@@ -77,25 +79,20 @@ class Training(ABC):
         return ("steps", *self.metrics, "wall_s")
 
     @abstractmethod
-    def make_env(self, seed: int, curve: Sequence[Row]) -> VecEnv:
-        """Make the training environment.
-
-        Args:
-            seed: seed of the worlds.
-            curve: evaluations so far; empty at the start.
-        """
+    def make_env(self) -> VecEnv:
+        """Make the training environment, with `get_state` and `set_state` for checkpoints."""
 
     @abstractmethod
-    def evaluate(self, model: Any, env: VecEnv) -> Row:
-        """Evaluate a model in the held-out worlds, which never change; return the `metrics`."""
+    def evaluate(self, policy: Any, env: VecEnv) -> Row:
+        """Evaluate a policy in the held-out worlds, which never change; return the `metrics`."""
 
     @abstractmethod
     def score(self, row: Row) -> tuple[float, ...]:
         """Return the score of an evaluation, for comparing checkpoints; higher is better."""
 
     @abstractmethod
-    def model_card(self, seed: int, steps: int) -> ModelCard:
-        """Return the metadata of the model file."""
+    def description(self) -> dict[str, Any]:
+        """Return `scenarios` and `settings` for `planners.model_file.save_model`."""
 
     def settings(self) -> dict[str, Any]:
         """Return the arguments of the algorithm's constructor, without the learning rate."""
@@ -106,9 +103,10 @@ class Training(ABC):
         del model, seed
 
     def train(self, seed: int, folder: Path, *, tensorboard: bool = False) -> list[Row]:
-        """Train with one seed; resume from the folder's checkpoint if there is one.
+        """Train with one seed; resume from the folder's checkpoint if there is one, as if there had been no stop.
 
-        `model.zip` is the checkpoint with the best evaluation, `curve.csv` lists all evaluations.
+        `model.safetensors` is the model with the best evaluation, `curve.csv` lists all evaluations; the checkpoint is
+        removed at the end.
 
         Args:
             seed: seed of the network and of the worlds.
@@ -119,45 +117,35 @@ class Training(ABC):
             The rows of `curve.csv`.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        curve = read_curve(folder / CURVE)
-        checkpoint, kind = folder / CHECKPOINT, algorithm_class(self.algorithm)
-        log = str(folder / "tensorboard") if tensorboard else None
-        first = TRAINING_SEEDS * (seed + 1)
-        if curve and checkpoint.exists():
-            done = ModelCard.of_file(checkpoint).steps
-            curve = [row for row in curve if row["steps"] <= done]
-            # Do not repeat the worlds from the start of the training.
-            env = self.make_env(first + done, curve)
-            model = kind.load(checkpoint, env=env, device="cpu", tensorboard_log=log)
-            if (folder / REPLAY).exists():
-                with warnings.catch_warnings():
-                    # Unfinished drives end at the interruption, and hindsight replay warns about it.
-                    warnings.filterwarnings("ignore", message="The last trajectory", category=UserWarning)
-                    model.load_replay_buffer(folder / REPLAY)
-            elif hasattr(model, "learning_starts"):
-                model.learning_starts += done
+        checkpoint, curve = folder / CHECKPOINT, read_curve(folder / CURVE)
+        if not checkpoint.exists() and curve and curve[-1]["steps"] >= self.steps:
+            return curve
+        env, rate = self.make_env(), self.config.settings["learning_rate"]
+        model = algorithm_class(self.algorithm)(
+            self.config.policy,
+            env,
+            learning_rate=LinearSchedule(rate, rate * self.config.final_learning_rate, 1.0),
+            seed=seed,
+            device="cpu",
+            tensorboard_log=str(folder / "tensorboard") if tensorboard else None,
+            **self.settings(),
+        )
+        # stable-baselines3 has seeded the environment with the network's seed.
+        env.seed(TRAINING_SEEDS * (seed + 1))
+        if checkpoint.exists():
+            state, curve = read_checkpoint(checkpoint)
+            restore(state, model)
         else:
-            curve, env = [], self.make_env(first, ())
-            rate = self.config.settings["learning_rate"]
-            schedule = LinearSchedule(rate, rate * self.config.final_learning_rate, 1.0)
-            model = kind(
-                self.config.policy,
-                env,
-                learning_rate=schedule,
-                seed=seed,
-                device="cpu",
-                tensorboard_log=log,
-                **self.settings(),
-            )
+            curve = []
             self.prepare(model, seed)
-        evaluator = _Evaluator(self, seed, folder, env, curve)
+        evaluator = _Evaluator(self, folder, curve)
         left = self.steps - model.num_timesteps
         if left > 0:
             model.learn(left, callback=evaluator, reset_num_timesteps=False, tb_log_name="run")
-        if evaluator.curve[-1]["steps"] < model.num_timesteps:
-            evaluator.evaluate(model, model.num_timesteps)
-        (folder / REPLAY).unlink(missing_ok=True)
-        return evaluator.curve
+        if curve[-1]["steps"] < model.num_timesteps:
+            evaluator.evaluate(model)
+        checkpoint.unlink(missing_ok=True)
+        return curve
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +154,7 @@ class Trained:
 
     Attributes:
         curve: rows of `curve.csv`.
-        model: content of `model.zip`.
+        model: content of the model file.
     """
 
     curve: list[Row]
@@ -192,10 +180,9 @@ def train_one(training: Training, seed: int, folder: Path, tensorboard: bool = F
 class _Evaluator(BaseCallback):  # type: ignore[misc]
     """Callback that evaluates and saves the model during training."""
 
-    def __init__(self, training: Training, seed: int, folder: Path, env: VecEnv, curve: list[Row]) -> None:
+    def __init__(self, training: Training, folder: Path, curve: list[Row]) -> None:
         super().__init__()
-        self.subject, self.seed, self.folder, self.curve = training, seed, folder, curve
-        self.env = env
+        self.subject, self.folder, self.curve = training, folder, curve
         self._start = time.monotonic() - (curve[-1]["wall_s"] if curve else 0.0)
         self._due = self._due_after(curve[-1]["steps"] if curve else 0)
 
@@ -203,47 +190,30 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
         """Return the step of the next evaluation; it depends on `steps` alone, so an interruption changes nothing."""
         return self.subject.evaluate_every * (1 + steps // self.subject.evaluate_every)
 
-    def _on_training_start(self) -> None:
-        if not self.curve:
-            self._evaluate_and_log()
-
     def _on_rollout_start(self) -> None:
         # Between rollouts, so that a checkpoint loses no samples.
-        if self.num_timesteps >= self._due:
+        if not self.curve or self.num_timesteps >= self._due:
             self._due = self._due_after(self.num_timesteps)
-            self._evaluate_and_log()
+            for name, value in self.evaluate(self.model).items():
+                self.logger.record(f"evaluation/{name}", value)
 
     def _on_step(self) -> bool:
         return True
 
-    def _evaluate_and_log(self) -> None:
-        for name, value in self.evaluate(self.model, self.num_timesteps).items():
-            self.logger.record(f"evaluation/{name}", value)
-
-    def evaluate(self, model: Any, steps: int) -> Row:
-        """Evaluate, write the curve and a checkpoint, keep the model if it is the best so far; return the metrics."""
+    def evaluate(self, model: Any) -> Row:
+        """Evaluate; keep the model if it is the best so far; write the curve and a checkpoint; return the metrics."""
         subject = self.subject
-        scores = subject.evaluate(model, self.env)
-        row = {"steps": steps, **scores, "wall_s": time.monotonic() - self._start}
-        best = max((subject.score(r) for r in self.curve), default=(-np.inf,))
-        self.curve.append(row)
-        card = subject.model_card(self.seed, steps)
-        if steps and hasattr(model, "save_replay_buffer"):
-            with atomic_write(self.folder / REPLAY) as beside:
-                model.save_replay_buffer(beside)
-        save_model(model, card, self.folder / CHECKPOINT)
-        if subject.score(row) >= best:
-            save_model(model, card, self.folder / MODEL)
+        scores = subject.evaluate(model.policy, model.env)
+        best = max((subject.score(row) for row in self.curve), default=(-np.inf,))
+        self.curve.append({"steps": model.num_timesteps, **scores, "wall_s": time.monotonic() - self._start})
+        if subject.score(scores) >= best:
+            save_model(
+                model, self.folder / MODEL, results=scores, command=subject.command, **subject.description()
+            )
         write_curve(self.folder / CURVE, self.curve)
+        # Last: a training that is killed before this line repeats what it has just done.
+        save_checkpoint(self.folder / CHECKPOINT, model, self.curve)
         return scores
-
-
-def save_model(model: Any, card: ModelCard, path: Path) -> None:
-    """Write a model file atomically."""
-    with atomic_write(path) as beside, beside.open("wb") as file:
-        model.save(file, exclude=["env"])
-        file.close()
-        card.add_to(beside)
 
 
 def write_curve(path: Path, curve: Sequence[Mapping[str, Any]]) -> None:

@@ -11,7 +11,6 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from parkenv import __version__
 from parkenv.envs.search_sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.evaluation.experiments.statistics import mean_interval
@@ -26,7 +25,7 @@ from parkenv.evaluation.training.configs import (
 )
 from parkenv.evaluation.training.rl_training import Row, Training
 from parkenv.world.scenario import Scenario
-from planners.learned import OBSERVATION, LearnedAgent, ModelCard
+from planners.learned import LearnedAgent
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,19 +65,16 @@ class SearchTraining(Training):
         """Mean total time, s, its 95 % interval, and the fraction of episodes that ended parked."""
         return ("total_s", "low_s", "high_s", "parked_fraction")
 
-    def make_env(self, seed: int, curve: Sequence[Row]) -> VecEnv:
+    def make_env(self) -> SearchVecEnv:
         """Make a batch of search environments over all scenarios."""
-        del curve
-        env = SearchVecEnv(
+        return SearchVecEnv(
             self.config.n_envs, self.scenarios, REWARD_SCALE, self.k, max_episode_steps=MAX_STEPS
         )
-        env.seed(seed)
-        return env
 
-    def evaluate(self, model: Any, env: VecEnv) -> Row:
+    def evaluate(self, policy: Any, env: VecEnv) -> Row:
         """Run one episode in each held-out world."""
         del env
-        times, parked = episode_times(model, self.scenarios[0], self.evaluation_seeds, self.k)
+        times, parked = episode_times(policy, self.scenarios[0], self.evaluation_seeds, self.k)
         return dict(zip(self.metrics, (*mean_interval(times), float(parked.mean())), strict=True))
 
     def score(self, row: Row) -> tuple[float, ...]:
@@ -90,13 +86,12 @@ class SearchTraining(Training):
         if self.demonstrations is not None:
             clone(model, self.demonstrations, seed)
 
-    def model_card(self, seed: int, steps: int) -> ModelCard:
-        """Return the metadata of the model file."""
+    def description(self) -> dict[str, Any]:
+        """Return scenarios and settings for the model file."""
         config = self.config
         settings = {"n_envs": config.n_envs, "policy": config.policy, **config.settings}
         settings["clone"] = None if self.demonstrations is None else self.demonstrations.agent
-        names = tuple(s.name for s in self.scenarios)
-        return ModelCard(self.algorithm, names, self.k, OBSERVATION, seed, steps, settings, __version__)
+        return {"scenarios": [scenario.name for scenario in self.scenarios], "settings": settings}
 
 
 def search_times(agent: LearnedAgent, scenario: Scenario, seeds: Sequence[int]) -> Row:

@@ -31,7 +31,7 @@ from parkenv.evaluation.figures.picture_files import INK, STYLE, save_picture
 from parkenv.evaluation.trips.driven_search import DrivenSearch, Trip
 from parkenv.evaluation.trips.executor import EDGE_KINDS, Leg, ParkingAttempt
 from parkenv.evaluation.trips.lot_driver import DrivingStyle
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import append_text, atomic_write
 from parkenv.files.limited_reading import parse_json, read_text
 from parkenv.files.versioned_json import JsonFormat
 from parkenv.world.scenario import KMH, Scenario
@@ -156,8 +156,7 @@ class TripFolder:
 
     def add(self, rows: Sequence[Row]) -> None:
         """Append finished trips."""
-        with self._file.open("a", encoding="utf-8") as file:
-            file.writelines(json.dumps(row) + "\n" for row in rows)
+        append_text(self._file, "".join(json.dumps(row) + "\n" for row in rows))
         self.rows |= {(row["slots"], row["seed"]): row for row in rows}
 
     def put_in_order(self) -> None:

@@ -1,0 +1,124 @@
+"""`parkenv publish`: a folder with a trained model for the Hugging Face Hub."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from parkenv import __version__
+from parkenv.cli import arguments as args
+from parkenv.cli.tables import make_console
+from parkenv.cli.training_task import FIGURE, TEST_SEED
+from parkenv.cli.trust import require_trust
+from parkenv.errors import InputError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from parkenv.scenarios.spec import ScenarioSpec
+
+
+def publish(
+    trained: Path,
+    /,
+    out: Path,
+    scenario: str | None = None,
+    episodes: int = 500,
+    seed: int = TEST_SEED,
+    *,
+    trust: bool = False,
+    machines: args.Machines,
+) -> None:
+    """Make a folder with a trained model that the Hugging Face Hub takes as it is; nothing is uploaded.
+
+    Of a training, the best model is published, with its learning curve. The model is evaluated beside planners in the
+    same worlds, by default in the scenarios that it was tested in; the model card gives results with 95 % intervals
+    and the command that repeats them.
+
+    Examples:
+        parkenv publish results/maskable-ppo --out hub/maskable-ppo
+        parkenv publish mine.safetensors --scenario my_lot.toml --out hub/mine
+
+    Options:
+        trained (DIR|FILE): The folder of a finished training, or a model file.
+        out, -o (DIR): The folder to make.
+        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: those of the training's test]
+        episodes, -n (N >= 2): Episodes of the evaluation in each scenario.
+    """
+    from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.publication import CARD, FILM, MODEL, Publication
+    from parkenv.scenarios.build import build
+    from planners.model_file import ModelCard
+
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"--out {out}: exists; name a new folder")
+    model, tested = _best(trained, trust) if trained.is_dir() else (trained, None)
+    card = ModelCard.of_file(model)
+    if scenario is not None:
+        tested = args.scenario_specs(scenario)
+    named = {_file_of(spec): spec for spec in (tested or _trained_on(model, card.scenarios))}
+    published = Publication(model, {name: build(spec) for name, spec in named.items()}, episodes, seed)
+    make_folder(out)
+    console = make_console()
+    with console.status("Evaluating"), machines.workers() as workers:
+        rows = published.evaluate(workers)
+    with console.status("Filming"):
+        published.film(out / FILM)
+    shutil.copyfile(model, out / MODEL)
+    further = ""
+    for name, spec in named.items():
+        if name.endswith(".json"):
+            spec.write(out / name)
+            if files := spec.files():
+                further += f"\n`{name}` needs files that are not here: {', '.join(f.name for f in files)}.\n"
+    if (curve := trained / FIGURE).exists():
+        shutil.copyfile(curve, out / FIGURE)
+        further += f"\n## Training\n\n![Learning curves]({FIGURE})\n"
+    published.write_card(rows, out / CARD, further)
+    results = {"command": published.command, "version": __version__, "seed": seed, "rows": rows}
+    write_summary(out, results, "results.json")
+    console.print(f"{out} holds {', '.join(sorted(path.name for path in out.iterdir()))}")
+    console.print(f"To upload it: hf upload USER/NAME {shlex.quote(str(out))}")
+
+
+def _best(folder: Path, trust: bool) -> tuple[Path, Sequence[ScenarioSpec] | None]:
+    """Return the best model of a training, and the scenarios of its test.
+
+    Raises:
+        InputError: the folder holds no finished training.
+    """
+    from parkenv.evaluation.experiments.spec import TrainingSpec
+    from parkenv.evaluation.report.run_folder import RunFolder
+    from parkenv.evaluation.training.rl_training import MODEL
+
+    run = RunFolder.read(folder)
+    spec = run.spec()
+    if not isinstance(spec, TrainingSpec):
+        raise InputError(f"{folder}: holds a run of {run.kind}, want one of train")
+    require_trust(spec, folder, trust)
+    rows = run.summary["rows"]
+    key = "total_s" if spec.env == "search" else "success"
+    best = (min if spec.env == "search" else max)(rows, key=lambda row: float(row[key]))
+    return folder / f"seed_{int(best['seed'])}" / MODEL, spec.test_on or spec.scenarios
+
+
+def _trained_on(model: Path, names: Sequence[str]) -> list[ScenarioSpec]:
+    """Return the scenarios that a model was trained on, if they are packaged ones."""
+    from parkenv.scenarios.spec import SCENARIO_NAMES, scenario_spec
+
+    for name in names:
+        if name not in SCENARIO_NAMES:
+            raise InputError(f"{model}: was trained on {name}, which is not packaged; add --scenario")
+    if not names:
+        raise InputError(f"{model}: names no scenario that it was trained on; add --scenario")
+    return [scenario_spec(name) for name in names]
+
+
+def _file_of(spec: ScenarioSpec) -> str:
+    """Return the name of a packaged scenario, or of a file for any other."""
+    from parkenv.scenarios.spec import SCENARIO_NAMES, scenario_spec
+
+    packaged = spec.title in SCENARIO_NAMES and spec == scenario_spec(spec.title)
+    return spec.title if packaged else f"{spec.title}.json"

@@ -1,0 +1,63 @@
+"""Ask before running code that a file names, or that a model file may hold."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import typer
+
+from parkenv.errors import InputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from parkenv.files.spec_file import Spec
+
+
+def require_trust(spec: Spec, source: Path, trust: bool) -> None:
+    """Refuse a specification that names classes, unless the user trusts it; ask in a terminal.
+
+    Args:
+        spec: content of a file or of a run folder.
+        source: the file or folder, for the message.
+        trust: the value of `--trust`.
+
+    Raises:
+        InputError: it names classes and is not trusted; the message lists them with their files.
+    """
+    from parkenv.evaluation.experiments.agent_spec import classes_in
+    from parkenv.files.user_class import find_module
+
+    named = {name: find_module(name) for name in classes_in(spec)}
+    if trust or not named:
+        return
+    shown = ", ".join(f"{name} ({file or 'not found'})" for name, file in named.items())
+    if sys.stdin.isatty() and typer.confirm(f"{source} runs {shown}. Run this code?"):
+        return
+    raise InputError(f"{source}: would run {shown}; read that code, then add --trust")
+
+
+def readable_models(agents: Sequence[str], trust_model: bool) -> list[str]:
+    """Return the agents, with archives of stable-baselines3 converted to model files if the user trusts them.
+
+    Args:
+        agents: names or `ALGORITHM:FILE`.
+        trust_model: the value of `--trust-model`; without it, archives are refused where models are loaded.
+
+    Raises:
+        InputError: an archive cannot be converted.
+    """
+    from planners.names import ALGORITHMS
+
+    readable = list(agents)
+    for i, agent in enumerate(agents if trust_model else ()):
+        algorithm, _, file = agent.partition(":")
+        if algorithm in ALGORITHMS and file.endswith(".zip"):
+            from planners.model_file import convert_archive
+
+            made = convert_archive(algorithm, file)
+            typer.echo(f"Converted: {made}; from now on, name that file")
+            readable[i] = f"{algorithm}:{made}"
+    return readable

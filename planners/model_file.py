@@ -1,0 +1,309 @@
+"""Model files: a policy's weights and its card in one safetensors file, which runs no code when it is opened.
+
+The card is JSON in the file's metadata. It holds what is needed to build the policy again, and what the model was
+trained on. Archives that stable-baselines3 writes itself hold pickled Python objects, which run code; see
+`convert_archive`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from gymnasium import spaces
+from pydantic import Field, JsonValue
+from pydantic_core import to_jsonable_python
+
+from parkenv import __version__
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import parse_json, read_bytes
+from parkenv.files.spec_file import Several, Spec
+from planners.names import ALGORITHMS
+
+SUFFIX = ".safetensors"
+OBSERVATION = "local-1"
+"""Version of the layout of `parkenv.envs.local_observation`, which search models observe."""
+FIXED_NUMBERS, NUMBERS_PER_SLOT = 46, 8
+"""Size of that observation: for k slots, 46 + 8k numbers."""
+COMMANDS = {"search": "parkenv compare", "drive": "parkenv park"}
+"""Commands that run the models of each task."""
+_KEY = "parkenv"
+_MAX_HEADER, _MAX_BYTES = 1_000_000, 500_000_000
+_ZIP = b"PK"
+
+# Bounds, so that a card cannot ask for more memory than a network of a few million weights needs.
+Width = Annotated[int, Field(ge=1, le=1024)]
+Layers = Annotated[Several[Width], Field(max_length=8)]
+
+
+class BoxSpace(Spec):
+    """A `gymnasium.spaces.Box` with equal bounds; None for unbounded."""
+
+    shape: Annotated[Several[Annotated[int, Field(ge=1, le=16_384)]], Field(max_length=1)]
+    dtype: Literal["float32", "int8"]
+    low: float | None = None
+    high: float | None = None
+
+    @classmethod
+    def of(cls, space: spaces.Space[Any]) -> Self:
+        """Describe a space.
+
+        Raises:
+            InputError: the space is of another kind.
+        """
+        if not isinstance(space, spaces.Box):
+            raise InputError(f"the model has a space {space}, want boxes of numbers")
+        low, high = (
+            float(v) if np.isfinite(v := bound.flat[0]) else None for bound in (space.low, space.high)
+        )
+        content = {"shape": space.shape, "dtype": str(space.dtype), "low": low, "high": high}
+        return cls.parse(content, "space of the model")
+
+    def box(self) -> spaces.Box:
+        """Make the space."""
+        low = -np.inf if self.low is None else self.low
+        high = np.inf if self.high is None else self.high
+        return spaces.Box(low, high, self.shape, np.dtype(self.dtype).type)
+
+
+class PolicyOptions(Spec):
+    """Arguments of stable-baselines3's policies that a model file can hold; classes go by their names."""
+
+    net_arch: Layers | dict[Literal["pi", "vf", "qf"], Layers] | None = None
+    activation_fn: Literal["Tanh", "ReLU", "ELU", "GELU", "SiLU", "LeakyReLU"] | None = None
+    features_extractor_class: Literal["GoalFeatures"] | None = None
+    log_std_init: float | None = None
+    ortho_init: bool | None = None
+    lstm_hidden_size: Width | None = None
+    n_lstm_layers: Annotated[int, Field(ge=1, le=4)] | None = None
+    shared_lstm: bool | None = None
+    enable_critic_lstm: bool | None = None
+    n_critics: Annotated[int, Field(ge=1, le=8)] | None = None
+    n_quantiles: Annotated[int, Field(ge=1, le=256)] | None = None
+    use_sde: Literal[False] | None = None
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the keyword arguments, with classes instead of names."""
+        import torch
+
+        from planners.goal_features import GoalFeatures
+
+        given = self.model_dump(exclude_none=True)
+        if self.activation_fn is not None:
+            given["activation_fn"] = getattr(torch.nn, self.activation_fn)
+        if self.features_extractor_class is not None:
+            given["features_extractor_class"] = GoalFeatures
+        if isinstance(self.net_arch, tuple):
+            given["net_arch"] = list(self.net_arch)
+        return given
+
+
+class ModelCard(Spec):
+    """Metadata of a model file."""
+
+    format: Literal["parkenv-model-2"] = "parkenv-model-2"
+    algorithm: Literal["dqn", "ppo", "maskable-ppo", "recurrent-ppo", "sac", "tqc"]
+    task: Literal["search", "drive"]
+    observation: str = Field(description="Version of the observation's layout.")
+    k: int = Field(ge=0, le=1_000, description="Slots in the observation; 0 for driving.")
+    policy: Literal["MultiInputPolicy", "MultiInputLstmPolicy"]
+    policy_options: PolicyOptions
+    observation_space: Annotated[dict[str, BoxSpace], Field(max_length=16)]
+    action_space: BoxSpace | Annotated[int, Field(ge=1, le=1_000)]
+    scenarios: Several[str] = Field((), description="Trained on; for driving, lots.")
+    seed: int | None = Field(None, description="Of the training.")
+    steps: int = Field(0, ge=0, description="Decisions of the training.")
+    settings: dict[str, JsonValue] = Field({}, description="Of the algorithm.")
+    results: dict[str, float | None] = Field({}, description="Of the evaluation during training.")
+    command: Several[str] = Field((), description="Command line of the training.")
+    parkenv: str = __version__
+
+    @classmethod
+    def of_file(cls, path: str | os.PathLike[str]) -> Self:
+        """Read the card of a model file.
+
+        Raises:
+            InputError: the file is missing or damaged, is a pickled archive, or has no card of this version.
+        """
+        return cls._of_bytes(read_bytes(Path(path), _MAX_BYTES), path)
+
+    @classmethod
+    def _of_bytes(cls, data: bytes, path: str | os.PathLike[str]) -> Self:
+        if data.startswith(_ZIP):
+            raise InputError(
+                f"{path}: is an archive of pickled objects, which run code when they are loaded; if you trust its "
+                f"author, convert it to a {SUFFIX} file: name it once with --trust-model (compare, park, benchmark run)"
+            )
+        # The layout of safetensors: the header's length, 8 bytes; the header, JSON; the tensors.
+        size = int.from_bytes(data[:8], "little")
+        if not data[8:9] == b"{" or size > min(_MAX_HEADER, len(data) - 8):
+            raise InputError(f"{path}: no model file, or a damaged one")
+        header = parse_json(data[8 : 8 + size], f"{path}: header")
+        text = header.get("__metadata__", {})
+        text = text.get(_KEY) if isinstance(text, dict) else None
+        if not isinstance(text, str):
+            raise InputError(f"{path}: no model of `parkenv train`: it has no card")
+        content = parse_json(text, f"{path}: card")
+        if not isinstance(content, dict):
+            raise InputError(f"{path}: card is a {type(content).__name__}, want a JSON object")
+        return cls.parse(content, f"{path}: card")
+
+    def build(self) -> Any:
+        """Build the policy, with random weights."""
+        observed = spaces.Dict({name: space.box() for name, space in self.observation_space.items()})
+        action = self.action_space
+        acted = spaces.Discrete(action) if isinstance(action, int) else action.box()
+        kind = algorithm_class(self.algorithm).policy_aliases[self.policy]
+        return kind(observed, acted, lambda _: 0.0, **self.policy_options.arguments())
+
+
+def algorithm_class(name: str) -> Any:
+    """Return the stable-baselines3 class of an algorithm.
+
+    Raises:
+        InputError: the name is unknown, or the extra `rl` is not installed.
+    """
+    if name not in ALGORITHMS:
+        raise InputError(f"unknown algorithm {name!r}; known: {', '.join(ALGORITHMS)}")
+    module, class_name = ALGORITHMS[name]
+    try:
+        return getattr(import_module(module), class_name)
+    except ImportError as error:
+        raise InputError(f'{name} needs the extra rl: pip install "parkenv[rl]"') from error
+
+
+def save_model(
+    model: Any,
+    path: str | os.PathLike[str],
+    *,
+    scenarios: Sequence[str] = (),
+    settings: Mapping[str, Any] | None = None,
+    results: Mapping[str, float] | None = None,
+    command: Sequence[str] = (),
+) -> None:
+    """Write a model of stable-baselines3 or sb3-contrib to a model file, atomically.
+
+    Args:
+        model: trained on `parkenv.envs.search_sb3.SearchVecEnv`, or another environment of the `local` observation; or
+            on the driving observation of `planners.driving.policy_interface`.
+        path: file to write; its name should end in `.safetensors`.
+        scenarios: names of the training scenarios; for driving, of the lots.
+        settings: settings of the algorithm, for the card.
+        results: results of an evaluation, for the card.
+        command: command line of the training, for the card.
+
+    Raises:
+        InputError: the model is of another algorithm or observation, or its policy has an option that a card cannot
+            hold.
+    """
+    from safetensors.torch import save_file
+
+    name = type(model).__name__
+    algorithm = next((key for key, (_, class_name) in ALGORITHMS.items() if class_name == name), None)
+    if algorithm is None:
+        raise InputError(f"the model is a {name}, want one of {', '.join(ALGORITHMS)}")
+    task, observation, k = _observation_of(model.observation_space)
+    aliases = {kind: alias for alias, kind in type(model).policy_aliases.items()}
+    options = {
+        key: value.__name__ if isinstance(value, type) else value
+        for key, value in (model.policy_kwargs or {}).items()
+        if not key.startswith("optimizer_")
+    }
+    action = model.action_space
+    found = {key: None if value != value else float(value) for key, value in (results or {}).items()}
+    card = ModelCard.parse(
+        {
+            "algorithm": algorithm, "task": task, "observation": observation, "k": k,
+            "policy": aliases.get(model.policy_class, model.policy_class.__name__), "policy_options": options,
+            "observation_space": {key: BoxSpace.of(space) for key, space in model.observation_space.items()},
+            "action_space": int(action.n) if isinstance(action, spaces.Discrete) else BoxSpace.of(action),
+            "scenarios": tuple(scenarios), "seed": model.seed, "steps": model.num_timesteps,
+            "settings": to_jsonable_python(dict(settings or {})), "results": found, "command": tuple(command),
+        },
+        "model",
+    )  # fmt: skip
+    # Networks may share tensors; safetensors wants each on its own.
+    weights = {key: value.detach().cpu().clone() for key, value in model.policy.state_dict().items()}
+    with atomic_write(path) as beside:
+        save_file(weights, beside, {_KEY: card.model_dump_json()})
+
+
+def _observation_of(space: spaces.Space[Any]) -> tuple[str, str, int]:
+    """Return task, observation version and k of a model's observation space."""
+    if isinstance(space, spaces.Dict) and "local" in space.spaces and space["local"].shape:
+        return "search", OBSERVATION, (space["local"].shape[0] - FIXED_NUMBERS) // NUMBERS_PER_SLOT
+    if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces:
+        return "drive", import_module("planners.driving.policy_interface").INTERFACE, 0
+    raise InputError("the model observes neither `local` (to search) nor `achieved_goal` (to drive)")
+
+
+def load_model(
+    algorithm: str, path: str | os.PathLike[str], task: str, observation: str
+) -> tuple[ModelCard, Any]:
+    """Load a model's card and policy; no code from the file is run.
+
+    Args:
+        algorithm: algorithm that it was trained with.
+        path: the model file.
+        task: `search` or `drive`.
+        observation: version of the environment's observation layout.
+
+    Raises:
+        InputError: the file is not a model, or is one of another algorithm, task or observation.
+    """
+    data = read_bytes(Path(path), _MAX_BYTES)
+    card = ModelCard._of_bytes(data, path)
+    if card.algorithm != algorithm:
+        raise InputError(f"{path}: is a model of {card.algorithm}, not of {algorithm}")
+    if card.task != task:
+        raise InputError(
+            f"{path}: was trained to {card.task}, not to {task}; `{COMMANDS[card.task]}` runs it"
+        )
+    if card.observation != observation:
+        raise InputError(
+            f"{path}: observes {card.observation!r}, this version of parkenv gives {observation!r}; "
+            f"it was trained with parkenv {card.parkenv}"
+        )
+    try:
+        policy = card.build()
+        policy.load_state_dict(import_module("safetensors.torch").load(data))
+    except InputError:
+        raise
+    except Exception as error:  # torch and stable-baselines3 raise many types for weights that do not fit
+        raise InputError(f"{path}: its network cannot be read ({type(error).__name__}: {error})") from error
+    policy.set_training_mode(False)
+    return card, policy
+
+
+def convert_archive(algorithm: str, path: str | os.PathLike[str]) -> Path:
+    """Convert an archive of stable-baselines3's `model.save` to a model file beside it.
+
+    This unpickles the archive, which runs whatever code its author put there.
+
+    Args:
+        algorithm: algorithm that it was trained with.
+        path: the archive, `NAME.zip`.
+
+    Returns:
+        The model file, `NAME.safetensors`.
+
+    Raises:
+        InputError: the archive cannot be read, the model does not fit, or the model file exists.
+    """
+    made = Path(path).with_suffix(SUFFIX)
+    if made.exists():
+        raise InputError(f"{made}: exists; name it instead of {path}, or remove it")
+    # A model that is not trained further needs no replay buffer.
+    unneeded: dict[str, Any] = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
+    kind = algorithm_class(algorithm)
+    try:
+        model = kind.load(Path(path), device="cpu", custom_objects=unneeded)
+    except Exception as error:  # unpickling raises anything
+        raise InputError(f"{path}: no archive of {algorithm} ({type(error).__name__}: {error})") from error
+    save_model(model, made)
+    return made

@@ -1,0 +1,170 @@
+"""Runs that a signal stops at some moment, and what they leave.
+
+As a program, trials at random moments: `python tests/stopped_runs.py compare SIGTERM 10` prints a line for each.
+"""
+
+import csv
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from pathlib import Path
+
+from command_line import parkenv
+
+from parkenv.evaluation.training.rl_training import CHECKPOINT
+
+COMMANDS = {
+    "compare": "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --occupancy-levels none --no-figures",
+    "survey": "survey --scenario mini --sessions 3 --every 6",
+    "calibrate": "calibrate --scenario mini -n 6",
+    "benchmark": "benchmark run v1 --agents first-free",
+    "train": "train ppo --scenario mini --steps 16000 --trainings 2 --evaluate-every 4000 --evaluation-episodes 16 "
+    "--agents none",
+}
+START_S = 1.5
+"""Time that a process takes to import its modules."""
+GONE_S = 5.0
+"""Time until no process of a stopped run is left."""
+
+
+class Run:
+    """A command of `COMMANDS` that runs in processes of its own, as in a terminal."""
+
+    def __init__(self, name, out, *options):
+        script = out.with_name("parkenv")
+        script.write_text("from parkenv.cli import main\nmain()\n")
+        self.mark = f"PARKENV_STOPPED_RUN={uuid.uuid4()}"
+        self.started = time.monotonic()
+        self.process = subprocess.Popen(
+            [sys.executable, script, *COMMANDS[name].split(), "--jobs", "2", "--out", out, *options],
+            env=dict([*os.environ.items(), self.mark.split("=")]),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            # A shell's background jobs, and what they start, ignore Ctrl-C.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+
+    def stop(self, number):
+        """Send a signal; Ctrl-C goes to all processes of the terminal. Return exit code, output, errors."""
+        (os.killpg if number == signal.SIGINT else os.kill)(self.process.pid, number)
+        sent = time.monotonic()
+        while living := self.processes():
+            if time.monotonic() > sent + GONE_S:
+                for pid in living:
+                    os.kill(pid, signal.SIGKILL)
+                raise AssertionError(
+                    f"{living} at work {GONE_S} s after {number!r}: {self.process.communicate()}"
+                )
+            time.sleep(0.05)
+        self.gone_s = time.monotonic() - sent
+        return self.end()
+
+    def end(self):
+        output, errors = self.process.communicate()
+        return self.process.returncode, output, errors
+
+    def processes(self):
+        """Return the living processes that this run has started."""
+        living = []
+        for environment in Path("/proc").glob("[0-9]*/environ"):
+            try:
+                if self.mark.encode() in environment.read_bytes():
+                    living.append(int(environment.parent.name))
+            except OSError:
+                pass
+        return living
+
+
+def finished(name, out, *options):
+    """Run a command to its end, in this process; other workers, same result."""
+    done = parkenv(*COMMANDS[name].split(), "--jobs", 1, "--out", out, *options)
+    assert done.returncode == 0, (done.stdout, done.stderr)
+
+
+def resumed(name, out):
+    """Finish a stopped run as its own message says; return whether its result is that of an unbroken one."""
+    again = name == "survey" or not (out / "settings.json").exists()
+    broken = name == "train" and bool(list(out.glob(f"seed_*/{CHECKPOINT}")))
+    finished(name, out, *([] if again else ["--resume"]))
+    return not broken
+
+
+def result_of(name, out):
+    """Return what does not depend on wall time."""
+    summary = json.loads((out / "summary.json").read_text())
+    if name in ("compare", "benchmark"):
+        return (
+            (out / "episodes.csv").read_bytes(),
+            summary["complete"],
+            [r["total_s"] for r in summary["rows"]],
+        )
+    if name == "survey":
+        with (out / "sessions.csv").open(newline="") as file:
+            rows = [{**row, "seconds_per_frame": None} for row in csv.DictReader(file)]
+        return rows, summary["rows"][0]["occupancy_mae"]
+    if name == "calibrate":
+        return (out / "calibrated.json").read_bytes()
+    return [(row["seed"], row["total_s"]) for row in summary["rows"]], all(
+        row["steps"] >= 16_000 for row in summary["rows"]
+    )
+
+
+def trial(name, number, moment, folder, unbroken):
+    """Stop a run after `moment` seconds and finish it; return what happened, in a line."""
+    out = folder / "out"
+    run = Run(name, out)
+    time.sleep(moment)
+    if run.process.poll() is not None:
+        run.end()
+        return "over before"
+    code, output, errors = run.stop(number)
+    ends = {0, -number} if number == signal.SIGKILL else {0, -number, 128 + number}
+    assert code in ends, (code, output, errors)
+    if number != signal.SIGKILL:
+        assert "Traceback" not in errors, errors
+        assert not output.strip() or "Interrupted" in output or (out / "summary.json").exists(), output
+    kept = any(out.glob("*")) if out.exists() else False
+    assert not (out / ".lock").exists() or number == signal.SIGKILL
+    if code == 0 or (out / "summary.json").exists():
+        return "over before"
+    same = resumed(name, out)
+    assert not list(out.rglob(".*.part"))
+    if same:
+        assert result_of(name, out) == unbroken
+    else:
+        assert result_of(name, out)[-1]
+    what = "results equal" if same else "training completed"
+    return f"exit {code}, gone after {run.gone_s:.1f} s, {'something' if kept else 'nothing'} kept, {what}"
+
+
+def trials(name, number, seeds):
+    """Yield the outcome of trials at random moments of a run."""
+    with tempfile.TemporaryDirectory() as folder:
+        whole = Path(folder) / "whole"
+        started = time.monotonic()
+        finished(name, whole)
+        lasts = START_S + time.monotonic() - started
+        for seed in seeds:
+            moment = random.Random(f"{name} {number} {seed}").uniform(0.0, lasts)
+            with tempfile.TemporaryDirectory() as its:
+                yield (
+                    f"{moment:5.2f} s of {lasts:.1f}",
+                    trial(name, number, moment, Path(its), result_of(name, whole)),
+                )
+
+
+if __name__ == "__main__":
+    command, name_of_signal, count, *first = sys.argv[1:]
+    start = int(first[0]) if first else 0
+    for when, outcome in trials(command, signal.Signals[name_of_signal], range(start, start + int(count))):
+        sys.stdout.write(f"{command} | {name_of_signal} | {when} | {outcome}\n")
+        sys.stdout.flush()

@@ -1,0 +1,192 @@
+"""Help pages, hints, completion and the start of the command line; what commands do is tested elsewhere."""
+
+import inspect
+import os
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import fields, is_dataclass
+
+import pytest
+import typer
+from command_line import parkenv
+
+from parkenv.cli import app, compare, demo, survey, train
+from parkenv.cli.command import SHARED, read_docstring
+from parkenv.evaluation.experiments import spec as specs
+from parkenv.files.names import SCENARIO_NAMES, WEATHERS, RigName
+from planners.names import AGENTS
+from sim_sensors.camera.weather import PRESETS
+from sim_sensors.rig import RIG_NAMES
+
+
+def commands(command=None, path=()):
+    """Yield every command with its words."""
+    command = command or typer.main.get_command(app)
+    for name, its in getattr(command, "commands", {}).items():
+        yield from commands(its, (*path, name))
+    if not hasattr(command, "commands"):
+        yield pytest.param(path, command, id=" ".join(path))
+
+
+COMMANDS = {" ".join(one.values[0]): one.values[1] for one in commands()}
+
+
+@pytest.mark.parametrize(("path", "command"), [*commands()])
+def test_a_help_page_says_what_a_newcomer_needs(path, command, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    page = parkenv(*path, "--help").stdout
+    assert max(map(len, page.splitlines())) <= 80
+    assert not re.search(r"<\w+>|INTEGER|RANGE|\[x|[{}]", page)
+    for option in command.params:
+        if option.param_type_name == "option":
+            assert option.help, option.name
+            flag = option.is_flag or option.required
+            assert (
+                flag or option.default is not None or "[default: " in option.help or option.name in OPTIONAL
+            ), option.name
+    examples = page.partition("Examples:\n")[2].partition("\n\n")[0]
+    assert examples
+    for line in examples.replace("\\\n      ", " ").splitlines():
+        name, *words = shlex.split(line)
+        assert name == "parkenv"
+        its = next(c for c in (" ".join(words[:2]), words[0]) if c in COMMANDS)
+        known = {opt for p in COMMANDS[its].params for opt in (*p.opts, *p.secondary_opts)}
+        assert {word for word in words if word[0] == "-"} <= known
+
+
+OPTIONAL = (
+    "address", "agents", "beside", "bounds", "calibrated", "clone", "crops", "lot", "map_says", "model", "picture",
+    "replay", "rerun", "rig", "uiuc",
+)  # fmt: skip
+"""Options that do nothing unless they are given."""
+
+
+def test_an_option_means_the_same_everywhere():
+    """A short form belongs to one option, and an option that is described once is not described again."""
+    short = {}
+    for command in COMMANDS.values():
+        for option in command.params:
+            for form in option.opts:
+                if len(form) == 2 and option.param_type_name == "option":
+                    short.setdefault(form, set()).add(option.opts[0])
+    assert short == {"-n": {"--episodes"}, "-o": {"--out"}, "-j": {"--jobs"}}
+    assert {"scenario", "agents", "seed", "rig", "detector", "weather", "lot", "rerun"} == set(SHARED)
+
+
+@pytest.mark.parametrize(
+    ("function", "kind"),
+    [
+        (compare.compare, specs.ExperimentSpec),
+        (survey.survey, specs.SurveySpec),
+        (demo.demo, specs.DemoSpec),
+        (train.train, specs.TrainingSpec),
+    ],
+)
+def test_defaults_are_those_of_the_specification(function, kind):
+    _, _, entries = read_docstring(function.__doc__)
+    for name, parameter in inspect.signature(function).parameters.items():
+        if name not in kind.model_fields or name in ("scenario", "agents"):
+            continue
+        default = kind.model_fields[name].default
+        if parameter.default is not None:
+            assert parameter.default == default, name
+        elif default is not None and not isinstance(default, bool):
+            shown = ",".join(default) if isinstance(default, tuple) else str(default)
+            assert f"[default: {shown}]".replace(" ", "") in entries[name].help.replace(" ", ""), name
+
+
+def test_names_are_those_of_the_modules_behind_them():
+    assert tuple(PRESETS) == WEATHERS
+    assert set(RigName.__args__) == set(RIG_NAMES)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "Start here:"),
+        (("comp",), "no command 'comp'; did you mean 'compare'?"),
+        (("benchmark", "chek"), "parkenv benchmark has no command 'chek'; did you mean 'check'?"),
+        (
+            ("compare", "--agent", "mdp"),
+            "no option --agent; did you mean '--agents'? see parkenv compare --help",
+        ),
+        (("compare", "-n", "0"), "--episodes: want N >= 1; see parkenv compare --help"),
+        (("compare", "--agents", "gredy-goal"), "unknown agent 'gredy-goal'; did you mean 'greedy-goal'?"),
+        (("compare", "--agents", "mdp(failre_s=1)"), "no option 'failre_s'; did you mean 'failure_s'?"),
+        (
+            ("survey", "--scenario", "campsu"),
+            "unknown scenario 'campsu', and no such file; did you mean 'campus'?",
+        ),
+        (("plan", "--scenario", "mini,jam"), "--scenario names 2 scenarios, want one"),
+        (("run", "nowhere.toml"), "nowhere.toml: No such file or directory"),
+        (("train", "--env", "sarch"), "--env: 'sarch' is not one of 'search', 'drive'"),
+        (("map",), "Missing argument 'FILE'; see parkenv map --help"),
+    ],
+)
+def test_a_mistake_is_answered_by_what_was_meant(words, said, tmp_path):
+    done = parkenv(*words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in (done.stderr if words else done.stdout)
+    assert not [*tmp_path.iterdir()]
+
+
+def fresh(*words, **environment):
+    """Run a command in a process of its own; return its lines, and which large modules it has loaded."""
+    heavy = "pydantic", "numba", "scipy", "rich", "torch", "matplotlib", "cv2", "shapely"
+    program = (
+        "import atexit, sys; sys.argv[0] = 'parkenv'\n"
+        f"atexit.register(lambda: print([m for m in {heavy} if m in sys.modules], file=sys.stderr))\n"
+        "import runpy; runpy.run_module('parkenv', run_name='__main__')"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split("\n")[:-1], done.stderr.strip()
+
+
+@pytest.mark.parametrize(
+    ("line", "wanted"),
+    [
+        ("parkenv compare --scenario ca", ["campus"]),
+        ("parkenv compare --agents mdp,be", ["mdp,belief"]),
+        ("parkenv benchmark run v1 --agents be", ["belief"]),
+        ("parkenv plan --sensor-model las", ["laser"]),
+        ("parkenv survey --weather r", ["rain"]),
+        ("parkenv run examples/courtyard/s", ["examples/courtyard/sweep.toml"]),
+        ("parkenv lot sh", ["show"]),
+        ("parkenv report here --rep", ["--replay"]),
+    ],
+)
+def test_values_are_completed_without_loading_anything_large(line, wanted):
+    variables = {"_PARKENV_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
+    assert fresh(**variables) == (wanted, "[]")
+
+
+def test_version_and_help_load_nothing_large():
+    assert fresh("--version") == (["parkenv 0.1.0"], "[]")
+    page, loaded = fresh("--help")
+    assert loaded == "[]"
+    assert {line.split()[0] for line in page if line.startswith("  ")} >= {"demo", "compare", "lot", "bench"}
+
+
+def test_agents_and_scenarios_are_listed_in_help():
+    page = parkenv("compare", "--help").stdout.replace("\n", " ")
+    for name in (*AGENTS, *SCENARIO_NAMES):
+        assert name in re.sub(r"- +", "-", page)
+
+
+def test_option_groups_are_described():
+    """Every field of a group of options has a line in a docstring; `add` would have failed otherwise."""
+    from parkenv.cli import arguments
+
+    groups = [its for its in vars(arguments).values() if is_dataclass(its)]
+    for its in groups:
+        described = {n for base in its.__mro__ for n in read_docstring(base.__doc__)[2]} | set(SHARED)
+        assert {f.name for f in fields(its)} <= described

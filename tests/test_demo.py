@@ -1,0 +1,42 @@
+"""The demo: from a survey to a film, in one command."""
+
+import json
+
+from command_line import parkenv
+from PIL import Image
+
+from parkenv.evaluation.experiments.compare import Case
+from parkenv.evaluation.experiments.demo import AGENTS, demo_cases, demo_survey
+from parkenv.evaluation.experiments.spec import DemoSpec
+from parkenv.mapping.store import MapStore
+from parkenv.scenarios.spec import scenario_spec
+
+
+def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
+    out = tmp_path / "demo"
+    done = parkenv("demo", "--scenario", "mini", "--quick", "--jobs", 1, "--out", out)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    assert [row["agent"] for row in summary["rows"]] == list(AGENTS)
+    assert {"belief", "oracle"} <= set(AGENTS)
+    assert all(row["regret_s"] >= -1e-6 for row in summary["rows"])
+    for name in ("report.html", "search.gif"):
+        assert str(out / name) in done.stdout
+    assert done.stdout.count("\n  parkenv ") == 3, "commands to try next"
+    page = (out / "report.html").read_text()
+    assert page.count("<figure") == len(list(out.glob("*.png"))) == 5
+    assert '"drives":[{' in page
+    with Image.open(out / "search.gif") as film:
+        assert film.n_frames > 10
+        assert film.width == 840
+    assert (out / "search.gif").stat().st_size < 3e6
+
+    # The oracle needs no sensors.
+    spec = DemoSpec(scenario=scenario_spec("mini"), sessions=2, episodes=2, every=4.0)
+    its, _ = demo_survey(spec)
+    with MapStore(out / "map.sqlite", its.lot, create=False) as store:
+        cases = demo_cases(spec, its, store.log())
+    (oracle,) = [case for case, _ in cases if case.agent == "oracle"]
+    seed = cases[0][1][0]
+    looking = Case(oracle.scenario, "oracle", rig="laser").runner().run(seed).row
+    assert looking["total_s"] == oracle.runner().run(seed).row["total_s"]

@@ -1,0 +1,184 @@
+"""Stopped runs leave no process at work and keep what is finished, to be resumed; a folder has one writer."""
+
+import errno
+import json
+import multiprocessing
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import killed_once
+import pytest
+from command_line import parkenv
+from stopped_runs import COMMANDS, Run, finished, result_of, resumed, trials
+
+from parkenv.errors import InputError
+from parkenv.evaluation.experiments import workers
+from parkenv.evaluation.experiments.workers import Workers
+from parkenv.files import atomic_write
+from parkenv.files.atomic_write import append_text
+from parkenv.files.folder_lock import LOCK, folder_lock
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+
+
+def has_lines(path, count):
+    deadline = time.monotonic() + 60.0
+    while not (path.exists() and len(path.read_text().splitlines()) > count):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+@pytest.mark.parametrize(
+    ("name", "number", "file"),
+    [("compare", signal.SIGTERM, "episodes.csv"), ("calibrate", signal.SIGKILL, "trips.jsonl")],
+)
+def test_a_stopped_run_leaves_no_process_and_is_resumed_to_the_same_result(tmp_path, name, number, file):
+    out = tmp_path / "out"
+    run = Run(name, out)
+    has_lines(out / file, 5)
+    code, output, errors = run.stop(number)
+    assert "Traceback" not in errors
+    if number == signal.SIGTERM:
+        assert code == 143
+        assert f"--resume --out {out} goes on" in " ".join(output.split())
+        summary = json.loads((out / "summary.partial.json").read_text())
+        lines = len((out / file).read_text().splitlines()) - 1
+        assert (summary["complete"], sum(row["episodes"] for row in summary["rows"])) == (False, lines)
+    else:
+        assert code == -signal.SIGKILL
+    kept = (out / file).read_text().splitlines()
+    assert len(kept) > 5
+    assert resumed(name, out)
+    assert set(kept[1:-1]) <= set((out / file).read_text().splitlines())
+    finished(name, tmp_path / "whole")
+    assert result_of(name, out) == result_of(name, tmp_path / "whole")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COMMANDS)
+def test_runs_stopped_at_random_moments(name):
+    for number in (signal.SIGTERM, signal.SIGKILL, signal.SIGINT):
+        list(trials(name, number, [int(number)]))
+
+
+def test_ctrl_c_while_modules_are_imported_is_quiet(tmp_path):
+    for moment in (0.1, 0.4, 0.7):
+        run = Run("compare", tmp_path / "out")
+        time.sleep(moment)
+        code, output, errors = run.stop(signal.SIGINT)
+        assert (code in (-signal.SIGINT, 130), output, errors) == (True, "", "")
+
+
+@pytest.mark.parametrize("thread", ["main", "other"])
+def test_workers_end_with_their_killed_parent(tmp_path, thread):
+    """Linux kills them; the workers of a thread that may end before the process watch for themselves."""
+    script = (
+        "import sys, threading, killed_once\n"
+        "from functools import partial\n"
+        "from parkenv.evaluation.experiments.workers import Workers\n"
+        "def work():\n"
+        f"    list(Workers(2).results([partial(killed_once.wait, {str(tmp_path)!r})] * 2))\n"
+        "other = threading.Thread(target=work)\n"
+        f"{'work()' if thread == 'main' else 'other.start(); other.join()'}\n"
+    )
+    here = str(Path(__file__).parent)
+    path = os.pathsep.join([here, *sys.path])
+    parent = subprocess.Popen([sys.executable, "-c", script], env={**os.environ, "PYTHONPATH": path})
+    while len(started := list(tmp_path.iterdir())) < 2:
+        assert parent.poll() is None
+        time.sleep(0.02)
+    parent.kill()
+    parent.wait()
+    deadline = time.monotonic() + 3.0
+    while any(Path("/proc", worker.name).exists() for worker in started):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def test_there_are_no_more_workers_than_cores_and_tasks(monkeypatch):
+    monkeypatch.setattr(workers, "cpu_count", lambda: 3)
+    assert Workers(1000).jobs == Workers(None).jobs == 3
+    before = set(multiprocessing.active_children())
+    with Workers(1000) as many:
+        list(many.results([partial(killed_once.square, k) for k in range(2)]))
+    assert len(set(multiprocessing.active_children()) - before) <= 2
+
+
+def test_a_folder_has_one_writer(tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    torn = out / ".episodes.csv.123.part"
+    torn.touch()
+    holder = subprocess.Popen(
+        [
+            sys.executable, "-c", "import sys, time; from pathlib import Path; from parkenv.files import folder_lock\n"
+            "with folder_lock.folder_lock(Path(sys.argv[1])): print(flush=True); time.sleep(60)", out,
+        ],
+        stdout=subprocess.PIPE,
+    )  # fmt: skip
+    try:
+        holder.stdout.readline()
+        assert not torn.exists()
+        for command in ("compare", "survey", "train", "calibrate", "demo", "park"):
+            refused = parkenv(command, "--scenario", "mini", "--out", out)
+            assert refused.returncode == 2
+            assert f"out: process {holder.pid} on " in refused.stderr
+            assert len(refused.stderr.splitlines()) == 1
+        assert [path.name for path in out.iterdir()] == [LOCK]
+    finally:
+        holder.kill()
+        holder.communicate()
+    with folder_lock(out), pytest.raises(InputError, match=f"process {os.getpid()} on"), folder_lock(out):
+        pass
+    assert not list(out.iterdir())
+
+
+def test_an_invalid_command_leaves_no_folder(tmp_path):
+    out = tmp_path / "results" / "compare"
+    assert parkenv("compare", "--scenario", "mini", "--agents", "nobody", "--out", out).returncode == 2
+    assert not out.parent.exists()
+
+
+def test_a_full_disk_leaves_files_as_they_were(tmp_path):
+    path = tmp_path / "episodes.csv"
+    path.write_text("one\n")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (6, limits[1]))
+    try:
+        with pytest.raises(InputError, match=r"episodes\.csv: cannot be written: File too large"):
+            append_text(path, "two\n")
+        with pytest.raises(InputError, match="cannot be written"), atomic_write.atomic_write(path) as beside:
+            beside.write_text("another text\n")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_text() == "one\n"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_comparison_on_a_full_disk_ends_in_a_line_and_is_resumed(tmp_path, monkeypatch):
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    arguments = ("compare", "--scenario", "mini", "--agents", "first-free,oracle", "-n", 60, "--occupancy-levels",
+                 "none", "--no-figures", "--jobs", 1, "--out")  # fmt: skip
+    calls = iter(range(100))
+
+    def full(descriptor):
+        if next(calls) == 5:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(atomic_write.os, "fsync", full)
+        done = parkenv(*arguments, out)
+    assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
+    assert f"{out / 'episodes.csv'}: cannot be written: No space left on device" in done.stderr
+    kept = (out / "episodes.csv").read_text()
+    assert len(kept.splitlines()) > 1
+    assert parkenv(*arguments, out, "--resume").returncode == 0
+    assert parkenv(*arguments, whole).returncode == 0
+    assert (out / "episodes.csv").read_bytes() == (whole / "episodes.csv").read_bytes()
+    assert (whole / "episodes.csv").read_text().startswith(kept)

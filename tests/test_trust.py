@@ -1,0 +1,83 @@
+"""Code that files name runs only when the user trusts it, and a user's agents keep their names."""
+
+import csv
+import json
+import sys
+
+import pytest
+from command_line import parkenv
+
+AGENT = """
+from pathlib import Path
+from planners.greedy import FirstFreeAgent
+
+Path("was_run").touch()
+
+class Mine(FirstFreeAgent):
+    name = "mine"
+"""
+EXPERIMENTS = {
+    "compare": {"agents": ["mdp", "{module}:Mine"], "grid": {}, "figures": False, "episodes": 2},
+    "benchmark": {"agents": ["{module}:Mine"]},
+    "train": {"agents": ["{module}:Mine"]},
+    "survey": {"detector": "{module}:Mine"},
+    "demo": {"detector": "{module}:Mine"},
+}
+
+
+@pytest.fixture
+def module(tmp_path, monkeypatch, request):
+    """A module of a user's agent in the working directory, which leaves a mark when it is imported."""
+    name = f"their_{abs(hash(request.node.name))}"
+    (tmp_path / f"{name}.py").write_text(AGENT)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    return name
+
+
+def experiment(path, kind, module):
+    tables = {"kind": kind, "jobs": 1} | EXPERIMENTS[kind]
+    if kind in ("compare", "train"):
+        tables["scenarios"] = ["mini"]
+    path.write_text(json.dumps(tables).replace("{module}", module))
+    return path
+
+
+@pytest.mark.parametrize("kind", EXPERIMENTS)
+def test_an_experiment_file_that_names_a_class_shows_it_and_asks_for_trust(module, tmp_path, kind):
+    refused = parkenv("run", experiment(tmp_path / "theirs.json", kind, module))
+    message = " ".join(refused.stderr.split())
+    assert refused.returncode == 2
+    assert f"theirs.json: would run {module}:Mine ({tmp_path / module}.py); read that code" in message
+    assert not (tmp_path / "was_run").exists()
+    assert not (tmp_path / "results").exists()
+
+
+def test_a_run_folder_that_names_a_class_asks_for_trust_and_the_class_names_the_agent(module, tmp_path):
+    mark, out = tmp_path / "was_run", tmp_path / "out"
+    done = parkenv("run", experiment(tmp_path / "theirs.json", "compare", module), "--out", out, "--trust")
+    assert done.returncode == 0, done.stderr
+    assert mark.exists()
+    assert [row["agent"] for row in json.loads((out / "summary.json").read_text())["rows"]] == ["mdp", "mine"]
+    with (out / "episodes.csv").open() as file:
+        assert [row["agent"] for row in csv.DictReader(file)] == ["mdp"] * 2 + ["mine"] * 2
+    sys.modules.pop(module)
+    mark.unlink()
+    for command in (("report", out), ("run", out, "--resume"), ("compare", "--resume", "--out", out)):
+        refused = parkenv(*command)
+        assert (refused.returncode, "add --trust" in refused.stderr) == (2, True), refused.stderr
+    assert not mark.exists()
+    done = parkenv("report", out, "--trust", "--jobs", 1, "--episodes", 1)
+    assert done.returncode == 0, done.stderr
+    assert "Note" not in done.stdout
+    assert mark.exists()
+
+
+def test_agents_on_the_command_line_are_the_users_own_choice(module, tmp_path):
+    command = ["compare", "--scenario", "mini", "--episodes", 1, "--occupancy-levels", "none", "--no-figures"]
+    command += ["--jobs", 1, "--out", tmp_path / "out", "--agents"]
+    done = parkenv(*command, f"mdp,{module}:Mine", "--report")
+    assert done.returncode == 0, done.stderr
+    (tmp_path / f"{module}_too.py").write_text(AGENT)
+    done = parkenv(*command, f"{module}:Mine,{module}_too:Mine", "--overwrite")
+    assert (done.returncode, "two agents are called 'mine'" in done.stderr) == (2, True)
