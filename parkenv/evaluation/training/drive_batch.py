@@ -7,7 +7,8 @@ not a collision in pymunk, so grazing contacts may differ. Trained models are te
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, Self
+from collections.abc import Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -91,6 +92,15 @@ class DriveBatch:
         self.approach, self.took = drives.approach, drives.took
         view = self.view
         self._car = _Car(vehicle.limits, view.half, view.body, view.pedals, vehicle.middle)
+
+    def get_state(self) -> Sequence[NDArray[Any]]:
+        """Return the arrays of all drives, for `set_state`."""
+        return self._drives
+
+    def set_state(self, state: Sequence[NDArray[Any]]) -> None:
+        """Continue from a state that `get_state` returned for as many drives."""
+        for array, values in zip(self._drives, state, strict=True):
+            array[...] = values
 
     def start(self, i: int, task: PreparedTask, pose: FloatArray | None = None) -> None:
         """Restart drive i with a task, at the task's start or at `pose`, (3,) of the rear axle, slot frame."""

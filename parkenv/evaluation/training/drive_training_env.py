@@ -165,7 +165,7 @@ class DriveTrainingEnv(SharedVecEnv):
             "stood": self._stood,
             "returns": self._returns,
             "lengths": self._lengths,
-            "batch": {name: array for name, array in vars(self.batch).items() if _changes(array)},
+            "batch": self.batch.get_state(),
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
@@ -178,7 +178,7 @@ class DriveTrainingEnv(SharedVecEnv):
         self._seeds_of = dict(zip(self._seeds_of, map(list, state["seeds"]), strict=True))
         self._at, self._stood = list(state["at"]), state["stood"]
         self._returns, self._lengths = state["returns"], state["lengths"]
-        vars(self.batch).update(state["batch"])
+        self.batch.set_state(state["batch"])
 
     def reset(self) -> Observations:
         """Start a new episode in every drive; keep the levels."""
@@ -286,8 +286,3 @@ class DriveTrainingEnv(SharedVecEnv):
             task = self._tasks[key].draw(seed)
             made[seed] = CurriculumTask(PreparedTask(task), planned_path(task) if on_path else None)
         return made[seed]
-
-
-def _changes(value: Any) -> bool:
-    """Whether a part of a batch may change: the car's own arrays are read-only."""
-    return isinstance(value, np.ndarray) and value.flags.writeable
