@@ -22,8 +22,8 @@ from planners.routes import DriveRoutes
 class SearchTrace:
     """Trace of one search, for pictures."""
 
-    scenario: Scenario  # the scenario
-    agent: str  # name of the agent
+    scenario: Scenario
+    agent: str
     path: list[int]  # vertices in the order driven, the entry first
     occupied: NDArray[np.bool_]  # (n_slots,) bool, the true occupancy at the arrival
     forecast: NDArray[np.float64]  # (n_slots,) float64, the occupancy forecast at the arrival
