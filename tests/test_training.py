@@ -23,8 +23,6 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from parkenv import make_scenario
-from parkenv.cli.search_task import SearchTask
-from parkenv.cli.training_task import curves_beside
 from parkenv.envs.local_observation import LocalObservation, local_space
 from parkenv.envs.search_sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
@@ -36,7 +34,9 @@ from parkenv.evaluation.training.checkpoint import save_checkpoint
 from parkenv.evaluation.training.cloning import Demonstrations, clone
 from parkenv.evaluation.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
 from parkenv.evaluation.training.rl_training import TRAINING_SEEDS, read_curve, train_one
+from parkenv.evaluation.training.search_task import SearchTask
 from parkenv.evaluation.training.search_training import SearchTraining, episode_times, search_times
+from parkenv.evaluation.training.training_task import curves_beside
 from parkenv.evaluation.trips.driven_search import DrivenSearch
 from parkenv.scenarios.spec import scenario_spec
 from planners.agent import make_agent

@@ -137,7 +137,7 @@ def page(results: list[Path], /, out: Path = Path("results/benchmark.html")) -> 
     `parkenv benchmark check` is refused, and no page is written.
 
     Examples:
-        parkenv benchmark page results/v1 results/yours/result.json --out results/benchmark.html
+        parkenv benchmark page results/v1 yours/result.json --out v1.html
 
     Options:
         results (FILE|DIR): Result files, or folders with result.json files in them.

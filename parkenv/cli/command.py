@@ -168,7 +168,7 @@ def add(app: typer.Typer, name: str, function: Callable[..., None], heading: str
     text, examples, own = read_docstring(function.__doc__)
     signature = inspect.signature(function, eval_str=True)
     annotations: dict[str, Any] = {name: p.annotation for name, p in signature.parameters.items()}
-    groups = {name: kind for name, kind in annotations.items() if is_dataclass(kind)}
+    groups: dict[str, Any] = {name: kind for name, kind in annotations.items() if is_dataclass(kind)}
     parameters: list[Parameter] = []
     for parameter in signature.parameters.values():
         kind = groups.get(parameter.name)

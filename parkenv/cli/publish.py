@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console
-from parkenv.cli.training_task import FIGURE, TEST_SEED
 from parkenv.cli.trust import require_trust
 from parkenv.errors import InputError
+from parkenv.files.names import SCENARIO_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -26,7 +26,7 @@ def publish(
     out: Path,
     scenario: str | None = None,
     episodes: int = 500,
-    seed: int = TEST_SEED,
+    seed: int | None = None,
     *,
     trust: bool = False,
     machines: args.Machines,
@@ -46,14 +46,17 @@ def publish(
         out, -o (DIR): The folder to make.
         scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: those of the training's test]
         episodes, -n (N >= 2): Episodes of the evaluation in each scenario.
+        seed (N >= 0): First seed; episode i uses seed + i.  [default: 3000000, as in the tests of trainings]
     """
     from parkenv.evaluation.experiments.results import make_folder, write_summary
     from parkenv.evaluation.publication import CARD, FILM, MODEL, Publication
+    from parkenv.evaluation.training.training_task import FIGURE, TEST_SEED
     from parkenv.scenarios.build import build
     from planners.model_file import ModelCard
 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"--out {out}: exists; name a new folder")
+    seed = TEST_SEED if seed is None else seed
     model, tested = _best(trained, trust) if trained.is_dir() else (trained, None)
     card = ModelCard.of_file(model)
     if scenario is not None:
@@ -106,7 +109,7 @@ def _best(folder: Path, trust: bool) -> tuple[Path, Sequence[ScenarioSpec] | Non
 
 def _trained_on(model: Path, names: Sequence[str]) -> list[ScenarioSpec]:
     """Return the scenarios that a model was trained on, if they are packaged ones."""
-    from parkenv.scenarios.spec import SCENARIO_NAMES, scenario_spec
+    from parkenv.scenarios.spec import scenario_spec
 
     for name in names:
         if name not in SCENARIO_NAMES:
@@ -118,7 +121,7 @@ def _trained_on(model: Path, names: Sequence[str]) -> list[ScenarioSpec]:
 
 def _file_of(spec: ScenarioSpec) -> str:
     """Return the name of a packaged scenario, or of a file for any other."""
-    from parkenv.scenarios.spec import SCENARIO_NAMES, scenario_spec
+    from parkenv.scenarios.spec import scenario_spec
 
     packaged = spec.title in SCENARIO_NAMES and spec == scenario_spec(spec.title)
     return spec.title if packaged else f"{spec.title}.json"

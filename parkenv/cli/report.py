@@ -189,10 +189,10 @@ def _trained(run: RunFolder, spec: TrainingSpec) -> Cases:
     """Return the best model and the best planners in the test scenarios; none for driving, or without a test."""
     if spec.env != "search" or not run.summary.get("transfer"):
         return []
-    from parkenv.cli.search_task import SearchTask
-    from parkenv.cli.training_task import TEST_SEED
     from parkenv.evaluation.experiments.compare import Case
     from parkenv.evaluation.training.rl_training import MODEL
+    from parkenv.evaluation.training.search_task import SearchTask
+    from parkenv.evaluation.training.training_task import TEST_SEED
 
     best = min(run.summary["rows"], key=lambda row: float(row["total_s"]))
     model = run.path / f"seed_{int(best['seed'])}" / MODEL

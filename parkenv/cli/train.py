@@ -12,16 +12,16 @@ from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.report import PAGE, make_report
 from parkenv.cli.single_writer import writing_into
-from parkenv.cli.tables import command_line, make_console, save_summary
+from parkenv.cli.tables import command_line, make_console, make_table, save_summary
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.cli.training_task import Row, TrainingTask
     from parkenv.evaluation.experiments.spec import TrainingSpec
     from parkenv.evaluation.experiments.workers import Workers
     from parkenv.evaluation.training.rl_training import Training
+    from parkenv.evaluation.training.training_task import Row, TrainingTask
 
 
 def train(
@@ -109,8 +109,8 @@ def train(
 
 
 def _task_of(spec: TrainingSpec) -> TrainingTask:
-    from parkenv.cli.drive_task import DriveTask
-    from parkenv.cli.search_task import SearchTask
+    from parkenv.evaluation.training.drive_task import DriveTask
+    from parkenv.evaluation.training.search_task import SearchTask
 
     return DriveTask(spec) if spec.env == "drive" else SearchTask(spec)
 
@@ -121,9 +121,9 @@ def run_training(spec: TrainingSpec, out: Path, folder: args.RunFolder, beside: 
     Raises:
         InputError: the training is impossible, or the folder cannot be used.
     """
-    from parkenv.cli.training_task import curves_beside
     from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.training.rl_training import MODEL
+    from parkenv.evaluation.training.training_task import FIGURE, Trained, curves_beside
 
     task = _task_of(spec)
     task.check()
@@ -132,13 +132,14 @@ def run_training(spec: TrainingSpec, out: Path, folder: args.RunFolder, beside: 
     _require_free(out, settings, folder)
     console = make_console()
     with args.workers_of(spec) as workers:
-        training = dataclasses.replace(task.training(console), command=tuple(command_line()))
+        training = dataclasses.replace(task.training(console.status), command=tuple(command_line()))
         _claim(out, settings, folder.overwrite)
         spec.write(out / SPEC_FILE)
         numbers = range(spec.seed, spec.seed + spec.trainings)
         curves = _train_all(console, task, training, numbers, out, workers, spec.tensorboard)
         models = {n: out / f"seed_{n}" / MODEL for n in numbers}
-        outcome = task.report(console, workers, curves, models, out, others)
+        outcome, table = task.report(console.status, workers, Trained(curves, models, others), out / FIGURE)
+    console.print(make_table(*table))
     save_summary(out, spec.seed, outcome.pop("rows"), settings=settings, **outcome)
     console.print(f"Models, curves, summary and figure are in {out}")
     if folder.report:
@@ -164,8 +165,8 @@ def _claim(out: Path, settings: Row, overwrite: bool) -> None:
     """Write the settings of the new training, and remove the results of the previous one."""
     import shutil
 
-    from parkenv.cli.training_task import FIGURE
     from parkenv.evaluation.experiments.results import SUMMARY, write_settings
+    from parkenv.evaluation.training.training_task import FIGURE
 
     # Delete the summary: a folder without one holds an unfinished training.
     for outcome in (SUMMARY, PAGE, FIGURE):

@@ -1,23 +1,21 @@
-"""The tasks of `parkenv train`: defaults, checks, settings and reports."""
+"""What the kinds of training differ in: defaults, checks, settings and reports."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, ClassVar, NamedTuple
 
-from parkenv.cli.tables import make_table
 from parkenv.errors import InputError
-
-if TYPE_CHECKING:
-    from rich.console import Console
-
-    from parkenv.evaluation.experiments.spec import TrainingSpec
-    from parkenv.evaluation.experiments.workers import Workers
-    from parkenv.evaluation.training.rl_training import Training
-    from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.evaluation.experiments.experiment import fingerprints, flat_tables
+from parkenv.evaluation.experiments.results import read_settings
+from parkenv.evaluation.experiments.spec import TrainingSpec
+from parkenv.evaluation.experiments.workers import Workers
+from parkenv.evaluation.figures.learning_curves import COLORS
+from parkenv.evaluation.training.rl_training import CURVE, Training, read_curve
+from parkenv.scenarios.spec import scenario_spec
 
 EVALUATION_SEED, TEST_SEED = 2_000_000, 3_000_000
 """First world seeds of the evaluations during training, and of the final test."""
@@ -25,9 +23,26 @@ EVALUATION_SEED, TEST_SEED = 2_000_000, 3_000_000
 FIGURE = "learning_curve.png"
 
 Row = dict[str, Any]
+Status = Callable[[str], AbstractContextManager[Any]]
+"""Shows what is going on during a block."""
+Table = tuple[str, list[str], list[list[str]]]
+"""Title, headings and rows."""
 
 
-@dataclass(eq=False)
+class Trained(NamedTuple):
+    """Trainings that have ended.
+
+    Attributes:
+        curves: rows of `curve.csv`, by training.
+        models: model files by seed.
+        beside: curves of other trainings, by name.
+    """
+
+    curves: list[list[Row]]
+    models: dict[int, Path]
+    beside: dict[str, list[list[Row]]]
+
+
 class TrainingTask(ABC):
     """A kind of training: its defaults, checks and report.
 
@@ -35,26 +50,32 @@ class TrainingTask(ABC):
         spec: specification of the training; the task supplies missing values.
     """
 
-    spec: TrainingSpec
+    default_scenarios: ClassVar[tuple[str, ...]]
+    default_episodes: ClassVar[int]
+    """Default number of episodes of an evaluation."""
+    default_algorithm: ClassVar[str]
+    prefix: ClassVar[str] = ""
+    """Of the default name of the output folder."""
+
+    def __init__(self, spec: TrainingSpec) -> None:
+        self.spec = spec
+        self.algorithm = spec.algorithm or self.default_algorithm
+        self.scenarios = spec.scenarios or tuple(map(scenario_spec, self.default_scenarios))
+        self.evaluation_episodes = spec.evaluation_episodes or self.default_episodes
+        self.evaluation_seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.evaluation_episodes)
+        self.test_seeds = range(TEST_SEED, TEST_SEED + 2 * self.evaluation_episodes)
 
     @property
-    @abstractmethod
-    def algorithm(self) -> str:
-        """Name of the algorithm."""
-
-    @property
-    @abstractmethod
     def folder(self) -> str:
         """Default name of the output folder."""
+        return self.prefix + self.algorithm
+
+    @property
+    @abstractmethod
+    def measures(self) -> tuple[str, ...]:
+        """Columns of `curve.csv` to draw."""
 
     @abstractmethod
-    def config(self) -> Any:
-        """Training config of the algorithm.
-
-        Raises:
-            InputError: the algorithm has none for this task.
-        """
-
     def check(self) -> None:
         """Check, before training, that everything can be trained, tested and drawn.
 
@@ -63,24 +84,24 @@ class TrainingTask(ABC):
         """
         from planners.model_file import algorithm_class
 
-        self.config()
         algorithm_class(self.algorithm)
 
     @abstractmethod
     def settings(self) -> Row:
         """Return the settings that a resumed training must share with this one."""
+        return {
+            "algorithm": self.algorithm,
+            "evaluation_episodes": self.evaluation_episodes,
+            "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in self.scenarios},
+            "files": fingerprints([file for s in self.scenarios for file in s.files()]),
+        }
 
     @abstractmethod
     def evaluation_settings(self, settings: Row) -> Row:
         """Return the settings that evaluations depend on: curves are comparable if these are equal."""
 
-    @property
     @abstractmethod
-    def measures(self) -> tuple[str, ...]:
-        """Columns of `curve.csv` to draw."""
-
-    @abstractmethod
-    def training(self, console: Console) -> Training:
+    def training(self, status: Status) -> Training:
         """Make the training, with demonstrations if needed."""
 
     @abstractmethod
@@ -88,37 +109,14 @@ class TrainingTask(ABC):
         """Return the score of an evaluation as text for the progress bar."""
 
     @abstractmethod
-    def report(
-        self,
-        console: Console,
-        workers: Workers,
-        curves: list[list[Row]],
-        models: dict[int, Path],
-        out: Path,
-        beside: dict[str, list[list[Row]]],
-    ) -> Row:
-        """Test the models, draw the figure and print the table; return the entries of the summary."""
-
-
-def scenario_settings(scenarios: Sequence[ScenarioSpec]) -> Row:
-    """Return the settings that training depends on: scenarios and fingerprints of their files."""
-    from parkenv.evaluation.experiments.experiment import fingerprints, flat_tables
-
-    return {
-        "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in scenarios},
-        "files": fingerprints([file for s in scenarios for file in s.files()]),
-    }
+    def report(self, status: Status, workers: Workers, trained: Trained, figure: Path) -> tuple[Row, Table]:
+        """Test the models and draw the figure; return the entries of the summary, and a table to print."""
 
 
 def name_of(settings: Row) -> str:
     """Return the name of a training in a figure with others."""
-    name, cloned, scenarios = (
-        str(settings["algorithm"]),
-        settings.get("clone"),
-        settings.get("scenario", ()),
-    )
-    if len(scenarios) > 1:
-        name += f" on {', '.join(scenarios)}"
+    scenarios, cloned = settings.get("scenario", ()), settings.get("clone")
+    name = f"{settings['algorithm']}{' on ' + ', '.join(scenarios) if len(scenarios) > 1 else ''}"
     return f"{name} after cloning {cloned}" if cloned else name
 
 
@@ -134,10 +132,6 @@ def curves_beside(folders: Sequence[str], out: Path, task: TrainingTask) -> dict
         InputError: a folder has no training, or one with other evaluations; a folder is given twice; or there are too
             many to tell apart.
     """
-    from parkenv.evaluation.experiments.results import read_settings
-    from parkenv.evaluation.figures.learning_curves import COLORS
-    from parkenv.evaluation.training.rl_training import CURVE, read_curve
-
     if len(folders) >= len(COLORS):
         raise InputError(f"--beside names {len(folders)} folders, want at most {len(COLORS) - 1}")
     own, known = task.settings(), {out.resolve()}
@@ -176,25 +170,23 @@ def row_of(agent: str, scenario: str, number: int, curve: list[Row], own: Row, m
     }  # fmt: skip
 
 
-def print_tests(
-    console: Console,
+def table_of_tests(
     title: str,
     algorithm: str,
     transfer: list[Row],
     planners: list[Row],
     text_of: Callable[[Row], str],
     *further: str,
-) -> None:
-    """Print a table with a column per scenario and further key, and a row per model and planner."""
+) -> Table:
+    """Return a table with a column per scenario and further key, and a row per model and planner."""
     columns = list(
         dict.fromkeys((row["test_scenario"], *(row[name] for name in further)) for row in transfer)
     )
-    table = make_table(title, ["", *(" ".join(column) for column in columns)])
-    agents = {f"{algorithm}, seed {n}": n for n in dict.fromkeys(row["seed"] for row in transfer)}
-    for agent, number in agents.items():
-        its = {(r["test_scenario"], *(r[f] for f in further)): r for r in transfer if r["seed"] == number}
-        table.add_row(agent, *(text_of(its[column]) for column in columns))
-    for agent in dict.fromkeys(row["agent"] for row in planners):
-        its = {(r["scenario"], *(r[f] for f in further)): r for r in planners if r["agent"] == agent}
-        table.add_row(agent, *(text_of(its[column]) for column in columns))
-    console.print(table)
+    found: dict[str, dict[tuple[Any, ...], Row]] = {}
+    for row in transfer:
+        key = (row["test_scenario"], *(row[name] for name in further))
+        found.setdefault(f"{algorithm}, seed {row['seed']}", {})[key] = row
+    for row in planners:
+        found.setdefault(row["agent"], {})[(row["scenario"], *(row[name] for name in further))] = row
+    rows = [[agent, *(text_of(its[column]) for column in columns)] for agent, its in found.items()]
+    return title, ["", *(" ".join(column) for column in columns)], rows
