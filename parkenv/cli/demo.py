@@ -77,6 +77,9 @@ def demo(
 
     Sensors:
         every (M >= 0.1): Metres between captures.  [default: 2.5]
+
+    Results:
+        report: The demo writes its report in any case.
     """
     from parkenv.evaluation.experiments.demo import QUICK
     from parkenv.evaluation.experiments.spec import DemoSpec
@@ -128,7 +131,7 @@ def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | No
             for _ in where.results(tasks):
                 progress.advance(bar)
 
-        run_all("compiling, once after an installation", warm_up_tasks(settings, AGENTS), workers)
+        run_all("compiling, once per installation", warm_up_tasks(settings, AGENTS), workers)
         bar = progress.add_task("1/4 survey drives", total=spec.sessions)
         run = run_survey(
             its, settings, spec.sessions, map_file, workers=workers, record=record_drive,

@@ -63,7 +63,7 @@ def progress_bar(console: Console, unit: str = "") -> Progress:
 
     return Stages(
         TextColumn("{task.description}", markup=False),
-        BarColumn(),
+        BarColumn(20),
         MofNCompleteColumn(),
         TextColumn(unit),
         TimeElapsedColumn(),

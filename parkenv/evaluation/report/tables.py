@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from parkenv.evaluation.experiments.results import Row
+from parkenv.evaluation.figures.picture_files import OPTIONAL_TIMES
 
 Cell = float | int | str | bool | None | list[float | None]
 
@@ -148,7 +149,9 @@ def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False)
         same = [k for k in keys if len({repr(v) for v in values[k]}) == 1]
         # Compared values stay in the table even if they are equal.
         same = [
-            k for k in same if values[k][0] is None or k in _ORDER[:6] or k in ("episodes", "rig", "slots")
+            k
+            for k in same
+            if values[k][0] is None or k in _ORDER[:6] or k in ("episodes", "rig", "slots", *OPTIONAL_TIMES)
         ]
     shown = [k for k in keys if k not in same]
     return {
