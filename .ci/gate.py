@@ -74,7 +74,7 @@ STAGES = (
     ),
     Stage(
         "README: demo",
-        '.venv/bin/parkenv demo --report --out "$SCRATCH/demo"',
+        '.venv/bin/parkenv demo --out "$SCRATCH/demo"',
         needs=("README: tests",),
         cores=CORES,
     ),

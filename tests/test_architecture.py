@@ -67,7 +67,7 @@ READS = {
     "np.loadtxt": (),
     "np.genfromtxt": (),
     "cv2.imread": (),
-    "cv2.imdecode": ("parkenv/files/images.py",),
+    "cv2.imdecode": (),
     "PillowImage.open": ("parkenv/files/images.py",),
     "Image.open": (),
     "tarfile.open": ("parkenv/files/archives.py",),

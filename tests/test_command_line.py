@@ -119,6 +119,7 @@ def test_names_are_those_of_the_modules_behind_them():
             "unknown scenario 'campsu', and no such file; did you mean 'campus'?",
         ),
         (("plan", "--scenario", "mini,jam"), "--scenario names 2 scenarios, want one"),
+        (("plan", "--scenario", "mini", "--agents", "mdp,oracle"), "--agents names 2 agents, want one"),
         (("run", "nowhere.toml"), "nowhere.toml: No such file or directory"),
         (("train", "--env", "sarch"), "--env: 'sarch' is not one of 'search', 'drive'"),
         (("map",), "Missing argument 'FILE'; see parkenv map --help"),
@@ -189,3 +190,30 @@ def test_option_groups_are_described():
     for its in groups:
         described = {n for base in its.__mro__ for n in read_docstring(base.__doc__)[2]} | set(SHARED)
         assert {f.name for f in fields(its)} <= described
+
+
+@pytest.mark.parametrize(
+    ("words", "levels", "blind"),
+    [
+        (["--failure-cost", "sweep"], (), True),
+        (["--failure-cost", "sweep", "--occupancy-levels", "0.9"], (0.9,), True),
+        (["--occupancy-levels", "none"], (), False),
+        ([], compare.LEVELS, False),
+    ],
+)
+def test_a_sweep_keeps_the_levels_that_are_given(monkeypatch, tmp_path, words, levels, blind):
+    ran = []
+    monkeypatch.setattr(compare, "run_comparison", lambda spec, *_: ran.append(spec))
+    done = parkenv("compare", "--scenario", "mini", *words, "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert ran[0].grid.occupancy_levels == levels
+    assert ran[0].grid.blind == blind
+
+
+def test_the_rig_of_a_scenario_file_is_that_of_its_environments(tmp_path):
+    from parkenv.envs.sensors import SearchSensorsEnv
+
+    file = tmp_path / "own.toml"
+    file.write_text('lot = "mini"\nrig = "stereo"\n')
+    assert SearchSensorsEnv(str(file)).rig.stereo_cameras
+    assert SearchSensorsEnv(str(file), rig="laser").rig.lasers

@@ -305,6 +305,16 @@ def test_spaces_that_not_everyone_may_use_are_left_out(tmp_path, tags, reason):
         assert number in reasons(draft)[reason]
 
 
+def test_spaces_alone_lack_an_aisle(tmp_path):
+    place = Map()
+    for i in range(3):
+        place.box(2.5 * i, 0, 2.5 * i + 2.5, 5, {"amenity": "parking_space"})
+    (tmp_path / "turbo.geojson").write_text(place.geojson())
+    draft = import_lot(tmp_path / "turbo.geojson")
+    with pytest.raises(InputError, match="no "):
+        draft.lot()
+
+
 def test_spaces_in_private_parking_are_private(tmp_path):
     place = car_park()
     place.ways[27] = (place.ways[27][0], {"amenity": "parking", "access": "private"})

@@ -91,6 +91,10 @@ def _global_options(
     del version
 
 
+MAX_MESSAGE = 1_500
+"""Maximum length of an error message, characters."""
+
+
 def main() -> None:
     """Entry point; exit codes: 2 for invalid input, 70 for an error of parkenv's own, 128 + n after signal n."""
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -132,6 +136,8 @@ def _report(error: BaseException) -> int:
 
 def _complain(message: str) -> int:
     line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in " ".join(message.split()))
+    # A value from a file may be pages long.
+    line = line if len(line) <= MAX_MESSAGE else f"{line[: MAX_MESSAGE - 200]} ... {line[-200:]}"
     typer.echo(f"parkenv: error: {line}", err=True)
     return 2
 

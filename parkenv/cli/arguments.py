@@ -313,6 +313,20 @@ def one_scenario(specs: list[ScenarioSpec]) -> ScenarioSpec:
     return specs[0]
 
 
+def one_agent(agents: str) -> str:
+    """Return the only agent.
+
+    Raises:
+        InputError: there are several agents, or none.
+    """
+    from parkenv.evaluation.experiments.agent_spec import split_agents
+
+    names = split_agents(agents)
+    if len(names) != 1:
+        raise InputError(f"--agents names {len(names)} agents, want one")
+    return names[0]
+
+
 def saved(folder: Path, kind: type[SpecT]) -> SpecT:
     """Read the specification in the folder of a run.
 

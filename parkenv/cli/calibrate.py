@@ -67,6 +67,7 @@ def calibrate(
     its = build(spec)
     speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
     style = DrivingStyle(speed=speed, notice_m=notice)
+    agents = args.one_agent(agents)
     DrivenSearch(its, agents, style=style, rig=rig)  # raises an error before anything is driven
     with writing_into(out, "the same command with --resume"):
         settings = {
@@ -159,7 +160,7 @@ def trip(
     its = build(traffic.on(world.spec(scenario)))
     speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
     style = DrivingStyle(speed=speed, notice_m=notice)
-    search = DrivenSearch(blind_scenario(its) if blind else its, agents, style=style, rig=rig)
+    search = DrivenSearch(blind_scenario(its) if blind else its, args.one_agent(agents), style=style, rig=rig)
     make_folder(out.parent)
     console = make_console()
     with console.status("Driving and drawing"):

@@ -46,7 +46,7 @@ def plan(
 
     grid = costs.grid(Grid())
     base = build(world.spec(scenario))
-    named = AgentSpec.of(agents)
+    named = AgentSpec.of(args.one_agent(agents))
     if not isinstance(make_agent(named.name, base, **named.options), StaticAgent):
         raise InputError(f"--agents {agents!r} makes no plan; known: mdp, mdp-static")
     make_folder(out)

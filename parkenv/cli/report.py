@@ -13,21 +13,12 @@ from parkenv.cli.trust import require_trust
 from parkenv.errors import InputError, nearest
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.experiments.compare import Case
-    from parkenv.evaluation.experiments.spec import TrainingSpec, Workplace
-    from parkenv.evaluation.report.run_folder import RunFolder
-    from parkenv.files.spec_file import Spec
-    from parkenv.mapping.survey import Survey
-
-    Cases = list[tuple[Case, Sequence[int]]]
-    Surveys = tuple[Callable[[], Survey], int]
+    from parkenv.evaluation.experiments.spec import Workplace
+    from parkenv.evaluation.report.repetition import Cases
 
 PAGE = "report.html"
-MAP_FILE = "map.sqlite"
 EPISODES, SENSED = 20, 4
 """Default number of replayed searches: in general, and with rendered sensors at every step."""
-BESIDE_MODELS = 3
-"""Number of planners shown beside a trained model."""
 
 
 def report(
@@ -100,13 +91,13 @@ def make_report(
             are not trusted.
     """
     from parkenv.evaluation.report.page import page_data, write_page
+    from parkenv.evaluation.report.repetition import Repetition, differences, drawable
     from parkenv.evaluation.report.run_folder import RunFolder
     from parkenv.evaluation.report.search_recording import choose, record
 
     run = RunFolder.read(folder)
     console = make_console()
-    surveys: Surveys | None = None
-    cases: Cases = []
+    repeated = Repetition([])
     notes: list[str] = []
     spec = None
     try:
@@ -117,23 +108,22 @@ def make_report(
         # The page is made on the machines of this command, not of the run.
         require_trust(spec.changed(address=None), folder, trust)
     try:
-        surveys, cases = _run_again(run, spec)
+        repeated = Repetition.of_run(run, spec)
     except (InputError, OSError) as error:
         # The page still has tables and figures.
         notes.append(f"There is no replay: {error}")
-    sensed = any(case.rig is not None for case, _ in cases)
+    sensed = any(case.rig is not None for case, _ in repeated.cases)
     wanted = episodes if episodes is not None else SENSED if sensed else EPISODES
-    cases, too_large = _small_enough(_chosen(cases, replay, agents))
+    cases, too_large = drawable(_chosen(repeated.cases, replay, agents))
     notes += too_large
     encounters = choose(cases, wanted) if wanted else []
-    again = range(min(sessions, surveys[1])) if surveys is not None and drives is None else range(0)
+    again = range(min(sessions, repeated.sessions) if drives is None else 0)
     counted = run.totals()
     tasks: list[Callable[[], dict[str, Any]]] = []
     for encounter in encounters:
         keys = [case.key(encounter.seed) for case in encounter.cases]
         tasks.append(partial(record, encounter, {k: counted[k] for k in keys if k in counted}))
-    if surveys is not None:
-        tasks += [partial(_drive_again, surveys[0], number, frames // max(len(again), 1)) for number in again]
+    tasks += [partial(repeated.drive, number, frames // max(len(again), 1)) for number in again]
     with args.workers_of(machines) as workers, progress_bar(console) as progress:
         bar = progress.add_task(stage, total=len(tasks))
         done: list[dict[str, Any]] = []
@@ -141,7 +131,7 @@ def make_report(
             done.append(recorded)
             progress.advance(bar)
     watched = done[: len(encounters)]
-    notes += _differing(watched)
+    notes += differences(watched)
     path = out or folder / PAGE
     recorded = done[len(encounters) :] if drives is None else drives
     write_page(page_data(run, watched, recorded, notes), path, run.figures)
@@ -149,66 +139,6 @@ def make_report(
         console.print(f"Note: {note}")
     console.print(f"Written: {path}, {path.stat().st_size / 1e6:.1f} MB")
     return path
-
-
-def _run_again(run: RunFolder, spec: Spec | None) -> tuple[Surveys | None, Cases]:
-    """Return the survey of a run, with its number of drives, and its searches, from its specification.
-
-    Raises:
-        InputError, OSError: the run cannot be repeated.
-    """
-    from parkenv.evaluation.experiments import spec as specs
-    from parkenv.evaluation.experiments.experiment import Experiment, require_unchanged
-    from parkenv.evaluation.experiments.results import read_settings
-
-    match spec:
-        case specs.ExperimentSpec():
-            require_unchanged(spec, read_settings(run.path) or {})
-            return None, [*Experiment(spec).cases]
-        case specs.BenchmarkSpec():
-            from parkenv.evaluation.experiments.benchmark import Suite
-
-            return None, [*Suite.named(spec.suite).cases(spec.agents)]
-        case specs.SurveySpec():
-            from parkenv.evaluation.experiments.surveys import survey_of
-
-            return (partial(_survey, *survey_of(spec)), len(run.table("sessions.csv"))), []
-        case specs.DemoSpec():
-            from parkenv.evaluation.experiments.demo import demo_cases, demo_survey
-            from parkenv.mapping.store import MapStore
-
-            its, settings = demo_survey(spec)
-            with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:
-                log = store.log()
-            return (partial(_survey, its, settings), len(log.time)), [*demo_cases(spec, its, log)]
-        case specs.TrainingSpec():
-            return None, _trained(run, spec)
-    return None, []
-
-
-def _trained(run: RunFolder, spec: TrainingSpec) -> Cases:
-    """Return the best model and the best planners in the test scenarios; none for driving, or without a test."""
-    if spec.env != "search" or not run.summary.get("transfer"):
-        return []
-    from parkenv.evaluation.experiments.compare import Case
-    from parkenv.evaluation.training.rl_training import MODEL
-    from parkenv.evaluation.training.search_task import SearchTask
-    from parkenv.evaluation.training.training_task import TEST_SEED
-
-    best = min(run.summary["rows"], key=lambda row: float(row["total_s"]))
-    model = run.path / f"seed_{int(best['seed'])}" / MODEL
-    task = SearchTask(spec)
-    seeds = range(TEST_SEED, TEST_SEED + int(run.summary["transfer"][0]["episodes"]))
-    cases: Cases = []
-    for scenario in task.tested:
-        planners = [row for row in run.summary.get("planners", []) if row["scenario"] == scenario.name]
-        beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
-        cases.append((Case(scenario, f"{task.algorithm}:{model}"), seeds))
-        made = {
-            case.label: case for case in (Case(scenario, a.name, options=a.options) for a in task.compared)
-        }
-        cases += [(made[row["agent"]], seeds) for row in beside if row["agent"] in made]
-    return cases
 
 
 def _chosen(cases: Cases, replay: str | None, agents: str | None) -> Cases:
@@ -231,42 +161,3 @@ def _chosen(cases: Cases, replay: str | None, agents: str | None) -> Cases:
             wanted.append(int(number))
         cases = [(case, wanted) for case, _ in cases]
     return cases
-
-
-def _small_enough(cases: Cases) -> tuple[Cases, list[str]]:
-    """Return the searches on lots that are small enough to draw, and notes on the others."""
-    from parkenv.evaluation.report.search_recording import MOST_SLOTS
-
-    large = {
-        case.scenario.name: case.scenario.lot.n_slots
-        for case, _ in cases
-        if case.scenario.lot.n_slots > MOST_SLOTS
-    }
-    notes = [
-        f"{name} has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"
-        for name, n in large.items()
-    ]
-    return [(case, its) for case, its in cases if case.scenario.name not in large], notes
-
-
-def _differing(watched: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a note for every search whose total time differs from that in the results."""
-    return [
-        f"{search['agent']}, {e['world']['scenario']}, seed {e['world']['seed']}: run again it took "
-        f"{search['total_s']:.2f} s, episodes.csv says {search['counted_s']:.2f} s"
-        for e in watched
-        for search in e["searches"]
-        if search["agrees"] is False
-    ]
-
-
-def _survey(scenario: Any, settings: Any) -> Survey:
-    from parkenv.mapping.survey import Survey
-
-    return Survey(scenario, settings)
-
-
-def _drive_again(survey: Callable[[], Survey], number: int, frames: int) -> dict[str, Any]:
-    from parkenv.evaluation.report.drive_recording import record_drive
-
-    return record_drive(survey(), number, most_frames=frames)[1]

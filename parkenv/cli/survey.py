@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from parkenv.cli import arguments as args
-from parkenv.cli.report import MAP_FILE, make_report
+from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError, nearest
@@ -83,6 +83,7 @@ def run_survey_of(spec: SurveySpec, out: Path, folder: args.RunFolder, rerun: Pa
     """
     from parkenv.evaluation.experiments.spec import SPEC_FILE
     from parkenv.evaluation.experiments.surveys import (
+        MAP_FILE,
         mean_occupancy,
         run_survey,
         slots_found,

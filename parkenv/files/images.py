@@ -8,7 +8,6 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
@@ -40,29 +39,31 @@ def decode_image(data: bytes, name: str) -> Image:
             with `name`.
     """
     try:
-        # OpenCV takes the memory that the header claims, and cannot read the header alone.
         with (
             warnings.catch_warnings(action="ignore"),
-            PillowImage.open(io.BytesIO(data), formats=_FORMATS) as header,
+            PillowImage.open(io.BytesIO(data), formats=_FORMATS) as image,
         ):
-            width, height = header.size
-        if width * height > MAX_PIXELS:
-            raise PillowImage.DecompressionBombError(f"{width}×{height} px")
-        image = (
-            None if _is_truncated(data) else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        )
+            width, height = image.size
+            if width * height > MAX_PIXELS:
+                raise PillowImage.DecompressionBombError(f"{width}×{height} px")
+            if image.mode.startswith(("I", "F")):
+                raise InputError(f"{name}: has more than 8 bits a channel")
+            # Palettes, transparency and other colour spaces become RGB.
+            return np.array(image.convert("L" if image.mode in ("1", "L") else "RGB"))
+    except InputError:
+        raise
     except PillowImage.DecompressionBombError as error:
         raise InputError(f"{name}: is too large ({error}), want at most {MAX_PIXELS:,} pixels") from error
-    except (OSError, SyntaxError, ValueError, LookupError, ArithmeticError, struct.error, cv2.error):
-        image = None
-    if image is None:
-        raise InputError(f"{name}: is no image that can be read whole; want {', '.join(SUFFIXES)}")
-    if image.dtype != np.uint8:
-        raise InputError(f"{name}: has {8 * image.dtype.itemsize} bits a channel, want 8")
-    if image.ndim == 2:
-        return np.asarray(image, dtype=np.uint8)
-    code = {1: None, 3: cv2.COLOR_BGR2RGB, 4: cv2.COLOR_BGRA2RGB}.get(image.shape[2])
-    return np.asarray(image[..., 0] if code is None else cv2.cvtColor(image, code), dtype=np.uint8)
+    # Pillow raises these for damaged files.
+    except (OSError, SyntaxError, ValueError, LookupError, ArithmeticError, TypeError, struct.error) as error:
+        raise InputError(f"{name}: is no image that can be read whole; want {', '.join(SUFFIXES)}") from error
+
+
+def image_text(path: Path, key: str) -> str | None:
+    """Return a text that a PNG file carries beside its image (of one that `read_image` has read), or None."""
+    with PillowImage.open(io.BytesIO(read_bytes(path)), formats=_FORMATS) as opened:
+        text = opened.info.get(key)
+    return text if isinstance(text, str) else None
 
 
 def images_in(folder: Path) -> list[Path]:
@@ -95,19 +96,3 @@ def _parts(text: str) -> Iterator[tuple[str, int]]:
                 word, digits = "", ""
             word += letter
     yield word, int(digits or -1)
-
-
-def _is_truncated(data: bytes) -> bool:
-    """Return whether a PNG, JPEG or PGM file is truncated; OpenCV fills the missing part without an error."""
-    if data.startswith(b"\x89PNG"):
-        return b"IEND" not in data[-16:]
-    if data.startswith(b"\xff\xd8"):
-        return b"\xff\xd9" not in data[-64:]
-    if data.startswith((b"P5", b"P6")):
-        fields = data[:512].split()
-        try:
-            width, height, most = (int(f) for f in fields[1:4])
-        except (ValueError, IndexError):
-            return False
-        return len(data) < width * height * (3 if data.startswith(b"P6") else 1) * (2 if most > 255 else 1)
-    return False

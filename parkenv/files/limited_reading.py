@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import json
 import re
 import tomllib
 import zlib
@@ -26,6 +27,7 @@ MAX_SPEC_BYTES = 1_000_000
 """Maximum size of TOML and YAML, which hold no data and are read slowly."""
 MAX_DEPTH = 100
 """Maximum nesting of tables and lists in TOML and YAML; JSON may have 200 levels, the limit of its parser."""
+_HUGE = re.compile(rb"[eE]\+?\d{3}")
 _LONG_NUMBER = re.compile(rb"[0-9]{301,}")
 # tomllib takes cubic time for a key of many parts.
 _DEEP_KEY = re.compile(r"(?:\.[ \t]*[\w\"'-]+[ \t]*){100}")
@@ -95,17 +97,22 @@ def read_text(path: str | Path, most: int = MAX_BYTES) -> str:
         return file.read().decode("utf-8-sig")
 
 
-def read_json(path: str | Path, most: int = MAX_BYTES) -> Any:
+def read_json(path: str | Path, most: int = MAX_BYTES, *, finite: bool = False) -> Any:
     """Return the content of a JSON file; see `parse_json`.
 
     Raises:
         InputError: the file cannot be read, is too large or is not JSON within the limits; the message names it.
     """
-    return parse_json(read_text(path, most), str(path))
+    return parse_json(read_text(path, most), str(path), finite=finite)
 
 
-def parse_json(text: str | bytes, name: str) -> Any:
+def parse_json(text: str | bytes, name: str, *, finite: bool = False) -> Any:
     """Return the value of a JSON text: at most 200 levels deep, numbers that fit a float, no lone surrogates.
+
+    Args:
+        text: the text, in UTF-8.
+        name: of the text, for messages.
+        finite: whether to refuse NaN, infinities, and numbers that become one.
 
     Raises:
         InputError: the text is anything else; the message starts with `name`.
@@ -113,7 +120,11 @@ def parse_json(text: str | bytes, name: str) -> Any:
     data = text.encode() if isinstance(text, str) else text
     _require_short_numbers(data, name)
     try:
-        return from_json(data)
+        value = from_json(data, allow_inf_nan=not finite)
+        if finite and _HUGE.search(data):
+            # An infinity that is left would not be JSON when it is written again.
+            json.dumps(value, allow_nan=False)
+        return value
     except ValueError as error:
         what = str(error).replace("recursion limit exceeded", "nested deeper than 200 levels")
         raise InputError(f"{name}: not JSON: {what}") from error

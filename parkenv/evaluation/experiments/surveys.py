@@ -32,6 +32,8 @@ from parkenv.world.recorded_occupancy import RecordedOccupancy
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S
 
+MAP_FILE = "map.sqlite"
+"""Map of the sessions in the folder of a survey or a demo."""
 FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
 Recorder = Callable[[Survey, int, int], tuple[SessionResult, Any]]

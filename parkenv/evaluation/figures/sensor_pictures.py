@@ -76,8 +76,8 @@ def save_sensor_preview(
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10.6, 8.4))
         figure.suptitle(title, x=0.02, ha="left", weight="bold")
-        places = ((0.02, 0.5), (0.02, 0.02), (0.5, 0.02), (0.5, 0.5))
-        axes = [figure.add_axes((x, y, 0.46, 0.43)) for x, y in places]
+        places = ((0.02, 0.5), (0.02, 0.02), (0.52, 0.02), (0.52, 0.5))
+        axes = [figure.add_axes((x, y, 0.44, 0.43)) for x, y in places]
         axes[0].imshow(with_boxes(frame.image, boxes))
         axes[0].set_title("camera; true boxes: view, distance, visible fraction")
         shown = axes[1].imshow(frame.depth, cmap="viridis_r", norm=LogNorm(NEAREST, FARTHEST))

@@ -22,7 +22,7 @@ from parkenv.evaluation.report.learning import learning_of
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.report.tables import tables_of
 from parkenv.files.atomic_write import atomic_write
-from parkenv.files.images import read_image
+from parkenv.files.images import image_text, read_image
 
 FORMAT, VERSION = "parkenv-report", 1
 SCHEMA = Path(__file__).with_name("report.schema.json")
@@ -118,8 +118,7 @@ def _rank(path: Path) -> int:
 
 def _figure(path: Path) -> str:
     picture = PillowImage.fromarray(read_image(path)).convert("RGB")
-    with PillowImage.open(path) as opened:
-        caption = html.escape(opened.info.get(CAPTION) or path.stem.replace("_", " "))
+    caption = html.escape(image_text(path, CAPTION) or path.stem.replace("_", " "))
     if picture.width > MOST_WIDTH:
         picture = picture.resize((MOST_WIDTH, round(picture.height * MOST_WIDTH / picture.width)))
     source, (width, height) = _webp(picture), picture.size

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
+import jsonschema
+
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.results import SETTING_COLUMNS, SETTINGS, SUMMARY, SUMMARY_PARTIAL, Row
@@ -50,24 +52,26 @@ class RunFolder:
                     f"{path}: holds a run that was interrupted; finish it (--resume), then report it"
                 )
             raise InputError(f"{path}: holds no {SUMMARY}; want a folder that a command with --out wrote")
-        summary = read_json(file)
-        missing = [
-            name
-            for name, kind in (("command", list), ("version", str), ("rows", list))
-            if not isinstance(summary, dict) or not isinstance(summary.get(name), kind)
-        ]
-        if missing or len(summary["command"]) < 2:
-            raise InputError(
-                f"{file}: want the summary of a command, with {', '.join(missing or ['command'])}"
+        summary = read_json(file, finite=True)
+        if not isinstance(summary, dict):
+            raise InputError(f"{file}: want the summary of a command")
+        spec, command = path / SPEC_FILE, summary.get("command")
+        kind = read_tables(spec).get("kind") if spec.exists() else None
+        kind = str(kind or (command[1] if isinstance(command, list) and len(command) > 1 else ""))
+        try:
+            jsonschema.validate(
+                {**summary, "kind": kind}, read_json(Path(__file__).with_name("summary.schema.json"))
             )
+        except jsonschema.ValidationError as error:
+            raise InputError(
+                f"{file}: is not as a command wrote it: {error.json_path:.80} {error.message:.200}"
+            ) from error
         if summary["version"] != __version__:
             raise InputError(
                 f"{file}: was written by parkenv {summary['version']}, this is {__version__}, whose searches may "
                 "differ; run the command again, or report it with that version"
             )
-        spec = path / SPEC_FILE
-        kind = read_tables(spec).get("kind") if spec.exists() else None
-        return cls(path, summary, tuple(sorted(path.glob("*.png"))), str(kind or summary["command"][1]))
+        return cls(path, summary, tuple(sorted(path.glob("*.png"))), kind)
 
     def spec(self) -> Spec | None:
         """Read the specification that the run kept; None for a command that keeps none.

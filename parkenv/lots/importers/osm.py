@@ -126,8 +126,13 @@ class _OsmImporter:
                 for e in elements
                 if wanted(e) and e.lines and e.is_closed and not e.is_node
             ]
+            for flat in (a.element for a in found if not shapely.area(a.polygon)):
+                self._leave_out("outlines without an area", flat.id)
             return [
-                a for a in found if box is None or shapely.contains(box, shapely.point_on_surface(a.polygon))
+                a
+                for a in found
+                if shapely.area(a.polygon)
+                and (box is None or shapely.contains(box, shapely.point_on_surface(a.polygon)))
             ]
 
         self.outlines = areas(lambda e: e.tags.get("amenity") == "parking")

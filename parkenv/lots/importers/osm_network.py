@@ -91,6 +91,8 @@ def open_ends(roads: Sequence[Road], edge: shapely.Geometry, blind: FloatArray) 
 
 def _road_nodes(roads: Sequence[Road]) -> list[NDArray[np.int64]]:
     """Return the node labels of the points of each road; roads meet where they share a label."""
+    if not roads:
+        return []
     label = node_labels(np.concatenate([road.points for road in roads]))
     return np.split(label, np.cumsum([len(road.points) for road in roads])[:-1])
 
@@ -153,7 +155,7 @@ def dead_ends(roads: Sequence[Road]) -> FloatArray:
 def road_ends(roads: Sequence[Road]) -> list[tuple[Road, FloatArray, bool]]:
     """Return unshared road ends: the road, the point, (2,) m, and whether it is the road's first point."""
     along = _road_nodes(roads)
-    users = np.bincount(np.concatenate(along))
+    users = np.bincount(np.concatenate([np.empty(0, np.int64), *along]))
     return [
         (road, road.points[i], i == 0)
         for road, on_road in zip(roads, along, strict=True)

@@ -1,0 +1,348 @@
+"""Damaged and hostile variants of each kind of file are read, or refused by one `InputError`."""
+
+import contextlib
+import json
+import tempfile
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from file_mutations import mutated_bytes, mutated_json, mutated_text
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from test_import_osm import car_park
+
+from parkenv.errors import InputError
+from parkenv.evaluation.experiments.benchmark import Suite, check_result
+from parkenv.evaluation.experiments.results import ResultFolder
+from parkenv.evaluation.experiments.spec import ExperimentSpec
+from parkenv.evaluation.report.page import page_data, write_page
+from parkenv.evaluation.report.run_folder import RunFolder
+from parkenv.evaluation.trips.calibration import Calibration, TripFolder
+from parkenv.files.images import read_image
+from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
+from parkenv.lots.importers.import_options import ImportOptions
+from parkenv.mapping.store import MapStore, Session
+from parkenv.perception.car_model import CarModel
+from parkenv.scenarios.build import build
+from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.world.occupancy import OccupancyProcess
+from parkenv.world.occupancy_log import OccupancyLog
+from parkenv.world.sensor_model import SensorModel
+
+MINI = packaged_lot("mini")
+ROOT = Path(__file__).parents[1] / "parkenv"
+
+
+@dataclass
+class Format:
+    """A kind of file: its name, good content, damaged variants of it, and all that reads it."""
+
+    name: str
+    good: Any
+    mutated: Callable[[Any], st.SearchStrategy[bytes]]
+    read: Callable[[Path], object]
+
+    def __str__(self):
+        return self.name
+
+
+def written(write, suffix=""):
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"file{suffix}"
+        write(path)
+        return path.read_bytes()
+
+
+def lot(path):
+    problems = check_lot(path)
+    assert all("\n" not in p.message for p in problems)
+    write_lot(read_lot(path), path.with_name("copy.geojson"))
+
+
+def imported(path):
+    import_lot(path, ImportOptions(goals=((1.0, 2.0),), entries=((0.0, 4.0),))).lot()
+
+
+def map_file(path):
+    with MapStore(path, MINI) as store:
+        cars = np.array([[1.0, 2.0, 0.5]])
+        store.add(Session("a", 0.0, "laser", "rain", np.full(MINI.n_slots, 0.7), cars))
+
+
+def mapped(path):
+    with MapStore(path, MINI, create=False) as store:
+        store.log()
+
+
+def scenario(path):
+    build(ScenarioSpec.read(path))
+
+
+def resumed(path):
+    ResultFolder(path.parent, {"seed": 0, "agents": {}}, resume=True)
+
+
+def resumed_trips(path):
+    TripFolder(path.parent, {"seed": 0}, resume=True)
+
+
+def reported(path):
+    run = RunFolder.read(path.parent)
+    run.totals()
+    write_page(page_data(run), path.with_name("report.html"), run.figures)
+
+
+def benchmark(path):
+    check_result(path)
+
+
+LOG = "datetime,camera,slot_id,weather,occupied\n" + "".join(
+    f"2015-11-{12 + h // 24} {h % 24:02d}:0{m},1,{s},SUNNY,{(h + s) % 2}\n"
+    for h in range(0, 40, 9)
+    for m in (0, 5)
+    for s in range(3)
+)
+MAP = """PARKING_AREAS:
+  A: {bounds: [[10, 73], [40, 73], [40, 68], [10, 68]], areas: [{shape: [1, 12], coords: null}]}
+  B: {bounds: [[10, 61], [40, 61], [40, 50], [10, 50]], areas: [{shape: [2, 12], coords: null}]}
+WAYPOINTS:
+""" + "".join(
+    f"  {name}: {{bounds: [[{x0}, {y0}], [{x1}, {y1}]]}}\n"
+    for name, x0, y0, x1, y1 in (
+        *((f"R{k}L", 3, y, 20, y) for k, y in enumerate((65, 47, 30, 13), start=1)),
+        *((f"R{k}R", 20, y, 45, y) for k, y in enumerate((65, 47, 30, 13), start=1)),
+        ("C1", 3, 65, 3, 13), ("C2", 20, 65, 20, 13), ("EXT", 12, 80, 12, 65),
+    )
+)  # fmt: skip
+SCENARIO = """name = "mine"
+lot = { grid = { rows = 2, columns = 3, pitch = 2.5 } }
+goal = [1.0, 2.0]
+forecast = { flat = 0.5 }
+sensor_model = { hit_rate = 0.9, false_alarm_rate = 0.1, view_range = 10.0 }
+[occupancy]
+typical = { pull = 1.0, demand = 0.5 }
+event = { share = 0.5, factor = 10.0 }
+[arrivals]
+hours = "08:00-13:00"
+days = ["mon", "tue"]
+[costs]
+failure_s = 10.0
+[traffic]
+cars = 2
+"""
+EXPERIMENT = {
+    "kind": "compare",
+    "agents": ["mdp", "mdp(failure_s=20)"],
+    "scenarios": ["mini", {"name": "x", "lot": "jam", "speeds": {"v_walk_kmh": 3.0}}],
+    "episodes": 3,
+    "seed": 1,
+    "grid": {"failure_s": [10.0, 20.0], "occupancy_levels": [0.5]},
+}
+MODEL = json.loads((ROOT / "world" / "sensor_models" / "laser.json").read_text())
+_HOURS = np.full(168, 1e-4)
+PROCESS = json.loads(written(OccupancyProcess(np.ones(3), _HOURS, np.ones(3), _HOURS).to_file))
+SUITE = Suite.named("v1")
+EPISODES = {"total_s": [100.0] * 3, "bound_s": [90.0] * 3}
+RESULT = {
+    "format": "parkenv-benchmark-result", "version": 1, "suite": "v1", "suite_sha256": SUITE.fingerprint,
+    "parkenv": "0.1.0", "command": ["parkenv", "benchmark"], "scores": {"mdp": 0.9},
+    "rows": [
+        {
+            "task": t.name, "agent": "mdp", "episodes": 3, "parked_fraction": 1.0, "total_s": 100.0,
+            "total_s_ci95": [90.0, 110.0], "regret_s": 10.0, "regret_s_ci95": [5.0, 15.0], "failed_parks": 0.0,
+            "decision_ms": 1.0, "decision_ms_p99": 2.0, "score": 0.9,
+        } for t in SUITE.tasks
+    ],
+    "episodes": {"mdp": {t.name: EPISODES for t in SUITE.tasks}},
+}  # fmt: skip
+SUMMARY_ROW = {
+    "scenario": "mini",
+    "occupancy_level": None,
+    "agent": "mdp",
+    "failure_cost_s": 10.0,
+    "v_walk_kmh": 4.0,
+    "v_drive_kmh": 10.0,
+    "episodes": 2,
+    "parked_fraction": 1.0,
+    "truncated_fraction": 0.0,
+    "total_s": 50.0,
+    "total_s_ci95": [40.0, 60.0],
+    "difference_s": 0.0,
+    "difference_s_ci95": [0.0, 0.0],
+    "drive_s": 30.0,
+    "failed_s": 0.0,
+    "walk_s": 20.0,
+    "parking_cost_s": 0.0,
+    "gave_up_s": 0.0,
+    "bound_s": 49.0,
+    "failed_parks": 0.0,
+    "replans": 1.0,
+    "regret_s": 1.0,
+    "regret_s_ci95": [0.0, 2.0],
+    "decision_ms": 0.1,
+    "decision_ms_p99": 0.2,
+}
+EPISODE_ROWS = (
+    "scenario,occupancy_level,agent,failure_cost_s,v_walk_kmh,v_drive_kmh,seed,day,arrival_s,occupancy,slot,parked,truncated,"
+    "total_s,drive_s,failed_s,walk_s,parking_cost_s,gave_up_s,bound_s,driven_m,walked_m,failed_parks,slots_passed,replans,steps\n"
+    "mini,,mdp,10.0,4.0,10.0,0,mon,3600.0,0.5,A1,True,False,50.0,30.0,0.0,20.0,0.0,0.0,49.0,80.0,20.0,0,3,1,9\n"
+    "mini,,mdp,10.0,4.0,10.0,1,tue,3600.0,0.5,A2,True,False,50.0,30.0,0.0,20.0,0.0,0.0,,80.0,20.0,0,3,1,9\n"
+)
+SUMMARY = {
+    "command": ["parkenv", "compare", "--episodes", "2"], "version": "0.1.0", "seed": 0,
+    "rows": [SUMMARY_ROW, SUMMARY_ROW | {"agent": "random", "total_s": 70.0}],
+}  # fmt: skip
+TRIP = {
+    "slots": "observed",
+    "seed": 0,
+    "graph_m": 10.0,
+    "lanes_s": 5.0,
+    "failed_s": 0.0,
+    "legs": [],
+    "attempts": [],
+}
+_PIXELS = np.random.default_rng(0).integers(0, 255, (9, 12, 3), dtype=np.uint8)
+
+
+def image(suffix):
+    return cv2.imencode(suffix, _PIXELS[..., 0] if suffix == ".pgm" else _PIXELS)[1].tobytes()
+
+
+FORMATS = [
+    Format(
+        "lot.geojson",
+        json.loads((ROOT / "lots" / "packaged" / "mini.geojson").read_text()),
+        mutated_json,
+        lot,
+    ),
+    Format("map.yml", MAP, mutated_text, lot),
+    Format("osm.osm", car_park().xml(), mutated_text, imported),
+    Format("overpass.json", json.loads(car_park().overpass(geometry=False)), mutated_json, imported),
+    Format("turbo.geojson", json.loads(car_park().geojson()), mutated_json, imported),
+    Format(
+        "slots.csv",
+        "id,x,y,yaw\n" + "".join(f"s{i}{j},{2.5 * i},{j},{j}\n" for i in range(9) for j in (0, 8)),
+        mutated_text,
+        imported,
+    ),
+    Format("log.csv", LOG, mutated_text, OccupancyLog.read),
+    Format("log.csv.gz", LOG.encode(), mutated_bytes, OccupancyLog.read),
+    Format("process.json", PROCESS, mutated_json, OccupancyProcess.from_file),
+    Format("model.json", MODEL, mutated_json, SensorModel.from_file),
+    Format("scenario.toml", SCENARIO, mutated_text, scenario),
+    Format("scenario.json", tomllib.loads(SCENARIO), mutated_json, scenario),
+    Format("experiment.json", EXPERIMENT, mutated_json, ExperimentSpec.read),
+    Format(
+        "calibrated.json",
+        {
+            "format": "parkenv-calibration",
+            "version": 1,
+            "scenario": "mini",
+            "v_drive": 2.0,
+            "failure_s": 9.0,
+            "manoeuvre_s": 8.0,
+            "trips": 3,
+            "speed_limit": 2.7,
+        },
+        mutated_json,
+        Calibration.from_file,
+    ),
+    Format("map.sqlite", written(map_file), mutated_bytes, mapped),
+    Format(
+        "model.npz", (ROOT / "perception" / "models" / "side.npz").read_bytes(), mutated_bytes, CarModel.load
+    ),
+    Format("image.png", image(".png"), mutated_bytes, read_image),
+    Format("image.jpg", image(".jpg"), mutated_bytes, read_image),
+    Format("image.pgm", image(".pgm"), mutated_bytes, read_image),
+    Format("image.bmp", image(".bmp"), mutated_bytes, read_image),
+    Format("image.tif", image(".tiff"), mutated_bytes, read_image),
+    Format("image.webp", image(".webp"), mutated_bytes, read_image),
+    Format("result.json", RESULT, mutated_json, benchmark),
+    Format("summary.json", SUMMARY, mutated_json, reported),
+    Format("episodes.csv", EPISODE_ROWS, mutated_text, resumed),
+    Format("settings.json", {"seed": 0, "agents": {"mdp": {"failure_s": 1.0}}}, mutated_json, resumed),
+    Format(
+        "trips.jsonl",
+        json.dumps(TRIP) + "\n" + json.dumps(TRIP | {"seed": 1}) + "\n",
+        mutated_text,
+        resumed_trips,
+    ),
+]
+BESIDE = {
+    "episodes.csv": {"settings.json": '{"seed": 0, "agents": {}}'},
+    "trips.jsonl": {"settings.json": '{"seed": 0}'},
+    "summary.json": {"episodes.csv": EPISODE_ROWS},
+}
+"""Other files that stand in the folder of a file."""
+
+
+def read(kind, content, folder):
+    """Read a file; only an InputError may come out of it."""
+    for name, text in BESIDE.get(kind.name, {}).items():
+        (folder / name).write_text(text)
+    path = folder / kind.name
+    path.write_bytes(content)
+    with contextlib.suppress(InputError):
+        kind.read(path)
+
+
+def content_of(kind):
+    good = kind.good
+    return good if isinstance(good, bytes) else (good if isinstance(good, str) else json.dumps(good)).encode()
+
+
+@pytest.mark.parametrize("kind", [k for k in FORMATS if k.name not in ("log.csv.gz", "result.json")], ids=str)
+def test_the_good_file_is_read(tmp_path, kind):
+    for name, text in BESIDE.get(kind.name, {}).items():
+        (tmp_path / name).write_text(text)
+    (tmp_path / kind.name).write_bytes(content_of(kind))
+    kind.read(tmp_path / kind.name)
+
+
+def fuzz(kind, **options):
+    with tempfile.TemporaryDirectory() as folder:
+
+        @settings(deadline=None, suppress_health_check=list(HealthCheck), database=None, **options)
+        @given(kind.mutated(kind.good))
+        def run(content):
+            for path in Path(folder).iterdir():
+                path.unlink()
+            read(kind, content, Path(folder))
+
+        run()
+
+
+@pytest.mark.parametrize("kind", FORMATS, ids=str)
+def test_damaged_files_are_read_or_refused(kind):
+    fuzz(kind, max_examples=15, derandomize=True)
+
+
+FOUND = [
+    ("turbo.geojson", b'{"features": [{"properties": {"@id": "way/1", "amenity": "parking_space"}, "geometry": '
+     b'{"type": "Polygon", "coordinates": [[[7, 48], [7, 48], [7, 48], [7, 48]]]}}]}'),
+    ("summary.json", b'{"command": ["parkenv", "compare"], "version": "0.1.0", "rows": [7]}'),
+    ("summary.json", b'{"command": 5, "version": "0.1.0", "rows": []}'),
+    ("summary.json", json.dumps(SUMMARY | {"seed": 1e300, "rows": [SUMMARY_ROW | {"drive_s": 1e300}]}).encode()),
+    ("summary.json", json.dumps(SUMMARY).replace("30.0", "1e999").encode()),
+    ("settings.json", json.dumps({"seed": "x" * 5000}).encode()),
+    ("map.yml", b"PARKING_AREAS: {A: {areas: [{shape: [2, 2015-11-12]}]}}"),
+]  # fmt: skip
+"""Variants that were found to end in a traceback, or in pages of text."""
+
+
+@pytest.mark.parametrize(("name", "content"), FOUND)
+def test_what_was_found_is_refused(tmp_path, name, content):
+    (kind,) = (k for k in FORMATS if k.name == name)
+    read(kind, content, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", FORMATS, ids=str)
+def test_many_damaged_files_are_read_or_refused(kind):
+    fuzz(kind, max_examples=1000)
