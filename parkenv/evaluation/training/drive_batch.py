@@ -99,8 +99,8 @@ class DriveBatch:
 
     def set_state(self, state: Sequence[NDArray[Any]]) -> None:
         """Continue from a state that `get_state` returned for as many drives."""
-        for name, values in zip(self._drives._fields, state, strict=True):
-            getattr(self._drives, name)[...] = values
+        for array, values in zip(self.get_state(), state, strict=True):
+            array[...] = values
 
     def start(self, i: int, task: PreparedTask, pose: FloatArray | None = None) -> None:
         """Restart drive i with a task, at the task's start or at `pose`, (3,) of the rear axle, slot frame."""
