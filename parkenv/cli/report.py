@@ -127,8 +127,8 @@ def make_report(
     with args.workers_of(machines) as workers, progress_bar(console) as progress:
         bar = progress.add_task(stage, total=len(tasks))
         done: list[dict[str, Any]] = []
-        for recorded in workers.in_order(tasks):
-            done.append(recorded)
+        for one in workers.in_order(tasks):
+            done.append(one)
             progress.advance(bar)
     watched = done[: len(encounters)]
     notes += differences(watched)
