@@ -105,7 +105,8 @@ def make_report(
     except (InputError, OSError) as error:
         notes.append(f"There is no replay: {error}")
     if spec is not None:
-        require_trust(spec, folder, trust)
+        # The page is made on the machines of this command, not of the run.
+        require_trust(spec.changed(address=None), folder, trust)
     try:
         repeated = Repetition.of_run(run, spec)
     except (InputError, OSError) as error:
