@@ -65,8 +65,12 @@ def test_a_stopped_run_leaves_no_process_and_is_resumed_to_the_same_result(
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "number"),
-    zip(
-        COMMANDS, [signal.SIGINT, signal.SIGTERM, signal.SIGINT, signal.SIGKILL, signal.SIGTERM], strict=True
+    list(
+        zip(
+            COMMANDS,
+            [signal.SIGINT, signal.SIGTERM, signal.SIGINT, signal.SIGKILL, signal.SIGTERM],
+            strict=True,
+        )
     ),
 )
 def test_runs_stopped_at_random_moments(name, number):
