@@ -103,10 +103,9 @@ _KNOWN = {
     )
 }  # fmt: skip
 _ORDER = (
-    "scenario", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh", "agent", "seed",
-    "total_s", "difference_s", "gap_to_exact", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s",
-    "gave_up_s",
-    "parked_fraction",
+    "scenario", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh", "agent",
+    "seed", "total_s", "difference_s", "gap_to_exact", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s",
+    "gave_up_s", "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""
 _TABLES_OF_THEIR_OWN = ("by_weather",)
