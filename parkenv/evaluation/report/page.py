@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image as PillowImage
 
-from parkenv.evaluation.experiments.results import Row
+from parkenv.evaluation.experiments.results import SETTING_AXES, Row
 from parkenv.evaluation.figures.picture_files import CAPTION
 from parkenv.evaluation.figures.registry import FIGURES
 from parkenv.evaluation.report.drive_recording import data_uri
@@ -203,9 +203,7 @@ def _survey_finding(row: Row) -> str:
 def _comparison_findings(rows: Sequence[Row]) -> list[str]:
     settings: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
-        settings.setdefault(
-            (row["scenario"], row["failure_cost_s"], row["v_walk_kmh"], row["v_drive_kmh"]), []
-        ).append(row)
+        settings.setdefault((row["scenario"], *(row[name] for name in SETTING_AXES)), []).append(row)
     findings = []
     speeds = len({key[2:] for key in settings}) > 1
     for (name, failure, walk, drive), its in settings.items():
