@@ -38,7 +38,7 @@ def frozen_world(lot, taken, **changes):
 
 def test_unknown_names_and_options_are_refused_with_the_known_ones():
     scenario = make_scenario("mini")
-    with pytest.raises(InputError, match="unknown agent 'mpd'; known: mdp, mdp-static, greedy-goal"):
+    with pytest.raises(InputError, match=r"unknown agent 'mpd'; did you mean 'mdp'\? known: mdp, mdp-static"):
         make_agent("mpd", scenario)
     with pytest.raises(InputError, match="no option 'cost'; known: failure_s, gamma"):
         make_agent("mdp", scenario, cost=3)

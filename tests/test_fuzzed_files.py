@@ -28,6 +28,7 @@ from parkenv.files.images import read_image
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.importers.import_options import ImportOptions
 from parkenv.mapping.store import MapStore, Session
+from parkenv.perception.car_datasets import read_uiuc_test
 from parkenv.perception.car_model import CarModel
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import ScenarioSpec
@@ -96,6 +97,13 @@ def reported(path):
     run = RunFolder.read(path.parent)
     run.totals()
     write_page(page_data(run), path.with_name("report.html"), run.figures)
+
+
+def true_locations(path):
+    (path.parent / "TestImages").mkdir(exist_ok=True)
+    for number in range(2):
+        (path.parent / "TestImages" / f"test-{number}.pgm").write_bytes(image(".pgm"))
+    read_uiuc_test(path.parent, "single")
 
 
 def benchmark(path):
@@ -263,6 +271,7 @@ FORMATS = [
     Format("image.bmp", image(".bmp"), mutated_bytes, read_image),
     Format("image.tif", image(".tiff"), mutated_bytes, read_image),
     Format("image.webp", image(".webp"), mutated_bytes, read_image),
+    Format("trueLocations.txt", "0: (-5,30)\n1: (2,3) (4,5)\n", mutated_text, true_locations),
     Format("result.json", RESULT, mutated_json, benchmark),
     Format("summary.json", SUMMARY, mutated_json, reported),
     Format("episodes.csv", EPISODE_ROWS, mutated_text, resumed),
@@ -312,7 +321,8 @@ def fuzz(kind, **options):
         @given(kind.mutated(kind.good))
         def run(content):
             for path in Path(folder).iterdir():
-                path.unlink()
+                if path.is_file():
+                    path.unlink()
             read(kind, content, Path(folder))
 
         run()

@@ -77,9 +77,9 @@ def test_what_never_happens_gets_the_lowest_rate():
 @pytest.mark.parametrize(
     ("dt", "start", "message"),
     [
-        ([], [], r"looks: got shapes \(0,\)"),
-        ([1.0, 2.0], [1], "looks: got shapes"),
-        ([0.0], [1], "looks: dt: wanted finite seconds > 0"),
+        ([], [], r"intervals: got shapes \(0,\)"),
+        ([1.0, 2.0], [1], "intervals: got shapes"),
+        ([0.0], [1], "intervals: dt: wanted finite seconds > 0"),
     ],
 )
 def test_bad_looks_are_refused(dt, start, message):
@@ -189,7 +189,7 @@ def test_a_slot_that_never_changed_gets_a_finite_rate():
 
 def test_nothing_to_fit_is_refused():
     log = OccupancyLog(("a",), ("2024-01-01",), [0, 0], [0, 0], [0.0, 9000.0], [0, 1])
-    with pytest.raises(InputError, match="no two looks at a slot on one day within 7200 s"):
+    with pytest.raises(InputError, match="no two observations of a slot on one day within 7200 s"):
         fit_process(log)
     with pytest.raises(InputError, match=r"prior_sd: got 0\.0"):
         fit_process(log, prior_sd=0.0)

@@ -75,7 +75,7 @@ def test_camera_and_weather_may_be_absent_and_the_later_of_two_cameras_stands(tm
     ("text", "message"),
     [
         ("", "empty, wanted a header"),
-        (HEADER, "no looks"),
+        (HEADER, "no observations"),
         (
             "datetime,slot_id,occupied,colour\n",
             "column 'colour' is unknown, wanted some of datetime, camera,",
@@ -125,7 +125,7 @@ def test_torn_missing_and_falsely_named_files_are_refused(tmp_path):
         ({"second": [1.0, 2.0]}, "of one length"),
         ({"days": ("1 May",)}, "days: wanted different ISO dates"),
         ({"max_gap_s": 0.0}, "max_gap_s: got 0.0"),
-        ({"slot": []}, "no looks"),
+        ({"slot": []}, "no observations"),
     ],
 )
 def test_a_bad_log_object_is_refused(fields, message):

@@ -45,7 +45,7 @@ def test_every_word_leads_to_the_goal(goal):
     n = words_between(*goal, words)
     assert 1 <= n <= MOST_WORDS
     for k in range(n):
-        used = slice(words.count[k])
+        used = slice(words.n_pieces[k])
         same_pose(end_of(words.piece[k, used], words.turn[k, used]), goal, 1e-6)
 
 

@@ -153,7 +153,7 @@ def test_folders_that_hold_no_finished_run_are_refused_in_words(tmp_path):
         RunFolder.read(tmp_path)
     with pytest.raises(InputError, match=r"written by parkenv 0\.0\.9"):
         RunFolder.read(summary_in(tmp_path, version="0.0.9"))
-    with pytest.raises(InputError, match="want the summary of a command, with rows"):
+    with pytest.raises(InputError, match="rows None is not of type 'array'"):
         RunFolder.read(summary_in(tmp_path, rows=None))
     (tmp_path / "summary.json").write_text('{"command": [')
     with pytest.raises(InputError, match="not JSON"):

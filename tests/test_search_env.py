@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
+from parkenv.envs.search_kernel import COUNT_METRICS, REWARD_TERMS, STEP_RESULT, TIME_METRICS
 from parkenv.envs.wrappers import ThesisReward
 from parkenv.files.names import SCENARIO_NAMES
 from parkenv.lots import grid_lot
@@ -124,6 +125,20 @@ def test_the_world_does_not_depend_on_who_drives(seed):
         times = state.arrival.time + np.array([0.0, 60.0, 600.0, 3600.0])
         worlds.append([state.world.occupied(np.arange(scenario.lot.n_slots), t) for t in times])
     np.testing.assert_array_equal(worlds[0], worlds[1])
+
+
+def test_a_step_returns_the_numbers_in_the_order_of_their_names():
+    env = gym.make("parkenv/Search-v1", scenario="mini").unwrapped
+    env.reset(seed=0)
+    record = env.searches.records[0]
+    for action in (3, PARK, 3):
+        result = dict(zip(STEP_RESULT, env._advance(action), strict=True))
+        for name in (*TIME_METRICS, *COUNT_METRICS, "parked", "over", "vertex"):
+            if name != "total_s":
+                assert result[name] == record[name], name
+        terms = ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s")
+        assert [result[name] for name in REWARD_TERMS] == [-record[f"step_{name}"] for name in terms]
+        assert result["total_s"] == pytest.approx(sum(record[name] for name in terms))
 
 
 @pytest.mark.parametrize("scenario", SCENARIO_NAMES)

@@ -217,6 +217,16 @@ def test_cloning_begins_near_the_planner():
     assert np.median(cloned) < 1.2 * planner < np.median(fresh)
 
 
+def test_cloning_takes_the_read_only_arrays_of_a_worker():
+    shown = Demonstrations.collect("mdp", SCENARIO, range(5_000_000, 5_000_002))
+    for array in (shown.local, shown.masks, shown.actions, shown.times):
+        array.flags.writeable = False
+    model = PPO("MultiInputPolicy", SearchVecEnv(2, "mini"), n_steps=8, batch_size=16, seed=0)
+    before = model.policy.action_net.weight.clone()
+    clone(model, shown, 0, updates=1)
+    assert not torch.equal(before, model.policy.action_net.weight)
+
+
 def test_algorithms_without_cloning_are_refused():
     shown = Demonstrations.collect("mdp", SCENARIO, range(5_000_000, 5_000_002))
     with pytest.raises(InputError, match="dqn has no behaviour cloning"):

@@ -53,6 +53,17 @@ def test_an_experiment_file_that_names_a_class_shows_it_and_asks_for_trust(modul
     assert not (tmp_path / "results").exists()
 
 
+def test_a_cluster_in_a_file_asks_for_trust(tmp_path):
+    file = tmp_path / "theirs.json"
+    file.write_text(
+        json.dumps({"agents": ["mdp"], "backend": "dask", "address": "tcp://theirs.example:8786"})
+    )
+    refused = parkenv("run", file, "--out", tmp_path / "out")
+    assert refused.returncode == 2
+    assert "would run tasks on the cluster at tcp://theirs.example:8786" in " ".join(refused.stderr.split())
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_run_folder_that_names_a_class_asks_for_trust_and_the_class_names_the_agent(module, tmp_path):
     mark, out = tmp_path / "was_run", tmp_path / "out"
     done = parkenv("run", experiment(tmp_path / "theirs.json", "compare", module), "--out", out, "--trust")

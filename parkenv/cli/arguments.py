@@ -9,7 +9,7 @@ Options:
     seed (N >= 0): First seed; episode i uses seed + i.
 
 Code of others:
-    trust: Run the classes (MODULE:CLASS) that the file or the folder of the run names.
+    trust: Run the classes (MODULE:CLASS), and use the cluster, that the file or the folder of the run names.
     trust_model: Convert archives of stable-baselines3 (ALGORITHM:FILE.zip) to model files; this runs the code in them.
 
 Sensors:

@@ -105,7 +105,8 @@ def make_report(
     except (InputError, OSError) as error:
         notes.append(f"There is no replay: {error}")
     if spec is not None:
-        require_trust(spec, folder, trust)
+        # The page is made on the machines of this command, not of the run.
+        require_trust(spec.changed(address=None), folder, trust)
     try:
         repeated = Repetition.of_run(run, spec)
     except (InputError, OSError) as error:
@@ -126,8 +127,8 @@ def make_report(
     with args.workers_of(machines) as workers, progress_bar(console) as progress:
         bar = progress.add_task(stage, total=len(tasks))
         done: list[dict[str, Any]] = []
-        for recorded in workers.in_order(tasks):
-            done.append(recorded)
+        for one in workers.in_order(tasks):
+            done.append(one)
             progress.advance(bar)
     watched = done[: len(encounters)]
     notes += differences(watched)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def require_trust(spec: Spec, source: Path, trust: bool) -> None:
-    """Refuse a specification that names classes, unless the user trusts it; ask in a terminal.
+    """Refuse a specification that names classes or a cluster, unless the user trusts it; ask in a terminal.
 
     Args:
         spec: content of a file or of a run folder.
@@ -25,15 +25,18 @@ def require_trust(spec: Spec, source: Path, trust: bool) -> None:
         trust: the value of `--trust`.
 
     Raises:
-        InputError: it names classes and is not trusted; the message lists them with their files.
+        InputError: it names some and is not trusted; the message lists them, classes with their files.
     """
     from parkenv.evaluation.experiments.agent_spec import classes_in
     from parkenv.files.user_class import find_module
 
-    named = {name: find_module(name) for name in classes_in(spec)}
+    named = [f"{name} ({find_module(name) or 'not found'})" for name in classes_in(spec)]
+    if address := getattr(spec, "address", None):
+        # A cluster's answers are pickled objects.
+        named.append(f"tasks on the cluster at {address}")
     if trust or not named:
         return
-    shown = ", ".join(f"{name} ({file or 'not found'})" for name, file in named.items())
+    shown = ", ".join(named)
     if sys.stdin.isatty() and typer.confirm(f"{source} runs {shown}. Run this code?"):
         return
     raise InputError(f"{source}: would run {shown}; read that code, then add --trust")

@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 class DriveState:
     """Everything that changes during an episode."""
 
-    key: np.uint64  # key of the world
+    key: np.uint64
     task: ParkingTask  # the parking task; never changes
     vehicle: FloatArray  # (6,) state of the car, see `parkenv.driving.vehicle`
     rng: np.random.Generator  # random generator of the laser's noise

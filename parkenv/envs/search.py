@@ -31,7 +31,6 @@ LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no 
 MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
 _REBUILT = {"searches", "_state", "_address", "_copy_time", "_copy_p_occupied", "_copy_belief"}
 _REBUILT |= {"_seeded_with", "_begun", "_over"}
-REWARD_TERMS = ("drive", "failed", "walk", "parking", "gave_up")
 
 
 class SavedSearch(NamedTuple):
@@ -282,7 +281,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return self._observation(state), reward, over, False, info
 
     def _advance(self, action: int) -> tuple[Any, ...]:
-        """Act, observe, and return the result of `parkenv.envs.search_kernel.step_result`."""
+        """Act, observe, and return the numbers named by `parkenv.envs.search_kernel.STEP_RESULT`."""
         result: tuple[Any, ...] = self._step(self._address, action)
         return result
 

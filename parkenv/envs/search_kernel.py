@@ -46,6 +46,21 @@ from parkenv.world.occupancy_kernel import inlined, kernel
 from parkenv.world.pointers import float32s, float64s, int32s, int64s
 from parkenv.world.week import DAY_S, WEEK_HOURS, hour_of_week
 
+REWARD_TERMS = ("drive", "failed", "walk", "parking", "gave_up")
+TIME_METRICS = (
+    "drive_s",
+    "failed_s",
+    "walk_s",
+    "parking_cost_s",
+    "gave_up_s",
+    "total_s",
+    "driven_m",
+    "walked_m",
+)
+COUNT_METRICS = ("failed_parks", "slots_passed")
+STEP_RESULT = ("reward", *REWARD_TERMS, *TIME_METRICS, *COUNT_METRICS, "parked", "over", "vertex")
+"""Names of the numbers that a step returns; metrics are those of the episode so far."""
+
 # ---- one search, from Python
 
 
@@ -177,9 +192,9 @@ def complete_step(search: Any) -> tuple[Any, ...]:
 
 @inlined
 def step_result(search: Any) -> tuple[Any, ...]:
-    """Return the reward and its terms, the metrics of the episode so far, its status, and the car's vertex.
+    """Return the numbers named by `STEP_RESULT`.
 
-    Reading all numbers at once, as a tuple in the order below, is faster than reading them one by one.
+    Compiled code makes a plain tuple six times as fast as a named one.
     """
     drive, failed, walk = search.step_drive_s, search.step_failed_s, search.step_walk_s
     parking, gave_up = search.step_parking_cost_s, search.step_gave_up_s

@@ -13,8 +13,17 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
 from parkenv.envs.local_observation import Surroundings, local_space, observe_surroundings
-from parkenv.envs.search import REWARD_TERMS, search_space
-from parkenv.envs.search_kernel import arrive, init_prior, refresh_belief, take_step, write_clock
+from parkenv.envs.search import search_space
+from parkenv.envs.search_kernel import (
+    COUNT_METRICS,
+    REWARD_TERMS,
+    TIME_METRICS,
+    arrive,
+    init_prior,
+    refresh_belief,
+    take_step,
+    write_clock,
+)
 from parkenv.envs.search_records import N_ACTIONS, ScenarioRecords, Searches, scenario_at, search_at
 from parkenv.envs.search_state import arrival_of
 from parkenv.errors import InputError
@@ -29,17 +38,6 @@ from parkenv.world.scenario import Scenario
 OBSERVATIONS = ("full", "occupancy", "local")
 MAX_ENVS = 1_000_000
 """Maximum number of environments."""
-TIME_METRICS = (
-    "drive_s",
-    "failed_s",
-    "walk_s",
-    "parking_cost_s",
-    "gave_up_s",
-    "total_s",
-    "driven_m",
-    "walked_m",
-)
-COUNT_METRICS = ("failed_parks", "slots_passed")
 # Gymnasium's names of the masks that say which searches have a metric.
 _WHICH = tuple(f"_{name}" for name in ("reward_terms", "parked", *TIME_METRICS, *COUNT_METRICS))
 _WHICH_TERMS = tuple(f"_{name}" for name in REWARD_TERMS)

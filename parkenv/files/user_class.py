@@ -45,8 +45,10 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
         if isinstance(error, AttributeError) and module in sys.modules:
             raise InputError(f"{kind} {name!r}: module {module!r} has no {class_name!r}") from None
         at = traceback.extract_tb(error.__traceback__)[-1]
+        # Syntax errors say where they are.
+        where = "" if isinstance(error, SyntaxError) else f" ({at.filename}, line {at.lineno})"
         raise InputError(
-            f"{kind} {name!r}: its module fails: {type(error).__name__}: {error} ({at.filename}, line {at.lineno})"
+            f"{kind} {name!r}: its module fails: {type(error).__name__}: {error}{where}"
         ) from error
     if not isinstance(found, type) or not callable(getattr(found, method.partition("(")[0], None)):
         raise InputError(f"{kind} {name!r}: has no method {method}")

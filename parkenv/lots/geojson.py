@@ -28,10 +28,10 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import read_json
-from parkenv.lots.geojson_slots import FARTHEST, SLOT_SHAPE, RawFeature, is_coordinate, read_slots
+from parkenv.lots.geojson_slots import SLOT_SHAPE, RawFeature, is_coordinate, read_slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_contents import KINDS, LotContents
-from parkenv.world.lot import Lane, Mouth, ParkingLot, is_building
+from parkenv.world.lot import FARTHEST, Lane, Mouth, ParkingLot, is_building
 
 FloatArray = NDArray[np.float64]
 

@@ -15,13 +15,12 @@ from parkenv.files.file_names import is_plain
 from parkenv.lots.generators import Slots
 from parkenv.lots.lot_contents import LotContents
 from parkenv.lots.slot_polygons import slots_from_polygons
-from parkenv.world.lot import SLOT_SIDE, Mouth, corner_points
+from parkenv.world.lot import FARTHEST, SLOT_SIDE, Mouth, corner_points
 
 FloatArray = NDArray[np.float64]
 
 SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")  # the properties that define a slot exactly
 MOUTHS = {mouth.name.lower(): mouth for mouth in Mouth}
-FARTHEST = 1e8  # largest coordinate, m: enough for any map grid, and small enough for millimetres in float64
 SLOT_AGREEMENT = 0.01  # largest distance, m, between a slot's polygon and the rectangle of its properties
 
 

@@ -23,6 +23,7 @@ UIUC_TESTS = {
     "single": ("TestImages", "trueLocations.txt"),
     "multi": ("TestImages_Scale", "trueLocations_Scale.txt"),
 }
+_PLACE = re.compile(r"\(((?:\s*-?\d{1,6}\s*,){1,2}\s*-?\d{1,6}\s*)\)", re.ASCII)
 _POSITIVE, _NEGATIVE = ("positives", "vehicles", "pos"), ("negatives", "non-vehicles", "neg")
 
 
@@ -87,10 +88,14 @@ def read_uiuc_test(folder: Path, test_set: str) -> list[LabelledImage]:
         if not line.strip():
             continue
         number, _, places = line.partition(":")
-        numbers = [[int(n) for n in found.split(",")] for found in re.findall(r"\(([-\d,\s]+)\)", places)]
-        if not number.strip().isdigit() or any(len(n) != (2 if test_set == "single" else 3) for n in numbers):
+        numbers = [[int(n) for n in found.split(",")] for found in _PLACE.findall(places)]
+        if (
+            not re.fullmatch(r"\s*\d{1,9}\s*", number, re.ASCII)
+            or _PLACE.sub("", places).strip()
+            or any(len(n) != (2 if test_set == "single" else 3) for n in numbers)
+        ):
             raise InputError(
-                f"{truth}: line {line!r}, want n: (i,j) ... with a width each in the multi-scale set"
+                f"{truth}: line {line!r:.80}, want n: (i,j) ... with a width each in the multi-scale set"
             )
         boxes = []
         for top, left, *width in numbers:

@@ -22,6 +22,7 @@ MOVES = ("up", "down", "left", "right")
 """The names of the four columns of `ParkingLot.neighbors`, in order (eq. 3.13)."""
 PARK = len(MOVES)  # the action "park" (eq. 3.14); lower actions are the moves.
 ACTIONS = (*MOVES, "park")
+FARTHEST = 1e8  # largest coordinate, m: enough for any map grid, and small enough for millimetres in float64
 SLOT_SIDE = 0.1  # least length and width of a slot, m
 
 
@@ -294,9 +295,11 @@ def _frozen(values: ArrayLike, name: str) -> FloatArray:
 
 
 def _require_finite(what: str, values: FloatArray) -> None:
-    if not np.isfinite(values).all():
-        where = tuple(np.argwhere(~np.isfinite(values))[0])
-        raise InputError(f"{what}[{', '.join(map(str, where))}] is {values[where]}, want a finite number")
+    wrong = ~(np.abs(values) <= FARTHEST)
+    if wrong.any():
+        where = tuple(np.argwhere(wrong)[0])
+        index = ", ".join(map(str, where))
+        raise InputError(f"{what}[{index}] is {values[where]}, want a finite number, at most {FARTHEST:.0e}")
 
 
 def _same(a: object, b: object) -> bool:

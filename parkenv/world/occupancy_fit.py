@@ -62,9 +62,9 @@ def fit_constant_rates(dt: ArrayLike, start: ArrayLike, end: ArrayLike) -> tuple
     """
     dt, start, end = np.asarray(dt, float), np.asarray(start, bool), np.asarray(end, bool)
     if not dt.shape == start.shape == end.shape == (dt.size,) or not dt.size:
-        raise InputError(f"looks: got shapes {dt.shape}, {start.shape}, {end.shape}, wanted (k,), k > 0")
+        raise InputError(f"intervals: got shapes {dt.shape}, {start.shape}, {end.shape}, wanted (k,), k > 0")
     if not np.all((dt > 0) & np.isfinite(dt)):
-        raise InputError("looks: dt: wanted finite seconds > 0")
+        raise InputError("intervals: dt: wanted finite seconds > 0")
     gaps, which = np.unique(dt, return_inverse=True)
     n = np.bincount(which * 4 + start * 2 + end, minlength=4 * gaps.size).reshape(-1, 2, 2).T
     (stay_free, leave), (take, stay) = n  # n[end, start, gap]
@@ -227,18 +227,18 @@ def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float 
     """
     if not prior_sd > 0:
         raise InputError(f"prior_sd: got {prior_sd}, wanted a number > 0")
-    looks = log.intervals(max_gap_s)
-    if not looks.slot.size:
-        raise InputError(f"{log.source}: no two looks at a slot on one day within {max_gap_s:g} s")
+    pairs = log.intervals(max_gap_s)
+    if not pairs.slot.size:
+        raise InputError(f"{log.source}: no two observations of a slot on one day within {max_gap_s:g} s")
     n = len(log.slot_ids)
-    kind = log.weekend[looks.day].astype(np.int64)
-    data = Intervals(looks.slot, kind * _DAY_HOURS, looks.start, looks.end, looks.before, looks.after)
+    kind = log.weekend[pairs.day].astype(np.int64)
+    data = Intervals(pairs.slot, kind * _DAY_HOURS, pairs.start, pairs.end, pairs.before, pairs.after)
 
     constant = np.zeros((2, 2))  # log rates: arrival and departure, on weekdays and weekend days
     for k in np.unique(kind):
         used = kind == k
-        dt = looks.end[used] - looks.start[used]
-        constant[:, k] = np.log(fit_constant_rates(dt, looks.before[used], looks.after[used]))
+        dt = pairs.end[used] - pairs.start[used]
+        constant[:, k] = np.log(fit_constant_rates(dt, pairs.before[used], pairs.after[used]))
     centre = np.concatenate([np.repeat(constant.ravel(), _DAY_HOURS), np.zeros(2 * n)])
 
     def loss(theta: FloatArray) -> tuple[float, FloatArray]:
@@ -256,7 +256,7 @@ def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float 
     centred = _centring(n)
     profile, factor = _split(centred @ theta)
     profile_se, factor_se = _split(np.sqrt(np.diag(centred @ covariance @ centred.T)))
-    observed = _observed_hours(kind, looks.start, looks.end)
+    observed = _observed_hours(kind, pairs.start, pairs.end)
     profile_se[:, ~observed] = np.nan
     begins = log.first[:-1][np.diff(log.first) > 0]
     for k in np.unique(kind):
@@ -269,7 +269,7 @@ def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float 
     week, week_se = _week(np.exp(profile)), _week(profile_se)
     process = OccupancyProcess(np.exp(factor[0]), week[0], np.exp(factor[1]), week[1])
     errors = factor_se[0], week_se[0], factor_se[1], week_se[1]
-    return FittedProcess(process, log.slot_ids, float(value), looks.slot.size, *errors)
+    return FittedProcess(process, log.slot_ids, float(value), pairs.slot.size, *errors)
 
 
 def _split(theta: FloatArray) -> tuple[FloatArray, FloatArray]:

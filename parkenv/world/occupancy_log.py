@@ -110,7 +110,7 @@ class OccupancyLog:
         slot, day = np.asarray(self.slot, np.int64), np.asarray(self.day, np.int64)
         second, occupied = np.asarray(self.second, float), np.asarray(self.occupied, bool)
         if not slot.size:
-            raise InputError(f"{self.source}: no looks, wanted at least one")
+            raise InputError(f"{self.source}: no observations, wanted at least one")
         if not slot.shape == day.shape == second.shape == occupied.shape == (slot.size,):
             raise InputError(f"{self.source}: wanted slot, day, second and occupied of one length")
         if len(self.slot_ids) * len(self.days) > MAX_RECORDS:
@@ -159,7 +159,7 @@ class OccupancyLog:
         slots: dict[str, int] = {}
         moments: dict[str, datetime] = {}  # one image shows many slots: many lines have the same text
         latest: dict[str, datetime] = {}
-        looks: list[tuple[int, datetime, bool]] = []
+        found: list[tuple[int, datetime, bool]] = []
         rows = csv_rows(path, MAX_LOG_BYTES)
         at_time, at_slot, at_occupied = csv_columns(path, rows, _KNOWN, ("datetime", "slot_id", "occupied"))
         for line, row in rows:
@@ -174,23 +174,23 @@ class OccupancyLog:
             if moment < latest.get(slot_id, moment):
                 raise InputError(
                     f"{path}: line {line}: datetime: {text} of slot {slot_id} is before its line above,"
-                    f" {latest[slot_id]}; wanted looks in order of time"
+                    f" {latest[slot_id]}; wanted observations in order of time"
                 )
             latest[slot_id] = moment
-            looks.append((slots.setdefault(slot_id, len(slots)), moment, taken == "1"))
-        if not looks:
-            raise InputError(f"{path}: no looks, wanted at least one line below the header")
-        dates = [moment.date().isoformat() for _, moment, _ in looks]
+            found.append((slots.setdefault(slot_id, len(slots)), moment, taken == "1"))
+        if not found:
+            raise InputError(f"{path}: no observations, wanted at least one line below the header")
+        dates = [moment.date().isoformat() for _, moment, _ in found]
         days = sorted(set(dates))
         day_index = {day: i for i, day in enumerate(days)}
-        seconds = [m.hour * 3600 + m.minute * 60 + m.second + m.microsecond * 1e-6 for _, m, _ in looks]
+        seconds = [m.hour * 3600 + m.minute * 60 + m.second + m.microsecond * 1e-6 for _, m, _ in found]
         return cls(
             tuple(slots),
             tuple(days),
-            np.array([slot for slot, _, _ in looks], np.int64),
+            np.array([slot for slot, _, _ in found], np.int64),
             np.array([day_index[day] for day in dates], np.int64),
             np.array(seconds, float),
-            np.array([taken for _, _, taken in looks], bool),
+            np.array([taken for _, _, taken in found], bool),
             max_gap_s,
             str(path),
         )
@@ -279,11 +279,11 @@ def _sum_hours(
     for record in range(first.size - 1):
         day, slot = record // n_slots, record % n_slots
         last = first[record + 1] - 1
-        for look in range(first[record], last + 1):
-            start, end = from_s[look], DAY_S if look == last else from_s[look + 1]
+        for i in range(first[record], last + 1):
+            start, end = from_s[i], DAY_S if i == last else from_s[i + 1]
             watched, left = max(start, second[first[record]]), min(end, second[last])
             _add_hours(seen[slot, day], watched, left)
-            if taken[look]:
+            if taken[i]:
                 _add_hours(replayed[slot, day], start, end)
                 _add_hours(occupied[slot, day], watched, left)
 

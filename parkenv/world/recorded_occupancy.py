@@ -293,13 +293,13 @@ class RecordedOccupancy:
             if held_out.issuperset(days):
                 break
             held_out.update(days)
-        looks = log.intervals(log.max_gap_s)
-        used = others[looks.day]
+        pairs = log.intervals(log.max_gap_s)
+        used = others[pairs.day]
         if not used.any():
             raise InputError(
-                f"{log.source}: no two consecutive looks on the days that are left to forecast from"
+                f"{log.source}: no two consecutive observations on the days that are left to forecast from"
             )
-        rates = fit_constant_rates((looks.end - looks.start)[used], looks.before[used], looks.after[used])
+        rates = fit_constant_rates((pairs.end - pairs.start)[used], pairs.before[used], pairs.after[used])
         share = log.replayed_share[:, others].sum(axis=1)
         n_days = log.recorded[:, others].sum(axis=1)
         return MappedLog(

@@ -190,7 +190,7 @@ def _search(
             if word >= 0:
                 if shot_node < 0:
                     last = min(last, opened + int(patience * opened) + 32)
-                best, shot_node, shot_count = cost[node] + more, node, words.count[word]
+                best, shot_node, shot_count = cost[node] + more, node, words.n_pieces[word]
                 shot_piece[:], shot_turn[:] = words.piece[word], words.turn[word]
         for direction in (1.0, -1.0):
             for share in _STEERINGS:

@@ -47,7 +47,7 @@ def shorten_path(
                 )
                 if word < 0:
                     continue
-                count = words.count[word]
+                count = words.n_pieces[word]
                 new_lengths = np.concatenate(
                     (lengths[:first], words.piece[word, :count] * radius, lengths[end:])
                 )

@@ -30,7 +30,7 @@ class Words(NamedTuple):
 
     piece: FloatArray  # (MOST_WORDS, 5) signed length of each piece, negative backward
     turn: IntArray  # (MOST_WORDS, 5) `LEFT`, `STRAIGHT` or `RIGHT`
-    count: IntArray  # (MOST_WORDS,) number of pieces
+    n_pieces: IntArray  # (MOST_WORDS,)
     cost: FloatArray  # (MOST_WORDS,) scratch for the caller
 
 
@@ -195,7 +195,7 @@ def words_between(x: float, y: float, phi: float, words: Words) -> int:
                             pieces[n, i] = -pieces[n, i]
                         if mirror:
                             turns[n, i] = -turns[n, i]
-                    words.count[n] = count
+                    words.n_pieces[n] = count
                     n += 1
     return n
 
@@ -219,7 +219,7 @@ def distance_between(x: float, y: float, phi: float, radius: float, change_m: fl
     """Return the lowest `word_cost` of all words to a pose, m."""
     best = math.inf
     for k in range(words_between(x / radius, y / radius, phi, words)):
-        best = min(best, word_cost(words.piece[k], words.count[k], radius, change_m))
+        best = min(best, word_cost(words.piece[k], words.n_pieces[k], radius, change_m))
     return best
 
 
@@ -247,7 +247,7 @@ def reeds_shepp(
     x, y = (c * step[0] + s * step[1]) / radius, (c * step[1] - s * step[0]) / radius
     words = words_buffer()
     n = words_between(float(x), float(y), float(step[2]), words)
-    costs = [word_cost(words.piece[k], int(words.count[k]), radius, change_m) for k in range(n)]
+    costs = [word_cost(words.piece[k], int(words.n_pieces[k]), radius, change_m) for k in range(n)]
     best = int(np.argmin(costs))
-    kept = np.flatnonzero(np.abs(words.piece[best, : words.count[best]]) > _EDGE)
+    kept = np.flatnonzero(np.abs(words.piece[best, : words.n_pieces[best]]) > _EDGE)
     return words.piece[best, kept] * radius, words.turn[best, kept]

@@ -47,7 +47,7 @@ class DriveCosts(NamedTuple):
 def _word_is_free(
     space: Clearance, x: float, y: float, yaw: float, words: Words, word: int, costs: DriveCosts
 ) -> bool:
-    for i in range(words.count[word]):
+    for i in range(words.n_pieces[word]):
         curvature, way = words.turn[word, i] / costs.radius, words.piece[word, i] * costs.radius
         if not arc_is_free(space, x, y, yaw, curvature, way, costs.margin):
             return False
@@ -78,10 +78,10 @@ def cheapest_shot(
     n = words_between(along, across, end[2] - yaw, words)
     for k in range(n):
         turned, before = 0.0, steering
-        for i in range(words.count[k]):
+        for i in range(words.n_pieces[k]):
             turned += costs.steer_m * abs(words.turn[k, i] - before)
             before = float(words.turn[k, i])
-        words.cost[k] = word_cost(words.piece[k], words.count[k], costs.radius, costs.change_m) + turned
+        words.cost[k] = word_cost(words.piece[k], words.n_pieces[k], costs.radius, costs.change_m) + turned
         if words.piece[k, 0] * direction < 0.0:
             words.cost[k] += costs.change_m
     while True:

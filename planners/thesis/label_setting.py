@@ -67,10 +67,11 @@ class StoppingGraph(NamedTuple):
         """Make the graph of a decision process, without its probabilities."""
         # Copies: numba would compile every function again for read-only arrays.
         neighbors, move_s = mdp.neighbors.astype(np.int32), np.array(mdp.move_s, order="C")
+        start, source, move, seconds = edges_in(neighbors, move_s)
         never_s = _never(neighbors, move_s, mdp.wait_s, mdp.gamma)
-        park_reward = np.ascontiguousarray(mdp.park_reward)
-        costs = float(mdp.failure_s), float(mdp.wait_s), float(mdp.gamma)
-        return cls(neighbors, move_s, *edges_in(neighbors, move_s), park_reward, never_s, *costs)
+        reward, failure_s = np.ascontiguousarray(mdp.park_reward), float(mdp.failure_s)
+        wait_s, gamma = float(mdp.wait_s), float(mdp.gamma)
+        return cls(neighbors, move_s, start, source, move, seconds, reward, never_s, failure_s, wait_s, gamma)
 
 
 @dataclass

@@ -125,7 +125,7 @@ def look_up(dome: Float32Array, x: float, y: float, z: float) -> tuple[float, fl
 def _mixed(
     dome: Float32Array, row: int, column: int, channel: int, weights: tuple[float, float, float, float]
 ) -> float:
-    return (
+    return float(
         dome[row, column, channel] * weights[0]
         + dome[row, column + 1, channel] * weights[1]
         + dome[row + 1, column, channel] * weights[2]

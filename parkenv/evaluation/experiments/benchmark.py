@@ -73,7 +73,7 @@ class Suite:
     description: str  # one sentence
     arrival: ArrivalWindow  # when searches begin
     seeds: range  # seeds; every task has one search per seed
-    tasks: tuple[Task, ...]  # the tasks
+    tasks: tuple[Task, ...]
     fingerprint: str  # SHA-256 of the suite's file, as JSON without white space
 
     @classmethod

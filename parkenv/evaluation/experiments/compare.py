@@ -34,7 +34,7 @@ class Case:
     """One agent in one scenario, with the costs and speeds of one setting."""
 
     scenario: Scenario  # the scenario, with the setting's costs and speeds
-    agent: str  # name of the agent
+    agent: str
     occupancy_level: float | None = None  # mean occupancy of the world; None for the scenario's own
     # simulated sensors that observe the slots; None to use the scenario's sensor model
     rig: str | None = None

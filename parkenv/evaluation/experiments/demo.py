@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.spec import DemoSpec, SurveySpec
 from parkenv.evaluation.experiments.surveys import survey_of
@@ -50,5 +52,5 @@ def demo_cases(spec: DemoSpec, scenario: Scenario, log: SessionLog) -> list[tupl
     """
     known = scenario.replace(prior=MapPrior(log), sensor_model=SensorModel.named(RIG))
     seeds = range(spec.seed + _APART, spec.seed + _APART + spec.episodes)
-    sensors = {"rig": RIG, "detector": spec.detector, "every": spec.every}
+    sensors: dict[str, Any] = {"rig": RIG, "detector": spec.detector, "every": spec.every}
     return [(Case(known, name, **({} if name == "oracle" else sensors)), seeds) for name in AGENTS]

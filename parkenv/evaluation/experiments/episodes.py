@@ -22,8 +22,8 @@ from planners.routes import DriveRoutes
 class SearchTrace:
     """Trace of one search, for pictures."""
 
-    scenario: Scenario  # the scenario
-    agent: str  # name of the agent
+    scenario: Scenario
+    agent: str
     path: list[int]  # vertices in the order driven, the entry first
     occupied: NDArray[np.bool_]  # (n_slots,) bool, the true occupancy at the arrival
     forecast: NDArray[np.float64]  # (n_slots,) float64, the occupancy forecast at the arrival
@@ -85,13 +85,12 @@ class EpisodeRunner:
         self.scenario = scenario
         self.name = name
         self.agent = agent
-        if rig is None:
-            env = gym.make("parkenv/Search-v1", scenario=scenario)
-        else:
-            spacing = {} if every is None else {"every": every}
-            env = gym.make(
-                "parkenv/SearchPerception-v1", scenario=scenario, rig=rig, detector=detector, **spacing
-            )
+        options: dict[str, Any] = {}
+        if rig is not None:
+            options = {"rig": rig, "detector": detector} | ({} if every is None else {"every": every})
+        name_of_env = "parkenv/Search-v1" if rig is None else "parkenv/SearchPerception-v1"
+        # The environments are checked by their tests; checking each again takes as long as some searches.
+        env = gym.make(name_of_env, disable_env_checker=True, scenario=scenario, **options)
         self.env = adapt_to_agent(env, agent)
         self._routes = DriveRoutes(scenario)
 

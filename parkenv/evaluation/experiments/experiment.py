@@ -211,7 +211,7 @@ def agent_fingerprints(names: Iterable[str]) -> dict[str, str]:
 class ExperimentResult:
     """Result of an experiment."""
 
-    experiment: Experiment  # the experiment
+    experiment: Experiment
     folder: ResultFolder  # its result folder, with every finished episode
     rows: list[Row]  # one row per case with finished episodes, as in `summary.json`
     occupancy_rows: list[Row]  # the same at the occupancy levels

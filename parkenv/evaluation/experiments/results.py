@@ -18,7 +18,8 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import append_text, atomic_write
 from parkenv.files.limited_reading import csv_records, parse_json, read_json
 
-SETTING_COLUMNS = ("scenario", "occupancy_level", "agent", "failure_cost_s", "v_walk_kmh", "v_drive_kmh")
+SETTING_AXES = ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")  # of a grid, as columns
+SETTING_COLUMNS = ("scenario", "occupancy_level", "agent", *SETTING_AXES)
 EPISODE_COLUMNS = (
     *SETTING_COLUMNS,
     "seed",

@@ -78,11 +78,9 @@ class Workers:
         with ExitStack() as opened:
             if self.address is not None:
                 _require_listener(self.address)
-            with _interrupts_blocked():
-                if self.backend == "ray":
-                    self._start_ray(opened)
-                elif self.backend == "dask":
-                    self._start_dask(opened)
+            if self.backend != "loky":
+                with _interrupts_blocked():
+                    (self._start_ray if self.backend == "ray" else self._start_dask)(opened)
             self._open = opened.pop_all()
         return self
 
@@ -164,6 +162,7 @@ class Workers:
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         ray = _required("ray", "ray")
+        on_sigterm = signal.getsignal(signal.SIGTERM)
         local = {"num_cpus": self.jobs, "include_dashboard": False}
         try:
             ray.init(
@@ -174,6 +173,8 @@ class Workers:
             )
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise InputError(f"--backend ray --address {self.address}: {error}") from error
+        if signal.getsignal(signal.SIGTERM) is not on_sigterm:
+            signal.signal(signal.SIGTERM, on_sigterm)  # Ray would end this process
         opened.callback(ray.shutdown)
         self._run = _run_by_ray
         self._lost = (ray.exceptions.WorkerCrashedError, ray.exceptions.NodeDiedError)

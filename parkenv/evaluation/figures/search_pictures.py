@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.episodes import SearchTrace
+from parkenv.evaluation.experiments.results import SETTING_AXES
 from parkenv.evaluation.figures.lot_picture import BELIEF_MAP, draw_discs, draw_lot, points_per_m
 from parkenv.evaluation.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
 from parkenv.evaluation.figures.registry import ComparisonResults, Drawn, Setting
@@ -197,7 +198,7 @@ def searches(results: ComparisonResults) -> Iterator[Drawn]:
     for case, _ in results.cases:
         if case.scenario.name in results.scenarios:
             c = case.columns
-            setting = c["failure_cost_s"], c["v_walk_kmh"], c["v_drive_kmh"]
+            setting = tuple(c[name] for name in SETTING_AXES)
             settings.setdefault((c["scenario"], setting), []).append(case)
     totals = {(*_setting_of(row), row["agent"]): row["total_s"] for row in results.rows}
     for (name, setting), cases in settings.items():
@@ -214,7 +215,7 @@ def searches(results: ComparisonResults) -> Iterator[Drawn]:
 
 
 def _setting_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in ("scenario", "failure_cost_s", "v_walk_kmh", "v_drive_kmh"))
+    return tuple(row[name] for name in ("scenario", *SETTING_AXES))
 
 
 def draw_searches(traces: Sequence[SearchTrace]) -> Figure:

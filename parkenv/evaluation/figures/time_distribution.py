@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.evaluation.experiments.results import SETTING_AXES
 from parkenv.evaluation.figures.picture_files import INK, STYLE
 from parkenv.evaluation.figures.registry import ComparisonResults, Drawn, Setting
 from parkenv.evaluation.figures.time_figures import AGENT_COLORS, OTHER_AGENT
@@ -37,7 +38,7 @@ def time_distributions(results: ComparisonResults) -> Iterator[Drawn]:
         c = case.columns
         if not episodes or c["scenario"] not in results.scenarios:
             continue
-        panels = settings.setdefault((c["failure_cost_s"], c["v_walk_kmh"], c["v_drive_kmh"]), {})
+        panels = settings.setdefault(tuple(c[name] for name in SETTING_AXES), {})
         totals = panels.setdefault(c["scenario"], {})
         totals[case.label] = np.array([episode["total_s"] for episode in episodes])
         totals[BOUND] = np.array([episode["bound_s"] for episode in episodes])

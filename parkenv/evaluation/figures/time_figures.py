@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.compare import BLIND, against_occupancy
+from parkenv.evaluation.experiments.results import SETTING_AXES
 from parkenv.evaluation.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
 from parkenv.evaluation.figures.registry import ComparisonResults, Drawn
 
@@ -83,7 +84,7 @@ def times_against_map(results: ComparisonResults) -> Iterator[Drawn]:
     forecasts = results.flat_forecasts
     if not forecasts:
         return
-    setting = {c: results.rows[0][c] for c in ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")}
+    setting = {c: results.rows[0][c] for c in SETTING_AXES}
     rows = [row for row in results.rows if setting.items() <= row.items()]
     for name in dict.fromkeys(varied for varied, _ in forecasts.values()):
         probability = {flat: p for flat, (varied, p) in forecasts.items() if varied == name}
@@ -104,9 +105,7 @@ def draw_time_split(rows: Sequence[Row]) -> Figure:
     _require_rows(rows)
     panels: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
-        panels.setdefault(tuple(row[k] for k in ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")), []).append(
-            row
-        )
+        panels.setdefault(tuple(row[k] for k in SETTING_AXES), []).append(row)
     most = max(len(panel) for panel in panels.values())
     columns = 1 if len(panels) == 1 else 2 if len(panels) <= 4 else 3
     lines = -(-len(panels) // columns)

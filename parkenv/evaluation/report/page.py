@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from PIL import Image as PillowImage
 
-from parkenv.evaluation.experiments.results import Row
+from parkenv.evaluation.experiments.results import SETTING_AXES, Row
 from parkenv.evaluation.figures.picture_files import CAPTION
 from parkenv.evaluation.figures.registry import FIGURES
 from parkenv.evaluation.report.drive_recording import data_uri
@@ -121,8 +121,8 @@ def _figure(path: Path) -> str:
     caption = html.escape(image_text(path, CAPTION) or path.stem.replace("_", " "))
     if picture.width > MOST_WIDTH:
         picture = picture.resize((MOST_WIDTH, round(picture.height * MOST_WIDTH / picture.width)))
-    source, (width, height) = _webp(picture), picture.size
     white = bool((np.asarray(picture).min(axis=2) > 250).mean() > _WHITE)
+    source, (width, height) = _webp(picture, chart=white), picture.size
     return (
         f'<figure{" class=plotted" * white}><button type="button" class="enlarge" aria-label="Enlarge: {caption}">'
         f'<img src="{source}" width="{width}" height="{height}" alt="{caption}"></button>'
@@ -130,11 +130,12 @@ def _figure(path: Path) -> str:
     )
 
 
-def _webp(picture: PillowImage.Image) -> str:
-    """Encode as WebP: lossless if the result is small (charts), else lossy."""
+def _webp(picture: PillowImage.Image, *, chart: bool) -> str:
+    """Encode as WebP: charts lossless if the result is small, everything else lossy."""
     content = io.BytesIO()
-    picture.save(content, "WEBP", lossless=True)
-    if content.tell() > LOSSLESS:
+    if chart:
+        picture.save(content, "WEBP", lossless=True)
+    if not 0 < content.tell() <= LOSSLESS:
         content = io.BytesIO()
         picture.save(content, "WEBP", quality=_QUALITY)
     return data_uri("image/webp", content.getvalue())
@@ -202,9 +203,7 @@ def _survey_finding(row: Row) -> str:
 def _comparison_findings(rows: Sequence[Row]) -> list[str]:
     settings: dict[tuple[Any, ...], list[Row]] = {}
     for row in rows:
-        settings.setdefault(
-            (row["scenario"], row["failure_cost_s"], row["v_walk_kmh"], row["v_drive_kmh"]), []
-        ).append(row)
+        settings.setdefault((row["scenario"], *(row[name] for name in SETTING_AXES)), []).append(row)
     findings = []
     speeds = len({key[2:] for key in settings}) > 1
     for (name, failure, walk, drive), its in settings.items():

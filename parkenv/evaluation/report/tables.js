@@ -1,6 +1,6 @@
 // Tables: every number of the summary; click a heading, or press Enter on it, to sort.
 
-const SETTING = ["scenario", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh"];
+const SETTING = ["scenario", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh"];
 
 function sortValue(value) {
   if (Array.isArray(value)) return value[0];

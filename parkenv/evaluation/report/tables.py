@@ -103,10 +103,9 @@ _KNOWN = {
     )
 }  # fmt: skip
 _ORDER = (
-    "scenario", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh", "agent", "seed",
-    "total_s", "difference_s", "gap_to_exact", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s",
-    "gave_up_s",
-    "parked_fraction",
+    "scenario", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh", "agent",
+    "seed", "total_s", "difference_s", "gap_to_exact", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s",
+    "gave_up_s", "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""
 _TABLES_OF_THEIR_OWN = ("by_weather",)
@@ -151,7 +150,7 @@ def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False)
         same = [
             k
             for k in same
-            if values[k][0] is None or k in _ORDER[:6] or k in ("episodes", "rig", "slots", *OPTIONAL_TIMES)
+            if values[k][0] is None or k in _ORDER[:7] or k in ("episodes", "rig", "slots", *OPTIONAL_TIMES)
         ]
     shown = [k for k in keys if k not in same]
     return {

@@ -99,7 +99,7 @@ class DriveBatch:
 
     def set_state(self, state: Sequence[NDArray[Any]]) -> None:
         """Continue from a state that `get_state` returned for as many drives."""
-        for array, values in zip(self._drives, state, strict=True):
+        for array, values in zip(self.get_state(), state, strict=True):
             array[...] = values
 
     def start(self, i: int, task: PreparedTask, pose: FloatArray | None = None) -> None:

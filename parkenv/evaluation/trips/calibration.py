@@ -52,7 +52,7 @@ class Calibration:
         InputError: a value is out of range; the message names it.
     """
 
-    scenario: str  # name of the scenario
+    scenario: str
     v_drive: float  # m/s, distance on the drive graph divided by the time on the lanes
     # s, time of an attempt at a taken slot, less the time for the part of the onward route that it covers
     failure_s: float
@@ -96,8 +96,8 @@ class Calibration:
 class TripPlan:
     """Which trips to drive."""
 
-    scenario: Scenario  # the scenario
-    agent: str  # name of the agent
+    scenario: Scenario
+    agent: str
     style: DrivingStyle  # driving style
     rig: str | None = None  # name of the sensor rig; None for the scenario's sensor model
 

@@ -117,7 +117,7 @@ class Trip:
     """One trip from the entry to the goal."""
 
     seed: int  # seed of the world
-    agent: str  # name of the agent
+    agent: str
     total_s: float  # sum of the next six
     lanes_s: float  # driving on the lanes, waiting included
     manoeuvre_s: float  # from the decision to park until the car stood in the slot

@@ -32,7 +32,7 @@ class Leg(NamedTuple):
 class ParkingAttempt(NamedTuple):
     """An attempt to park."""
 
-    slot: str  # name of the slot
+    slot: str
     kind: str  # orientation of the slot to its lane
     way: str  # nose-in or back-in; empty for parallel slots and if no path was found
     seconds: float  # from the decision until the car stands in the slot, or is back on the lane

@@ -31,7 +31,7 @@ CHUNK = 25  # episodes per task of a worker
 class ParkingCase:
     """A parking task distribution on one lot."""
 
-    lot: ParkingLot  # the lot
+    lot: ParkingLot
     kinds: tuple[str, ...] | None = None  # kinds of slots; None for all kinds on the lot
     ways: tuple[str, ...] = ("nose-in", "back-in")  # orientations in perpendicular and oblique slots
     occupancy: float = 0.85  # fraction of the other slots that are occupied
