@@ -34,6 +34,7 @@ COMMANDS = {"search": "parkenv compare", "drive": "parkenv park"}
 """Commands that run the models of each task."""
 _KEY = "parkenv"
 _MAX_HEADER, _MAX_BYTES = 1_000_000, 500_000_000
+_MAX_WEIGHT = 1e6  # products of larger ones over several layers could overflow
 _ZIP = b"PK"
 
 # Bounds, so that a card cannot ask for more memory than a network of a few million weights needs.
@@ -271,7 +272,10 @@ def load_model(
         )
     try:
         policy = card.build()
-        policy.load_state_dict(import_module("safetensors.torch").load(data))
+        weights = import_module("safetensors.torch").load(data)
+        if not all(bool((w.abs() <= _MAX_WEIGHT).all()) for w in weights.values()):
+            raise InputError(f"{path}: has weights that are no numbers, or above {_MAX_WEIGHT:g}")
+        policy.load_state_dict(weights)
     except InputError:
         raise
     except Exception as error:  # torch and stable-baselines3 raise many types for weights that do not fit

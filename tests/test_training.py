@@ -295,6 +295,11 @@ def encoded(mark):
     ("spoil", "algorithm", "wanted"),
     [
         (lambda path, _: path.write_bytes(path.read_bytes()[:-2000]), "maskable-ppo", "its network cannot be read"),
+        (
+            lambda path, _: path.write_bytes(path.read_bytes()[:-4] + b"\0\0\xc0\x7f"),
+            "maskable-ppo",
+            "has weights that are no numbers",
+        ),
         (written(b""), "maskable-ppo", "no model file, or a damaged one"),
         (written(b"\xff" * 7 + b"\x00{" + b" " * 99), "maskable-ppo", "no model file, or a damaged one"),
         (written(with_header(b"{" * 300_000)), "maskable-ppo", "header: "),

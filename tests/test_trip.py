@@ -669,6 +669,10 @@ def test_trips_are_gone_on_with_where_they_were_left(tmp_path):
         TripFolder(tmp_path, settings_row)
     with pytest.raises(InputError, match="agent was 'mdp' in"):
         TripFolder(tmp_path, {"agent": "belief"}, resume=True)
+    for damaged in ('{"slots": [], "seed": 1}', lines[0].replace('"seed": 1', '"seed": "x"'), "[1]"):
+        (tmp_path / "trips.jsonl").write_text(f"{damaged.strip()}\n")
+        with pytest.raises(InputError, match=r"line 1: .* is no trip"):
+            TripFolder(tmp_path, settings_row, resume=True)
 
 
 @pytest.mark.slow

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,6 +18,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from pydantic import TypeAdapter
 from scipy import stats
 
 from parkenv.driving.parking_task import KINDS
@@ -41,6 +41,9 @@ Row = dict[str, Any]
 
 OBSERVED, UNOBSERVED = "observed", "unobserved"  # whether the agent observes slots from the lane
 BLOCK = 5  # trips per task
+MAX_VALUE = 1_000_000
+"""Maximum of each number of a calibration; sums of larger ones could overflow."""
+_TRIP = TypeAdapter(Trip)
 _FORMAT = JsonFormat("parkenv-calibration", 1, "a calibration of `parkenv calibrate`")
 
 
@@ -67,8 +70,11 @@ class Calibration:
             value = getattr(self, name)
             number = isinstance(value, int | float) and not isinstance(value, bool)
             least = "at least 0" if name in ("failure_s", "manoeuvre_s") else "above 0"
-            if not (number and math.isfinite(value) and (value >= 0.0 if "at" in least else value > 0.0)):
-                raise InputError(f"calibration {name} is {value!r}, want a finite number {least}")
+            in_range = number and (value >= 0.0 if "at" in least else value > 0.0) and value <= MAX_VALUE
+            if not in_range:
+                raise InputError(
+                    f"calibration {name} is {value!r:.60}, want a finite number {least}, at most {MAX_VALUE:,}"
+                )
 
     def applied(self, scenario: Scenario) -> Scenario:
         """Return the scenario with the measured speed and failure cost, under the same name."""
@@ -148,8 +154,13 @@ class TripFolder:
             whole, _, _ = read_text(self._file).rpartition("\n")
             for number, line in enumerate(whole.splitlines(), start=1):
                 row = parse_json(line, f"{self._file}: line {number}")
-                if not isinstance(row, dict) or not {"slots", "seed"} <= row.keys():
-                    raise InputError(f"{self._file}: line {number}: {line!r:.40} is no trip")
+                try:
+                    slots = row.pop("slots")
+                    row = {"slots": slots, **dataclasses.asdict(_TRIP.validate_python(row))}
+                    if slots not in (OBSERVED, UNOBSERVED):
+                        raise ValueError(slots)
+                except (AttributeError, KeyError, TypeError, ValueError) as error:
+                    raise InputError(f"{self._file}: line {number}: {line!r:.40} is no trip") from error
                 self.rows[row["slots"], row["seed"]] = row
         write_settings(path, settings)
         self.put_in_order()

@@ -232,9 +232,13 @@ def sensor_log(path: str | Path, lot: ParkingLot, rig: SensorRig) -> Iterator[Se
         rrb.TimePanel(state="collapsed", timeline=TIMELINE),
         collapse_panels=True,
     )
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
     with atomic_write(path) as beside:
         recording = rr.RecordingStream("parkenv", recording_id=Path(path).stem, send_properties=False)
-        recording.save(beside, default_blueprint=layout)
+        try:
+            recording.save(beside, default_blueprint=layout)
+        except RuntimeError as error:
+            raise InputError(f"{path}: cannot be written: {error}") from error
         try:
             yield SensorLog(recording, lot, rig)
         finally:
