@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import os
 import struct
 import tarfile
 import zipfile
@@ -23,6 +24,8 @@ from parkenv.files.limited_reading import (
     read_toml,
     read_yaml,
 )
+from parkenv.lots import packaged_lot
+from parkenv.mapping.store import MapStore
 
 
 def npy(descr="'<f8'", shape="(2,)", content=bytes(16), version=b"\x01\x00"):
@@ -112,6 +115,14 @@ def test_what_cannot_be_opened_is_named(tmp_path, name):
     with pytest.raises(InputError) as caught, open_limited(tmp_path / name):
         pass
     str(caught.value).encode()
+
+
+def test_a_pipe_is_refused_and_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="is a pipe, want a file"):
+        read_bytes(tmp_path / "pipe")
+    with pytest.raises(InputError, match="is no file"):
+        MapStore(tmp_path / "pipe", packaged_lot("mini"), create=False)
 
 
 def test_csv_rows_have_one_width_and_a_torn_end_is_left_out(tmp_path):

@@ -6,6 +6,7 @@ Every file that a user names is read through this module, `parkenv.files.archive
 from __future__ import annotations
 
 import csv
+import errno
 import gzip
 import io
 import json
@@ -59,6 +60,8 @@ def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]
         InputError: the file cannot be read or unpacked, or more bytes were asked for; the message names it.
     """
     try:
+        if Path(path).is_fifo():
+            raise OSError(errno.EINVAL, "is a pipe, want a file")  # opening would wait for its writer
         file = Path(path).open("rb")  # noqa: SIM115  # its own errors are caught here, those of reading below
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error

@@ -98,6 +98,8 @@ class MapStore:
         self.path, self._lot = path, lot
         if not path.exists() and not create:
             raise InputError(f"{path}: no such map file; parkenv survey makes one")
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: is no file")  # SQLite would wait for the writer of a pipe
         if path.exists() and path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: has more than {MAX_BYTES:,} bytes, the most that is read")
         # The journal of a writer that was killed is rolled back before reading, which takes writing.
