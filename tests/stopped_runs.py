@@ -111,8 +111,11 @@ def result_of(name, out):
         return rows, summary["rows"][0]["occupancy_mae"]
     if name == "calibrate":
         return (out / "calibrated.json").read_bytes()
+    # Weights come after the header, whose length is in the first 8 bytes, and which names the command line.
     models = [(out / f"seed_{seed}" / MODEL).read_bytes() for seed in (0, 1)]
-    return models, [row["total_s"] for row in summary["rows"]]
+    return [m[8 + int.from_bytes(m[:8], "little") :] for m in models], [
+        row["total_s"] for row in summary["rows"]
+    ]
 
 
 def trial(name, number, moment, folder, unbroken):
