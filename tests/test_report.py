@@ -348,3 +348,9 @@ def test_a_survey_is_driven_again(tmp_path):
 def test_data_without_replays_are_valid_too(tmp_path):
     run = RunFolder.read(summary_in(tmp_path))
     jsonschema.validate(page_data(run, notes=["a"]), json.loads(SCHEMA.read_text(encoding="utf-8")))
+
+
+def test_a_table_of_a_run_holds_what_json_can(tmp_path):
+    (tmp_path / "sessions.csv").write_text("weather,recall,precision\nrain,nan,0.5\n")
+    table = RunFolder(tmp_path, {}, (), "survey").table("sessions.csv")
+    assert table == [{"weather": "rain", "recall": None, "precision": 0.5}]

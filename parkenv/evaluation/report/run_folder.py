@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,7 +107,7 @@ class RunFolder:
         return totals
 
     def table(self, name: str) -> list[Row]:
-        """Read the rows of a CSV file in the folder, with numbers converted; empty without the file."""
+        """Read the rows of a CSV file in the folder, numbers converted (None: not finite); empty without it."""
         file = self.path / name
         if not file.exists():
             return []
@@ -123,6 +124,7 @@ def _value(column: str, text: str) -> Any:
 
 def _number(text: str) -> Any:
     try:
-        return float(text)
+        number = float(text)
     except ValueError:
         return text
+    return number if math.isfinite(number) else None
