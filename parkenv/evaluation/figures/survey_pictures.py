@@ -78,7 +78,7 @@ def save_detections(result: SessionResult, path: Path) -> None:
             ("a car's side", SIDE_COLOR, 2.0), ("front or rear", END_COLOR, 2.0), ("no distance", UNRANGED_COLOR, 1.0),
         )  # fmt: skip
         handles = [
-            Patch(fill=False, edgecolor=np.array(color) / 255, linewidth=width, label=name)
+            Patch(fill=False, edgecolor="#{:02x}{:02x}{:02x}".format(*color), linewidth=width, label=name)
             for name, color, width in kinds
         ]
         note = Line2D(
@@ -196,7 +196,9 @@ def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Pa
 def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, title: str, path: Path) -> None:
     """Draw the map's prediction for every slot (T Fig. 4.6), and the true probabilities if known."""
     with mpl.rc_context(STYLE):
-        panels = [("what the map says", "P(taken)", BELIEF_MAP, predicted.p_occupied)]
+        panels: list[tuple[str, str, Colormap, FloatArray]] = [
+            ("what the map says", "P(taken)", BELIEF_MAP, predicted.p_occupied)
+        ]
         if true is not None:
             panels.append(("the truth", "P(taken)", BELIEF_MAP, true))
         width = predicted.high - predicted.low
@@ -219,7 +221,7 @@ def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:
     draw_lot(lot, ax, slot_color=color)
     for corners in lot.slot_corners()[wrong]:
         ax.fill(*corners.T, fill=False, edgecolor=WRONG, linewidth=2.0, zorder=4)
-    names = {"taken": TAKEN, "free": FREE, "never in view": UNKNOWN}
+    names: dict[str, Any] = {"taken": TAKEN, "free": FREE, "never in view": UNKNOWN}
     handles = [Patch(color=c, label=name) for name, c in names.items()]
     handles.append(Patch(fill=False, edgecolor=WRONG, linewidth=2.0, label=f"wrong ({wrong.sum()})"))
     _draw_key(ax, handles)
