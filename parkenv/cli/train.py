@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -203,9 +204,11 @@ def _train_all(
     def update_bars() -> None:
         while not over.is_set():
             for k, bar in bars.items():
-                if curve := read_curve(out / f"seed_{k}" / CURVE):
-                    last = curve[-1]
-                    progress.update(bar, completed=last["steps"], score=task.score_text(last))
+                # The training itself reports a damaged curve.
+                with suppress(InputError):
+                    if curve := read_curve(out / f"seed_{k}" / CURVE):
+                        last = curve[-1]
+                        progress.update(bar, completed=last["steps"], score=task.score_text(last))
             over.wait(2.0)
 
     watcher = threading.Thread(target=update_bars, daemon=True)

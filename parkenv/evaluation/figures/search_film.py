@@ -254,7 +254,7 @@ class SearchFilm(Observer):
         cv2.rectangle(panel, (6, 6), (6 + 136, 6 + 20), INK, cv2.FILLED)
         write_text(panel, "camera, detected cars", (11, 20), WHITE, 12, 500)
         left = width + 28
-        x = write_text(panel, f"{self._name}:", (left, 28), INK, 16, 700) + 12
+        x = write_text(panel, f"agent {self._name}:", (left, 28), INK, 16, 700) + 12
         for key, (name, color) in TIME_COLORS.items():
             if key in OPTIONAL_TIMES and not parts[key]:
                 continue
@@ -277,7 +277,7 @@ class SearchFilm(Observer):
         car(left, 63, CAR, INK)
         words("the searching car", left + 38, 63)
         car(right, 63, PARKED_CAR, GLASS)
-        words("a parked car", right + 38, 63)
+        words("a parked car, hidden until seen", right + 38, 63)
         cv2.line(panel, (left, 88), (left + 22, 88), INK, 2, cv2.LINE_AA)
         fill_disc(panel, np.array([left + 22.0, 88.0]), 5.0, INK)
         words("its plan", left + 38, 93)

@@ -33,7 +33,7 @@ def save_checkpoint(path: Path, model: Any, curve: list[Row]) -> None:
     buffer = getattr(model, "replay_buffer", None)
     state = {
         "format": _FORMAT,
-        "curve": [{n: int(v) if n == "steps" else float(v) for n, v in row.items()} for row in curve],
+        "curve": _plain(curve),
         "numbers": _numbers(model),
         "parameters": model.get_parameters(),
         "variables": {name: getattr(model, name).detach() for name in _variables(model)},
@@ -66,7 +66,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Any], list[Row]]:
         state = torch.load(path, map_location="cpu", weights_only=True)
         if state["format"] != _FORMAT:
             raise ValueError(f"its format is {state['format']!r}, want {_FORMAT!r}")
-        return state, state["curve"]
+        return state, _plain(state["curve"])
     except Exception as error:  # torch raises many types for damaged files
         raise InputError(
             f"{path}: no checkpoint of this version, or a damaged one ({error}); train again with --overwrite"
@@ -98,10 +98,18 @@ def restore(state: Mapping[str, Any], model: Any) -> None:
         model.action_space.np_random.bit_generator.state = actions
         np.random.set_state(draws)  # noqa: NPY002
         torch.set_rng_state(state["random"][2])
-    except (KeyError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+    except (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         raise InputError(
             f"the checkpoint does not fit this training ({error}); train again with --overwrite"
         ) from error
+
+
+def _plain(curve: list[Row]) -> list[Row]:
+    """Return evaluations with Python's numbers, each with its `steps`."""
+    return [
+        {"steps": int(row["steps"])} | {name: float(row[name]) for name in row if name != "steps"}
+        for row in curve
+    ]
 
 
 def _numbers(model: Any) -> dict[str, Any]:
