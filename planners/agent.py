@@ -155,6 +155,8 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
     Raises:
         InputError: an unknown name or option; the message lists the known ones.
     """
+    if not isinstance(name, str):
+        raise InputError(f"agent is {name!r:.60}, want a name, such as 'mdp'")
     before, colon, after = name.partition(":")
     if colon and before in ALGORITHMS:
         if options:
@@ -182,7 +184,16 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
     for option in options:
         if option not in known:
             raise InputError(f"agent {name!r} has no option {option!r}; {nearest(option, known)}")
-    return agent(scenario, **options)
+    try:
+        return agent(scenario, **options)
+    except InputError:
+        raise
+    except Exception as error:
+        # A user's class may raise anything, ours if the value of an option has a wrong type.
+        if not colon and not options:
+            raise
+        given = ", ".join(f"{option}={value!r:.60}" for option, value in options.items())
+        raise InputError(f"{name}({given}) cannot be made: {type(error).__name__}: {error}") from error
 
 
 def shown_name(name: str) -> str:

@@ -2,6 +2,7 @@
 
 import errno
 import re
+import shlex
 import subprocess
 from pathlib import Path
 
@@ -33,6 +34,13 @@ def test_a_full_disk_is_no_error_of_ours(monkeypatch):
     monkeypatch.setattr("parkenv.lots.load_lot", failing(OSError(errno.ENOSPC, "No space left on device")))
     ended = parkenv("lot", "show", "mini")
     assert (ended.returncode, ended.stderr) == (2, "parkenv: error: No space left on device\n")
+
+
+def test_closed_streams_do_not_stop_a_command(tmp_path):
+    shown = tmp_path / "mini.png"
+    command = shlex.join([*PARKENV, "lot", "show", "mini", "--out", str(shown)])
+    assert subprocess.run(f"{command} >&- 2>&-", shell=True).returncode == 0
+    assert shown.exists()
 
 
 def test_a_reader_that_ends_is_not_complained_about():

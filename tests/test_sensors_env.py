@@ -140,6 +140,7 @@ def test_frames_show_the_camera_beside_the_lot():
         ({"captures": 0}, "captures is 0, want a whole number of at least 1"),
         ({"every": float("nan")}, "every is nan m"),
         ({"traffic": 5}, "traffic is a int, want a Traffic"),
+        ({"arrival": "08:00"}, "arrival is '08:00', want an ArrivalWindow"),
     ],
 )
 def test_bad_arguments_are_named(options, words):

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import errno
 import io
+import os
 import re
 import sys
 import tempfile
 import traceback
 import warnings
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -97,6 +99,8 @@ MAX_MESSAGE = 1_500
 
 def main() -> None:
     """Entry point; exit codes: 2 for invalid input, 70 for an error of parkenv's own, 128 + n after signal n."""
+    # Both are None where they are closed.
+    sys.stdout, sys.stderr = (s or Path(os.devnull).open("w") for s in (sys.stdout, sys.stderr))  # noqa: SIM115
     if isinstance(sys.stdout, io.TextIOWrapper):
         # Names may hold what the terminal cannot show.
         sys.stdout.reconfigure(errors="backslashreplace")

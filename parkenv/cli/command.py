@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 import textwrap
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -28,6 +29,11 @@ from parkenv.cli import arguments as args
 from parkenv.cli.completion import COMPLETERS, NAMES
 from parkenv.errors import InputError, nearest
 
+if sys.flags.optimize > 1:
+    sys.stderr.write(
+        "parkenv: error: its help is made from docstrings; run it without PYTHONOPTIMIZE=2 and -OO\n"
+    )
+    sys.exit(2)
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 _HEADING = re.compile(r"^([A-Z][\w ,]*):$", re.MULTILINE)
 _ENTRY = re.compile(r"(\w+)((?:, -\w)?)(?: \(([^)]*)\))?: (.*)")

@@ -174,6 +174,8 @@ class Scenario(SearchProblem):
             _require_index("entry", self.entry, len(self.lot.entries))
         if not isinstance(self.traffic, Traffic):
             raise InputError(f"traffic is a {type(self.traffic).__name__}, want a Traffic")
+        if not isinstance(self.arrival, ArrivalWindow):
+            raise InputError(f"arrival is {self.arrival!r:.60}, want an ArrivalWindow")
         for name in ("occupancy", "prior"):
             model = getattr(self, name)
             if model is not None and model.n_slots != self.lot.n_slots:
