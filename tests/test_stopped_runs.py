@@ -78,11 +78,13 @@ def test_runs_stopped_at_random_moments(name, number):
 
 
 def test_ctrl_c_while_modules_are_imported_is_quiet(tmp_path):
+    """On a fast machine the command has begun its work at the last moment, and says where that is."""
     for moment in (0.1, 0.4, 0.7):
         run = Run("compare", tmp_path / "out")
         time.sleep(moment)
         code, output, errors = run.stop(signal.SIGINT)
-        assert (code in (-signal.SIGINT, 130), output, errors) == (True, "", "")
+        assert (code in (-signal.SIGINT, 130), errors) == (True, "")
+        assert output == "" or output.startswith(("Searching", "Interrupted."))
 
 
 @pytest.mark.parametrize("thread", ["main", "other"])
