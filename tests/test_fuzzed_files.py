@@ -356,6 +356,7 @@ FOUND = [
     ("summary.json", json.dumps(SUMMARY).replace("30.0", "1e999").encode()),
     ("settings.json", json.dumps({"seed": "x" * 5000}).encode()),
     ("map.yml", b"PARKING_AREAS: {A: {areas: [{shape: [2, 2015-11-12]}]}}"),
+    ("experiment.json", json.dumps({"kind": "compare", "agents": ["mdp"], "scenarios": ["x" * 5000]}).encode()),
 ]  # fmt: skip
 """Variants that were found to end in a traceback, or in pages of text."""
 

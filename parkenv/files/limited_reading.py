@@ -52,6 +52,14 @@ class _Counted(io.RawIOBase):
         return len(data)
 
 
+def is_there(path: str | Path) -> bool:
+    """Whether there is such a file or folder; False for what cannot be a path, such as a name of 10,000 letters."""
+    try:
+        return Path(path).exists()
+    except (OSError, ValueError):
+        return False
+
+
 @contextmanager
 def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]:
     """Open a file for reading at most `most` bytes; a name that ends in `.gz` is unpacked.

@@ -24,7 +24,7 @@ from pydantic_core import CoreSchema, ErrorDetails
 
 from parkenv.errors import InputError, nearest
 from parkenv.files.atomic_write import atomic_write
-from parkenv.files.limited_reading import MAX_SPEC_BYTES, read_json, read_toml
+from parkenv.files.limited_reading import MAX_SPEC_BYTES, is_there, read_json, read_toml
 
 _SHOWN = 60
 _FOLDER = "folder"
@@ -54,7 +54,7 @@ def _resolved(value: object, info: ValidationInfo) -> object:
         return value
     folder = (info.context or {}).get(_FOLDER, Path())
     path = (Path(folder) / Path(value).expanduser()).absolute()
-    if not path.is_file():
+    if not (is_there(path) and path.is_file()):
         raise ValueError(f"a file; there is none at {path}")
     return path
 

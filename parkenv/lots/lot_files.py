@@ -6,6 +6,7 @@ from importlib import resources
 from pathlib import Path
 
 from parkenv.errors import InputError
+from parkenv.files.limited_reading import is_there
 from parkenv.files.names import PACKAGED_LOTS
 from parkenv.lots.dragon_lake import dragon_lake_lot
 from parkenv.lots.file_formats import LotFormat, lot_format
@@ -30,7 +31,7 @@ def load_lot(name_or_path: str | Path) -> ParkingLot:
     if str(name_or_path) in PACKAGED_LOTS:
         return packaged_lot(str(name_or_path))
     path = Path(name_or_path)
-    if not path.exists():
+    if not is_there(path):
         raise InputError(f"{path}: no such file, nor a packaged lot ({', '.join(PACKAGED_LOTS)})")
     return read_lot(path)
 

@@ -11,6 +11,7 @@ from typing import Annotated, Self
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from parkenv.errors import InputError, nearest
+from parkenv.files.limited_reading import is_there
 from parkenv.files.names import (
     LOT_SUFFIXES,
     PACKAGED_LOTS,
@@ -342,7 +343,7 @@ def scenario_spec(source: str | Path) -> ScenarioSpec:
     path = Path(source)
     if path.suffix in LOT_SUFFIXES and path.suffix != ".json":
         return ScenarioSpec.parse({"name": path.stem, "lot": str(path)}, str(path))
-    if path.suffix in (".toml", ".json") or path.exists():
+    if path.suffix in (".toml", ".json") or is_there(path):
         return ScenarioSpec.read(path)
     raise InputError(
         f"unknown scenario {str(source)!r}, and no such file; {nearest(str(source), SCENARIO_NAMES)}"
