@@ -27,7 +27,7 @@ print(f"{lot.n_slots} slots")
 with tempfile.TemporaryDirectory() as folder:
     file = Path(folder) / "map.sqlite"
     settings = SurveySettings(every=2.5, windows=(world.arrival,), seed=1)
-    run = run_survey(world, settings, 3, file, pictures=0)
+    run = run_survey(world, settings, 3, file)
     surveyed = summarize(world, settings, run, file)
     with MapStore(file, lot, create=False) as store:
         log = store.log()
