@@ -118,7 +118,7 @@ STAGES = (
             "tests/test_search_env.py::test_every_id_passes_the_checker_without_a_warning[mini-parkenv/Search-v1]" \\
             tests/test_compare.py::test_figures_and_occupancy_levels \\
             tests/test_survey.py::test_survey_and_map_on_the_command_line \\
-            tests/test_training.py::test_every_algorithm_trains_a_model_that_searches
+            tests/test_training.py::test_a_resumed_training_equals_an_unbroken_one
         """,
         needs=("oldest versions: install", "README: tests"),
         cores=CORES,
