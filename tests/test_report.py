@@ -13,7 +13,7 @@ from command_line import parkenv
 from parkenv import InputError, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.cli.arguments import Machines
-from parkenv.cli.report import make_report
+from parkenv.cli.report import Replays, make_report
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.results import episode_key
 from parkenv.evaluation.report.page import SCHEMA, page_data
@@ -112,7 +112,7 @@ def test_the_same_folder_gives_the_same_page(run, tmp_path):
 
 def test_searches_can_be_chosen(run, tmp_path):
     made = tmp_path / "chosen.html"
-    make_report(run, Machines(jobs=1), replay="9,8", agents="belief,oracle", out=made)
+    make_report(run, Machines(jobs=1), Replays(replay="9,8", agents="belief,oracle"), out=made)
     worlds = data_of(made)["worlds"]
     assert [w["seed"] for w in worlds] == [9, 9, 8, 8]
     assert {s["agent"] for w in worlds for s in w["searches"]} == {"belief", "oracle"}
@@ -127,7 +127,7 @@ def test_searches_can_be_chosen(run, tmp_path):
 )
 def test_what_is_not_in_the_run_cannot_be_chosen(run, tmp_path, options, message):
     with pytest.raises(InputError, match=re.escape(message)):
-        make_report(run, Machines(), out=tmp_path / "x.html", **options)
+        make_report(run, Machines(), Replays(**options), out=tmp_path / "x.html")
     assert not list(tmp_path.iterdir())
 
 
@@ -341,7 +341,7 @@ def test_a_survey_is_driven_again(tmp_path):
     assert (out / "report.html").stat().st_size < 10e6
 
     made = tmp_path / "short.html"
-    make_report(out, Machines(jobs=1), frames=6, sessions=2, out=made)
+    make_report(out, Machines(jobs=1), Replays(frames=6, sessions=2), out=made)
     assert [len(d["frames"]) <= 4 for d in data_of(made)["drives"]] == [True, True]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,14 +22,33 @@ EPISODES, SENSED = 20, 4
 """Default number of replayed searches: in general, and with rendered sensors at every step."""
 
 
+@dataclass(frozen=True)
+class Replays:
+    """What a page replays.
+
+    Options:
+        episodes, -n (N >= 0): About how many episodes to replay, all agents together.  [default: 20; through simulated
+            sensors 4]
+        replay (SEED[,...]): Replay the episodes with these seeds.
+        agents (NAME[,...]): Replay only these agents.
+        sessions (N >= 0): Survey drives to replay.
+        frames (2 <= N <= 250): Captures of them to keep, all drives together.
+    """
+
+    episodes: int | None = None
+    replay: str | None = None
+    agents: str | None = None
+    sessions: int = 1
+    frames: int = 120
+
+
+REPLAYS = Replays()
+
+
 def report(
     run: Path,
     /,
-    episodes: int | None = None,
-    replay: str | None = None,
-    agents: str | None = None,
-    sessions: int = 1,
-    frames: int = 120,
+    replays: Replays,
     out: Path | None = None,
     *,
     trust: bool = False,
@@ -46,36 +66,16 @@ def report(
 
     Options:
         run (DIR): Folder of compare, survey, demo, train or another command.
-        episodes, -n (N >= 0): About how many episodes to replay, all agents together.  [default: 20; through simulated
-            sensors 4]
-        replay (SEED[,...]): Replay the episodes with these seeds.
-        agents (NAME[,...]): Replay only these agents.
-        sessions (N >= 0): Survey drives to replay.
-        frames (2 <= N <= 250): Captures of them to keep, all drives together.
         out, -o (FILE.html): The page.  [default: DIR/report.html]
     """
-    make_report(
-        run,
-        machines,
-        episodes=episodes,
-        replay=replay,
-        agents=agents,
-        sessions=sessions,
-        frames=frames,
-        out=out,
-        trust=trust,
-    )
+    make_report(run, machines, replays, out=out, trust=trust)
 
 
 def make_report(
     folder: Path,
     machines: args.Machines | Workplace,
+    replays: Replays = REPLAYS,
     *,
-    episodes: int | None = None,
-    replay: str | None = None,
-    agents: str | None = None,
-    sessions: int = 1,
-    frames: int = 120,
     out: Path | None = None,
     drives: Sequence[dict[str, Any]] | None = None,
     stage: str = "Running again",
@@ -83,8 +83,8 @@ def make_report(
 ) -> Path:
     """Write the page, and return its path.
 
-    The arguments are those of `report`; `drives` are survey drives that are already recorded (None: `sessions` of them
-    are driven again), and `stage` describes the progress bar.
+    The arguments are those of `report`; `drives` are survey drives that are already recorded (None: `replays.sessions`
+    of them are driven again), and `stage` describes the progress bar.
 
     Raises:
         InputError: the folder holds no finished run of this version, not the chosen searches, or names classes that
@@ -113,17 +113,17 @@ def make_report(
         # The page still has tables and figures.
         notes.append(f"There is no replay: {error}")
     sensed = any(case.rig is not None for case, _ in repeated.cases)
-    wanted = episodes if episodes is not None else SENSED if sensed else EPISODES
-    cases, too_large = drawable(_chosen(repeated.cases, replay, agents))
+    wanted = replays.episodes if replays.episodes is not None else SENSED if sensed else EPISODES
+    cases, too_large = drawable(_chosen(repeated.cases, replays.replay, replays.agents))
     notes += too_large
     encounters = choose(cases, wanted) if wanted else []
-    again = range(min(sessions, repeated.sessions) if drives is None else 0)
+    again = range(min(replays.sessions, repeated.sessions) if drives is None else 0)
     counted = run.totals()
     tasks: list[Callable[[], dict[str, Any]]] = []
     for encounter in encounters:
         keys = [case.key(encounter.seed) for case in encounter.cases]
         tasks.append(partial(record, encounter, {k: counted[k] for k in keys if k in counted}))
-    tasks += [partial(repeated.drive, number, frames // max(len(again), 1)) for number in again]
+    tasks += [partial(repeated.drive, number, replays.frames // max(len(again), 1)) for number in again]
     with args.workers_of(machines) as workers, progress_bar(console) as progress:
         bar = progress.add_task(stage, total=len(tasks))
         done: list[dict[str, Any]] = []

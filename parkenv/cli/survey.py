@@ -199,12 +199,9 @@ def show_map(
         confidence (P): Of the interval, 0 to 1.
         out, -o (DIR): Folder for map.png, slots.csv, summary.json.  [default: none]
     """
-    import csv
-    import io
-
     from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.figures.survey_pictures import save_map
-    from parkenv.files.atomic_write import atomic_write
+    from parkenv.files.csv_writing import write_csv
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
     from parkenv.scenarios.build import build
@@ -247,11 +244,6 @@ def show_map(
         return
     make_folder(out)
     save_map(its.lot, found, None, f"{its.name}, {when}", out / "map.png")
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    with atomic_write(out / "slots.csv") as beside:
-        beside.write_text(text.getvalue(), encoding="utf-8")
+    write_csv(out / "slots.csv", list(rows[0]), rows)
     save_summary(out, None, rows)
     console.print(f"Written: {out / 'map.png'}, slots.csv, summary.json")

@@ -6,8 +6,6 @@ of its decisions to `timings.csv`. `summary.json` is written at the end.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,6 +14,7 @@ from typing import Any
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import append_text, atomic_write
+from parkenv.files.csv_writing import csv_text, write_csv
 from parkenv.files.limited_reading import csv_records, parse_json, read_json
 
 SETTING_AXES = ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")  # of a grid, as columns
@@ -188,8 +187,8 @@ class ResultFolder:
         (path / SUMMARY).unlink(missing_ok=True)
         write_settings(path, settings)
         # Rewrite the readable lines: this drops a line truncated by a crash, and its episode runs again.
-        _write_text(path / "episodes.csv", _csv_text(EPISODE_COLUMNS, self.episodes.values(), header=True))
-        _write_text(path / "timings.csv", _csv_text(TIMING_COLUMNS, self._timings.values(), header=True))
+        write_csv(path / "episodes.csv", EPISODE_COLUMNS, self.episodes.values())
+        write_csv(path / "timings.csv", TIMING_COLUMNS, self._timings.values())
 
     def add(self, rows: Sequence[Row], timings: Sequence[Row]) -> None:
         """Append finished episodes, and flush them to disk."""
@@ -197,8 +196,8 @@ class ResultFolder:
         self._timings |= {episode_key(r): r for r in timings}
         self.episodes |= {episode_key(r): r for r in rows}
         # Timings before episodes: an episode in `episodes.csv` is finished, and would not run again for its timing.
-        append_text(self.path / "timings.csv", _csv_text(TIMING_COLUMNS, timings))
-        append_text(self.path / "episodes.csv", _csv_text(EPISODE_COLUMNS, rows))
+        append_text(self.path / "timings.csv", csv_text(TIMING_COLUMNS, timings))
+        append_text(self.path / "episodes.csv", csv_text(EPISODE_COLUMNS, rows))
 
     def decision_s(self, key: Key) -> list[float]:
         """Return the wall times of an episode's decisions, s; empty if a crash lost them."""
@@ -215,8 +214,8 @@ class ResultFolder:
         wanted |= dict.fromkeys(self.episodes)
         rows = [self.episodes[key] for key in wanted]
         timings = [self._timings[key] for key in wanted if key in self._timings]
-        _write_text(self.path / "episodes.csv", _csv_text(EPISODE_COLUMNS, rows, header=True))
-        _write_text(self.path / "timings.csv", _csv_text(TIMING_COLUMNS, timings, header=True))
+        write_csv(self.path / "episodes.csv", EPISODE_COLUMNS, rows)
+        write_csv(self.path / "timings.csv", TIMING_COLUMNS, timings)
         (self.path / SUMMARY_PARTIAL).unlink(missing_ok=True)
         write_summary(self.path, summary, SUMMARY if complete else SUMMARY_PARTIAL)
 
@@ -224,15 +223,6 @@ class ResultFolder:
 def _write_text(path: Path, text: str) -> None:
     with atomic_write(path) as beside:
         beside.write_text(text, encoding="utf-8")
-
-
-def _csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]], *, header: bool = False) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    if header:
-        writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()
 
 
 def _read(path: Path, columns: Sequence[str]) -> list[Row]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +15,7 @@ from numpy.typing import NDArray
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.spec import BUSY, SurveySpec
 from parkenv.evaluation.experiments.workers import HERE, Workers
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.csv_writing import write_csv
 from parkenv.files.limited_reading import csv_records
 from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
 from parkenv.mapping.inference import SessionLog, predict
@@ -148,7 +146,7 @@ def run_survey(
         ):
             row = session_row(result)
             rows[row["key"]] = row
-            _write_rows(table, list(rows.values()))
+            write_csv(table, SESSION_COLUMNS, list(rows.values()))
             if not store.has(row["key"]):
                 store.add(result.session)
             if number == 0:
@@ -337,12 +335,3 @@ def _read_rows(path: Path) -> list[Row]:
         except ValueError as error:
             raise InputError(f"{path}: line {line}: {error}") from error
     return rows
-
-
-def _write_rows(path: Path, rows: Sequence[Row]) -> None:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, SESSION_COLUMNS, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    with atomic_write(path) as beside:
-        beside.write_text(text.getvalue(), encoding="utf-8")

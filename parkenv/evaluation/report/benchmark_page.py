@@ -54,11 +54,11 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
         }
         for agent, searches in result["episodes"].items():
             score: list[float | None] = list(score_interval(searches))
-            lines.append([agent, score, *(times[agent, task] for task in tasks), *_told(result).values()])
+            lines.append([agent, score, *(times[agent, task] for task in tasks), *_origin(result).values()])
     lines.sort(key=lambda line: -line[1][0])  # type: ignore[index, operator]
-    details = [{**row, **_told(result)} for result in results for row in result["rows"]]
+    details = [{**row, **_origin(result)} for result in results for row in result["rows"]]
     commands: list[list[Cell]] = [
-        [", ".join(r["episodes"]), shlex.join(r["command"]), *_told(r).values()] for r in results
+        [", ".join(r["episodes"]), shlex.join(r["command"]), *_origin(r).values()] for r in results
     ]
     return {
         "format": FORMAT,
@@ -88,7 +88,7 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
     }  # fmt: skip
 
 
-def _told(result: Row) -> Row:
+def _origin(result: Row) -> Row:
     return {column.key: result[column.key] for column in _WHO}
 
 

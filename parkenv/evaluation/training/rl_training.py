@@ -6,11 +6,8 @@ Subclasses of `Training` define the task and its score: `parkenv.evaluation.trai
 
 from __future__ import annotations
 
-import csv
-import io
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,6 +21,7 @@ from parkenv.errors import InputError
 from parkenv.evaluation.training.checkpoint import read_checkpoint, restore, save_checkpoint
 from parkenv.evaluation.training.configs import TrainingConfig
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.csv_writing import write_csv
 from parkenv.files.limited_reading import csv_records
 from planners.model_file import algorithm_class, save_model
 
@@ -163,7 +161,7 @@ class Trained:
     def save(self, folder: Path) -> None:
         """Write both files to a folder."""
         folder.mkdir(parents=True, exist_ok=True)
-        write_curve(folder / CURVE, self.curve)
+        write_csv(folder / CURVE, list(self.curve[0]), self.curve)
         with atomic_write(folder / MODEL) as beside:
             beside.write_bytes(self.model)
 
@@ -210,20 +208,10 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
             save_model(
                 model, self.folder / MODEL, results=scores, command=subject.command, **subject.description()
             )
-        write_curve(self.folder / CURVE, self.curve)
+        write_csv(self.folder / CURVE, list(self.curve[0]), self.curve)
         # Last: a training that is killed before this line repeats what it has just done.
         save_checkpoint(self.folder / CHECKPOINT, model, self.curve)
         return scores
-
-
-def write_curve(path: Path, curve: Sequence[Mapping[str, Any]]) -> None:
-    """Write evaluations as CSV."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(curve[0]) if curve else [], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(curve)
-    with atomic_write(path) as beside:
-        beside.write_text(text.getvalue(), encoding="utf-8")
 
 
 def read_curve(path: Path) -> list[Row]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -18,7 +17,7 @@ from parkenv.envs.drive import DriveEnv
 from parkenv.envs.drive_state import DriveState
 from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.evaluation.simulate import Observer, Step, simulate
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.csv_writing import write_csv
 from parkenv.world.lot import ParkingLot
 from planners.agent import Agent
 from planners.driving.parking import ParkingMemory
@@ -181,10 +180,7 @@ def parking_table(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 def write_parkings(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Write rows of parkings as CSV, atomically."""
     columns = list(dict.fromkeys(name for row in rows for name in row))
-    with atomic_write(path) as beside, beside.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(path, columns, rows)
 
 
 def _summary(kind: str, way: str, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
