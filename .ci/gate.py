@@ -115,7 +115,7 @@ STAGES = (
         oldest=("$SCRATCH/oldest/bin/pytest" -p no:cacheprovider -W ignore::DeprecationWarning)
         "${oldest[@]}" --collect-only -qq
         "${oldest[@]}" -n auto tests/test_{compilation,lot,lot_files,mapping,figures,hog,drive_env}.py \\
-            "tests/test_search_env.py::test_every_id_passes_the_checker_without_a_warning[mini-parkenv/Search-v1]" \\
+            "tests/test_search_env.py::test_every_id_passes_the_checker_without_a_warning[mini-parkenv/Search-v2]" \\
             tests/test_compare.py::test_figures_and_occupancy_levels \\
             tests/test_survey.py::test_survey_and_map_on_the_command_line \\
             tests/test_training.py::test_a_resumed_training_equals_an_unbroken_one

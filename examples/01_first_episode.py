@@ -6,7 +6,7 @@ import parkenv
 from planners import make_agent
 
 scenario = parkenv.make_scenario("campus")
-env = gym.make("parkenv/Search-v1", scenario=scenario, render_mode="ansi")
+env = gym.make("parkenv/Search-v2", scenario=scenario, render_mode="ansi")
 agent = make_agent("mdp", scenario)
 
 observation, info = env.reset(seed=7)

@@ -14,7 +14,7 @@ GAMMA, LAMBDA, CLIP, ENTROPY, VALUE, LEARNING_RATE, SCALE = 0.999, 0.95, 0.2, 0.
 
 torch.manual_seed(0)
 envs = gym.make_vec(
-    "parkenv/Search-v1", ENVS, vectorization_mode="vector_entry_point", scenario="mini", observation="local",
+    "parkenv/Search-v2", ENVS, vectorization_mode="vector_entry_point", scenario="mini", observation="local",
     max_episode_steps=500, autoreset_mode=AutoresetMode.SAME_STEP,
 )  # fmt: skip
 n_inputs, n_actions = envs.single_observation_space["local"].shape[0], envs.single_action_space.n

@@ -76,12 +76,12 @@ def __getattr__(name: str) -> Any:
 
 for _name, _entry_point, _vector_entry_point in (
     (
-        "parkenv/Search-v1",
+        "parkenv/Search-v2",
         "parkenv.envs.search:SearchEnv",
         "parkenv.envs.search_vector:ParkSearchVectorEnv",
     ),
-    ("parkenv/SearchSensors-v1", "parkenv.envs.sensors:SearchSensorsEnv", None),
-    ("parkenv/SearchPerception-v1", "parkenv.envs.perception:SearchPerceptionEnv", None),
+    ("parkenv/SearchSensors-v2", "parkenv.envs.sensors:SearchSensorsEnv", None),
+    ("parkenv/SearchPerception-v2", "parkenv.envs.perception:SearchPerceptionEnv", None),
 ):
     if _name not in registry:
         register(

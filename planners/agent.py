@@ -55,7 +55,7 @@ class PlanPreview:
 
 
 class SearchAgent(ABC, Generic[Memory]):
-    """Base class of the agents for `parkenv/Search-v1`.
+    """Base class of the agents for `parkenv/Search-v2`.
 
     A subclass decides on one observation at a time, from the belief that the observation contains; this class handles
     batches. An agent object does not change: the memory of an episode is in `state`, so one object can serve many
@@ -86,7 +86,7 @@ class SearchAgent(ABC, Generic[Memory]):
         """Choose actions for one observation or a batch with a leading axis (stable-baselines3's interface).
 
         Args:
-            observation: from `parkenv/Search-v1` or a vector of them.
+            observation: from `parkenv/Search-v2` or a vector of them.
             state: returned by the previous call; None at the start.
             episode_start: for each environment, whether its episode has just begun. With None, episodes begin where
                 `state` is None.

@@ -1,4 +1,4 @@
-"""The search of `parkenv/Search-v1` in plain Python: the specification that the compiled kernels must agree with."""
+"""The search of `parkenv/Search-v2` in plain Python: the specification that the compiled kernels must agree with."""
 
 import math
 
@@ -148,7 +148,7 @@ class ReferenceSearch:
             self.set_belief(slot, taken, if_taken * p / evidence if evidence > 0.0 else float(taken))
 
     def observation(self):
-        """What `parkenv/Search-v1` should observe."""
+        """What `parkenv/Search-v2` should observe."""
         return {
             "vertex": self.vertex,
             "time": np.array([self.time, self.time - self.arrival.time]),

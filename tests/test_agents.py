@@ -69,7 +69,7 @@ def test_an_agent_of_your_own_is_named_by_module_and_class(tmp_path, monkeypatch
     scenario = make_scenario("mini")
     agent = make_agent("my_agents:Parker", scenario)
     assert not hasattr(agent.given, "occupancy")  # it must not know the occupancy
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     action, _ = agent.predict(env.reset(seed=0)[0])
     assert action == 4
     assert make_agent("my_agents:Parker", scenario, action=3).action == 3
@@ -117,7 +117,7 @@ def test_agents_get_the_public_part_of_a_scenario_only(name):
 def test_a_batch_of_observations_gives_the_actions_of_the_single_ones(name):
     scenario = make_scenario("campus")
     agent = make_agent(name, scenario)
-    envs = [gym.make("parkenv/Search-v1", scenario=scenario) for _ in range(3)]
+    envs = [gym.make("parkenv/Search-v2", scenario=scenario) for _ in range(3)]
     observations = [env.reset(seed=i)[0] for i, env in enumerate(envs)]
     singles, batch, start = [None] * 3, None, np.ones(3, dtype=bool)
     for _ in range(15):
@@ -135,7 +135,7 @@ def test_stable_baselines_evaluates_a_planner():
     from stable_baselines3.common.evaluation import evaluate_policy
 
     scenario = make_scenario("mini")
-    venv = make_vec_env(lambda: gym.make("parkenv/Search-v1", scenario=scenario), n_envs=2, seed=0)
+    venv = make_vec_env(lambda: gym.make("parkenv/Search-v2", scenario=scenario), n_envs=2, seed=0)
     reward, _ = evaluate_policy(make_agent("mdp", scenario), venv, n_eval_episodes=6)
     assert -120.0 < reward < 0.0
 
@@ -224,7 +224,7 @@ def test_the_planner_plans_again_only_when_a_probability_changes():
     lot = grid_lot(2, 20)
     scenario = frozen_world(lot, np.arange(lot.n_slots) % 2 == 0, sensor_model=SensorModel(view_range=0.0))
     agent = make_agent("mdp", scenario)
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     observation, _ = env.reset(seed=0)
     _, memory = agent.predict(observation)
     assert memory.replans == 0
@@ -283,7 +283,7 @@ def test_the_oracle_waits_for_a_slot_that_is_about_to_come_free():
 
 def test_the_oracle_must_be_shown_the_future():
     scenario = make_scenario("mini")
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     with pytest.raises(RuntimeError, match="prepare"):
         make_agent("oracle", scenario).predict(env.reset(seed=0)[0])
 

@@ -125,7 +125,7 @@ def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong():
 def test_doubt_costs_nothing_where_cars_drive_past_what_is_free(level):
     """A free slot far from the goal is driven past, so having come so far does not mean that it was taken."""
     scenario = at_occupancy(make_scenario("campus"), level)
-    observation, _ = gym.make("parkenv/Search-v1", scenario=scenario).reset(seed=5)
+    observation, _ = gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=5)
     expected = []
     for trusting in (True, False):
         _, memory = make_agent("belief", scenario, trust_forecast=trusting).predict(observation)
@@ -254,7 +254,7 @@ def test_it_expects_slots_that_it_saw_taken_to_come_free():
     occupancy = OccupancyProcess.from_demand(np.full(lot.n_slots, 2.5), np.zeros(168), 300.0)
     sighting = SensorModel(view_range=0.0)
     scenario = Scenario(name="busy", lot=lot, occupancy=occupancy, give_up_s=1e4, sensor_model=sighting)
-    agent, env = make_agent("belief", scenario), gym.make("parkenv/Search-v1", scenario=scenario)
+    agent, env = make_agent("belief", scenario), gym.make("parkenv/Search-v2", scenario=scenario)
     expected = []
     for seed in range(10):
         observation, _ = env.reset(seed=seed)

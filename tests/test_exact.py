@@ -198,7 +198,7 @@ def test_it_goes_on_from_what_it_knows():
 
 def test_the_agent_runs_from_any_entry_of_the_environment():
     scenario = make_scenario("mini")
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     agent = make_agent("exact", scenario)
     observation, _ = env.reset(seed=1)
     memory, over = None, False

@@ -254,7 +254,7 @@ def test_changes_everywhere_are_planned_afresh(city):
 @pytest.mark.parametrize("name", SCENARIO_NAMES)
 def test_both_solvers_lead_to_the_same_actions(name, failure_s):
     scenario = make_scenario(name, failure_s=failure_s)
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     agents = [make_agent("mdp", scenario, solver=s) for s in ("label_setting", "policy_iteration")]
     for seed in range(6):
         observation, _ = env.reset(seed=seed)
@@ -300,7 +300,7 @@ def test_agents_say_what_is_wrong():
 
 def test_without_discount_the_agent_plans_in_seconds():
     scenario = make_scenario("campus")
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     agent = make_agent("mdp", scenario, gamma=1.0)
     observation, _ = env.reset(seed=1)
     memory, over, info = None, False, {}

@@ -29,7 +29,7 @@ def test_checkers_accept_it_without_a_warning(scenario):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*different from the unwrapped version")
-        env = LocalObservation(gym.make("parkenv/Search-v1", scenario=scenario).unwrapped)
+        env = LocalObservation(gym.make("parkenv/Search-v2", scenario=scenario).unwrapped)
         check_env(env, skip_render_check=True)
         check_sb3(env)
 
@@ -49,7 +49,7 @@ def test_every_number_is_what_the_table_says(name):
     scenario = make_scenario(name)
     lot, n = scenario.lot, scenario.lot.n_slots
     drive = dict(nx.all_pairs_dijkstra_path_length(graph_of(scenario)))
-    env = LocalObservation(gym.make("parkenv/Search-v1", scenario=scenario), K)
+    env = LocalObservation(gym.make("parkenv/Search-v2", scenario=scenario), K)
     rng = np.random.default_rng(2)
     for seed in range(3):
         observation, _ = env.reset(seed=seed)
@@ -111,7 +111,7 @@ def test_what_lies_ahead_is_told_move_by_move():
     """In an aisle that is full on one side and free on the other, the move features show the right direction."""
     taken = np.arange(12) >= 6
     scenario = aisle(taken)
-    env = LocalObservation(gym.make("parkenv/Search-v1", scenario=scenario), K)
+    env = LocalObservation(gym.make("parkenv/Search-v2", scenario=scenario), K)
     observation, _ = env.reset(seed=0)
     lot = scenario.lot
     for _ in range(40):
@@ -132,7 +132,7 @@ def test_what_lies_ahead_is_told_move_by_move():
 
 def test_the_best_free_slot_is_remembered_until_it_is_seen_taken():
     scenario = make_scenario("street")
-    env = LocalObservation(gym.make("parkenv/Search-v1", scenario=scenario), K)
+    env = LocalObservation(gym.make("parkenv/Search-v2", scenario=scenario), K)
     rng = np.random.default_rng(0)
     remembered = 0
     for seed in range(5):
@@ -154,14 +154,14 @@ def test_the_best_free_slot_is_remembered_until_it_is_seen_taken():
 
 def test_it_has_the_same_size_on_every_lot():
     sizes = {
-        LocalObservation(gym.make("parkenv/Search-v1", scenario=name), 7).observation_space["local"].shape
+        LocalObservation(gym.make("parkenv/Search-v2", scenario=name), 7).observation_space["local"].shape
         for name in SCENARIO_NAMES
     }
     assert sizes == {(FIRST_NEAR + PER_NEAR * 7,)}
 
 
 def test_a_lot_smaller_than_k_is_told_of_as_far_as_it_goes():
-    env = LocalObservation(gym.make("parkenv/Search-v1", scenario=aisle([False, True])), 6)
+    env = LocalObservation(gym.make("parkenv/Search-v2", scenario=aisle([False, True])), 6)
     observation, _ = env.reset(seed=0)
     near = observation["local"][FIRST_NEAR:].reshape(6, PER_NEAR)
     np.testing.assert_array_equal(near[2:], [[0, 0, 1, 1, 0, 0, 0, 0]] * 4)
@@ -169,8 +169,8 @@ def test_a_lot_smaller_than_k_is_told_of_as_far_as_it_goes():
 
 
 def test_wrong_use_is_refused():
-    with pytest.raises(TypeError, match="wraps parkenv/Search-v1, not CartPoleEnv"):
+    with pytest.raises(TypeError, match="wraps parkenv/Search-v2, not CartPoleEnv"):
         LocalObservation(gym.make("CartPole-v1"))
     for wrong in (0, -1, 2.5, True, 10**9):
         with pytest.raises(InputError, match=f"k is {wrong}"):
-            LocalObservation(gym.make("parkenv/Search-v1", scenario="mini"), wrong)
+            LocalObservation(gym.make("parkenv/Search-v2", scenario="mini"), wrong)

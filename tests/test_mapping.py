@@ -228,7 +228,7 @@ def test_a_map_is_a_prior_of_a_search():
     lot = make_scenario("mini").lot
     log = sessions([40_000.0] * 9, [np.arange(lot.n_slots) % 2 == 0] * 9)
     scenario = make_scenario("mini", prior=MapPrior(log))
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     observation, _ = env.reset(seed=0)
     even = observation["p_occupied"][::2]
     assert even.min() > observation["p_occupied"][1::2].max()

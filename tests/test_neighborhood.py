@@ -122,7 +122,7 @@ def test_a_bad_size_is_refused():
 @pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
 def test_a_city_of_100_000_slots(name):
     scenario = at_occupancy(make_scenario(city_lot(100_000)), 0.95)
-    agent, env = make_agent(name, scenario), gym.make("parkenv/Search-v1", scenario=scenario)
+    agent, env = make_agent(name, scenario), gym.make("parkenv/Search-v2", scenario=scenario)
     for seed in range(2):
         observation, _ = env.reset(seed=seed)
         memory, over = None, False

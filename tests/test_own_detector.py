@@ -66,7 +66,7 @@ def test_the_environment_observes_slots_with_it():
     seen = {}
     for detector in ("hog", OWN, make_detector(OWN)):
         env = gym.make(
-            "parkenv/SearchPerception-v1", scenario=scenario, weather="overcast", detector=detector
+            "parkenv/SearchPerception-v2", scenario=scenario, weather="overcast", detector=detector
         )
         env.reset(seed=0)
         env.step(3)

@@ -45,7 +45,7 @@ def search(agent, env, seed=0):
 
 
 def parked_at(agent, scenario):
-    return search(agent, gym.make("parkenv/Search-v1", scenario=scenario))[0]
+    return search(agent, gym.make("parkenv/Search-v2", scenario=scenario))[0]
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_the_bound_counts_prices():
         empty_lot(priced(lot, rng.uniform(0.0, 120.0, lot.n_slots))),
         occupancy=OccupancyProcess.from_demand(np.full(lot.n_slots, 2.0), np.zeros(168), 600.0),
     )
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     for seed in range(5):
         env.reset(seed=seed)
         state = env.unwrapped.state

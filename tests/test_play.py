@@ -37,7 +37,7 @@ def played(
 
 
 def test_search_is_played_with_five_keys(monkeypatch: pytest.MonkeyPatch) -> None:
-    env = gym.make("parkenv/Search-v1", scenario="campus", render_mode="rgb_array")
+    env = gym.make("parkenv/Search-v2", scenario="campus", render_mode="rgb_array")
     keys = [[pygame.K_w], [pygame.K_s], [pygame.K_a], [pygame.K_d], [pygame.K_SPACE]]
     assert played(env, keys, 4, monkeypatch) == [0, 1, 2, 3, 4]
 

@@ -38,7 +38,7 @@ def row_lot(goal=(40.0, 0.0), vertical=False):
 
 
 def start(lot, **fields):
-    env = gym.make("parkenv/Search-v1", scenario=make_scenario(lot, **fields), render_mode="rgb_array")
+    env = gym.make("parkenv/Search-v2", scenario=make_scenario(lot, **fields), render_mode="rgb_array")
     env.reset(seed=1)
     return env
 
@@ -117,7 +117,7 @@ def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
     scenario = make_scenario(city_lot(4000, seed=2))
     renderer = SearchRenderer(scenario)
     assert renderer._whole is None
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     env.reset(seed=0)
     state = env.unwrapped.state
     nothing = np.zeros(4000, dtype=bool)
@@ -135,7 +135,7 @@ def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
 
 def test_a_goal_out_of_the_window_is_pointed_at():
     scenario = make_scenario(city_lot(4000, seed=2))
-    env = gym.make("parkenv/Search-v1", scenario=scenario, render_mode="rgb_array")
+    env = gym.make("parkenv/Search-v2", scenario=scenario, render_mode="rgb_array")
     env.reset(seed=0)
     away = scenario.lot.goals[0] - scenario.lot.vertex_xy[env.unwrapped.state.vertex]
     rows, columns = np.nonzero((env.render()[:446] == rendering.WALK).all(axis=2))
@@ -198,7 +198,7 @@ def test_text_tells_place_time_and_surroundings():
 
 
 def test_text_of_a_large_lot_fits_the_terminal_too():
-    env = gym.make("parkenv/Search-v1", scenario=make_scenario(city_lot(4000, seed=2)), render_mode="ansi")
+    env = gym.make("parkenv/Search-v2", scenario=make_scenario(city_lot(4000, seed=2)), render_mode="ansi")
     env.reset(seed=0)
     lines = env.render().splitlines()
     assert len(lines) <= 22
@@ -214,7 +214,7 @@ def test_clock(time, text):
 
 def test_frames_of_an_episode_can_be_collected():
     env = gym.wrappers.RenderCollection(
-        gym.make("parkenv/Search-v1", scenario="mini", render_mode="rgb_array")
+        gym.make("parkenv/Search-v2", scenario="mini", render_mode="rgb_array")
     )
     env.reset(seed=0)
     for _ in range(3):
@@ -242,4 +242,4 @@ def test_window(monkeypatch):
 def test_a_window_without_pygame_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(gym.error.DependencyNotInstalled, match=r'pip install "parkenv\[human\]"'):
-        check_env(gym.make("parkenv/Search-v1", scenario="mini").unwrapped)
+        check_env(gym.make("parkenv/Search-v2", scenario="mini").unwrapped)

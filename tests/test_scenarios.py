@@ -76,7 +76,7 @@ def test_a_file_says_it_all(tmp_path):
     assert (made.sensor_model.hit_rate, made.sensor_model.view_range) == (0.9, 12.0)
     assert made.traffic.cars == 2
 
-    env = gym.make("parkenv/Search-v1", scenario=str(file), failure_s=7.0)
+    env = gym.make("parkenv/Search-v2", scenario=str(file), failure_s=7.0)
     env.reset(seed=3)
     assert env.unwrapped.scenario.failure_s == 7.0
     assert env.unwrapped.scenario.lot.n_slots == 12

@@ -1,4 +1,4 @@
-"""`parkenv/Search-v1`: contract, determinism, rewards, ends, observations."""
+"""`parkenv/Search-v2`: contract, determinism, rewards, ends, observations."""
 
 import copy
 import hashlib
@@ -82,7 +82,7 @@ def test_importing_twice_does_no_harm_and_specs_have_a_limit(env_id):
 
 @pytest.mark.parametrize("scenario", SCENARIO_NAMES)
 def test_equal_seeds_give_equal_episodes(scenario):
-    one, two = (gym.make("parkenv/Search-v1", scenario=scenario) for _ in range(2))
+    one, two = (gym.make("parkenv/Search-v2", scenario=scenario) for _ in range(2))
     for seed in (0, 1, 2**40):
         assert digest(one, seed) == digest(two, seed)
     assert digest(one, 0) != digest(one, 1)
@@ -91,16 +91,16 @@ def test_equal_seeds_give_equal_episodes(scenario):
 def test_equal_seeds_give_equal_episodes_in_another_process():
     program = (
         "import sys; sys.path.insert(0, 'tests'); import gymnasium as gym, parkenv;"
-        "from test_search_env import digest; print(digest(gym.make('parkenv/Search-v1', scenario='street'), 5))"
+        "from test_search_env import digest; print(digest(gym.make('parkenv/Search-v2', scenario='street'), 5))"
     )
     theirs = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout
-    assert theirs.strip() == digest(gym.make("parkenv/Search-v1", scenario="street"), 5)
+    assert theirs.strip() == digest(gym.make("parkenv/Search-v2", scenario="street"), 5)
 
 
 def test_resets_without_a_seed_go_through_other_worlds_of_the_same_seed():
-    env = gym.make("parkenv/Search-v1", scenario="mini")
+    env = gym.make("parkenv/Search-v2", scenario="mini")
     runs = []
     for _ in range(2):
         env.reset(seed=4)
@@ -116,7 +116,7 @@ def test_the_world_does_not_depend_on_who_drives(seed):
     scenario = make_scenario("street")
     worlds = []
     for policy in (0, 1):
-        env = gym.make("parkenv/Search-v1", scenario=scenario)
+        env = gym.make("parkenv/Search-v2", scenario=scenario)
         env.reset(seed=seed)
         rng = np.random.default_rng(policy)
         for _ in range(20 * policy):
@@ -128,7 +128,7 @@ def test_the_world_does_not_depend_on_who_drives(seed):
 
 
 def test_a_step_returns_the_numbers_in_the_order_of_their_names():
-    env = gym.make("parkenv/Search-v1", scenario="mini").unwrapped
+    env = gym.make("parkenv/Search-v2", scenario="mini").unwrapped
     env.reset(seed=0)
     record = env.searches.records[0]
     for action in (3, PARK, 3):
@@ -143,7 +143,7 @@ def test_a_step_returns_the_numbers_in_the_order_of_their_names():
 
 @pytest.mark.parametrize("scenario", SCENARIO_NAMES)
 def test_reward_terms_add_up_and_the_return_is_minus_the_total_time(scenario):
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     for seed in range(5):
         steps = random_episode(env, seed, steps=2000)[1:]
         for _, reward, _, _, info in steps:
@@ -156,7 +156,7 @@ def test_reward_terms_add_up_and_the_return_is_minus_the_total_time(scenario):
 
 
 def test_the_thesis_reward_differs_by_r_max_on_success():
-    env = ThesisReward(gym.make("parkenv/Search-v1", scenario="mini"))
+    env = ThesisReward(gym.make("parkenv/Search-v2", scenario="mini"))
     observation, _ = env.reset(seed=1)
     rng = np.random.default_rng(0)
     done = False
@@ -179,7 +179,7 @@ def two_slots(taken):
 
 def test_moves_tries_and_parking_cost_what_they_should():
     scenario = two_slots([True, False])
-    env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
+    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
     observation, _ = env.reset(seed=0)
     lot = scenario.lot
     missing = int(np.flatnonzero(observation["action_mask"] == 0)[0])
@@ -206,7 +206,7 @@ def test_moves_tries_and_parking_cost_what_they_should():
 
 def test_a_lot_proven_full_ends_the_search_with_the_cost_of_going_elsewhere():
     scenario = two_slots([True, True]).replace(give_up_s=300.0, sensor_model=SensorModel(view_range=0.0))
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     observation, _ = env.reset(seed=0)
     seen_before_the_end = set()
     for _ in range(20):
@@ -223,7 +223,7 @@ def test_a_lot_proven_full_ends_the_search_with_the_cost_of_going_elsewhere():
 
 
 def test_the_time_limit_truncates_and_does_not_terminate():
-    env = gym.make("parkenv/Search-v1", scenario="mini", max_episode_steps=3)
+    env = gym.make("parkenv/Search-v2", scenario="mini", max_episode_steps=3)
     env.reset(seed=0)
     for step in range(3):
         _, _, terminated, truncated, info = env.step(2)
@@ -234,7 +234,7 @@ def test_the_time_limit_truncates_and_does_not_terminate():
 
 
 def test_the_mask_tells_what_the_graph_has():
-    env = gym.make("parkenv/Search-v1", scenario="mini").unwrapped
+    env = gym.make("parkenv/Search-v2", scenario="mini").unwrapped
     observation, _ = env.reset(seed=0)
     lot = env.scenario.lot
     for _ in range(30):
@@ -246,7 +246,7 @@ def test_the_mask_tells_what_the_graph_has():
 
 
 def test_state_deepcopy_and_pickle_bring_an_episode_back():
-    env = gym.make("parkenv/Search-v1", scenario="campus").unwrapped
+    env = gym.make("parkenv/Search-v2", scenario="campus").unwrapped
     env.reset(seed=3)
     actions = np.random.default_rng(0).integers(0, 4, 60)
     for a in actions[:20]:
@@ -262,11 +262,11 @@ def test_state_deepcopy_and_pickle_bring_an_episode_back():
     assert rest(twin) == expected
     assert rest(thawed) == expected
     with pytest.raises(InputError, match="slots"):
-        gym.make("parkenv/Search-v1", scenario="mini").unwrapped.set_state(saved)
+        gym.make("parkenv/Search-v2", scenario="mini").unwrapped.set_state(saved)
 
 
 def test_observations_are_not_live_buffers():
-    env = gym.make("parkenv/Search-v1", scenario="campus").unwrapped
+    env = gym.make("parkenv/Search-v2", scenario="campus").unwrapped
     before, _ = env.reset(seed=0)
     kept = copy.deepcopy(before)
     for _ in range(10):
@@ -279,7 +279,7 @@ def test_observations_are_not_live_buffers():
 def test_the_observed_belief_explains_p_occupied(noisy):
     """`belief` holds all that `p_occupied` is computed from, and its constants are those of the forecast."""
     model = SensorModel(8.0, hit_rate=0.9, false_alarm_rate=0.2) if noisy else SensorModel()
-    env = gym.make("parkenv/Search-v1", scenario="campus", sensor_model=model).unwrapped
+    env = gym.make("parkenv/Search-v2", scenario="campus", sensor_model=model).unwrapped
     observation, _ = env.reset(seed=4)
     foreseen = env.scenario.forecast(env.state.arrival)
     rng = np.random.default_rng(1)
@@ -317,7 +317,7 @@ def test_old_ids_are_not_registered():
 def test_only_slots_in_view_are_observed():
     """The belief of a slot that was never in view stays at its forecast, whether it is taken or not."""
     scenario = make_scenario("campus", sensor_model=SensorModel(view_range=6.0))
-    env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
+    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
     observation, _ = env.reset(seed=0)
     lot, forecast = scenario.lot, env.state.belief.forecast
     np.testing.assert_array_equal(observation["p_occupied"], forecast.astype(np.float32))
@@ -352,7 +352,7 @@ def test_the_belief_in_a_slot_left_behind_decays():
     lot = grid_lot(1, 12)
     process = OccupancyProcess.from_demand(np.zeros(12), np.zeros(168), 600.0)
     scenario = Scenario(name="a", lot=lot, occupancy=process, sensor_model=SensorModel(view_range=0.0))
-    env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
+    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
     observation, _ = env.reset(seed=0)
     rng = np.random.default_rng(0)
     last = {}
@@ -371,7 +371,7 @@ def test_the_belief_in_a_slot_left_behind_decays():
 
 
 def test_a_seed_holds_after_going_on_from_another_search():
-    one, other = (gym.make("parkenv/Search-v1", scenario="mini").unwrapped for _ in range(2))
+    one, other = (gym.make("parkenv/Search-v2", scenario="mini").unwrapped for _ in range(2))
     wanted, _ = one.reset(seed=1)
     other.reset(seed=2)
     one.set_state(other.get_state())
@@ -388,7 +388,7 @@ def test_noisy_sight_errs_as_often_as_stated():
         occupancy=always(lot, taken),
         sensor_model=SensorModel(view_range=1e3, hit_rate=0.8, false_alarm_rate=0.3),
     )
-    env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
+    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
     looks_taken = np.zeros(lot.n_slots)
     seeds = 100
     for seed in range(seeds):
@@ -419,7 +419,7 @@ def test_sight_differs_by_distance_and_side():
     across = lot.slot_yaw[slots[rows]] != lot.slot_yaw[0]
     assert across.any()
     np.testing.assert_array_equal(rates.seen[across], 0.25)
-    env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
+    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
     seen, looked_taken = np.zeros(lot.n_slots), np.zeros(lot.n_slots)
     way_to_0 = next(c for c in range(4) for v in [lot.neighbors[lot.entry_vertices[0], c]] if v >= 0)
     seeds = 400
@@ -474,7 +474,7 @@ def test_wrong_options_are_refused_by_name(changes, message):
 
 
 def test_wrong_use_is_refused():
-    env = gym.make("parkenv/Search-v1", scenario="mini").unwrapped
+    env = gym.make("parkenv/Search-v2", scenario="mini").unwrapped
     with pytest.raises(gym.error.ResetNeeded):
         env.step(0)
     with pytest.raises(InputError, match="no options"):

@@ -76,9 +76,9 @@ def assert_agrees(observation, wanted):
 def test_single_environment_and_batch_agree_with_the_reference(kind, sensor, seed):
     rng = np.random.default_rng([seed, len(sensor), len(kind)])
     scenario = random_scenario(rng, kind, sensor)
-    env = gym.make("parkenv/Search-v1", scenario=scenario, max_episode_steps=LIMIT)
+    env = gym.make("parkenv/Search-v2", scenario=scenario, max_episode_steps=LIMIT)
     envs = gym.make_vec(
-        "parkenv/Search-v1",
+        "parkenv/Search-v2",
         N_SEARCHES,
         vectorization_mode="vector_entry_point",
         scenario=scenario,

@@ -1,4 +1,4 @@
-"""The compiled batch of `parkenv/Search-v1`: mixed lots, resets, ends, bad input; see also the reference's tests."""
+"""The compiled batch of `parkenv/Search-v2`: mixed lots, resets, ends, bad input; see also the reference's tests."""
 
 import gymnasium as gym
 import numpy as np
@@ -56,7 +56,7 @@ def recorded_scenario():
 
 def make_batch(n, scenario, **options):
     return gym.make_vec(
-        "parkenv/Search-v1", n, vectorization_mode="vector_entry_point", scenario=scenario, **options
+        "parkenv/Search-v2", n, vectorization_mode="vector_entry_point", scenario=scenario, **options
     )
 
 
@@ -65,7 +65,7 @@ def assert_parity(scenarios, observation="full", n=4, steps=250, k=5, **changes)
     envs = make_batch(n, scenarios, observation=observation, max_episode_steps=LIMIT, k=k, **changes)
     each = scenarios if isinstance(scenarios, list) else [scenarios]
     singles = [
-        gym.make("parkenv/Search-v1", scenario=each[i % len(each)], max_episode_steps=LIMIT, **changes)
+        gym.make("parkenv/Search-v2", scenario=each[i % len(each)], max_episode_steps=LIMIT, **changes)
         for i in range(n)
     ]
     if observation == "local":
@@ -159,7 +159,7 @@ def test_equal_seeds_give_equal_batches_of_any_size(observation):
 def test_gymnasium_s_own_batch_of_single_environments_says_the_same():
     ours = make_batch(3, "mini", max_episode_steps=LIMIT)
     theirs = gym.make_vec(
-        "parkenv/Search-v1", 3, vectorization_mode="sync", scenario="mini", max_episode_steps=LIMIT
+        "parkenv/Search-v2", 3, vectorization_mode="sync", scenario="mini", max_episode_steps=LIMIT
     )
     assert ours.observation_space == theirs.observation_space
     assert ours.action_space == theirs.action_space
@@ -231,7 +231,7 @@ def test_a_sequence_of_seeds_and_resets_without_one():
     envs = make_batch(3, "mini")
     first, _ = envs.reset(seed=[9, 9, 4])
     np.testing.assert_array_equal(first["time"][0], first["time"][1])
-    single = gym.make("parkenv/Search-v1", scenario="mini")
+    single = gym.make("parkenv/Search-v2", scenario="mini")
     single.reset(seed=4)
     np.testing.assert_array_equal(envs.reset()[0]["time"][2], single.reset()[0]["time"])
     kept, _ = envs.reset(seed=[None, 9, None])
@@ -252,7 +252,7 @@ def test_a_generator_that_was_set_by_hand_is_drawn_from():
     times = []
     for make in (
         lambda: make_batch(2, "mini"),
-        lambda: gym.make("parkenv/Search-v1", scenario="mini").unwrapped,
+        lambda: gym.make("parkenv/Search-v2", scenario="mini").unwrapped,
     ):
         for k in (3, 3, 4):
             env = make()
@@ -263,7 +263,7 @@ def test_a_generator_that_was_set_by_hand_is_drawn_from():
 
 
 def test_a_refused_action_skips_no_world():
-    single = gym.make("parkenv/Search-v1", scenario="mini")
+    single = gym.make("parkenv/Search-v2", scenario="mini")
     single.reset(seed=0)
     envs = make_batch(1, "mini", max_episode_steps=1)
     envs.reset(seed=0)

@@ -71,7 +71,7 @@ def test_the_stack_is_nearly_always_right_beside_the_car(name):
 
 
 def test_unseen_slots_are_known_once_they_were_tried():
-    env = gym.make("parkenv/Search-v1", scenario="mini", sensor_model=SensorModel.blind()).unwrapped
+    env = gym.make("parkenv/Search-v2", scenario="mini", sensor_model=SensorModel.blind()).unwrapped
     prior = env.reset(seed=0)[0]["p_occupied"]
     lot = env.scenario.lot
     while True:

@@ -1,4 +1,4 @@
-"""`parkenv/SearchSensors-v1`: raw observations of the same searches, and what else moves in the lot."""
+"""`parkenv/SearchSensors-v2`: raw observations of the same searches, and what else moves in the lot."""
 
 import copy
 import pickle
@@ -29,7 +29,7 @@ BUSY = Traffic(cars=4, pedestrians=6)
 
 
 def make(**options):
-    return gym.make("parkenv/SearchSensors-v1", **{"scenario": "mini", "rig": SMALL_RIG, **options})
+    return gym.make("parkenv/SearchSensors-v2", **{"scenario": "mini", "rig": SMALL_RIG, **options})
 
 
 def drive(env, seed, actions):
@@ -45,7 +45,7 @@ def test_the_same_seed_shows_the_same_pictures_to_everyone():
 
 
 def test_the_search_is_that_of_the_search_environment():
-    sensors, plain = make(rig=LASER_ONLY), gym.make("parkenv/Search-v1", scenario="mini")
+    sensors, plain = make(rig=LASER_ONLY), gym.make("parkenv/Search-v2", scenario="mini")
     sensors.reset(seed=5)
     observation, _ = plain.reset(seed=5)
     rng = np.random.default_rng(0)
@@ -306,7 +306,7 @@ def test_a_mover_of_a_model_that_the_fleet_lacks_is_refused():
 
 def test_samplers_of_equal_worlds_see_the_same_whatever_was_looked_at_before():
     scenario = make_scenario("mini", traffic=BUSY)
-    env = gym.make("parkenv/Search-v1", scenario=scenario).unwrapped
+    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
     env.reset(seed=0)
     eager, late = (SensorSampler(scenario, SMALL_RIG, None, 3, 0.5) for _ in range(2))
     for action in (3, 3, 3):

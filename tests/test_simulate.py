@@ -43,7 +43,7 @@ class Waiting:
 
 @pytest.mark.parametrize("name", ["mdp", "first-free", "oracle"])
 def test_observers_see_the_whole_episode_in_order(name):
-    env, one, two = gym.make("parkenv/Search-v1", scenario=MINI), Counter(), Counter()
+    env, one, two = gym.make("parkenv/Search-v2", scenario=MINI), Counter(), Counter()
     result = simulate(env, make_agent(name, MINI), 5, (one, two))
     assert one.calls == ["reset", *["step"] * result.steps, "end"] == two.calls
     assert one.results == [result]
@@ -61,7 +61,7 @@ def test_observers_see_the_whole_episode_in_order(name):
 
 
 def test_a_truncated_search_is_charged_the_give_up_penalty_once():
-    env = TimeLimit(gym.make("parkenv/Search-v1", scenario=MINI), 7)
+    env = TimeLimit(gym.make("parkenv/Search-v2", scenario=MINI), 7)
     counter = Counter()
     result = simulate(env, Waiting(), 0, (counter,))
     assert result.truncated
@@ -72,7 +72,7 @@ def test_a_truncated_search_is_charged_the_give_up_penalty_once():
 
 
 def test_a_search_that_parks_at_the_step_limit_is_not_truncated():
-    env = gym.make("parkenv/Search-v1", scenario=MINI)
+    env = gym.make("parkenv/Search-v2", scenario=MINI)
     agent = make_agent("first-free", MINI)
     free = simulate(env, agent, 3)
     limited = simulate(TimeLimit(env, free.steps), agent, 3)
@@ -91,7 +91,7 @@ def test_decision_times_leave_out_compilation():
             return super().predict(observation, state, episode_start, deterministic)
 
     before = seconds_spent()
-    result = simulate(TimeLimit(gym.make("parkenv/Search-v1", scenario=MINI), 3), Compiling(), 0)
+    result = simulate(TimeLimit(gym.make("parkenv/Search-v2", scenario=MINI), 3), Compiling(), 0)
     compiling_s = seconds_spent() - before
     assert compiling_s > 0.02
     assert min(result.decision_s) > 0.0

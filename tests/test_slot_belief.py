@@ -42,7 +42,7 @@ def test_observed_slots_are_free_or_taken_even_where_the_forecast_was_certain():
 def test_an_observation_states_the_belief_that_the_same_reports_lead_to(sensor_model):
     """The environment's compiled belief, as observed, decays between observations as `SlotBelief` does."""
     scenario = make_scenario("street", sensor_model=sensor_model)
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     observation, _ = env.reset(seed=2)
     rng = np.random.default_rng(0)
     belief = SlotBelief.of_observation(observation)
@@ -78,5 +78,5 @@ def test_parts_and_observations_keep_the_belief():
 
 
 def test_observations_of_other_environments_are_refused():
-    with pytest.raises(InputError, match="has no 'p_occupied'; want one of parkenv/Search-v1, got vertex"):
+    with pytest.raises(InputError, match="has no 'p_occupied'; want one of parkenv/Search-v2, got vertex"):
         SlotBelief.of_observation({"vertex": 0})

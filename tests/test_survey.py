@@ -127,7 +127,7 @@ def test_survey_and_map_on_the_command_line(tmp_path):
 
 def test_the_search_sees_what_is_there_and_nothing_else():
     scenario, taken = halves()
-    env = gym.make("parkenv/SearchPerception-v1", scenario=scenario, weather="sunny").unwrapped
+    env = gym.make("parkenv/SearchPerception-v2", scenario=scenario, weather="sunny").unwrapped
     prior = env.reset(seed=0)[0]["p_occupied"]
     lot = scenario.lot
     for _ in range(6):
@@ -141,8 +141,8 @@ def test_the_search_sees_what_is_there_and_nothing_else():
 
 
 def test_the_search_and_its_worlds_are_the_same_as_without_sensors():
-    plain = gym.make("parkenv/Search-v1", scenario="mini")
-    seeing = gym.make("parkenv/SearchPerception-v1", scenario="mini", weather="overcast")
+    plain = gym.make("parkenv/Search-v2", scenario="mini")
+    seeing = gym.make("parkenv/SearchPerception-v2", scenario="mini", weather="overcast")
     first, _ = plain.reset(seed=4)
     second, _ = seeing.reset(seed=4)
     np.testing.assert_array_equal(first["p_occupied"], second["p_occupied"])

@@ -130,7 +130,7 @@ def test_a_model_learns_to_park_and_evaluate_policy_agrees_with_compare(trained)
     assert times.mean() == pytest.approx(best)
     rows, _ = Case(SCENARIO, name).run(EVALUATED)
     assert [row["total_s"] for row in rows] == pytest.approx(times)
-    env = LocalObservation(gym.make("parkenv/Search-v1", scenario=SCENARIO))
+    env = LocalObservation(gym.make("parkenv/Search-v2", scenario=SCENARIO))
     env.reset(seed=EVALUATED[0])
     returns, _ = evaluate_policy(agent, env, n_eval_episodes=5, return_episode_rewards=True, warn=False)
     assert len(returns) == 5
@@ -352,7 +352,7 @@ def test_archives_of_stable_baselines3_need_trust_and_are_converted(tmp_path):
     done = parkenv(*command, "--trust-model")
     assert (done.returncode, mark.exists()) == (0, True), done.stderr
     made = LearnedAgent(SCENARIO, "maskable-ppo", tmp_path / "mine.safetensors")
-    observation = LocalObservation(gym.make("parkenv/Search-v1", scenario=SCENARIO)).reset(seed=0)[0]
+    observation = LocalObservation(gym.make("parkenv/Search-v2", scenario=SCENARIO)).reset(seed=0)[0]
     wanted, _ = model.predict(observation, deterministic=True, action_masks=observation["action_mask"])
     assert made.predict(observation)[0] == wanted
     assert parkenv(*command, "--trust-model").returncode == 2, "the converted file is not replaced"
@@ -366,7 +366,7 @@ def test_only_models_that_can_be_described_are_saved(tmp_path):
         model = PPO("MultiInputPolicy", SearchVecEnv(2, "mini"), n_steps=8, batch_size=16, **changed)
         with pytest.raises(InputError, match=wanted):
             save_model(model, tmp_path / "m.safetensors")
-    plain = PPO("MultiInputPolicy", gym.make("parkenv/Search-v1", scenario="mini"), n_steps=8, batch_size=8)
+    plain = PPO("MultiInputPolicy", gym.make("parkenv/Search-v2", scenario="mini"), n_steps=8, batch_size=8)
     with pytest.raises(InputError, match="observes neither `local`"):
         save_model(plain, tmp_path / "m.safetensors")
     assert local_space(7)["local"].shape == (FIXED_NUMBERS + 7 * NUMBERS_PER_SLOT,)
@@ -383,7 +383,7 @@ def test_a_checkpoint_runs_nothing(tmp_path, monkeypatch):
 
 def test_observations_of_another_kind_are_refused(trained):
     agent = LearnedAgent(SCENARIO, "maskable-ppo", trained / "model.safetensors")
-    env = gym.make("parkenv/Search-v1", scenario=SCENARIO)
+    env = gym.make("parkenv/Search-v2", scenario=SCENARIO)
     plain, _ = env.reset(seed=0)
     with pytest.raises(InputError, match=r"wants observations of .*LocalObservation, got vertex, time"):
         agent.predict(plain)

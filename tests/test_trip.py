@@ -200,7 +200,7 @@ def test_a_lane_keeper_stays_near_its_path_at_any_speed_and_slows_down_in_turns(
 
 @pytest.mark.parametrize("name", ["mini", "campus"])
 def test_with_the_graphs_times_a_trip_is_the_search_itself(name):
-    """With the graph's times instead of driven ones, every decision and time equals that of Search-v1."""
+    """With the graph's times instead of driven ones, every decision and time equals that of Search-v2."""
     scenario = blind_scenario(make_scenario(name))
     agent = make_agent("mdp", scenario)
     plain, driven = SearchEnv(scenario), DrivenSearchEnv(scenario, GraphExecutor(scenario))

@@ -38,7 +38,7 @@ def test_it_sees_the_forecast_and_not_the_world():
     full = OccupancyProcess.from_demand(np.full(scenario.lot.n_slots, 9.0), np.zeros(168))
     chosen = []
     for s in (scenario, scenario.replace(occupancy=full, prior=scenario.prior)):
-        observation, _ = gym.make("parkenv/Search-v1", scenario=s).reset(seed=4)
+        observation, _ = gym.make("parkenv/Search-v2", scenario=s).reset(seed=4)
         agent = make_agent("mdp-tuned", s)
         chosen.append(agent.begin(observation, SlotBelief.of_observation(observation)).failure_s)
     assert chosen[0] == chosen[1]

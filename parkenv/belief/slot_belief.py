@@ -56,7 +56,7 @@ class SlotBelief:
 
     @classmethod
     def of_observation(cls, observation: Mapping[str, Any]) -> Self:
-        """Return the belief in an observation of `parkenv/Search-v1`, sharing its arrays.
+        """Return the belief in an observation of `parkenv/Search-v2`, sharing its arrays.
 
         Raises:
             InputError: the observation comes from another environment.
@@ -65,7 +65,7 @@ class SlotBelief:
             return cls(observation["p_occupied"], observation["belief"], float(observation["time"][1]))
         except KeyError as error:
             raise InputError(
-                f"observation has no {error.args[0]!r}; want one of parkenv/Search-v1, got {', '.join(observation)}"
+                f"observation has no {error.args[0]!r}; want one of parkenv/Search-v2, got {', '.join(observation)}"
             ) from None
 
     def to_observation(self) -> dict[str, NDArray[np.float32]]:

@@ -66,7 +66,7 @@ def train(
     Options:
         algorithm (ALGORITHM): To search: dqn, ppo, maskable-ppo (default), recurrent-ppo. To drive: sac, tqc, ppo
             (default).
-        env (search|drive): Learn to search (parkenv/Search-v1), or to drive into slots (parkenv/Drive-v1).
+        env (search|drive): Learn to search (parkenv/Search-v2), or to drive into slots (parkenv/Drive-v1).
         scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus; to drive, campus,street]
         steps (N >= 1): Decisions of a training.  [default: 2000000; to drive, the training config's]
         trainings (N >= 1): How many, with one seed each from --seed on.

@@ -145,10 +145,10 @@ def local_space(k: int) -> spaces.Dict:
 class LocalObservation(
     gym.ObservationWrapper[dict[str, Any], np.int64, dict[str, Any]], gym.utils.RecordConstructorArgs
 ):
-    """Observe `parkenv/Search-v1` as `local` and `action_mask`; the module describes `local`.
+    """Observe `parkenv/Search-v2` as `local` and `action_mask`; the module describes `local`.
 
     Args:
-        env: `parkenv/Search-v1`, or an environment with the same observations.
+        env: `parkenv/Search-v2`, or an environment with the same observations.
         k: number of slots described.
 
     Raises:
@@ -158,7 +158,7 @@ class LocalObservation(
     Examples:
         >>> import gymnasium as gym
         >>> import parkenv
-        >>> env = LocalObservation(gym.make("parkenv/Search-v1", scenario="mini"), k=5)
+        >>> env = LocalObservation(gym.make("parkenv/Search-v2", scenario="mini"), k=5)
         >>> observation, info = env.reset(seed=0)
         >>> observation["local"].shape
         (86,)
@@ -168,7 +168,7 @@ class LocalObservation(
         gym.utils.RecordConstructorArgs.__init__(self, k=k)
         super().__init__(env)
         if not isinstance(env.unwrapped, SearchEnv):
-            raise TypeError(f"LocalObservation wraps parkenv/Search-v1, not {type(env.unwrapped).__name__}")
+            raise TypeError(f"LocalObservation wraps parkenv/Search-v2, not {type(env.unwrapped).__name__}")
         self._surroundings = Surroundings.of([env.unwrapped.scenario], k)
         self.observation_space = local_space(k)
 

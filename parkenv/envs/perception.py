@@ -1,4 +1,4 @@
-"""`parkenv/SearchPerception-v1`: the search with the real perception pipeline in the loop."""
+"""`parkenv/SearchPerception-v2`: the search with the real perception pipeline in the loop."""
 
 from __future__ import annotations
 
@@ -83,34 +83,34 @@ class OnboardPerception:
 
 
 class SearchPerceptionEnv(SensingSearchEnv):
-    """`parkenv/Search-v1` with the real perception pipeline in the loop: the belief comes from simulated sensors.
+    """`parkenv/Search-v2` with the real perception pipeline in the loop: the belief comes from simulated sensors.
 
     ## Description
-    World, decisions and rewards are those of `parkenv/Search-v1`, and equal seeds give equal worlds. But a perception
+    World, decisions and rewards are those of `parkenv/Search-v2`, and equal seeds give equal worlds. But a perception
     pipeline replaces the sensor model: at every step the car's camera and laser measure (as in
-    `parkenv/SearchSensors-v1`), cars are detected and located, beams are traced into the slots, and the observed states
+    `parkenv/SearchSensors-v2`), cars are detected and located, beams are traced into the slots, and the observed states
     of the slots update the belief. So the belief has the errors of a real detector, and occlusion as well as distance
     decides which slots are observed.
 
     ## Action space
-    `Discrete(5)`, as in `parkenv/Search-v1`: up, down, left, right, park.
+    `Discrete(5)`, as in `parkenv/Search-v2`: up, down, left, right, park.
 
     ## Observation space
-    The `Dict` of `parkenv/Search-v1`: `vertex`, `time`, `p_occupied`, `belief`, `action_mask`.
+    The `Dict` of `parkenv/Search-v2`: `vertex`, `time`, `p_occupied`, `belief`, `action_mask`.
 
     ## Rewards
-    Minus the seconds of the step, as in `parkenv/Search-v1`.
+    Minus the seconds of the step, as in `parkenv/Search-v2`.
 
     ## Starting state
-    As in `parkenv/Search-v1`. The weather is drawn for each episode unless it is given.
+    As in `parkenv/Search-v2`. The weather is drawn for each episode unless it is given.
 
     ## Episode end
-    As in `parkenv/Search-v1`. The lot counts as full when the *observed* states of all slots are taken.
+    As in `parkenv/Search-v2`. The lot counts as full when the *observed* states of all slots are taken.
 
     ## Arguments
     | Name | Default | Meaning |
     |------|---------|---------|
-    | `scenario`, `render_mode`, changes | | as in `parkenv/Search-v1` |
+    | `scenario`, `render_mode`, changes | | as in `parkenv/Search-v2` |
     | `rig` | the scenario's | `laser` (the thesis's camera and 270° laser), `stereo`, `both_sides`, or a `SensorRig` |
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 2 | largest number of captures on an edge |
@@ -120,13 +120,13 @@ class SearchPerceptionEnv(SensingSearchEnv):
     The scenario's `sensor_model` gives the error rates that the belief update assumes, and its range: farther slots
     are not updated. If it is perfect, the fitted model of the rig replaces it (`SensorModel.named`).
 
-    `info` is that of `parkenv/Search-v1`. `env.unwrapped.perception` has the results of the last step: `results`
+    `info` is that of `parkenv/Search-v2`. `env.unwrapped.perception` has the results of the last step: `results`
     (captures, detections, located cars, range scans) and `observation` (the observed slots and their states).
 
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
-    >>> env = gym.make("parkenv/SearchPerception-v1", scenario="mini", weather="sunny")
+    >>> env = gym.make("parkenv/SearchPerception-v2", scenario="mini", weather="sunny")
     >>> observation, info = env.reset(seed=0)
     >>> observation, reward, terminated, truncated, info = env.step(3)
     >>> observation["p_occupied"].shape
@@ -135,6 +135,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
     ```
 
     ## Version history
+    - v2: observations gain `day_error`; packaged scenarios have days that differ from their forecast.
     - v1: observations gain `belief`.
     - v0: first version.
     """

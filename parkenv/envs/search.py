@@ -1,4 +1,4 @@
-"""`parkenv/Search-v1`: search a parking lot for a free slot."""
+"""`parkenv/Search-v2`: search a parking lot for a free slot."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
-    >>> env = gym.make("parkenv/Search-v1", scenario="mini", failure_s=5.0)
+    >>> env = gym.make("parkenv/Search-v2", scenario="mini", failure_s=5.0)
     >>> observation, info = env.reset(seed=0)
     >>> observation["p_occupied"].shape, env.action_space.n
     ((10,), np.int64(5))
@@ -139,6 +139,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     ```
 
     ## Version history
+    - v2: observations gain `day_error`; packaged scenarios have days that differ from their forecast.
     - v1: observations gain `belief`.
     - v0: first version.
     """

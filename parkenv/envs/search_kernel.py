@@ -1,6 +1,6 @@
 """The compiled search: the effect of an action on the car, its observations and its belief.
 
-`parkenv/Search-v1` and its batch both run this code, so they agree to the bit. The cost of a step does not grow with
+`parkenv/Search-v2` and its batch both run this code, so they agree to the bit. The cost of a step does not grow with
 the lot: only slots that a search has observed or queried get a column in its tables.
 
 Functions named `..._at` take an address: that of a record of `Searches`, where they are called from Python.

@@ -25,7 +25,7 @@ class SearchVecEnv(SharedVecEnv):
     """`ParkSearchVectorEnv` for stable-baselines3 and sb3-contrib.
 
     When a search ends, its `info` has `terminal_observation`, `TimeLimit.truncated`, `episode` (return in seconds and
-    length, as from `Monitor`) and the metrics of `parkenv/Search-v1`. `action_masks` is available to sb3-contrib.
+    length, as from `Monitor`) and the metrics of `parkenv/Search-v2`. `action_masks` is available to sb3-contrib.
 
     Args:
         num_envs: number of searches.

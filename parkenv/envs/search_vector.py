@@ -1,4 +1,4 @@
-"""A compiled batch of searches: the `vector_entry_point` of `parkenv/Search-v1`."""
+"""A compiled batch of searches: the `vector_entry_point` of `parkenv/Search-v2`."""
 
 from __future__ import annotations
 
@@ -172,17 +172,17 @@ def _report(search: Any, e: int, fresh: bool, limit: int, steps: Steps, mask: ND
 
 
 class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]]):
-    """A batch of `parkenv/Search-v1` environments in one compiled step.
+    """A batch of `parkenv/Search-v2` environments in one compiled step.
 
     ## Description
-    World, decisions, rewards, ends and observations are those of `parkenv/Search-v1`: search i of a batch reset with
+    World, decisions, rewards, ends and observations are those of `parkenv/Search-v2`: search i of a batch reset with
     `seed=s` equals the single environment reset with `seed=s + i`, bit for bit, in this and all later episodes.
 
     ## Action space
     `MultiDiscrete([5, ...])`: up, down, left, right, park.
 
     ## Observation space
-    - `observation="full"`: the `Dict` of `parkenv/Search-v1`, with a row for each search. If lots differ in size,
+    - `observation="full"`: the `Dict` of `parkenv/Search-v2`, with a row for each search. If lots differ in size,
       smaller lots are padded with slots that are taken (1) and never observed; the four parts of `belief` have the
       largest lot's size.
     - `observation="occupancy"`: the same without `belief`, which saves copying it.
@@ -190,14 +190,14 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
       cost are the same on every lot.
 
     ## Rewards
-    As in `parkenv/Search-v1`, float64. `reward_terms` holds the last step's terms.
+    As in `parkenv/Search-v2`, float64. `reward_terms` holds the last step's terms.
 
     ## Starting state
-    As in `parkenv/Search-v1`. `reset(seed=s)` gives search i the seed s + i; a sequence gives one seed to each.
+    As in `parkenv/Search-v2`. `reset(seed=s)` gives search i the seed s + i; a sequence gives one seed to each.
     Without a seed, every search continues with the next world of its seed.
 
     ## Episode end
-    As in `parkenv/Search-v1`; truncated after `max_episode_steps`. `autoreset_mode` then applies:
+    As in `parkenv/Search-v2`; truncated after `max_episode_steps`. `autoreset_mode` then applies:
 
     - NEXT_STEP: the next step ignores the action and begins a new search, with reward 0;
     - SAME_STEP: a new search begins at once; `info["final_obs"]` and `info["final_info"]` hold the last observations
@@ -221,7 +221,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
-    >>> envs = gym.make_vec("parkenv/Search-v1", 3, vectorization_mode="vector_entry_point", scenario="mini")
+    >>> envs = gym.make_vec("parkenv/Search-v2", 3, vectorization_mode="vector_entry_point", scenario="mini")
     >>> observations, infos = envs.reset(seed=0)
     >>> observations["p_occupied"].shape
     (3, 10)

@@ -1,4 +1,4 @@
-"""`parkenv/SearchSensors-v1`: the search with raw sensor data."""
+"""`parkenv/SearchSensors-v2`: the search with raw sensor data."""
 
 from __future__ import annotations
 
@@ -55,18 +55,18 @@ class SensingSearchEnv(SearchEnv):
 
 
 class SearchSensorsEnv(SensingSearchEnv):
-    """`parkenv/Search-v1` with raw sensor data instead of a belief: images, laser scans and poses.
+    """`parkenv/Search-v2` with raw sensor data instead of a belief: images, laser scans and poses.
 
     ## Description
-    World, decisions and rewards are those of `parkenv/Search-v1`, and equal seeds give equal worlds. The agent needs
+    World, decisions and rewards are those of `parkenv/Search-v2`, and equal seeds give equal worlds. The agent needs
     its own perception. Simulated sensors measure up to `captures` times on every edge, at equal distances, the last
     time at its end. At a vertex the vehicle is headed along the lane, between two vertices along the edge. There is
     one capture at the start, and one after waiting or a failed attempt.
 
-    Observations do not contain the forecast; the first observation of `parkenv/Search-v1` with the same seed has it.
+    Observations do not contain the forecast; the first observation of `parkenv/Search-v2` with the same seed has it.
 
     ## Action space
-    `Discrete(5)`, as in `parkenv/Search-v1`: up, down, left, right, park.
+    `Discrete(5)`, as in `parkenv/Search-v2`: up, down, left, right, park.
 
     ## Observation space
     A `Dict`. K = `captures`; the newest capture is the last of `count`; rows from `count` on are 0.
@@ -87,18 +87,18 @@ class SearchSensorsEnv(SensingSearchEnv):
     the poses and models of the sensors. The thesis's rig has `image.right` and `scan.laser`.
 
     ## Rewards
-    Minus the seconds of the step, as in `parkenv/Search-v1`.
+    Minus the seconds of the step, as in `parkenv/Search-v2`.
 
     ## Starting state
-    As in `parkenv/Search-v1`. The weather is drawn for each episode unless it is given.
+    As in `parkenv/Search-v2`. The weather is drawn for each episode unless it is given.
 
     ## Episode end
-    As in `parkenv/Search-v1`, whose error-free observations decide whether the lot is full.
+    As in `parkenv/Search-v2`, whose error-free observations decide whether the lot is full.
 
     ## Arguments
     | Name | Default | Meaning |
     |------|---------|---------|
-    | `scenario`, `render_mode`, changes | | as in `parkenv/Search-v1`; `traffic=Traffic(4, 6)` adds road users |
+    | `scenario`, `render_mode`, changes | | as in `parkenv/Search-v2`; `traffic=Traffic(4, 6)` adds road users |
     | `rig` | the scenario's | `laser` (the thesis's camera and 270° laser), `stereo`, `both_sides`, or a `SensorRig` |
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 4 | largest number of captures on an edge |
@@ -107,7 +107,7 @@ class SearchSensorsEnv(SensingSearchEnv):
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
-    >>> env = gym.make("parkenv/SearchSensors-v1", scenario="mini", captures=2)
+    >>> env = gym.make("parkenv/SearchSensors-v2", scenario="mini", captures=2)
     >>> observation, info = env.reset(seed=0)
     >>> observation["image.right"].shape, observation["scan.laser"].shape, int(observation["count"])
     ((2, 480, 640, 3), (2, 1081), 1)
@@ -115,7 +115,8 @@ class SearchSensorsEnv(SensingSearchEnv):
     ```
 
     ## Version history
-    - v1: same version number as `parkenv/Search-v1`.
+    - v2: observations gain `day_error`; packaged scenarios have days that differ from their forecast.
+    - v1: same version number as `parkenv/Search-v2`.
     - v0: first version.
     """
 

@@ -1,4 +1,4 @@
-"""Wrappers for `parkenv/Search-v1`."""
+"""Wrappers for `parkenv/Search-v2`."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ class ThesisReward(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorA
     Examples:
         >>> import gymnasium as gym
         >>> import parkenv
-        >>> env = ThesisReward(gym.make("parkenv/Search-v1", scenario="mini"))
+        >>> env = ThesisReward(gym.make("parkenv/Search-v2", scenario="mini"))
     """
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         gym.utils.RecordConstructorArgs.__init__(self)
         super().__init__(env)
         if not isinstance(env.unwrapped, SearchEnv):
-            raise TypeError(f"ThesisReward wraps parkenv/Search-v1, not {type(env.unwrapped).__name__}")
+            raise TypeError(f"ThesisReward wraps parkenv/Search-v2, not {type(env.unwrapped).__name__}")
         self.r_max = float(env.unwrapped.scenario.walk_s.max())
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:

@@ -96,7 +96,7 @@ class Publication:
         if self.card.task == "search":
             agent = make_agent(self._source, scenario)
             env = gym.make(
-                "parkenv/Search-v1", scenario=scenario, render_mode="rgb_array", max_episode_steps=_LONGEST
+                "parkenv/Search-v2", scenario=scenario, render_mode="rgb_array", max_episode_steps=_LONGEST
             )
             for seed in seeds:
                 simulate(adapt_to_agent(env, agent), agent, seed, (frames,))
@@ -112,7 +112,7 @@ class Publication:
     def metadata(self, rows: Sequence[Row]) -> Row:
         """Return the model card's metadata as the Hub specifies it, with a `model-index` of the results."""
         card = self.card
-        env = "parkenv/Search-v1" if card.task == "search" else "parkenv/Drive-v1"
+        env = "parkenv/Search-v2" if card.task == "search" else "parkenv/Drive-v1"
         results = [
             {
                 "task": {"type": "reinforcement-learning", "name": f"{card.task} for parking"},
@@ -253,7 +253,7 @@ from parkenv.envs.local_observation import LocalObservation
 from planners import make_agent
 
 scenario = parkenv.make_scenario("{scenario}")
-env = LocalObservation(gym.make("parkenv/Search-v1", scenario=scenario), k={card.k})
+env = LocalObservation(gym.make("parkenv/Search-v2", scenario=scenario), k={card.k})
 agent = make_agent("{card.algorithm}:{MODEL}", scenario)
 observation, info = env.reset(seed=0)
 action, state = agent.predict(observation)"""

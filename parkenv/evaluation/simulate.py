@@ -15,7 +15,7 @@ from planners.agent import Agent, ClairvoyantAgent
 from sim_sensors.compilation import seconds_spent
 
 STEP_LIMIT = 2000
-"""Step limit of environments that are not made by `gymnasium.make`, the same as that of `parkenv/Search-v1`."""
+"""Step limit of environments that are not made by `gymnasium.make`, the same as that of `parkenv/Search-v2`."""
 
 
 class Step(NamedTuple):

@@ -74,7 +74,7 @@ class Detector(Protocol):
 
     A custom detector is a class with this method and a constructor without arguments. Its name is `MODULE:CLASS`
     wherever a detector is expected: `parkenv survey --detector my_detectors:Mine`,
-    `gym.make("parkenv/SearchPerception-v1", detector="my_detectors:Mine")`.
+    `gym.make("parkenv/SearchPerception-v2", detector="my_detectors:Mine")`.
 
     The method must not depend on earlier calls: images of several cameras and episodes arrive in any order.
     """

@@ -21,7 +21,7 @@ MOST_STEPS = 2000  # decisions after which a search is truncated at a cost of `g
 def expected_time(agent: Agent, problem: SearchProblem, p_occupied: ArrayLike, vertex: int) -> float:
     """Return the mean total time, s, of an agent's search where slots do not change and the forecast is right.
 
-    The rules are those of `parkenv/Search-v1`. Each slot is taken with its forecast probability, independently of the
+    The rules are those of `parkenv/Search-v2`. Each slot is taken with its forecast probability, independently of the
     others, and does not change. Every possible history of observations is enumerated, so lots can have about a dozen
     slots.
 

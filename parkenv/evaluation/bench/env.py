@@ -66,7 +66,7 @@ def env_rows(
     cart_pole = gym.make_vec("CartPole-v1", batch, vectorization_mode="vector_entry_point")
     steppers = {case: batch_stepper(envs, len(ACTIONS), seed) for case, envs in batches.items()}
     steppers |= {"CartPole batch": batch_stepper(cart_pole, 2, seed)}
-    steppers |= {"Search-v1": single_stepper(gym.make("parkenv/Search-v1", scenario=scenario), seed)}
+    steppers |= {"Search-v2": single_stepper(gym.make("parkenv/Search-v2", scenario=scenario), seed)}
     steppers |= {"CartPole": single_stepper(gym.make("CartPole-v1"), seed)}
     others, missing = installed_peers(batch, seed)
     rates = measured(steppers | others, seconds)
@@ -76,7 +76,7 @@ def env_rows(
         rows += rate("batch", case, rates[case], "steps/s", **peers)
     single = {"gymnasium CartPole-v1": rates["CartPole"]} | {name: rates[name] for name in others}
     rows += rate(
-        "single", f"Search-v1, {scenario.lot.n_slots} slots", rates["Search-v1"], "steps/s", **single
+        "single", f"Search-v2, {scenario.lot.n_slots} slots", rates["Search-v2"], "steps/s", **single
     )
     for name in missing:
         rows += absent("single", f"{name}: not installed", "steps/s")

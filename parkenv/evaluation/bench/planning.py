@@ -147,7 +147,7 @@ def city_rows(
         agents: names of the agents.
     """
     scenario = make_scenario(city_lot(n_slots, seed))
-    env = gym.make("parkenv/Search-v1", scenario=scenario)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
     rows: list[BenchRow] = []
     for name in agents:
         first, decisions = [], []

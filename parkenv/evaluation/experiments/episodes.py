@@ -69,8 +69,8 @@ class EpisodeRunner:
         scenario: the scenario, with the costs and speeds of the setting.
         name: name of the agent, for the trace.
         agent: the agent.
-        rig: sensor rig for `parkenv/SearchPerception-v1`; None for `parkenv/Search-v1`.
-        detector, every: detector and distance between captures, m, for `parkenv/SearchPerception-v1`; None for its own.
+        rig: sensor rig for `parkenv/SearchPerception-v2`; None for `parkenv/Search-v2`.
+        detector, every: detector and distance between captures, m, for `parkenv/SearchPerception-v2`; None for its own.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class EpisodeRunner:
         options: dict[str, Any] = {}
         if rig is not None:
             options = {"rig": rig, "detector": detector} | ({} if every is None else {"every": every})
-        name_of_env = "parkenv/Search-v1" if rig is None else "parkenv/SearchPerception-v1"
+        name_of_env = "parkenv/Search-v2" if rig is None else "parkenv/SearchPerception-v2"
         # The environments are checked by their tests; checking each again takes as long as some searches.
         env = gym.make(name_of_env, disable_env_checker=True, scenario=scenario, **options)
         self.env = adapt_to_agent(env, agent)

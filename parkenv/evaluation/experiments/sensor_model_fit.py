@@ -124,7 +124,7 @@ def count_observations(
         InputError: an unknown rig.
     """
     scenario = scenario.replace(sensor_model=_ASSUMED)
-    env = gym.make("parkenv/SearchPerception-v1", scenario=scenario, rig=rig, weather=weather)
+    env = gym.make("parkenv/SearchPerception-v2", scenario=scenario, rig=rig, weather=weather)
     searcher, counter = make_agent(agent, scenario), _ObservationCounter(scenario)
     for seed in seeds:
         simulate(env, searcher, seed, (counter,))

@@ -104,7 +104,7 @@ class FilmRenderer(SearchRenderer):
 
 
 class SearchFilm(Observer):
-    """Films a search in `parkenv/SearchPerception-v1`.
+    """Films a search in `parkenv/SearchPerception-v2`.
 
     Args:
         scenario: the scenario.

@@ -67,7 +67,7 @@ class Demonstrations:
             InputError: all searches were truncated.
         """
         planner = make_agent(agent, scenario)
-        env = gym.make("parkenv/Search-v1", scenario=scenario, max_episode_steps=MAX_STEPS)
+        env = gym.make("parkenv/Search-v2", scenario=scenario, max_episode_steps=MAX_STEPS)
         recorder = _DecisionRecorder(LocalObservation(env, k))
         for seed in seeds:
             simulate(env, planner, seed, (recorder,))

@@ -1,4 +1,4 @@
-"""Training for `parkenv/Search-v1`: the score is the mean total time."""
+"""Training for `parkenv/Search-v2`: the score is the mean total time."""
 
 from __future__ import annotations
 

@@ -26,16 +26,16 @@ from sim_sensors.rig import SensorRig
 
 
 class DrivenSearchEnv(SearchEnv):
-    """`parkenv/Search-v1` with continuous driving: edges, waits and attempts take as long as a simulated car needs.
+    """`parkenv/Search-v2` with continuous driving: edges, waits and attempts take as long as a simulated car needs.
 
-    World, observations and decisions are those of `parkenv/Search-v1`. An attempt also fails if the car does not fit
+    World, observations and decisions are those of `parkenv/Search-v2`. An attempt also fails if the car does not fit
     into a free slot, which then counts as taken. The manoeuvre into the slot counts as driving time.
 
     Args:
         scenario: the scenario.
         executor: executes the decisions.
         perception: simulated sensors on the car, made for this scenario: the belief is updated from their measurements
-            along the driven path, as in `parkenv/SearchPerception-v1`. If None, slots are observed from the vertices
+            along the driven path, as in `parkenv/SearchPerception-v2`. If None, slots are observed from the vertices
             with the scenario's sensor model.
     """
 
@@ -148,7 +148,7 @@ class DrivenSearch:
         style: driving style.
         rig: simulated sensors that observe the slots: laser, stereo, both_sides, or a `sim_sensors.rig.SensorRig`;
             None to use the scenario's sensor model.
-        weather: as in `parkenv/SearchPerception-v1`.
+        weather: as in `parkenv/SearchPerception-v2`.
         captures: maximum number of captures per edge.
 
     Raises:
