@@ -22,6 +22,7 @@ class TripRecorder(Observer):
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
         """Begin a trip."""
+        del observation
         search: Any = env.unwrapped
         self._problem = search.scenario.public()
         # The belief that the observation holds, also where the agent gets a shorter observation.

@@ -1,10 +1,10 @@
 """What observations say about the error of an occupancy map: a Gaussian process on the logit scale.
 
-On day d, slot i is taken with probability sigmoid(x_i + f_i + g(hour) + L_d + S_d·nearness_i). The map gives x. Its error
-f, the same on all days but for a slow drift, is a Gaussian process over slots: a common level, a slope toward the goal, a
-part that is smooth in nearness, and a part of each slot's own. Its error g is smooth in the hour of the day, one for
-weekdays and one for weekends. L_d and S_d are the day's own (the day error): all observations of a day share them, and
-they are integrated out. From one day to the next, f and g move by an Ornstein-Uhlenbeck step, which forgets them.
+On day d, slot i is taken with probability sigmoid(x_i + f_i + g(hour) + L_d + S_d·nearness_i). The map gives x. Its
+error f, the same on all days but for a slow drift, is a Gaussian process over slots: a common level, a slope toward the
+goal, a part that is smooth in nearness, and a part of each slot's own. Its error g is smooth in the hour of the day, on
+weekdays and on weekends. L_d and S_d are the day's own (the day error): all observations of a day share them,
+and they are integrated out. From one day to the next, f and g move by an Ornstein-Uhlenbeck step, which forgets them.
 
 How wrong the map is, and how fast that changes, is not known either: several priors are followed at once, weighted by
 the probability that each gave to the observations so far (Bayesian model averaging).
@@ -14,8 +14,9 @@ A day's observations are added by expectation propagation (Minka 2001; Rasmussen
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,8 +118,9 @@ class MapError:
         The map says 50 % for both slots. After slot 0 was taken on ten days, the map is corrected there most.
 
         >>> error = MapError(np.array([1.0, -1.0]), [MapErrorPrior(0.5, 0.0, 0.0, 1.0, 0.0, 1e3)])
+        >>> taken = Evidence(np.array([0]), np.array([9.0]), np.array([[0.0, 1.0]]))
         >>> for _ in range(10):
-        ...     error.observe(Evidence(np.array([0]), np.array([9.0]), np.array([[0.0, 1.0]])), np.zeros((1, 1)), (0.5, 0.0))
+        ...     error.observe(taken, np.zeros((1, 1)), (0.5, 0.0))
         >>> mean, _ = error.predict(9.0)
         >>> bool(mean[0, 0] > mean[0, 1] > 0.1)
         True
@@ -161,11 +163,11 @@ class MapError:
         if not len(evidence.slots):
             return
         parts = [(evidence.slots, np.ones(len(evidence.slots))), *self._knots(evidence.hours)]
-        with_all = sum(self._covariance[:, :, at] * part for at, part in parts)
+        with_all = _summed(self._covariance[:, :, at] * part for at, part in parts)
         nearness = self._nearness[evidence.slots]
-        among = sum(with_all[:, at] * part[:, None] for at, part in parts)
+        among = _summed(with_all[:, at] * part[:, None] for at, part in parts)
         among += day_error[0] ** 2 + day_error[1] ** 2 * np.outer(nearness, nearness)
-        mean = logits + sum(self._mean[:, at] * part for at, part in parts)
+        mean = logits + _summed(self._mean[:, at] * part for at, part in parts)
         precision, location, log_evidence = _approximate(mean, among, evidence.likelihood)
         # Condition on the approximate observations: their noise has the variance 1/precision.
         root = np.sqrt(precision)
@@ -183,9 +185,9 @@ class MapError:
     def predict(self, hour: float) -> tuple[FloatArray, FloatArray]:
         """Return mean and variance of each slot's error, (n_priors, n) each, at hours since Monday 00:00."""
         n, knots = len(self._nearness), self._knots(np.array([hour]))
-        mean = self._mean[:, :n] + sum(self._mean[:, at] * part for at, part in knots)
-        with_hour = sum(self._covariance[:, :, at[0]] * part for at, part in knots)
-        of_hour = sum(with_hour[:, at] * part for at, part in knots)
+        mean = self._mean[:, :n] + _summed(self._mean[:, at] * part for at, part in knots)
+        with_hour = _summed(self._covariance[:, :, at[0]] * part for at, part in knots)
+        of_hour = _summed(with_hour[:, at] * part for at, part in knots)
         variance = np.diagonal(self._covariance, axis1=1, axis2=2)[:, :n] + 2.0 * with_hour[:, :n] + of_hour
         return mean, variance
 
@@ -218,6 +220,10 @@ class MapError:
             ((first + before).astype(np.int64), 1.0 - part),
             ((first + after).astype(np.int64), part),
         ]
+
+
+def _summed(parts: Iterable[FloatArray]) -> FloatArray:
+    return reduce(np.add, parts)
 
 
 def mean_probability(logits: FloatArray, variance: FloatArray) -> FloatArray:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
 from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior, mean_probability
-from parkenv.mapping.inference import RELAXATION_S
+from parkenv.mapping.inference import RELAXATION_S, MapPrior, SessionLog
 from parkenv.mapping.trips import Trip, state_likelihoods
 from parkenv.world.day_error import MAX_LOGITS, DayError, centred_logits, nearness
 from parkenv.world.occupancy import Arrival, Forecast, PriorModel
@@ -24,13 +24,13 @@ MOST_SLOTS = 3_000
 USUAL_DAY = DayError(0.8)
 """Day error of a map that states none: the median of 99 car parks over two years is 0.77 logits."""
 _MEMORY = (30.0, 365.0)
-_SHAPE = np.array([1.0, 0.8, 0.8, 0.6, 0.5])
-"""Standard deviations of level, slope, smooth, own and hour, relative to that of the level."""
+_SHAPE = {"level": 1.0, "slope": 0.8, "smooth": 0.8, "own": 0.6, "hour": 0.5}
+"""Standard deviations, relative to that of the level."""
 
 
 def _priors(scales: dict[float, float]) -> tuple[MapErrorPrior, ...]:
     return tuple(
-        MapErrorPrior(*(scale * _SHAPE), memory_days=days, weight=weight)
+        MapErrorPrior(**{part: scale * sd for part, sd in _SHAPE.items()}, memory_days=days, weight=weight)
         for (scale, weight), days in product(scales.items(), _MEMORY)
     )
 
@@ -85,6 +85,27 @@ class ReversedMap:
         """Return the forecast with the slots in reverse order of their walks."""
         right = self._right.forecast(arrival)
         return Forecast(right.p_occupied[self._from], right.decay_rate[self._from], right.day_error)
+
+
+def map_prior(log: SessionLog, trips: Sequence[Trip], walk: ArrayLike) -> PriorModel:
+    """Return the forecast of a map file: its survey sessions, corrected by the trips after them.
+
+    Args:
+        log: the sessions.
+        trips: the trips.
+        walk: (n,) walk from each slot to the goal.
+
+    Raises:
+        InputError: neither sessions nor trips, or a lot that is too large to learn from trips.
+    """
+    if not trips:
+        return MapPrior(log)
+    surveyed = len(log.time) > 0
+    learned = LearnedMap(
+        MapPrior(log) if surveyed else EmptyMap(log.n_slots), walk, GIVEN_MAP if surveyed else NO_MAP
+    )
+    learned.learn(trips)
+    return learned
 
 
 class LearnedMap:
@@ -143,7 +164,9 @@ class LearnedMap:
             mean_logits.append(logits)
         weights = self._error.weights
         p = np.clip(weights @ np.array(p_taken), MIN_PROBABILITY, MAX_PROBABILITY)
-        return Forecast(p, base.decay_rate, self._day_error(base.day_error, weights, np.array(mean_logits), hour))
+        return Forecast(
+            p, base.decay_rate, self._day_error(base.day_error, weights, np.array(mean_logits), hour)
+        )
 
     def _learn_day(self, trips: Sequence[Trip]) -> None:
         slots, hours, likelihood, p, day_error = [], [], [], [], DayError()

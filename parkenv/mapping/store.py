@@ -109,7 +109,7 @@ class MapStore:
     """
 
     def __init__(self, path: Path, lot: ParkingLot, *, create: bool = True) -> None:
-        self.path, self._lot = path, lot
+        self.path, self._lot, self._version = path, lot, VERSION
         if not path.exists() and not create:
             raise InputError(f"{path}: no such map file; parkenv survey makes one")
         if path.exists() and not path.is_file():
@@ -214,7 +214,13 @@ class MapStore:
         """
         self._require_slots(trip)
         head = (trip.key, trip.time, trip.date)
-        columns = (trip.slots, trip.after_s, trip.taken.astype(np.int64), trip.hit_rate, trip.false_alarm_rate)
+        columns = (
+            trip.slots,
+            trip.after_s,
+            trip.taken.astype(np.int64),
+            trip.hit_rate,
+            trip.false_alarm_rate,
+        )
         rows = zip(*(column.tolist() for column in columns), strict=True)
         with self._errors_in_words():
             try:
@@ -252,7 +258,9 @@ class MapStore:
                 ).fetchall()
                 try:
                     table = np.array(rows, dtype=np.float64).reshape(-1, 5).T
-                    trip = Trip(key, time, date, table[0].astype(np.int64), table[1], table[2] == 1.0, *table[3:])
+                    trip = Trip(
+                        key, time, date, table[0].astype(np.int64), table[1], table[2] == 1.0, *table[3:]
+                    )
                 except (TypeError, ValueError) as error:
                     raise InputError(f"{self.path}: trip {key!r:.40}: {error}") from error
                 self._require_slots(trip)

@@ -48,7 +48,8 @@ class Trip:
             "key": not self.key,
             "time": not math.isfinite(self.time),
             "slots": (self.slots < 0).any(),
-            "after_s": not np.isfinite(self.after_s).all() or (np.diff(self.after_s, prepend=0.0) < 0.0).any(),
+            "after_s": not np.isfinite(self.after_s).all()
+            or (np.diff(self.after_s, prepend=0.0) < 0.0).any(),
             "rates": not ((rates >= 0.0) & (rates <= 1.0)).all(),
         }
         for name, bad in wrong.items():
@@ -70,7 +71,8 @@ def state_likelihoods(trip: Trip, forecast: Forecast) -> tuple[NDArray[np.int64]
 
     Returns:
         (k,) int64, the slots, in the order of their first observations; and (k, 2) float64, the probability of all
-        observations of a slot if it was free at the first, and if it was taken. Contradictory observations are left out.
+        observations of a slot if it was free at the first, and if it was taken. Slots with contradictory observations
+        are left out.
     """
     slots, first = np.unique(trip.slots, return_index=True)
     slots = slots[np.argsort(first)]

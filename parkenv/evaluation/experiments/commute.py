@@ -70,7 +70,10 @@ def calendar(scenario: Scenario, days: int) -> list[Day]:
         dates = sorted(occupancy.days_in(window))[:days]
         counts = [date.fromisoformat(day).toordinal() for day in dates]
         first_monday = counts[0] - date.fromisoformat(dates[0]).weekday()
-        return [Day(i + 1, count - first_monday, day) for i, (count, day) in enumerate(zip(counts, dates, strict=True))]
+        return [
+            Day(i + 1, count - first_monday, day)
+            for i, (count, day) in enumerate(zip(counts, dates, strict=True))
+        ]
     weekdays = sorted(window.weekdays)
     return [Day(i + 1, 7 * (i // len(weekdays)) + weekdays[i % len(weekdays)], "") for i in range(days)]
 
@@ -123,7 +126,9 @@ class Course:
                 return LearnedMap(scenario.prior or ReversedMap(scenario.occupancy, walk), walk, GIVEN_MAP)
         return scenario.occupancy
 
-    def run(self, days: Sequence[Day], before: Sequence[Trip]) -> tuple[list[Row], list[Row], list[Trip], list[str]]:
+    def run(
+        self, days: Sequence[Day], before: Sequence[Trip]
+    ) -> tuple[list[Row], list[Row], list[Trip], list[str]]:
         """Run some days.
 
         Args:
@@ -168,7 +173,12 @@ class Course:
                     trips.sort(key=lambda trip: (trip.time, trip.key))
                     known.learn(trips)
                     made += trips
-        return rows, timings, made, [f"{self.agent.label} in {self.scenario.name}: {w.message}" for w in caught]
+        return (
+            rows,
+            timings,
+            made,
+            [f"{self.agent.label} in {self.scenario.name}: {w.message}" for w in caught],
+        )
 
     def _search(self, day: Day, driver: int, known: PriorModel) -> tuple[Scenario, int]:
         """Return the scenario of a driver's search, at the same time every day, and the seed of the day's world."""
@@ -182,7 +192,9 @@ class Course:
         for seed in seeds:
             if scenario.occupancy.draw_arrival(window, world_key(seed, 0)).day == day.date:
                 return scenario, seed
-        raise InputError(f"scenario {scenario.name!r}: no world of {day.date or 'a day'} in {_MOST_TRIES} seeds")
+        raise InputError(
+            f"scenario {scenario.name!r}: no world of {day.date or 'a day'} in {_MOST_TRIES} seeds"
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -163,7 +163,12 @@ class CommuteSpec(Workplace):
     def _bounded(self) -> Self:
         _require_distinct(self.agents, self.scenarios)
         count = (
-            len(self.agents) * len(self.scenarios) * (len(self.maps) + 1) * self.days * self.drivers * self.fleet
+            len(self.agents)
+            * len(self.scenarios)
+            * (len(self.maps) + 1)
+            * self.days
+            * self.drivers
+            * self.fleet
         )
         if count > MAX_EPISODES:
             raise PydanticCustomError(
