@@ -1,1 +1,1 @@
-"""Forecasts of how full car parks are, which state how sure they are: counts, models of days, scores."""
+"""Forecasting models: arrays of days, hours and slots in, logits with standard deviations out."""
