@@ -211,7 +211,7 @@ def _parts(periods: tuple[int, int, int], part: float) -> FloatArray:
 
 
 def _variance(parts: FloatArray, covariance: FloatArray) -> FloatArray:
-    return np.einsum("ta,iab,tb->it", parts, covariance, parts, optimize=True)
+    return np.asarray(np.einsum("ta,iab,tb->it", parts, covariance, parts, optimize=True))
 
 
 def _log_determinant(positive: FloatArray) -> float:

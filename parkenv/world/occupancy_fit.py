@@ -114,13 +114,14 @@ def fit_hourly_decay_rates(
         after: (k,) bool, taken at end.
     """
     dt, hour = end - start, ((start + end) / 2 // HOUR_S).astype(np.int64)
-    rates = np.full(_DAY_HOURS, math.log(sum(fit_constant_rates(dt, before, after))))
+    rates: FloatArray = np.full(_DAY_HOURS, math.log(sum(fit_constant_rates(dt, before, after))))
     for h in np.unique(hour):
         here = hour == h
         own = math.log(sum(fit_constant_rates(dt[here], before[here], after[here])))
         n = int((before[here] != after[here]).sum())
         rates[h] += n / (n + PRIOR_CHANGES) * (own - rates[h])
-    return np.exp(rates)
+    decay_rates: FloatArray = np.exp(rates)
+    return decay_rates
 
 
 class Intervals(NamedTuple):

@@ -305,4 +305,4 @@ def recorded_forecast(day: Any, slot: int, second: float) -> tuple[float, float]
 @kernel
 def recorded_day_level(day: Any, second: float) -> float:
     """Return the standard deviation of the error of a recorded day's level at a second of it, logits."""
-    return _between_periods(day.day_level, second)
+    return float(_between_periods(day.day_level, second))
