@@ -67,6 +67,7 @@ class ReferenceSearch:
         self.vertex = int(entries[int(keyed_uniform(self.key, ENTRY_STREAM, 0, 0) * len(entries))])
         known = scenario.forecast(self.arrival)
         self.forecast, self.decay_rate = known.p_occupied, known.decay_rate
+        self.day_error = [known.day_error.level, known.day_error.slope]
         self.p_observed = self.forecast.copy()
         self.observed_at = np.full(len(self.forecast), -1.0)
         self.observed_taken = np.zeros(len(self.forecast), dtype=bool)
@@ -154,6 +155,7 @@ class ReferenceSearch:
             "time": np.array([self.time, self.time - self.arrival.time]),
             "p_occupied": self.p_occupied(),
             "belief": np.concatenate([self.forecast, self.decay_rate, self.p_observed, self.observed_at]),
+            "day_error": self.day_error,
             "action_mask": np.append(
                 self.scenario.lot.neighbors[self.vertex] >= 0, self.vertex < self.scenario.lot.n_slots
             ),

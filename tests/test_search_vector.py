@@ -12,6 +12,7 @@ from parkenv.belief.slot_belief import bayes_update
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots import city_lot, grid_lot
+from parkenv.world.day_error import DayError
 from parkenv.world.occupancy import Arrival, ArrivalWindow, Forecast
 from parkenv.world.occupancy_log import OccupancyLog
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -27,7 +28,7 @@ class Rumour:
 
     def forecast(self, arrival: Arrival) -> Forecast:
         p = 0.1 + 0.8 * np.linspace(0, 1, self.n_slots) * (arrival.time % 3600) / 3600
-        return Forecast(p, np.full(self.n_slots, 1 / 900))
+        return Forecast(p, np.full(self.n_slots, 1 / 900), DayError(p[-1], 0.5 * p[-1]))
 
 
 def busy_log(n_slots=6, n_days=12):

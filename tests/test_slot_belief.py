@@ -67,14 +67,19 @@ def test_an_observation_states_the_belief_that_the_same_reports_lead_to(sensor_m
 
 def test_parts_and_observations_keep_the_belief():
     belief = (
-        SlotBelief.of_forecast([0.2, 0.5, 0.8], np.full(3, 1e-3)).decay(10.0).update([2], [True]).decay(5.0)
+        SlotBelief.of_forecast([0.2, 0.5, 0.8], np.full(3, 1e-3), (0.5, 0.25))
+        .decay(10.0)
+        .update([2], [True])
+        .decay(5.0)
     )
     part = belief.take(np.array([2, 0]))
+    assert part.day_error.tolist() == [0.5, 0.25]
     assert (part.age.tolist(), part.observed_taken.tolist()) == ([5.0, np.inf], [True, False])
     observation = {"time": np.array([0.0, 15.0]), **belief.to_observation()}
     again = SlotBelief.of_observation(observation)
     np.testing.assert_allclose(again.p_occupied, belief.p_occupied, rtol=1e-6)
     assert again.age.tolist() == belief.age.tolist()
+    assert again.day_error.tolist() == [0.5, 0.25]
 
 
 def test_observations_of_other_environments_are_refused():

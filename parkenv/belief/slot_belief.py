@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Self
 
@@ -17,6 +17,9 @@ from sim_sensors.compilation import compiled
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
+
+_SURE = np.zeros(2)
+_SURE.flags.writeable = False
 
 UNOBSERVED, OBSERVED_FREE, OBSERVED_TAKEN = 0, 1, 2  # result of a slot's last observation
 
@@ -40,6 +43,8 @@ class SlotBelief:
             `p_observed`, P(taken) right after the slot's last observation; the forecast if there was none;
             `observed_at`, time of that observation, s since the search began; -1 if there was none.
         time: current time, s since the search began.
+        day_error: (2,) float, logits, how far whole days differ from the forecast: standard deviations over days of
+            the level and of the slope to the goal; see `parkenv.world.day_error`.
 
     Examples:
         Slot 1 is observed free and stays likely to be free for a while.
@@ -53,6 +58,7 @@ class SlotBelief:
     p_occupied: NDArray[np.floating]
     parts: NDArray[np.floating]
     time: float
+    day_error: NDArray[np.floating] = field(default_factory=lambda: _SURE)
 
     @classmethod
     def of_observation(cls, observation: Mapping[str, Any]) -> Self:
@@ -62,27 +68,39 @@ class SlotBelief:
             InputError: the observation comes from another environment.
         """
         try:
-            return cls(observation["p_occupied"], observation["belief"], float(observation["time"][1]))
+            return cls(
+                observation["p_occupied"],
+                observation["belief"],
+                float(observation["time"][1]),
+                observation["day_error"],
+            )
         except KeyError as error:
             raise InputError(
                 f"observation has no {error.args[0]!r}; want one of parkenv/Search-v2, got {', '.join(observation)}"
             ) from None
 
     def to_observation(self) -> dict[str, NDArray[np.float32]]:
-        """Return this belief as entries of an observation: `p_occupied` and `belief`, float32."""
-        return {"p_occupied": self.p_occupied.astype(np.float32), "belief": self.parts.astype(np.float32)}
+        """Return this belief as entries of an observation: `p_occupied`, `belief` and `day_error`, float32."""
+        return {
+            "p_occupied": self.p_occupied.astype(np.float32),
+            "belief": self.parts.astype(np.float32),
+            "day_error": self.day_error.astype(np.float32),
+        }
 
     @classmethod
-    def of_forecast(cls, p_occupied: ArrayLike, decay_rate: ArrayLike) -> Self:
+    def of_forecast(
+        cls, p_occupied: ArrayLike, decay_rate: ArrayLike, day_error: ArrayLike = (0.0, 0.0)
+    ) -> Self:
         """Return the belief before any observation.
 
         Args:
             p_occupied: (n_slots,) the forecast.
             decay_rate: (n_slots,) 1/s.
+            day_error: (2,) logits.
         """
         forecast = np.array(p_occupied, dtype=np.float64)
         parts = np.concatenate([forecast, decay_rate, forecast, np.full(len(forecast), -1.0)])
-        return cls(forecast, parts, 0.0)
+        return cls(forecast, parts, 0.0, np.array(day_error, dtype=np.float64))
 
     @cached_property
     def _rows(self) -> NDArray[np.floating]:
@@ -145,7 +163,7 @@ class SlotBelief:
     def take(self, slots: NDArray[np.integer]) -> Self:
         """Return the belief of some of the slots, (k,), in float64."""
         parts = self._rows[:, slots].astype(np.float64)
-        return type(self)(self.p_occupied[slots].astype(np.float64), parts.ravel(), self.time)
+        return type(self)(self.p_occupied[slots].astype(np.float64), parts.ravel(), self.time, self.day_error)
 
     def update(
         self,
@@ -171,14 +189,18 @@ class SlotBelief:
                 (false_alarm_rate, np.float64),
             )
         )
-        later = type(self)(self.p_occupied.astype(np.float64), self.parts.astype(np.float64), self.time)
+        later = type(self)(
+            self.p_occupied.astype(np.float64), self.parts.astype(np.float64), self.time, self.day_error
+        )
         _update_slots(later.p_occupied, observed, reports, hits, false_alarms)
         later.p_observed[observed], later.observed_at[observed] = later.p_occupied[observed], self.time
         return later
 
     def decay(self, seconds: float) -> Self:
         """Return the belief after some time without observations."""
-        later = type(self)(self.p_occupied, self.parts.astype(np.float64), self.time + seconds)
+        later = type(self)(
+            self.p_occupied, self.parts.astype(np.float64), self.time + seconds, self.day_error
+        )
         later.p_occupied = _decay_slots(later.forecast, later.decay_rate, later.p_observed, later.age)
         return later
 

@@ -96,7 +96,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
     `Discrete(5)`, as in `parkenv/Search-v2`: up, down, left, right, park.
 
     ## Observation space
-    The `Dict` of `parkenv/Search-v2`: `vertex`, `time`, `p_occupied`, `belief`, `action_mask`.
+    The `Dict` of `parkenv/Search-v2`: `vertex`, `time`, `p_occupied`, `belief`, `day_error`, `action_mask`.
 
     ## Rewards
     Minus the seconds of the step, as in `parkenv/Search-v2`.

@@ -20,6 +20,7 @@ from parkenv.envs.search_records import NEVER_OBSERVED, ScenarioRecords, Searche
 from parkenv.envs.search_state import SearchState
 from parkenv.errors import InputError
 from parkenv.scenarios.build import make_scenario
+from parkenv.world.day_error import MAX_LOGITS
 from parkenv.world.keyed_random import seed_state
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.scenario import Scenario
@@ -29,8 +30,7 @@ if TYPE_CHECKING:
 
 LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no search takes three years
 MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
-_REBUILT = {"searches", "_state", "_address", "_copy_time", "_copy_p_occupied", "_copy_belief"}
-_REBUILT |= {"_seeded_with", "_begun", "_over"}
+_REBUILT = {"searches", "_state", "_address", "_copies", "_copy_mask", "_seeded_with", "_begun", "_over"}
 
 
 class SavedSearch(NamedTuple):
@@ -67,6 +67,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
     | `p_occupied` | `Box(0, 1, (n_slots,), float32)` | current P(taken) of each slot |
     | `belief` | `Box((4 * n_slots,), float32)` | the belief state behind `p_occupied`, four parts as below |
+    | `day_error` | `Box(0, 5, (2,), float32)` | how far whole days differ from the forecast, logits, as below |
     | `action_mask` | `Box(0, 1, (5,), int8)` | the actions that the graph has here |
 
     `belief` has four parts of n_slots numbers each; unpack them with
@@ -78,6 +79,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     | 1 | `decay_rate` | 0, 1e6 | 1/s, rate of decay to the forecast; constant in an episode |
     | 2 | `p_observed` | 0, 1 | P(taken) right after the last observation of the slot; the forecast before the first |
     | 3 | `observed_at` | -1, 1e8 | time of that observation, s since the search began; -1 before the first |
+
+    `day_error` holds two standard deviations over days, in logits, `(level, slope)`; constant in an episode.
+    A day has a level L ~ N(0, level²) and a slope S ~ N(0, slope²), which are not observed. It multiplies
+    the odds that slot i is taken by `exp(L + S * nearness_i)` (times a constant, such that the forecast is the mean
+    over days); nearness falls from 1 at the slot nearest to the goal to -1 at the farthest, by rank.
 
     An observation updates the belief in a slot by Bayes' rule; then the belief decays to the forecast:
     `p_occupied = forecast + (p_observed - forecast) * exp(-decay_rate * (time[1] - observed_at))`.
@@ -160,7 +166,6 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         lot = self.scenario.lot
         self.action_space = spaces.Discrete(len(ACTIONS))
         self.observation_space = search_space(lot.n_slots, lot.n_vertices)
-        self._masks = list(self.scenario.action_masks)
         self._step = step_exact_at if self.scenario.sensor_model.perfect else step_noisy_at
         self._vertices = list(np.arange(lot.n_vertices))
         self._renderer: SearchRenderer | None = None
@@ -172,10 +177,14 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         )
         self._address = self.searches.address
         self._state = SearchState(self.scenario, self.searches)
-        # Bound methods that copy the observation: looking them up takes a tenth of a step.
-        self._copy_time = self.searches.records["clock"][0].copy
-        self._copy_p_occupied = self.searches.p_occupied[0].copy
-        self._copy_belief = self.searches.belief[0].reshape(-1).copy
+        # Bound methods that copy the parts of an observation: looking them up takes a tenth of a step.
+        self._copies = (
+            self.searches.records["clock"][0].copy,
+            self.searches.p_occupied[0].copy,
+            self.searches.belief[0].reshape(-1).copy,
+            self.searches.day_error[0].copy,
+        )
+        self._copy_mask = [mask.copy for mask in self.scenario.action_masks]
         self._seeded_with: int | None = None
         self._begun, self._over = False, True
 
@@ -228,14 +237,13 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             record["seed_state"] = seed_state(self.np_random_seed)
         begin_search_at(self._address)
         if len(self.searches.external_forecast):
-            forecast = self.scenario.forecast(self._state.arrival)
-            self.searches.external_forecast[0] = forecast.p_occupied, forecast.decay_rate
+            self.searches.set_external_forecast(0, self.scenario.forecast(self._state.arrival))
             init_external_forecast_at(self._address)
         self._begun, self._over = True, False
         self._state.path = [self._state.vertex]
         if self.render_mode == "human":
             self.render()
-        return self._observation(self._state), {}
+        return self._observation(self._state.vertex), {}
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Drive along an edge, or attempt to park; see the class."""
@@ -279,7 +287,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         }
         if self.render_mode == "human":
             self.render()
-        return self._observation(state), reward, over, False, info
+        return self._observation(vertex), reward, over, False, info
 
     def _advance(self, action: int) -> tuple[Any, ...]:
         """Act, observe, and return the numbers named by `parkenv.envs.search_kernel.STEP_RESULT`."""
@@ -288,7 +296,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the actions that the graph has here, (5,) bool; sb3-contrib expects this name."""
-        mask: NDArray[np.bool_] = self._masks[self.state.vertex].astype(np.bool_)
+        mask: NDArray[np.bool_] = self.scenario.action_masks[self.state.vertex].astype(np.bool_)
         return mask
 
     def render(self) -> Any:
@@ -327,14 +335,15 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self._renderer.window.close()
             self._renderer = None
 
-    def _observation(self, state: SearchState) -> dict[str, Any]:
-        vertex = state.path[-1]
+    def _observation(self, vertex: int) -> dict[str, Any]:
+        time, p_occupied, belief, day_error = self._copies
         return {
             "vertex": self._vertices[vertex],
-            "time": self._copy_time(),
-            "p_occupied": self._copy_p_occupied(),
-            "belief": self._copy_belief(),
-            "action_mask": self._masks[vertex].copy(),
+            "time": time(),
+            "p_occupied": p_occupied(),
+            "belief": belief(),
+            "day_error": day_error(),
+            "action_mask": self._copy_mask[vertex](),
         }
 
 
@@ -351,6 +360,7 @@ def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
             "time": spaces.Box(0.0, LATEST, (2,), np.float32),
             "p_occupied": spaces.Box(0.0, 1.0, (n_slots,), np.float32),
             "belief": spaces.Box(low, high, dtype=np.float32),
+            "day_error": spaces.Box(0.0, MAX_LOGITS, (2,), np.float32),
             "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
         }
     )

@@ -233,6 +233,18 @@ def arrive(search: Any) -> None:
         search.n_last_observed_taken
     ) = 0
     search.remembered_slot = -1
+    _write_day_error(search)
+
+
+@inlined
+def _write_day_error(search: Any) -> None:
+    """Write the day error of the forecast, unless the prior is external."""
+    scenario, day_error = scenario_at(search.scenario, 0), float32s(search.day_error)
+    for i in range(2):
+        if scenario.prior_kind == LOG_KIND:
+            day_error[i] = worlds.recorded_day_at(scenario.prior, search.day).day_error[i]
+        elif scenario.prior_kind == PROCESS_KIND:
+            day_error[i] = worlds.process_at(scenario.prior, 0).day_error[i]
 
 
 @kernel

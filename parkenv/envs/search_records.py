@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
 from parkenv.world.lot import MOVES, PARK
-from parkenv.world.occupancy import IntArray, OccupancyModel, OccupancyProcess, PriorModel
+from parkenv.world.occupancy import Forecast, IntArray, OccupancyModel, OccupancyProcess, PriorModel
 from parkenv.world.occupancy_kernel import CURSOR_FIELDS, PROCESS, RECORDED_DAY
 from parkenv.world.occupancy_log import weekday_of
 from parkenv.world.pointers import ADDRESS, address_of, record_at
@@ -121,12 +121,13 @@ SEARCH = np.dtype(
         # Time since Monday 00:00, and since the search began, as observed.
         _EPISODES[2],
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
-        # float64 forecast and decay rate of an external prior, or 0.
+        # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast.
         ("scenario", ADDRESS),
         ("blocks", ADDRESS),
         ("slots", ADDRESS),
         ("columns", ADDRESS),
         ("external_forecast", ADDRESS),
+        ("day_error", ADDRESS),
         # Number of slots of the largest lot; (width,) float32 current belief and (4, width) float32 `belief` of the
         # observation, or 0 if these are not kept.
         ("width", np.int64),
@@ -275,6 +276,7 @@ class Searches:
             first use; the first column is the sentinel. m is the number of slots of the largest lot.
         external_forecast: (n, 2, m) float64, forecast and decay rate of priors that only Python can compute; else
             (0, 2, 0).
+        day_error: (n, 2) float32, logits, day error of each search's forecast: level and slope.
         p_occupied: (n, m) float32, current belief in every slot; (0, 0) if not kept.
         belief: (n, 4, m) float32: forecast, decay rate, belief after the last observation, and its time; (0, 4, 0) if
             not kept.
@@ -290,6 +292,7 @@ class Searches:
         # Zeros stand for the sentinel; the system allocates no memory for pages that are never written.
         self._columns = np.zeros((n, m), np.int32)
         self.external_forecast = np.zeros((n, 2, m) if external else (0, 2, 0))
+        self.day_error = np.zeros((n, 2), np.float32)
         # Padding past the last slot of a smaller lot: taken, constant, never observed.
         self.p_occupied = np.ones((n, m) if full_belief else (0, 0), np.float32)
         self.belief = np.zeros((n, 4, m) if full_belief else (0, 4, 0), np.float32)
@@ -301,6 +304,12 @@ class Searches:
             first = address_of(array, array.dtype)
             self.records[name] = first + np.arange(n) * array.strides[0] if len(array) else 0
 
+    def set_external_forecast(self, search: int, forecast: Forecast) -> None:
+        """Store the forecast of a prior that only Python can compute."""
+        n = len(forecast.p_occupied)
+        self.external_forecast[search, :, :n] = forecast.p_occupied, forecast.decay_rate
+        self.day_error[search] = forecast.day_error.level, forecast.day_error.slope
+
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays with a row for each search, keyed by the SEARCH field that holds the row's address."""
         return {
@@ -308,6 +317,7 @@ class Searches:
             "blocks": self._blocks,
             "columns": self._columns,
             "external_forecast": self.external_forecast,
+            "day_error": self.day_error,
             "p_occupied": self.p_occupied,
             "belief": self.belief,
         }

@@ -51,7 +51,9 @@ class SearchState:
     def belief(self) -> SlotBelief:
         """A float64 copy of the current belief about the slots."""
         forecast = self._scenario.forecast(self.arrival)
-        belief = SlotBelief.of_forecast(forecast.p_occupied, forecast.decay_rate)
+        belief = SlotBelief.of_forecast(
+            forecast.p_occupied, forecast.decay_rate, (forecast.day_error.level, forecast.day_error.slope)
+        )
         belief.time = self.time - self.arrival.time
         read_belief_at(self._searches.address, belief.p_occupied, belief.p_observed, belief.observed_at)
         return belief

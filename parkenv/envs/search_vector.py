@@ -293,6 +293,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._seen: dict[str, NDArray[Any]] = empty
         if self._full:
             self._seen["p_occupied"] = self._searches.p_occupied
+            self._seen["day_error"] = self._searches.day_error
         if "belief" in self._seen:
             self._seen["belief"] = self._searches.belief.reshape(n, -1)
         self._steps = Steps.of(n)
@@ -313,7 +314,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     @property
     def bytes_each(self) -> float:
         """Memory of one search, bytes, after observing every slot; without the shared tables of the scenarios."""
-        own = (a for name, a in self._seen.items() if name not in ("p_occupied", "belief"))
+        own = (a for name, a in self._seen.items() if name not in ("p_occupied", "belief", "day_error"))
         return (self._searches.n_bytes + sum(a.nbytes for a in (*own, *self._steps))) / self.num_envs
 
     def reset(
@@ -429,9 +430,9 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             return
         for i in np.flatnonzero(which):
             scenario = self.scenarios[i % len(self.scenarios)]
-            forecast = scenario.forecast(arrival_of(scenario, searches.records[i]))
-            n = len(forecast.p_occupied)
-            searches.external_forecast[i, :, :n] = forecast.p_occupied, forecast.decay_rate
+            searches.set_external_forecast(
+                int(i), scenario.forecast(arrival_of(scenario, searches.records[i]))
+            )
 
     def _observations(self) -> dict[str, NDArray[Any]]:
         return {name: a.copy() for name, a in self._seen.items()} if self._copy else dict(self._seen)

@@ -19,7 +19,7 @@ from sim_sensors.rig import SensorRig
 
 FARTHEST = 1e7  # bound, m, of the observed positions: Gymnasium requires one, and every lot is smaller
 
-_NOT_SENSED = ("p_occupied", "belief")
+_NOT_SENSED = ("p_occupied", "belief", "day_error")
 
 
 class SensingSearchEnv(SearchEnv):
@@ -149,9 +149,10 @@ class SearchSensorsEnv(SensingSearchEnv):
             seen[f"scan.{name}"] = spaces.Box(0.0, laser.max_range, (k, laser.n_beams), np.float32)
         self.observation_space = spaces.Dict(seen)
 
-    def _observation(self, state: SearchState) -> dict[str, Any]:
+    def _observation(self, vertex: int) -> dict[str, Any]:
+        state = self._state
         self._captures = [] if state.parked else self._sampler.sample_step(state, self._before)
-        observation = super()._observation(state)
+        observation = super()._observation(vertex)
         for name in _NOT_SENSED:
             del observation[name]
         for name, space in self.observation_space.items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +26,7 @@ class FlatMap:
     """
 
     p_occupied: float  # the probability, 0 to 1; clipped to the range of forecasts
-    true: PriorModel  # provides the decay rates, which remain correct
+    true: PriorModel  # provides the decay rates and the day error, which remain correct
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.p_occupied <= 1.0:
@@ -40,4 +40,4 @@ class FlatMap:
     def forecast(self, arrival: Arrival) -> Forecast:
         """Forecast the same probability for every slot."""
         p = min(max(self.p_occupied, MIN_PROBABILITY), MAX_PROBABILITY)
-        return Forecast(np.full(self.n_slots, p), self.true.forecast(arrival).decay_rate)
+        return replace(self.true.forecast(arrival), p_occupied=np.full(self.n_slots, p))

@@ -16,6 +16,7 @@ from scipy.optimize import brentq
 from parkenv.errors import InputError
 from parkenv.files.versioned_json import JsonFormat
 from parkenv.world import occupancy_kernel as kernels
+from parkenv.world.day_error import EXACT, DayError
 from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.world.occupancy_kernel import kernel
 from parkenv.world.pointers import address_of
@@ -105,6 +106,7 @@ class Forecast:
     p_occupied: FloatArray  # (n,) float64, P(taken) at the arrival
     # (n,) float64, 1/s, arrival rate plus departure rate: how fast an observation loses its value
     decay_rate: FloatArray
+    day_error: DayError = EXACT  # by how much whole days differ from `p_occupied`
 
 
 class World(Protocol):
@@ -277,7 +279,9 @@ class OccupancyProcess:
         marginals = np.zeros((WEEK_HOURS, arrival.size))
         addresses = (address_of(a, np.float64) for a in (factors, profiles, hazards, marginals))
         object.__setattr__(self, "hourly_marginals", marginals)
-        object.__setattr__(self, "record", np.array([(arrival.size, *addresses)], kernels.PROCESS))
+        object.__setattr__(
+            self, "record", np.array([(arrival.size, *addresses, (0.0, 0.0))], kernels.PROCESS)
+        )
         for name, row in zip(_FIELDS, (factors[0], profiles[0], factors[1], profiles[1]), strict=True):
             object.__setattr__(self, name, row)
 

@@ -44,6 +44,7 @@ PROCESS = np.dtype(
         ("profiles", ADDRESS),
         ("hazards", ADDRESS),
         ("hourly_marginals", ADDRESS),
+        ("day_error", np.float64, (2,)),
     ],
     align=True,
 )
@@ -51,6 +52,7 @@ PROCESS = np.dtype(
 
 factors (2, n_slots); profiles (2, 168), 1/s; hazards (2, 169), integrals of the profiles from Monday 00:00 to full
 hours; hourly_marginals (168, n_slots), P(taken) at full hours, computed when first needed, 0 before. All float64.
+day_error: standard deviations over days of level and slope, logits.
 """
 
 RECORDED_DAY = np.dtype(
@@ -58,6 +60,7 @@ RECORDED_DAY = np.dtype(
         ("midnight", np.float64),
         ("decay_rate", np.float64),
         ("n_records", np.float64),
+        ("day_error", np.float64, (2,)),
         ("log_slot", ADDRESS),
         ("record", ADDRESS),
         ("share", ADDRESS),

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import csv_rows
+from parkenv.world.day_error import EXACT, DayError
 from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.world.occupancy import (
     DAY_NAMES,
@@ -168,6 +169,7 @@ class MappedLog(NamedTuple):
     n_days: IntArray  # (m,) number of other days with a record
     n_records: int  # sum of n_days
     decay_rate: float
+    day_error: DayError = EXACT
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,11 +237,11 @@ class RecordedOccupancy:
         one day to the mean of all the log's slots, and clipped to [0.001, 0.999]. The decay rate is that of one chain
         with constant rates, fitted to all observations on those days.
         """
-        rate = self._at(arrival).decay_rate
+        mapped = self._at(arrival)
         p = np.empty(self.n_slots)
         day = self.day_records([arrival.day])
         _forecast(address_of(day, RECORDED_DAY), arrival.time - float(day["midnight"][0]), p)
-        return Forecast(p, np.full(self.n_slots, rate))
+        return Forecast(p, np.full(self.n_slots, mapped.decay_rate), mapped.day_error)
 
     def day_records(self, days: Sequence[str]) -> NDArray[np.void]:
         """Return recorded days for compiled code, (k,) of the dtype RECORDED_DAY; valid while this object lives."""
@@ -249,6 +251,7 @@ class RecordedOccupancy:
             mapped = self.mapped_log(day)
             record["midnight"], record["decay_rate"] = weekday_of(day) * DAY_S, mapped.decay_rate
             record["n_records"] = mapped.n_records
+            record["day_error"] = mapped.day_error.level, mapped.day_error.slope
             for name in ("log_slot", "record", "n_days"):
                 record[name] = address_of(getattr(mapped, name), np.int64)
             for name in ("share", "lot_share"):
