@@ -29,7 +29,7 @@ FAILURE_COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 DEPTH = 3  # maximum number of targets before a path follows the thesis's planner
 WORK_PER_MS = 50_000  # steps of the path search per millisecond, approximately
 WORTH_PASSING_S = 1.0
-"""s by which driving on must be better than a known free slot, unless the forecast is trusted.
+"""s by which driving on must be better than a known free slot, unless days never differ from their forecast.
 
 If the forecast is right, stopping for a smaller gain costs next to nothing; if it is wrong, the slot that was passed
 may have been the last one for a long time.
@@ -66,8 +66,8 @@ class BeliefSearch:
 class BeliefAgent(SearchAgent[BeliefSearch]):
     """`belief`: follows the path with the least expected time under optimal stopping.
 
-    **Model.** A slot is free with the forecast probability, unless the day differs from its forecast in one of several
-    ways; the slots observed so far are evidence for these (`ForecastErrorModel`). A slot is revealed when it comes into
+    **Model.** A slot is free with the forecast probability, unless the day differs from its forecast; the slots observed
+    so far are evidence for how it does (`DayBelief`). A slot is revealed when it comes into
     view; then its state decays as a two-state Markov chain, so a free slot may be gone on arrival and a taken one may
     become free.
 
@@ -98,9 +98,9 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         problem: lot, goal, speeds and costs.
         budget_ms: approximate time of a decision, ms. It limits the amount of work, not the wall time, so the same
             observations give the same actions on every machine.
-        trust_forecast: whether to assume that the forecast is always right.
+        day: whether to learn from observations how the day differs from its forecast; if not, the forecast is believed to
+            be right whatever is observed.
         most_vertices: a larger lot is planned for in part (`Neighborhoods`).
-        forecast_error: how a day may differ from its forecast, if that is not trusted.
 
     Raises:
         InputError: the budget is not positive, `most_vertices` is out of range, or no slot can be observed.
