@@ -259,15 +259,16 @@ def test_hidden_slots_are_tried_where_nothing_better_is_left(seen_rate):
 
 def test_a_path_is_kept_to_until_something_is_seen_unless_another_is_better_than_it_was(monkeypatch):
     """Paths are valued by estimates, which differ by where the car is: it could turn round between two for ever."""
-    scenario = at_occupancy(make_scenario("campus"), 0.95)
-    made = choices(scenario, monkeypatch, seed=442, budget_ms=10.0)
-    kept = [(remaining_s, choice.onward_s) for remaining_s, choice in made if remaining_s < np.inf]
+    scenario, kept = at_occupancy(make_scenario("campus"), 0.95), []
+    for seed in (5, 11, 17, 29):
+        made = choices(scenario, monkeypatch, seed=seed, budget_ms=10.0)
+        kept += [(remaining_s, choice.onward_s) for remaining_s, choice in made if remaining_s < np.inf]
+        last = [choice.remaining_s for _, choice in made]
+        assert all(
+            remaining_s in (last_s, np.inf) for (remaining_s, _), last_s in zip(made[1:], last, strict=False)
+        )
     assert len(kept) > 10
     assert all(onward_s <= remaining_s for remaining_s, onward_s in kept)
-    last = [choice.remaining_s for _, choice in made]
-    assert all(
-        remaining_s in (last_s, np.inf) for (remaining_s, _), last_s in zip(made[1:], last, strict=False)
-    )
 
 
 def test_views_show_what_worse_ones_missed():

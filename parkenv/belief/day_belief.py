@@ -11,12 +11,12 @@ further on are also more likely to be taken.
 from __future__ import annotations
 
 import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import SlotBelief, decay_to_prior
 from parkenv.world.day_error import DayError, centred_logits
-from parkenv.world.decay import decay_factor
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
@@ -35,9 +35,12 @@ With higher probabilities the car would turn round after fewer taken slots: soon
 often without need on other days.
 """
 HALF_EVENTS_AT = 40.0
-"""Number of slots of a lot in which events are half as likely as in a very large one: small lots fill up on usual days."""
+"""Number of slots of a lot with half the events of a very large one: small lots fill up on usual days."""
 P_TAKEN_AT_EVENT = 0.998
 """P(taken) of the affected slots, unless the forecast is even higher."""
+WORTHLESS = 0.004
+"""Probability that the forecast says nothing about the day: then its level is one of `OTHER_LEVELS`, logits."""
+OTHER_LEVELS, OTHER_SLOPES = np.array([-2.0, 0.0, 2.0, 4.0]), np.array([0.0, 2.0, 4.0])
 _LEAST, _MOST = 1e-6, 1.0 - 1e-6
 
 
@@ -121,7 +124,7 @@ class DayBelief:
 
 
 def _hypotheses(
-    forecast: FloatArray, nearness: FloatArray, whole: int, day_error: FloatArray
+    forecast: FloatArray, nearness: FloatArray, whole: int, day_error: NDArray[np.floating]
 ) -> tuple[FloatArray, FloatArray]:
     """Return prior weights, (k,), and P(taken), (n_slots, k), of the hypotheses about the day.
 
@@ -137,12 +140,20 @@ def _hypotheses(
     (levels, level_weight), (slopes, slope_weight) = (
         _nodes(deviation, count) for deviation, count in ((error.level, LEVELS), (error.slope, SLOPES))
     )
-    shift = (levels + nearness[:, None, None] * slopes[:, None]).reshape(len(forecast), -1)
-    days = 1.0 / (1.0 + np.exp(-(centre[:, None] + shift)))
-    usual_weight = np.outer(slope_weight, level_weight).ravel()
-    weight = np.concatenate([(1.0 - event_weight.sum()) * usual_weight, event_weight])
+    usual_weight = np.outer(slope_weight, level_weight).ravel() * (1.0 - event_weight.sum() - WORTHLESS)
+    usual_days = centre[:, None] + _shifts(levels, slopes, nearness)
+    other_days = _shifts(OTHER_LEVELS, OTHER_SLOPES, nearness)
+    days = 1.0 / (1.0 + np.exp(-np.concatenate([usual_days, other_days], axis=1)))
     events = np.where(within, at_event[:, None], usual[:, None])
+    weight = np.concatenate(
+        [usual_weight, np.full(other_days.shape[1], WORTHLESS / other_days.shape[1]), event_weight]
+    )
     return weight, np.clip(np.concatenate([days, events], axis=1), 1e-9, 1.0 - 1e-9)
+
+
+def _shifts(levels: FloatArray, slopes: FloatArray, nearness: FloatArray) -> FloatArray:
+    """Return the shifts of all slots, (n_slots, n_slopes * n_levels) logits, on days with these levels and slopes."""
+    return np.asarray((levels + nearness[:, None, None] * slopes[:, None]).reshape(len(nearness), -1))
 
 
 def _nodes(deviation: float, count: int) -> tuple[FloatArray, FloatArray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -27,6 +28,9 @@ MAX_BYTES = 1_000_000_000
 """Maximum size of a map file."""
 MAX_STATES = 50_000_000
 """Maximum number of sessions times slots that are read."""
+
+_JOURNAL_MAGIC = bytes.fromhex("d9d505f920a163d7")
+"""Begins a journal of SQLite's; at its end, the magic follows the name of a file that SQLite removes in the end."""
 
 _SCHEMA = """
 CREATE TABLE lot (name TEXT NOT NULL, digest TEXT NOT NULL, n_slots INTEGER NOT NULL) STRICT;
@@ -102,8 +106,11 @@ class MapStore:
             raise InputError(f"{path}: is no file")  # SQLite would wait for the writer of a pipe
         if path.exists() and path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: has more than {MAX_BYTES:,} bytes, the most that is read")
+        journal = Path(f"{os.path.realpath(path)}-journal")
+        if journal.exists() and (not journal.is_file() or _names_another_file(journal)):
+            raise InputError(f"{journal}: is no journal of a map; SQLite might remove another file for it")
         # The journal of a writer that was killed is rolled back before reading, which takes writing.
-        mode = "rwc" if create else "rw" if path.with_name(f"{path.name}-journal").exists() else "ro"
+        mode = "rwc" if create else "rw" if journal.exists() else "ro"
         address = f"{path.absolute().as_uri()}?mode={mode}"
         with self._errors_in_words():
             self._db = sqlite3.connect(address, timeout=_PATIENCE_S, isolation_level=None, uri=True)
@@ -281,6 +288,13 @@ def lot_digest(lot: ParkingLot) -> str:
     places = np.column_stack([lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width])
     # Adding 0 turns -0.0 into 0.0.
     return hashlib.sha256((np.round(places, 3) + 0.0).tobytes()).hexdigest()[:16]
+
+
+def _names_another_file(journal: Path) -> bool:
+    """Whether a journal is part of a transaction over several databases, of which maps have none."""
+    with journal.open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - len(_JOURNAL_MAGIC)))
+        return file.read() == _JOURNAL_MAGIC
 
 
 def _reason(error: sqlite3.DatabaseError) -> str:

@@ -66,10 +66,9 @@ class BeliefSearch:
 class BeliefAgent(SearchAgent[BeliefSearch]):
     """`belief`: follows the path with the least expected time under optimal stopping.
 
-    **Model.** A slot is free with the forecast probability, unless the day differs from its forecast; the slots observed
-    so far are evidence for how it does (`DayBelief`). A slot is revealed when it comes into
-    view; then its state decays as a two-state Markov chain, so a free slot may be gone on arrival and a taken one may
-    become free.
+    **Model.** A slot is free with the forecast probability, unless the day differs from its forecast; the slots
+    observed so far are evidence for how it does (`DayBelief`). A slot is revealed when it comes into view; then its
+    state decays as a two-state Markov chain, so a free slot may be gone on arrival and a taken one may become free.
 
     **Search.** Each decision rolls out candidate paths (`rollout_path`): they follow the thesis's planner as if every
     slot that it observes were taken, at several failure costs, and pass up to three inserted vertices first. Each path
@@ -98,8 +97,8 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         problem: lot, goal, speeds and costs.
         budget_ms: approximate time of a decision, ms. It limits the amount of work, not the wall time, so the same
             observations give the same actions on every machine.
-        day: whether to learn from observations how the day differs from its forecast; if not, the forecast is believed to
-            be right whatever is observed.
+        day: whether to learn from observations how the day differs from its forecast; if not, the forecast is believed
+            to be right whatever is observed.
         most_vertices: a larger lot is planned for in part (`Neighborhoods`).
 
     Raises:
