@@ -500,7 +500,7 @@ def find_state(search: Any, record: Any, time: float) -> None:
         worlds.recorded_state(worlds.recorded_day_at(scenario.world, search.day), slot, record, time)
     else:
         worlds.process_state(
-            worlds.process_at(scenario.world, 0), search.key, search.arrival, search.hour, search.second_of_hour,
+            worlds.process_at(search.process, 0), search.key, search.arrival, search.hour, search.second_of_hour,
             slot, record, time,
         )  # fmt: skip
 
