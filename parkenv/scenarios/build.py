@@ -138,11 +138,11 @@ def _prior(spec: ForecastSpec, occupancy: OccupancyModel, lot: ParkingLot, goal:
     if spec.flat is not None:
         return FlatMap(spec.flat, occupancy)
     if spec.map is not None:
-        from parkenv.mapping.inference import MapPrior
+        from parkenv.mapping.learned_map import map_prior
         from parkenv.mapping.store import MapStore
 
         with MapStore(spec.map, lot, create=False) as store:
-            return MapPrior(store.log())
+            return map_prior(store.log(), store.trips(), lot.walk_m(goal))
     return None
 
 
