@@ -2,6 +2,7 @@ import copy
 import gzip
 import math
 import pickle
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from parkenv.errors import InputError
 from parkenv.world.keyed_random import world_key
 from parkenv.world.occupancy import Arrival, ArrivalWindow
-from parkenv.world.occupancy_log import OccupancyLog, day_class
+from parkenv.world.occupancy_log import OccupancyLog, day_class, weekday_of
 from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
 from parkenv.world.week import DAY_S, HOUR_S
 
@@ -42,7 +43,7 @@ def random_log(n_slots=4, days=(*MONDAYS, *SATURDAYS), seed=0, change_days=()):
 
 
 def at(day, hour):
-    return Arrival((5 if day_class(day) == "weekend" else 0) * DAY_S + hour * HOUR_S, day)
+    return Arrival(weekday_of(day) * DAY_S + hour * HOUR_S, day)
 
 
 # Reading
@@ -272,16 +273,37 @@ def test_the_forecast_knows_nothing_of_the_days_that_are_replayed(n, day):
     assert not np.array_equal(before.p_occupied, elsewhere.p_occupied)
 
 
-def test_the_forecast_is_the_shrunk_mean_of_the_hour_around_the_arrival():
-    # From 7 to 9 slot a is taken on every day, slot b on none; after 9 it is the other way round.
-    looks = [
-        (s, d, h * HOUR_S, (h < 9) == (s == 0)) for d in range(4) for s in range(2) for h in range(7, 12)
-    ]
-    log = OccupancyLog(("a", "b"), MONDAYS[:4], *(np.array(column) for column in zip(*looks, strict=True)))
-    model = RecordedOccupancy(log, np.zeros(2), mapping=np.array([0, 1]))
-    assert model.forecast(at(MONDAYS[0], 8.0)).p_occupied == pytest.approx([3.5 / 4, 0.5 / 4])
-    assert model.forecast(at(MONDAYS[0], 9.0)).p_occupied == pytest.approx([0.5, 0.5])
-    assert model.forecast(at(MONDAYS[0], 9.25)).p_occupied == pytest.approx([0.25 * 0.75 + 0.125, 0.6875])
+@pytest.mark.parametrize("forecast_from", ["past", "rolling"])
+@pytest.mark.parametrize("n", [3, 8])
+def test_nothing_of_a_replayed_or_later_day_is_known_beforehand(forecast_from, n):
+    days = tuple(f"2024-01-{day:02d}" for day in (1, 2, 3, 4, 8, 9, 10, 11, 12))
+
+    def replay(**settings):
+        log = random_log(days=days, **settings)
+        return RecordedOccupancy(log, np.arange(float(n)), None, date(2024, 1, 8), forecast_from)
+
+    # Two copies of each slot replay two consecutive days; on the last one, the day before it.
+    assert replay().days_in(ArrivalWindow()) == list(days[4:])
+    day = "2024-01-12" if n > 4 else "2024-01-09"
+    first = days.index(day) - (n > 4)
+    kept = first if forecast_from == "rolling" else 4
+    model, arrival = replay(), at(day, 9.2)
+    mapped = model.mapped_log(day)
+    assert mapped.held_out == {days.index(day)} | ({first} if n > 4 else set())
+    assert mapped.known.tolist() == list(range(kept))
+    before, after = (replay(change_days=changed).forecast(arrival) for changed in ((), days[kept:]))
+    for field in ("p_occupied", "decay_rate"):
+        assert np.array_equal(getattr(before, field), getattr(after, field))
+    assert before.day_error == after.day_error
+    changed = replay(change_days=days[kept:])
+    assert np.array_equal(changed.mapped_log(day).log_slot, mapped.log_slot)
+    slots = np.arange(n)
+    assert np.array_equal(
+        changed.world(0, arrival).occupied(slots, arrival.time),
+        ~model.world(0, arrival).occupied(slots, arrival.time),
+    )
+    earlier = replay(change_days=days[kept - 1 : kept]).forecast(arrival)
+    assert not np.array_equal(before.p_occupied, earlier.p_occupied)
 
 
 def test_arrivals_are_recorded_days_of_the_window():
@@ -322,8 +344,28 @@ def test_copies_of_a_world_answer_alike():
         (lambda m: RecordedOccupancy(m.log, [math.nan]), "walk_m: got shape"),
         (lambda m: RecordedOccupancy(m.log, [1.0], mapping=[9]), "mapping: wanted"),
         (
+            lambda m: RecordedOccupancy(m.log, [1.0], forecast_from="past"),
+            "forecast_from 'past' wants replay_from",
+        ),
+        (
+            lambda m: RecordedOccupancy(m.log, [1.0], None, date(2024, 1, 1), "rolling").mapped_log(
+                MONDAYS[0]
+            ),
+            "replays 1 of 5 recorded weekday days, wanted at least one before 2024-01-01 to forecast from",
+        ),
+        (
+            lambda m: RecordedOccupancy(m.log, [1.0], None, date(2024, 2, 1)).days_in(ArrivalWindow()),
+            "no recorded day from 2024-02-01 on is one of mon,tue",
+        ),
+        (
+            lambda m: RecordedOccupancy(m.log, np.zeros(9), None, date(2024, 1, 22), "past").mapped_log(
+                MONDAYS[4]
+            ),
+            "was recorded on 2 days of the class from 2024-01-22 on; wanted a smaller lot",
+        ),
+        (
             lambda m: RecordedOccupancy(m.log, np.zeros(8)).forecast(at(SATURDAYS[0], 9)),
-            "replays all 2 recorded weekend",
+            "replays 2 of 2 recorded weekend days, wanted at least one more",
         ),
         (
             lambda m: RecordedOccupancy(m.log, np.zeros(80)).forecast(at(MONDAYS[0], 9)),

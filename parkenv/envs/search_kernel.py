@@ -240,10 +240,11 @@ def arrive(search: Any) -> None:
 def _write_day_error(search: Any) -> None:
     """Write the day error of the forecast, unless the prior is external."""
     scenario, day_error = scenario_at(search.scenario, 0), float32s(search.day_error)
-    for i in range(2):
-        if scenario.prior_kind == LOG_KIND:
-            day_error[i] = worlds.recorded_day_at(scenario.prior, search.day).day_error[i]
-        elif scenario.prior_kind == PROCESS_KIND:
+    if scenario.prior_kind == LOG_KIND:
+        day = worlds.recorded_day_at(scenario.prior, search.day)
+        day_error[0], day_error[1] = worlds.recorded_day_level(day, search.second_of_day), 0.0
+    elif scenario.prior_kind == PROCESS_KIND:
+        for i in range(2):
             day_error[i] = worlds.process_at(scenario.prior, 0).day_error[i]
 
 
@@ -513,7 +514,7 @@ def forecast_of(search: Any, slot: int) -> tuple[float, float]:
         return external[slot], external[search.width + slot]
     if scenario.prior_kind == LOG_KIND:
         day = worlds.recorded_day_at(scenario.prior, search.day)
-        p, rate = worlds.recorded_forecast(day, slot, search.second_of_day), day.decay_rate
+        p, rate = worlds.recorded_forecast(day, slot, search.second_of_day)
     else:
         p, rate = worlds.process_forecast(
             worlds.process_at(scenario.prior, 0), search.hour, search.second_of_hour, slot
