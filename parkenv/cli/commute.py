@@ -75,7 +75,8 @@ def commute(
     World:
         occupancy (FILE): Which slots are taken when: a recorded log (.csv, .csv.gz), or a process (.json).  [default:
             the scenario's]
-        mapping (FILE): CSV slot_id,log_slot_id that assigns the log's slots to the lot's.
+        mapping (FILE): CSV slot_id,log_slot_id that assigns the log's slots to the lot's.  [default: the log's fullest
+            slots are nearest to the goal]
         hours (HH:MM-HH:MM): Drivers come between these hours.  [default: the scenario's, 08:00-13:00]
 
     Sensors:
