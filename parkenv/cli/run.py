@@ -60,7 +60,7 @@ def run(
         file, out = file / specs.SPEC_FILE, file
     tables = read_tables(file)
     name = tables.get("kind", "compare")
-    if name not in KINDS:
+    if not isinstance(name, str) or name not in KINDS:
         raise InputError(f"{file}: kind is {name!r}; {nearest(str(name), KINDS)}")
     spec = specs.SPECS[name].parse(tables, str(file), file.parent)
     require_trust(spec, experiment, trust)
