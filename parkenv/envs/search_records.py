@@ -123,8 +123,8 @@ SEARCH = np.dtype(
         # Time since Monday 00:00, and since the search began, as observed.
         _EPISODES[2],
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
-        # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; PROCESS record
-        # of the world, if it is a process.
+        # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; PROCESS
+        # record of the world, if it is a process.
         ("scenario", ADDRESS),
         ("blocks", ADDRESS),
         ("slots", ADDRESS),
