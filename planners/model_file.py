@@ -23,6 +23,7 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import parse_json, read_bytes
 from parkenv.files.spec_file import Several, Spec
+from parkenv.world.lot import ACTIONS
 from planners.names import ALGORITHMS
 
 SUFFIX = ".safetensors"
@@ -202,7 +203,7 @@ def save_model(
         InputError: the model is of another algorithm or observation, or its policy has an option that a card cannot
             hold.
     """
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     name = type(model).__name__
     algorithm = next((key for key, (_, class_name) in ALGORITHMS.items() if class_name == name), None)
@@ -231,7 +232,7 @@ def save_model(
     # Networks may share tensors; safetensors wants each on its own.
     weights = {key: value.detach().cpu().clone() for key, value in model.policy.state_dict().items()}
     with atomic_write(path) as beside:
-        save_file(weights, beside, {_KEY: card.model_dump_json()})
+        beside.write_bytes(save(weights, {_KEY: card.model_dump_json()}))
 
 
 def _observation_of(space: spaces.Space[Any]) -> tuple[str, str, int]:
@@ -270,6 +271,7 @@ def load_model(
             f"{path}: observes {card.observation!r}, this version of parkenv gives {observation!r}; "
             f"it was trained with parkenv {card.parkenv}"
         )
+    _require_spaces(card, path)
     try:
         policy = card.build()
         weights = import_module("safetensors.torch").load(data)
@@ -282,6 +284,22 @@ def load_model(
         raise InputError(f"{path}: its network cannot be read ({type(error).__name__}: {error})") from error
     policy.set_training_mode(False)
     return card, policy
+
+
+def _require_spaces(card: ModelCard, path: str | os.PathLike[str]) -> None:
+    """Refuse a card whose observation or action differs from that of its task, which would fail in a search."""
+    observed = {name: space.shape for name, space in card.observation_space.items()}
+    acted = card.action_space if isinstance(card.action_space, int) else card.action_space.shape
+    if card.task == "search":
+        wanted = {"local": (FIXED_NUMBERS + NUMBERS_PER_SLOT * card.k,), "action_mask": (len(ACTIONS),)}
+        act: int | tuple[int, ...] = len(ACTIONS)
+    else:
+        size = import_module("planners.driving.policy_interface").OBSERVATION_SIZE
+        wanted, act = {"observation": (size,), "achieved_goal": (7,), "desired_goal": (7,)}, (2,)
+    if observed != wanted or acted != act:
+        raise InputError(
+            f"{path}: card: observes {observed} and acts {acted}, want {wanted} and {act} to {card.task}"
+        )
 
 
 def convert_archive(algorithm: str, path: str | os.PathLike[str]) -> Path:

@@ -24,6 +24,8 @@ ALGORITHMS = {
     "tqc": ("sb3_contrib", "TQC"),
 }
 """Module and class of each learning algorithm; `ALGORITHM:FILE` names a trained model."""
+WITHOUT_FORECAST = ("greedy-goal", "greedy-drive", "first-free", "random", "oracle")
+"""Agents that make no use of an occupancy forecast."""
 SMALL_LOTS_ONLY = ("exact",)
 """Agents for small lots and sensors without errors only."""
 AGENT_NAMES = tuple(name for name in AGENTS if name not in SMALL_LOTS_ONLY)

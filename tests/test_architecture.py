@@ -17,6 +17,7 @@ MAY_SEE_PLANNERS = ("parkenv/evaluation/", "parkenv/cli/")
 LAYERS = (
     "errors",
     "files",
+    "forecast",
     "world",
     "lots",
     "perception",

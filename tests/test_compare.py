@@ -16,7 +16,7 @@ from command_line import PARKENV, parkenv
 from scipy import stats
 
 from parkenv import InputError, SensorModel
-from parkenv.evaluation.experiments.results import EPISODE_COLUMNS, ResultFolder
+from parkenv.evaluation.experiments.results import KEY_COLUMNS, OUTCOME_COLUMNS, ResultFolder
 from parkenv.evaluation.experiments.statistics import mean_interval, summarize
 from parkenv.lots import packaged_lot, write_lot
 
@@ -420,7 +420,7 @@ def test_a_goal_may_lie_anywhere_and_plan_draws_one_scenario(tmp_path, lot_file)
 
 
 def test_columns_are_stable():
-    assert EPISODE_COLUMNS[:7] == (
+    assert (*KEY_COLUMNS, *OUTCOME_COLUMNS)[:7] == (
         "scenario",
         "occupancy_level",
         "agent",

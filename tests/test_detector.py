@@ -1,6 +1,8 @@
 """Finding cars: training, files, the sliding window, and scores by UIUC's rule."""
 
+import dataclasses
 import json
+import math
 import zipfile
 
 import cv2
@@ -107,6 +109,19 @@ def test_bad_model_files_are_told_apart(model, tmp_path):
             CarModel.load(tmp_path / name)
 
 
+@pytest.mark.parametrize(
+    ("changed", "wanted"),
+    [
+        ({"calibration": (0.0, 1.0)}, r"calibration \(0.0, 1.0\), want finite numbers, the slope above 0"),
+        ({"calibration": (1.0, math.nan)}, "want finite numbers"),
+        ({"bias": math.inf}, "bias is inf"),
+    ],
+)
+def test_bad_numbers_of_a_model_are_named(model, changed, wanted):
+    with pytest.raises(InputError, match=wanted):
+        dataclasses.replace(model, **changed)
+
+
 def test_the_shipped_models_are_small_and_say_what_they_know():
     side, front = CarModel.load("side"), CarModel.load("front")
     assert (side.descriptor.size, front.descriptor.size) == (1152, 2304)
@@ -204,6 +219,7 @@ def test_uiuc_is_read_as_published_trained_on_and_judged(tmp_path):
     ("break_it", "message"),
     [
         (lambda f: (f / "trueLocations.txt").write_text("0: (1,2,3)\n"), "line '0: .1,2,3.', want n:"),
+        (lambda f: (f / "trueLocations.txt").write_text("\n"), "trueLocations.txt: names no image"),
         (lambda f: (f / "trueLocations.txt").unlink(), "trueLocations.txt: no such file"),
         (lambda f: (f / "TestImages/test-0.pgm").unlink(), "test-0.pgm: No such file"),
         (
@@ -247,7 +263,8 @@ def test_images_of_all_kinds(tmp_path):
 def test_numbers_in_names_are_counted(tmp_path):
     for n in (10, 9, 1):
         cv2.imwrite(str(tmp_path / f"pos-{n}.pgm"), np.zeros((4, 4), np.uint8))
-    assert [f.stem for f in images_in(tmp_path)] == ["pos-1", "pos-9", "pos-10"]
+    cv2.imwrite(str(tmp_path / "pos-²a.pgm"), np.zeros((4, 4), np.uint8))
+    assert [f.stem for f in images_in(tmp_path)][:3] == ["pos-1", "pos-9", "pos-10"]
 
 
 def test_too_little_to_train_on_is_said(crops):
@@ -284,3 +301,10 @@ def test_held_out_blocks_are_judged_once_each(crops):
     assert min(s.auc for s in scores) > 0.8
     with pytest.raises(InputError, match="folds is 1, want 2 to 30"):
         cross_validated(Crops(*crops), folds=1)
+
+
+def test_a_detector_that_does_not_exist_is_named(tmp_path):
+    for command in ("demo", "survey"):
+        refused = parkenv(command, "--detector", "nowhere:Mine", "--out", tmp_path / command, "--jobs", 1)
+        assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1), refused.stderr
+        assert "detector 'nowhere:Mine': no module 'nowhere'" in refused.stderr

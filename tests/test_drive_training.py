@@ -415,7 +415,7 @@ def test_a_relabelled_goal_ends_the_drive_unless_something_was_touched():
 def test_a_model_is_trained_evaluated_and_driven(trained):
     algorithm, folder = trained
     training = training_of(algorithm, STEPS[algorithm])
-    curve = read_curve(folder / "curve.csv")
+    curve = read_curve(folder / "curve.csv", ("steps", "success"))
     assert list(curve[0]) == list(training.columns)
     assert curve[0]["steps"] == 0
     assert curve[-1]["steps"] >= STEPS[algorithm]
@@ -539,15 +539,18 @@ def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algo
         [*PARKENV, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
     )
     deadline = time.monotonic() + 600
-    while time.monotonic() < deadline and len(read_curve(out / "seed_0" / "curve.csv")) < 2:
+    while (
+        time.monotonic() < deadline
+        and len(read_curve(out / "seed_0" / "curve.csv", ("steps", "success"))) < 2
+    ):
         time.sleep(0.2)
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
-    survived = read_curve(out / "seed_0" / "curve.csv")
+    survived = read_curve(out / "seed_0" / "curve.csv", ("steps", "success"))
     refused = parkenv(*command)
     assert (refused.returncode, "--resume" in refused.stderr) == (2, True)
     assert parkenv(*command, "--resume").returncode == 0
-    curve = read_curve(out / "seed_0" / "curve.csv")
+    curve = read_curve(out / "seed_0" / "curve.csv", ("steps", "success"))
     # What came after the last checkpoint is trained again, and takes another time.
     kept, again = ([row | {"wall_s": 0.0} for row in rows[: len(survived)]] for rows in (survived, curve))
     assert repr(again) == repr(kept)

@@ -70,6 +70,10 @@ def imported(path):
     import_lot(path, ImportOptions(goals=((1.0, 2.0),), entries=((0.0, 4.0),))).lot()
 
 
+def sensor_model(path):
+    SensorModel.from_file(path).rates(np.array([1.0, 7.0]), np.array([True, False]))
+
+
 def map_file(path):
     with MapStore(path, MINI) as store:
         cars = np.array([[1.0, 2.0, 0.5]])
@@ -256,7 +260,7 @@ FORMATS = [
     Format("log.csv", LOG, mutated_text, OccupancyLog.read),
     Format("log.csv.gz", LOG.encode(), mutated_bytes, OccupancyLog.read),
     Format("process.json", PROCESS, mutated_json, OccupancyProcess.from_file),
-    Format("model.json", MODEL, mutated_json, SensorModel.from_file),
+    Format("model.json", MODEL, mutated_json, sensor_model),
     Format("scenario.toml", SCENARIO, mutated_text, scenario),
     Format("scenario.json", tomllib.loads(SCENARIO), mutated_json, scenario),
     Format("experiment.json", EXPERIMENT, mutated_json, ExperimentSpec.read),

@@ -364,6 +364,30 @@ def test_reading_changes_and_makes_no_file(mini, tmp_path):
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
 
+def test_a_strangers_journal_removes_no_file(mini, tmp_path):
+    """A journal may name the file of a larger transaction, which SQLite removes after rolling back."""
+    path, mine = tmp_path / "map.sqlite", tmp_path / "mine.txt"
+    with MapStore(path, mini) as store:
+        store.add(session(mini, "a"))
+    mine.write_text("mine")
+    magic, name, size = bytes.fromhex("d9d505f920a163d7"), os.fsencode(mine), path.stat().st_size
+    page = int.from_bytes(path.read_bytes()[16:18], "big")
+    head = (magic + b"".join(n.to_bytes(4, "big") for n in (0, 1, size // page, 512, page))).ljust(512, b"\0")
+    tail = [
+        (2**30 // page + 1).to_bytes(4, "big"),
+        name,
+        len(name).to_bytes(4, "big"),
+        sum(name).to_bytes(4, "big"),
+    ]
+    (tmp_path / "map.sqlite-journal").write_bytes(head + b"".join(tail) + magic)
+    (tmp_path / "link").symlink_to(path)
+    for opened in (path, tmp_path / "link"):
+        for create in (False, True):
+            with pytest.raises(InputError, match=r"map\.sqlite-journal: is no journal of a map"):
+                MapStore(opened, mini, create=create)
+    assert mine.read_text() == "mine"
+
+
 def test_a_session_is_written_once(mini, tmp_path):
     with MapStore(tmp_path / "m", mini) as store:
         store.add(session(mini, "a"))

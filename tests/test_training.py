@@ -3,9 +3,11 @@
 import base64
 import dataclasses
 import json
+import math
 import os
 import pathlib
 import pickle
+import resource
 import shutil
 import signal
 import subprocess
@@ -118,7 +120,7 @@ def test_bad_arguments_of_the_adapter_are_named(arguments, wanted):
 
 
 def test_a_model_learns_to_park_and_evaluate_policy_agrees_with_compare(trained):
-    curve = read_curve(trained / "curve.csv")
+    curve = read_curve(trained / "curve.csv", ("steps", "total_s"))
     assert [row["steps"] for row in curve] == sorted(row["steps"] for row in curve)
     assert curve[0]["steps"] == 0
     assert curve[-1]["steps"] >= 80_000
@@ -153,6 +155,20 @@ def test_a_resumed_training_equals_an_unbroken_one(algorithm, tmp_path, monkeypa
     """Killed right before its third checkpoint: the evaluation before it is repeated."""
     small_config(algorithm, monkeypatch)
     training = SearchTraining(algorithm, 1_500, 400, (SCENARIO, make_scenario("campus")), EVALUATED[:4])
+    stop_training(training, tmp_path / "resumed", monkeypatch)
+    resumed, whole = training.train(0, tmp_path / "resumed"), training.train(0, tmp_path / "whole")
+    assert [row["steps"] for row in whole][:3] == [0, 512, 1024] if algorithm != "dqn" else len(whole) == 5
+    assert [row | {"wall_s": 0.0} for row in resumed] == [row | {"wall_s": 0.0} for row in whole]
+    files = [tmp_path / name / "model.safetensors" for name in ("resumed", "whole")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert {path.name for path in (tmp_path / "resumed").iterdir()} == {"curve.csv", "model.safetensors"}
+    row = search_times(LearnedAgent(SCENARIO, algorithm, files[0]), SCENARIO, EVALUATED[:4])
+    assert row["total_s"] == min(row["total_s"] for row in whole)
+    assert training.train(0, tmp_path / "resumed") == resumed, "a finished training is not repeated"
+
+
+def stop_training(training, folder, monkeypatch):
+    """Train until right before the third checkpoint."""
     saves = []
 
     def killed(*arguments):
@@ -164,16 +180,7 @@ def test_a_resumed_training_equals_an_unbroken_one(algorithm, tmp_path, monkeypa
     with monkeypatch.context() as patch:
         patch.setattr("parkenv.evaluation.training.rl_training.save_checkpoint", killed)
         with pytest.raises(KeyboardInterrupt):
-            training.train(0, tmp_path / "resumed")
-    resumed, whole = training.train(0, tmp_path / "resumed"), training.train(0, tmp_path / "whole")
-    assert [row["steps"] for row in whole][:3] == [0, 512, 1024] if algorithm != "dqn" else len(whole) == 5
-    assert [row | {"wall_s": 0.0} for row in resumed] == [row | {"wall_s": 0.0} for row in whole]
-    files = [tmp_path / name / "model.safetensors" for name in ("resumed", "whole")]
-    assert files[0].read_bytes() == files[1].read_bytes()
-    assert {path.name for path in (tmp_path / "resumed").iterdir()} == {"curve.csv", "model.safetensors"}
-    row = search_times(LearnedAgent(SCENARIO, algorithm, files[0]), SCENARIO, EVALUATED[:4])
-    assert row["total_s"] == min(row["total_s"] for row in whole)
-    assert training.train(0, tmp_path / "resumed") == resumed, "a finished training is not repeated"
+            training.train(0, folder)
 
 
 def small_config(algorithm, monkeypatch):
@@ -311,6 +318,8 @@ def encoded(mark):
         (changed_card(policy_options={"net_arch": [64]}), "maskable-ppo", "its network cannot be read"),
         (changed_card(policy_options={"activation_fn": "Module"}), "maskable-ppo", "activation_fn is 'Module'"),
         (changed_card(policy="os.system"), "maskable-ppo", "policy is 'os.system'"),
+        (changed_card(observation_space={}), "maskable-ppo", r"card: observes {} and acts 5, want {'local': \(86,\)"),
+        (changed_card(action_space=6), "maskable-ppo", "and acts 6, want"),
         (changed_card(observation="local-0"), "maskable-ppo", "observes 'local-0', this version of parkenv gives"),
         (lambda *_: None, "dqn", "is a model of maskable-ppo, not of dqn"),
         (lambda path, _: path.unlink(), "maskable-ppo", "No such file"),
@@ -381,6 +390,79 @@ def test_a_checkpoint_runs_nothing(tmp_path, monkeypatch):
     assert not mark.exists()
 
 
+@pytest.fixture
+def checkpoint(tmp_path, monkeypatch):
+    """A small training that was stopped, and its checkpoint."""
+    small_config("ppo", monkeypatch)
+    training = SearchTraining("ppo", 1_100, 400, (SCENARIO,), EVALUATED[:4])
+    stop_training(training, tmp_path, monkeypatch)
+    return training, tmp_path / "checkpoint.pt"
+
+
+def at(state, *keys):
+    for key in keys[:-1]:
+        state = state[key]
+    return state, keys[-1]
+
+
+AVERAGES = ("parameters", "policy.optimizer", "state", 0)
+
+
+@pytest.mark.parametrize(
+    ("keys", "value", "wanted"),
+    [
+        (("numbers", "n_epochs"), "x", "n_epochs was 'x', is"),
+        (("numbers", "num_timesteps"), "x", "invalid literal"),
+        (("curve", 0, "total_s"), None, "has no column 'total_s'"),
+        (("env", "lengths"), torch.zeros(3, 3), "environment: lengths is torch.float32"),
+        (("env", "searches"), {}, "environment: searches is a dict, want a tuple"),
+        (("last", "_last_obs"), None, "last observation: _last_obs is a NoneType"),
+        (("parameters", "policy", "value_net.bias"), torch.tensor([math.nan]), "a weight is no number"),
+        ((*AVERAGES, "exp_avg"), torch.zeros(3), "averages are of other weights"),
+        ((*AVERAGES, "step"), torch.tensor(0.0), "averages are damaged"),
+        (("parameters", "policy.optimizer", "param_groups", 0, "amsgrad"), True, "have other options"),
+    ],
+)
+def test_a_checkpoint_that_does_not_fit_is_refused(checkpoint, keys, value, wanted):
+    training, path = checkpoint
+    state = torch.load(path, weights_only=True)
+    part, key = at(state, *keys)
+    if value is None and keys[0] == "curve":
+        del part[key]
+    else:
+        part[key] = value
+    torch.save(state, path)
+    with pytest.raises(InputError, match=wanted):
+        training.train(0, path.parent)
+
+
+def test_checkpoints_and_models_on_a_full_disk_are_named(checkpoint, tmp_path):
+    training, _ = checkpoint
+    model = PPO("MultiInputPolicy", training.make_env(), n_steps=8, batch_size=16)
+    model.env.reset()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, limits[1]))
+    try:
+        for save in (
+            lambda: save_checkpoint(tmp_path / "a.pt", model, []),
+            lambda: save_model(model, tmp_path / "a.safetensors"),
+        ):
+            with pytest.raises(InputError, match="cannot be written: File too large"):
+                save()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.glob("*.part")) + list(tmp_path.glob("a.*"))
+
+
+def test_a_damaged_checkpoint_is_refused(checkpoint):
+    training, path = checkpoint
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(InputError, match="is not as it was written"):
+        training.train(0, path.parent)
+
+
 def test_observations_of_another_kind_are_refused(trained):
     agent = LearnedAgent(SCENARIO, "maskable-ppo", trained / "model.safetensors")
     env = gym.make("parkenv/Search-v2", scenario=SCENARIO)
@@ -431,17 +513,20 @@ def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp
         [*PARKENV, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
     )
     deadline = time.monotonic() + 600
-    while time.monotonic() < deadline and len(read_curve(out / "seed_0" / "curve.csv")) < 2:
+    while (
+        time.monotonic() < deadline
+        and len(read_curve(out / "seed_0" / "curve.csv", ("steps", "total_s"))) < 2
+    ):
         time.sleep(0.2)
 
     os.killpg(process.pid, signal.SIGKILL)
     process.wait()
     assert not (out / "summary.json").exists()
-    survived = read_curve(out / "seed_0" / "curve.csv")
+    survived = read_curve(out / "seed_0" / "curve.csv", ("steps", "total_s"))
     refused = parkenv(*command)
     assert (refused.returncode, "--resume" in refused.stderr) == (2, True)
     assert parkenv(*command, "--resume").returncode == 0
-    curve = read_curve(out / "seed_0" / "curve.csv")
+    curve = read_curve(out / "seed_0" / "curve.csv", ("steps", "total_s"))
     # What came after the last checkpoint is trained again, and takes another time.
     kept, again = ([row | {"wall_s": 0.0} for row in rows[: len(survived)]] for rows in (survived, curve))
     assert again == kept
@@ -515,7 +600,7 @@ def curve_of_another_kind(folder):
         ({}, torn_settings, "settings.json: not JSON"),
         ({}, settings_of_another_kind, "want the settings of a command"),
         ({}, torn_curve, "curve.csv: line 2: got 1 fields"),
-        ({}, curve_of_another_kind, "was not written by this version"),
+        ({}, curve_of_another_kind, "curve.csv: has no column 'total_s', want steps, total_s"),
     ],
 )
 def test_trainings_that_cannot_be_compared_are_refused(tmp_path, changed, spoil, wanted):

@@ -64,6 +64,16 @@ def test_a_cluster_in_a_file_asks_for_trust(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_cluster_in_a_run_folder_asks_for_trust_whoever_searches(tmp_path):
+    cluster = {"backend": "dask", "address": "tcp://theirs.example:8786"}
+    compared = {"kind": "compare", "scenarios": ["mini"], "agents": ["theirs:Mine"]} | cluster
+    (tmp_path / "experiment.json").write_text(json.dumps(compared))
+    command = ("compare", "--resume", "--agents", "mdp", "--out", tmp_path)
+    refused = " ".join(parkenv(*command).stderr.split())
+    assert "would run tasks on the cluster at tcp://theirs.example:8786; read" in refused
+    assert "holds no comparison to go on with" in parkenv(*command, "--backend", "loky").stderr
+
+
 def test_a_run_folder_that_names_a_class_asks_for_trust_and_the_class_names_the_agent(module, tmp_path):
     mark, out = tmp_path / "was_run", tmp_path / "out"
     done = parkenv("run", experiment(tmp_path / "theirs.json", "compare", module), "--out", out, "--trust")

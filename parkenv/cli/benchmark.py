@@ -53,8 +53,7 @@ def run(
 
     out = out or Path("results") / suite
     base = args.saved(out, BenchmarkSpec) if folder.resume else BenchmarkSpec()
-    if agents is None:
-        require_trust(base, out, trust)
+    require_trust(base, out, trust, given=args.not_none(agents=agents) | machines.given)
     named = None if agents is None else readable_models(split_agents(agents), trust_model)
     given = args.not_none(by=by, agents=named)
     spec = base.changed(suite=suite, **given, **machines.given)

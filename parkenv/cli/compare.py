@@ -95,8 +95,7 @@ def compare(
     sweep = costs.failure_cost == "sweep"
     if folder.resume:
         base = args.saved(out, ExperimentSpec)
-        if agents is None:
-            require_trust(base, out, trust)
+        require_trust(base, out, trust, given=args.not_none(agents=agents) | machines.given)
     else:
         base = ExperimentSpec().changed(grid={"occupancy_levels": () if sweep else LEVELS})
     grid = costs.grid(base.grid)

@@ -206,7 +206,7 @@ def _train_all(
             for k, bar in bars.items():
                 # The training itself reports a damaged curve.
                 with suppress(InputError):
-                    if curve := read_curve(out / f"seed_{k}" / CURVE):
+                    if curve := read_curve(out / f"seed_{k}" / CURVE, training.columns):
                         last = curve[-1]
                         progress.update(bar, completed=last["steps"], score=task.score_text(last))
             over.wait(2.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING
 
 import typer
@@ -16,13 +16,14 @@ if TYPE_CHECKING:
     from parkenv.files.spec_file import Spec
 
 
-def require_trust(spec: Spec, source: Path, trust: bool) -> None:
+def require_trust(spec: Spec, source: Path, trust: bool, given: Collection[str] = ()) -> None:
     """Refuse a specification that names classes or a cluster, unless the user trusts it; ask in a terminal.
 
     Args:
         spec: content of a file or of a run folder.
         source: the file or folder, for the message.
         trust: the value of `--trust`.
+        given: fields of the specification that the command line replaces.
 
     Raises:
         InputError: it names some and is not trusted; the message lists them, classes with their files.
@@ -30,8 +31,9 @@ def require_trust(spec: Spec, source: Path, trust: bool) -> None:
     from parkenv.evaluation.experiments.agent_spec import classes_in
     from parkenv.files.user_class import find_module
 
-    named = [f"{name} ({find_module(name) or 'not found'})" for name in classes_in(spec)]
-    if address := getattr(spec, "address", None):
+    classes = () if "agents" in given else classes_in(spec)
+    named = [f"{name} ({find_module(name) or 'not found'})" for name in classes]
+    if "address" not in given and (address := getattr(spec, "address", None)):
         # A cluster's answers are pickled objects.
         named.append(f"tasks on the cluster at {address}")
     if trust or not named:

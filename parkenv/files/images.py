@@ -88,7 +88,7 @@ def natural_order(path: Path) -> list[tuple[str, int]]:
 def _parts(text: str) -> Iterator[tuple[str, int]]:
     word, digits = "", ""
     for letter in text:
-        if letter.isdigit():
+        if letter.isdecimal():
             digits += letter
         else:
             if digits:

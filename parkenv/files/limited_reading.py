@@ -11,6 +11,7 @@ import gzip
 import io
 import json
 import re
+import stat
 import tomllib
 import zlib
 from collections.abc import Iterator
@@ -68,8 +69,10 @@ def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]
         InputError: the file cannot be read or unpacked, or more bytes were asked for; the message names it.
     """
     try:
-        if Path(path).is_fifo():
-            raise OSError(errno.EINVAL, "is a pipe, want a file")  # opening would wait for its writer
+        kind = Path(path).stat().st_mode
+        if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
+            # Opening a pipe would wait for its writer, reading a terminal for its user.
+            raise OSError(errno.EINVAL, "is a pipe or a device, want a file")
         file = Path(path).open("rb")  # noqa: SIM115  # its own errors are caught here, those of reading below
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error

@@ -15,4 +15,10 @@ SENSOR_MODELS: tuple[SensorModelName, ...] = get_args(SensorModelName)
 RigName = Literal["laser", "stereo", "both_sides"]
 WeatherName = Literal["sunny", "overcast", "low_sun", "dusk", "rain"]
 WEATHERS: tuple[WeatherName, ...] = get_args(WeatherName)
+MapName = Literal["empty", "right", "wrong"]
+"""Maps that a commute starts from."""
+MAP_NAMES: tuple[MapName, ...] = get_args(MapName)
 BackendName = Literal["loky", "ray", "dask"]
+ForecastFrom = Literal["others", "rolling", "past"]
+FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
+"""Recorded days that a forecast is made from; see `parkenv.world.recorded_occupancy`."""

@@ -1,9 +1,10 @@
-"""The map file: survey sessions in an SQLite database, one transaction per session."""
+"""The map file: survey sessions and trips in an SQLite database, one transaction for each."""
 
 from __future__ import annotations
 
 import hashlib
 import math
+import os
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -16,17 +17,21 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.mapping.inference import SessionLog
+from parkenv.mapping.trips import Trip
 from parkenv.world.lot import ParkingLot
 
 FloatArray = NDArray[np.float64]
 
 APPLICATION_ID = 0x7061726B  # "park"
-VERSION = 1
+VERSION = 2
 _PATIENCE_S = 30.0
 MAX_BYTES = 1_000_000_000
 """Maximum size of a map file."""
 MAX_STATES = 50_000_000
-"""Maximum number of sessions times slots that are read."""
+"""Maximum number of sessions times slots, and of observations of trips, that are read."""
+
+_JOURNAL_MAGIC = bytes.fromhex("d9d505f920a163d7")
+"""Begins a journal of SQLite's; at its end, the magic follows the name of a file that SQLite removes in the end."""
 
 _SCHEMA = """
 CREATE TABLE lot (name TEXT NOT NULL, digest TEXT NOT NULL, n_slots INTEGER NOT NULL) STRICT;
@@ -43,6 +48,19 @@ CREATE TABLE car (
 ) STRICT;
 CREATE INDEX car_of_session ON car(session);
 """
+_SCHEMA_OF_TRIPS = """
+CREATE TABLE trip (
+    id INTEGER PRIMARY KEY, key TEXT NOT NULL UNIQUE, time REAL NOT NULL, date TEXT NOT NULL
+) STRICT;
+CREATE TABLE observation (
+    trip INTEGER NOT NULL REFERENCES trip(id), number INTEGER NOT NULL, slot INTEGER NOT NULL CHECK (slot >= 0),
+    after_s REAL NOT NULL, taken INTEGER NOT NULL CHECK (taken IN (0, 1)),
+    hit_rate REAL NOT NULL, false_alarm_rate REAL NOT NULL,
+    PRIMARY KEY (trip, number)
+) STRICT, WITHOUT ROWID;
+"""
+"""Tables that files of version 1 lack."""
+_TABLES = ("lot", "session", "sighting", "car", "trip", "observation")
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,15 +113,18 @@ class MapStore:
     """
 
     def __init__(self, path: Path, lot: ParkingLot, *, create: bool = True) -> None:
-        self.path, self._lot = path, lot
+        self.path, self._lot, self._version = path, lot, VERSION
         if not path.exists() and not create:
             raise InputError(f"{path}: no such map file; parkenv survey makes one")
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: is no file")  # SQLite would wait for the writer of a pipe
         if path.exists() and path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: has more than {MAX_BYTES:,} bytes, the most that is read")
+        journal = Path(f"{os.path.realpath(path)}-journal")
+        if journal.exists() and (not journal.is_file() or _names_another_file(journal)):
+            raise InputError(f"{journal}: is no journal of a map; SQLite might remove another file for it")
         # The journal of a writer that was killed is rolled back before reading, which takes writing.
-        mode = "rwc" if create else "rw" if path.with_name(f"{path.name}-journal").exists() else "ro"
+        mode = "rwc" if create else "rw" if journal.exists() else "ro"
         address = f"{path.absolute().as_uri()}?mode={mode}"
         with self._errors_in_words():
             self._db = sqlite3.connect(address, timeout=_PATIENCE_S, isolation_level=None, uri=True)
@@ -187,6 +208,78 @@ class MapStore:
         known = np.isfinite(p)
         return SessionLog(np.array([s.time for s in sessions]), np.where(known, p, 0.0) > 0.5, known)
 
+    def has_trip(self, key: str) -> bool:
+        """Return whether the file holds a trip."""
+        with self._errors_in_words():
+            return self._db.execute("SELECT 1 FROM trip WHERE key = ?", (key,)).fetchone() is not None
+
+    def add_trip(self, trip: Trip) -> None:
+        """Write the observations of a search in one transaction.
+
+        Raises:
+            InputError: a trip with this key exists, a slot is not of the lot, or the file cannot be written.
+        """
+        self._require_slots(trip)
+        head = (trip.key, trip.time, trip.date)
+        columns = (
+            trip.slots,
+            trip.after_s,
+            trip.taken.astype(np.int64),
+            trip.hit_rate,
+            trip.false_alarm_rate,
+        )
+        rows = zip(*(column.tolist() for column in columns), strict=True)
+        with self._errors_in_words():
+            try:
+                with self._transaction("IMMEDIATE"):
+                    number = self._db.execute(
+                        "INSERT INTO trip (key, time, date) VALUES (?, ?, ?)", head
+                    ).lastrowid
+                    self._db.executemany(
+                        "INSERT INTO observation VALUES (?, ?, ?, ?, ?, ?, ?)",
+                        ((number, i, *row) for i, row in enumerate(rows)),
+                    )
+            except sqlite3.IntegrityError as error:
+                raise InputError(f"{self.path}: holds a trip {trip.key!r} already") from error
+
+    def trips(self) -> list[Trip]:
+        """Return all trips, ordered by time and key.
+
+        Raises:
+            InputError: the file cannot be read, or a row holds what `add_trip` does not write.
+        """
+        if self._version < VERSION:
+            return []
+        found = []
+        with self._errors_in_words(), self._transaction():
+            count = self._db.execute("SELECT count(*) FROM observation").fetchone()[0]
+            if count > MAX_STATES:
+                raise InputError(f"{self.path}: holds {count:,} observations, want at most {MAX_STATES:,}")
+            for number, key, time, date in self._db.execute(
+                "SELECT id, key, time, date FROM trip ORDER BY time, key"
+            ).fetchall():
+                rows = self._db.execute(
+                    "SELECT slot, after_s, taken, hit_rate, false_alarm_rate FROM observation WHERE trip = ? "
+                    "ORDER BY number",
+                    (number,),
+                ).fetchall()
+                try:
+                    table = np.array(rows, dtype=np.float64).reshape(-1, 5).T
+                    trip = Trip(
+                        key, time, date, table[0].astype(np.int64), table[1], table[2] == 1.0, *table[3:]
+                    )
+                except (TypeError, ValueError) as error:
+                    raise InputError(f"{self.path}: trip {key!r:.40}: {error}") from error
+                self._require_slots(trip)
+                found.append(trip)
+        return found
+
+    def _require_slots(self, trip: Trip) -> None:
+        if len(trip.slots) and not trip.slots.max() < self._lot.n_slots:
+            raise InputError(
+                f"{self.path}: trip {trip.key!r:.40}: slot {trip.slots.max()}, want slots 0 to {self._lot.n_slots - 1}"
+            )
+
     def cars(self) -> FloatArray:
         """Return the poses of all cars of all sessions, (n, 3) x, y in m and yaw in rad."""
         return np.concatenate([np.zeros((0, 3)), *(session.cars for session in self.sessions())])
@@ -218,21 +311,30 @@ class MapStore:
                 if self._is_empty():
                     self._make()
                 self._check()
+        if create and self._version < VERSION:
+            with self._transaction("IMMEDIATE"):
+                if self._pragma("user_version") < VERSION:
+                    self._execute_all(_SCHEMA_OF_TRIPS)
+                    self._db.execute(f"PRAGMA user_version = {VERSION}")
+                self._version = VERSION
 
     def _check(self) -> None:
         if self._pragma("application_id") != APPLICATION_ID:
             raise InputError(f"{self.path}: is a database, but no map file of parkenv")
-        version = self._pragma("user_version")
-        if version > VERSION:
+        self._version = self._pragma("user_version")
+        if self._version > VERSION:
             raise InputError(
-                f"{self.path}: was written by a newer parkenv (schema {version}, want at most {VERSION}): update it"
+                f"{self.path}: was written by a newer parkenv (schema {self._version}, want at most {VERSION}): "
+                "update it"
             )
+        wanted = _TABLES if self._version == VERSION else _TABLES[:4]
+        # A view in place of a table could have rows without end.
         tables = self._db.execute(
             "SELECT count(*) FROM sqlite_master WHERE type = 'table' AND sql LIKE 'CREATE TABLE%' "
-            "AND name IN ('lot', 'session', 'sighting', 'car')"
+            f"AND name IN ({', '.join('?' * len(wanted))})",
+            wanted,
         ).fetchone()
-        # A view in place of a table could have rows without end.
-        lot = tables == (4,) and self._db.execute("SELECT name, digest FROM lot").fetchone()
+        lot = tables == (len(wanted),) and self._db.execute("SELECT name, digest FROM lot").fetchone()
         if not lot:
             raise InputError(f"{self.path}: is no whole map file: a table is missing or empty")
         name, digest = lot
@@ -242,12 +344,16 @@ class MapStore:
             )
 
     def _make(self) -> None:
-        for statement in _SCHEMA.split(";"):
-            self._db.execute(statement)
+        self._execute_all(_SCHEMA + _SCHEMA_OF_TRIPS)
         head = (self._lot.name, lot_digest(self._lot), self._lot.n_slots)
         self._db.execute("INSERT INTO lot VALUES (?, ?, ?)", head)
         self._db.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         self._db.execute(f"PRAGMA user_version = {VERSION}")
+
+    def _execute_all(self, statements: str) -> None:
+        # Not `executescript`, which commits first.
+        for statement in statements.split(";"):
+            self._db.execute(statement)
 
     def _is_empty(self) -> bool:
         return bool(self._db.execute("SELECT count(*) FROM sqlite_master").fetchone() == (0,))
@@ -281,6 +387,13 @@ def lot_digest(lot: ParkingLot) -> str:
     places = np.column_stack([lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width])
     # Adding 0 turns -0.0 into 0.0.
     return hashlib.sha256((np.round(places, 3) + 0.0).tobytes()).hexdigest()[:16]
+
+
+def _names_another_file(journal: Path) -> bool:
+    """Whether a journal is part of a transaction over several databases, of which maps have none."""
+    with journal.open("rb") as file:
+        file.seek(max(0, file.seek(0, os.SEEK_END) - len(_JOURNAL_MAGIC)))
+        return file.read() == _JOURNAL_MAGIC
 
 
 def _reason(error: sqlite3.DatabaseError) -> str:

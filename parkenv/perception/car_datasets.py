@@ -104,6 +104,8 @@ def read_uiuc_test(folder: Path, test_set: str) -> list[LabelledImage]:
         file = images / f"test-{int(number)}.pgm"
         box = np.array(boxes, dtype=np.float64).reshape(-1, 4)
         labelled.append(LabelledImage(file.name, as_grey(read_image(file)), box))
+    if not labelled:
+        raise InputError(f"{truth}: names no image, want lines n: (i,j) ...")
     return labelled
 
 

@@ -57,6 +57,11 @@ class CarModel:
             raise InputError(f"car is {self.car}, want fractions left < right, top < bottom of the window")
         if not (self.region_aspect > 0.0 and math.isfinite(self.region_aspect)):
             raise InputError(f"region_aspect is {self.region_aspect}, want a finite number above 0")
+        slope, offset = self.calibration
+        if not (math.isfinite(self.bias) and math.isfinite(offset) and 0.0 < slope < math.inf):
+            raise InputError(
+                f"bias is {self.bias}, calibration {self.calibration}, want finite numbers, the slope above 0"
+            )
 
     def probability(self, score: Float32Array) -> Float32Array:
         """Return P(car) of each score."""
@@ -126,8 +131,8 @@ class CarModel:
                 weights,
                 float(settings["bias"]),
                 float(settings["region_aspect"]),
-                tuple(settings["car"]),
-                tuple(settings["calibration"]),
+                tuple(float(v) for v in settings["car"]),  # type: ignore[arg-type]  # checked when made
+                tuple(float(v) for v in settings["calibration"]),  # type: ignore[arg-type]
                 bool(settings["ends"]),
                 str(settings["trained_on"]),
             )

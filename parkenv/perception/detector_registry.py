@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 from parkenv.errors import InputError
 from parkenv.files.user_class import file_of_class, load_class
@@ -39,7 +40,7 @@ def make_detector(name: str | Detector | None = None) -> Detector:
     if name in PACKAGED_MODELS or Path(name).is_file():
         return HogDetector.load(name, threshold=LEAST_PROBABILITY)
     if ":" in name:
-        made: Detector = load_class(name, "detector", "detect(image)")()
+        made: Detector = _class(name)()
         return made
     raise InputError(
         f"unknown detector {name!r}; want {DEFAULT_DETECTOR}, {', '.join(PACKAGED_MODELS)}, a model file (.npz) or "
@@ -51,7 +52,17 @@ def detector_version(name: str) -> str:
     """Return the name with a hash of its model or module file.
 
     Args:
-        name: as for `make_detector`, which must have accepted it before.
+        name: as for `make_detector`.
+
+    Raises:
+        InputError: there is no such class.
     """
-    file = Path(name) if Path(name).is_file() else file_of_class(name) if ":" in name else None
+    file = Path(name) if Path(name).is_file() else None
+    if file is None and ":" in name:
+        _class(name)
+        file = file_of_class(name)
     return name if file is None else f"{name}@{hashlib.sha256(file.read_bytes()).hexdigest()[:8]}"
+
+
+def _class(name: str) -> Any:
+    return load_class(name, "detector", "detect(image)")

@@ -19,14 +19,12 @@ from parkenv.world.day_error import TABLE_ROWS, TABLE_STEPS
 from parkenv.world.decay import decay_factor
 from parkenv.world.keyed_random import DAY_STREAM, OCCUPANCY_STREAM, keyed_exponential, keyed_uniform
 from parkenv.world.pointers import ADDRESS, float64s, int64s, record_at, uint8s
-from parkenv.world.week import DAY_HOURS, DAY_S, HOUR_S, WEEK_HOURS, WEEK_S, hour_of_week
+from parkenv.world.week import DAY_HOURS, DAY_PERIODS, HOUR_S, PERIOD_S, WEEK_HOURS, WEEK_S, hour_of_week
 from sim_sensors.compilation import compiled
 
 # Forecasts are never certain, so that a planner can recover from a wrong one.
 MIN_PROBABILITY = 0.001
 MAX_PROBABILITY = 0.999
-
-PRIOR_DAYS = 1.0  # weight, in days, of the lot's mean in a slot's forecast from a log
 
 _NEVER_WEEKS = 1e9
 _FORGOTTEN = 1e-17
@@ -76,21 +74,18 @@ used as well.
 RECORDED_DAY = np.dtype(
     [
         ("midnight", np.float64),
-        ("decay_rate", np.float64),
-        ("n_records", np.float64),
-        ("day_error", np.float64, (2,)),
-        ("log_slot", ADDRESS),
         ("record", ADDRESS),
-        ("share", ADDRESS),
-        ("lot_share", ADDRESS),
-        ("n_days", ADDRESS),
+        ("log_odds", ADDRESS),
+        ("day_level", ADDRESS),
+        ("decay_rate", ADDRESS),
         ("first", ADDRESS),
         ("from_s", ADDRESS),
         ("occupied", ADDRESS),
     ],
     align=True,
 )
-"""A log day replayed on a lot: fields of `MappedLog` and `OccupancyLog`, and its midnight, s since Monday 00:00."""
+"""A log day replayed on a lot: its midnight, s since Monday 00:00; fields of `MappedLog`,
+`DayForecast` and `OccupancyLog`."""
 
 CURSOR_FIELDS = [
     ("sojourn", np.int32),
@@ -390,20 +385,25 @@ def recorded_state(day: Any, slot: int, cursor: Any, time: float) -> bool:
     return bool(cursor.occupied)
 
 
-@kernel
-def recorded_forecast(day: Any, slot: int, second: float) -> float:
-    """Return P(taken) of a slot at a second of a recorded day, from the hour around it on the other days.
+@inlined
+def _between_periods(values: int, second: float) -> float:
+    """Interpolate linearly between the middles of a day's half-hours; the first and the last value hold to midnight."""
+    at = min(max(second / PERIOD_S - 0.5, 0.0), DAY_PERIODS - 1.0)
+    low = min(int(at), DAY_PERIODS - 2)
+    of = float64s(values)
+    return float(of[low] + (at - low) * (of[low + 1] - of[low]))
 
-    The mean over the days that the world does not replay is shrunk by a Beta prior worth `PRIOR_DAYS` to the mean of
-    all slots of the log.
-    """
-    share, lot_share = float64s(day.share), float64s(day.lot_share)
-    log_slot = int64s(day.log_slot)[slot]
-    low, high = max(second - HOUR_S / 2, 0.0), min(second + HOUR_S / 2, DAY_S)
-    taken = in_all = 0.0
-    for hour in range(int(low // HOUR_S), min(int(high // HOUR_S), DAY_HOURS - 1) + 1):
-        weight = (min((hour + 1) * HOUR_S, high) - max(hour * HOUR_S, low)) / (high - low)
-        taken += weight * share[log_slot * DAY_HOURS + hour]
-        in_all += weight * lot_share[hour]
-    p = (taken + PRIOR_DAYS * in_all / day.n_records) / (int64s(day.n_days)[log_slot] + PRIOR_DAYS)
-    return float(min(max(p, MIN_PROBABILITY), MAX_PROBABILITY))
+
+@kernel
+def recorded_forecast(day: Any, slot: int, second: float) -> tuple[float, float]:
+    """Return P(taken) of a slot at a second of a recorded day, and its decay rate there, 1/s."""
+    logit = _between_periods(day.log_odds + slot * DAY_PERIODS * 8, second)
+    p = 1.0 / (1.0 + math.exp(-logit))
+    rate = float64s(day.decay_rate)[min(int(second // HOUR_S), DAY_HOURS - 1)]
+    return min(max(p, MIN_PROBABILITY), MAX_PROBABILITY), float(rate)
+
+
+@kernel
+def recorded_day_level(day: Any, second: float) -> float:
+    """Return the standard deviation of the error of a recorded day's level at a second of it, logits."""
+    return float(_between_periods(day.day_level, second))

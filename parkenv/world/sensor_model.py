@@ -58,6 +58,8 @@ class SensorBand:
     def __post_init__(self) -> None:
         if not (self.up_to >= 0.0 and math.isfinite(self.up_to)):
             raise InputError(f"up_to is {self.up_to} m, want a finite distance of at least 0")
+        if not isinstance(self.beside, bool):
+            raise InputError(f"beside is {self.beside!r}, want true or false")
         _require_rates(self.hit_rate, self.false_alarm_rate)
         if not 0.0 <= self.seen_rate <= 1.0:
             raise InputError(f"seen_rate is {self.seen_rate}, want a probability")

@@ -19,9 +19,9 @@ from parkenv.files.limited_reading import csv_records, parse_json, read_json
 
 SETTING_AXES = ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")  # of a grid, as columns
 SETTING_COLUMNS = ("scenario", "occupancy_level", "agent", *SETTING_AXES)
-EPISODE_COLUMNS = (
-    *SETTING_COLUMNS,
-    "seed",
+KEY_COLUMNS = (*SETTING_COLUMNS, "seed")
+"""Columns that identify an episode of a comparison."""
+OUTCOME_COLUMNS = (
     "day",
     "arrival_s",
     "occupancy",
@@ -42,10 +42,9 @@ EPISODE_COLUMNS = (
     "replans",
     "steps",
 )
-TIMING_COLUMNS = (*SETTING_COLUMNS, "seed", "decisions_us")
-
-_TEXT = {"scenario", "agent", "day", "slot", "decisions_us"}
-_WHOLE = {"seed", "failed_parks", "slots_passed", "replans", "steps"}
+"""Columns of an episode's outcome."""
+_TEXT = {"scenario", "map", "agent", "day", "slot", "decisions_us"}
+_WHOLE = {"seed", "course", "day_number", "driver", "failed_parks", "slots_passed", "replans", "steps"}
 _BOOL = {"parked", "truncated"}
 
 SETTINGS = "settings.json"
@@ -147,7 +146,7 @@ def make_folder(path: Path) -> None:
 
 def episode_key(row: Mapping[str, Any]) -> Key:
     """Return the key of an episode: its setting, agent and seed."""
-    return (*(row[c] for c in SETTING_COLUMNS), row["seed"])
+    return tuple(row[c] for c in KEY_COLUMNS)
 
 
 class ResultFolder:
@@ -156,6 +155,9 @@ class ResultFolder:
     Args:
         path: the folder; created if missing.
         settings: settings of the run; everything that affects the outcome of an episode.
+        keys: columns that identify an episode.
+        columns: the other columns of an episode.
+        kind: kind of run, for messages.
         resume: continue an earlier run with the same settings.
         overwrite: replace the results of another run.
 
@@ -168,36 +170,46 @@ class ResultFolder:
     """
 
     def __init__(
-        self, path: Path, settings: Mapping[str, Any], *, resume: bool = False, overwrite: bool = False
+        self,
+        path: Path,
+        settings: Mapping[str, Any],
+        *,
+        keys: Sequence[str] = KEY_COLUMNS,
+        columns: Sequence[str] = OUTCOME_COLUMNS,
+        kind: str = "comparison",
+        resume: bool = False,
+        overwrite: bool = False,
     ) -> None:
         make_folder(path)
         self.path = path
+        self._keys = tuple(keys)
+        self._columns = {"episodes.csv": (*keys, *columns), "timings.csv": (*keys, "decisions_us")}
         self.episodes: dict[Key, Row] = {}
         self._timings: dict[Key, Row] = {}
         if resume:
-            settings = require_same_settings(path, settings, "comparison")
-            self.episodes = {episode_key(r): r for r in _read(path / "episodes.csv", EPISODE_COLUMNS)}
-            self._timings = {episode_key(r): r for r in _read(path / "timings.csv", TIMING_COLUMNS)}
+            settings = require_same_settings(path, settings, kind)
+            self.episodes, self._timings = (
+                self._by_key(_read(path / name, columns)) for name, columns in self._columns.items()
+            )
         elif (path / "episodes.csv").exists() and not overwrite:
             state = "a finished" if (path / SUMMARY).exists() else "an unfinished"
             raise InputError(
-                f"--out {path}: holds {state} comparison; add --resume to go on with it, --overwrite to replace it, "
+                f"--out {path}: holds {state} {kind}; add --resume to go on with it, --overwrite to replace it, "
                 "or name another folder"
             )
         (path / SUMMARY).unlink(missing_ok=True)
         write_settings(path, settings)
         # Rewrite the readable lines: this drops a line truncated by a crash, and its episode runs again.
-        write_csv(path / "episodes.csv", EPISODE_COLUMNS, self.episodes.values())
-        write_csv(path / "timings.csv", TIMING_COLUMNS, self._timings.values())
+        self._write(self.episodes.values(), self._timings.values())
 
     def add(self, rows: Sequence[Row], timings: Sequence[Row]) -> None:
         """Append finished episodes, and flush them to disk."""
         # Memory first: after an interruption, `finish` rewrites the files from it.
-        self._timings |= {episode_key(r): r for r in timings}
-        self.episodes |= {episode_key(r): r for r in rows}
+        self._timings |= self._by_key(timings)
+        self.episodes |= self._by_key(rows)
         # Timings before episodes: an episode in `episodes.csv` is finished, and would not run again for its timing.
-        append_text(self.path / "timings.csv", csv_text(TIMING_COLUMNS, timings))
-        append_text(self.path / "episodes.csv", csv_text(EPISODE_COLUMNS, rows))
+        for name, new in (("timings.csv", timings), ("episodes.csv", rows)):
+            append_text(self.path / name, csv_text(self._columns[name], new))
 
     def decision_s(self, key: Key) -> list[float]:
         """Return the wall times of an episode's decisions, s; empty if a crash lost them."""
@@ -214,10 +226,16 @@ class ResultFolder:
         wanted |= dict.fromkeys(self.episodes)
         rows = [self.episodes[key] for key in wanted]
         timings = [self._timings[key] for key in wanted if key in self._timings]
-        write_csv(self.path / "episodes.csv", EPISODE_COLUMNS, rows)
-        write_csv(self.path / "timings.csv", TIMING_COLUMNS, timings)
+        self._write(rows, timings)
         (self.path / SUMMARY_PARTIAL).unlink(missing_ok=True)
         write_summary(self.path, summary, SUMMARY if complete else SUMMARY_PARTIAL)
+
+    def _by_key(self, rows: Iterable[Row]) -> dict[Key, Row]:
+        return {tuple(row[c] for c in self._keys): row for row in rows}
+
+    def _write(self, episodes: Iterable[Row], timings: Iterable[Row]) -> None:
+        for name, rows in (("episodes.csv", episodes), ("timings.csv", timings)):
+            write_csv(self.path / name, self._columns[name], rows)
 
 
 def _write_text(path: Path, text: str) -> None:

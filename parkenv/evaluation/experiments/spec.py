@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, mod
 from pydantic_core import PydanticCustomError
 
 from parkenv.evaluation.experiments.agent_spec import AgentItem, AgentSpec
-from parkenv.files.names import SCENARIO_NAMES, BackendName, RigName, WeatherName
+from parkenv.files.names import SCENARIO_NAMES, BackendName, MapName, RigName, WeatherName
 from parkenv.files.spec_file import Axis, FilePath, OrText, Several, Spec
 from parkenv.scenarios.spec import (
     Cost,
@@ -23,6 +23,8 @@ from parkenv.scenarios.spec import (
 
 MAX_EPISODES = 10_000_000
 """Maximum number of episodes of an experiment, over all agents, scenarios and settings."""
+MAX_DAYS = 3_650
+"""Maximum number of days of a commute."""
 SPEC_FILE = "experiment.json"  # file in a run folder with the specification of its experiment
 DEFAULT_AGENTS = (
     "mdp", "mdp-static", "mdp-tuned", "belief", "greedy-goal", "greedy-drive", "first-free", "random", "oracle",
@@ -88,6 +90,16 @@ class Workplace(Spec):
     address: str | None = Field(None, description="Of a Ray or Dask cluster.")
 
 
+def _require_distinct(agents: tuple[AgentSpec, ...], scenarios: tuple[ScenarioSpec, ...]) -> None:
+    for what, names in (
+        ("agents", [agent.label for agent in agents]),
+        ("scenarios", [scenario.title for scenario in scenarios]),
+    ):
+        repeated = [name for i, name in enumerate(names) if name in names[:i]]
+        if repeated:
+            raise PydanticCustomError("whole", f"{what} has {{name}} twice", {"name": repr(repeated[0])})
+
+
 class ExperimentSpec(Workplace):
     """An experiment file: all agents search in the same worlds, in every scenario and setting."""
 
@@ -105,13 +117,7 @@ class ExperimentSpec(Workplace):
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:
-        for what, names in (
-            ("agents", [agent.label for agent in self.agents]),
-            ("scenarios", [scenario.title for scenario in self.scenarios]),
-        ):
-            repeated = [name for i, name in enumerate(names) if name in names[:i]]
-            if repeated:
-                raise PydanticCustomError("whole", f"{what} has {{name}} twice", {"name": repr(repeated[0])})
+        _require_distinct(self.agents, self.scenarios)
         if (count := self.episode_count) > MAX_EPISODES:
             raise PydanticCustomError(
                 "whole",
@@ -133,6 +139,45 @@ class ExperimentSpec(Workplace):
             failure * walk * drive + (walk if grid.calibrated else 0) + failure * len(grid.occupancy_levels)
         )
         return len(self.agents) * worlds * settings * self.episodes
+
+
+class CommuteSpec(Workplace):
+    """Drivers who come day after day, with a map that learns from their trips."""
+
+    kind: Literal["commute"] = "commute"
+    agents: Several[AgentItem] = Field(
+        tuple(AgentSpec(name=name) for name in ("belief", "mdp", "first-free", "greedy-drive")),
+        min_length=1,
+        max_length=1_000,
+    )
+    scenarios: Several[ScenarioItem] = Field((scenario_spec("campus"),), min_length=1, max_length=1_000)
+    maps: Annotated[Axis[MapName], BeforeValidator(_listed)] = Field(
+        ("empty",), description="Maps to start from: empty, right or wrong."
+    )
+    days: int = Field(30, ge=1, le=MAX_DAYS, description="Days on which each driver comes.")
+    drivers: int = Field(40, ge=1, le=100_000, description="Repetitions, each with a map of its own.")
+    fleet: int = Field(1, ge=1, le=1_000, description="Drivers who share a map.")
+    seed: int = Field(0, ge=0, lt=2**31)
+    figures: bool = True
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        _require_distinct(self.agents, self.scenarios)
+        count = (
+            len(self.agents)
+            * len(self.scenarios)
+            * (len(self.maps) + 1)
+            * self.days
+            * self.drivers
+            * self.fleet
+        )
+        if count > MAX_EPISODES:
+            raise PydanticCustomError(
+                "whole",
+                "agents x scenarios x maps x days x drivers is {count} searches, want at most {most}",
+                {"count": count, "most": MAX_EPISODES},
+            )
+        return self
 
 
 class BenchmarkSpec(Workplace):
@@ -232,6 +277,7 @@ class TrainingSpec(Workplace):
 
 SPECS: dict[str, type[Workplace]] = {
     "compare": ExperimentSpec,
+    "commute": CommuteSpec,
     "benchmark": BenchmarkSpec,
     "survey": SurveySpec,
     "demo": DemoSpec,

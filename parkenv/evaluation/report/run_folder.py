@@ -12,7 +12,7 @@ import jsonschema
 
 from parkenv import __version__
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.results import SETTING_COLUMNS, SETTINGS, SUMMARY, SUMMARY_PARTIAL, Row
+from parkenv.evaluation.experiments.results import KEY_COLUMNS, SETTINGS, SUMMARY, SUMMARY_PARTIAL, Row
 from parkenv.evaluation.experiments.spec import SPEC_FILE, SPECS
 from parkenv.files.limited_reading import csv_records, read_json
 from parkenv.files.spec_file import Spec, read_tables
@@ -89,19 +89,20 @@ class RunFolder:
         return [str(word) for word in self.summary["command"][2:]]
 
     def totals(self) -> dict[tuple[Any, ...], float]:
-        """Read the total time, s, of every search in `episodes.csv`, by `results.episode_key`; empty without the file.
+        """Read the total time, s, of every search in `episodes.csv`, by `results.episode_key`.
+
+        Empty without the file, and for a commute, whose searches depend on those before.
 
         Raises:
             InputError: the file is not in the format of this version.
         """
         file = self.path / "episodes.csv"
-        if not file.exists():
+        if not file.exists() or self.kind == "commute":
             return {}
-        columns = (*SETTING_COLUMNS, "seed")
         totals = {}
         for line, row in csv_records(file):
             try:
-                totals[tuple(_value(c, row[c]) for c in columns)] = float(row["total_s"])
+                totals[tuple(_value(c, row[c]) for c in KEY_COLUMNS)] = float(row["total_s"])
             except (KeyError, ValueError) as error:
                 raise InputError(f"{file}: line {line}: cannot be read ({error})") from error
         return totals

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -115,7 +116,7 @@ class Training(ABC):
             The rows of `curve.csv`.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        checkpoint, curve = folder / CHECKPOINT, read_curve(folder / CURVE)
+        checkpoint, curve = folder / CHECKPOINT, read_curve(folder / CURVE, self.columns)
         if not checkpoint.exists() and curve and curve[-1]["steps"] >= self.steps:
             return curve
         env, rate = self.make_env(), self.config.settings["learning_rate"]
@@ -132,6 +133,7 @@ class Training(ABC):
         env.seed(TRAINING_SEEDS * (seed + 1))
         if checkpoint.exists():
             state, curve = read_checkpoint(checkpoint)
+            require_columns(curve, self.columns, checkpoint)
             restore(state, model)
         else:
             curve = []
@@ -214,20 +216,40 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
         return scores
 
 
-def read_curve(path: Path) -> list[Row]:
+def read_curve(path: Path, columns: Sequence[str]) -> list[Row]:
     """Read evaluations from CSV; return an empty list if there is no file.
 
+    Args:
+        path: a `curve.csv`.
+        columns: those that it must have.
+
     Raises:
-        InputError: a value is not a number.
+        InputError: a column is missing, or a value is not a number.
     """
     if not path.exists():
         return []
     try:
-        return [
-            {name: int(value) if name == "steps" else float(value) for name, value in row.items()}
-            for _, row in csv_records(path)
-        ]
+        return require_columns(
+            [
+                {name: int(value) if name == "steps" else float(value) for name, value in row.items()}
+                for _, row in csv_records(path)
+            ],
+            columns,
+            path,
+        )
     except InputError:
         raise
     except ValueError as error:
         raise InputError(f"{path}: want numbers in every column of every line ({error})") from error
+
+
+def require_columns(curve: list[Row], columns: Sequence[str], path: Path) -> list[Row]:
+    """Return evaluations that a file held.
+
+    Raises:
+        InputError: one lacks a column.
+    """
+    for name in columns:
+        if any(name not in row for row in curve):
+            raise InputError(f"{path}: has no column {name!r}, want {', '.join(columns)}")
+    return curve

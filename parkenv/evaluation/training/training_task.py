@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
@@ -134,16 +135,17 @@ def curves_beside(folders: Sequence[str], out: Path, task: TrainingTask) -> dict
     """
     if len(folders) >= len(COLORS):
         raise InputError(f"--beside names {len(folders)} folders, want at most {len(COLORS) - 1}")
-    own, known = task.settings(), {out.resolve()}
+    own, known = task.settings(), {os.path.realpath(out)}
     beside: dict[str, list[list[Row]]] = {}
     for folder in map(Path, folders):
-        if folder.resolve() in known:
+        if os.path.realpath(folder) in known:
             raise InputError(f"--beside: {folder} is already drawn")
-        known.add(folder.resolve())
+        known.add(os.path.realpath(folder))
         settings = read_settings(folder)
-        curves = [read_curve(its) for its in sorted(folder.glob(f"seed_*/{CURVE}"))]
+        columns = ("steps", *task.measures)
+        curves = [read_curve(its, columns) for its in sorted(folder.glob(f"seed_*/{CURVE}"))]
         curves = [curve for curve in curves if curve]
-        if settings is None or not curves:
+        if settings is None or not curves or "algorithm" not in settings:
             raise InputError(f"--beside: {folder} holds no training")
         theirs = task.evaluation_settings(settings)
         for name, value in task.evaluation_settings(own).items():
@@ -152,8 +154,6 @@ def curves_beside(folders: Sequence[str], out: Path, task: TrainingTask) -> dict
                     f"--beside: {name} is {theirs[name]!r} in {folder} and {value!r} here; their evaluations cannot "
                     "be compared"
                 )
-        if not {"steps", *task.measures} <= {*curves[0][0]} or "algorithm" not in settings:
-            raise InputError(f"--beside: {folder} was not written by this version of parkenv")
         name = name_of(settings)
         if name == name_of(own) or name in beside:
             name = f"{name} ({folder})"

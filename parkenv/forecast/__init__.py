@@ -1,0 +1,1 @@
+"""Forecasting models: arrays of days, hours and slots in, logits with standard deviations out."""

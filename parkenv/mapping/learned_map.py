@@ -1,0 +1,198 @@
+"""A map that learns from every trip: an occupancy forecast, corrected by what searches observed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby, product
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from parkenv.errors import InputError
+from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior, mean_probability
+from parkenv.mapping.inference import RELAXATION_S, MapPrior, SessionLog
+from parkenv.mapping.trips import Trip, state_likelihoods
+from parkenv.world.day_error import MAX_LOGITS, DayError, centred_logits, nearness
+from parkenv.world.occupancy import Arrival, Forecast, PriorModel
+from parkenv.world.occupancy_kernel import MAX_PROBABILITY, MIN_PROBABILITY
+from parkenv.world.week import DAY_S, HOUR_S, WEEK_S
+
+FloatArray = NDArray[np.float64]
+
+MOST_SLOTS = 3_000
+"""Largest lot: memory and time grow with the square of the slots."""
+USUAL_DAY = DayError(0.8)
+"""Day error of a map that states none: the median of 99 car parks over two years is 0.77 logits."""
+_MEMORY = (30.0, 365.0)
+_SHAPE = {"level": 1.0, "slope": 0.8, "smooth": 0.8, "own": 0.6, "hour": 0.5}
+"""Standard deviations, relative to that of the level."""
+
+
+def _priors(scales: dict[float, float]) -> tuple[MapErrorPrior, ...]:
+    return tuple(
+        MapErrorPrior(**{part: scale * sd for part, sd in _SHAPE.items()}, memory_days=days, weight=weight)
+        for (scale, weight), days in product(scales.items(), _MEMORY)
+    )
+
+
+GIVEN_MAP = _priors({0.1: 0.3, 0.5: 0.3, 1.0: 0.25, 2.5: 0.15})
+"""Priors for a given map: right, a little off, or quite wrong, with or without drift over weeks."""
+NO_MAP = _priors({1.0: 0.5, 2.0: 0.5})
+"""Priors for a lot of which nothing is known."""
+
+
+class EmptyMap:
+    """The map of a lot of which nothing is known: 50 % for every slot.
+
+    Args:
+        n_slots: number of slots.
+    """
+
+    def __init__(self, n_slots: int) -> None:
+        self._forecast = Forecast(np.full(n_slots, 0.5), np.full(n_slots, 1.0 / RELAXATION_S), USUAL_DAY)
+
+    @property
+    def n_slots(self) -> int:
+        """Number of slots."""
+        return len(self._forecast.p_occupied)
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        """Return 50 % for every slot."""
+        del arrival
+        return self._forecast
+
+
+class ReversedMap:
+    """A wrong map: slots near the goal get the forecast of slots far from it, and the other way round.
+
+    Args:
+        right: the map to reverse.
+        walk: (n,) walk from each slot to the goal.
+    """
+
+    def __init__(self, right: PriorModel, walk: ArrayLike) -> None:
+        self._right = right
+        order = np.argsort(np.asarray(walk), kind="stable")
+        self._from = np.empty_like(order)
+        self._from[order] = order[::-1]
+
+    @property
+    def n_slots(self) -> int:
+        """Number of slots."""
+        return self._right.n_slots
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        """Return the forecast with the slots in reverse order of their walks."""
+        right = self._right.forecast(arrival)
+        return Forecast(right.p_occupied[self._from], right.decay_rate[self._from], right.day_error)
+
+
+def map_prior(log: SessionLog, trips: Sequence[Trip], walk: ArrayLike) -> PriorModel:
+    """Return the forecast of a map file: its survey sessions, corrected by the trips after them.
+
+    Args:
+        log: the sessions.
+        trips: the trips.
+        walk: (n,) walk from each slot to the goal.
+
+    Raises:
+        InputError: neither sessions nor trips, or a lot that is too large to learn from trips.
+    """
+    if not trips:
+        return MapPrior(log)
+    surveyed = len(log.time) > 0
+    learned = LearnedMap(
+        MapPrior(log) if surveyed else EmptyMap(log.n_slots), walk, GIVEN_MAP if surveyed else NO_MAP
+    )
+    learned.learn(trips)
+    return learned
+
+
+class LearnedMap:
+    """A map and what trips have taught since.
+
+    The forecast is the mean over days of the corrected map; its day error holds the day's own and what is still unknown
+    of the error that all slots share.
+
+    Args:
+        base: the map before any trip.
+        walk: (n,) walk from each slot to the goal.
+        priors: how wrong that map may be.
+
+    Raises:
+        InputError: a lot with more than 3,000 slots.
+    """
+
+    def __init__(
+        self, base: PriorModel, walk: ArrayLike, priors: Sequence[MapErrorPrior] = GIVEN_MAP
+    ) -> None:
+        if base.n_slots > MOST_SLOTS:
+            raise InputError(
+                f"a map that learns from trips has at most {MOST_SLOTS:,} slots, this lot has {base.n_slots:,}"
+            )
+        self._base = base
+        self._nearness = nearness(walk)
+        self._error = MapError(self._nearness, priors)
+        self._day: int | None = None
+
+    @property
+    def n_slots(self) -> int:
+        """Number of slots."""
+        return self._base.n_slots
+
+    def pass_time(self, day: int) -> None:
+        """Let the map age until a day, counted from the first Monday; it never gets younger."""
+        if self._day is not None and day > self._day:
+            self._error.pass_days(day - self._day)
+        self._day = day if self._day is None else max(day, self._day)
+
+    def learn(self, trips: Sequence[Trip]) -> None:
+        """Add trips, ordered by time and not before those already added."""
+        for day, its in groupby(trips, key=lambda trip: int(trip.time // DAY_S)):
+            self.pass_time(day)
+            self._learn_day(list(its))
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        """Return the forecast of the corrected map."""
+        base, hour = self._base.forecast(arrival), arrival.time / HOUR_S
+        p_taken, mean_logits = [], []
+        mean, variance = self._error.predict(hour)
+        day = base.day_error.deviations(self._nearness)
+        for prior_sd, its_mean, its_variance in zip(self._error.prior_sd(), mean, variance, strict=True):
+            logits = centred_logits(base.p_occupied, np.hypot(prior_sd, day)) + its_mean
+            p_taken.append(mean_probability(logits, its_variance + day**2))
+            mean_logits.append(logits)
+        weights = self._error.weights
+        p = np.clip(weights @ np.array(p_taken), MIN_PROBABILITY, MAX_PROBABILITY)
+        return Forecast(
+            p, base.decay_rate, self._day_error(base.day_error, weights, np.array(mean_logits), hour)
+        )
+
+    def _learn_day(self, trips: Sequence[Trip]) -> None:
+        slots, hours, likelihood, p, day_error = [], [], [], [], DayError()
+        for trip in trips:
+            base = self._base.forecast(Arrival(trip.time % WEEK_S, trip.date))
+            its_slots, its_likelihood = state_likelihoods(trip, base)
+            slots.append(its_slots)
+            likelihood.append(its_likelihood)
+            hours.append(np.full(len(its_slots), trip.time / HOUR_S))
+            p.append(base.p_occupied[its_slots])
+            day_error = base.day_error
+        evidence = Evidence(np.concatenate(slots), np.concatenate(hours), np.concatenate(likelihood))
+        day = day_error.deviations(self._nearness[evidence.slots])
+        deviation = np.hypot(self._error.prior_sd()[:, evidence.slots], day)
+        logits = centred_logits(np.concatenate(p), deviation)
+        self._error.observe(evidence, logits, (day_error.level, day_error.slope))
+
+    def _day_error(self, day: DayError, weights: FloatArray, logits: FloatArray, hour: float) -> DayError:
+        """Return the day's own error together with the uncertainty of what all slots share."""
+        level_sd, slope_sd = self._error.common_sd(hour)
+        rise = self._nearness / max(float(self._nearness @ self._nearness), 1e-12)
+        both = []
+        for own, unknown, its in (
+            (day.level, level_sd, logits.mean(axis=1)),
+            (day.slope, slope_sd, logits @ rise),
+        ):
+            apart = its - weights @ its
+            both.append(min(float(np.sqrt(own**2 + weights @ (unknown**2 + apart**2))), MAX_LOGITS))
+        return DayError(*both)

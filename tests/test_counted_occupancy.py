@@ -1,0 +1,128 @@
+"""Worlds that follow the counts of a car park."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.special import expit, logit
+
+from parkenv import make_scenario
+from parkenv.envs.search_vector import ParkSearchVectorEnv
+from parkenv.errors import InputError
+from parkenv.world.counted_occupancy import CountedOccupancy, level_of_mean, process_of_curve
+from parkenv.world.occupancy import Arrival, ArrivalWindow
+
+N = 120
+ATTRACTION = 1.6 * np.linspace(1.0, -1.0, N) + np.random.default_rng(4).normal(0.0, 0.6, N)
+CURVE = np.array([0.1] * 6 + [0.15, 0.3, 0.6, 0.85, 0.95, 0.97, 0.97, 0.96, 0.95, 0.9, 0.8, 0.6, 0.4, 0.3]
+                 + [0.2, 0.15, 0.12, 0.1])  # fmt: skip
+MONDAY, TUESDAY = "2024-01-01", "2024-01-02"
+
+
+def counted(**changes):
+    """Two equal days whose forecast is right in the mean and wrong by 0.8 logits."""
+    arguments = {
+        "days": (MONDAY, TUESDAY),
+        "occupied": np.stack([CURVE, CURVE]),
+        "level": logit(np.stack([CURVE, CURVE])),
+        "level_sd": np.full((2, 24), 0.8),
+        "attraction": ATTRACTION,
+    }
+    return CountedOccupancy(**arguments | changes)
+
+
+@settings(max_examples=25)
+@given(arrays(float, 24, elements=st.floats(0.0, 1.0)))
+def test_the_mean_follows_any_counts(curve):
+    process = process_of_curve(ATTRACTION, curve, 7200.0)
+    mean = [process.marginal((hour + 1) * 3600.0).mean() for hour in range(24)]
+    np.testing.assert_allclose(mean, np.clip(curve, 0.002, 0.998), atol=2e-3)
+
+
+def test_popular_slots_are_fuller():
+    p = process_of_curve(ATTRACTION, CURVE, 7200.0).marginal(11 * 3600.0)
+    order = np.argsort(ATTRACTION)
+    assert (np.diff(p[order]) >= 0).all()
+    assert p[order[-1]] > 0.98 > 0.9 > p[order[0]]
+
+
+def test_the_world_is_as_full_as_counted():
+    occupancy = counted()
+    taken = [
+        occupancy.world(np.uint64(key), Arrival(10 * 3600.0, MONDAY)).occupied(np.arange(N), 10 * 3600.0)
+        for key in range(200)
+    ]
+    assert np.mean(taken) == pytest.approx(CURVE[9], abs=0.01)
+
+
+def test_the_forecast_is_the_mean_over_possible_days():
+    forecast = counted().forecast(Arrival(10 * 3600.0, MONDAY))
+    levels = logit(CURVE[9]) + 0.8 * np.random.default_rng(0).normal(size=100_000)
+    assert forecast.p_occupied.mean() == pytest.approx(expit(levels).mean(), abs=2e-3)
+
+
+def test_the_day_error_moves_the_lot_by_that_of_its_level():
+    level = logit(CURVE[11])
+    error = counted().forecast(Arrival(11.5 * 3600.0, MONDAY)).day_error
+    middle = level_of_mean(ATTRACTION, CURVE[11])
+    low, high = (logit(expit(ATTRACTION + middle + side * error.level).mean()) for side in (-1, 1))
+    assert (high - low) / 2 == pytest.approx(0.8, abs=0.05)
+    assert low < level < high
+    assert error.slope == 0.0
+
+
+def test_only_days_that_were_counted_throughout_are_replayed():
+    occupied = np.stack([CURVE, CURVE])
+    occupied[0, 9] = np.nan
+    occupancy = counted(occupied=occupied)
+    assert occupancy.days_in(ArrivalWindow(start_s=8 * 3600.0, end_s=13 * 3600.0)) == [TUESDAY]
+    assert occupancy.days_in(ArrivalWindow(start_s=10 * 3600.0, end_s=13 * 3600.0)) == [MONDAY, TUESDAY]
+    with pytest.raises(InputError, match="no day on sat was counted from 8:00 to 13:00"):
+        occupancy.days_in(ArrivalWindow(weekdays=(5,)))
+    # The gap is filled between its neighbours.
+    mean = occupancy.process_of(MONDAY).marginal(10 * 3600.0).mean()
+    assert mean == pytest.approx((CURVE[8] + CURVE[10]) / 2, abs=2e-3)
+
+
+def test_wrong_shapes_and_days_are_refused():
+    with pytest.raises(InputError, match=r"level has shape \(2, 23\), want \(2, 24\)"):
+        counted(level=np.zeros((2, 23)))
+    with pytest.raises(InputError, match="wanted a counted day"):
+        counted().forecast(Arrival(0.0, "2024-01-03"))
+
+
+def test_searches_meet_the_counted_days():
+    lot = make_scenario("campus").lot
+    occupancy = counted(attraction=np.linspace(1.6, -1.6, lot.n_slots))
+    scenario = make_scenario("campus", occupancy=occupancy)
+    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
+    batch = ParkSearchVectorEnv(6, scenario)
+    together, _ = batch.reset(seed=0)
+    days = set()
+    for seed in range(6):
+        observation, _ = env.reset(seed=seed)
+        arrival = env.state.arrival
+        days.add(arrival.day)
+        forecast = occupancy.forecast(arrival)
+        np.testing.assert_array_equal(observation["p_occupied"], forecast.p_occupied.astype(np.float32))
+        assert observation["day_error"][0] == np.float32(forecast.day_error.level)
+        saved = env.get_state()
+        seen = []
+        for action in np.random.default_rng(seed).integers(0, 4, 60):
+            observation, *_ = env.step(action)
+            seen.append(observation["belief"])
+        belief, world = env.state.belief, occupancy.world(env.state.key, arrival)
+        for slot in np.flatnonzero(belief.observed):
+            when = arrival.time + belief.time - belief.age[slot]
+            assert world.occupied([slot], when)[0] == belief.observed_taken[slot]
+        env.set_state(saved)
+        for action, before in zip(np.random.default_rng(seed).integers(0, 4, 60), seen, strict=True):
+            np.testing.assert_array_equal(env.step(action)[0]["belief"], before)
+        np.testing.assert_array_equal(
+            together["belief"][seed][: lot.n_slots], forecast.p_occupied.astype(np.float32)
+        )
+    assert days == {MONDAY, TUESDAY}
+    for _ in range(40):
+        together, *_ = batch.step(np.random.default_rng(1).integers(0, 4, 6))

@@ -1,0 +1,268 @@
+"""A map that learns from trips: what observations say about its error, trips in the map file, and their forecast."""
+
+import sqlite3
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from parkenv import make_scenario
+from parkenv.errors import InputError
+from parkenv.evaluation.simulate import simulate
+from parkenv.evaluation.trip_recorder import TripRecorder
+from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior, mean_probability
+from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, ReversedMap, map_prior
+from parkenv.mapping.store import VERSION, MapStore
+from parkenv.mapping.trips import Trip, state_likelihoods
+from parkenv.world.day_error import DayError
+from parkenv.world.occupancy import Arrival, Forecast
+from parkenv.world.scenario import SearchProblem
+from parkenv.world.sensor_model import SensorModel
+from parkenv.world.week import DAY_S, HOUR_S
+from planners.agent import make_agent
+
+MORNING = Arrival(9 * HOUR_S)
+GRID = np.linspace(-15.0, 15.0, 1201)
+
+
+def sigmoid(x):
+    return 1.0 / (1.0 + np.exp(-x))
+
+
+def evidence(slots, taken):
+    states = np.asarray(taken, float)
+    return Evidence(np.asarray(slots), np.full(len(states), 9.0), np.column_stack([1.0 - states, states]))
+
+
+def trip(key, day, slots, taken, hit_rate=1.0, false_alarm_rate=0.0, after_s=None):
+    k = len(slots)
+    return Trip(
+        key, day * DAY_S + 9 * HOUR_S, "", np.asarray(slots), np.arange(k) * 1.0 if after_s is None else after_s,
+        np.asarray(taken, bool), np.full(k, hit_rate), np.full(k, false_alarm_rate),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("taken", "free"), [(5, 1), (12, 0), (0, 3), (20, 20)])
+def test_the_error_of_one_slot_has_its_exact_posterior(taken, free):
+    """Against numerical integration of prior times likelihood."""
+    error = MapError(np.array([1.0, -1.0]), [MapErrorPrior(0.0, 0.0, 0.0, 1.5, 0.0, memory_days=1e12)])
+    for state in np.random.default_rng(0).permutation([1.0] * taken + [0.0] * free):
+        error.observe(evidence([0], [state]), np.full((1, 1), 0.3), (0.0, 0.0))
+    density = np.exp(-0.5 * (GRID / 1.5) ** 2) * sigmoid(GRID + 0.3) ** taken * sigmoid(-GRID - 0.3) ** free
+    density /= density.sum()
+    mean, variance = error.predict(9.0)
+    assert mean_probability(0.3 + mean, variance)[0, 0] == pytest.approx(
+        density @ sigmoid(GRID + 0.3), abs=0.01
+    )
+    assert mean[0, 1] == 0.0
+    assert variance[0, 1] == pytest.approx(1.5**2)
+
+
+def test_the_level_of_the_day_is_integrated_out():
+    """Twelve taken slots of one day say less about the map than twelve of twelve days; both as in exact integration."""
+    prior, day, n = 1.0, 1.2, 12
+    probability = {}
+    for days in (1, n):
+        error = MapError(
+            np.linspace(1.0, -1.0, n), [MapErrorPrior(prior, 0.0, 0.0, 0.0, 0.0, memory_days=1e12)]
+        )
+        for part in np.split(np.arange(n), days):
+            error.observe(evidence(part, np.ones(len(part))), np.zeros((1, len(part))), (day, 0.0))
+        level, today = GRID[:, None], GRID
+        of_day = np.exp(-0.5 * (today / day) ** 2)
+        of_day /= of_day.sum()
+        likelihood = (sigmoid(level + today) ** (n // days) @ of_day) ** days
+        density = np.exp(-0.5 * (GRID / prior) ** 2) * likelihood
+        mean, variance = error.predict(9.0)
+        probability[days] = float(mean_probability(mean, variance)[0, 0])
+        assert probability[days] == pytest.approx(density @ sigmoid(GRID) / density.sum(), abs=0.01)
+    assert probability[1] < probability[n] - 0.1
+
+
+def test_the_prior_that_foretold_the_observations_gains_weight():
+    priors = [MapErrorPrior(0.1, 0.0, 0.0, 0.1, 0.0, 1e3), MapErrorPrior(2.0, 0.0, 0.0, 1.0, 0.0, 1e3)]
+    for logit, states, winner in ((0.0, np.arange(10) % 2, 0), (-3.0, np.ones(10), 1)):
+        error = MapError(np.linspace(1.0, -1.0, 20), priors)
+        for day in range(4):
+            error.observe(
+                evidence(np.arange(0, 20, 2), np.roll(states, day)),
+                np.full((len(error.weights), 10), logit),
+                (0.5, 0.0),
+            )
+        assert error.weights.max() > 0.8
+        assert (error.prior_sd()[error.weights.argmax(), 0] > 1.0) == (winner == 1)
+
+
+def test_a_map_without_trips_forecasts_as_before():
+    scenario = make_scenario("campus")
+    for base, priors in ((scenario.occupancy, GIVEN_MAP), (EmptyMap(scenario.lot.n_slots), NO_MAP)):
+        before = base.forecast(MORNING)
+        after = LearnedMap(base, scenario.walk_s, priors).forecast(MORNING)
+        np.testing.assert_allclose(after.p_occupied, before.p_occupied, atol=5e-4)
+        np.testing.assert_array_equal(after.decay_rate, before.decay_rate)
+        # Planners hear that the level is less certain than a right map's.
+        assert after.day_error.level > before.day_error.level
+
+
+def test_an_empty_map_learns_the_level_from_half_of_the_slots_and_forgets_it():
+    n, rng = 60, np.random.default_rng(0)
+    learned = LearnedMap(EmptyMap(n), np.arange(n), NO_MAP)
+    for day in range(10):
+        slots = np.arange(0, n, 2)
+        learned.learn([trip(f"{day}", day, slots, rng.random(len(slots)) < 0.9)])
+    soon = learned.forecast(MORNING)
+    assert soon.p_occupied[1::2].mean() == pytest.approx(0.9, abs=0.08)
+    assert (
+        soon.day_error.level < LearnedMap(EmptyMap(n), np.arange(n), NO_MAP).forecast(MORNING).day_error.level
+    )
+    learned.pass_time(20_000)
+    np.testing.assert_allclose(learned.forecast(MORNING).p_occupied, 0.5, atol=0.01)
+
+
+def test_a_map_learns_the_hours_and_the_slots_that_differ():
+    """Slot 3 is taken, the others are free at nine and taken at fifteen."""
+    n = 12
+    learned = LearnedMap(EmptyMap(n), np.arange(n), NO_MAP)
+    for day in range(8):
+        for hour, level in ((9, False), (15, True)):
+            its = trip(f"{day}-{hour}", day, np.arange(n), np.where(np.arange(n) == 3, True, level))
+            learned.learn([Trip(its.key, day * DAY_S + hour * HOUR_S, "", *list(vars(its).values())[3:])])
+    nine, fifteen = (learned.forecast(Arrival(hour * HOUR_S)).p_occupied for hour in (9, 15))
+    rest = np.arange(n) != 3
+    assert nine[rest].max() < 0.25 < 0.4 < nine[3]
+    assert fifteen[rest].min() > 0.75
+
+
+def test_later_trips_do_not_change_earlier_forecasts_and_the_order_within_a_day_hardly_matters():
+    n, rng = 20, np.random.default_rng(1)
+    days = [trip(f"{d}", d, rng.permutation(n)[:8], rng.random(8) < 0.7) for d in range(6)]
+    forecasts = []
+    for later in (days[3:], [trip("x", 9, np.arange(n), np.ones(n))]):
+        learned = LearnedMap(EmptyMap(n), np.arange(n), NO_MAP)
+        learned.learn(days[:3])
+        forecasts.append(learned.forecast(MORNING).p_occupied)
+        learned.learn(later)
+    np.testing.assert_array_equal(*forecasts)
+    ordered = []
+    for order in (slice(None), slice(None, None, -1)):
+        learned = LearnedMap(EmptyMap(n), np.arange(n), NO_MAP)
+        learned.learn([trip("a", 0, days[0].slots[order], days[0].taken[order])])
+        ordered.append(learned.forecast(MORNING).p_occupied)
+    np.testing.assert_allclose(*ordered, atol=0.01)
+
+
+def test_trips_of_one_day_are_learned_together():
+    """They share the day's level, so they say less than the same trips on different days."""
+    n = 20
+    shared, apart = (LearnedMap(EmptyMap(n), np.arange(n), NO_MAP) for _ in range(2))
+    shared.learn([trip(f"{i}", 0, np.arange(i, n, 4), np.ones(5)) for i in range(4)])
+    apart.learn([trip(f"{i}", i, np.arange(i, n, 4), np.ones(5)) for i in range(4)])
+    assert shared.forecast(MORNING).p_occupied.mean() < apart.forecast(MORNING).p_occupied.mean()
+
+
+def test_what_a_trip_says_about_a_slot():
+    """Repeated observations of one slot count as one state, which decays in between."""
+    known = Forecast(np.array([0.4, 0.4]), np.array([0.0, 1e-2]))
+    cases = [
+        ([0], [True], [[0.1, 0.8]]),
+        ([0, 0], [True, False], [[0.1 * 0.9, 0.8 * 0.2]]),
+        # Slot 1 has forgotten its state after 1e4 s: the second observation says nothing about the first.
+        ([1, 1], [True, False], [[0.1, 0.8]]),
+    ]
+    for slots, taken, wanted in cases:
+        its = trip("a", 0, slots, taken, 0.8, 0.1, after_s=np.arange(len(slots)) * 1e4)
+        found, likelihood = state_likelihoods(its, known)
+        assert found.tolist() == slots[:1]
+        np.testing.assert_allclose(
+            likelihood[:, 1] / likelihood[:, 0], np.array(wanted)[:, 1] / np.array(wanted)[:, 0], rtol=1e-9
+        )
+    assert len(state_likelihoods(trip("a", 0, [0, 0], [True, False], after_s=np.zeros(2)), known)[0]) == 0
+
+
+@pytest.mark.parametrize(
+    "sensor", [SensorModel(), SensorModel(hit_rate=0.9, false_alarm_rate=0.1), SensorModel.blind()]
+)
+def test_a_trip_holds_what_the_agent_observed(sensor):
+    """With an exact sensor the observations are the truth; attempts are exact with any sensor."""
+    scenario = make_scenario("jam", sensor_model=sensor)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    agent = make_agent("mdp", scenario)
+    attempts = 0
+    for seed in range(5):
+        recorder = TripRecorder()
+        simulate(env, agent, seed, (recorder,))
+        state = env.unwrapped.state
+        its = recorder.trip("a", state.arrival.time, "")
+        exact = (its.hit_rate == 1.0) & (its.false_alarm_rate == 0.0)
+        times = state.arrival.time + its.after_s
+        true = np.array([state.world.occupied([s], t)[0] for s, t in zip(its.slots, times, strict=True)])
+        agree = true == its.taken
+        # The clock of the observation is float32: a slot may change within the rounding.
+        assert agree[exact].mean() > 0.97
+        observed = np.unique(its.slots)
+        assert set(np.flatnonzero(state.belief.observed)) <= set(observed)
+        attempts += exact.sum()
+        if not exact[:-1].any():
+            assert 0.7 < agree.mean() < 1.0
+    assert attempts >= 5
+
+
+def test_map_files_keep_trips(tmp_path):
+    lot = make_scenario("mini").lot
+    its = [trip("b", 1, [3, 1, 3], [True, False, True], 0.9, 0.2), trip("a", 0, [], [])]
+    with MapStore(tmp_path / "map.sqlite", lot) as store:
+        for one in its:
+            store.add_trip(one)
+        with pytest.raises(InputError, match="holds a trip 'b' already"):
+            store.add_trip(its[0])
+        with pytest.raises(InputError, match="slot 10, want slots 0 to 9"):
+            store.add_trip(trip("c", 1, [10], [True]))
+    with MapStore(tmp_path / "map.sqlite", lot, create=False) as store:
+        read = store.trips()
+        assert [one.key for one in read] == ["a", "b"]
+        assert store.has_trip("b")
+        assert not store.has_trip("c")
+        for name, value in vars(its[0]).items():
+            np.testing.assert_array_equal(getattr(read[1], name), value)
+        assert len(store.log().time) == 0
+        learned = map_prior(store.log(), read, lot.walk_m(0)).forecast(MORNING).p_occupied
+    assert learned[3] > 0.5 > learned[1]
+
+
+def test_map_files_of_version_1_are_read_and_gain_trips(tmp_path):
+    lot, path = make_scenario("mini").lot, tmp_path / "map.sqlite"
+    MapStore(path, lot).close()
+    with sqlite3.connect(path) as db:
+        db.executescript("DROP TABLE observation; DROP TABLE trip; PRAGMA user_version = 1")
+    db.close()
+    with MapStore(path, lot, create=False) as store:
+        assert store.trips() == []
+    with MapStore(path, lot) as store:
+        store.add_trip(trip("a", 0, [1], [True]))
+    with MapStore(path, lot, create=False) as store:
+        assert [one.key for one in store.trips()] == ["a"]
+    with sqlite3.connect(path) as db:
+        assert db.execute("PRAGMA user_version").fetchone() == (VERSION,)
+    db.close()
+
+
+def test_wrong_trips_and_maps_are_refused():
+    with pytest.raises(InputError, match="after_s of trip"):
+        trip("a", 0, [1, 2], [True, True], after_s=np.array([2.0, 1.0]))
+    with pytest.raises(InputError, match="rates of trip"):
+        trip("a", 0, [1], [True], hit_rate=1.5)
+    with pytest.raises(InputError, match="at most 3,000 slots"):
+        LearnedMap(EmptyMap(3_001), np.arange(3_001))
+    with pytest.raises(InputError, match="memory_days is 0"):
+        MapErrorPrior(1.0, 1.0, 1.0, 1.0, 1.0, 0.0)
+
+
+def test_the_reversed_map_is_wrong():
+    scenario = make_scenario("campus")
+    right, wrong = (
+        m.forecast(MORNING) for m in (scenario.occupancy, ReversedMap(scenario.occupancy, scenario.walk_s))
+    )
+    near = scenario.walk_s < np.median(scenario.walk_s)
+    assert wrong.p_occupied[near].mean() == pytest.approx(right.p_occupied[~near].mean(), abs=0.02)
+    assert isinstance(wrong.day_error, DayError)
+    assert isinstance(scenario.public(), SearchProblem)
