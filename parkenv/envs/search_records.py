@@ -13,7 +13,6 @@ from parkenv.world.counted_occupancy import CountedOccupancy
 from parkenv.world.lot import MOVES, PARK
 from parkenv.world.occupancy import (
     Arrival,
-    Forecast,
     IntArray,
     OccupancyModel,
     OccupancyProcess,
