@@ -66,6 +66,30 @@ def test_a_log_is_read(tmp_path, name):
     assert log.recorded.tolist() == [[True, False], [True, True]]
 
 
+def test_several_logs_are_one_by_date(tmp_path):
+    later = write(
+        tmp_path, HEADER + "2024-01-02 07:00,1,a,sunny,0\n2024-01-02 07:00,1,b,sunny,1\n", "later.csv"
+    )
+    first = write(
+        tmp_path, HEADER + "2024-01-01 08:00,1,b,sunny,0\n2024-01-01 09:00,1,a,sunny,1\n", "first.csv"
+    )
+    log = OccupancyLog.read_all([later, first])
+    assert log.slot_ids == ("a", "b")
+    assert log.days == ("2024-01-01", "2024-01-02")
+    assert log.day.tolist() == [0, 0, 1, 1]
+    assert log.slot.tolist() == [0, 1, 0, 1]
+    assert log.occupied.tolist() == [True, False, False, True]
+    with pytest.raises(
+        InputError, match=r"first.csv: 2024-01-01 is also in .*first.csv, wanted different days"
+    ):
+        OccupancyLog.read_all([first, first])
+    other = write(tmp_path, HEADER + "2024-01-03 07:00,1,c,sunny,0\n", "other.csv")
+    with pytest.raises(
+        InputError, match=r"other.csv: slot_id: 'a' is in one of this log and .* only, wanted the same"
+    ):
+        OccupancyLog.read_all([first, other])
+
+
 def test_camera_and_weather_may_be_absent_and_the_later_of_two_cameras_stands(tmp_path):
     text = "slot_id,occupied,datetime\na,1,2024-01-01 07:00\na,0,2024-01-01 07:00\na,0,2024-01-01 08:00\n"
     log = OccupancyLog.read(write(tmp_path, text))
@@ -345,7 +369,7 @@ def test_copies_of_a_world_answer_alike():
         (lambda m: RecordedOccupancy(m.log, [1.0], mapping=[9]), "mapping: wanted"),
         (
             lambda m: RecordedOccupancy(m.log, [1.0], forecast_from="past"),
-            "forecast_from 'past' wants replay_from",
+            "forecast_from is 'past', want replay_from with it",
         ),
         (
             lambda m: RecordedOccupancy(m.log, [1.0], None, date(2024, 1, 1), "rolling").mapped_log(

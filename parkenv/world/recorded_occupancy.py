@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,7 @@ from scipy.special import logit
 
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import csv_rows
+from parkenv.files.names import FORECAST_FROM, ForecastFrom
 from parkenv.forecast.slot_days import MAX_DAYS, FittedSlotDays, fit_slot_days
 from parkenv.world.day_error import MAX_LOGITS, DayError
 from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform
@@ -40,9 +41,6 @@ from parkenv.world.occupancy_kernel import (
 from parkenv.world.occupancy_log import OccupancyLog, csv_columns, day_class, weekday_of
 from parkenv.world.pointers import address_of, float64s, int64s, uint8s
 from parkenv.world.week import DAY_S
-
-ForecastFrom = Literal["others", "rolling", "past"]
-FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
 
 
 def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
@@ -237,9 +235,7 @@ class RecordedOccupancy:
                 f"forecast_from: got {self.forecast_from!r}, wanted one of {', '.join(FORECAST_FROM)}"
             )
         if self.replay_from is None and self.forecast_from != "others":
-            raise InputError(
-                f"forecast_from {self.forecast_from!r} wants replay_from, the first day to replay"
-            )
+            raise InputError(f"forecast_from is {self.forecast_from!r}, want replay_from with it")
 
     @property
     def n_slots(self) -> int:
