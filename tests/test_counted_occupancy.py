@@ -1,5 +1,6 @@
 """Worlds that follow the counts of a car park."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,6 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.special import expit, logit
 
+from parkenv import make_scenario
+from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
 from parkenv.world.counted_occupancy import CountedOccupancy, level_of_mean, process_of_curve
 from parkenv.world.occupancy import Arrival, ArrivalWindow
@@ -88,3 +91,38 @@ def test_wrong_shapes_and_days_are_refused():
         counted(level=np.zeros((2, 23)))
     with pytest.raises(InputError, match="wanted a counted day"):
         counted().forecast(Arrival(0.0, "2024-01-03"))
+
+
+def test_searches_meet_the_counted_days():
+    lot = make_scenario("campus").lot
+    occupancy = counted(attraction=np.linspace(1.6, -1.6, lot.n_slots))
+    scenario = make_scenario("campus", occupancy=occupancy)
+    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
+    batch = ParkSearchVectorEnv(6, scenario)
+    together, _ = batch.reset(seed=0)
+    days = set()
+    for seed in range(6):
+        observation, _ = env.reset(seed=seed)
+        arrival = env.state.arrival
+        days.add(arrival.day)
+        forecast = occupancy.forecast(arrival)
+        np.testing.assert_array_equal(observation["p_occupied"], forecast.p_occupied.astype(np.float32))
+        assert observation["day_error"][0] == np.float32(forecast.day_error.level)
+        saved = env.get_state()
+        seen = []
+        for action in np.random.default_rng(seed).integers(0, 4, 60):
+            observation, *_ = env.step(action)
+            seen.append(observation["belief"])
+        belief, world = env.state.belief, occupancy.world(env.state.key, arrival)
+        for slot in np.flatnonzero(belief.observed):
+            when = arrival.time + belief.time - belief.age[slot]
+            assert world.occupied([slot], when)[0] == belief.observed_taken[slot]
+        env.set_state(saved)
+        for action, before in zip(np.random.default_rng(seed).integers(0, 4, 60), seen, strict=True):
+            np.testing.assert_array_equal(env.step(action)[0]["belief"], before)
+        np.testing.assert_array_equal(
+            together["belief"][seed][: lot.n_slots], forecast.p_occupied.astype(np.float32)
+        )
+    assert days == {MONDAY, TUESDAY}
+    for _ in range(40):
+        together, *_ = batch.step(np.random.default_rng(1).integers(0, 4, 6))

@@ -80,9 +80,7 @@ def test_leaving_out_what_cannot_matter_changes_nothing(level, seeds):
     scenario = at_occupancy(make_scenario(grid_lot(8, 40)), level)
     most = scenario.lot.n_vertices * 9 // 10
     whole, part = (
-        EpisodeRunner(
-            scenario, "belief", make_agent("belief", scenario, trust_forecast=True, most_vertices=m)
-        )
+        EpisodeRunner(scenario, "belief", make_agent("belief", scenario, day=False, most_vertices=m))
         for m in (scenario.lot.n_vertices, most)
     )
     for seed in range(seeds):

@@ -38,7 +38,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from parkenv.errors import InputError
-from parkenv.files.names import BackendName
+from parkenv.files.names import BackendName, ForecastFrom
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import Grid, Workplace
@@ -54,8 +54,12 @@ class World:
     """Where and when: changes to the scenarios, which take precedence over scenario files.
 
     World:
-        occupancy (FILE): Which slots are taken when: a recorded log (.csv, .csv.gz), replayed day by day, or a process
-            that `parkenv occupancy fit` wrote (.json).  [default: the scenario's]
+        occupancy (FILE[,FILE...]): Which slots are taken when: recorded logs (.csv, .csv.gz) of the same slots,
+            replayed day by day, or a process that `parkenv occupancy fit` wrote (.json).  [default: the scenario's]
+        replay_from (DATE): First day of the log that is replayed.  [default: the scenario's, all]
+        forecast_from (past|rolling|others): Days of the log that the forecast is made from. past: those before
+            --replay-from; rolling: those before the earliest that a world replays; others: all that it does not
+            replay.  [default: the scenario's, others]
         mapping (FILE): CSV slot_id,log_slot_id that assigns the log's slots to the lot's.  [default: the log's fullest
             slots are nearest to the goal]
         goal (X,Y): Walk to this point, m, or to the lot's goal of this index.  [default: the scenario's]
@@ -64,6 +68,8 @@ class World:
 
     lot: str | None = None
     occupancy: str | None = None
+    replay_from: str | None = None
+    forecast_from: ForecastFrom | None = None
     mapping: str | None = None
     goal: str | None = None
     days: str | None = None
@@ -101,6 +107,9 @@ class World:
             log = {"log": self.occupancy, "mapping": self.mapping} if self.mapping else self.occupancy
             option = "--mapping" if self.mapping else "--occupancy"
             spec = spec.changed(option, occupancy=log, forecast="own")
+        replay = not_none(replay_from=self.replay_from, forecast_from=self.forecast_from)
+        if replay:
+            spec = spec.changed(occupancy=spec.occupancy.changed("--replay-from, --forecast-from", **replay))
         if self.goal is not None:
             index = int(self.goal) if self.goal.isdecimal() else numbers("--goal", self.goal, 2)
             spec = spec.changed("--goal", goal=index)

@@ -117,9 +117,9 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
         from parkenv.world.occupancy_log import OccupancyLog
         from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
 
-        log = OccupancyLog.read(spec.log)
+        log = OccupancyLog.read_all(spec.log)
         mapped = None if spec.mapping is None else read_mapping(spec.mapping, lot.slot_ids, log)
-        return RecordedOccupancy(log, lot.walk_m(goal), mapped)
+        return RecordedOccupancy(log, lot.walk_m(goal), mapped, spec.replay_from, spec.forecast_from)
     process = (
         _typical(spec.typical or TypicalWeek(), lot, goal)
         if spec.process is None

@@ -10,9 +10,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.forecast_error import DayBelief, ForecastErrorModel
-from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED, SlotBelief
+from parkenv.belief.day_belief import DayBelief
+from parkenv.belief.slot_belief import UNOBSERVED, SlotBelief
 from parkenv.errors import InputError
+from parkenv.world.day_error import nearness
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
@@ -28,7 +29,7 @@ FAILURE_COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 DEPTH = 3  # maximum number of targets before a path follows the thesis's planner
 WORK_PER_MS = 50_000  # steps of the path search per millisecond, approximately
 WORTH_PASSING_S = 1.0
-"""s by which driving on must be better than a known free slot, unless the forecast is trusted.
+"""s by which driving on must be better than a known free slot, unless days never differ from their forecast.
 
 If the forecast is right, stopping for a smaller gain costs next to nothing; if it is wrong, the slot that was passed
 may have been the last one for a long time.
@@ -44,7 +45,7 @@ class BeliefSearch:
     # the part of the lot that is planned for. The arrays below cover its slots, in its numbering.
     near: Neighborhood
     n_unobserved: int  # number of its slots that were unobserved when it was chosen
-    day: DayBelief  # belief about how much the day differs from the forecast
+    day: DayBelief  # belief about the day and, given the day, about the slots
     state: NDArray[np.int8]  # (n_slots,) int8, `SlotBelief.state` at the last decision
     # (n_slots,) float64, the highest detection rate among the views from which a slot was not detected
     missed_rate: FloatArray
@@ -65,10 +66,9 @@ class BeliefSearch:
 class BeliefAgent(SearchAgent[BeliefSearch]):
     """`belief`: follows the path with the least expected time under optimal stopping.
 
-    **Model.** A slot is free with the forecast probability, unless the day differs from its forecast in one of several
-    ways; the slots observed so far are evidence for these (`ForecastErrorModel`). A slot is revealed when it comes into
-    view; then its state decays as a two-state Markov chain, so a free slot may be gone on arrival and a taken one may
-    become free.
+    **Model.** A slot is free with the forecast probability, unless the day differs from its forecast; the slots
+    observed so far are evidence for how it does (`DayBelief`). A slot is revealed when it comes into view; then its
+    state decays as a two-state Markov chain, so a free slot may be gone on arrival and a taken one may become free.
 
     **Search.** Each decision rolls out candidate paths (`rollout_path`): they follow the thesis's planner as if every
     slot that it observes were taken, at several failure costs, and pass up to three inserted vertices first. Each path
@@ -97,12 +97,16 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         problem: lot, goal, speeds and costs.
         budget_ms: approximate time of a decision, ms. It limits the amount of work, not the wall time, so the same
             observations give the same actions on every machine.
-        trust_forecast: whether to assume that the forecast is always right.
+        day: whether to learn from observations how the day differs from its forecast; if not, the forecast is believed
+            to be right whatever is observed.
         most_vertices: a larger lot is planned for in part (`Neighborhoods`).
-        forecast_error: how a day may differ from its forecast, if that is not trusted.
+        explore: s, what the first observation of a slot with a forecast of 50 % is worth for later searches, with a map
+            that learns from trips; it is in proportion to p(1 - p). A slot that nothing later on the path can beat is
+            taken all the same.
 
     Raises:
-        InputError: the budget is not positive, `most_vertices` is out of range, or no slot can be observed.
+        InputError: the budget is not positive, `explore` is negative, `most_vertices` is out of range, or no slot
+            can be observed.
     """
 
     name: ClassVar[str] = "belief"
@@ -111,18 +115,20 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         self,
         problem: SearchProblem,
         budget_ms: float = 5.0,
-        trust_forecast: bool = False,
+        day: bool = True,
         most_vertices: int = MOST_VERTICES,
-        forecast_error: ForecastErrorModel | None = None,
+        explore: float = 0.0,
     ) -> None:
         super().__init__(problem)
         require_observations(self.name, problem)
         if not (budget_ms > 0.0 and math.isfinite(budget_ms)):
             raise InputError(f"budget_ms is {budget_ms}, want a finite number above 0")
-        self._forecast_error = (
-            ForecastErrorModel.none() if trust_forecast else forecast_error or ForecastErrorModel()
-        )
-        self._worth_passing_s = 0.0 if trust_forecast else WORTH_PASSING_S
+        if not (explore >= 0.0 and math.isfinite(explore)):
+            raise InputError(f"explore is {explore}, want finite seconds of at least 0")
+        self._explore = explore
+        self._day = day
+        self._nearness = nearness(self.problem.walk_s)
+        self._worth_passing_s = WORTH_PASSING_S if day else 0.0
         self._budget = Budget(np.array(FAILURE_COSTS), int(budget_ms * WORK_PER_MS), DEPTH)
         # With a perfect sensor no taken slot is attempted.
         self._failure_s = 0.0 if self.problem.sensor_model.perfect else self.problem.failure_s
@@ -139,11 +145,11 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
 
     def _search_of(self, near: Neighborhood, belief: SlotBelief) -> BeliefSearch:
         n = near.n_slots
-        walk_s = self.problem.walk_s[near.slots]
+        known = belief.take(near.slots)
         return BeliefSearch(
             near=near,
             n_unobserved=n,
-            day=self._forecast_error.prior(belief.forecast[near.slots], walk_s),
+            day=DayBelief(known, self._nearness[near.slots], len(self._nearness), certain=not self._day),
             state=np.full(n, UNOBSERVED, dtype=np.int8),
             missed_rate=np.zeros(n),
             time=belief.time,
@@ -180,7 +186,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         first = np.flatnonzero((state != UNOBSERVED) & (memory.state == UNOBSERVED))
         if len(first):
             memory.news_at = belief.time
-            memory.day.update(first, state[first] == OBSERVED_TAKEN)
+        memory.day.update(known)
         if (state != memory.state).any():
             memory.remaining_s = math.inf
         memory.state = state
@@ -205,7 +211,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             memory.remaining_s,
             self._budget,
             near.planning_graph(self.problem, self._failure_s),
-            _snapshot(here, known, memory),
+            _snapshot(here, known, memory, self._explore),
             memory.path,
         )
         kept = choice.failure_s == memory.failure_s and np.array_equal(choice.targets, memory.targets)
@@ -231,6 +237,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         new = self._search_of(near, belief)
         _, ours, theirs = np.intersect1d(old.slots, near.slots, assume_unique=True, return_indices=True)
         new.missed_rate[theirs] = memory.missed_rate[ours]
+        new.day.carry_over(memory.day, theirs, ours)
         new.failure_s, new.replans = memory.failure_s, memory.replans
         # Update in place: the caller keeps `memory`.
         vars(memory).update(vars(new))
@@ -260,26 +267,23 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         return PlanPreview(tuple(path))
 
 
-def _snapshot(here: int, known: SlotBelief, memory: BeliefSearch) -> BeliefSnapshot:
+def _snapshot(here: int, known: SlotBelief, memory: BeliefSearch, explore: float) -> BeliefSnapshot:
     """Return the belief about the slots of a part as the path search uses it."""
     weights, p_free_if = memory.day.mixture()
     n, state = len(memory.state), memory.state
     # Cars leave as often as forecast; on a fuller day free slots are taken faster.
-    usual = np.maximum(weights @ p_free_if, 1e-6)
+    usual = np.maximum(p_free_if @ weights, 1e-6)
     rate = known.decay_rate * (1.0 - known.forecast) / usual
-    p_free = np.where(state == UNOBSERVED, usual, 1.0 - known.p_occupied)
-    # An observation decays to the forecast; on a fuller day a slot is less likely to be still free.
-    age = np.where(known.observed, known.age, 0.0)
-    lasted = usual + (1.0 - usual) * np.exp(-rate * age)
-    p_free = np.where(state == OBSERVED_FREE, np.minimum(p_free, lasted), p_free)
+    p_free = 1.0 - memory.day.p_occupied(known)
     drive_s = memory.near.table.seconds[here, :n]
     on_arrival = usual + (p_free - usual) * np.exp(-rate * np.where(np.isfinite(drive_s), drive_s, 0.0))
     slots = np.empty(n, SLOT)
     slots["p_free"], slots["p_free_usual"], slots["decay_rate"] = p_free, usual, rate
     slots["odds"] = np.divide(1.0 - on_arrival, on_arrival, out=np.full(n, np.inf), where=on_arrival > 0.0)
     slots["least_odds"] = 1.0 / usual - 1.0
+    slots["bonus_s"] = 4.0 * explore * known.forecast * (1.0 - known.forecast)
     slots["missed_rate"], slots["state"] = memory.missed_rate, state
-    return BeliefSnapshot(slots, weights, np.ascontiguousarray(p_free_if.T))
+    return BeliefSnapshot(slots, weights, p_free_if)
 
 
 def _n_unobserved(state: NDArray[np.int8]) -> int:

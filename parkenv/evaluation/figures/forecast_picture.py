@@ -118,7 +118,7 @@ def _draw_coverage(ax: Axes, compared: Compared) -> None:
             )  # fmt: skip
             label = "_nolegend_"
             ax.annotate(
-                f"{days:,}", (i + shift, 0.52), ha="center", fontsize=7.5, color=color,
+                f"{days:,}", (i, 0.515 if observed else 0.545), ha="center", fontsize=7.5, color=color,
                 rotation=0, annotation_clip=True,
             )  # fmt: skip
     ax.axhspan(0.8, 0.97, color="#eeeeee", zorder=0)

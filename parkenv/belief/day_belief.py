@@ -1,0 +1,218 @@
+"""The belief about the day: how far the occupancy of a whole day differs from its forecast.
+
+Forecast errors are correlated: on a fuller day every slot is more likely to be taken than forecast. The day is one of
+several hypotheses; given the hypothesis, slots are independent. A usual day has a level L and a slope S toward the
+goal, drawn from the forecast's own `DayError`. On the day of an event the slots nearest to the goal are taken. Each
+observation updates the weights of the hypotheses by Bayes' rule and so changes the belief about the other slots. The
+same update is applied to hypothetical observations while planning: if the car has not parked along a path, the slots
+further on are also more likely to be taken.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.belief.slot_belief import SlotBelief, decay_to_prior
+from parkenv.world.day_error import DayError, centred_logits
+from sim_sensors.compilation import compiled
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+NEGLIGIBLE = 5e-4
+"""Hypotheses with less weight are left out of a plan; they return if observations speak for them."""
+LEVELS, SLOPES = 9, 5
+"""Numbers of levels and slopes. Searches take as long with 21 levels, within noise, and 1 % longer with five."""
+REACH, FREEDOM = 4.2, 4.0
+"""Largest value and degrees of freedom of the t-distribution of levels and slopes, before it is scaled."""
+EVENTS = dict.fromkeys((0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0), 0.08 / 7)
+"""Fraction of the lot, nearest to the goal, that an event fills -> its probability in a very large lot.
+
+With higher probabilities the car would turn round after fewer taken slots: sooner on the day of an event, and more
+often without need on other days.
+"""
+HALF_EVENTS_AT = 40.0
+"""Number of slots of a lot with half the events of a very large one: small lots fill up on usual days."""
+P_TAKEN_AT_EVENT = 0.998
+"""P(taken) of the affected slots, unless the forecast is even higher."""
+WORTHLESS = 0.004
+"""Probability that the forecast says nothing about the day: then its level is one of `OTHER_LEVELS`, logits."""
+OTHER_LEVELS, OTHER_SLOPES = np.array([-2.0, 0.0, 2.0, 4.0]), np.array([0.0, 2.0, 4.0])
+_LEAST, _MOST = 1e-6, 1.0 - 1e-6
+
+
+class DayBelief:
+    """Belief about the day and the slots of (a part of) a lot: the exact posterior over hypotheses about the day.
+
+    Under each hypothesis a slot's state is a two-state Markov chain that is observed now and then: the second of two
+    observations at short intervals says nothing about the day. How much an observation says follows from how far it
+    moved the `SlotBelief`, so the error rates of the sensor count.
+
+    Args:
+        belief: belief about these slots before any observation.
+        nearness: (n_slots,) see `parkenv.world.day_error.nearness`; over the whole lot.
+        whole: number of slots of the whole lot.
+        certain: whether the forecast is right on every day, whatever is observed.
+
+    Examples:
+        The forecast is 60 % for every slot. The first ten slots are all taken, so P(taken) of the others rises.
+
+        >>> from parkenv.world.day_error import nearness
+        >>> belief = SlotBelief.of_forecast(np.full(40, 0.6), np.zeros(40))
+        >>> belief.day_error = np.array([0.8, 0.0])
+        >>> day = DayBelief(belief, nearness(np.arange(40.0)), 40)
+        >>> round(float(day.p_occupied(belief)[20]), 2)
+        0.6
+        >>> seen = belief.update(np.arange(10), np.full(10, True))
+        >>> day.update(seen)
+        >>> bool(day.p_occupied(seen)[20] > 0.7)
+        True
+    """
+
+    def __init__(self, belief: SlotBelief, nearness: FloatArray, whole: int, certain: bool = False) -> None:
+        forecast = np.clip(belief.forecast.astype(np.float64), _LEAST, _MOST)
+        if certain:
+            weight, self._p_taken = np.ones(1), forecast[:, None]
+        else:
+            weight, self._p_taken = _hypotheses(forecast, nearness, whole, belief.day_error)
+        self._log_weight = np.log(weight)
+        # P(taken) at each slot's last observation under each hypothesis, when that was, and the result
+        self._p_then = np.empty_like(self._p_taken)
+        self._observed_at = np.full(len(forecast), -1.0)
+        self._p_observed = forecast.copy()
+
+    def carry_over(self, other: DayBelief, ours: IntArray, theirs: IntArray) -> None:
+        """Take over what is known about the day, and about the slots `theirs` of another part, here `ours`, (k,)."""
+        self._log_weight = other._log_weight.copy()
+        self._p_then[ours] = other._p_then[theirs]
+        self._observed_at[ours] = other._observed_at[theirs]
+        self._p_observed[ours] = other._p_observed[theirs]
+
+    def update(self, belief: SlotBelief) -> None:
+        """Update from the observations in a belief that were made since the last call."""
+        _update(
+            self._log_weight,
+            self._p_taken,
+            self._p_then,
+            self._observed_at,
+            self._p_observed,
+            belief.parts.astype(np.float64).reshape(4, -1),
+        )
+
+    def mixture(self) -> tuple[FloatArray, FloatArray]:
+        """Return the weights, (k,), of the hypotheses that matter, and P(free) under each, (n_slots, k)."""
+        weight = np.exp(self._log_weight - self._log_weight.max())
+        kept = weight >= NEGLIGIBLE * weight.sum()
+        return weight[kept] / weight[kept].sum(), 1.0 - self._p_taken[:, kept]
+
+    def p_occupied(self, belief: SlotBelief) -> FloatArray:
+        """P(taken) of each slot at the time of the belief, (n_slots,), observed or not."""
+        weight = np.exp(self._log_weight - self._log_weight.max())
+        return np.asarray(
+            _p_occupied(
+                weight / weight.sum(),
+                self._p_taken,
+                self._p_then,
+                self._observed_at,
+                belief.parts.astype(np.float64).reshape(4, -1),
+                belief.time,
+            )
+        )
+
+
+def _hypotheses(
+    forecast: FloatArray, nearness: FloatArray, whole: int, day_error: NDArray[np.floating]
+) -> tuple[FloatArray, FloatArray]:
+    """Return prior weights, (k,), and P(taken), (n_slots, k), of the hypotheses about the day.
+
+    A forecast describes the average day, so the usual days are chosen such that the mean over all days is the forecast.
+    """
+    error = DayError(*(float(e) for e in day_error))
+    within = nearness[:, None] > 1.0 - 2.0 * np.array(list(EVENTS))
+    event_weight = np.array(list(EVENTS.values())) * whole / (whole + HALF_EVENTS_AT)
+    at_event = np.maximum(forecast, P_TAKEN_AT_EVENT)
+    share = within @ event_weight
+    usual = np.maximum((forecast - share * at_event) / (1.0 - share), 0.5 * forecast)
+    centre = centred_logits(usual, error.deviations(nearness))
+    (levels, level_weight), (slopes, slope_weight) = (
+        _nodes(deviation, count) for deviation, count in ((error.level, LEVELS), (error.slope, SLOPES))
+    )
+    usual_weight = np.outer(slope_weight, level_weight).ravel() * (1.0 - event_weight.sum() - WORTHLESS)
+    usual_days = centre[:, None] + _shifts(levels, slopes, nearness)
+    other_days = _shifts(OTHER_LEVELS, OTHER_SLOPES, nearness)
+    days = 1.0 / (1.0 + np.exp(-np.concatenate([usual_days, other_days], axis=1)))
+    events = np.where(within, at_event[:, None], usual[:, None])
+    weight = np.concatenate(
+        [usual_weight, np.full(other_days.shape[1], WORTHLESS / other_days.shape[1]), event_weight]
+    )
+    return weight, np.clip(np.concatenate([days, events], axis=1), 1e-9, 1.0 - 1e-9)
+
+
+def _shifts(levels: FloatArray, slopes: FloatArray, nearness: FloatArray) -> FloatArray:
+    """Return the shifts of all slots, (n_slots, n_slopes * n_levels) logits, on days with these levels and slopes."""
+    return np.asarray((levels + nearness[:, None, None] * slopes[:, None]).reshape(len(nearness), -1))
+
+
+def _nodes(deviation: float, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return values and weights, (k,) each, of a distribution around 0; a single value without deviation.
+
+    Student's t-distribution instead of a normal one: its tails are for days that differ more than the forecast says.
+    """
+    if deviation == 0.0:
+        return np.zeros(1), np.ones(1)
+    values = np.linspace(-REACH, REACH, count)
+    weight = (1.0 + values**2 / FREEDOM) ** (-0.5 * (FREEDOM + 1.0))
+    weight /= weight.sum()
+    return deviation / math.sqrt(weight @ values**2) * values, weight
+
+
+@compiled
+def _update(
+    log_weight: FloatArray,
+    p_taken: FloatArray,
+    p_then: FloatArray,
+    observed_at: FloatArray,
+    p_observed: FloatArray,
+    parts: FloatArray,
+) -> None:
+    for s in range(len(observed_at)):
+        time = parts[3, s]
+        if time < 0.0 or time == observed_at[s]:
+            continue
+        forecast, rate = parts[0, s], parts[1, s]
+        first, gap = observed_at[s] < 0.0, time - observed_at[s]
+        before = forecast if first else decay_to_prior(forecast, rate, p_observed[s], gap)
+        before = min(max(before, _LEAST), _MOST)
+        # The likelihoods of the observation, up to a common factor, if the slot is taken or free
+        if_taken, if_free = parts[2, s] / before, (1.0 - parts[2, s]) / (1.0 - before)
+        for h in range(len(log_weight)):
+            p = p_taken[s, h]
+            if not first:
+                p = decay_to_prior(p, rate * (1.0 - forecast) / (1.0 - p), p_then[s, h], gap)
+            likelihood = max(if_taken * p + if_free * (1.0 - p), 1e-300)
+            p_then[s, h] = if_taken * p / likelihood
+            log_weight[h] += math.log(likelihood)
+        observed_at[s], p_observed[s] = time, parts[2, s]
+
+
+@compiled
+def _p_occupied(
+    weight: FloatArray,
+    p_taken: FloatArray,
+    p_then: FloatArray,
+    observed_at: FloatArray,
+    parts: FloatArray,
+    now: float,
+) -> FloatArray:
+    p_occupied = np.zeros(len(observed_at))
+    for s in range(len(observed_at)):
+        leaving = parts[1, s] * (1.0 - parts[0, s])
+        for h in range(len(weight)):
+            p = p_taken[s, h]
+            if observed_at[s] >= 0.0:
+                p = decay_to_prior(p, leaving / (1.0 - p), p_then[s, h], now - observed_at[s])
+            p_occupied[s] += weight[h] * p
+    return p_occupied

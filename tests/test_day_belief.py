@@ -1,0 +1,126 @@
+"""The belief about the day: the posterior by hand, levels found, sensors that err, repeated observations, parts."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from parkenv.belief import day_belief
+from parkenv.belief.day_belief import DayBelief
+from parkenv.belief.slot_belief import SlotBelief
+from parkenv.world.day_error import DayError, centred_logits, nearness
+
+
+def forecast_of(n, seed=0, level=0.8, slope=0.0, decay_rate=0.0):
+    """Forecast, nearness, and belief before any observation."""
+    rng = np.random.default_rng(seed)
+    near = nearness(rng.uniform(10.0, 90.0, n))
+    p = rng.uniform(0.3, 0.95, n)
+    return p, near, SlotBelief.of_forecast(p, np.full(n, decay_rate), (level, slope))
+
+
+def logit(p):
+    return np.log(p / (1.0 - p))
+
+
+@pytest.mark.parametrize(("level", "slope"), [(0.0, 0.0), (0.8, 0.0), (0.5, 0.5), (1.5, 0.0)])
+def test_before_any_observation_the_forecast_is_believed(level, slope):
+    p, near, belief = forecast_of(60, level=level, slope=slope)
+    np.testing.assert_allclose(DayBelief(belief, near, 60).p_occupied(belief), p, atol=0.01)
+
+
+def test_it_finds_the_level_of_the_day_from_its_observations(monkeypatch):
+    """On days drawn from the forecast's own error, P(taken) of what is not observed is right in the mean."""
+    monkeypatch.setattr(day_belief, "EVENTS", {1.0: 1e-12})
+    p, near, before = forecast_of(300, level=0.8, slope=0.4)
+    rng, error, found, forecast_errors = np.random.default_rng(1), DayError(0.8, 0.4), [], []
+    centre = centred_logits(p, error.deviations(near))
+    for _ in range(60):
+        level, slope = error.level * rng.standard_normal(), error.slope * rng.standard_normal()
+        truth = 1.0 / (1.0 + np.exp(-(centre + level + slope * near)))
+        seen = rng.permutation(300)[:100]
+        belief = before.update(seen, rng.random(100) < truth[seen])
+        day = DayBelief(before, near, 300)
+        day.update(belief)
+        rest = np.setdiff1d(np.arange(300), seen)
+        found.append((day.p_occupied(belief) - truth)[rest])
+        forecast_errors.append((p - truth)[rest])
+    assert abs(np.mean(found)) < 0.015
+    assert np.abs(found).mean() < 0.35 * np.abs(forecast_errors).mean()
+
+
+def test_an_event_is_told_from_a_fuller_day():
+    """Slots near the goal are all taken, those further on as forecast: the belief changes near the goal alone."""
+    p, near, before = forecast_of(120, level=0.3)
+    seen = np.flatnonzero((near > 0.3) | (near < -0.8))
+    belief = before.update(seen, np.where(near[seen] > 0.0, True, np.arange(len(seen)) % 3 > 0))
+    day = DayBelief(before, near, 120)
+    day.update(belief)
+    found = day.p_occupied(belief)
+    assert found[(near < 0.3) & (near > 0.0)].min() > 0.99
+    far = (near < -0.6) & (near > -0.8)
+    assert abs((logit(found[far]) - logit(p[far])).mean()) < 0.5
+
+
+def test_a_certain_forecast_is_believed_whatever_is_observed():
+    _, near, before = forecast_of(60)
+    belief = before.update(np.arange(15), np.ones(15, dtype=bool))
+    day = DayBelief(before, near, 60, certain=True)
+    day.update(belief)
+    np.testing.assert_allclose(day.p_occupied(belief), belief.p_occupied)
+
+
+def test_sensor_errors_and_repeated_observations_count_for_what_they_say():
+    """Against Bayes' rule by enumeration of the states of three slots under each hypothesis."""
+    p, near, belief = forecast_of(3, level=1.0)
+
+    weight, p_if = day_belief._hypotheses(p, near, 3, belief.day_error)
+    posterior, day = np.zeros((len(weight), 8)), DayBelief(belief, near, 3)
+    states = np.array(list(itertools.product((False, True), repeat=3)))
+    for h in range(len(weight)):
+        posterior[h] = weight[h] * np.prod(np.where(states, p_if[:, h], 1.0 - p_if[:, h]), axis=1)
+    for slots, taken, hit, alarm in (
+        ([0, 1], [True, True], 0.9, 0.2),
+        ([0], [True], 0.7, 0.1),
+        ([1], [False], 0.9, 0.2),
+    ):
+        belief = belief.decay(5.0).update(slots, taken, hit, alarm)
+        day.update(belief)
+        for s, said in zip(slots, taken, strict=True):
+            chance = np.where(states[:, s], hit, alarm)
+            posterior *= chance if said else 1.0 - chance
+    np.testing.assert_allclose(
+        day.p_occupied(belief), posterior.sum(axis=0) @ states / posterior.sum(), rtol=1e-9
+    )
+
+
+def test_seen_again_at_once_says_nothing_and_after_long_says_as_much_as_another_slot():
+    p, near, before = forecast_of(40, decay_rate=1e-2)
+    unseen = np.arange(20, 40)
+
+    def moved(*gaps):
+        belief, day = before, DayBelief(before, near, 40)
+        for gap in gaps:
+            belief = belief.decay(gap).update(np.arange(20), np.ones(20, dtype=bool))
+            day.update(belief)
+        return (logit(day.p_occupied(belief)[unseen]) - logit(p[unseen])).mean()
+
+    once = moved(1.0)
+    assert moved(1.0, 0.0) == pytest.approx(once, rel=1e-6)
+    assert moved(1.0, 1.0) == pytest.approx(once, rel=0.05)
+    assert moved(1.0, 1e5) > 1.2 * once
+
+
+def test_another_part_of_the_lot_starts_with_what_is_known_of_the_day():
+    _, near, whole = forecast_of(80)
+    seen = whole.update(np.arange(30), np.ones(30, dtype=bool))
+    first, second = np.arange(0, 50), np.arange(20, 80)
+    at_once, old, new = (
+        DayBelief(whole, near, 80),
+        *(DayBelief(whole.take(part), near[part], 80) for part in (first, second)),
+    )
+    at_once.update(seen)
+    old.update(seen.take(first))
+    new.carry_over(old, np.arange(30), np.arange(20, 50))
+    new.update(seen.take(second))
+    np.testing.assert_allclose(new.p_occupied(seen.take(second)), at_once.p_occupied(seen)[second], rtol=1e-9)
