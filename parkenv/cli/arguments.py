@@ -33,6 +33,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -348,3 +349,15 @@ def saved(folder: Path, kind: type[SpecT]) -> SpecT:
     if not file.exists():
         raise InputError(f"--resume: {folder} holds no run to go on with: no {SPEC_FILE}")
     return kind.read(file)
+
+
+def iso_date(option: str, text: str) -> date:
+    """Parse a date.
+
+    Raises:
+        InputError: the text is something else; the message names the option.
+    """
+    try:
+        return date.fromisoformat(text)
+    except ValueError:
+        raise InputError(f"{option} is {text!r}, want a date such as 2024-01-31") from None
