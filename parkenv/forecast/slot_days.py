@@ -72,6 +72,7 @@ class SlotForecast(NamedTuple):
     p_taken: FloatArray  # (k, m, p) P(taken), the mean over what each day may be like
     # (p, k, k) covariance of the errors of the days' levels, logits²: what the days share is the fitted mean's error
     level_covariance: FloatArray
+    curve_covariance: FloatArray  # (k, p, p) covariance of the error of each day's level over its periods
 
 
 class _Normal(NamedTuple):
@@ -143,12 +144,15 @@ class FittedSlotDays:
         shared = np.linalg.inv(found.precision)
         covariance = np.einsum("jta,ab,ktb->tjk", design, shared, design, optimize=True)
         each = np.arange(len(days.number))
-        covariance[:, each, each] += np.diag(curves.day_covariance(self.hyperparameters))[:, None]
+        day = curves.day_covariance(self.hyperparameters)
+        covariance[:, each, each] += np.diag(day)[:, None]
+        curve = design @ shared @ design.transpose(0, 2, 1) + day
         parts = _parts(self.periods, _HABIT_PART)
         mean = (design @ found.mean + self.correction)[:, None] + self.habits @ parts.T
         variance = covariance[:, each, each].T[:, None] + _variance(parts, self.habit_covariance)
         at = np.clip(np.arange(n), first, last) - first
-        return SlotForecast(_FINE.expit(mean, np.sqrt(variance))[0][:, :, at], covariance[at])
+        p = _FINE.expit(mean, np.sqrt(variance))[0]
+        return SlotForecast(p[:, :, at], covariance[at], curve[:, at][:, :, at])
 
 
 def fit_slot_days(data: SlotDays) -> FittedSlotDays:
