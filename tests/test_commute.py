@@ -19,6 +19,7 @@ from parkenv.mapping.store import MapStore
 from parkenv.world.occupancy import ArrivalWindow
 from parkenv.world.occupancy_log import OccupancyLog
 from parkenv.world.recorded_occupancy import RecordedOccupancy
+from planners.agent import make_agent
 
 SMALL = {
     "scenarios": ["mini"],
@@ -146,6 +147,20 @@ def test_a_map_of_a_commute_is_a_forecast(tmp_path):
     learned = known.forecast(arrival)
     assert np.ptp(learned.p_occupied) > 0.05
     assert learned.day_error.level > 0.0
+
+
+def test_a_bonus_for_observations_lets_the_car_see_more():
+    scenario = make_scenario("jam")
+    days = calendar(scenario, 2)
+    seen = []
+    for bonus in (0, 1.0):
+        _, _, trips, _ = Course(scenario, AgentSpec.of(f"belief(explore={bonus})"), "empty", 0, 3, 0).run(
+            days, []
+        )
+        seen.append(np.mean([len(np.unique(trip.slots)) for trip in trips]))
+    assert seen[1] > seen[0] + 5
+    with pytest.raises(InputError, match="explore is -1"):
+        make_agent("belief", scenario, explore=-1.0)
 
 
 @pytest.mark.slow

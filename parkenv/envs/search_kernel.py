@@ -223,6 +223,8 @@ def arrive(search: Any) -> None:
     clear_slots(search)
     search.key, search.day, search.hour, search.second_of_hour = key, day, hour, second
     search.arrival, search.time, search.second_of_day = arrival, arrival, arrival - midnight
+    if scenario.world_kind == PROCESS_KIND:
+        worlds.draw_day(worlds.process_at(scenario.world, 0), search)
     search.vertex = search.previous_vertex = int64s(scenario.entries)[entry]
     search.parked = search.over = False
     search.drive_s = search.failed_s = search.walk_s = search.parking_cost_s = search.gave_up_s = 0.0
@@ -499,10 +501,7 @@ def find_state(search: Any, record: Any, time: float) -> None:
     if scenario.world_kind == LOG_KIND:
         worlds.recorded_state(worlds.recorded_day_at(scenario.world, search.day), slot, record, time)
     else:
-        worlds.process_state(
-            worlds.process_at(search.process, 0), search.key, search.arrival, search.hour, search.second_of_hour,
-            slot, record, time,
-        )  # fmt: skip
+        worlds.process_state(worlds.process_at(search.process, 0), search, slot, record, time)
 
 
 @kernel

@@ -11,8 +11,14 @@ from numpy.typing import ArrayLike, NDArray
 from parkenv.errors import InputError
 from parkenv.world.counted_occupancy import CountedOccupancy
 from parkenv.world.lot import MOVES, PARK
-from parkenv.world.occupancy import Arrival, IntArray, OccupancyModel, OccupancyProcess, PriorModel
-from parkenv.world.occupancy_kernel import CURSOR_FIELDS, PROCESS, RECORDED_DAY
+from parkenv.world.occupancy import (
+    Arrival,
+    IntArray,
+    OccupancyModel,
+    OccupancyProcess,
+    PriorModel,
+)
+from parkenv.world.occupancy_kernel import CURSOR_FIELDS, PROCESS, RECORDED_DAY, WORLD_FIELDS
 from parkenv.world.occupancy_log import weekday_of
 from parkenv.world.pointers import ADDRESS, address_of, record_at
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -90,13 +96,9 @@ _PROGRESS = [
     ("time", np.float64),
     ("parked", np.bool_),
     ("over", np.bool_),
-    # The world: index of the weekday or recorded day among the scenario's; hour of the week of the arrival, second of
-    # that hour and of that day.
-    ("key", np.uint64),
+    # The world; index of the weekday or recorded day among the scenario's; second of that day at the arrival.
+    *WORLD_FIELDS,
     ("day", np.int64),
-    ("arrival", np.float64),
-    ("hour", np.int64),
-    ("second_of_hour", np.float64),
     ("second_of_day", np.float64),
     # Counts: slots with a column in the tables; slots observed; of those, free when first observed, expected to be
     # free, and taken when last observed.

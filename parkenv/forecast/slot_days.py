@@ -46,7 +46,7 @@ _WEEKDAY_PART, _HABIT_PART = 3.0, 1.5  # distances of the knots of linear interp
 # many slots this prior counts for.
 _HABIT_SD, _HABIT_CONSTANT, _HABIT_LENGTH, _HABIT_PRIOR_SLOTS = 1.5, 0.2, 2.0, 10.0
 _DISPERSION, _DISPERSION_PRIOR = 3.0, 10.0  # before any data, and its weight as a sum of variances p(1 - p)
-_ROUNDS, _LEVEL_STEPS, _HABIT_STEPS, _TUNING_STEPS = 5, 4, 3, 8
+_ROUNDS, _LEVEL_STEPS, _HABIT_STEPS, _TUNING_STEPS, _CORRECTION_STEPS = 5, 4, 3, 8, 8
 _MAX_STEP, _MAX_LEVEL = 2.0, 12.0  # logits
 _JITTER = 1e-6
 
@@ -72,6 +72,7 @@ class SlotForecast(NamedTuple):
     p_taken: FloatArray  # (k, m, p) P(taken), the mean over what each day may be like
     # (p, k, k) covariance of the errors of the days' levels, logits²: what the days share is the fitted mean's error
     level_covariance: FloatArray
+    curve_covariance: FloatArray  # (k, p, p) covariance of the error of each day's level over its periods
 
 
 class _Normal(NamedTuple):
@@ -114,6 +115,7 @@ class FittedSlotDays:
     Attributes:
         days: the fitted days.
         hyperparameters: (6,) logarithms, as `_MEDIAN`.
+        correction: (t,) logits, added to all slots.
         habits: (m, k) coefficients of the slots, and habit_covariance (m, k, k) of their errors.
         dispersion: (t,) of the states of a slot on a day.
     """
@@ -123,6 +125,7 @@ class FittedSlotDays:
     response: FloatArray  # (d, t) working response of the levels
     information: FloatArray  # (d, t) its precision
     hyperparameters: FloatArray
+    correction: FloatArray
     habits: FloatArray
     habit_covariance: FloatArray
     dispersion: FloatArray
@@ -141,12 +144,15 @@ class FittedSlotDays:
         shared = np.linalg.inv(found.precision)
         covariance = np.einsum("jta,ab,ktb->tjk", design, shared, design, optimize=True)
         each = np.arange(len(days.number))
-        covariance[:, each, each] += np.diag(curves.day_covariance(self.hyperparameters))[:, None]
+        day = curves.day_covariance(self.hyperparameters)
+        covariance[:, each, each] += np.diag(day)[:, None]
+        curve = design @ shared @ design.transpose(0, 2, 1) + day
         parts = _parts(self.periods, _HABIT_PART)
-        mean = (design @ found.mean)[:, None] + self.habits @ parts.T
+        mean = (design @ found.mean + self.correction)[:, None] + self.habits @ parts.T
         variance = covariance[:, each, each].T[:, None] + _variance(parts, self.habit_covariance)
         at = np.clip(np.arange(n), first, last) - first
-        return SlotForecast(_FINE.expit(mean, np.sqrt(variance))[0][:, :, at], covariance[at])
+        p = _FINE.expit(mean, np.sqrt(variance))[0]
+        return SlotForecast(p[:, :, at], covariance[at], curve[:, at][:, :, at])
 
 
 def fit_slot_days(data: SlotDays) -> FittedSlotDays:
@@ -200,7 +206,19 @@ def fit_slot_days(data: SlotDays) -> FittedSlotDays:
         expected = (seen * slope).sum(axis=(0, 1)) @ parts**2
         weight = _DISPERSION_PRIOR
         dispersion = parts @ np.maximum((sums + weight * _DISPERSION) / (expected + weight), 1.0)
-    return FittedSlotDays(data.days, periods, response, information, hyper, habits, covariance, dispersion)
+    # The mean over days of what is forecast is that of what was observed: Laplace's approximation shrinks the rare
+    # state, and the variance of the level is that of all hours.
+    found = curves.solve(hyper, response, information)
+    mean = curves.design(data.days) @ found.mean + (habits @ parts.T)[:, None]
+    sd = np.sqrt(np.diag(curves.day_covariance(hyper)) + _variance(parts, covariance))[:, None]
+    correction = np.zeros(len(parts))
+    for _ in range(_CORRECTION_STEPS):
+        p, slope = _COARSE.expit(mean + correction, sd)
+        score = (taken - seen * p).sum(axis=(0, 1))
+        correction += np.clip(score / (1.0 + (seen * slope).sum(axis=(0, 1))), -1.0, 1.0)
+    return FittedSlotDays(
+        data.days, periods, response, information, hyper, correction, habits, covariance, dispersion
+    )
 
 
 def _parts(periods: tuple[int, int, int], part: float) -> FloatArray:

@@ -32,6 +32,7 @@ from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap,
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.trips import Trip
 from parkenv.scenarios.build import build
+from parkenv.world.counted_occupancy import CountedOccupancy
 from parkenv.world.keyed_random import world_key
 from parkenv.world.occupancy import ArrivalWindow, PriorModel
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -66,7 +67,7 @@ def calendar(scenario: Scenario, days: int) -> list[Day]:
     A log with fewer days than wanted ends the commute early.
     """
     occupancy, window = scenario.occupancy, scenario.arrival
-    if isinstance(occupancy, RecordedOccupancy):
+    if isinstance(occupancy, RecordedOccupancy | CountedOccupancy):
         dates = sorted(occupancy.days_in(window))[:days]
         counts = [date.fromisoformat(day).toordinal() for day in dates]
         first_monday = counts[0] - date.fromisoformat(dates[0]).weekday()
