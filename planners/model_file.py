@@ -203,7 +203,7 @@ def save_model(
         InputError: the model is of another algorithm or observation, or its policy has an option that a card cannot
             hold.
     """
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     name = type(model).__name__
     algorithm = next((key for key, (_, class_name) in ALGORITHMS.items() if class_name == name), None)
@@ -232,7 +232,7 @@ def save_model(
     # Networks may share tensors; safetensors wants each on its own.
     weights = {key: value.detach().cpu().clone() for key, value in model.policy.state_dict().items()}
     with atomic_write(path) as beside:
-        save_file(weights, beside, {_KEY: card.model_dump_json()})
+        beside.write_bytes(save(weights, {_KEY: card.model_dump_json()}))
 
 
 def _observation_of(space: spaces.Space[Any]) -> tuple[str, str, int]:

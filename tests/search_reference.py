@@ -4,7 +4,9 @@ import math
 
 import numpy as np
 
+from parkenv.world.day_error import centred_logits
 from parkenv.world.keyed_random import (
+    DAY_STREAM,
     ENTRY_STREAM,
     OBSERVATION_STREAM,
     OCCUPANCY_STREAM,
@@ -17,13 +19,28 @@ from parkenv.world.occupancy import OccupancyProcess
 from parkenv.world.occupancy_log import weekday_of
 
 
+def day_factor(process, key, slot, p):
+    """Factor of the odds of a slot with the forecast `p` on the day of the world."""
+    if not process.day_error:
+        return 1.0
+    radius = math.sqrt(-2.0 * math.log(keyed_uniform(key, DAY_STREAM, 0, 0)))
+    angle = 2.0 * math.pi * keyed_uniform(key, DAY_STREAM, 0, 1)
+    near = 0.0 if process.nearness is None else process.nearness[slot]
+    shift = process.day_error.level * radius * math.cos(angle)
+    shift += process.day_error.slope * radius * math.sin(angle) * near
+    centre = centred_logits(p, process.day_error.deviations(near))
+    return math.exp(shift + centre - math.log(p / (1.0 - p)))
+
+
 def process_taken(process, key, arrival, slot, time):
     """Whether a slot of a process is taken: draw the state at the arrival, then sojourn after sojourn.
 
     A sojourn ends when the hazard gathered since its begin, the integral of factor times profile, reaches an
-    exponential random number.
+    exponential random number. The day changes the odds at the arrival, and the arrival rates.
     """
-    taken = keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < process.marginal(arrival)[slot]
+    p = process.marginal(arrival)[slot]
+    odds = p / (1.0 - p) * day_factor(process, key, slot, p)
+    taken = keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < odds / (1.0 + odds)
     now, sojourn = arrival, 1
     while True:
         factor, profile = (
@@ -34,6 +51,8 @@ def process_taken(process, key, arrival, slot, time):
         left = -math.log(keyed_uniform(key, OCCUPANCY_STREAM, slot, sojourn))
         while True:  # hour by hour, in which the rate is constant
             rate, hour_ends = factor * profile[int(now // 3600) % 168], (now // 3600 + 1) * 3600
+            if not taken:
+                rate *= day_factor(process, key, slot, process.marginal(now // 3600 * 3600.0)[slot])
             if rate * (hour_ends - now) >= left:
                 now += left / rate
                 break

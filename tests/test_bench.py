@@ -91,7 +91,7 @@ def test_steps_are_measured_and_peers_that_are_not_there_are_named(monkeypatch):
     monkeypatch.setattr(bench_env, "find_spec", lambda name: None)
     rows = bench_env.env_rows(seed=0, seconds=0.0, batch=4, large=300)
     measured = [row for row in rows if row["part"] in ("batch", "single") and row["value"] is not None]
-    assert len(measured) == 6
+    assert len(measured) == 8
     assert all(row["value"] > 0 and row["ratio"] == row["value"] / row["peer_value"] for row in measured)
     absent = [row["case"] for row in rows if row["value"] is None]
     assert absent == [

@@ -34,6 +34,17 @@ def result(small, tmp_path_factory):
     return result_of(small, cases, folder, ["parkenv", "benchmark", "run"])
 
 
+def test_a_suite_without_its_timings_is_refused(small, tmp_path):
+    folder, cases = ResultFolder(tmp_path / "run", {}), small.cases([AgentSpec(name="first-free")])
+    run_cases(cases, folder)
+    (tmp_path / "run" / "timings.csv").write_text("")
+    folder = ResultFolder(tmp_path / "run", {}, resume=True)
+    with pytest.raises(
+        InputError, match=r"run: holds no decision_ms of first-free in .*timings\.csv is not whole"
+    ):
+        result_of(small, cases, folder, ["parkenv", "benchmark", "run"])
+
+
 def checked(content, small, path, monkeypatch):
     monkeypatch.setattr(benchmark.Suite, "named", classmethod(lambda cls, name: small))
     write_summary(path, content, "result.json")

@@ -1,13 +1,21 @@
 """Worlds that follow the counts of a car park."""
 
+import json
+from datetime import date, timedelta
+
+import gymnasium as gym
 import numpy as np
 import pytest
+from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.special import expit, logit
 
+from parkenv import make_scenario
+from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
+from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.world.counted_occupancy import CountedOccupancy, level_of_mean, process_of_curve
 from parkenv.world.occupancy import Arrival, ArrivalWindow
 
@@ -88,3 +96,104 @@ def test_wrong_shapes_and_days_are_refused():
         counted(level=np.zeros((2, 23)))
     with pytest.raises(InputError, match="wanted a counted day"):
         counted().forecast(Arrival(0.0, "2024-01-03"))
+
+
+def test_searches_meet_the_counted_days():
+    lot = make_scenario("campus").lot
+    occupancy = counted(attraction=np.linspace(1.6, -1.6, lot.n_slots))
+    scenario = make_scenario("campus", occupancy=occupancy)
+    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
+    batch = ParkSearchVectorEnv(6, scenario)
+    together, _ = batch.reset(seed=0)
+    days = set()
+    for seed in range(6):
+        observation, _ = env.reset(seed=seed)
+        arrival = env.state.arrival
+        days.add(arrival.day)
+        forecast = occupancy.forecast(arrival)
+        np.testing.assert_array_equal(observation["p_occupied"], forecast.p_occupied.astype(np.float32))
+        assert observation["day_error"][0] == np.float32(forecast.day_error.level)
+        saved = env.get_state()
+        seen = []
+        for action in np.random.default_rng(seed).integers(0, 4, 60):
+            observation, *_ = env.step(action)
+            seen.append(observation["belief"])
+        belief, world = env.state.belief, occupancy.world(env.state.key, arrival)
+        for slot in np.flatnonzero(belief.observed):
+            when = arrival.time + belief.time - belief.age[slot]
+            assert world.occupied([slot], when)[0] == belief.observed_taken[slot]
+        env.set_state(saved)
+        for action, before in zip(np.random.default_rng(seed).integers(0, 4, 60), seen, strict=True):
+            np.testing.assert_array_equal(env.step(action)[0]["belief"], before)
+        np.testing.assert_array_equal(
+            together["belief"][seed][: lot.n_slots], forecast.p_occupied.astype(np.float32)
+        )
+    assert days == {MONDAY, TUESDAY}
+    for _ in range(40):
+        together, *_ = batch.step(np.random.default_rng(1).integers(0, 4, 6))
+
+
+def write_counts(path, days=40, change=lambda park, day, taken: taken):
+    """Counts of three car parks of 100 places, one of them never used, from Monday 2024-01-01 on."""
+    noise = np.random.default_rng(3).normal(0.0, 0.5, (2, days))
+    lines = ["car_park,capacity,hour,free"]
+    for day in range(days):
+        for hour, mean in enumerate(CURVE):
+            moment = f"{date(2024, 1, 1) + timedelta(day)}T{hour:02d}:00"
+            for park in range(2):
+                taken = change(park, day, expit(logit(mean) + noise[park, day]))
+                lines.append(f"P{park},100,{moment},{round(100 * (1 - taken))}")
+            lines.append(f"empty,100,{moment},100")
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def spec_of(file, mode):
+    counts = {"file": str(file), "car_park": "P0"}
+    occupancy = {"counts": counts, "replay_from": "2024-01-29", "forecast_from": mode}
+    return ScenarioSpec.parse({"name": "counted", "lot": "mini", "occupancy": occupancy}, "test")
+
+
+@pytest.mark.parametrize("mode", ["rolling", "past"])
+def test_no_later_count_reaches_a_forecast(tmp_path, mode):
+    first = make_scenario(spec_of(write_counts(tmp_path / "a.csv"), mode)).occupancy
+    changed = write_counts(tmp_path / "b.csv", change=lambda _, day, taken: taken if day < 34 else 0.5)
+    second = make_scenario(spec_of(changed, mode)).occupancy
+    assert first.days == second.days
+    assert first.days[0] == "2024-01-29"
+    for name in ("level", "level_sd"):
+        same = (getattr(first, name) == getattr(second, name)).all(axis=1)
+        # The first changed day is the seventh that is replayed; it is predicted before it is counted.
+        assert same[:7].all()
+        assert same.all() == (mode == "past")
+
+
+def test_every_car_park_is_a_scenario(tmp_path):
+    file = write_counts(tmp_path / "counts.csv")
+    run = parkenv(
+        "compare", "--scenario", "mini", "--occupancy", file, "--car-park", "all", "--replay-from", "2024-01-29",
+        "--agents", "mdp,first-free", "--episodes", "3", "--jobs", "1", "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    rows = json.loads((tmp_path / "out" / "summary.json").read_text())["rows"]
+    assert [row["scenario"] for row in rows] == ["mini P0", "mini P0", "mini P1", "mini P1"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--car-park", "P9", "--replay-from", "2024-01-29"], "has no car park 'P9'"),
+        (["--car-park", "P0", "--replay-from", "2024-01-03"], "want one from 2024-01-08 to 2024-02-09"),
+        (["--car-park", "P0"], "--car-park goes with"),
+        (
+            ["--car-park", "P0", "--replay-from", "2024-01-29", "--forecast-from", "others"],
+            "rolling or past together with counts",
+        ),
+    ],
+)
+def test_what_counts_cannot_do_is_refused(tmp_path, options, message):
+    file = write_counts(tmp_path / "counts.csv")
+    run = parkenv("compare", "--scenario", "mini", "--occupancy", file, *options, "--out", tmp_path / "out")
+    assert run.returncode == 2
+    assert message in run.stderr
+    assert len(run.stderr.splitlines()) == 1

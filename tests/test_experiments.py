@@ -171,6 +171,7 @@ def test_agents_with_options_are_read_from_words_and_tables():
         ("grid = { failure_s = [1, 1] }", "grid.failure_s is [1, 1], want different values; 1.0 is repeated"),
         ("seed = -1", "seed is -1, want a number of at least 0"),
         ("kind = 'comparison'", "kind is 'comparison'; did you mean 'compare'?"),
+        ("kind = { a = 1 }", "kind is {'a': 1}; "),
         ("backend = 'spark'", "backend is 'spark', want 'loky', 'ray' or 'dask'"),
     ],
 )  # fmt: skip

@@ -2,6 +2,7 @@ import copy
 import gzip
 import math
 import pickle
+from datetime import date
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from parkenv.errors import InputError
 from parkenv.world.keyed_random import world_key
 from parkenv.world.occupancy import Arrival, ArrivalWindow
-from parkenv.world.occupancy_log import OccupancyLog, day_class
+from parkenv.world.occupancy_log import OccupancyLog, day_class, weekday_of
 from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
 from parkenv.world.week import DAY_S, HOUR_S
 
@@ -42,7 +43,7 @@ def random_log(n_slots=4, days=(*MONDAYS, *SATURDAYS), seed=0, change_days=()):
 
 
 def at(day, hour):
-    return Arrival((5 if day_class(day) == "weekend" else 0) * DAY_S + hour * HOUR_S, day)
+    return Arrival(weekday_of(day) * DAY_S + hour * HOUR_S, day)
 
 
 # Reading
@@ -63,6 +64,30 @@ def test_a_log_is_read(tmp_path, name):
     assert log.second.tolist() == [25_200.0, 25_200.0, 27_030.0, 28_800.0]
     assert log.occupied.tolist() == [True, False, True, False]
     assert log.recorded.tolist() == [[True, False], [True, True]]
+
+
+def test_several_logs_are_one_by_date(tmp_path):
+    later = write(
+        tmp_path, HEADER + "2024-01-02 07:00,1,a,sunny,0\n2024-01-02 07:00,1,b,sunny,1\n", "later.csv"
+    )
+    first = write(
+        tmp_path, HEADER + "2024-01-01 08:00,1,b,sunny,0\n2024-01-01 09:00,1,a,sunny,1\n", "first.csv"
+    )
+    log = OccupancyLog.read_all([later, first])
+    assert log.slot_ids == ("a", "b")
+    assert log.days == ("2024-01-01", "2024-01-02")
+    assert log.day.tolist() == [0, 0, 1, 1]
+    assert log.slot.tolist() == [0, 1, 0, 1]
+    assert log.occupied.tolist() == [True, False, False, True]
+    with pytest.raises(
+        InputError, match=r"first.csv: 2024-01-01 is also in .*first.csv, wanted different days"
+    ):
+        OccupancyLog.read_all([first, first])
+    other = write(tmp_path, HEADER + "2024-01-03 07:00,1,c,sunny,0\n", "other.csv")
+    with pytest.raises(
+        InputError, match=r"other.csv: slot_id: 'a' is in one of this log and .* only, wanted the same"
+    ):
+        OccupancyLog.read_all([first, other])
 
 
 def test_camera_and_weather_may_be_absent_and_the_later_of_two_cameras_stands(tmp_path):
@@ -272,16 +297,37 @@ def test_the_forecast_knows_nothing_of_the_days_that_are_replayed(n, day):
     assert not np.array_equal(before.p_occupied, elsewhere.p_occupied)
 
 
-def test_the_forecast_is_the_shrunk_mean_of_the_hour_around_the_arrival():
-    # From 7 to 9 slot a is taken on every day, slot b on none; after 9 it is the other way round.
-    looks = [
-        (s, d, h * HOUR_S, (h < 9) == (s == 0)) for d in range(4) for s in range(2) for h in range(7, 12)
-    ]
-    log = OccupancyLog(("a", "b"), MONDAYS[:4], *(np.array(column) for column in zip(*looks, strict=True)))
-    model = RecordedOccupancy(log, np.zeros(2), mapping=np.array([0, 1]))
-    assert model.forecast(at(MONDAYS[0], 8.0)).p_occupied == pytest.approx([3.5 / 4, 0.5 / 4])
-    assert model.forecast(at(MONDAYS[0], 9.0)).p_occupied == pytest.approx([0.5, 0.5])
-    assert model.forecast(at(MONDAYS[0], 9.25)).p_occupied == pytest.approx([0.25 * 0.75 + 0.125, 0.6875])
+@pytest.mark.parametrize("forecast_from", ["past", "rolling"])
+@pytest.mark.parametrize("n", [3, 8])
+def test_nothing_of_a_replayed_or_later_day_is_known_beforehand(forecast_from, n):
+    days = tuple(f"2024-01-{day:02d}" for day in (1, 2, 3, 4, 8, 9, 10, 11, 12))
+
+    def replay(**settings):
+        log = random_log(days=days, **settings)
+        return RecordedOccupancy(log, np.arange(float(n)), None, date(2024, 1, 8), forecast_from)
+
+    # Two copies of each slot replay two consecutive days; on the last one, the day before it.
+    assert replay().days_in(ArrivalWindow()) == list(days[4:])
+    day = "2024-01-12" if n > 4 else "2024-01-09"
+    first = days.index(day) - (n > 4)
+    kept = first if forecast_from == "rolling" else 4
+    model, arrival = replay(), at(day, 9.2)
+    mapped = model.mapped_log(day)
+    assert mapped.held_out == {days.index(day)} | ({first} if n > 4 else set())
+    assert mapped.known.tolist() == list(range(kept))
+    before, after = (replay(change_days=changed).forecast(arrival) for changed in ((), days[kept:]))
+    for field in ("p_occupied", "decay_rate"):
+        assert np.array_equal(getattr(before, field), getattr(after, field))
+    assert before.day_error == after.day_error
+    changed = replay(change_days=days[kept:])
+    assert np.array_equal(changed.mapped_log(day).log_slot, mapped.log_slot)
+    slots = np.arange(n)
+    assert np.array_equal(
+        changed.world(0, arrival).occupied(slots, arrival.time),
+        ~model.world(0, arrival).occupied(slots, arrival.time),
+    )
+    earlier = replay(change_days=days[kept - 1 : kept]).forecast(arrival)
+    assert not np.array_equal(before.p_occupied, earlier.p_occupied)
 
 
 def test_arrivals_are_recorded_days_of_the_window():
@@ -322,8 +368,28 @@ def test_copies_of_a_world_answer_alike():
         (lambda m: RecordedOccupancy(m.log, [math.nan]), "walk_m: got shape"),
         (lambda m: RecordedOccupancy(m.log, [1.0], mapping=[9]), "mapping: wanted"),
         (
+            lambda m: RecordedOccupancy(m.log, [1.0], forecast_from="past"),
+            "forecast_from is 'past', want replay_from with it",
+        ),
+        (
+            lambda m: RecordedOccupancy(m.log, [1.0], None, date(2024, 1, 1), "rolling").mapped_log(
+                MONDAYS[0]
+            ),
+            "replays 1 of 5 recorded weekday days, wanted at least one before 2024-01-01 to forecast from",
+        ),
+        (
+            lambda m: RecordedOccupancy(m.log, [1.0], None, date(2024, 2, 1)).days_in(ArrivalWindow()),
+            "no recorded day from 2024-02-01 on is one of mon,tue",
+        ),
+        (
+            lambda m: RecordedOccupancy(m.log, np.zeros(9), None, date(2024, 1, 22), "past").mapped_log(
+                MONDAYS[4]
+            ),
+            "was recorded on 2 days of the class from 2024-01-22 on; wanted a smaller lot",
+        ),
+        (
             lambda m: RecordedOccupancy(m.log, np.zeros(8)).forecast(at(SATURDAYS[0], 9)),
-            "replays all 2 recorded weekend",
+            "replays 2 of 2 recorded weekend days, wanted at least one more",
         ),
         (
             lambda m: RecordedOccupancy(m.log, np.zeros(80)).forecast(at(MONDAYS[0], 9)),

@@ -213,6 +213,8 @@ def test_learning_curves_are_those_of_the_training(tmp_path, drives):
     """One panel for searches, one per kind of slot for driving; other trainings are shown by their medians."""
     names = ["oblique_success", "parallel_success"] if drives else ["total_s"]
     (tmp_path / "seed_3").mkdir()
+    (tmp_path / "seed_4").mkdir()
+    (tmp_path / "seed_4" / "curve.csv").write_text(f"step,{names[0]}\n0,1\n")
     examinations = [["steps", *names], ["0", *("0.25" for _ in names)], ["500", *("0.5" for _ in names)]]
     (tmp_path / "seed_3" / "curve.csv").write_text("\n".join(",".join(row) for row in examinations) + "\n")
     ends = ("low", "high") if drives else ("low_s", "high_s")
@@ -228,7 +230,7 @@ def test_learning_curves_are_those_of_the_training(tmp_path, drives):
     summary_in(
         tmp_path,
         command=["parkenv", "train"],
-        rows=[{"agent": "ppo", "scenario": "campus,street", "seed": 3, "success": 0.5}],
+        rows=[{"agent": "ppo", "scenario": "campus,street", "seed": k, "success": 0.5} for k in (3, 4)],
         evaluated=dict.fromkeys(kinds, 1.0) if drives else {"mdp": 80.0, "clairvoyant bound": 60.0},
         curve=dict(zip(kinds, curves, strict=True)) if drives else curves[0],
         beside={"dqn": dict(zip(kinds, curves, strict=True)) if drives else curves[0]},
@@ -239,7 +241,7 @@ def test_learning_curves_are_those_of_the_training(tmp_path, drives):
     assert [panel["title"] for panel in data["learning"]] == (kinds if drives else ["total time, s"])
     for panel in data["learning"]:
         assert panel["mean"] == [[0.0, 0.25, None, None], [500.0, 0.5, None, None]]
-        assert panel["seeds"] == [[[0.0, 0.25], [500.0, 0.5]]]
+        assert panel["seeds"] == [[[0.0, 0.25], [500.0, 0.5]], []], "a curve without steps is not drawn"
         assert panel["beside"] == [["dqn", [[0.0, 0.125], [500.0, 0.375]]]]
         assert panel["lines"] == (
             [["planner", 1.0]] if drives else [["mdp", 80.0], ["clairvoyant bound", 60.0]]

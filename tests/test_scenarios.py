@@ -11,7 +11,7 @@ from parkenv.mapping.inference import MapPrior
 from parkenv.mapping.store import MapStore, Session
 from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
 from parkenv.world.flat_map import FlatMap
-from parkenv.world.occupancy import Arrival
+from parkenv.world.occupancy import Arrival, ArrivalWindow
 from parkenv.world.recorded_occupancy import RecordedOccupancy
 from parkenv.world.typical_week import typical_occupancy
 
@@ -114,6 +114,25 @@ def test_logs_and_maps(tmp_path):
     assert isinstance(made.occupancy, RecordedOccupancy)
     assert isinstance(made.prior, MapPrior)
     assert made.forecast(TUESDAY_NOON).p_occupied.shape == (10,)
+    (tmp_path / "later.csv").write_text((tmp_path / "log.csv").read_text().replace("2016-01-1", "2016-01-2"))
+    for log in ("'log.csv,later.csv'", "['log.csv', 'later.csv']"):
+        spec = scenario_spec(
+            written(
+                tmp_path,
+                f"""
+                lot = "mini"
+                [occupancy]
+                log = {log}
+                replay_from = 2016-01-22
+                forecast_from = "rolling"
+                """,
+            )
+        )
+        spec.write(tmp_path / "copy.json")
+        assert ScenarioSpec.read(tmp_path / "copy.json") == spec
+        occupancy = make_scenario(spec).occupancy
+        assert occupancy.days_in(ArrivalWindow()) == ["2016-01-22"]
+        assert occupancy.log.days[3:] == ("2016-01-22", "2016-01-23", "2016-01-24")
 
 
 @pytest.mark.parametrize(
@@ -139,6 +158,10 @@ def test_logs_and_maps(tmp_path):
         ('lot = "mini"\narrivals = { hours = "8-9" }', "arrivals.hours is '8-9', want HH:MM-HH:MM within one day"),
         ('lot = "mini"\noccupancy = "busy"', "occupancy is 'busy', want typical, a process (.json), a recorded log"),
         ('lot = "mini"\noccupancy = { mapping = "mine.toml" }', "want mapping only together with a log"),
+        ('lot = "mini"\noccupancy = { replay_from = 2016-01-01 }', "want replay_from only together with a log"),
+        ('lot = "mini"\noccupancy = { forecast_from = "past" }', "want forecast_from only together with replay_from"),
+        ('lot = "mini"\noccupancy = { replay_from = 2016 }', "occupancy.replay_from is 2016, want a date such as"),
+        ('lot = "mini"\noccupancy = { log = "no.csv" }', "occupancy.log.0 is 'no.csv', want a file; there is none at"),
         ('lot = "mini"\nsensor_model = { hit_rate = 0.5 }', "want hit_rate and false_alarm_rate together"),
         ('lot = "mini"\nname = "a/b"', "name is 'a/b', want at most 80 printable characters without comma or slash"),
         ('lot = "mini', "not TOML: "),

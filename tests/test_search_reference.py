@@ -10,6 +10,7 @@ from search_reference import ReferenceSearch
 import parkenv  # noqa: F401 - registers the ids
 from parkenv import OccupancyProcess, Scenario, SensorBand, SensorModel
 from parkenv.lots import grid_lot
+from parkenv.world.day_error import DayError
 from parkenv.world.occupancy import ArrivalWindow
 from parkenv.world.occupancy_log import OccupancyLog
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -47,6 +48,8 @@ def random_scenario(rng, kind, sensor):
         costs = rng.uniform(0.0, 60.0, lot.n_slots)
         lot = dataclasses.replace(lot, slot_parking_cost_s=costs)
     process = random_process(rng, lot.n_slots)
+    if kind == "days":
+        process = process.with_day_error(DayError(*rng.uniform(0.0, 2.0, 2)), lot.walk_m())
     return Scenario(
         name="random",
         lot=lot,
@@ -73,7 +76,7 @@ def assert_agrees(observation, wanted):
 
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("sensor", SENSORS)
-@pytest.mark.parametrize("kind", ["process", "log"])
+@pytest.mark.parametrize("kind", ["process", "days", "log"])
 def test_single_environment_and_batch_agree_with_the_reference(kind, sensor, seed):
     rng = np.random.default_rng([seed, len(sensor), len(kind)])
     scenario = random_scenario(rng, kind, sensor)

@@ -358,9 +358,7 @@ def test_a_world_of_another_kind_is_refused():
             return None
 
     scenario = make_scenario("mini").replace(occupancy=Empty(10))
-    with pytest.raises(
-        InputError, match="occupancy is a Empty, want an OccupancyProcess or a RecordedOccupancy"
-    ):
+    with pytest.raises(InputError, match="occupancy is a Empty, want an OccupancyProcess, a Recorded"):
         ParkSearchVectorEnv(2, scenario)
 
 

@@ -7,6 +7,7 @@ import math
 import os
 import pathlib
 import pickle
+import resource
 import shutil
 import signal
 import subprocess
@@ -433,6 +434,24 @@ def test_a_checkpoint_that_does_not_fit_is_refused(checkpoint, keys, value, want
     torch.save(state, path)
     with pytest.raises(InputError, match=wanted):
         training.train(0, path.parent)
+
+
+def test_checkpoints_and_models_on_a_full_disk_are_named(checkpoint, tmp_path):
+    training, _ = checkpoint
+    model = PPO("MultiInputPolicy", training.make_env(), n_steps=8, batch_size=16)
+    model.env.reset()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, limits[1]))
+    try:
+        for save in (
+            lambda: save_checkpoint(tmp_path / "a.pt", model, []),
+            lambda: save_model(model, tmp_path / "a.safetensors"),
+        ):
+            with pytest.raises(InputError, match="cannot be written: File too large"):
+                save()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.glob("*.part")) + list(tmp_path.glob("a.*"))
 
 
 def test_a_damaged_checkpoint_is_refused(checkpoint):

@@ -20,6 +20,7 @@ from parkenv.cli import (
     bench,
     benchmark,
     calibrate,
+    commute,
     compare,
     demo,
     detect,
@@ -57,6 +58,7 @@ START, SEARCH, SENSE, DRIVE, DATA = (
 add(app, "demo", demo.demo, START)
 add(app, "compare", compare.compare, SEARCH)
 add(app, "report", report.report, SEARCH)
+add(app, "commute", commute.commute, SEARCH)
 add(app, "plan", plan.plan, SEARCH)
 add(app, "train", train.train, SEARCH)
 add(app, "publish", publish.publish, SEARCH)

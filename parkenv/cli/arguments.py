@@ -33,11 +33,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from parkenv.errors import InputError
-from parkenv.files.names import BackendName
+from parkenv.files.file_names import file_name
+from parkenv.files.names import BackendName, ForecastFrom
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import Grid, Workplace
@@ -53,8 +55,14 @@ class World:
     """Where and when: changes to the scenarios, which take precedence over scenario files.
 
     World:
-        occupancy (FILE): Which slots are taken when: a recorded log (.csv, .csv.gz), replayed day by day, or a process
-            that `parkenv occupancy fit` wrote (.json).  [default: the scenario's]
+        occupancy (FILE[,FILE...]): Which slots are taken when: recorded logs (.csv, .csv.gz) of the same slots,
+            replayed day by day, or a process that `parkenv occupancy fit` wrote (.json).  [default: the scenario's]
+        car_park (NAME[,NAME...]|all): --occupancy is a file of hourly counts, car_park,capacity,hour,free; replay the
+            days of these car parks on the lot, each as a scenario of its own. all: those that show some use.
+        replay_from (DATE): First day of the log or the counts that is replayed.  [default: the scenario's, all]
+        forecast_from (past|rolling|others): Days that the forecast is made from. past: those before --replay-from;
+            rolling: those before the earliest that a world replays; others: all that it does not replay.  [default: the
+            scenario's; others, with counts rolling]
         mapping (FILE): CSV slot_id,log_slot_id that assigns the log's slots to the lot's.  [default: the log's fullest
             slots are nearest to the goal]
         goal (X,Y): Walk to this point, m, or to the lot's goal of this index.  [default: the scenario's]
@@ -63,6 +71,9 @@ class World:
 
     lot: str | None = None
     occupancy: str | None = None
+    car_park: str | None = None
+    replay_from: str | None = None
+    forecast_from: ForecastFrom | None = None
     mapping: str | None = None
     goal: str | None = None
     days: str | None = None
@@ -89,17 +100,46 @@ class World:
             raise InputError("--mapping goes with --occupancy FILE.csv")
         if base is None or scenario is not None or self.lot is not None:
             base = scenario_specs(scenario or default, self.lot)
-        return [self._changed(spec) for spec in base]
+        if self.car_park is None:
+            return [self._changed(spec) for spec in base]
+        return [
+            self._changed(spec.changed("--car-park", **counted))
+            for spec in base
+            for counted in self._counted(spec.title)
+        ]
 
     def spec(self, scenario: str | None) -> ScenarioSpec:
         """Return the one scenario that the options describe; see `specs`."""
         return one_scenario(self.specs(scenario))
 
+    def _counted(self, title: str) -> list[dict[str, Any]]:
+        """Return the changes to a scenario for each of the car parks."""
+        from parkenv.scenarios.build import car_parks
+
+        if self.occupancy is None or self.replay_from is None:
+            raise InputError("--car-park goes with --occupancy FILE.csv and --replay-from DATE")
+        given = self.car_park or ""
+        names = car_parks(Path(self.occupancy)) if given == "all" else words("--car-park", given)
+        return [
+            {
+                "name": file_name(f"{title} {name}").replace(",", " ")[:80],
+                "occupancy": {
+                    "counts": {"file": self.occupancy, "car_park": name},
+                    "replay_from": self.replay_from,
+                },
+                "forecast": "own",
+            }
+            for name in names
+        ]
+
     def _changed(self, spec: ScenarioSpec) -> ScenarioSpec:
-        if self.occupancy is not None:
+        if self.occupancy is not None and self.car_park is None:
             log = {"log": self.occupancy, "mapping": self.mapping} if self.mapping else self.occupancy
             option = "--mapping" if self.mapping else "--occupancy"
             spec = spec.changed(option, occupancy=log, forecast="own")
+        replay = not_none(replay_from=self.replay_from, forecast_from=self.forecast_from)
+        if replay:
+            spec = spec.changed(occupancy=spec.occupancy.changed("--replay-from, --forecast-from", **replay))
         if self.goal is not None:
             index = int(self.goal) if self.goal.isdecimal() else numbers("--goal", self.goal, 2)
             spec = spec.changed("--goal", goal=index)
@@ -339,3 +379,15 @@ def saved(folder: Path, kind: type[SpecT]) -> SpecT:
     if not file.exists():
         raise InputError(f"--resume: {folder} holds no run to go on with: no {SPEC_FILE}")
     return kind.read(file)
+
+
+def iso_date(option: str, text: str) -> date:
+    """Parse a date.
+
+    Raises:
+        InputError: the text is something else; the message names the option.
+    """
+    try:
+        return date.fromisoformat(text)
+    except ValueError:
+        raise InputError(f"{option} is {text!r}, want a date such as 2024-01-31") from None

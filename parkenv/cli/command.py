@@ -219,7 +219,7 @@ def _option(parameter: Parameter, entry: Entry) -> Parameter:
     if parameter.kind is Parameter.POSITIONAL_ONLY:
         info: Any = typer.Argument(**given)
     else:
-        name = f"--{parameter.name.replace('_', '-')}"
+        name = f"--{parameter.name.rstrip('_').replace('_', '-')}"  # from_ is --from
         switch = f"{name}/--no-{name[2:]}" if kind == bool | None else name
         heading = None if entry.heading == "Options" else entry.heading
         info = typer.Option(switch, *filter(None, [entry.short]), rich_help_panel=heading, **given)

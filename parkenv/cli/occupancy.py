@@ -1,40 +1,68 @@
-"""`parkenv occupancy`: estimate rates from a recorded log."""
+"""`parkenv occupancy`: fit models to recorded occupancy, and score their forecasts."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from parkenv.cli.arguments import iso_date, words
 from parkenv.cli.command import add, group
-from parkenv.cli.tables import make_console, make_table, save_summary
+from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
+from parkenv.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from parkenv.forecast.comparison import Compared
+    from parkenv.forecast.counts import Counts
+
+TIMEZONE = "Europe/Berlin"
 
 
-def fit(log: Path, /, max_gap_h: float = 2.0, out: Path = Path("results/occupancy")) -> None:
-    """Fit arrival and departure rates to a log by maximum likelihood.
+def fit(
+    log: Path, /, max_gap_h: float = 2.0, timezone: str = TIMEZONE, out: Path = Path("results/occupancy")
+) -> None:
+    """Fit a model to recorded occupancy by maximum likelihood.
 
-    Every slot is a two-state Markov chain. Its rates depend on the hour, separately for weekdays and weekends, and on a
-    factor per slot. The log shows a slot only at single times; the likelihood covers all possible changes in between.
-    Use the result, process.json, as --occupancy of `parkenv compare`: unchanged on a lot with the same number of slots,
-    on any other lot with the fullest slots nearest to the goal.
+    A log of slots: arrival and departure rates. Every slot is a two-state Markov chain. Its rates depend on the hour,
+    separately for weekdays and weekends, and on a factor per slot. The log shows a slot only at single times; the
+    likelihood covers all possible changes in between. Use the result, process.json, as --occupancy of `parkenv
+    compare`: unchanged on a lot with the same number of slots, on any other lot with the fullest slots nearest to the
+    goal.
+
+    Counts of whole car parks: by how much days differ from their forecasts, and which readings are faulty.
 
     Examples:
         parkenv occupancy fit CNR-EXT.csv.gz --out results/pisa
         parkenv compare --occupancy results/pisa/process.json
+        parkenv occupancy fit car_parks.csv.gz --out results/car-parks
 
     Options:
-        log (FILE): A log: datetime,camera,slot_id,weather,occupied as .csv or .csv.gz.
-        max_gap_h (H >= 0): Observations farther apart than this, h, are not linked.
-        out, -o (DIR): Folder for process.json, rates.png, summary.json.
+        log (FILE): A log, datetime,camera,slot_id,weather,occupied, or counts, car_park,capacity,hour,free (or
+            hour_utc), as .csv or .csv.gz.
+        max_gap_h (H >= 0): Observations of a log farther apart than this, h, are not linked.
+        timezone (NAME): Local time of counts with hour_utc.
+        out, -o (DIR): Folder for summary.json and, of a log, process.json and rates.png.
     """
+    from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.forecast.counts import Counts, is_counts
+
+    make_folder(out)
+    console = make_console()
+    if is_counts(log):
+        _fit_counts(Counts.read(log, timezone), out, console)
+    else:
+        _fit_log(log, max_gap_h, out, console)
+
+
+def _fit_log(log: Path, max_gap_h: float, out: Path, console: Console) -> None:
     import numpy as np
 
-    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.figures.rates_picture import save_rates
     from parkenv.world.occupancy_fit import fit_process
     from parkenv.world.occupancy_log import OccupancyLog
     from parkenv.world.week import DAY_S, HOUR_S
 
-    make_folder(out)
-    console = make_console()
     record = OccupancyLog.read(log)
     with console.status("Fitting rates"):
         fitted = fit_process(record, max_gap_s=3600.0 * max_gap_h)
@@ -65,5 +93,173 @@ def fit(log: Path, /, max_gap_h: float = 2.0, out: Path = Path("results/occupanc
     console.print(f"Process, picture and summary are in {out}")
 
 
-app = group("occupancy", "Fit models to recorded occupancy.")
+def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
+    from dataclasses import asdict
+
+    import numpy as np
+
+    from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
+
+    n = len(counts.days)
+    with progress_bar(console) as progress:
+        steps, days = progress.add_task("Fit", total=FIT_STEPS), progress.add_task("Forecast days", total=n)
+        settings = fit_settings(counts, n, lambda: progress.advance(steps))
+        forecast = forecast_days(
+            counts, 0, "rolling", settings, lambda day: progress.update(days, completed=day)
+        )
+    rows, cells = [], []
+    for i, name in enumerate(counts.car_parks):
+        seen = np.isfinite(counts.occupied[i])
+        counted = np.flatnonzero(seen.any(axis=1))
+        row = {
+            "car_park": name,
+            "capacity": float(counts.capacity[i, -1]),
+            "days": int(counted.size),
+            "mean_occupancy": float(counts.occupied[i][seen].mean()) if counted.size else None,
+            "day_error": float(np.median(forecast.level_sd[i, counted[-28:]])) if counted.size else None,
+        } | counts.faults[i]
+        rows.append(row)
+        cells.append([f"{value:.2f}" if isinstance(value, float) else str(value) for value in row.values()])
+    idle = counts.idle()
+    drift = float(np.sqrt(7 * settings.level_drift))
+    save_summary(
+        out,
+        None,
+        rows,
+        idle=idle,
+        variances=asdict(settings),
+        level_drift_per_week=drift,
+        faults=counts.total_faults(),
+    )
+    headings = [str(key).replace("_", " ") for key in rows[0]]
+    console.print(make_table(f"{counts.source}: {n} days", headings, cells))
+    _print_notes(counts, console)
+    console.print(f"Levels drift by {drift:.2f} logits a week. The summary is in {out}")
+
+
+def evaluate(
+    log: Path,
+    /,
+    from_: str | None = None,
+    car_parks: str | None = None,
+    timezone: str = TIMEZONE,
+    seed: int = 0,
+    out: Path = Path("results/forecasts"),
+) -> None:
+    """Score forecasts of occupancy, each day from the days before it, beside simple ones.
+
+    Models: day-curves (ours); last-four-weekdays, the mean of the hour on the last four same weekdays; last-week;
+    hour-mean, of all weekdays or weekend days before; gradient-boosting. The variances of ours are fitted to the days
+    before --from. Differences of log-losses are to ours, with 95 % intervals over car parks and weeks.
+
+    Examples:
+        parkenv occupancy evaluate car_parks.csv.gz --from 2024-01-01
+
+    Options:
+        log (FILE): Counts, car_park,capacity,hour,free (or hour_utc), as .csv or .csv.gz.
+        from_ (DATE): First day that is scored.  [default: halfway]
+        car_parks (NAME[,...]): Car parks.  [default: all]
+        timezone (NAME): Local time of hour_utc.
+        seed (N >= 0): Seed of the bootstrap.
+        out, -o (DIR): Folder for summary.json and a picture of each model.
+    """
+    from dataclasses import asdict
+
+    import numpy as np
+
+    from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.evaluation.figures.forecast_picture import save_forecast, shown_week
+    from parkenv.forecast.comparison import MODELS, compare
+    from parkenv.forecast.counts import Counts
+    from parkenv.forecast.day_curves import FIT_STEPS, fit_settings
+    from parkenv.forecast.scores import mean_where, paired_intervals
+
+    make_folder(out)
+    console = make_console()
+    with console.status("Reading"):
+        counts = Counts.read(log, timezone)
+    if car_parks is not None:
+        counts = counts.chosen(words("--car-parks", car_parks))
+    n = len(counts.days)
+    first = n // 2 if from_ is None else counts.day_index(iso_date("--from", from_))
+    scored = np.isfinite(counts.occupied[:, first:])
+    if not scored.any():
+        raise InputError(f"--from is {from_}: {log} has no usable readings from then on")
+    models: list[Compared] = []
+    rows, cells = [], []
+    with progress_bar(console) as progress:
+        steps, days, done = (
+            progress.add_task(name, total=total)
+            for name, total in (("Fit", FIT_STEPS), ("Forecast days", n), ("Models", len(MODELS)))
+        )
+        settings = fit_settings(counts, first, lambda: progress.advance(steps))
+        week = shown_week(counts, first)
+        for compared in compare(counts, first, settings, lambda day: progress.update(days, completed=day)):
+            save_forecast(compared, counts, week, out / f"{compared.model}.png")
+            models.append(compared)
+            progress.advance(done)
+    differences = paired_intervals(
+        models[0].scores.log_loss, [m.scores.log_loss for m in models], np.random.default_rng(seed)
+    )
+    for (model, _, scores), (difference, *interval) in zip(models, differences, strict=True):
+        bands = scores.coverage_by_band()
+        row: dict[str, Any] = {
+            "model": model,
+            "log_loss": mean_where(scores.log_loss),
+            "brier": mean_where(scores.brier),
+            "crps": mean_where(scores.crps),
+            "coverage_90": mean_where(scores.day_held),
+            "coverage_90_hours": mean_where(scores.hour_held),
+            "days": int(scored.any(axis=(0, 2)).sum()),
+            "car_parks": int(scored.any(axis=(1, 2)).sum()),
+            "difference": difference,
+            "difference_ci95": interval,
+            "coverage_90_by_band": bands,
+            "coverage_90_by_observed_band": scores.coverage_by_band(observed=True),
+        }
+        rows.append(row)
+        shown = [f"{row[key]:.4f}" for key in ("log_loss", "brier", "crps")]
+        shown += [f"{row[key]:.1%}" for key in ("coverage_90", "coverage_90_hours")]
+        shown += [f"{band['coverage_90']:.1%}" if band["days"] else "-" for band in bands]
+        cells.append([model, *shown, f"{difference:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]"])
+    save_summary(
+        out,
+        seed,
+        rows,
+        first_day=counts.days[first].isoformat(),
+        faults=counts.total_faults(),
+        faults_by_car_park=dict(zip(counts.car_parks, counts.faults, strict=True)),
+        idle=counts.idle(),
+        variances=asdict(settings),
+    )
+    band_names = [f"{band['from']:.0%}-{band['to']:.0%}" for band in rows[0]["coverage_90_by_band"]]
+    headings = (
+        "model",
+        "log-loss",
+        "Brier",
+        "CRPS",
+        "90 %: days",
+        "hours",
+        *band_names,
+        "log-loss more than ours",
+    )
+    title = f"{rows[0]['car_parks']} car parks, {rows[0]['days']} days from {counts.days[first]}"
+    console.print(make_table(title, headings, cells))
+    console.print(
+        "90 %: days whose mean lies in its 90 % interval, in all and by forecast fullness.", soft_wrap=True
+    )
+    _print_notes(counts, console)
+    console.print(f"Pictures and summary are in {out}")
+
+
+def _print_notes(counts: Counts, console: Console) -> None:
+    """Print what was wrong with the counts."""
+    faults = ", ".join(f"{name.replace('_', ' ')} {n:,}" for name, n in counts.total_faults().items() if n)
+    console.print(f"Faults: {faults or 'none'}", soft_wrap=True)
+    for name, what in counts.idle().items():
+        console.print(f"{name}: {what}", soft_wrap=True)
+
+
+app = group("occupancy", "Fit models to recorded occupancy, and score forecasts.")
 add(app, "fit", fit)
+add(app, "evaluate", evaluate)

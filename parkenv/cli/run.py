@@ -7,6 +7,7 @@ from pathlib import Path
 
 from parkenv.cli import arguments as args
 from parkenv.cli.benchmark import run_suite
+from parkenv.cli.commute import run_commute_of
 from parkenv.cli.compare import run_comparison
 from parkenv.cli.demo import run_demo
 from parkenv.cli.single_writer import writing_into
@@ -17,6 +18,7 @@ from parkenv.errors import InputError, nearest
 
 KINDS: Mapping[str, Callable[..., None]] = {
     "compare": run_comparison,
+    "commute": run_commute_of,
     "benchmark": run_suite,
     "survey": run_survey_of,
     "demo": run_demo,
@@ -37,8 +39,8 @@ def run(
     """Run an experiment file: agents, scenarios, and a grid of settings.
 
     Settings that the file leaves out have the defaults of its command. The result folder keeps a copy, experiment.json,
-    for `parkenv report` and `--resume`. The key `kind` selects the command: compare (the default), benchmark, survey,
-    demo or train.
+    for `parkenv report` and `--resume`. The key `kind` selects the command: compare (the default), commute,
+    benchmark, survey, demo or train.
 
     Examples:
         parkenv run sweep.toml --out results/sweep --report
@@ -58,7 +60,7 @@ def run(
         file, out = file / specs.SPEC_FILE, file
     tables = read_tables(file)
     name = tables.get("kind", "compare")
-    if name not in KINDS:
+    if not isinstance(name, str) or name not in KINDS:
         raise InputError(f"{file}: kind is {name!r}; {nearest(str(name), KINDS)}")
     spec = specs.SPECS[name].parse(tables, str(file), file.parent)
     require_trust(spec, experiment, trust)

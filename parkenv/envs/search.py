@@ -237,7 +237,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             record["seed_state"] = seed_state(self.np_random_seed)
         begin_search_at(self._address)
         if len(self.searches.external_forecast):
-            self.searches.set_external_forecast(0, self.scenario.forecast(self._state.arrival))
+            self.searches.complete_arrival(0)
             init_external_forecast_at(self._address)
         self._begun, self._over = True, False
         self._state.path = [self._state.vertex]

@@ -223,6 +223,8 @@ def arrive(search: Any) -> None:
     clear_slots(search)
     search.key, search.day, search.hour, search.second_of_hour = key, day, hour, second
     search.arrival, search.time, search.second_of_day = arrival, arrival, arrival - midnight
+    if scenario.world_kind == PROCESS_KIND:
+        worlds.draw_day(worlds.process_at(scenario.world, 0), search)
     search.vertex = search.previous_vertex = int64s(scenario.entries)[entry]
     search.parked = search.over = False
     search.drive_s = search.failed_s = search.walk_s = search.parking_cost_s = search.gave_up_s = 0.0
@@ -240,10 +242,11 @@ def arrive(search: Any) -> None:
 def _write_day_error(search: Any) -> None:
     """Write the day error of the forecast, unless the prior is external."""
     scenario, day_error = scenario_at(search.scenario, 0), float32s(search.day_error)
-    for i in range(2):
-        if scenario.prior_kind == LOG_KIND:
-            day_error[i] = worlds.recorded_day_at(scenario.prior, search.day).day_error[i]
-        elif scenario.prior_kind == PROCESS_KIND:
+    if scenario.prior_kind == LOG_KIND:
+        day = worlds.recorded_day_at(scenario.prior, search.day)
+        day_error[0], day_error[1] = worlds.recorded_day_level(day, search.second_of_day), 0.0
+    elif scenario.prior_kind == PROCESS_KIND:
+        for i in range(2):
             day_error[i] = worlds.process_at(scenario.prior, 0).day_error[i]
 
 
@@ -498,10 +501,7 @@ def find_state(search: Any, record: Any, time: float) -> None:
     if scenario.world_kind == LOG_KIND:
         worlds.recorded_state(worlds.recorded_day_at(scenario.world, search.day), slot, record, time)
     else:
-        worlds.process_state(
-            worlds.process_at(scenario.world, 0), search.key, search.arrival, search.hour, search.second_of_hour,
-            slot, record, time,
-        )  # fmt: skip
+        worlds.process_state(worlds.process_at(search.process, 0), search, slot, record, time)
 
 
 @kernel
@@ -513,7 +513,7 @@ def forecast_of(search: Any, slot: int) -> tuple[float, float]:
         return external[slot], external[search.width + slot]
     if scenario.prior_kind == LOG_KIND:
         day = worlds.recorded_day_at(scenario.prior, search.day)
-        p, rate = worlds.recorded_forecast(day, slot, search.second_of_day), day.decay_rate
+        p, rate = worlds.recorded_forecast(day, slot, search.second_of_day)
     else:
         p, rate = worlds.process_forecast(
             worlds.process_at(scenario.prior, 0), search.hour, search.second_of_hour, slot

@@ -9,9 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.errors import InputError
+from parkenv.world.counted_occupancy import CountedOccupancy
 from parkenv.world.lot import MOVES, PARK
-from parkenv.world.occupancy import Forecast, IntArray, OccupancyModel, OccupancyProcess, PriorModel
-from parkenv.world.occupancy_kernel import CURSOR_FIELDS, PROCESS, RECORDED_DAY
+from parkenv.world.occupancy import (
+    Arrival,
+    IntArray,
+    OccupancyModel,
+    OccupancyProcess,
+    PriorModel,
+)
+from parkenv.world.occupancy_kernel import CURSOR_FIELDS, PROCESS, RECORDED_DAY, WORLD_FIELDS
 from parkenv.world.occupancy_log import weekday_of
 from parkenv.world.pointers import ADDRESS, address_of, record_at
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -52,7 +59,8 @@ SCENARIO = np.dtype(
         ("seen_rate", ADDRESS),
         ("hit_rate", ADDRESS),
         ("false_alarm_rate", ADDRESS),
-        # For PROCESS_KIND, a PROCESS record; for LOG_KIND, RECORDED_DAY records, one for each of `weekdays`.
+        # For PROCESS_KIND, a PROCESS record (that of the world may change from search to search, see SEARCH); for
+        # LOG_KIND, RECORDED_DAY records, one for each of `weekdays`.
         ("world_kind", np.int64),
         ("world", ADDRESS),
         ("prior_kind", np.int64),
@@ -88,13 +96,9 @@ _PROGRESS = [
     ("time", np.float64),
     ("parked", np.bool_),
     ("over", np.bool_),
-    # The world: index of the weekday or recorded day among the scenario's; hour of the week of the arrival, second of
-    # that hour and of that day.
-    ("key", np.uint64),
+    # The world; index of the weekday or recorded day among the scenario's; second of that day at the arrival.
+    *WORLD_FIELDS,
     ("day", np.int64),
-    ("arrival", np.float64),
-    ("hour", np.int64),
-    ("second_of_hour", np.float64),
     ("second_of_day", np.float64),
     # Counts: slots with a column in the tables; slots observed; of those, free when first observed, expected to be
     # free, and taken when last observed.
@@ -121,13 +125,15 @@ SEARCH = np.dtype(
         # Time since Monday 00:00, and since the search began, as observed.
         _EPISODES[2],
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
-        # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast.
+        # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; PROCESS
+        # record of the world, if it is a process.
         ("scenario", ADDRESS),
         ("blocks", ADDRESS),
         ("slots", ADDRESS),
         ("columns", ADDRESS),
         ("external_forecast", ADDRESS),
         ("day_error", ADDRESS),
+        ("process", ADDRESS),
         # Number of slots of the largest lot; (width,) float32 current belief and (4, width) float32 `belief` of the
         # observation, or 0 if these are not kept.
         ("width", np.int64),
@@ -178,6 +184,7 @@ class ScenarioRecords:
 
     Attributes:
         records: (n,) of the dtype SCENARIO.
+        scenarios: the scenarios.
 
     Raises:
         InputError: an occupancy that is neither a process nor a log.
@@ -185,6 +192,7 @@ class ScenarioRecords:
 
     def __init__(self, scenarios: Sequence[Scenario]) -> None:
         self._kept: list[Any] = []
+        self.scenarios = tuple(scenarios)
         self.records = np.zeros(len(scenarios), SCENARIO)
         for record, scenario in zip(self.records, scenarios, strict=True):
             self._write_search(record, scenario)
@@ -235,7 +243,7 @@ class ScenarioRecords:
 
     def _write_occupancy(self, record: np.void, scenario: Scenario) -> None:
         occupancy, prior = scenario.occupancy, scenario.prior
-        if isinstance(occupancy, RecordedOccupancy):
+        if isinstance(occupancy, RecordedOccupancy | CountedOccupancy):
             weekdays = [weekday_of(day) for day in occupancy.days_in(scenario.arrival)]
         else:
             weekdays = list(scenario.arrival.weekdays)
@@ -243,9 +251,12 @@ class ScenarioRecords:
         record["world_kind"], record["world"] = self._kind_and_address(occupancy, scenario)
         if record["world_kind"] == EXTERNAL_KIND:
             raise InputError(
-                f"occupancy is a {type(occupancy).__name__}, want an OccupancyProcess or a RecordedOccupancy"
+                f"occupancy is a {type(occupancy).__name__}, want an OccupancyProcess, a RecordedOccupancy or a "
+                "CountedOccupancy"
             )
-        if prior is None or prior is occupancy:
+        if isinstance(prior or occupancy, CountedOccupancy):
+            record["prior_kind"] = EXTERNAL_KIND
+        elif prior is None or prior is occupancy:
             record["prior_kind"], record["prior"] = record["world_kind"], record["world"]
         elif isinstance(prior, OccupancyProcess):
             record["prior_kind"], record["prior"] = self._kind_and_address(prior, scenario)
@@ -259,6 +270,10 @@ class ScenarioRecords:
         if isinstance(model, RecordedOccupancy):
             self._kept += [model, days := model.day_records(model.days_in(scenario.arrival))]
             return LOG_KIND, address_of(days, RECORDED_DAY)
+        if isinstance(model, CountedOccupancy):
+            # A process for every day, made when a search begins on it: `Searches.complete_arrival`.
+            self._kept.append(first := model.process_of(model.days_in(scenario.arrival)[0]))
+            return PROCESS_KIND, address_of(first.record, PROCESS)
         return EXTERNAL_KIND, 0
 
 
@@ -300,15 +315,30 @@ class Searches:
         self.belief[:, OBSERVED_AT] = NEVER_OBSERVED
         self.records["width"] = m
         self.records["scenario"] = address_of(scenarios.records, SCENARIO) + scenario_of * SCENARIO.itemsize
+        self.records["process"] = scenarios.records["world"][scenario_of]
+        self._scenario_of = scenario_of
         for name, array in self._arrays().items():
             first = address_of(array, array.dtype)
             self.records[name] = first + np.arange(n) * array.strides[0] if len(array) else 0
 
-    def set_external_forecast(self, search: int, forecast: Forecast) -> None:
-        """Store the forecast of a prior that only Python can compute."""
+    def complete_arrival(self, search: int) -> None:
+        """Add what only Python can compute about a search that has just begun: an external forecast, a counted day."""
+        if not len(self.external_forecast):
+            return
+        scenario, record = self.scenarios.scenarios[self._scenario_of[search]], self.records[search]
+        arrival = arrival_of(scenario, record)
+        self._find_process(search)
+        forecast = scenario.forecast(arrival)
         n = len(forecast.p_occupied)
         self.external_forecast[search, :, :n] = forecast.p_occupied, forecast.decay_rate
         self.day_error[search] = forecast.day_error.level, forecast.day_error.slope
+
+    def _find_process(self, search: int) -> None:
+        """Write the address of the process of a counted day; it differs from computer process to process."""
+        scenario = self.scenarios.scenarios[self._scenario_of[search]]
+        if isinstance(scenario.occupancy, CountedOccupancy):
+            day = arrival_of(scenario, self.records[search]).day
+            self.records[search]["process"] = address_of(scenario.occupancy.process_of(day).record, PROCESS)
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays with a row for each search, keyed by the SEARCH field that holds the row's address."""
@@ -351,3 +381,14 @@ class Searches:
             self.records[name] = records[name]
         for mine, array in zip(self._arrays().values(), arrays, strict=True):
             mine[...] = array.view(mine.dtype)
+        if len(self.external_forecast):
+            for search in range(len(self.records)):
+                self._find_process(search)
+
+
+def arrival_of(scenario: Scenario, record: np.void) -> Arrival:
+    """Return the arrival of the search in a SEARCH record."""
+    time = float(record["arrival"])
+    if isinstance(scenario.occupancy, RecordedOccupancy | CountedOccupancy):
+        return Arrival(time, scenario.occupancy.days_in(scenario.arrival)[int(record["day"])])
+    return Arrival(time)

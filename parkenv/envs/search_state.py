@@ -6,9 +6,8 @@ import numpy as np
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.envs.search_kernel import read_belief_at
-from parkenv.envs.search_records import Searches
+from parkenv.envs.search_records import Searches, arrival_of
 from parkenv.world.occupancy import Arrival, World
-from parkenv.world.recorded_occupancy import RecordedOccupancy
 from parkenv.world.scenario import Scenario
 
 
@@ -97,11 +96,3 @@ class SearchState:
     def over(self) -> bool:
         """Whether the search is over."""
         return bool(self._record["over"])
-
-
-def arrival_of(scenario: Scenario, record: np.void) -> Arrival:
-    """Return the arrival of the search in a SEARCH record."""
-    time = float(record["arrival"])
-    if isinstance(scenario.occupancy, RecordedOccupancy):
-        return Arrival(time, scenario.occupancy.days_in(scenario.arrival)[int(record["day"])])
-    return Arrival(time)

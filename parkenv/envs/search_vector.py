@@ -25,7 +25,6 @@ from parkenv.envs.search_kernel import (
     write_clock,
 )
 from parkenv.envs.search_records import N_ACTIONS, ScenarioRecords, Searches, scenario_at, search_at
-from parkenv.envs.search_state import arrival_of
 from parkenv.errors import InputError
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.keyed_random import seed_state
@@ -429,10 +428,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         if not len(searches.external_forecast):
             return
         for i in np.flatnonzero(which):
-            scenario = self.scenarios[i % len(self.scenarios)]
-            searches.set_external_forecast(
-                int(i), scenario.forecast(arrival_of(scenario, searches.records[i]))
-            )
+            searches.complete_arrival(int(i))
 
     def _observations(self) -> dict[str, NDArray[Any]]:
         return {name: a.copy() for name, a in self._seen.items()} if self._copy else dict(self._seen)

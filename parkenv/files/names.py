@@ -19,3 +19,6 @@ MapName = Literal["empty", "right", "wrong"]
 """Maps that a commute starts from."""
 MAP_NAMES: tuple[MapName, ...] = get_args(MapName)
 BackendName = Literal["loky", "ray", "dask"]
+ForecastFrom = Literal["others", "rolling", "past"]
+FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
+"""Recorded days that a forecast is made from; see `parkenv.world.recorded_occupancy`."""

@@ -50,6 +50,7 @@ class MapErrorPrior:
         hour: of the part that depends on the hour of the day.
         memory_days: time constant of the drift, in days: after this time, 1/e of the error is left.
         weight: probability of this prior, relative to the others.
+        trust: factor of the map's logits; 0 if the map says nothing.
 
     Raises:
         InputError: a number that is negative, or a memory or weight of 0.
@@ -62,6 +63,7 @@ class MapErrorPrior:
     hour: float
     memory_days: float
     weight: float = 1.0
+    trust: float = 1.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -112,7 +114,8 @@ class MapError:
         priors: how wrong the map may be.
 
     Attributes:
-        weights: (k,) float64, probability of each prior.
+        weights: (k,) float64, probability of each prior that is still followed.
+        trust: (k,) float64, its factor of the map's logits.
 
     Examples:
         The map says 50 % for both slots. After slot 0 was taken on ten days, the map is corrected there most.
@@ -130,6 +133,7 @@ class MapError:
         self._nearness = np.asarray(nearness, np.float64)
         self._priors = np.stack([prior.covariance(self._nearness) for prior in priors])
         self._memory_days = np.array([prior.memory_days for prior in priors])
+        self.trust = np.array([prior.trust for prior in priors])
         weights = np.array([prior.weight for prior in priors])
         self._log_weights = np.log(weights / weights.sum())
         self._mean, self._covariance = np.zeros(self._priors.shape[:2]), self._priors.copy()
@@ -206,7 +210,7 @@ class MapError:
         rest = log_weights[kept]
         self._log_weights = rest - np.log(np.exp(rest).sum())
         if not kept.all():
-            for name in ("_priors", "_memory_days", "_mean", "_covariance"):
+            for name in ("_priors", "_memory_days", "trust", "_mean", "_covariance"):
                 setattr(self, name, getattr(self, name)[kept])
 
     def _knots(self, hours: FloatArray) -> list[tuple[NDArray[np.int64], FloatArray]]:

@@ -28,15 +28,20 @@ _SHAPE = {"level": 1.0, "slope": 0.8, "smooth": 0.8, "own": 0.6, "hour": 0.5}
 """Standard deviations, relative to that of the level."""
 
 
-def _priors(scales: dict[float, float]) -> tuple[MapErrorPrior, ...]:
+def _priors(scales: dict[float, float], trust: float = 1.0) -> tuple[MapErrorPrior, ...]:
     return tuple(
-        MapErrorPrior(**{part: scale * sd for part, sd in _SHAPE.items()}, memory_days=days, weight=weight)
+        MapErrorPrior(
+            **{part: scale * sd for part, sd in _SHAPE.items()}, memory_days=days, weight=weight, trust=trust
+        )
         for (scale, weight), days in product(scales.items(), _MEMORY)
     )
 
 
-GIVEN_MAP = _priors({0.1: 0.3, 0.5: 0.3, 1.0: 0.25, 2.5: 0.15})
-"""Priors for a given map: right, a little off, or quite wrong, with or without drift over weeks."""
+GIVEN_MAP = (
+    *_priors({0.1: 0.3, 0.5: 0.3, 1.0: 0.25, 2.5: 0.15}),
+    *_priors({2.0: 0.002}, trust=0.0),
+)
+"""Priors for a given map: right, a little off, quite wrong, or worthless; with or without drift over weeks."""
 NO_MAP = _priors({1.0: 0.5, 2.0: 0.5})
 """Priors for a lot of which nothing is known."""
 
@@ -158,8 +163,9 @@ class LearnedMap:
         p_taken, mean_logits = [], []
         mean, variance = self._error.predict(hour)
         day = base.day_error.deviations(self._nearness)
-        for prior_sd, its_mean, its_variance in zip(self._error.prior_sd(), mean, variance, strict=True):
-            logits = centred_logits(base.p_occupied, np.hypot(prior_sd, day)) + its_mean
+        parts = (self._error.trust, self._error.prior_sd(), mean, variance)
+        for trust, prior_sd, its_mean, its_variance in zip(*parts, strict=True):
+            logits = trust * centred_logits(base.p_occupied, np.hypot(prior_sd, day)) + its_mean
             p_taken.append(mean_probability(logits, its_variance + day**2))
             mean_logits.append(logits)
         weights = self._error.weights
@@ -181,7 +187,7 @@ class LearnedMap:
         evidence = Evidence(np.concatenate(slots), np.concatenate(hours), np.concatenate(likelihood))
         day = day_error.deviations(self._nearness[evidence.slots])
         deviation = np.hypot(self._error.prior_sd()[:, evidence.slots], day)
-        logits = centred_logits(np.concatenate(p), deviation)
+        logits = self._error.trust[:, None] * centred_logits(np.concatenate(p), deviation)
         self._error.observe(evidence, logits, (day_error.level, day_error.slope))
 
     def _day_error(self, day: DayError, weights: FloatArray, logits: FloatArray, hour: float) -> DayError:

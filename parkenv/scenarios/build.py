@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+from datetime import date, timedelta
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from parkenv.errors import InputError
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot
 from parkenv.scenarios.spec import (
+    CountsSpec,
     ForecastSpec,
     LotSpec,
     OccupancySpec,
@@ -25,8 +28,15 @@ from parkenv.world.occupancy import OccupancyModel, OccupancyProcess, PriorModel
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
 from parkenv.world.traffic import Traffic
-from parkenv.world.typical_week import typical_occupancy, with_event
+from parkenv.world.typical_week import attraction, typical_occupancy, with_event
 
+if TYPE_CHECKING:
+    from parkenv.forecast.counts import Counts
+    from parkenv.forecast.day_forecast import DayForecast
+    from parkenv.world.counted_occupancy import CountedOccupancy
+
+MIN_PAST_DAYS = 7
+"""Days of counts that a forecast needs at least."""
 ScenarioSource = str | Path | ScenarioSpec | ParkingLot | Scenario
 
 
@@ -117,9 +127,14 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
         from parkenv.world.occupancy_log import OccupancyLog
         from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
 
-        log = OccupancyLog.read(spec.log)
+        log = OccupancyLog.read_all(spec.log)
         mapped = None if spec.mapping is None else read_mapping(spec.mapping, lot.slot_ids, log)
-        return RecordedOccupancy(log, lot.walk_m(goal), mapped)
+        return RecordedOccupancy(
+            log, lot.walk_m(goal), mapped, spec.replay_from, spec.forecast_from or "others"
+        )
+    if spec.counts is not None:
+        assert spec.replay_from is not None
+        return _counted(spec.counts, spec.replay_from, spec.forecast_from == "past", lot, goal)
     process = (
         _typical(spec.typical or TypicalWeek(), lot, goal)
         if spec.process is None
@@ -128,6 +143,56 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
     if spec.event is None:
         return process
     return with_event(process, lot, goal=goal, share=spec.event.share, factor=spec.event.factor)
+
+
+def _counted(spec: CountsSpec, first: date, past: bool, lot: ParkingLot, goal: int) -> CountedOccupancy:
+    from parkenv.world.counted_occupancy import CountedOccupancy
+
+    changed = spec.file.stat().st_mtime_ns if spec.file.exists() else 0
+    counts, forecast = _forecast_counts(spec.file, changed, spec.timezone, first, past)
+    if spec.car_park not in counts.car_parks:
+        counts.chosen([spec.car_park])  # says which names there are
+    row, days = counts.car_parks.index(spec.car_park), slice(forecast.first, None)
+    return CountedOccupancy(
+        tuple(day.isoformat() for day in counts.days[days]),
+        counts.occupied[row, days],
+        forecast.mean[row],
+        forecast.sd[row],
+        attraction(lot, goal, spec.pull, spec.unevenness),
+        spec.mean_stay_s,
+        f"{spec.file}: car park {spec.car_park}",
+    )
+
+
+@lru_cache(maxsize=2)
+def _forecast_counts(
+    file: Path,
+    changed: int,  # noqa: ARG001 - when the file was changed: another key of the cache
+    timezone: str,
+    first: date,
+    past: bool,
+) -> tuple[Counts, DayForecast]:
+    """Read counts and forecast all days from the first one on; car parks learn special days from one another."""
+    from parkenv.forecast.counts import Counts
+    from parkenv.forecast.day_curves import CurveSettings, forecast_days
+
+    counts = Counts.read(file, timezone)
+    index = counts.day_index(first)
+    if not MIN_PAST_DAYS <= index < len(counts.days):
+        raise InputError(
+            f"{file}: replay_from is {first}, want one from {counts.days[0] + timedelta(MIN_PAST_DAYS)} to "
+            f"{counts.days[-1]}: the forecast needs {MIN_PAST_DAYS} days before it"
+        )
+    return counts, forecast_days(counts, index, "past" if past else "rolling", CurveSettings())
+
+
+def car_parks(file: Path) -> list[str]:
+    """Return the car parks in a file of counts that show some use."""
+    from parkenv.forecast.counts import Counts
+
+    counts = Counts.read(file)
+    odd = counts.idle()
+    return [name for name in counts.car_parks if name not in odd]
 
 
 def _prior(spec: ForecastSpec, occupancy: OccupancyModel, lot: ParkingLot, goal: int) -> PriorModel | None:

@@ -5,6 +5,8 @@ Every table of the file has a class here, which validates it. The published JSON
 
 from __future__ import annotations
 
+import contextlib
+from datetime import date, datetime
 from pathlib import Path
 from typing import Annotated, Self
 
@@ -17,11 +19,12 @@ from parkenv.files.names import (
     PACKAGED_LOTS,
     SCENARIO_NAMES,
     SENSOR_MODELS,
+    ForecastFrom,
     PackagedLot,
     RigName,
     SensorModelName,
 )
-from parkenv.files.spec_file import FilePath, OrText, Spec, read_tables
+from parkenv.files.spec_file import FilePath, OrText, Several, Spec, read_tables
 from parkenv.world.occupancy import ArrivalWindow
 
 Speed = Annotated[float, Field(ge=0.1, le=300.0)]
@@ -131,12 +134,60 @@ def _occupancy_tables(value: object) -> object:
     raise ValueError("typical, a process (.json), a recorded log (.csv, .csv.gz), or a table")
 
 
+def _several(value: object) -> object:
+    return value.split(",") if isinstance(value, str) else value
+
+
+def _date(value: object) -> object:
+    if isinstance(value, str):
+        with contextlib.suppress(ValueError):
+            value = date.fromisoformat(value)
+    if not isinstance(value, date) or isinstance(value, datetime):
+        raise ValueError("a date such as 2015-11-20")
+    return value
+
+
+Date = Annotated[date, BeforeValidator(_date)]
+
+
+class CountsSpec(Spec):
+    """Days of a car park of which the number of free places was counted every hour, laid on the lot."""
+
+    file: FilePath = Field(
+        description="Counts: car_park,capacity,hour,free (or hour_utc) as .csv or .csv.gz."
+    )
+    car_park: str = Field(description="Name of the car park in the file.")
+    timezone: str = Field("Europe/Berlin", description="Of the hours in `hour_utc`.")
+    pull: float = Field(
+        1.6, ge=-20, le=20, description="Logits by which demand rises from the middle to the goal."
+    )
+    unevenness: float = Field(
+        0.6, ge=0, le=20, description="Standard deviation between equally near slots, logits."
+    )
+    mean_stay_s: float = Field(7200.0, ge=1.0, le=1e7)
+
+
 class OccupancySpec(Spec):
     """When slots are taken: a typical week by default."""
 
     typical: TypicalWeek | None = None
     process: FilePath | None = Field(None, description="Rates that `parkenv occupancy fit` wrote (.json).")
-    log: FilePath | None = Field(None, description="A recorded log (.csv, .csv.gz), replayed day by day.")
+    log: Annotated[Several[FilePath], BeforeValidator(_several), Field(min_length=1), OrText()] | None = (
+        Field(
+            None,
+            description="A recorded log (.csv, .csv.gz), or several of the same slots, replayed day by day.",
+        )
+    )
+    counts: CountsSpec | None = None
+    replay_from: Date | None = Field(
+        None, description="First day of the log or the counts that is replayed; all of a log if absent."
+    )
+    forecast_from: ForecastFrom | None = Field(
+        None,
+        description="Days that the forecast is made from: others, all that a world does not replay (the default, only "
+        "for logs); rolling, those before the earliest that it replays (the default for counts); past, those before "
+        "replay_from.",
+    )
     mapping: FilePath | None = Field(
         None, description="CSV slot_id,log_slot_id: which slot of the log is which."
     )
@@ -144,11 +195,20 @@ class OccupancySpec(Spec):
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        _require_one(self, ("typical", "process", "log"), least=0)
+        _require_one(self, ("typical", "process", "log", "counts"), least=0)
+        recorded = self.log is not None or self.counts is not None
         if self.mapping is not None and self.log is None:
             raise ValueError("mapping only together with a log")
-        if self.event is not None and self.log is not None:
-            raise ValueError("event only without a log: a recorded day is as full as it was")
+        if self.replay_from is not None and not recorded:
+            raise ValueError("replay_from only together with a log or counts")
+        if self.counts is not None and self.replay_from is None:
+            raise ValueError("replay_from together with counts: the days before it are for the forecast")
+        if self.counts is not None and self.forecast_from == "others":
+            raise ValueError("forecast_from rolling or past together with counts")
+        if self.forecast_from not in (None, "others") and self.replay_from is None:
+            raise ValueError("forecast_from only together with replay_from")
+        if self.event is not None and recorded:
+            raise ValueError("event only without a log or counts: a recorded day is as full as it was")
         return self
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,6 +55,7 @@ class DayError:
                 raise InputError(
                     f"day_error.{name} is {value!r:.60}, want a number of logits from 0 to {MAX_LOGITS:g}"
                 )
+            object.__setattr__(self, name, float(value))
 
     def __bool__(self) -> bool:
         """Whether days differ from their forecast at all."""
@@ -85,8 +87,8 @@ def centred_logits(p: ArrayLike, deviation: ArrayLike) -> FloatArray:
         p: probabilities, any shape; infinite logits for 0 and 1.
         deviation: standard deviations, logits, of a shape that broadcasts with `p`.
     """
-    p, deviation = np.broadcast_arrays(np.asarray(p, np.float64), np.asarray(deviation, np.float64))
-    return np.asarray(_centred_logits(p.ravel(), deviation.ravel())).reshape(p.shape)
+    each = [np.array(a) for a in np.broadcast_arrays(np.asarray(p, float), np.asarray(deviation, float))]
+    return np.asarray(_centred_logits(*(a.ravel() for a in each))).reshape(each[0].shape)
 
 
 @compiled(error_model="numpy")
@@ -110,6 +112,31 @@ def centred_logit(p: float, deviation: float) -> float:
         if abs(step) < _ACCURACY * max(1.0, abs(x)):
             break
     return x
+
+
+TABLE_STEPS, TABLE_ROWS = 512, 8
+
+
+@lru_cache(maxsize=64)
+def centring_table(day_error: DayError) -> FloatArray:
+    """Tabulate by which factor centring changes the odds of a slot, for compiled code.
+
+    Returns:
+        (rows, 513) float64, exp(centred_logits(p) - logit(p)). Column k is for p = k / 512; row j is for
+        nearness² = j / 8. Without a slope there is one row for all.
+    """
+    if not day_error:
+        return np.ones((1, TABLE_STEPS + 1))
+    p = np.arange(TABLE_STEPS + 1) / TABLE_STEPS
+    rows = np.sqrt(np.arange(TABLE_ROWS + 1) / TABLE_ROWS) if day_error.slope > 0.0 else np.zeros(1)
+    deviation = day_error.deviations(rows)[:, None]
+    factors = np.empty((rows.size, p.size))
+    inner = p[1:-1]
+    factors[:, 1:-1] = np.exp(centred_logits(inner, deviation) - np.log(inner / (1.0 - inner)))
+    # For p near 0, E[sigmoid(x + deviation·Z)] approaches E[exp(x + deviation·Z)]; near 1, likewise.
+    factors[:, :1], factors[:, -1:] = np.exp(-0.5 * deviation**2), np.exp(0.5 * deviation**2)
+    factors.flags.writeable = False
+    return factors
 
 
 @compiled

@@ -6,7 +6,7 @@ Times are seconds since Monday 00:00 of the scenario's week; rates are 1/s.
 import math
 import os
 import re
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -16,7 +16,7 @@ from scipy.optimize import brentq
 from parkenv.errors import InputError
 from parkenv.files.versioned_json import JsonFormat
 from parkenv.world import occupancy_kernel as kernels
-from parkenv.world.day_error import EXACT, DayError
+from parkenv.world.day_error import EXACT, DayError, centring_table, nearness
 from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.world.occupancy_kernel import kernel
 from parkenv.world.pointers import address_of
@@ -146,10 +146,7 @@ class OccupancyModel(PriorModel, Protocol):
 @kernel
 def _seek(
     process: int,
-    key: np.uint64,
-    arrival: float,
-    hour: int,
-    second: float,
+    world: int,
     slots: IntArray,
     time: float,
     cursors: int,
@@ -157,15 +154,20 @@ def _seek(
     ends: FloatArray,
 ) -> None:
     """Write the state of each of `slots` at `time` and, if `ends` has room, when its sojourn ends."""
-    of_all = kernels.process_at(process, 0)
+    of_all, here = kernels.process_at(process, 0), kernels.world_at(world, 0)
     for i in range(slots.size):
         slot, cursor = slots[i], kernels.cursor_at(cursors, slots[i])
         if time < cursor.since:
             cursor.sojourn, cursor.valid_until = 0, 0.0
-        occupied[i] = kernels.process_state(of_all, key, arrival, hour, second, slot, cursor, time)
+        occupied[i] = kernels.process_state(of_all, here, slot, cursor, time)
         if ends.size > 0:
-            kernels.find_sojourn_end(of_all, key, slot, cursor)
+            kernels.find_sojourn_end(of_all, here, slot, cursor)
             ends[i] = cursor.valid_until
+
+
+@kernel
+def _draw_day(process: int, world: int) -> None:
+    kernels.draw_day(kernels.process_at(process, 0), kernels.world_at(world, 0))
 
 
 @kernel
@@ -186,10 +188,12 @@ class ProcessWorld:
             raise InputError(f"Arrival.time: got {arrival.time}, wanted finite seconds")
         # np.zeros does not touch its memory, so a million slots cost nothing until they are queried.
         self._cursors = np.zeros(process.n_slots, kernels.CURSOR)
-        _, self._hour, self._second = hour_of_week(float(arrival.time))
         self.process = process
         self.key = np.uint64(key)
         self.arrival = arrival
+        _, hour, second = hour_of_week(float(arrival.time))
+        self._record = np.array([(self.key, arrival.time, hour, second, 1.0, 0.0)], kernels.WORLD)
+        _draw_day(process.address, address_of(self._record, kernels.WORLD))
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
         """(k,) bool, whether each of the slots (k,) is taken at `time`, at or after the arrival."""
@@ -220,10 +224,8 @@ class ProcessWorld:
             raise InputError(f"time: got {time}, wanted finite seconds at or after the arrival at {arrival}")
         occupied = np.empty(slots.size, np.bool_)
         cursors = address_of(self._cursors, kernels.CURSOR)
-        _seek(
-            self.process.address, self.key, arrival, self._hour, self._second,
-            slots, float(time), cursors, occupied, ends,
-        )  # fmt: skip
+        world = address_of(self._record, kernels.WORLD)
+        _seek(self.process.address, world, slots, float(time), cursors, occupied, ends)
         return occupied
 
 
@@ -234,11 +236,18 @@ class OccupancyProcess:
     A free slot s is taken at the rate `arrival_factor[s] * arrival_profile[h]`, a taken one becomes free at the
     rate `departure_factor[s] * departure_profile[h]`; h is the hour of the week, 0 = Monday 00:00 to 01:00.
 
+    With a day error, every episode draws the level L and the slope S of its day. The odds that a slot is taken at the
+    arrival are those of its forecast times c·exp(L + S·nearness), and its arrival rate is multiplied by the same factor
+    throughout the episode, so that its equilibrium moves along. The centring c makes the forecast the mean over days
+    (see `parkenv.world.day_error`); in the arrival rate of an hour, it is that of the forecast when the hour begins.
+
     Args:
         arrival_factor: (n,) float64, no unit, >= 0.
         arrival_profile: (168,) float64, 1/s, >= 0.
         departure_factor: (n,) float64, no unit, >= 0.
         departure_profile: (168,) float64, 1/s, >= 0.
+        day_error: how far days differ from the forecast.
+        nearness: (n,) float64, from -1 to 1, see `parkenv.world.day_error.nearness`; needed for a slope only.
 
     Attributes:
         factors: (2, n) float64, read-only, the two factors stacked; row = the state before the change.
@@ -248,18 +257,22 @@ class OccupancyProcess:
         record: (1,) of the dtype PROCESS, for compiled code.
 
     Raises:
-        InputError: a wrong shape, a value that is negative or not finite, or a rate above 1000/s.
+        InputError: a wrong shape, a value that is negative or not finite, a rate above 1000/s, or a slope without
+            nearness.
     """
 
     arrival_factor: FloatArray
     arrival_profile: FloatArray
     departure_factor: FloatArray
     departure_profile: FloatArray
+    day_error: DayError = EXACT
+    nearness: FloatArray | None = None
     factors: FloatArray = field(init=False, repr=False)
     profiles: FloatArray = field(init=False, repr=False)
     hazards: FloatArray = field(init=False, repr=False)
     hourly_marginals: FloatArray = field(init=False, repr=False)
     record: NDArray[np.void] = field(init=False, repr=False)
+    _centring: FloatArray = field(init=False, repr=False)  # `record` holds its address
 
     def __post_init__(self) -> None:
         arrival = _checked("arrival_factor", self.arrival_factor)
@@ -277,13 +290,28 @@ class OccupancyProcess:
             object.__setattr__(self, name, array)
         # Untouched memory costs nothing, so even a million slots can have a whole week.
         marginals = np.zeros((WEEK_HOURS, arrival.size))
-        addresses = (address_of(a, np.float64) for a in (factors, profiles, hazards, marginals))
+        near, centring = self._checked_nearness(arrival.size), centring_table(self.day_error)
         object.__setattr__(self, "hourly_marginals", marginals)
-        object.__setattr__(
-            self, "record", np.array([(arrival.size, *addresses, (0.0, 0.0))], kernels.PROCESS)
-        )
-        for name, row in zip(_FIELDS, (factors[0], profiles[0], factors[1], profiles[1]), strict=True):
+        object.__setattr__(self, "nearness", near)
+        object.__setattr__(self, "_centring", centring)
+        addresses = [address_of(a, np.float64) for a in (factors, profiles, hazards, marginals, centring)]
+        near_at = 0 if near is None else address_of(near, np.float64)
+        sizes = self.day_error.level, self.day_error.slope
+        record = np.array([(arrival.size, *addresses, near_at, sizes)], kernels.PROCESS)
+        object.__setattr__(self, "record", record)
+        for name, row in zip(_RATES, (factors[0], profiles[0], factors[1], profiles[1]), strict=True):
             object.__setattr__(self, name, row)
+
+    def _checked_nearness(self, n: int) -> FloatArray | None:
+        if self.nearness is None:
+            if self.day_error.slope > 0.0:
+                raise InputError("OccupancyProcess.nearness: got None, wanted numbers: its days have a slope")
+            return None
+        near = _numbers("nearness", self.nearness, n)
+        if not np.all(np.abs(near) <= 1.0):
+            raise InputError("OccupancyProcess.nearness: wanted numbers from -1 to 1")
+        near.flags.writeable = False
+        return near
 
     def __reduce__(self) -> tuple[Any, ...]:
         return OccupancyProcess, tuple(getattr(self, name) for name in _FIELDS)
@@ -317,20 +345,26 @@ class OccupancyProcess:
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Self:
         """Read a file written by `to_file`; InputError names the file and the problem."""
-        content = _FORMAT.read(path)
+        # A file of rates alone has no day error.
+        content = {"day_error": {}, "nearness": None, **_FORMAT.read(path)}
         wanted = set(_FIELDS)
         if content.keys() != wanted:
             odd = ", ".join(sorted(content.keys() ^ wanted))
             raise InputError(f"{path}: missing or unknown fields: {odd}; wanted {', '.join(sorted(wanted))}")
+        sizes = content.pop("day_error")
         try:
-            return cls(*(content[name] for name in _FIELDS))
+            if not isinstance(sizes, dict) or not sizes.keys() <= {"level", "slope"}:
+                raise InputError(f"day_error is {sizes!r:.60}, want an object with level and slope")
+            return cls(**content, day_error=DayError(**sizes))
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
     def to_file(self, path: str | os.PathLike[str]) -> None:
         """Write as JSON, replacing an existing file atomically."""
-        rates = {name: getattr(self, name).tolist() for name in _FIELDS}
-        _FORMAT.write(path, rates)
+        content: dict[str, Any] = {name: getattr(self, name).tolist() for name in _RATES}
+        content["day_error"] = asdict(self.day_error)
+        content["nearness"] = None if self.nearness is None else self.nearness.tolist()
+        _FORMAT.write(path, content)
 
     @property
     def n_slots(self) -> int:
@@ -344,8 +378,20 @@ class OccupancyProcess:
 
     def take(self, slots: ArrayLike) -> "OccupancyProcess":
         """Return a process whose slot i has the rates of this process's slot `slots[i]`; (n,) int64."""
-        arrival, departure = self.factors[:, np.asarray(slots, np.int64)]
-        return OccupancyProcess(arrival, self.arrival_profile, departure, self.departure_profile)
+        chosen = np.asarray(slots, np.int64)
+        arrival, departure = self.factors[:, chosen]
+        near = None if self.nearness is None else self.nearness[chosen]
+        return replace(self, arrival_factor=arrival, departure_factor=departure, nearness=near)
+
+    def with_day_error(self, day_error: DayError, walk: ArrayLike | None = None) -> "OccupancyProcess":
+        """Return this process with days that differ from its forecast.
+
+        Args:
+            day_error: by how much.
+            walk: (n,) walk from each slot to the goal, for a slope; None keeps the nearness of the slots.
+        """
+        near = self.nearness if walk is None else nearness(walk)
+        return replace(self, day_error=day_error, nearness=near)
 
     def mapped_to_lot(self, walk_m: ArrayLike) -> "OccupancyProcess":
         """Map the process by rank to a lot of any size: the fullest slots go nearest to the goal.
@@ -359,7 +405,8 @@ class OccupancyProcess:
         slots = np.empty(walk.size, np.int64)
         ranks = np.arange(walk.size) * self.n_slots // walk.size
         slots[np.argsort(walk, kind="stable")] = np.argsort(-mean, kind="stable")[ranks]
-        return self.take(slots)
+        taken = self.take(slots)
+        return taken if self.nearness is None else taken.with_day_error(self.day_error, walk)
 
     def at_mean_occupancy(self, target: float, time: float) -> "OccupancyProcess":
         """Scale all arrival rates by one factor such that the lot's mean marginal at `time` is `target`.
@@ -370,8 +417,7 @@ class OccupancyProcess:
             raise InputError(f"target mean occupancy: got {target}, wanted a number between 0 and 1")
 
         def scaled(shift: float) -> OccupancyProcess:
-            arrival, departure = self.factors * [[math.exp(shift)], [1.0]]
-            return OccupancyProcess(arrival, self.arrival_profile, departure, self.departure_profile)
+            return replace(self, arrival_factor=self.arrival_factor * math.exp(shift))
 
         def excess(shift: float) -> float:
             return float(scaled(shift).marginal(time).mean()) - target
@@ -397,7 +443,7 @@ class OccupancyProcess:
         return Arrival(window.weekdays[index] * DAY_S + window.draw_second(key))
 
     def world(self, key: np.uint64, arrival: Arrival) -> ProcessWorld:
-        """Return the world of the episode with this key; its initial state is drawn from the marginal."""
+        """Return the world of the episode with this key; its initial state is drawn from the marginal on its day."""
         return ProcessWorld(self, key, arrival)
 
     def forecast(self, arrival: Arrival) -> Forecast:
@@ -407,13 +453,22 @@ class OccupancyProcess:
         return Forecast(
             np.clip(self.marginal(arrival.time), kernels.MIN_PROBABILITY, kernels.MAX_PROBABILITY),
             rates[0] + rates[1],
+            self.day_error,
         )
 
 
 _FIELDS = tuple(f.name for f in fields(OccupancyProcess) if f.init)
+_RATES = _FIELDS[:4]
 
 
 def _checked(name: str, values: Any, size: int | None = None) -> FloatArray:
+    array = _numbers(name, values, size)
+    for i in np.flatnonzero(~((array >= 0) & np.isfinite(array))):
+        raise InputError(f"OccupancyProcess.{name}[{i}]: got {array[i]}, wanted a finite number >= 0")
+    return array
+
+
+def _numbers(name: str, values: Any, size: int | None = None) -> FloatArray:
     try:
         array = np.array(values, float)
     except (TypeError, ValueError) as error:
@@ -422,6 +477,4 @@ def _checked(name: str, values: Any, size: int | None = None) -> FloatArray:
         raise InputError(
             f"OccupancyProcess.{name}: got shape {array.shape}, wanted ({size or 'n'},), not empty"
         )
-    for i in np.flatnonzero(~((array >= 0) & np.isfinite(array))):
-        raise InputError(f"OccupancyProcess.{name}[{i}]: got {array[i]}, wanted a finite number >= 0")
     return array

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 # From once in 30 years to once a second; bounds for rates that the observations do not determine.
 _LOG_RATE_BOUNDS = (math.log(1e-9), 0.0)
 _LOG_FACTOR_BOUNDS = (-8.0, 8.0)
+PRIOR_CHANGES = 10.0
+"""Changes of state in an hour at which its own decay rate counts as much as the whole day's."""
 _TINY = 1e-300
 _DAY_HOURS = 24
 _N_BINS = 2 * _DAY_HOURS  # hours of a weekday, hours of a weekend day
@@ -95,6 +97,31 @@ def fit_constant_rates(dt: ArrayLike, start: ArrayLike, end: ArrayLike) -> tuple
     )
     arrival, departure = np.exp(found.x)
     return float(arrival), float(departure)
+
+
+def fit_hourly_decay_rates(
+    start: FloatArray, end: FloatArray, before: BoolArray, after: BoolArray
+) -> FloatArray:
+    """Fit the sum of arrival and departure rate in each hour of the day, (24,), 1/s, by maximum likelihood.
+
+    A pair of observations counts for the hour of its middle. The logarithm of an hour's rate is the mean of the hour's
+    own and the whole day's, weighted by the hour's changes and `PRIOR_CHANGES`.
+
+    Args:
+        start: (k,) float64, s of the day, first observation of a pair; k > 0.
+        end: (k,) float64, s of the day, second one.
+        before: (k,) bool, taken at start.
+        after: (k,) bool, taken at end.
+    """
+    dt, hour = end - start, ((start + end) / 2 // HOUR_S).astype(np.int64)
+    rates: FloatArray = np.full(_DAY_HOURS, math.log(sum(fit_constant_rates(dt, before, after))))
+    for h in np.unique(hour):
+        here = hour == h
+        own = math.log(sum(fit_constant_rates(dt[here], before[here], after[here])))
+        n = int((before[here] != after[here]).sum())
+        rates[h] += n / (n + PRIOR_CHANGES) * (own - rates[h])
+    decay_rates: FloatArray = np.exp(rates)
+    return decay_rates
 
 
 class Intervals(NamedTuple):

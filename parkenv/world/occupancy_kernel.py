@@ -15,17 +15,16 @@ from typing import Any
 
 import numpy as np
 
+from parkenv.world.day_error import TABLE_ROWS, TABLE_STEPS
 from parkenv.world.decay import decay_factor
-from parkenv.world.keyed_random import OCCUPANCY_STREAM, keyed_exponential, keyed_uniform
+from parkenv.world.keyed_random import DAY_STREAM, OCCUPANCY_STREAM, keyed_exponential, keyed_uniform
 from parkenv.world.pointers import ADDRESS, float64s, int64s, record_at, uint8s
-from parkenv.world.week import DAY_HOURS, DAY_S, HOUR_S, WEEK_HOURS, WEEK_S, hour_of_week
+from parkenv.world.week import DAY_HOURS, DAY_PERIODS, HOUR_S, PERIOD_S, WEEK_HOURS, WEEK_S, hour_of_week
 from sim_sensors.compilation import compiled
 
 # Forecasts are never certain, so that a planner can recover from a wrong one.
 MIN_PROBABILITY = 0.001
 MAX_PROBABILITY = 0.999
-
-PRIOR_DAYS = 1.0  # weight, in days, of the lot's mean in a slot's forecast from a log
 
 _NEVER_WEEKS = 1e9
 _FORGOTTEN = 1e-17
@@ -44,6 +43,8 @@ PROCESS = np.dtype(
         ("profiles", ADDRESS),
         ("hazards", ADDRESS),
         ("hourly_marginals", ADDRESS),
+        ("centring", ADDRESS),
+        ("nearness", ADDRESS),
         ("day_error", np.float64, (2,)),
     ],
     align=True,
@@ -51,28 +52,40 @@ PROCESS = np.dtype(
 """An `OccupancyProcess`: addresses of its arrays; a row of the first three is the state before the change.
 
 factors (2, n_slots); profiles (2, 168), 1/s; hazards (2, 169), integrals of the profiles from Monday 00:00 to full
-hours; hourly_marginals (168, n_slots), P(taken) at full hours, computed when first needed, 0 before. All float64.
-day_error: standard deviations over days of level and slope, logits.
+hours; hourly_marginals (168, n_slots), P(taken) at full hours, computed when first needed, 0 before; centring, see
+`centring_table`; nearness (n_slots,), or no address without one. All float64. day_error: standard deviations over days
+of level and slope, logits.
+"""
+
+WORLD_FIELDS = [
+    ("key", np.uint64),
+    ("arrival", np.float64),
+    ("hour", np.int64),
+    ("second_of_hour", np.float64),
+    ("day_odds", np.float64),
+    ("day_slope", np.float64),
+]
+WORLD = np.dtype(WORLD_FIELDS, align=True)
+"""The world of an episode in a process: its key; the arrival, s since Monday 00:00, the hour of the week and the second
+of that hour; the day's level as a factor of the odds, and its slope, logits. Other records with these fields can be
+used as well.
 """
 
 RECORDED_DAY = np.dtype(
     [
         ("midnight", np.float64),
-        ("decay_rate", np.float64),
-        ("n_records", np.float64),
-        ("day_error", np.float64, (2,)),
-        ("log_slot", ADDRESS),
         ("record", ADDRESS),
-        ("share", ADDRESS),
-        ("lot_share", ADDRESS),
-        ("n_days", ADDRESS),
+        ("log_odds", ADDRESS),
+        ("day_level", ADDRESS),
+        ("decay_rate", ADDRESS),
         ("first", ADDRESS),
         ("from_s", ADDRESS),
         ("occupied", ADDRESS),
     ],
     align=True,
 )
-"""A log day replayed on a lot: fields of `MappedLog` and `OccupancyLog`, and its midnight, s since Monday 00:00."""
+"""A log day replayed on a lot: its midnight, s since Monday 00:00; fields of `MappedLog`,
+`DayForecast` and `OccupancyLog`."""
 
 CURSOR_FIELDS = [
     ("sojourn", np.int32),
@@ -88,57 +101,97 @@ sojourn: number of the sojourn, from 1; 0 before the first query. since: its beg
 at least until then, and ends exactly then if end_known. Other records with these fields can be used as well.
 """
 
-process_at, recorded_day_at, cursor_at = record_at(PROCESS), record_at(RECORDED_DAY), record_at(CURSOR)
+process_at, world_at = record_at(PROCESS), record_at(WORLD)
+recorded_day_at, cursor_at = record_at(RECORDED_DAY), record_at(CURSOR)
+
+
+@inlined
+def draw_day(process: Any, world: Any) -> None:
+    """Draw the day's level and slope from the world's key."""
+    world.day_odds, world.day_slope = 1.0, 0.0
+    if has_days(process):
+        # Box and Muller: two independent normal numbers from two uniform ones.
+        radius = math.sqrt(-2.0 * math.log(keyed_uniform(world.key, DAY_STREAM, 0, 0)))
+        angle = 2.0 * math.pi * keyed_uniform(world.key, DAY_STREAM, 0, 1)
+        world.day_odds = math.exp(process.day_error[0] * radius * math.cos(angle))
+        world.day_slope = process.day_error[1] * radius * math.sin(angle)
+
+
+@inlined
+def has_days(process: Any) -> bool:
+    """Return whether days differ from the forecast."""
+    return bool(process.day_error[0] > 0.0 or process.day_error[1] > 0.0)
+
+
+@inlined
+def _odds_of_day(process: Any, world: Any, slot: int) -> float:
+    """Return the factor exp(L + S·nearness) of a slot's odds on the world's day."""
+    if process.day_error[1] == 0.0:
+        return float(world.day_odds)
+    return float(world.day_odds * math.exp(world.day_slope * float64s(process.nearness)[slot]))
+
+
+@inlined
+def _centring_odds(process: Any, slot: int, p: float) -> float:
+    """Return the factor of a slot's odds that makes `p` the mean over days, from the table."""
+    centring = float64s(process.centring)
+    column = p * TABLE_STEPS
+    k = min(int(column), TABLE_STEPS - 1)
+    part = column - k
+    factor = centring[k] + part * (centring[k + 1] - centring[k])
+    if process.day_error[1] > 0.0:
+        near = float64s(process.nearness)[slot]
+        row = near * near * TABLE_ROWS
+        j = min(int(row), TABLE_ROWS - 1)
+        low = j * (TABLE_STEPS + 1) + k
+        high = low + TABLE_STEPS + 1
+        factor = centring[low] + part * (centring[low + 1] - centring[low])
+        factor += (row - j) * (centring[high] + part * (centring[high + 1] - centring[high]) - factor)
+    return float(factor)
 
 
 @kernel
-def process_state(
-    process: Any,
-    key: np.uint64,
-    arrival: float,
-    hour: int,
-    second: float,
-    slot: int,
-    cursor: Any,
-    time: float,
-) -> bool:
+def process_state(process: Any, world: Any, slot: int, cursor: Any, time: float) -> bool:
     """Return whether a slot of a process is taken, and move its cursor to the sojourn that holds `time`.
 
     Args:
         process: a PROCESS record.
-        key: key of the world.
-        arrival: begin of the world, s since Monday 00:00.
-        hour: hour of the week of the arrival.
-        second: second of that hour.
+        world: a WORLD record.
         slot: index of the slot.
         cursor: its cursor, changed in place.
         time: s, not before the cursor's sojourn began.
     """
     if cursor.sojourn == 0:
-        _enter_first_sojourn(process, key, arrival, hour, second, slot, cursor)
+        _enter_first_sojourn(process, world, slot, cursor)
     while time >= cursor.valid_until:
         if cursor.end_known:
             cursor.since = cursor.valid_until
             cursor.occupied = not cursor.occupied
             cursor.sojourn += 1
             cursor.end_known = False
-        find_sojourn_end(process, key, slot, cursor)
+        find_sojourn_end(process, world, slot, cursor)
     return bool(cursor.occupied)
 
 
 @kernel
-def _enter_first_sojourn(
-    process: Any, key: np.uint64, arrival: float, hour: int, second: float, slot: int, cursor: Any
-) -> None:
-    """Draw the state at the arrival from the marginal, and bound its end from below."""
+def _enter_first_sojourn(process: Any, world: Any, slot: int, cursor: Any) -> None:
+    """Draw the state at the arrival from the marginal on the day, and bound its end from below."""
+    key, arrival, hour, second = world.key, world.arrival, world.hour, world.second_of_hour
     p, _ = process_forecast(process, hour, second, slot)
-    occupied = keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < p
+    if has_days(process):
+        odds = _centring_odds(process, slot, p) * _odds_of_day(process, world, slot)
+        occupied = keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) * (p * odds + (1.0 - p)) < p * odds
+    else:
+        occupied = keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) < p
     cursor.sojourn, cursor.since, cursor.occupied, cursor.end_known = 1, arrival, occupied, False
     # The sojourn ends when its hazard reaches -log(u), which is more than 1 - u; until the hour ends the rate is
     # constant. This bound is usually late enough, so the exact end need not be computed.
     state = 1 if occupied else 0
     factor = float64s(process.factors)[state * process.n_slots + slot]
-    rate = factor * float64s(process.profiles)[state * WEEK_HOURS + hour]
+    if has_days(process) and not occupied:
+        rate = _odds_of_day(process, world, slot) * factor * _day_profile(process, hour, slot)
+    else:
+        rate = factor * float64s(process.profiles)[state * WEEK_HOURS + hour]
     lasts = HOUR_S - second
     hazard = (1.0 - keyed_uniform(key, OCCUPANCY_STREAM, slot, 1)) * _SAFE
     if hazard < rate * lasts:
@@ -147,7 +200,7 @@ def _enter_first_sojourn(
 
 
 @kernel
-def find_sojourn_end(process: Any, key: np.uint64, slot: int, cursor: Any) -> None:
+def find_sojourn_end(process: Any, world: Any, slot: int, cursor: Any) -> None:
     """Compute the exact end of the cursor's sojourn, unless it is known."""
     if cursor.end_known:
         return
@@ -157,8 +210,11 @@ def find_sojourn_end(process: Any, key: np.uint64, slot: int, cursor: Any) -> No
     hazards = process.hazards + state * (WEEK_HOURS + 1) * 8
     end = np.inf
     if factor * float64s(hazards)[WEEK_HOURS] > 0.0:
-        hazard = keyed_exponential(key, OCCUPANCY_STREAM, slot, np.int64(cursor.sojourn)) / factor
-        end = _time_after(profile, hazards, cursor.since, hazard)
+        hazard = keyed_exponential(world.key, OCCUPANCY_STREAM, slot, np.int64(cursor.sojourn)) / factor
+        if has_days(process) and not cursor.occupied:
+            end = _taken_on_day(process, slot, cursor.since, hazard / _odds_of_day(process, world, slot))
+        else:
+            end = _time_after(profile, hazards, cursor.since, hazard)
     cursor.valid_until, cursor.end_known = end, True
 
 
@@ -186,6 +242,39 @@ def _time_after(profile: int, hazards: int, since: float, hazard: float) -> floa
     return end
 
 
+@inlined
+def _day_profile(process: Any, hour: int, slot: int) -> float:
+    """Return a slot's arrival rate, 1/s, in an hour of a day with level and slope 0, but for its factor.
+
+    It is centred for the forecast at the beginning of the hour, and constant in the hour.
+    """
+    p = _marginal_at_full_hour(process, hour, slot)
+    return float(float64s(process.profiles)[hour] * _centring_odds(process, slot, p))
+
+
+@kernel
+def _taken_on_day(process: Any, slot: int, since: float, hazard: float) -> float:
+    """As `_time_after`, with the arrival rates of `_day_profile`, hour by hour."""
+    _, hour, second = hour_of_week(since)
+    time, end, weekly = since, since + (HOUR_S - second), 0.0
+    for passed in range(3 * WEEK_HOURS):
+        rate = _day_profile(process, hour, slot)
+        gathered = rate * (end - time)
+        if rate > 0.0 and gathered >= hazard:
+            return float(min(time + max(hazard, 0.0) / rate, end))
+        hazard -= gathered
+        # The first hour is not a whole one; the 168 after it are a week.
+        weekly += gathered if passed > 0 else 0.0
+        if passed == WEEK_HOURS:
+            more_weeks = np.floor(hazard / weekly)
+            if not more_weeks < _NEVER_WEEKS:
+                return np.inf
+            hazard -= more_weeks * weekly
+            end += more_weeks * WEEK_S
+        time, end, hour = end, end + HOUR_S, (hour + 1) % WEEK_HOURS
+    return time
+
+
 @kernel
 def _count_below(address: int, begin: int, end: int, value: float, equal_too: bool) -> int:
     """Count the ascending float64 from `begin` to `end` below `value`; equal ones count with `equal_too`."""
@@ -205,12 +294,19 @@ def process_forecast(process: Any, hour: int, second: float, slot: int) -> tuple
     """Return P(taken) of a slot at a second of an hour of the week, and its decay rate there, 1/s."""
     n = process.n_slots
     factors, profiles = float64s(process.factors), float64s(process.profiles)
-    start = float64s(process.hourly_marginals)[hour * n + slot]
-    if start == 0.0:
-        start = _marginal_at_hour(process, hour, slot)
+    start = _marginal_at_full_hour(process, hour, slot)
     arrival = factors[slot] * profiles[hour]
     rate = arrival + factors[n + slot] * profiles[WEEK_HOURS + hour]
     return marginal_later(start, arrival, rate, second), rate
+
+
+@inlined
+def _marginal_at_full_hour(process: Any, hour: int, slot: int) -> float:
+    """Return P(taken) of a slot at the beginning of an hour of the week."""
+    start = float64s(process.hourly_marginals)[hour * process.n_slots + slot]
+    if start == 0.0:
+        start = _marginal_at_hour(process, hour, slot)
+    return float(start)
 
 
 @inlined
@@ -289,20 +385,25 @@ def recorded_state(day: Any, slot: int, cursor: Any, time: float) -> bool:
     return bool(cursor.occupied)
 
 
-@kernel
-def recorded_forecast(day: Any, slot: int, second: float) -> float:
-    """Return P(taken) of a slot at a second of a recorded day, from the hour around it on the other days.
+@inlined
+def _between_periods(values: int, second: float) -> float:
+    """Interpolate linearly between the middles of a day's half-hours; the first and the last value hold to midnight."""
+    at = min(max(second / PERIOD_S - 0.5, 0.0), DAY_PERIODS - 1.0)
+    low = min(int(at), DAY_PERIODS - 2)
+    of = float64s(values)
+    return float(of[low] + (at - low) * (of[low + 1] - of[low]))
 
-    The mean over the days that the world does not replay is shrunk by a Beta prior worth `PRIOR_DAYS` to the mean of
-    all slots of the log.
-    """
-    share, lot_share = float64s(day.share), float64s(day.lot_share)
-    log_slot = int64s(day.log_slot)[slot]
-    low, high = max(second - HOUR_S / 2, 0.0), min(second + HOUR_S / 2, DAY_S)
-    taken = in_all = 0.0
-    for hour in range(int(low // HOUR_S), min(int(high // HOUR_S), DAY_HOURS - 1) + 1):
-        weight = (min((hour + 1) * HOUR_S, high) - max(hour * HOUR_S, low)) / (high - low)
-        taken += weight * share[log_slot * DAY_HOURS + hour]
-        in_all += weight * lot_share[hour]
-    p = (taken + PRIOR_DAYS * in_all / day.n_records) / (int64s(day.n_days)[log_slot] + PRIOR_DAYS)
-    return float(min(max(p, MIN_PROBABILITY), MAX_PROBABILITY))
+
+@kernel
+def recorded_forecast(day: Any, slot: int, second: float) -> tuple[float, float]:
+    """Return P(taken) of a slot at a second of a recorded day, and its decay rate there, 1/s."""
+    logit = _between_periods(day.log_odds + slot * DAY_PERIODS * 8, second)
+    p = 1.0 / (1.0 + math.exp(-logit))
+    rate = float64s(day.decay_rate)[min(int(second // HOUR_S), DAY_HOURS - 1)]
+    return min(max(p, MIN_PROBABILITY), MAX_PROBABILITY), float(rate)
+
+
+@kernel
+def recorded_day_level(day: Any, second: float) -> float:
+    """Return the standard deviation of the error of a recorded day's level at a second of it, logits."""
+    return float(_between_periods(day.day_level, second))

@@ -14,11 +14,13 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import csv_rows
+from parkenv.forecast.slot_days import Days, SlotDays
 from parkenv.world.occupancy import BoolArray, FloatArray, IntArray
-from parkenv.world.week import DAY_HOURS, DAY_S, HOUR_S
+from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, PERIOD_S
 from sim_sensors.compilation import compiled
 
 DayClass = Literal["weekday", "weekend"]
@@ -68,12 +70,11 @@ class Intervals(NamedTuple):
     after: BoolArray
 
 
-class _Hours(NamedTuple):
-    """Seconds per (slot, day, hour of the day), each (m, n_days, 24) float64."""
+class _Periods(NamedTuple):
+    """Seconds between the day's first and last observation, each (m, n_days, 48) float64."""
 
-    replayed: FloatArray  # taken, over the whole replayed day
-    occupied: FloatArray  # taken, only between the day's first and last observation
-    seen: FloatArray  # between the day's first and last observation
+    occupied: FloatArray
+    seen: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,6 +196,43 @@ class OccupancyLog:
             str(path),
         )
 
+    @classmethod
+    def read_all(cls, paths: Sequence[str | os.PathLike[str]]) -> Self:
+        """Read logs of the same slots on different days as one log.
+
+        Raises:
+            InputError: as `read`; or other slots than in the first log, or a day of an earlier one.
+        """
+        log = cls.read(paths[0])
+        for path in paths[1:]:
+            log = log._with(cls.read(path))
+        return log
+
+    def _with(self, other: Self) -> Self:
+        odd = set(self.slot_ids) ^ set(other.slot_ids)
+        if odd:
+            raise InputError(
+                f"{other.source}: slot_id: {min(odd)!r} is in one of this log and {self.source} only,"
+                " wanted the same slots"
+            )
+        twice = set(self.days) & set(other.days)
+        if twice:
+            raise InputError(f"{other.source}: {min(twice)} is also in {self.source}, wanted different days")
+        days = sorted({*self.days, *other.days})
+        slot = {slot_id: i for i, slot_id in enumerate(self.slot_ids)}
+        slots = np.array([slot[slot_id] for slot_id in other.slot_ids], np.int64)
+        mine, theirs = (np.searchsorted(days, log.days) for log in (self, other))
+        return type(self)(
+            self.slot_ids,
+            tuple(days),
+            np.concatenate([self.slot, slots[other.slot]]),
+            np.concatenate([mine[self.day], theirs[other.day]]),
+            np.concatenate([self.second, other.second]),
+            np.concatenate([self.occupied, other.occupied]),
+            self.max_gap_s,
+            f"{self.source},{other.source}",
+        )
+
     @cached_property
     def weekend(self) -> BoolArray:
         """(n_days,) bool, whether the day is a Saturday or Sunday."""
@@ -232,8 +270,8 @@ class OccupancyLog:
         used = self.weekend == (kind == "weekend")
         if days is not None:
             used &= days
-        window = slice(*hours)
-        occupied, seen = (seconds[:, used, window].sum(axis=(1, 2)) for seconds in self._hours[1:])
+        window = slice(*(hour * DAY_PERIODS // DAY_HOURS for hour in hours))
+        occupied, seen = (seconds[:, used, window].sum(axis=(1, 2)) for seconds in self._periods)
         mean: FloatArray = np.divide(occupied, seen, out=np.full(occupied.shape, np.nan), where=seen > 0)
         return mean
 
@@ -242,50 +280,68 @@ class OccupancyLog:
         """(m, n_days) bool, whether the slot was observed on that day."""
         return (np.diff(self.first) > 0).reshape(len(self.days), -1).T
 
-    @property
-    def replayed_share(self) -> FloatArray:
-        """(m, n_days, 24) float64, fraction of each hour that the slot is taken in the replay; 0 without a record."""
-        return self._hours.replayed / HOUR_S
+    def slot_days(self, days: IntArray) -> SlotDays:
+        """Return the states of the slots in half-hours on `days`, (d,) indices.
+
+        A state counts from one observation to the next, the last one of a day to the end of its half-hour.
+        """
+        occupied, seen = (seconds.copy() for seconds in self._periods)
+        record = np.flatnonzero(np.diff(self.first))
+        day, slot = np.divmod(record, len(self.slot_ids))
+        last = self.first[record + 1] - 1
+        period = (self.second[last] // PERIOD_S).astype(np.int64)
+        rest = (period + 1) * PERIOD_S - self.second[last]
+        seen[slot, day, period] += rest
+        occupied[slot, day, period] += np.where(self.occupied[last], rest, 0.0)
+        seen, occupied = seen[:, days], occupied[:, days]
+        taken = np.divide(occupied, seen, out=np.zeros(seen.shape), where=seen > 0)
+        return SlotDays(self.dates(days), taken, seen / PERIOD_S)
+
+    def dates(self, days: ArrayLike) -> Days:
+        """Return the dates of `days`, (d,) indices."""
+        dates = [date.fromisoformat(self.days[day]) for day in np.asarray(days)]
+        return Days(
+            np.array([day.toordinal() for day in dates], np.int64),
+            np.array([day.weekday() for day in dates], np.int64),
+        )
 
     @cached_property
-    def _hours(self) -> _Hours:
-        shape = (len(self.slot_ids), len(self.days), DAY_HOURS)
-        hours = _Hours(np.zeros(shape), np.zeros(shape), np.zeros(shape))
-        _sum_hours(self.first, self.from_s, self.second, self.occupied, *hours)
-        return hours
+    def _periods(self) -> _Periods:
+        shape = (len(self.slot_ids), len(self.days), DAY_PERIODS)
+        periods = _Periods(np.zeros(shape), np.zeros(shape))
+        _sum_periods(self.first, self.from_s, self.second, self.occupied, *periods)
+        return periods
 
 
 @compiled
-def _add_hours(hours: FloatArray, start: float, end: float) -> None:
-    hour = int(start // HOUR_S)
+def _add_seconds(periods: FloatArray, start: float, end: float) -> None:
+    period = int(start // PERIOD_S)
     while start < end:
-        stop = min((hour + 1) * HOUR_S, end)
-        hours[hour] += stop - start
+        stop = min((period + 1) * PERIOD_S, end)
+        periods[period] += stop - start
         start = stop
-        hour += 1
+        period += 1
 
 
 @compiled
-def _sum_hours(
+def _sum_periods(
     first: IntArray,
     from_s: FloatArray,
     second: FloatArray,
     taken: BoolArray,
-    replayed: FloatArray,
     occupied: FloatArray,
     seen: FloatArray,
 ) -> None:
-    n_slots = replayed.shape[0]
+    n_slots = seen.shape[0]
     for record in range(first.size - 1):
         day, slot = record // n_slots, record % n_slots
         last = first[record + 1] - 1
         for i in range(first[record], last + 1):
             start, end = from_s[i], DAY_S if i == last else from_s[i + 1]
             watched, left = max(start, second[first[record]]), min(end, second[last])
-            _add_hours(seen[slot, day], watched, left)
+            _add_seconds(seen[slot, day], watched, left)
             if taken[i]:
-                _add_hours(replayed[slot, day], start, end)
-                _add_hours(occupied[slot, day], watched, left)
+                _add_seconds(occupied[slot, day], watched, left)
 
 
 def csv_columns(

@@ -4,15 +4,19 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from datetime import date
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import logit
 
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import csv_rows
-from parkenv.world.day_error import EXACT, DayError
+from parkenv.files.names import FORECAST_FROM, ForecastFrom
+from parkenv.forecast.slot_days import MAX_DAYS, FittedSlotDays, fit_slot_days
+from parkenv.world.day_error import MAX_LOGITS, DayError
 from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.world.occupancy import (
     DAY_NAMES,
@@ -23,11 +27,14 @@ from parkenv.world.occupancy import (
     Forecast,
     IntArray,
 )
-from parkenv.world.occupancy_fit import fit_constant_rates
+from parkenv.world.occupancy_fit import fit_hourly_decay_rates
 from parkenv.world.occupancy_kernel import (
+    MAX_PROBABILITY,
+    MIN_PROBABILITY,
     RECORDED_DAY,
     kernel,
     recorded_day_at,
+    recorded_day_level,
     recorded_forecast,
     recorded_index,
 )
@@ -108,9 +115,14 @@ def _changes(days: int, slots: IntArray, second: float, count: IntArray) -> None
 
 
 @kernel
-def _forecast(days: int, second: float, p: FloatArray) -> None:
+def _forecast(days: int, second: float, p: FloatArray, decay_rate: FloatArray) -> None:
     for slot in range(p.size):
-        p[slot] = recorded_forecast(recorded_day_at(days, 0), slot, second)
+        p[slot], decay_rate[slot] = recorded_forecast(recorded_day_at(days, 0), slot, second)
+
+
+@kernel
+def _day_level(days: int, second: float) -> float:
+    return float(recorded_day_level(recorded_day_at(days, 0), second))
 
 
 class RecordedWorld:
@@ -119,7 +131,7 @@ class RecordedWorld:
     def __init__(self, occupancy: "RecordedOccupancy", arrival: Arrival) -> None:
         self.arrival = arrival
         self._occupancy = occupancy  # keeps the record's arrays alive
-        self._day = occupancy.day_records([arrival.day])
+        self._day = occupancy.day_records([arrival.day], forecast=False)
         self._midnight = float(self._day["midnight"][0])
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
@@ -164,12 +176,16 @@ class MappedLog(NamedTuple):
     log_slot: IntArray  # (n,)
     record: IntArray  # (n,)
     held_out: frozenset[int]  # days that the world replays; the forecast must not use them
-    share: FloatArray  # (m * 24,) fraction of each hour taken, summed over the other days
-    lot_share: FloatArray  # (24,) the same, also summed over the slots
-    n_days: IntArray  # (m,) number of other days with a record
-    n_records: int  # sum of n_days
-    decay_rate: float
-    day_error: DayError = EXACT
+    known: IntArray  # (k,) days that it is made from
+    replayed: IntArray  # (n,) day that each slot replays
+
+
+class DayForecast(NamedTuple):
+    """Forecast of a replayed day."""
+
+    log_odds: FloatArray  # (n, 48) of P(taken), in the middles of the half-hours
+    day_level: FloatArray  # (48,) standard deviation of the error of the lot's level, logits
+    decay_rate: FloatArray  # (24,) 1/s, by hour
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,20 +195,29 @@ class RecordedOccupancy:
     The lot's slots, nearest to the goal first, get the log's m slots, fullest first (mean occupancy on the
     days of the arrival's class, weekday or weekend): rank r gets log rank floor(r·m/n). If the lot is larger,
     several lot slots share a log slot: the k-th copy replays the k-th next recorded day of the class on which the log
-    slot was observed, cyclically, so no two slots share a record. If it is smaller, the ranks are thinned evenly.
+    slot was observed, so no two slots share a record. After the last day follows the first one with `others`, else the
+    day before the arrival's, and so back. If it is smaller, the ranks are thinned evenly.
 
-    The days that a world replays are not used to map or forecast it.
+    The days that a world replays are not used to map or forecast it; nor, unless with `others`, is any later day.
 
     Args:
         log: the recorded observations.
         walk_m: (n,) float64, m, walking distance from each slot to the goal.
         mapping: (n,) int64, log slot of each lot slot, instead of this rule (see `read_mapping`).
+        replay_from: first day that is replayed; all days by default.
+        forecast_from: the days of the arrival's class that the forecast and the ranks are made from: `others`, all
+            that the world does not replay; `rolling`, those before the earliest that the world replays; `past`, those
+            before `replay_from`. The last two need a `replay_from`.
     """
 
     log: OccupancyLog
     walk_m: FloatArray
     mapping: IntArray | None = None
+    replay_from: date | None = None
+    forecast_from: ForecastFrom = "others"
     _mapped_logs: dict[int, MappedLog] = field(init=False, repr=False, default_factory=dict)
+    _forecasts: dict[int, DayForecast] = field(init=False, repr=False, default_factory=dict)
+    _fitted: dict[tuple[int, ...], FittedSlotDays] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         walk = np.array(self.walk_m, float)
@@ -205,71 +230,82 @@ class RecordedOccupancy:
             if mapping.shape != walk.shape or mapping.min() < 0 or mapping.max() >= m:
                 raise InputError(f"mapping: wanted ({walk.size},) indices of log slots from 0 to {m - 1}")
             object.__setattr__(self, "mapping", mapping)
+        if self.forecast_from not in FORECAST_FROM:
+            raise InputError(
+                f"forecast_from: got {self.forecast_from!r}, wanted one of {', '.join(FORECAST_FROM)}"
+            )
+        if self.replay_from is None and self.forecast_from != "others":
+            raise InputError(f"forecast_from is {self.forecast_from!r}, want replay_from with it")
 
     @property
     def n_slots(self) -> int:
         """Number of slots of the lot."""
         return int(self.walk_m.size)
 
+    @property
+    def _first(self) -> int:
+        """Index of the first day that can be replayed."""
+        first = "" if self.replay_from is None else self.replay_from.isoformat()
+        return int(np.searchsorted(self.log.days, first))
+
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
-        """Draw a recorded day among those on the window's weekdays, and a time of day, both uniform."""
+        """Draw a day to replay among those on the window's weekdays, and a time of day, both uniform."""
         days = self.days_in(window)
         day = days[int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(days))]
         return Arrival(weekday_of(day) * DAY_S + window.draw_second(key), day)
 
     def days_in(self, window: ArrivalWindow) -> list[str]:
-        """Return the recorded days on the window's weekdays; InputError if there are none."""
-        days = [day for day in self.log.days if weekday_of(day) in window.weekdays]
+        """Return the days to replay on the window's weekdays; InputError if there are none."""
+        days = [day for day in self.log.days[self._first :] if weekday_of(day) in window.weekdays]
         if not days:
             names = ",".join(DAY_NAMES[weekday] for weekday in window.weekdays)
-            raise InputError(f"{self.log.source}: no recorded day is one of {names}")
+            since = "" if self.replay_from is None else f" from {self.replay_from} on"
+            raise InputError(f"{self.log.source}: no recorded day{since} is one of {names}")
         return days
 
     def world(self, key: np.uint64, arrival: Arrival) -> RecordedWorld:  # noqa: ARG002 - the day decides all
         """Return the replay of the arrival's day."""
-        self._at(arrival)
+        self._second(arrival)
         return RecordedWorld(self, arrival)
 
     def forecast(self, arrival: Arrival) -> Forecast:
-        """Forecast the occupancy from the hour around the arrival on the other days of its class.
+        """Forecast the occupancy at the arrival by `parkenv.forecast.slot_days`, clipped to [0.001, 0.999].
 
-        P(taken) is the mean of a log slot over the days that the world does not replay, shrunk by a Beta prior worth
-        one day to the mean of all the log's slots, and clipped to [0.001, 0.999]. The decay rate is that of one chain
-        with constant rates, fitted to all observations on those days.
+        The decay rates are those of the hour, fitted to all observations on the days that the forecast is made from.
+        The day error is that of the lot as a whole: where several days are replayed at once, their errors partly
+        cancel.
         """
-        mapped = self._at(arrival)
-        p = np.empty(self.n_slots)
+        second = self._second(arrival)
         day = self.day_records([arrival.day])
-        _forecast(address_of(day, RECORDED_DAY), arrival.time - float(day["midnight"][0]), p)
-        return Forecast(p, np.full(self.n_slots, mapped.decay_rate), mapped.day_error)
+        p, decay_rate = np.empty(self.n_slots), np.empty(self.n_slots)
+        address = address_of(day, RECORDED_DAY)
+        _forecast(address, second, p, decay_rate)
+        return Forecast(p, decay_rate, DayError(_day_level(address, second)))
 
-    def day_records(self, days: Sequence[str]) -> NDArray[np.void]:
+    def day_records(self, days: Sequence[str], forecast: bool = True) -> NDArray[np.void]:
         """Return recorded days for compiled code, (k,) of the dtype RECORDED_DAY; valid while this object lives."""
         log = self.log
-        records = np.empty(len(days), RECORDED_DAY)
+        records = np.zeros(len(days), RECORDED_DAY)
         for record, day in zip(records, days, strict=True):
-            mapped = self.mapped_log(day)
-            record["midnight"], record["decay_rate"] = weekday_of(day) * DAY_S, mapped.decay_rate
-            record["n_records"] = mapped.n_records
-            record["day_error"] = mapped.day_error.level, mapped.day_error.slope
-            for name in ("log_slot", "record", "n_days"):
-                record[name] = address_of(getattr(mapped, name), np.int64)
-            for name in ("share", "lot_share"):
-                record[name] = address_of(getattr(mapped, name), np.float64)
+            record["midnight"] = weekday_of(day) * DAY_S
+            record["record"] = address_of(self.mapped_log(day).record, np.int64)
             record["first"], record["from_s"] = (
                 address_of(log.first, np.int64),
                 address_of(log.from_s, np.float64),
             )
             record["occupied"] = address_of(log.occupied, np.bool_)
+            if forecast:
+                for name, values in self.day_forecast(day)._asdict().items():
+                    record[name] = address_of(values, np.float64)
         return records
 
-    def _at(self, arrival: Arrival) -> MappedLog:
-        if arrival.day not in self.log.days:
+    def _second(self, arrival: Arrival) -> float:
+        if arrival.day not in self.log.days[self._first :]:
             raise InputError(f"Arrival.day: got {arrival.day!r}, wanted a recorded day of {self.log.source}")
         second = arrival.time - weekday_of(arrival.day) * DAY_S
         if not 0 <= second < DAY_S:
             raise InputError(f"Arrival.time: got {arrival.time}, wanted a second of {arrival.day}")
-        return self.mapped_log(arrival.day)
+        return second
 
     def mapped_log(self, day: str) -> MappedLog:
         """Return the log mapped to the lot for the replay of `day`, a day of the log."""
@@ -281,45 +317,78 @@ class RecordedOccupancy:
     def _map_log(self, day: int) -> MappedLog:
         log = self.log
         same_class = np.flatnonzero(log.weekend == log.weekend[day])
-        replay_order = np.roll(same_class, -int(np.searchsorted(same_class, day)))
+        later, earlier = same_class[same_class >= max(day, self._first)], same_class[same_class < day]
+        earlier = earlier[earlier >= self._first]
+        replay_order = np.append(later, earlier if self.forecast_from == "others" else earlier[::-1])
         held_out = {day}
         while True:
-            others = np.isin(np.arange(len(log.days)), [d for d in same_class if d not in held_out])
-            if not others.any():
-                raise InputError(
-                    f"{log.source}: a world of {self.n_slots} slots replays all {same_class.size} recorded"
-                    f" {day_class(log.days[day])} days, wanted at least one more to forecast from"
-                )
-            log_slot = self._assign(log.days[day], others) if self.mapping is None else self.mapping
+            known = self._known(same_class, held_out)
+            log_slot = self._assign(log.days[day], known) if self.mapping is None else self.mapping
             days = self._replay_days(log_slot, replay_order)
             # Replayed days must not affect the ranks: rank again without them.
             if held_out.issuperset(days):
                 break
             held_out.update(days)
-        pairs = log.intervals(log.max_gap_s)
-        used = others[pairs.day]
-        if not used.any():
-            raise InputError(
-                f"{log.source}: no two consecutive observations on the days that are left to forecast from"
-            )
-        rates = fit_constant_rates((pairs.end - pairs.start)[used], pairs.before[used], pairs.after[used])
-        share = log.replayed_share[:, others].sum(axis=1)
-        n_days = log.recorded[:, others].sum(axis=1)
         return MappedLog(
             log_slot,
             days * len(log.slot_ids) + log_slot,
             frozenset(held_out),
-            share.ravel(),
-            share.sum(axis=0),
-            n_days,
-            int(n_days.sum()),
-            sum(rates),
+            known,
+            days,
         )
 
-    def _assign(self, day: str, others: BoolArray) -> IntArray:
+    def day_forecast(self, day: str) -> DayForecast:
+        """Return the forecast of the lot for the replay of `day`, a day of the log."""
+        index = self.log.days.index(day)
+        if index not in self._forecasts:
+            self._forecasts[index] = self._forecast_day(index, self.mapped_log(day))
+        return self._forecasts[index]
+
+    def _known(self, same_class: IntArray, held_out: set[int]) -> IntArray:
+        """Return the days of the class that the forecast and the ranks are made from."""
+        log = self.log
+        if self.forecast_from == "others":
+            known, left = np.setdiff1d(same_class, list(held_out)), "one more"
+        else:
+            end = self._first if self.forecast_from == "past" else min(held_out)
+            known, left = same_class[same_class < end], f"one before {log.days[end]}"
+        if not known.size:
+            raise InputError(
+                f"{log.source}: a world of {self.n_slots} slots replays {len(held_out)} of {same_class.size} recorded"
+                f" {day_class(log.days[same_class[0]])} days, wanted at least {left} to forecast from"
+            )
+        return known
+
+    def _forecast_day(self, day: int, mapped: MappedLog) -> DayForecast:
+        log, known = self.log, mapped.known
+        rates = self._decay_rates(known)
+        days_away = np.abs(log.dates(known).number - log.dates([day]).number)
+        nearest = np.sort(known[np.argsort(days_away, kind="stable")[:MAX_DAYS]])
+        key = tuple(nearest.tolist())
+        if key not in self._fitted:
+            self._fitted[key] = fit_slot_days(log.slot_days(nearest))
+        replayed, which = np.unique(mapped.replayed, return_inverse=True)
+        found = self._fitted[key].forecast(log.dates(replayed))
+        share = np.bincount(which) / which.size
+        level = np.sqrt(np.einsum("j,pjk,k->p", share, found.level_covariance, share))
+        p = np.clip(found.p_taken[which, mapped.log_slot], MIN_PROBABILITY, MAX_PROBABILITY)
+        return DayForecast(np.ascontiguousarray(logit(p)), np.minimum(level, MAX_LOGITS), rates)
+
+    def _decay_rates(self, known: IntArray) -> FloatArray:
+        pairs = self.log.intervals(self.log.max_gap_s)
+        used = np.isin(pairs.day, known)
+        if not used.any():
+            raise InputError(
+                f"{self.log.source}: no two consecutive observations on the days that are left to forecast from"
+            )
+        return fit_hourly_decay_rates(
+            pairs.start[used], pairs.end[used], pairs.before[used], pairs.after[used]
+        )
+
+    def _assign(self, day: str, known: IntArray) -> IntArray:
         """Return the log slot of each lot slot by rank, (n,)."""
         n, m = self.n_slots, len(self.log.slot_ids)
-        mean = self.log.mean_occupancy(day_class(day), days=others)
+        mean = self.log.mean_occupancy(day_class(day), days=np.isin(np.arange(len(self.log.days)), known))
         unknown = np.isnan(mean)
         mean[unknown] = 0.0 if unknown.all() else mean[~unknown].mean()
         log_slot = np.empty(n, np.int64)
@@ -329,8 +398,9 @@ class RecordedOccupancy:
         return log_slot
 
     def _replay_days(self, log_slot: IntArray, replay_order: IntArray) -> IntArray:
-        """Return each lot slot's replay day, (n,): copies of a log slot, nearest first, cycle through the days."""
+        """Return each lot slot's replay day, (n,): copies of a log slot, nearest first, in the days' order."""
         recorded = self.log.recorded[:, replay_order]
+        since = "" if self.replay_from is None else f" from {self.replay_from} on"
         days = np.empty(self.n_slots, np.int64)
         left = {int(s): iter(replay_order[recorded[s]]) for s in np.unique(log_slot)}
         for slot in np.argsort(self.walk_m, kind="stable"):
@@ -343,7 +413,7 @@ class RecordedOccupancy:
                 )
                 raise InputError(
                     f"{self.log.source}: slot {name} would serve {n_copies} slots of the lot but was recorded"
-                    f" on {n_days} days of the class; wanted a smaller lot or a longer log"
+                    f" on {n_days} days of the class{since}; wanted a smaller lot or a longer log"
                 )
             days[slot] = chosen
         return days

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 
 from parkenv.world.lot import ParkingLot
-from parkenv.world.occupancy import OccupancyProcess
+from parkenv.world.occupancy import FloatArray, OccupancyProcess
 
 # Logit of the demand in each hour of a weekday; the shape is that of a campus lot: empty at night, full from
 # mid-morning to mid-afternoon.
@@ -41,11 +41,18 @@ def typical_occupancy(
         demand: logits added at every hour.
         mean_stay_s: mean parking duration, s.
     """
+    return OccupancyProcess.from_demand(
+        attraction(lot, goal, pull, unevenness), _WEEK_DEMAND + demand, mean_stay_s
+    )
+
+
+def attraction(lot: ParkingLot, goal: int, pull: float, unevenness: float) -> FloatArray:
+    """Return the popularity of the slots, (n_slots,) logits; arguments as of `typical_occupancy`."""
     walk = lot.walk_m(goal)
     span = float(np.ptp(walk)) or 1.0
     nearness = 1.0 - 2.0 * (walk - walk.min()) / span
     noise = np.random.default_rng(lot.n_slots).normal(0.0, unevenness, lot.n_slots)
-    return OccupancyProcess.from_demand(pull * nearness + noise, _WEEK_DEMAND + demand, mean_stay_s)
+    return np.asarray(pull * nearness + noise)
 
 
 def with_event(

@@ -100,9 +100,13 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         day: whether to learn from observations how the day differs from its forecast; if not, the forecast is believed
             to be right whatever is observed.
         most_vertices: a larger lot is planned for in part (`Neighborhoods`).
+        explore: s, what the first observation of a slot with a forecast of 50 % is worth for later searches, with a map
+            that learns from trips; it is in proportion to p(1 - p). A slot that nothing later on the path can beat is
+            taken all the same.
 
     Raises:
-        InputError: the budget is not positive, `most_vertices` is out of range, or no slot can be observed.
+        InputError: the budget is not positive, `explore` is negative, `most_vertices` is out of range, or no slot
+            can be observed.
     """
 
     name: ClassVar[str] = "belief"
@@ -113,11 +117,15 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         budget_ms: float = 1.0,
         day: bool = True,
         most_vertices: int = MOST_VERTICES,
+        explore: float = 0.0,
     ) -> None:
         super().__init__(problem)
         require_observations(self.name, problem)
         if not (budget_ms > 0.0 and math.isfinite(budget_ms)):
             raise InputError(f"budget_ms is {budget_ms}, want a finite number above 0")
+        if not (explore >= 0.0 and math.isfinite(explore)):
+            raise InputError(f"explore is {explore}, want finite seconds of at least 0")
+        self._explore = explore
         self._day = day
         self._nearness = nearness(self.problem.walk_s)
         self._worth_passing_s = WORTH_PASSING_S if day else 0.0
@@ -203,7 +211,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             memory.remaining_s,
             self._budget,
             near.planning_graph(self.problem, self._failure_s),
-            _snapshot(here, known, memory),
+            _snapshot(here, known, memory, self._explore),
             memory.path,
         )
         kept = choice.failure_s == memory.failure_s and np.array_equal(choice.targets, memory.targets)
@@ -259,7 +267,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         return PlanPreview(tuple(path))
 
 
-def _snapshot(here: int, known: SlotBelief, memory: BeliefSearch) -> BeliefSnapshot:
+def _snapshot(here: int, known: SlotBelief, memory: BeliefSearch, explore: float) -> BeliefSnapshot:
     """Return the belief about the slots of a part as the path search uses it."""
     weights, p_free_if = memory.day.mixture()
     n, state = len(memory.state), memory.state
@@ -273,6 +281,7 @@ def _snapshot(here: int, known: SlotBelief, memory: BeliefSearch) -> BeliefSnaps
     slots["p_free"], slots["p_free_usual"], slots["decay_rate"] = p_free, usual, rate
     slots["odds"] = np.divide(1.0 - on_arrival, on_arrival, out=np.full(n, np.inf), where=on_arrival > 0.0)
     slots["least_odds"] = 1.0 / usual - 1.0
+    slots["bonus_s"] = 4.0 * explore * known.forecast * (1.0 - known.forecast)
     slots["missed_rate"], slots["state"] = memory.missed_rate, state
     return BeliefSnapshot(slots, weights, p_free_if)
 

@@ -201,6 +201,14 @@ def _stop_optimally(n_stops: int, left_s: float, path: PathBuffer) -> tuple[floa
             expected += rest * observations[i].p_free * observations[i].value
             rest *= 1.0 - observations[i].p_free
         nothing = expected + rest * nothing
+        bonus_s = 0.0
+        for i in range(first, last):
+            if observations[i].is_first:
+                bonus_s += belief.slots[observations[i].slot].bonus_s
+        if bonus_s > 0.0:
+            nothing -= bonus_s
+            for j in range(oldest, first):
+                observations[j].value -= bonus_s
         onward = stops[k].time - stops[k - 1].time
     return onward + nothing, then_s
 

@@ -34,6 +34,7 @@ SLOT = np.dtype(
         ("decay_rate", np.float64),  # 1/s, rate of that decay
         ("odds", np.float64),  # P(taken)/P(free) at about the earliest arrival of the car; inf where hopeless
         ("least_odds", np.float64),  # the value to which those decay
+        ("bonus_s", np.float64),  # s, value of its first observation for later searches
         ("missed_rate", np.float64),  # highest detection rate among the views from which it was not detected
         ("state", np.int64),  # `SlotBelief.state`
     ]

@@ -15,8 +15,10 @@ from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.evaluation.bench.rows import BenchRow, absent, rate
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import make_scenario
+from parkenv.world.day_error import DayError
 from parkenv.world.lot import ACTIONS
 from parkenv.world.scenario import Scenario
+from parkenv.world.typical_week import typical_occupancy
 
 BATCH = 1024
 SLOTS = (10, 20)
@@ -37,6 +39,8 @@ def env_rows(
     resets. Actions are drawn beforehand. Gymnasium's CartPole batch is numpy on four numbers per environment, without
     a world to simulate or a belief to maintain.
 
+    Days that differ from their forecast are compared with days that do not, in the same run.
+
     Environments take turns. The value of each is the median over its turns, in CPU seconds of this process, so that
     other load on the machine affects all equally.
 
@@ -49,6 +53,7 @@ def env_rows(
     import parkenv  # noqa: F401 - registers the environments
 
     scenario = make_scenario(grid_lot(*SLOTS))
+    days = scenario.replace(occupancy=typical_occupancy(scenario.lot).with_day_error(DayError(0.8)))
     city = make_scenario(city_lot(large, seed))
     batches = {
         f"batch of {batch}, {scenario.lot.n_slots} slots, full belief, copy=False": _ours(
@@ -66,7 +71,11 @@ def env_rows(
     cart_pole = gym.make_vec("CartPole-v1", batch, vectorization_mode="vector_entry_point")
     steppers = {case: batch_stepper(envs, len(ACTIONS), seed) for case, envs in batches.items()}
     steppers |= {"CartPole batch": batch_stepper(cart_pole, 2, seed)}
-    steppers |= {"Search-v2": single_stepper(gym.make("parkenv/Search-v2", scenario=scenario), seed)}
+    steppers |= {
+        "batch with days": batch_stepper(_ours(days, batch, "full", False), len(ACTIONS), seed),
+        "Search-v2": single_stepper(gym.make("parkenv/Search-v2", scenario=scenario), seed),
+        "Search-v2 with days": single_stepper(gym.make("parkenv/Search-v2", scenario=days), seed),
+    }
     steppers |= {"CartPole": single_stepper(gym.make("CartPole-v1"), seed)}
     others, missing = installed_peers(batch, seed)
     rates = measured(steppers | others, seconds)
@@ -78,6 +87,12 @@ def env_rows(
     rows += rate(
         "single", f"Search-v2, {scenario.lot.n_slots} slots", rates["Search-v2"], "steps/s", **single
     )
+    for part, case, name in (
+        ("batch", next(iter(batches)), "batch with days"),
+        ("single", "Search-v2", "Search-v2 with days"),
+    ):
+        without = {"the same without": rates[case]}
+        rows += rate(part, f"{case}, day error 0.8", rates[name], "steps/s", **without)
     for name in missing:
         rows += absent("single", f"{name}: not installed", "steps/s")
     for case, envs in batches.items():

@@ -132,6 +132,9 @@ def result_of(
         folder: their finished episodes.
         command: the command that ran them.
         by: who submits the result; dated today.
+
+    Raises:
+        InputError: the wall times of an agent's decisions are lost.
     """
     episodes: dict[str, dict[str, dict[str, list[float]]]] = {}
     for case, seeds in cases:
@@ -139,6 +142,13 @@ def result_of(
         episodes.setdefault(case.label, {})[case.scenario.name] = {
             column: [round(row[column], 6) for row in rows] for column in ("total_s", "bound_s")
         }
+    measured = table(cases, folder)
+    for row in measured:
+        if missing := [metric for metric in METRICS if metric not in row]:
+            raise InputError(
+                f"{folder.path}: holds no {missing[0]} of {row['agent']} in {row['scenario']}, as timings.csv is not "
+                "whole; run the suite again with --overwrite"
+            )
     rows = [
         {
             "task": row["scenario"],
@@ -146,7 +156,7 @@ def result_of(
             **{metric: row[metric] for metric in METRICS},
             "score": _score(episodes[row["agent"]][row["scenario"]]),
         }
-        for row in table(cases, folder)
+        for row in measured
     ]
     return {
         "format": RESULT_FORMAT,

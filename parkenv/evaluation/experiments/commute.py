@@ -32,6 +32,7 @@ from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap,
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.trips import Trip
 from parkenv.scenarios.build import build
+from parkenv.world.counted_occupancy import CountedOccupancy
 from parkenv.world.keyed_random import world_key
 from parkenv.world.occupancy import ArrivalWindow, PriorModel
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -66,7 +67,7 @@ def calendar(scenario: Scenario, days: int) -> list[Day]:
     A log with fewer days than wanted ends the commute early.
     """
     occupancy, window = scenario.occupancy, scenario.arrival
-    if isinstance(occupancy, RecordedOccupancy):
+    if isinstance(occupancy, RecordedOccupancy | CountedOccupancy):
         dates = sorted(occupancy.days_in(window))[:days]
         counts = [date.fromisoformat(day).toordinal() for day in dates]
         first_monday = counts[0] - date.fromisoformat(dates[0]).weekday()
@@ -390,6 +391,7 @@ def week_rows(episodes: Sequence[Row]) -> list[Row]:
     The difference is paired by course: the same driver on the same days.
     """
     cases = _grouped(episodes, lambda row: (row["day_number"] - 1) // 5 + 1)
+    last = max((row["day_number"] for row in episodes), default=0)
     reference = {case[0]: by_week for case, by_week in reversed(cases.items()) if case[1] == NONE}
     rows = []
     for case, by_week in cases.items():
@@ -397,7 +399,7 @@ def week_rows(episodes: Sequence[Row]) -> list[Row]:
             its = list(by_course.values())
             row = {
                 **dict(zip(("scenario", "map", "agent"), case, strict=True)),
-                "days": f"{5 * week - 4}-{5 * week}",
+                "days": f"{5 * week - 4}-{min(5 * week, last)}",
                 "courses": len(by_course),
                 **_mean("total_s", its),
                 **_mean("forecast_error", its),
@@ -430,7 +432,9 @@ def _course_mean(name: str, episodes: Sequence[Mapping[str, Any]]) -> float:
 
 
 def _mean(name: str, courses: Iterable[Sequence[Row]]) -> Row:
-    mean, low, high = mean_interval([_course_mean(name, its) for its in courses])
+    means = [_course_mean(name, its) for its in courses]
+    # Agents without a map have no forecast error.
+    mean, low, high = mean_interval(means) if np.isfinite(means).all() else (np.nan,) * 3
     return {name: mean, f"{name}_ci95": [low, high]}
 
 

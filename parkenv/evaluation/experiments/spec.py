@@ -146,9 +146,10 @@ class CommuteSpec(Workplace):
 
     kind: Literal["commute"] = "commute"
     agents: Several[AgentItem] = Field(
-        tuple(AgentSpec(name=name) for name in ("belief", "mdp", "first-free")),
-        min_length=1, max_length=1_000,
-    )  # fmt: skip
+        tuple(AgentSpec(name=name) for name in ("belief", "mdp", "first-free", "greedy-drive")),
+        min_length=1,
+        max_length=1_000,
+    )
     scenarios: Several[ScenarioItem] = Field((scenario_spec("campus"),), min_length=1, max_length=1_000)
     maps: Annotated[Axis[MapName], BeforeValidator(_listed)] = Field(
         ("empty",), description="Maps to start from: empty, right or wrong."

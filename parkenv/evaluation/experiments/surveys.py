@@ -24,6 +24,7 @@ from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
 from parkenv.mapping.survey_score import DISTANCE_ENDS, METHODS
 from parkenv.scenarios.build import build
+from parkenv.world.counted_occupancy import CountedOccupancy
 from parkenv.world.occupancy import Arrival, ArrivalWindow, OccupancyModel
 from parkenv.world.occupancy_log import weekday_of
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -245,11 +246,11 @@ def detection_by_distance(rows: Sequence[Row]) -> list[Row]:
 def mean_occupancy(occupancy: OccupancyModel, window: ArrivalWindow) -> FloatArray:
     """Return the true P(taken) of every slot in the middle of a window, (n_slots,), as a reference for maps.
 
-    For a process, this is the marginal on the window's first day; for a recorded log, the fraction of its days on
-    which the slot was taken at that time.
+    For a process, this is the marginal on the window's first day; for a log or counts, the fraction of the days on
+    which the slot is taken at that time.
     """
     middle = 0.5 * (window.start_s + window.end_s)
-    if isinstance(occupancy, RecordedOccupancy):
+    if isinstance(occupancy, RecordedOccupancy | CountedOccupancy):
         arrivals = [Arrival(weekday_of(day) * DAY_S + middle, day) for day in occupancy.days_in(window)]
         slots = np.arange(occupancy.n_slots)
         taken = [occupancy.world(np.uint64(0), arrival).occupied(slots, arrival.time) for arrival in arrivals]

@@ -56,7 +56,9 @@ def _panel(
         "title": title,
         "share": share,
         "mean": [[row["steps"], *(row.get(name) for name in (column, low, high))] for row in curve],
-        "seeds": [[[row["steps"], row[column]] for row in its if column in row] for its in seeds],
+        "seeds": [
+            [[row["steps"], row[column]] for row in its if {"steps", column} <= row.keys()] for its in seeds
+        ],
         "beside": [[name, [[row["steps"], row[median]] for row in its]] for name, its in beside.items()],
         "lines": [[name, value] for name, value in lines.items()],
     }

@@ -147,6 +147,8 @@ def _title(kind: str, summary: Mapping[str, Any]) -> str:
     where = f" on {_listed(names)}" if names else ""
     if kind == "compare":
         return f"Agents compared{where}"
+    if kind == "commute":
+        return f"Maps that learn from every trip{where}"
     if kind == "survey":
         return f"Survey{where}"
     if kind == "demo":

@@ -40,6 +40,11 @@ _KNOWN = {
         Column("test_scenario", "tested on"),
         Column("occupancy_level", "occupancy level", share=True, digits=0, help="Mean occupancy the lot was set to"),
         Column("agent", "agent"),
+        Column("map", "map at first", help="fixed: right, does not learn; none: the agent uses no map"),
+        Column("day", "day", digits=0),
+        Column("days", "days"),
+        Column("courses", "drivers", digits=0),
+        Column("forecast_error", "forecast error", digits=3, help="Brier score of P(taken) at the arrival"),
         Column("failure_cost_s", "failure cost", "s", 0, help="Time of a failed parking attempt"),
         Column("v_walk_kmh", "walk", "km/h", 0),
         Column("v_drive_kmh", "drive", "km/h", 0),
@@ -103,9 +108,9 @@ _KNOWN = {
     )
 }  # fmt: skip
 _ORDER = (
-    "scenario", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh", "agent",
-    "seed", "total_s", "difference_s", "gap_to_exact", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s",
-    "gave_up_s", "parked_fraction",
+    "scenario", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh",
+    "agent", "seed", "total_s", "difference_s", "gap_to_exact", "regret_s", "drive_s", "failed_s", "walk_s",
+    "parking_cost_s", "gave_up_s", "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""
 _TABLES_OF_THEIR_OWN = ("by_weather",)
@@ -150,7 +155,7 @@ def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False)
         same = [
             k
             for k in same
-            if values[k][0] is None or k in _ORDER[:7] or k in ("episodes", "rig", "slots", *OPTIONAL_TIMES)
+            if values[k][0] is None or k in _ORDER[:8] or k in ("episodes", "rig", "slots", *OPTIONAL_TIMES)
         ]
     shown = [k for k in keys if k not in same]
     return {
@@ -209,6 +214,8 @@ def tables_of(kind: str, summary: Mapping[str, Any], sessions: Sequence[Row]) ->
         tables.append(table_of("transfer", "Test in held-out worlds", summary["transfer"]))
     if summary.get("planners"):
         tables.append(table_of("planners", "Planners in the same worlds", summary["planners"]))
+    if summary.get("weeks"):
+        tables.append(table_of("weeks", "By five days", summary["weeks"]))
     if summary.get("occupancy_rows"):
         tables.append(table_of("occupancy_rows", "By occupancy level", summary["occupancy_rows"]))
     if surveyed:

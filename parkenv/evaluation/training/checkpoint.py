@@ -36,6 +36,9 @@ def save_checkpoint(path: Path, model: Any, curve: list[Row]) -> None:
         path: file to write, atomically.
         model: of stable-baselines3 or sb3-contrib; its environment has `get_state` and `set_state`.
         curve: evaluations so far.
+
+    Raises:
+        InputError: the file cannot be written.
     """
     buffer = getattr(model, "replay_buffer", None)
     state = {
@@ -56,8 +59,12 @@ def save_checkpoint(path: Path, model: Any, curve: list[Row]) -> None:
             )
         ),
     }
-    with atomic_write(path) as beside:
-        torch.save(state, beside)
+    with atomic_write(path) as beside, beside.open("wb", buffering=0) as file:
+        try:
+            torch.save(state, file)
+        except RuntimeError as error:
+            # PyTorch raises its own error after that of a full disk.
+            raise error.__context__ or error from None
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Any], list[Row]]:

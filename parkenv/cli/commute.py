@@ -1,0 +1,157 @@
+"""`parkenv commute`: drivers come day after day, with a map that learns from their trips."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from parkenv.cli import arguments as args
+from parkenv.cli.report import make_report
+from parkenv.cli.single_writer import writing_into
+from parkenv.cli.tables import command_line, make_console, make_table, progress_bar
+from parkenv.cli.trust import readable_models, require_trust
+
+if TYPE_CHECKING:
+    from rich.progress import TaskID
+    from rich.table import Table
+
+    from parkenv.evaluation.experiments.spec import CommuteSpec
+
+PICTURE = "commute.png"
+
+
+def commute(
+    agents: str | None = None,
+    scenario: str | None = None,
+    map: str | None = None,
+    days: int | None = None,
+    drivers: int | None = None,
+    fleet: int | None = None,
+    seed: int | None = None,
+    out: Path = Path("results/commute"),
+    *,
+    lot: str | None = None,
+    occupancy: str | None = None,
+    mapping: str | None = None,
+    hours: str | None = None,
+    sensor_model: str | None = None,
+    figures: bool | None = None,
+    trust: bool = False,
+    trust_model: bool = False,
+    folder: args.RunFolder,
+    machines: args.Machines,
+) -> None:
+    """Let drivers come day after day, with a map that learns from every trip.
+
+    Each driver comes at the same time of day, on the next of the scenario's weekdays or recorded days. What the car
+    observes on a search goes into its map in the evening, with the sensor's error rates; the next day's forecast is
+    corrected by it. Nobody tells the map what else was free.
+
+    The table and the picture show mean total time and forecast error (Brier score of P(taken) at the arrival, over
+    all slots) against the day. For comparison, each agent also drives with the right map that does not learn (fixed);
+    agents that use no map (first-free, greedy-drive, ...) have one level. All meet the same worlds.
+
+    Examples:
+        parkenv commute --scenario jam --map wrong
+        parkenv commute --scenario campus,jam --map empty,wrong --days 20
+        parkenv commute --agents belief,first-free --drivers 100
+        parkenv commute --fleet 5 --map empty
+        parkenv commute --resume --days 60
+
+    Options:
+        agents (NAME[,...]): Agents, with any options in brackets; differences in `weeks` of summary.json are to the
+            first that uses no map.  [default: belief,mdp,first-free,greedy-drive]
+        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus]
+        map (empty|right|wrong[,...]): The map on the first day. empty: 50 % for every slot. right: the forecast of the
+            scenario's occupancy. wrong: the forecast of the scenario where it differs from that (jam), else the right
+            one with near and far slots exchanged.  [default: empty]
+        days (N >= 1): Days on which each driver comes, at most those of a recorded log.  [default: 30]
+        drivers (N >= 1): Drivers (or fleets), each with a map of their own: the more, the narrower the intervals.
+            [default: 40]
+        fleet (N >= 1): Drivers who share a map, and come every day.  [default: 1]
+        seed (N >= 0): Seed of days and drivers.  [default: 0]
+        out, -o (DIR): Folder for experiment.json, episodes.csv, summary.json, commute.png and the maps.
+
+    World:
+        occupancy (FILE): Which slots are taken when: a recorded log (.csv, .csv.gz), or a process (.json).  [default:
+            the scenario's]
+        mapping (FILE): CSV slot_id,log_slot_id that assigns the log's slots to the lot's.  [default: the log's fullest
+            slots are nearest to the goal]
+        hours (HH:MM-HH:MM): Drivers come between these hours.  [default: the scenario's, 08:00-13:00]
+
+    Sensors:
+        sensor_model (NAME|FILE): How slots are observed. perfect, blind, laser, stereo, or a file of `parkenv
+            fit-sensor-model`.  [default: the scenario's]
+
+    Results:
+        figures: Draw the picture.  [default: figures]
+    """
+    from parkenv.evaluation.experiments.agent_spec import split_agents
+    from parkenv.evaluation.experiments.spec import CommuteSpec
+
+    base = CommuteSpec()
+    if folder.resume:
+        base = args.saved(out, CommuteSpec)
+        if agents is None:
+            require_trust(base, out, trust)
+    given = args.not_none(days=days, drivers=drivers, fleet=fleet, seed=seed, figures=figures)
+    if agents is not None:
+        given["agents"] = readable_models(split_agents(agents), trust_model)
+    if map is not None:
+        given["maps"] = tuple(args.words("--map", map))
+    world = args.ObservedSearches(
+        lot=lot, occupancy=occupancy, mapping=mapping, hours=hours, sensor_model=sensor_model
+    )
+    spec = base.changed(scenarios=tuple(world.specs(scenario, base.scenarios)), **given, **machines.given)
+    with writing_into(out, f"--resume --out {out}"):
+        run_commute_of(spec, out, folder)
+
+
+def run_commute_of(spec: CommuteSpec, out: Path, folder: args.RunFolder) -> None:
+    """Run a commute with a progress bar, print its tables and draw its picture.
+
+    Raises:
+        InputError: the commute cannot be run, or the folder cannot be used.
+        KeyboardInterrupt: the run was interrupted; the results of finished days are printed and in the folder.
+    """
+    from parkenv.evaluation.experiments.commute import run_commute
+
+    console = make_console()
+    with progress_bar(console, "searches") as progress:
+        bars: list[TaskID] = []
+        result = run_commute(
+            spec,
+            out,
+            command=command_line(),
+            resume=folder.resume,
+            overwrite=folder.overwrite,
+            workers=args.workers_of(spec),
+            on_start=lambda n: bars.append(progress.add_task("Driving", total=n)),
+            on_progress=lambda n: progress.advance(bars[0], n),
+        )
+    for name in dict.fromkeys(row["scenario"] for row in result.weeks):
+        console.print(_table(name, [row for row in result.weeks if row["scenario"] == name]))
+    if not result.complete:
+        raise KeyboardInterrupt
+    if spec.figures:
+        from parkenv.evaluation.figures.commute_curves import save_commute_curves
+
+        with console.status("Drawing the picture"):
+            save_commute_curves(result.rows, out / PICTURE)
+    console.print(f"Episodes, summary and maps{' and the picture' if spec.figures else ''} are in {out}")
+    if folder.report:
+        make_report(out, spec)
+
+
+def _table(scenario: str, rows: list[dict[str, Any]]) -> Table:
+    """Make a table of mean total times, s, by map, agent and week, each with its forecast error."""
+    weeks = list(dict.fromkeys(row["days"] for row in rows))
+    cells: dict[tuple[str, str], dict[str, str]] = {}
+    for row in rows:
+        error = "" if row["forecast_error"] != row["forecast_error"] else f" ({row['forecast_error']:.3f})"
+        cells.setdefault((row["map"], row["agent"]), {})[row["days"]] = f"{row['total_s']:.1f}{error}"
+    return make_table(
+        f"{scenario}: total s (forecast error) by days, {rows[0]['courses']} drivers",
+        ("map", "agent", *(f"days {week}" for week in weeks)),
+        ((*key, *(its.get(week, "") for week in weeks)) for key, its in cells.items()),
+    )

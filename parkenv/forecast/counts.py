@@ -1,0 +1,357 @@
+"""Hourly counts of free places of whole car parks, cleaned by stated rules.
+
+A file has the columns `car_park,capacity,free` and `hour` (local time) or `hour_utc`. Real counts have faults. Each
+reading that is changed or dropped is counted under the name of its rule:
+
+- `negative`: below 0. Down to -5 % of the capacity it counts as full, below that it is dropped.
+- `above_capacity`: more free places than places. Up to 5 % it counts as empty, above that it is dropped (unless
+  the capacity is estimated, see below).
+- `stuck`: a run of equal readings is dropped if chance makes one of that length less than once in a billion, given
+  how often readings of those hours repeat on earlier days; so is one of over a day at full, or three days at empty.
+- `capacity_changed`: the stated capacity changes from one day to the next; occupancy refers to the day's own.
+- `capacity_estimated`: days of a car park where in the 28 days before more than 5 % of the readings exceed the stated
+  capacity. The 98 % quantile of those readings then serves as the capacity.
+- `duplicate`: several readings of one hour; the last counts. In the hour that comes twice, their mean.
+- `summer_time`: days of 23 or 25 hours. `gap`: hours without a reading between a car park's first and last day.
+
+Every rule looks back only: what is known of a day does not depend on later days. The exception are the hours of a run
+before it is recognised as stuck: `seen` has them, `occupied` has not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, date, datetime, timedelta
+from functools import cached_property
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError, nearest
+from parkenv.files.limited_reading import csv_rows
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+HOURS = 24
+MAX_COUNT_BYTES = 512_000_000
+"""Maximum size of a file of counts, unpacked."""
+MAX_NAME = 200
+"""Maximum length of a car park's name, characters."""
+MAX_DAYS = 400_000
+"""Maximum number of car parks times days of a file of counts."""
+_TOLERANCE = 0.05  # of the capacity
+_SURPRISE = math.log(1e9)
+_WINDOW = 28  # days
+_REPEATS_PRIOR = (2.0, 4.0)  # repeats of readings, and pairs, assumed before any is seen
+
+
+@dataclass(frozen=True, eq=False)
+class Counts:
+    """Occupancy of car parks by local hour; arrays over (car park, day, hour of the day).
+
+    Args:
+        car_parks: (c,) names.
+        days: (d,) dates without a gap, ascending.
+        capacity: (c, d) float64, places; that of the day before where a day states none.
+        occupied: (c, d, 24) float64, fraction of the places that is taken; NaN without a usable reading.
+        seen: (c, d, 24) float64, the same as known at the end of that day, for models that learn day by day.
+        faults: (c,) number of readings, or days, by rule.
+        source: name of the file in messages.
+    """
+
+    car_parks: tuple[str, ...]
+    days: tuple[date, ...]
+    capacity: FloatArray
+    occupied: FloatArray
+    seen: FloatArray
+    faults: tuple[dict[str, int], ...]
+    source: str = "counts"
+
+    @classmethod
+    def read(cls, path: str | Path, timezone: str = "Europe/Berlin") -> Counts:
+        """Read a file of counts and clean it.
+
+        Args:
+            path: .csv or .csv.gz.
+            timezone: IANA name of the local time of `hour_utc`, and of when summer time begins and ends.
+
+        Raises:
+            InputError: the file cannot be read, or is not such a file; the message names file, line and field.
+        """
+        zone = _time_zone(timezone)
+        readings = _read(path, zone)
+        return _cleaned(readings, zone, str(path))
+
+    @cached_property
+    def weekday(self) -> NDArray[np.int64]:
+        """(d,) weekday of each day, Monday = 0."""
+        return np.array([day.weekday() for day in self.days])
+
+    def day_index(self, day: date) -> int:
+        """Return the index of a date; 0 for one before the first, `len(days)` for one after the last."""
+        return min(max((day - self.days[0]).days, 0), len(self.days))
+
+    def total_faults(self) -> dict[str, int]:
+        """Return the number of readings, or days, by rule, over all car parks."""
+        return {name: sum(faults[name] for faults in self.faults) for name in self.faults[0]}
+
+    def idle(self, most: float = 0.02) -> dict[str, str]:
+        """Return what is odd about car parks that show no use: by name, without readings, dead, or never filling."""
+        found = {}
+        for name, y in zip(self.car_parks, self.occupied, strict=True):
+            y = y[np.isfinite(y)]
+            if not y.size:
+                found[name] = "no usable readings"
+            elif np.quantile(y, 0.98) - np.quantile(y, 0.02) < most:
+                found[name] = f"dead: always {np.median(y):.0%} full"
+            elif np.quantile(y, 0.999) < 0.25:
+                found[name] = f"never filling: at most {y.max():.0%} full"
+        return found
+
+    def chosen(self, names: Iterable[str]) -> Counts:
+        """Return the counts of some car parks.
+
+        Raises:
+            InputError: an unknown name.
+        """
+        rows = []
+        for name in names:
+            if name not in self.car_parks:
+                raise InputError(f"{self.source}: has no car park {name!r}; {nearest(name, self.car_parks)}")
+            rows.append(self.car_parks.index(name))
+        return self.part(rows)
+
+    def part(
+        self, rows: Sequence[int] | NDArray[np.int64], first: int = 0, last: int | None = None
+    ) -> Counts:
+        """Return the counts of car parks by index, and of the days with index `first` to `last` - 1."""
+        days = slice(first, last)
+        names, faults = zip(*((self.car_parks[i], self.faults[i]) for i in rows), strict=True)
+        capacity, occupied, seen = (array[rows, days] for array in (self.capacity, self.occupied, self.seen))
+        return Counts(names, self.days[days], capacity, occupied, seen, faults, self.source)
+
+
+def is_counts(path: str | Path) -> bool:
+    """Return whether a file has the columns of counts, and not those of a log of slots.
+
+    Raises:
+        InputError: the file cannot be read.
+    """
+    _, header = next(csv_rows(path, MAX_COUNT_BYTES), (0, []))
+    return {"car_park", "free"} <= set(header)
+
+
+@dataclass(frozen=True)
+class _Readings:
+    car_parks: tuple[str, ...]
+    first: date
+    n_days: int
+    park: NDArray[np.int64]
+    day: NDArray[np.int64]
+    hour: NDArray[np.int64]
+    capacity: FloatArray
+    free: FloatArray
+
+
+def _time_zone(name: str) -> ZoneInfo:
+    try:
+        return ZoneInfo(name)
+    except (KeyError, ValueError, OSError) as error:
+        raise InputError(f"timezone is {name!r}, want an IANA name such as Europe/Berlin") from error
+
+
+def _read(path: str | Path, zone: ZoneInfo) -> _Readings:
+    rows = csv_rows(path, MAX_COUNT_BYTES)
+    _, header = next(rows, (0, []))
+    time = "hour_utc" if "hour_utc" in header else "hour"
+    try:
+        columns = [header.index(name) for name in ("car_park", "capacity", time, "free")]
+    except ValueError:
+        raise InputError(f"{path}: want the columns car_park,capacity,hour,free (or hour_utc)") from None
+    names: dict[str, int] = {}
+    times: dict[str, tuple[int, int]] = {}
+    numbers: dict[str, float] = {}
+    table: list[tuple[int, int, int, float, float]] = []
+    for line, row in rows:
+        name, capacity, moment, free = (row[i] for i in columns)
+        if name not in names and not (0 < len(name) <= MAX_NAME and name.isprintable()):
+            raise InputError(f"{path}: line {line}: car_park is {name!a:.40}, want a printable name")
+        try:
+            if moment not in times:
+                times[moment] = _local_hour(moment, zone, utc=time == "hour_utc")
+            for text in (capacity, free):
+                if text not in numbers:
+                    numbers[text] = float(text) if text.strip() else math.nan
+        except (ValueError, OverflowError):
+            raise InputError(
+                f"{path}: line {line}: want an ISO time and numbers, got {','.join(row)!r:.80}"
+            ) from None
+        table.append((names.setdefault(name, len(names)), *times[moment], numbers[capacity], numbers[free]))
+    if not table:
+        raise InputError(f"{path}: has no readings, want at least one")
+    values = np.array(table, float)
+    rank = np.unique(list(names), return_inverse=True)[1]
+    days = values[:, 1].astype(np.int64)
+    n_days = int(days.max() - days.min()) + 1
+    if n_days * len(names) > MAX_DAYS:
+        raise InputError(
+            f"{path}: has {len(names):,} car parks over {n_days:,} days, want at most {MAX_DAYS:,} in all"
+        )
+    return _Readings(
+        tuple(sorted(names)),
+        date.fromordinal(int(days.min())),
+        n_days,
+        rank[values[:, 0].astype(np.int64)],
+        days - days.min(),
+        values[:, 2].astype(np.int64),
+        values[:, 3],
+        values[:, 4],
+    )
+
+
+def _local_hour(text: str, zone: ZoneInfo, *, utc: bool) -> tuple[int, int]:
+    """Return the day (proleptic Gregorian ordinal) and the hour of a time."""
+    moment = datetime.fromisoformat(text)
+    if utc or moment.tzinfo is not None:
+        moment = (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).astimezone(zone)
+    return moment.toordinal(), moment.hour
+
+
+def _cleaned(readings: _Readings, zone: ZoneInfo, source: str) -> Counts:
+    days = tuple(readings.first + timedelta(i) for i in range(readings.n_days))
+    changes = _summer_time(days, zone)
+    stated, free, duplicates = _by_hour(readings, changes)
+    known = np.isfinite(stated)
+    stated = _carried_forward(stated)
+    changed = (np.diff(stated, axis=1) != 0) & known[:, 1:]
+    capacity = np.stack([_capacity_in_force(*pair) for pair in zip(stated, free, strict=True)])
+    whole = capacity[:, :, None]
+    with np.errstate(invalid="ignore"):
+        negative, above = free < 0, free > stated[:, :, None]
+        lost = (free < -_TOLERANCE * whole) | (free > (1 + _TOLERANCE) * whole)
+    occupied = 1.0 - np.where(lost, np.nan, np.clip(free, 0.0, whole)) / whole
+    recognised, stuck = _stuck(occupied, np.array([day.weekday() >= 5 for day in days]))
+    spans = [_span(np.isfinite(y).any(axis=1)) for y in occupied]
+    faults = tuple(
+        {
+            "negative": int(negative[i].sum()),
+            "above_capacity": int(above[i].sum()),
+            "stuck": int(stuck[i].sum()),
+            "capacity_changed": int(changed[i].sum()),
+            "capacity_estimated": int((capacity[i] != stated[i]).sum()),
+            "duplicate": int(duplicates[i]),
+            "summer_time": sum(k in range(readings.n_days)[span] for k in changes),
+            "gap": int(np.isnan(occupied[i, span]).sum()),
+        }
+        for i, span in enumerate(spans)
+    )
+    usable, seen = (np.where(mask, np.nan, occupied) for mask in (stuck, recognised))
+    return Counts(readings.car_parks, days, capacity, usable, seen, faults, source)
+
+
+def _span(present: BoolArray) -> slice:
+    """Return the days from the first to the last with a reading."""
+    where = np.flatnonzero(present)
+    return slice(where[0], where[-1] + 1) if where.size else slice(0)
+
+
+def _summer_time(days: tuple[date, ...], zone: ZoneInfo) -> dict[int, int]:
+    """Return the days of 23 or 25 hours, by index, with the hour that comes twice, -1 if none does."""
+    midnights = [datetime(day.year, day.month, day.day, tzinfo=zone) for day in days]
+    found = {}
+    for i, start in enumerate(midnights):
+        hours = [start.replace(hour=hour) for hour in range(HOURS)]
+        if hours[0].utcoffset() != hours[-1].utcoffset():
+            # The hour that the spring leaves out differs by fold as well, but is changed on the way through UTC.
+            twice = (t.hour for t in hours if t.utcoffset() != t.replace(fold=1).utcoffset() and _exists(t))
+            found[i] = next(twice, -1)
+    return found
+
+
+def _exists(local: datetime) -> bool:
+    return local.astimezone(UTC).astimezone(local.tzinfo).hour == local.hour
+
+
+def _by_hour(
+    readings: _Readings, changes: dict[int, int]
+) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    """Return capacities (c, d), the last of each day, readings (c, d, 24), and the number of duplicates (c,)."""
+    c, d = len(readings.car_parks), readings.n_days
+    usable = np.isfinite(readings.free) & (readings.capacity > 0) & np.isfinite(readings.capacity)
+    park_day = (readings.park * d + readings.day)[usable]
+    key = park_day * HOURS + readings.hour[usable]
+    free, stated = np.full(c * d * HOURS, np.nan), np.full(c * d, np.nan)
+    free[key], stated[park_day] = readings.free[usable], readings.capacity[usable]  # the last one stays
+    times = np.bincount(key, minlength=free.size)
+    extra = np.maximum(times - 1, 0).reshape(c, d, HOURS)
+    for day, hour in changes.items():
+        if hour >= 0:
+            twice = (np.arange(c) * d + day) * HOURS + hour
+            total = np.bincount(key, readings.free[usable], free.size)[twice]
+            free[twice] = np.divide(total, times[twice], where=times[twice] > 0, out=np.full(c, np.nan))
+            extra[:, day, hour] = np.maximum(extra[:, day, hour] - 1, 0)
+    return stated.reshape(c, d), free.reshape(c, d, HOURS), extra.sum(axis=(1, 2))
+
+
+def _carried_forward(values: FloatArray) -> FloatArray:
+    """Replace NaN in rows by the last value before it, in front of the first by the first; all NaN by 1."""
+    index = np.where(np.isfinite(values), np.arange(values.shape[1]), 0)
+    filled = np.take_along_axis(values, np.maximum.accumulate(index, axis=1), axis=1)
+    first = np.take_along_axis(values, np.isfinite(values).argmax(axis=1)[:, None], axis=1)
+    return np.nan_to_num(np.where(np.isfinite(filled), filled, first), nan=1.0)
+
+
+def _capacity_in_force(stated: FloatArray, free: FloatArray) -> FloatArray:
+    """Return the capacity of each day (d,): the stated one, or that of the readings before if they exceed it."""
+    with np.errstate(invalid="ignore"):
+        suspicious = np.flatnonzero((free > stated[:, None]).any(axis=1))
+    result = stated.copy()
+    if not suspicious.size:
+        return result
+    estimate = 0.0
+    for day in range(int(suspicious[0]) + 1, len(stated)):
+        recent = free[max(day - _WINDOW, 0) : day]
+        recent = recent[np.isfinite(recent)]
+        if recent.size >= HOURS and (recent > stated[day]).mean() > _TOLERANCE:
+            value = float(np.quantile(recent, 0.98))
+            if abs(value - estimate) > _TOLERANCE * estimate:
+                estimate = value
+            result[day] = max(estimate, stated[day])
+        else:
+            estimate = 0.0
+    return result
+
+
+def _stuck(occupied: FloatArray, weekend: BoolArray) -> tuple[BoolArray, BoolArray]:
+    """Return which readings (c, d, 24) are known to be stuck when they arrive, and which belong to such a run."""
+    c, d, _ = occupied.shape
+    recognised = np.zeros(occupied.shape, bool)
+    stuck = recognised.copy()
+    for i in range(c):
+        where = np.flatnonzero(np.isfinite(occupied[i].ravel()))
+        if where.size < 2:
+            continue
+        values, hour, day = occupied[i].ravel()[where], where % HOURS, where // HOURS
+        same = np.r_[False, np.diff(values) == 0]
+        # How often readings of this hour repeated the one before, on earlier days of this class.
+        cell = weekend[day] * HOURS + hour
+        pairs, repeats = np.zeros((2, d + 1, 2 * HOURS))
+        np.add.at(pairs, (day + 1, cell), 1.0)
+        np.add.at(repeats, (day + 1, cell), same)
+        repeats, pairs = repeats.cumsum(axis=0)[day, cell], pairs.cumsum(axis=0)[day, cell]
+        chance = (repeats + _REPEATS_PRIOR[0]) / (pairs + _REPEATS_PRIOR[1])
+        limit = np.where(values >= 1, 24.0, np.where(values <= 0, 72.0, _SURPRISE))
+        step = np.where(same, np.where((values <= 0) | (values >= 1), 1.0, -np.log(chance)), 0.0)
+        run = np.cumsum(~same) - 1
+        start = np.flatnonzero(~same)
+        total = np.cumsum(step)
+        total -= total[start][run]
+        known = total > limit
+        recognised[i].ravel()[where] = known
+        stuck[i].ravel()[where] = np.logical_or.reduceat(known, start)[run]
+    return recognised, stuck

@@ -1,0 +1,317 @@
+"""Forecasts of daily occupancy curves: a linear state-space model, filtered day by day (Kalman).
+
+The log-odds of a car park's occupancy over a day are a curve of harmonics of the day. It is the sum of
+
+- a curve common to all days, which drifts,
+- on Saturdays and Sundays the difference of such days, which drifts slowly; on other days that of this weekday,
+- the day's own deviation, correlated from day to day (first-order autoregression),
+
+and is observed with noise: that of the hour, and that of a finite number of places. Days that fit badly count less.
+Public holidays, as far as earlier years show them, have the curve of a Sunday. All car parks are filtered at once; what
+they share are the variances (`CurveSettings`), fitted to the past by maximum likelihood of the occupied places.
+
+References:
+    West, Harrison: Bayesian Forecasting and Dynamic Models, 2nd ed., 1997.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit, gammaln
+
+from parkenv.forecast.calibration import calibrated
+from parkenv.forecast.counts import HOURS, BoolArray, Counts, FloatArray
+from parkenv.forecast.day_forecast import DIAGONAL, FREEDOM, DayForecast, logits
+from parkenv.forecast.scores import log_losses
+from parkenv.forecast.special_days import SpecialDays
+
+Mode = Literal["past", "rolling"]
+
+_HARMONICS = 6
+_ORDER = np.r_[1, np.repeat(np.arange(1, _HARMONICS + 1), 2)]
+_SIZE = len(_ORDER)
+_SMOOTH = 1.0 / _ORDER**2.0  # variances fall with the square of the frequency
+_HOUR = 2 * np.pi * np.arange(HOURS) / HOURS
+_BASIS = np.stack(
+    [np.ones(HOURS)] + [f(k * _HOUR) for k in range(1, _HARMONICS + 1) for f in (np.cos, np.sin)], axis=1
+)
+# Blocks of the state: the common curve, Saturday, Sunday, Monday to Friday, the day's own.
+_N_BLOCKS = 9
+_STATE = _N_BLOCKS * _SIZE
+_TODAY = slice(_STATE - _SIZE, _STATE)
+_BLOCKS = {day: (0, 3 + day, 8) for day in range(5)} | {5: (0, 1, 8), 6: (0, 2, 8)}
+_SUNDAY = 6
+_MIN_HOURS = 4  # to learn from a day
+_MIN_HOURS_SPECIAL = 8  # to tell whether a day was as a Sunday
+_SETTLED = 28  # days from which on weekdays and Sundays are told apart
+_MEMORY = 30.0  # days over which the scale of the noise is averaged
+_OUTLIER = 2.0  # ratio of squared error to variance from which on a day counts less
+_FIT_CAR_PARKS = 14
+_FIT_DAYS = 400
+_FIT_WARM_UP = 45
+
+
+@dataclass(frozen=True)
+class CurveSettings:
+    """Variances of the model, log-odds squared; those of a block are those of its mean level.
+
+    Args:
+        level_drift: of the common level, per day.
+        common_drift: of the first harmonics of the common curve, per day.
+        class_drift: of Saturdays and Sundays, per day.
+        class_spread: of Saturdays and Sundays before any is seen.
+        weekday_drift: of each other weekday, per day.
+        weekday_spread: of each other weekday before any is seen.
+        day_memory: correlation of a day's own deviation with that of the day before, in (0, 1).
+        day_spread: of the shape of a day's own deviation.
+        day_level_spread: of its mean level.
+        noise: of a single hour.
+    """
+
+    level_drift: float = 0.017
+    common_drift: float = 4e-4
+    class_drift: float = 3e-4
+    class_spread: float = 0.08
+    weekday_drift: float = 1e-5
+    weekday_spread: float = 0.02
+    day_memory: float = 0.55
+    day_spread: float = 0.036
+    day_level_spread: float = 0.28
+    noise: float = 0.02
+
+
+class _Filter:
+    """State of all car parks at once: mean (c, n) and covariance (c, n, n)."""
+
+    def __init__(self, n: int, settings: CurveSettings) -> None:
+        s = settings
+        own = np.r_[s.day_level_spread, s.day_spread * _SMOOTH[1:]]
+        start = np.r_[2.0, _SMOOTH[1:]]
+        start = np.r_[
+            start, np.tile(s.class_spread * _SMOOTH, 2), np.tile(s.weekday_spread * _SMOOTH, 5), own
+        ]
+        self._drift = np.r_[
+            s.level_drift,
+            s.common_drift * _SMOOTH[1:],
+            np.tile(s.class_drift * _SMOOTH, 2),
+            np.tile(s.weekday_drift * _SMOOTH, 5),
+            own * (1.0 - s.day_memory**2),
+        ]
+        self._settings = settings
+        self.mean = np.zeros((n, _STATE))
+        self.covariance = np.tile(np.diag(start), (n, 1, 1))
+
+    def next_day(self) -> None:
+        """Let one day pass."""
+        memory = self._settings.day_memory
+        self.mean[:, _TODAY] *= memory
+        self.covariance[:, _TODAY] *= memory
+        self.covariance[:, :, _TODAY] *= memory
+        self.covariance[:, np.arange(_STATE), np.arange(_STATE)] += self._drift
+
+    def curve(self, weekday: int) -> _Curve:
+        """Return the forecast of the curve of a weekday."""
+        parts = [slice(b * _SIZE, (b + 1) * _SIZE) for b in _BLOCKS[weekday]]
+        across = np.asarray(sum(self.covariance[:, :, part] for part in parts))
+        mean = np.asarray(sum(self.mean[:, part] for part in parts))
+        return _Curve(mean, np.asarray(sum(across[:, part] for part in parts)), across)
+
+    def update(self, curve: _Curve, fit: _Fit, discount: FloatArray) -> None:
+        """Take in an observed day; its information is divided by `discount` (c,)."""
+        self.mean += (curve.across @ (fit.step / discount[:, None])[:, :, None])[:, :, 0]
+        self.covariance -= (curve.across @ (fit.gain / discount[:, None, None])) @ np.swapaxes(
+            curve.across, 1, 2
+        )
+        self.covariance += np.swapaxes(self.covariance, 1, 2).copy()
+        self.covariance *= 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Curve:
+    """Coefficients of the curve of a day: mean (c, k), covariance (c, k, k), and with the state, (c, n, k)."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    across: FloatArray
+
+    def where(self, mask: BoolArray, other: _Curve) -> _Curve:
+        """Return this curve for the car parks of `mask`, else the other."""
+        if not mask.any():
+            return other
+        m = mask[:, None, None]
+        return _Curve(
+            np.where(mask[:, None], self.mean, other.mean),
+            np.where(m, self.covariance, other.covariance),
+            np.where(m, self.across, other.across),
+        )
+
+    def fit(self, z: FloatArray, weight: FloatArray) -> _Fit:
+        """Compare the curve with log-odds (c, 24), observed with inverse noise variances `weight`, 0 if unobserved."""
+        error = np.where(weight > 0, z - self.mean @ _BASIS.T, 0.0)
+        information = (_BASIS.T * weight[:, None]) @ _BASIS
+        score = (weight * error) @ _BASIS
+        ratio = np.eye(_SIZE) + information @ self.covariance
+        solved = np.linalg.solve(ratio, np.concatenate([information, score[:, :, None]], axis=2))
+        gain, step = solved[:, :, :-1], solved[:, :, -1]
+        explained = (score * (self.covariance @ step[:, :, None])[:, :, 0]).sum(axis=1)
+        distance = np.maximum((weight * error**2).sum(axis=1) - explained, 0.0)
+        gain = (gain + np.swapaxes(gain, 1, 2)) / 2
+        return _Fit(step, gain, distance, np.linalg.slogdet(ratio)[1])
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """How a day fits a curve: step (c, k), gain (c, k, k); squared distance and log-determinant (c,)."""
+
+    step: FloatArray
+    gain: FloatArray
+    distance: FloatArray
+    log_det: FloatArray
+
+    def log_likelihood(self, n: NDArray[np.int64]) -> FloatArray:
+        """Return the log-likelihood (c,) of n observed hours, multivariate t, up to what all curves share."""
+        return np.asarray(
+            gammaln((FREEDOM + n) / 2)
+            - self.log_det / 2
+            - (FREEDOM + n) / 2 * np.log1p(self.distance / (FREEDOM - 2))
+        )
+
+
+def filter_days(
+    counts: Counts,
+    settings: CurveSettings,
+    first: int,
+    last: int,
+    until: int | None = None,
+    on_day: Callable[[int], None] | None = None,
+) -> DayForecast:
+    """Forecast every day from all days before it.
+
+    Args:
+        counts: what was observed.
+        settings: of the model.
+        first: index of the first day to return; the filter starts with day 0.
+        last: index after the last day.
+        until: index of the first day from which nothing is learned any more; the days from there on are forecast
+            several days ahead.
+        on_day: called with the number of the days done.
+
+    Returns:
+        Forecasts; their covariances are the model's own, and not calibrated.
+    """
+    c = len(counts.car_parks)
+    state, special = _Filter(c, settings), SpecialDays(c)
+    mean, covariance = (
+        np.empty((c, last - first, HOURS)),
+        np.empty((c, last - first, HOURS, HOURS), np.float32),
+    )
+    scale, memory = np.ones(c), np.full(c, 15.0)
+    until = last if until is None else until
+    for day in range(last):
+        state.next_day()
+        date, weekday = counts.days[day], int(counts.weekday[day])
+        places = counts.capacity[:, max(min(day, until) - 1, 0), None]
+        own = curve = state.curve(weekday)
+        sunday = state.curve(_SUNDAY) if weekday != _SUNDAY and day >= _SETTLED else None
+        if sunday is not None:
+            curve = sunday.where(special.expected(date), own)
+        if day >= first:
+            middle = curve.mean @ _BASIS.T
+            p = expit(middle)
+            spread = (_BASIS @ curve.covariance @ _BASIS.T) * scale[:, None, None]
+            spread[:, DIAGONAL, DIAGONAL] += settings.noise * scale[:, None] + 1.0 / (
+                places * p * (1.0 - p) + 1.0
+            )
+            mean[:, day - first], covariance[:, day - first] = middle, spread
+        seen = counts.seen[:, day]
+        hours = np.isfinite(seen).sum(axis=1)
+        learned = hours >= _MIN_HOURS
+        if day < until and learned.any():
+            places = counts.capacity[:, day, None]
+            z = logits(seen, places)
+            p = expit(z)
+            weight = 1.0 / (settings.noise + 1.0 / (places * p * (1.0 - p) + 1.0))
+            weight = np.where(np.isfinite(seen) & learned[:, None], weight, 0.0)
+            if sunday is not None:
+                evidence = sunday.fit(z, weight).log_likelihood(hours) - own.fit(z, weight).log_likelihood(
+                    hours
+                )
+                curve = sunday.where(special.observe(date, evidence, hours >= _MIN_HOURS_SPECIAL), own)
+            fit = curve.fit(z, weight)
+            error = fit.distance / np.maximum(hours, 1)
+            memory = np.where(learned, np.minimum(memory + 1.0, _MEMORY), memory)
+            step = (np.minimum(error, _MEMORY * scale) - scale) / memory
+            scale = np.where(learned, scale + step, scale)
+            state.update(curve, fit, np.where(learned, np.maximum(error / (_OUTLIER * scale), 1.0), 1.0))
+        if on_day is not None:
+            on_day(day + 1)
+    return DayForecast(first, mean, covariance)
+
+
+def fit_settings(counts: Counts, before: int, on_step: Callable[[], None] | None = None) -> CurveSettings:
+    """Fit the variances to the days before index `before` by maximum likelihood of the occupied places.
+
+    The likelihood is that of day-ahead forecasts: a place is taken or not, and each hour of a car park counts as
+    one. The variances have log-normal priors around the defaults, so that a short past changes little.
+    """
+    start = max(before - _FIT_DAYS, 0)
+    enough = np.flatnonzero(np.isfinite(counts.seen[:, start:before]).any(axis=2).sum(axis=1) > _FIT_WARM_UP)
+    best = CurveSettings()
+    if not enough.size:
+        return best
+    chosen = enough[np.unique(np.linspace(0, enough.size - 1, _FIT_CAR_PARKS).round().astype(int))]
+    part = counts.part(chosen, start, before)
+
+    def loss(settings: CurveSettings) -> float:
+        forecast = filter_days(part, settings, _FIT_WARM_UP, before - start)
+        losses = log_losses(forecast, part.seen, part.capacity)
+        prior = sum(math.log(value / default[name]) ** 2 for name, value in asdict(settings).items()) / 2
+        return float(np.nansum(losses) + prior)
+
+    default = asdict(CurveSettings())
+    lowest = loss(best)
+    for factor in (2.0, 2.0, 1.4):
+        for name in default:
+            for change in (factor, 1.0 / factor):
+                value = asdict(best)[name] * change
+                if name == "day_memory":
+                    odds = best.day_memory / (1.0 - best.day_memory) * change
+                    value = odds / (1.0 + odds)
+                tried = replace(best, **{name: value})
+                if (its := loss(tried)) < lowest:
+                    best, lowest = tried, its
+                    break
+            if on_step is not None:
+                on_step()
+    return best
+
+
+FIT_STEPS = 30
+"""Number of calls of `on_step` in a fit."""
+
+
+def forecast_days(
+    counts: Counts,
+    first: int,
+    mode: Mode = "rolling",
+    settings: CurveSettings | None = None,
+    on_day: Callable[[int], None] | None = None,
+) -> DayForecast:
+    """Forecast the days from index `first` on, with spreads calibrated on earlier days.
+
+    Args:
+        counts: what was observed.
+        first: index of the first day; the settings are fitted to the days before it.
+        mode: rolling: each day from all days before it; past: all days from those before `first`.
+        settings: instead of fitted ones.
+        on_day: called with the number of the days done.
+    """
+    settings = fit_settings(counts, first) if settings is None else settings
+    n, until = len(counts.days), first if mode == "past" else None
+    return calibrated(filter_days(counts, settings, 0, n, until, on_day), counts, until).from_day(first)

@@ -1,0 +1,180 @@
+"""Scores of forecasts of occupancy: log-loss, Brier score, CRPS, reliability, coverage of intervals.
+
+References:
+    Gneiting, Raftery: Strictly Proper Scoring Rules, Prediction, and Estimation. JASA, 2007.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.special import expit
+
+from parkenv.forecast.calibration import MIN_HOURS, day_means, holds
+from parkenv.forecast.counts import BoolArray, Counts, FloatArray
+from parkenv.forecast.day_forecast import INTERVAL, DayForecast, draw_days, quantiles_of_t
+
+BANDS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)
+"""Bands of fullness."""
+
+
+def log_losses(forecast: DayForecast, occupied: FloatArray, capacity: FloatArray) -> FloatArray:
+    """Return the log-loss (c, d, 24) of a place that is taken or not, in the mean over the places; NaN if unobserved.
+
+    Probabilities stay a quarter of a place away from 0 and 1.
+    """
+    days = slice(forecast.first, forecast.first + forecast.mean.shape[1])
+    edge = 0.25 / capacity[:, days, None]
+    y, p = occupied[:, days], np.clip(forecast.occupancy, edge, 1.0 - edge)
+    return np.asarray(-(y * np.log(p) + (1.0 - y) * np.log1p(-p)))
+
+
+def crps_of_equally_likely(values: FloatArray, observed: FloatArray) -> FloatArray:
+    """Return the continuous ranked probability score of equally likely values.
+
+    Args:
+        values: (k, ...), ascending.
+        observed: (...).
+
+    >>> float(crps_of_equally_likely(np.array([0.0, 1.0]), np.array(0.0)))
+    0.25
+    """
+    k = len(values)
+    weight = (2.0 * np.arange(1, k + 1) - k - 1.0).reshape((k,) + (1,) * observed.ndim)
+    return np.asarray(np.abs(values - observed).mean(axis=0) - (weight * values).sum(axis=0) / k**2)
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """Scores of one model's forecasts; NaN where nothing was observed.
+
+    Args:
+        log_loss, brier, crps: (c, d, 24), of the occupied fraction.
+        hour_held: (c, d, 24) float64, 1 where the hour's 90 % interval holds the observed fraction.
+        occupancy: (c, d, 24) forecast.
+        observed: (c, d, 24) occupied fraction.
+        day_held: (c, d) float64, 1 where the 90 % interval of the day's mean holds the observed one.
+        day_forecast, day_observed: (c, d) mean over the day's observed hours.
+    """
+
+    log_loss: FloatArray
+    brier: FloatArray
+    crps: FloatArray
+    hour_held: FloatArray
+    occupancy: FloatArray
+    observed: FloatArray
+    day_held: FloatArray
+    day_forecast: FloatArray
+    day_observed: FloatArray
+
+    @classmethod
+    def of(cls, forecast: DayForecast, counts: Counts) -> Scores:
+        """Score a forecast."""
+        c, d = forecast.mean.shape[:2]
+        days = slice(forecast.first, forecast.first + d)
+        y, places = counts.occupied[:, days], counts.capacity[:, days]
+        observed = np.isfinite(y)
+        p, mean, sd = forecast.occupancy, forecast.mean, forecast.sd
+        crps = np.empty(y.shape)
+        day_held, day_forecast = np.full((2, c, d), np.nan)
+        hour_held = np.full(y.shape, np.nan)
+        enough = observed.sum(axis=2) >= MIN_HOURS
+        values = quantiles_of_t()[:, None, None]
+        for day in range(d):
+            crps[:, day] = crps_of_equally_likely(expit(mean[:, day] + sd[:, day] * values), y[:, day])
+            draws = draw_days(mean[:, day], forecast.covariance[:, day])
+            low, high = np.quantile(draws, INTERVAL, axis=1)
+            hour_held[:, day] = holds(y[:, day], low, high, places[:, day, None])
+            o, rows = observed[:, day], enough[:, day]
+            low, high = np.quantile(day_means(draws, o), INTERVAL, axis=1)
+            held = holds(day_means(y[:, day], o), low, high, places[:, day])
+            day_held[rows, day] = held[rows]
+            day_forecast[rows, day] = day_means(p[:, day], o)[rows]
+        return cls(
+            log_losses(forecast, counts.occupied, counts.capacity),
+            (p - y) ** 2,
+            crps,
+            np.where(observed, hour_held, np.nan),
+            p,
+            y,
+            day_held,
+            day_forecast,
+            np.where(
+                enough,
+                day_means(y.reshape(-1, y.shape[2]), observed.reshape(-1, y.shape[2])).reshape(c, d),
+                np.nan,
+            ),
+        )
+
+    def coverage_by_band(self, *, observed: bool = False) -> list[dict[str, float | int | None]]:
+        """Return how many days each band of fullness has, and how many of them the 90 % intervals hold.
+
+        Args:
+            observed: whether the day's observed fullness gives the band. Days of unexpected fullness are missed then by
+                construction; the forecast fullness does not know the day.
+        """
+        fullness = self.day_observed if observed else self.day_forecast
+        rows: list[dict[str, float | int | None]] = []
+        for low, high in pairwise(BANDS):
+            held = self.day_held[(fullness >= low) & ((fullness < high) | (high == BANDS[-1]))]
+            held = held[np.isfinite(held)]
+            rows.append(
+                {
+                    "from": low,
+                    "to": high,
+                    "days": held.size,
+                    "coverage_90": float(held.mean()) if held.size else None,
+                }
+            )
+        return rows
+
+    def reliability(self, bins: int = 20) -> FloatArray:
+        """Return mean forecast, mean occupancy and number of hours (3, k) of equally wide bins of the forecast."""
+        seen = np.isfinite(self.observed)
+        p, y = self.occupancy[seen], self.observed[seen]
+        cell = np.minimum((p * bins).astype(int), bins - 1)
+        n = np.bincount(cell, minlength=bins)
+        used = n > 0
+        means = (np.bincount(cell, values, bins)[used] / n[used] for values in (p, y))
+        return np.stack([*means, n[used].astype(float)])
+
+
+def paired_intervals(
+    ours: FloatArray, others: Sequence[FloatArray], rng: np.random.Generator, repetitions: int = 1000
+) -> list[tuple[float, float, float]]:
+    """Return the mean of others - ours with its 95 % interval, by a bootstrap over car parks and weeks.
+
+    Args:
+        ours: (c, d, 24) losses, NaN where unobserved.
+        others: of other models, alike.
+        rng: draws the car parks and weeks.
+        repetitions: number of resamples.
+    """
+    c, d, _ = ours.shape
+    weeks = -(-d // 7)
+    week = np.arange(d) // 7
+    parks = rng.multinomial(c, np.full(c, 1.0 / c), repetitions).astype(float)
+    times = rng.multinomial(weeks, np.full(weeks, 1.0 / weeks), repetitions).astype(float)
+    results = []
+    for other in others:
+        difference = other - ours
+        both = np.isfinite(difference)
+        total, n = np.zeros((c, weeks)), np.zeros((c, weeks))
+        np.add.at(total.T, week, np.where(both, difference, 0.0).sum(axis=2).T)
+        np.add.at(n.T, week, both.sum(axis=2).T)
+        drawn_n = np.einsum("rc,cw,rw->r", parks, n, times, optimize=True)
+        means = np.einsum("rc,cw,rw->r", parks, total, times, optimize=True) / np.maximum(drawn_n, 1.0)
+        low, high = (
+            np.quantile(means[drawn_n > 0], (0.025, 0.975)) if (drawn_n > 0).any() else (np.nan, np.nan)
+        )
+        results.append((float(total.sum() / max(n.sum(), 1.0)), float(low), float(high)))
+    return results
+
+
+def mean_where(values: FloatArray, mask: BoolArray | None = None) -> float:
+    """Return the mean of what is not NaN; NaN if there is nothing."""
+    chosen = values[np.isfinite(values) if mask is None else np.isfinite(values) & mask]
+    return float(chosen.mean()) if chosen.size else float("nan")

@@ -1,0 +1,177 @@
+"""Commute: a map that learns over days, resumed and reported."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import parkenv
+
+from parkenv import make_scenario
+from parkenv.errors import InputError
+from parkenv.evaluation.experiments.agent_spec import AgentSpec
+from parkenv.evaluation.experiments.commute import Course, calendar, run_commute
+from parkenv.evaluation.experiments.spec import CommuteSpec
+from parkenv.files.spec_file import read_tables
+from parkenv.mapping.store import MapStore
+from parkenv.world.occupancy import ArrivalWindow
+from parkenv.world.occupancy_log import OccupancyLog
+from parkenv.world.recorded_occupancy import RecordedOccupancy
+from planners.agent import make_agent
+
+SMALL = {
+    "scenarios": ["mini"],
+    "agents": ["belief", "first-free"],
+    "maps": ["empty"],
+    "days": 7,
+    "drivers": 2,
+}
+
+
+def spec(**changes):
+    return CommuteSpec.parse(SMALL | changes, "test")
+
+
+def content(folder):
+    """The results of a run, without wall times."""
+    return (folder / "episodes.csv").read_text(), json.loads((folder / "summary.json").read_text())
+
+
+def test_the_command_writes_rows_maps_picture_and_report(tmp_path):
+    out = tmp_path / "run"
+    done = parkenv(
+        "commute", "--scenario", "mini", "--map", "empty,wrong", "--agents", "belief,first-free", "--days", 6,
+        "--drivers", 2, "--out", out, "--jobs", 1, "--report",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "days 6-6" in done.stdout
+    rows = json.loads((out / "summary.json").read_text())["rows"]
+    assert {(r["map"], r["agent"], r["day"]) for r in rows} == {
+        (start, agent, day)
+        for start, agent in (
+            ("empty", "belief"),
+            ("wrong", "belief"),
+            ("fixed", "belief"),
+            ("none", "first-free"),
+        )
+        for day in range(1, 7)
+    }
+    with (out / "episodes.csv").open() as file:
+        episodes = list(csv.DictReader(file))
+    for row in rows:
+        its = [
+            e
+            for e in episodes
+            if (e["map"], e["agent"], e["day_number"]) == (row["map"], row["agent"], str(row["day"]))
+        ]
+        assert row["total_s"] == pytest.approx(np.mean([float(e["total_s"]) for e in its]))
+        if row["map"] != "none":
+            assert row["forecast_error"] == pytest.approx(np.mean([float(e["forecast_error"]) for e in its]))
+    # All agents meet the same worlds, every day a new one; a driver comes at the same time of day.
+    worlds = {(e["course"], e["day_number"], e["seed"], e["arrival_s"], e["occupancy"]) for e in episodes}
+    assert len(worlds) == 2 * 6
+    times = {(e["course"], round(float(e["arrival_s"]) % 86400, 2)) for e in episodes}
+    assert len(times) == 2
+    assert len(list((out / "maps").glob("*.sqlite"))) == 4
+    assert (out / "commute.png").stat().st_size > 10_000
+    assert "Maps that learn from every trip on mini" in (out / "report.html").read_text()
+    assert read_tables(out / "experiment.json")["kind"] == "commute"
+
+
+def test_a_resumed_commute_equals_an_unbroken_one(tmp_path):
+    """Also after a crash between trips and episodes, and with more days than at first."""
+    run_commute(spec(), tmp_path / "whole")
+    run_commute(spec(days=4), tmp_path / "broken")
+    # The last day's episodes are lost, its trips are not.
+    lines = (tmp_path / "broken" / "episodes.csv").read_text().splitlines(keepends=True)
+    kept = [line for line in lines if ",4," not in line or ",belief," not in line]
+    assert len(kept) < len(lines)
+    (tmp_path / "broken" / "episodes.csv").write_text("".join(kept))
+    run_commute(spec(), tmp_path / "broken", resume=True)
+    whole, broken = content(tmp_path / "whole"), content(tmp_path / "broken")
+    assert whole == broken
+    for file in (tmp_path / "whole" / "maps").iterdir():
+        lot = make_scenario("mini").lot
+        with MapStore(file, lot) as one, MapStore(tmp_path / "broken" / "maps" / file.name, lot) as other:
+            assert [t.key for t in one.trips()] == [f"{day:05}-0000" for day in range(1, 8)]
+            for mine, theirs in zip(one.trips(), other.trips(), strict=True):
+                np.testing.assert_array_equal(mine.taken, theirs.taken)
+    with pytest.raises(InputError, match="--resume: fleet was 1"):
+        run_commute(spec(fleet=2), tmp_path / "broken", resume=True)
+
+
+def test_days_do_not_depend_on_later_ones():
+    course = Course(make_scenario("mini"), AgentSpec(name="belief"), "wrong", 0, 2, 5)
+    days = calendar(course.scenario, 6)
+    rows, _, trips, _ = course.run(days, [])
+    first, _, first_trips, _ = course.run(days[:3], [])
+    rest, _, _, _ = course.run(days[3:], first_trips)
+    assert rows == first + rest
+    # A fleet's drivers meet the same day, at different times, and share their map.
+    assert len(trips) == 12
+    assert len({row["seed"] for row in rows if row["day_number"] == 1}) == 1
+    assert len({row["arrival_s"] for row in rows if row["day_number"] == 1}) == 2
+
+
+def test_drivers_come_on_the_next_weekdays_or_recorded_days(tmp_path):
+    mini = make_scenario("mini")
+    assert [day.count for day in calendar(mini, 7)] == [0, 1, 2, 3, 4, 7, 8]
+    lines = ["slot_id,datetime,occupied"]
+    dates = ("2024-03-05", "2024-03-06", "2024-03-09", "2024-03-12", "2024-03-13")
+    for day in dates:
+        lines += [f"s{s},{day}T{hour:02}:00,{(s + hour) % 2}" for s in range(10) for hour in range(7, 20)]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(lines) + "\n")
+    log = RecordedOccupancy(OccupancyLog.read(path), mini.lot.walk_m(0), np.arange(10))
+    recorded = mini.replace(occupancy=log, arrival=ArrivalWindow())
+    days = calendar(recorded, 30)
+    assert [(day.count, day.date) for day in days] == [
+        (1, dates[0]),
+        (2, dates[1]),
+        (8, dates[3]),
+        (9, dates[4]),
+    ]
+    rows, *_ = Course(recorded, AgentSpec(name="first-free"), "none", 0, 1, 0).run(days, [])
+    assert [row["day"] for row in rows] == [day.date for day in days]
+
+
+def test_a_map_of_a_commute_is_a_forecast(tmp_path):
+    """A scenario file takes the map file of a course; a copy of it goes on learning elsewhere."""
+    run_commute(spec(maps=["wrong"], agents=["belief"], drivers=1), tmp_path / "run")
+    shutil.copy(tmp_path / "run" / "maps" / "mini_wrong_belief_0.sqlite", tmp_path / "map.sqlite")
+    Path(tmp_path / "known.toml").write_text('lot = "mini"\nforecast = "map.sqlite"\n')
+    known = make_scenario(tmp_path / "known.toml")
+    arrival = known.occupancy.draw_arrival(known.arrival, np.uint64(1))
+    learned = known.forecast(arrival)
+    assert np.ptp(learned.p_occupied) > 0.05
+    assert learned.day_error.level > 0.0
+
+
+def test_a_bonus_for_observations_lets_the_car_see_more():
+    scenario = make_scenario("jam")
+    days = calendar(scenario, 2)
+    seen = []
+    for bonus in (0, 1.0):
+        _, _, trips, _ = Course(scenario, AgentSpec.of(f"belief(explore={bonus})"), "empty", 0, 3, 0).run(
+            days, []
+        )
+        seen.append(np.mean([len(np.unique(trip.slots)) for trip in trips]))
+    assert seen[1] > seen[0] + 5
+    with pytest.raises(InputError, match="explore is -1"):
+        make_agent("belief", scenario, explore=-1.0)
+
+
+@pytest.mark.slow
+def test_a_week_of_trips_closes_the_gap_of_a_wrong_map():
+    """On jam, where the map is wrong: belief after a week, and on the first day, with and without learning."""
+    scenario = make_scenario("jam")
+    days = calendar(scenario, 8)
+    totals = {}
+    for name in ("wrong", "fixed"):
+        courses = [Course(scenario, AgentSpec(name="belief"), name, number, 1, 0) for number in range(12)]
+        totals[name] = np.array([[row["total_s"] for row in course.run(days, [])[0]] for course in courses])
+    excess = totals["wrong"] - totals["fixed"]
+    assert excess[:, 0].mean() > 5.0
+    assert excess[:, 5:].mean() < 2.0

@@ -1,0 +1,195 @@
+"""Counts of car parks: their faults, each cleaned and counted."""
+
+from datetime import date, datetime, timedelta
+
+import numpy as np
+import pytest
+
+from parkenv.errors import InputError
+from parkenv.forecast.counts import Counts, is_counts
+
+CAPACITY = 200
+FIRST = date(2024, 3, 1)
+
+
+def free_places(days=60, rng=None):
+    """Free places (days, 24) of a car park that fills by day."""
+    rng = rng or np.random.default_rng(5)
+    hour = np.arange(24)
+    mean = 150 - 110 * np.exp(-(((hour - 13) / 4.0) ** 2))
+    return np.clip(mean + rng.normal(0.0, 6.0, (days, 24)), 1, CAPACITY - 1).round()
+
+
+def rows_of(free, name="centre", capacity=CAPACITY):
+    """Rows of a file; NaN has none."""
+    midnight = datetime(FIRST.year, FIRST.month, FIRST.day)
+    return [
+        f"{name},{capacity},{midnight + timedelta(days=d, hours=h):%Y-%m-%dT%H:%M},{free[d, h]:.0f}"
+        for d in range(len(free))
+        for h in range(24)
+        if np.isfinite(free[d, h])
+    ]
+
+
+def read(tmp_path, rows, header="car_park,capacity,hour,free", **options):
+    path = tmp_path / "counts.csv"
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return Counts.read(path, **options)
+
+
+def faults_of(counts, *left_out):
+    """The faults of the first car park, but for those of the calendar."""
+    return {n: k for n, k in counts.faults[0].items() if k and n not in ("summer_time", *left_out)}
+
+
+def test_clean_counts_are_kept(tmp_path):
+    free = free_places()
+    counts = read(tmp_path, rows_of(free))
+    np.testing.assert_allclose(counts.occupied[0], 1 - free / CAPACITY)
+    np.testing.assert_array_equal(counts.seen, counts.occupied)
+    assert (counts.days[0], len(counts.days), counts.weekday[0]) == (FIRST, 60, 4)
+    assert (faults_of(counts), counts.idle()) == ({}, {})
+
+
+def change(free, what):
+    """Put a fault into the free places of days 40 and later; return the expected number and states."""
+    if what == "negative":
+        free[40, 10:13] = -3
+        return 3, 1.0
+    if what == "far below 0":
+        free[40, 10:13] = -50
+        return 3, np.nan
+    if what == "above_capacity":
+        free[40, 10:13] = CAPACITY + 5
+        return 3, 0.0
+    if what == "far above the capacity":
+        free[40, 10:13] = 9999
+        return 3, np.nan
+    if what == "gap":
+        free[40, 10:13] = np.nan
+        return 3, np.nan
+    if what == "a week stuck":
+        free[40:47] = 97
+        return 7 * 24, np.nan
+    if what == "hours stuck":
+        free[40, 8:20] = 97
+        return 12, np.nan
+    if what == "a week stuck at full":
+        free[40:47] = 0
+        return 7 * 24, np.nan
+    raise ValueError(what)
+
+
+@pytest.mark.parametrize(
+    ("what", "rule"),
+    [
+        ("negative", "negative"),
+        ("far below 0", "negative"),
+        ("above_capacity", "above_capacity"),
+        ("far above the capacity", "above_capacity"),
+        ("gap", "gap"),
+        ("a week stuck", "stuck"),
+        ("hours stuck", "stuck"),
+        ("a week stuck at full", "stuck"),
+    ],
+)
+def test_each_fault_is_cleaned_and_counted(tmp_path, what, rule):
+    free = free_places()
+    expected, becomes = change(free, what)
+    counts = read(tmp_path, rows_of(free))
+    assert faults_of(counts, *({"gap"} - {rule}))[rule] in (
+        expected,
+        expected + 1,
+    )  # a neighbour may be equal
+    np.testing.assert_array_equal(counts.occupied[0, 40, 10:13], becomes)
+    np.testing.assert_allclose(counts.occupied[0, :40], 1 - free[:40] / CAPACITY)
+    np.testing.assert_allclose(counts.occupied[0, 48:], 1 - free[48:] / CAPACITY)
+
+
+def test_a_car_park_may_be_closed_on_sundays(tmp_path):
+    free = free_places(70)
+    free[2::7] = free[1::7, -1:]  # from Saturday night on
+    counts = read(tmp_path, rows_of(free))
+    # Once a few have been seen, they are not taken for a fault.
+    assert np.isfinite(counts.occupied[0, 58::7]).all()
+
+
+@pytest.mark.parametrize(
+    ("stated", "rule", "expected", "in_force"),
+    [((200, 120), "capacity_changed", 1, 120), ((60, 60), "capacity_estimated", 59, 155)],
+)
+def test_the_capacity_may_change_or_be_wrong(tmp_path, stated, rule, expected, in_force):
+    free = np.minimum(free_places(), stated[1] if rule == "capacity_changed" else 180)
+    rows = rows_of(free[:30], capacity=stated[0])
+    rows += [row.replace(",200,", f",{stated[1]},") for row in rows_of(free, capacity=200)[30 * 24 :]]
+    counts = read(tmp_path, rows)
+    assert counts.faults[0][rule] == pytest.approx(expected, abs=2)
+    assert counts.capacity[0, -1] == pytest.approx(in_force, rel=0.1)
+    assert np.isfinite(counts.occupied[0, 35:]).mean() > 0.95
+
+
+def test_summer_time_and_duplicates(tmp_path):
+    """In Berlin the clocks go forward on 31 March and back on 27 October 2024."""
+    start = datetime(2024, 3, 30)
+    hours = [start + timedelta(hours=h) for h in range(24 * 215)]
+    rows = [f"a,100,{hour:%Y-%m-%dT%H:%M}Z,{10 + (i * 7) % 50}" for i, hour in enumerate(hours)]
+    rows.append(rows[5].rsplit(",", 1)[0] + ",77")
+    counts = read(tmp_path, rows, "car_park,capacity,hour_utc,free")
+    forward, back = (counts.day_index(date(2024, *day)) for day in ((3, 31), (10, 27)))
+    assert np.isnan(counts.occupied[0, forward]).tolist() == [h == 2 for h in range(24)]
+    free = {hour: 10 + (i * 7) % 50 for i, hour in enumerate(hours)}
+    twice = [free[datetime(2024, 10, 27, 0)], free[datetime(2024, 10, 27, 1)]]
+    assert counts.occupied[0, back, 2] == pytest.approx(1 - np.mean(twice) / 100)
+    assert counts.occupied[0, 0, 6] == pytest.approx(0.23)  # 05:00 UTC, the last of two
+    assert (counts.faults[0]["summer_time"], counts.faults[0]["duplicate"]) == (2, 1)
+    utc = read(tmp_path, rows, "car_park,capacity,hour_utc,free", timezone="UTC")
+    assert utc.faults[0]["summer_time"] == 0
+
+
+def test_later_readings_change_nothing_that_was_known_before(tmp_path):
+    free = free_places()
+    changed = free.copy()
+    changed[45:] = 20
+    before, after = (read(tmp_path, rows_of(values)) for values in (free, changed))
+    for name in ("seen", "capacity"):
+        np.testing.assert_array_equal(getattr(before, name)[:, :45], getattr(after, name)[:, :45])
+
+
+def test_car_parks_without_use_are_named(tmp_path):
+    free = free_places()
+    rows = rows_of(free) + rows_of(np.where(free > 100, 181.0, 180.0), "dead")
+    rows += rows_of(180 + free // 12, "never") + rows_of(np.full_like(free, 9999), "broken")
+    idle = read(tmp_path, rows).idle()
+    assert {name: text.split(":")[0] for name, text in idle.items()} == {
+        "broken": "no usable readings", "dead": "dead", "never": "never filling",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a,b\n1,2\n", "want the columns car_park,capacity,hour,free"),
+        ("car_park,capacity,hour,free\n", "has no readings"),
+        ("car_park,capacity,hour,free\na,100,yesterday,5\n", "line 2: want an ISO time and numbers"),
+        ("car_park,capacity,hour,free\na,100,2024-01-01T00,five\n", "line 2: want an ISO time and numbers"),
+        (
+            "car_park,capacity,hour,free\na,100,0001-01-01,5\na,100,9999-12-31,5\n",
+            "over 3,652,059 days, want at",
+        ),
+        ("car_park,capacity,hour,free\n\x1bred,100,2024-01-01,5\n", "want a printable name"),
+    ],
+)
+def test_other_files_are_refused(tmp_path, text, message):
+    path = tmp_path / "counts.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        Counts.read(path)
+
+
+def test_unknown_names_are_refused(tmp_path):
+    counts = read(tmp_path, rows_of(free_places(2)))
+    assert is_counts(tmp_path / "counts.csv")
+    with pytest.raises(InputError, match=r"has no car park 'center'; did you mean 'centre'"):
+        counts.chosen(["center"])
+    with pytest.raises(InputError, match="timezone is 'Berlin'"):
+        Counts.read(tmp_path / "counts.csv", "Berlin")
