@@ -128,13 +128,15 @@ def _set_costs(
                     vertex, s, belief.slots[s].p_free, stops[k].time, fallback_s[s], graph, belief
                 ),
             )
-        stops[k].stop_s = stop_s
+        stops[k].stop_s, stops[k].bonus_s = stop_s, 0.0
         for j in range(first, last):
             observation = observations[j]
             slot = observation.slot
             at_once = expected_cost_to_slot(vertex, slot, 1.0, 0.0, fallback_s[slot], graph, belief)
             observation.kept_until = k if at_once <= stops[k].ahead_s else min(k + KEPT_IN_MIND, n_stops - 1)
             observation.parks = False
+            if observation.is_first:
+                stops[k].bonus_s += belief.slots[slot].bonus_s
             observation.expected_s = at_once
         _sort_observations(first, last, path)
         stops[k].first_cost = n_costs
@@ -201,10 +203,7 @@ def _stop_optimally(n_stops: int, left_s: float, path: PathBuffer) -> tuple[floa
             expected += rest * observations[i].p_free * observations[i].value
             rest *= 1.0 - observations[i].p_free
         nothing = expected + rest * nothing
-        bonus_s = 0.0
-        for i in range(first, last):
-            if observations[i].is_first:
-                bonus_s += belief.slots[observations[i].slot].bonus_s
+        bonus_s = stops[k].bonus_s
         if bonus_s > 0.0:
             nothing -= bonus_s
             for j in range(oldest, first):

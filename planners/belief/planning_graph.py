@@ -47,14 +47,9 @@ STOP = np.dtype(
         ("time", np.float64),
         ("first", np.int64),  # index of its first observation; the last precedes the next stop's first
         ("ahead_s", np.float64),  # scratch: least time to the goal after any later observation
-        (
-            "stop_s",
-            np.float64,
-        ),  # scratch: expected time of driving from here to the best slot that is known now
-        (
-            "first_cost",
-            np.int64,
-        ),  # scratch: index in `PathBuffer.costs` of the first observation remembered here
+        ("stop_s", np.float64),  # scratch: expected time of driving to the best slot that is known now
+        ("bonus_s", np.float64),  # scratch: value of its first observations for later searches
+        ("first_cost", np.int64),  # scratch: index in `PathBuffer.costs` of the first slot remembered here
     ]
 )
 """A stop of a path."""
