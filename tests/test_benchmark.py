@@ -15,6 +15,8 @@ from parkenv.evaluation.experiments.benchmark import Suite, check_result, result
 from parkenv.evaluation.experiments.compare import run_cases
 from parkenv.evaluation.experiments.results import ResultFolder, write_summary
 from parkenv.evaluation.report.page import SCHEMA
+from parkenv.world.day_error import DayError
+from parkenv.world.occupancy import Arrival
 
 AGENTS = ("first-free", "greedy-goal")
 
@@ -127,6 +129,18 @@ def test_suites_do_not_change():
     suite = Suite.named("v1")
     assert len(suite.tasks) == 8
     assert suite.fingerprint == "eb8b33585e781fa69eb00fe155aefb44a18fee96789c25a0b65ef4199264b03b"
+    assert {task.day_error for task in suite.tasks} == {(0.0,)}
+
+
+def test_the_days_of_the_second_suite_differ_from_their_forecast():
+    suite = Suite.named("v2")
+    sizes = {}
+    for task in suite.tasks:
+        made = task.made(suite.arrival)
+        sizes[task.name] = made.occupancy.day_error
+        assert made.forecast(Arrival(9 * 3600.0)).day_error == made.occupancy.day_error
+    assert sizes["campus"] == sizes["jam"] == sizes["campus-full"] == DayError(0.8)
+    assert (sizes["campus-slope"], sizes["campus-as-forecast"]) == (DayError(0.6, 0.6), DayError())
 
 
 def test_the_command_tells_of_suites_and_refuses_what_is_none(tmp_path):
@@ -134,7 +148,7 @@ def test_the_command_tells_of_suites_and_refuses_what_is_none(tmp_path):
     assert shown.returncode == 0
     assert "campus-full" in shown.stdout
     unknown = parkenv("benchmark", "run", "v7", "--out", tmp_path / "out")
-    assert (unknown.returncode, "known: v1" in unknown.stderr) == (2, True)
+    assert (unknown.returncode, "known: v1, v2" in unknown.stderr) == (2, True)
     for content in ('{"format": "park', "[" * 100_000):
         (tmp_path / "torn.json").write_text(content)
         torn = parkenv("benchmark", "check", tmp_path / "torn.json")

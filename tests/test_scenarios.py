@@ -5,11 +5,13 @@ import numpy as np
 import pytest
 
 from parkenv import InputError, make_scenario
+from parkenv.cli.arguments import World
 from parkenv.files.names import SCENARIO_NAMES
 from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.mapping.inference import MapPrior
 from parkenv.mapping.store import MapStore, Session
 from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
+from parkenv.world.day_error import DayError, nearness
 from parkenv.world.flat_map import FlatMap
 from parkenv.world.occupancy import Arrival, ArrivalWindow
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -43,6 +45,42 @@ def test_packaged_scenarios_are_files_like_any_other():
     assert 0.7 < np.mean(ratio > 1.0) <= 0.75
     known = jam.forecast(TUESDAY_NOON).p_occupied
     assert np.array_equal(known, usual.forecast(TUESDAY_NOON).p_occupied)
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("day_error = 0.5", DayError(0.5)),
+        ("day_error = 1", DayError(1.0)),
+        ("day_error = { level = 0.5, slope = 0.25 }", DayError(0.5, 0.25)),
+        ("day_error = { slope = 0.25 }", DayError(0.0, 0.25)),
+        ("", DayError()),
+    ],
+)
+def test_days_differ_from_their_forecast_by_what_the_file_says(tmp_path, text, wanted):
+    made = make_scenario(written(tmp_path, f'lot = "street"\n[forecast]\nflat = 0.5\n[occupancy]\n{text}'))
+    assert made.occupancy.day_error == made.forecast(TUESDAY_NOON).day_error == wanted
+    if wanted.slope:
+        np.testing.assert_array_equal(made.occupancy.nearness, nearness(made.walk_s))
+
+
+def test_days_of_scenarios_can_be_changed():
+    for name in SCENARIO_NAMES:
+        made = make_scenario(name)
+        assert made.occupancy.day_error == made.forecast(TUESDAY_NOON).day_error == DayError(0.8)
+        as_forecast = make_scenario(name, day_error=0.0)
+        assert not as_forecast.occupancy.day_error
+        assert not as_forecast.forecast(TUESDAY_NOON).day_error
+        p = [scenario.forecast(TUESDAY_NOON).p_occupied for scenario in (made, as_forecast)]
+        np.testing.assert_array_equal(*p)
+    spec = scenario_spec("jam")
+    assert World(day_error="0").specs("jam")[0].occupancy.day_error.level == 0.0
+    changed = World(day_error="0.5,0.25").spec("jam")
+    assert changed.occupancy.day_error.tables() == {"level": 0.5, "slope": 0.25}
+    assert changed.occupancy.event == spec.occupancy.event
+    for text in ("x", "1,2,3", "nan", "-1"):
+        with pytest.raises(InputError, match=r"^--day-error is "):
+            World(day_error=text).spec("jam")
 
 
 def test_a_file_says_it_all(tmp_path):
@@ -161,6 +199,9 @@ def test_logs_and_maps(tmp_path):
         ('lot = "mini"\noccupancy = { replay_from = 2016-01-01 }', "want replay_from only together with a log"),
         ('lot = "mini"\noccupancy = { forecast_from = "past" }', "want forecast_from only together with replay_from"),
         ('lot = "mini"\noccupancy = { replay_from = 2016 }', "occupancy.replay_from is 2016, want a date such as"),
+        ('lot = "mini"\noccupancy = { day_error = -1 }', "occupancy.day_error.level is -1"),
+        ('lot = "mini"\noccupancy = { day_error = "big" }', "occupancy.day_error is 'big', want"),
+        ('lot = "mini"\noccupancy = { log = "mine.toml", day_error = 1 }', "day_error only without a log or counts"),
         ('lot = "mini"\noccupancy = { log = "no.csv" }', "occupancy.log.0 is 'no.csv', want a file; there is none at"),
         ('lot = "mini"\nsensor_model = { hit_rate = 0.5 }', "want hit_rate and false_alarm_rate together"),
         ('lot = "mini"\nname = "a/b"', "name is 'a/b', want at most 80 printable characters without comma or slash"),

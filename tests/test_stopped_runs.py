@@ -87,6 +87,30 @@ def test_ctrl_c_while_modules_are_imported_is_quiet(tmp_path):
         assert output == "" or output.startswith(("Searching", "Interrupted."))
 
 
+def test_a_signal_during_compiled_code_stops_it():
+    script = (
+        "import collections, os, subprocess, numba, numpy as np\n"
+        "from parkenv.cli.stop_signals import stop_signals\n"
+        "Made = collections.namedtuple('Made', 'sum n')\n"
+        "@numba.njit\n"
+        "def work(n):\n"
+        "    made = np.zeros(1)\n"
+        "    for i in range(n):\n"
+        "        made[0] += np.sin(i)\n"
+        "    return Made(made[0], n)\n"
+        "work(1)\n"
+        "try:\n"
+        "    with stop_signals():\n"
+        "        subprocess.Popen(['sh', '-c', f'sleep 0.1; kill -TERM {os.getpid()}'])\n"
+        "        while True:\n"
+        "            work(1_000_000)\n"
+        "except KeyboardInterrupt:\n"
+        "    print('stopped')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, "stopped\n"), done.stderr
+
+
 @pytest.mark.parametrize("thread", ["main", "other"])
 def test_workers_end_with_their_killed_parent(tmp_path, thread):
     """Linux kills them; the workers of a thread that may end before the process watch for themselves."""

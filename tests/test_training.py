@@ -497,6 +497,7 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
     assert [row["steps"] for row in rows] == [0, 10]
     assert rows[1]["total_s"] == rows[1]["median_s"] == pytest.approx(91.0)
     save_learning_curves({"ppo": curves}, {"mdp": 85.0, "belief": 84.9}, "a title", tmp_path / "curve.png")
+    save_learning_curves({"ppo": [[curves[0][0]]]}, {}, "one evaluation", tmp_path / "one.png")
     assert (tmp_path / "curve.png").stat().st_size > 10_000
 
 

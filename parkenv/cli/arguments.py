@@ -63,6 +63,9 @@ class World:
         forecast_from (past|rolling|others): Days that the forecast is made from. past: those before --replay-from;
             rolling: those before the earliest that a world replays; others: all that it does not replay.  [default: the
             scenario's; others, with counts rolling]
+        day_error (X[,Y]): How far whole days differ from the forecast: standard deviations, logits, of their level and
+            of their slope to the goal; 0 for days that are as forecast.  [default: the scenario's, 0.8 in the packaged
+            ones]
         mapping (FILE): CSV slot_id,log_slot_id that assigns the log's slots to the lot's.  [default: the log's fullest
             slots are nearest to the goal]
         goal (X,Y): Walk to this point, m, or to the lot's goal of this index.  [default: the scenario's]
@@ -74,6 +77,7 @@ class World:
     car_park: str | None = None
     replay_from: str | None = None
     forecast_from: ForecastFrom | None = None
+    day_error: str | None = None
     mapping: str | None = None
     goal: str | None = None
     days: str | None = None
@@ -140,6 +144,12 @@ class World:
         replay = not_none(replay_from=self.replay_from, forecast_from=self.forecast_from)
         if replay:
             spec = spec.changed(occupancy=spec.occupancy.changed("--replay-from, --forecast-from", **replay))
+        if self.day_error is not None:
+            count = self.day_error.count(",") + 1
+            sizes = zip(
+                ("level", "slope"), numbers("--day-error", self.day_error, min(count, 2)), strict=False
+            )
+            spec = spec.changed(occupancy=spec.occupancy.changed("--day-error", day_error=dict(sizes)))
         if self.goal is not None:
             index = int(self.goal) if self.goal.isdecimal() else numbers("--goal", self.goal, 2)
             spec = spec.changed("--goal", goal=index)

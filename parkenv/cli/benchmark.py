@@ -23,7 +23,7 @@ RESULT = "result.json"
 
 
 def run(
-    suite: str = "v1",
+    suite: str = "v2",
     /,
     agents: str | None = None,
     out: Path | None = None,
@@ -40,11 +40,11 @@ def run(
     clairvoyant bound divided by the agent's own; its score in the suite is the mean over the tasks, at most 1.
 
     Examples:
-        parkenv benchmark run v1 --agents belief,mdp --out results/v1
-        parkenv benchmark check results/v1/result.json
+        parkenv benchmark run v2 --agents belief,mdp --out results/v2
+        parkenv benchmark check results/v2/result.json
 
     Options:
-        suite (SUITE): The suite.  [default: v1]
+        suite (SUITE): The suite.  [default: v2]
         out, -o (DIR): Folder for result.json and the episodes.  [default: results/SUITE]
         by (TEXT): Who submits the result: a name, an address of the code.  [default: nobody]
     """
@@ -113,7 +113,7 @@ def check(results: list[Path], /) -> None:
     differ in other worlds or at other costs and speeds. The times of an agent cannot be verified without running it.
 
     Examples:
-        parkenv benchmark check results/v1/result.json others.json
+        parkenv benchmark check results/v2/result.json others.json
 
     Options:
         results (FILE): Result files.
@@ -136,7 +136,7 @@ def page(results: list[Path], /, out: Path = Path("results/benchmark.html")) -> 
     `parkenv benchmark check` is refused, and no page is written.
 
     Examples:
-        parkenv benchmark page results/v1 yours/result.json --out v1.html
+        parkenv benchmark page results/v2 yours/result.json --out v2.html
 
     Options:
         results (FILE|DIR): Result files, or folders with result.json files in them.
@@ -159,14 +159,14 @@ def page(results: list[Path], /, out: Path = Path("results/benchmark.html")) -> 
     console.print(f"Written: {out}, {agents} agents in {len(checked)} results")
 
 
-def show(suite: str = "v1", /) -> None:
+def show(suite: str = "v2", /) -> None:
     """Show the tasks and settings of a suite.
 
     Examples:
-        parkenv benchmark show v1
+        parkenv benchmark show v2
 
     Options:
-        suite (SUITE): The suite.  [default: v1]
+        suite (SUITE): The suite.  [default: v2]
     """
     from parkenv.evaluation.experiments.benchmark import Suite
 
@@ -178,8 +178,9 @@ def show(suite: str = "v1", /) -> None:
         made = task.made(its.arrival)
         level = "as it comes" if task.occupancy_level is None else f"{task.occupancy_level:.0%}"
         walk = f"{made.v_walk * 3.6:g} km/h"
-        cells.append((task.name, task.scenario, str(made.lot.n_slots), level, task.sensor_model, walk))
-    headings = ["task", "scenario", "slots", "mean occupancy", "sensor model", "walking"]
+        days = ", ".join(f"{size:g}" for size in task.day_error)
+        cells.append((task.name, task.scenario, str(made.lot.n_slots), level, days, task.sensor_model, walk))
+    headings = ["task", "scenario", "slots", "mean occupancy", "day error", "sensor model", "walking"]
     console.print(make_table(None, headings, cells))
     console.print(
         f"{len(its.seeds)} episodes a task, seeds {its.seeds[0]} to {its.seeds[-1]}; suite {its.fingerprint[:16]}"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import _thread
+import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -18,7 +20,9 @@ def stop_signals() -> Iterator[list[int]]:
     received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
-        del frame
+        if _returns_from_compiled_code(frame):
+            _thread.start_new_thread(os.kill, (os.getpid(), number))
+            return
         received.append(number)
         raise KeyboardInterrupt
 
@@ -33,3 +37,12 @@ def stop_signals() -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _returns_from_compiled_code(frame: FrameType | None) -> bool:
+    """Whether numba is making the Python objects that a compiled function returns: it crashes if its helper raises."""
+    while frame is not None:
+        if frame.f_code.co_name == "_numba_unpickle":
+            return True
+        frame = frame.f_back
+    return False

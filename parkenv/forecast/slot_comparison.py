@@ -135,7 +135,7 @@ def _boosted(past: SlotDays) -> FloatArray:
     if len(np.unique(states[used] > 0.5)) < 2:
         return _shrunk_mean(past, everything)
     model = HistGradientBoostingClassifier(
-        max_iter=60, learning_rate=0.08, max_leaf_nodes=15, min_samples_leaf=50
+        max_iter=60, learning_rate=0.08, max_leaf_nodes=15, min_samples_leaf=50, early_stopping=False
     )
     model.fit(inputs[used], states[used] > 0.5, sample_weight=weights[used])
     return np.asarray(model.predict_proba(features(everything))[:, 1].reshape(n.shape[0], -1))

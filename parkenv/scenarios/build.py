@@ -22,6 +22,7 @@ from parkenv.scenarios.spec import (
     TypicalWeek,
     scenario_spec,
 )
+from parkenv.world.day_error import DayError
 from parkenv.world.flat_map import FlatMap
 from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy import OccupancyModel, OccupancyProcess, PriorModel
@@ -46,7 +47,8 @@ def make_scenario(source: ScenarioSource, **changes: Any) -> Scenario:
     Args:
         source: name of a packaged scenario (campus, jam, street, mini), a scenario file (.toml), a lot file, a
             `ScenarioSpec`, a `ParkingLot` (with the occupancy of a typical week), or a `Scenario`.
-        changes: fields of `Scenario` to replace.
+        changes: fields of `Scenario` to replace, and `day_error`, how far whole days differ from the forecast (a
+            `DayError`, or a number, its level): 0 for days that are as forecast.
 
     Raises:
         InputError: an unknown name or field, or an invalid file; the message is one line.
@@ -56,6 +58,9 @@ def make_scenario(source: ScenarioSource, **changes: Any) -> Scenario:
         >>> scenario.lot.name, scenario.failure_s
         ('campus', 90.0)
     """
+    if "day_error" in changes:
+        day_error = changes.pop("day_error")
+        return _with_day_error(make_scenario(source, **changes), day_error)
     if isinstance(source, Scenario):
         return source.replace(**changes)
     if isinstance(source, ParkingLot):
@@ -88,7 +93,7 @@ def build(spec: ScenarioSpec) -> Scenario:
         if not goal < len(lot.goals):
             raise InputError(f"goal is {goal}, want an index from 0 to {len(lot.goals) - 1}")
         occupancy = _occupancy(spec.occupancy, lot, goal)
-        return Scenario(
+        made = Scenario(
             name=spec.title,
             lot=lot,
             goal=goal,
@@ -107,8 +112,26 @@ def build(spec: ScenarioSpec) -> Scenario:
             else Traffic(spec.traffic.cars, spec.traffic.pedestrians),
             rig=spec.rig,
         )
+        error = spec.occupancy.day_error
+        return made if error is None else _with_day_error(made, DayError(error.level, error.slope))
     except InputError as error:
         raise InputError(f"{spec.source}: {error}") from error
+
+
+def _with_day_error(scenario: Scenario, day_error: DayError | float) -> Scenario:
+    """Return the scenario with other days, and with a forecast that states their error, unless it is from a map."""
+    if not isinstance(day_error, DayError):
+        day_error = DayError(day_error)
+
+    def changed(model: PriorModel) -> PriorModel:
+        if isinstance(model, OccupancyProcess):
+            return model.with_day_error(day_error, scenario.walk_s)
+        return dataclasses.replace(model, true=changed(model.true)) if isinstance(model, FlatMap) else model
+
+    if not isinstance(scenario.occupancy, OccupancyProcess):
+        raise InputError(f"day_error: the occupancy is a {type(scenario.occupancy).__name__}, want a process")
+    prior = scenario.prior and changed(scenario.prior)
+    return scenario.replace(occupancy=changed(scenario.occupancy), prior=prior)
 
 
 def _lot(spec: LotSpec) -> ParkingLot:

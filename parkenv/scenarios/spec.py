@@ -10,7 +10,9 @@ from datetime import date, datetime
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, GetJsonSchemaHandler, model_validator
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema
 
 from parkenv.errors import InputError, nearest
 from parkenv.files.limited_reading import is_there
@@ -25,6 +27,7 @@ from parkenv.files.names import (
     SensorModelName,
 )
 from parkenv.files.spec_file import FilePath, OrText, Several, Spec, read_tables
+from parkenv.world.day_error import MAX_LOGITS
 from parkenv.world.occupancy import ArrivalWindow
 
 Speed = Annotated[float, Field(ge=0.1, le=300.0)]
@@ -150,6 +153,30 @@ def _date(value: object) -> object:
 Date = Annotated[date, BeforeValidator(_date)]
 
 
+def _day_error_tables(value: object) -> object:
+    """Expand a number to a table: the level."""
+    return {"level": value} if isinstance(value, int | float) and not isinstance(value, bool) else value
+
+
+Deviation = Annotated[float, Field(ge=0.0, le=MAX_LOGITS)]
+
+
+class DayErrorSpec(Spec):
+    """How far whole days differ from the forecast: standard deviations over days, logits; or one number, the level."""
+
+    level: Deviation = Field(0.0, description="Of the shift of all slots at once.")
+    slope: Deviation = Field(0.0, description="Of the additional rise from the lot's middle to the goal.")
+
+
+class OrNumber:
+    """Annotation of a table that may also be given as a number: the JSON schema allows both."""
+
+    def __get_pydantic_json_schema__(
+        self, core_schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> JsonSchemaValue:
+        return {"anyOf": [{"type": "number"}, handler(core_schema)]}
+
+
 class CountsSpec(Spec):
     """Days of a car park of which the number of free places was counted every hour, laid on the lot."""
 
@@ -192,11 +219,17 @@ class OccupancySpec(Spec):
         None, description="CSV slot_id,log_slot_id: which slot of the log is which."
     )
     event: Event | None = None
+    day_error: Annotated[DayErrorSpec, BeforeValidator(_day_error_tables), OrNumber()] | None = Field(
+        None,
+        description="Worlds whose days differ from the forecast; if absent, the process's own, 0 for a typical week.",
+    )
 
     @model_validator(mode="after")
     def _one(self) -> Self:
         _require_one(self, ("typical", "process", "log", "counts"), least=0)
         recorded = self.log is not None or self.counts is not None
+        if self.day_error is not None and recorded:
+            raise ValueError("day_error only without a log or counts: recorded days differ as they did")
         if self.mapping is not None and self.log is None:
             raise ValueError("mapping only together with a log")
         if self.replay_from is not None and not recorded:

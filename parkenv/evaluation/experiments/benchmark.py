@@ -26,6 +26,7 @@ from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.results import ResultFolder, Row
 from parkenv.files.limited_reading import read_json
 from parkenv.scenarios.build import make_scenario
+from parkenv.world.day_error import DayError
 from parkenv.world.occupancy import ArrivalWindow
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
@@ -33,7 +34,7 @@ from planners.agent import make_agent
 
 RESULT_FORMAT = "parkenv-benchmark-result"
 RESULT_VERSION = 1
-SUITES = ("v1",)
+SUITES = ("v1", "v2")
 METRICS = (
     "episodes", "parked_fraction", "total_s", "total_s_ci95", "regret_s", "regret_s_ci95", "failed_parks",
     "decision_ms", "decision_ms_p99",
@@ -54,10 +55,13 @@ class Task:
     # `perfect`, or the rig whose fitted sensor model is used; `sight` in the suite's file
     sensor_model: str = "perfect"
     v_walk_kmh: float | None = None  # walking speed; None for the scenario's own
+    # how far days differ from the forecast, logits: (level,) or (level, slope)
+    day_error: tuple[float, ...] = (0.0,)
 
     def made(self, arrival: ArrivalWindow) -> Scenario:
         """Make the scenario, named after the task."""
-        made = make_scenario(self.scenario).replace(name=self.name, arrival=arrival)
+        days = DayError(*self.day_error)
+        made = make_scenario(self.scenario, name=self.name, arrival=arrival, day_error=days)
         if self.sensor_model != "perfect":
             made = made.replace(sensor_model=SensorModel.named(self.sensor_model))
         if self.v_walk_kmh is not None:
@@ -98,7 +102,7 @@ class Suite:
             content["description"],
             ArrivalWindow.parse(content["arrival"], content["days"]),
             range(first, first + content["episodes"]),
-            tuple(Task(sensor_model=task.pop("sight", "perfect"), **task) for task in content["tasks"]),
+            tuple(_task(**task) for task in content["tasks"]),
             hashlib.sha256(canonical.encode()).hexdigest(),
         )
 
@@ -115,6 +119,11 @@ class Suite:
         cases = [Case(world, agent.name, options=agent.options) for world in worlds for agent in agents]
         require_distinct(cases)
         return [(case, self.seeds) for case in cases]
+
+
+def _task(sight: str = "perfect", day_error: Sequence[float] = (0.0,), **fields: Any) -> Task:
+    """Return a task of a suite's file; v1 is older than days that differ from their forecast."""
+    return Task(sensor_model=sight, day_error=tuple(day_error), **fields)
 
 
 def result_of(

@@ -184,7 +184,7 @@ class BenchmarkSpec(Workplace):
     """A run of a benchmark suite, which defines scenarios, costs, speeds and seeds."""
 
     kind: Literal["benchmark"] = "benchmark"
-    suite: str = "v1"
+    suite: str = "v2"
     by: str = Field("", max_length=200, description="Who submits the result.")
     agents: Several[AgentItem] = Field(
         tuple(

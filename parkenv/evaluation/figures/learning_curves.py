@@ -72,8 +72,8 @@ def save_learning_curves(
         highest = 0.0
         for (name, its), color in zip(curves.items(), COLORS, strict=False):
             drawn = _draw(axes, name, its, "total_s", color, alone=len(curves) == 1)
-            highest = max(highest, *drawn[len(drawn) // 10 :])
-        low = min(*planners.values(), *(r["total_s"] for its in curves.values() for c in its for r in c))
+            highest = max([highest, *drawn[len(drawn) // 10 :]])
+        low = min([*planners.values(), *(r["total_s"] for its in curves.values() for c in its for r in c)])
         # An untrained policy drives in circles, so cut off high values to keep the end of the curves readable.
         high = min(max([highest, *planners.values()]), OFF_SCALE * low)
         margin = 0.06 * (high - low) or 1.0
