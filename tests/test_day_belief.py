@@ -26,7 +26,7 @@ def logit(p):
 @pytest.mark.parametrize(("level", "slope"), [(0.0, 0.0), (0.8, 0.0), (0.5, 0.5), (1.5, 0.0)])
 def test_before_any_observation_the_forecast_is_believed(level, slope):
     p, near, belief = forecast_of(60, level=level, slope=slope)
-    np.testing.assert_allclose(DayBelief(belief, near, 60).p_occupied(belief), p, atol=0.01)
+    np.testing.assert_allclose(DayBelief(belief, near).p_occupied(belief), p, atol=0.01)
 
 
 def test_it_finds_the_level_of_the_day_from_its_observations(monkeypatch):
@@ -40,7 +40,7 @@ def test_it_finds_the_level_of_the_day_from_its_observations(monkeypatch):
         truth = 1.0 / (1.0 + np.exp(-(centre + level + slope * near)))
         seen = rng.permutation(300)[:100]
         belief = before.update(seen, rng.random(100) < truth[seen])
-        day = DayBelief(before, near, 300)
+        day = DayBelief(before, near)
         day.update(belief)
         rest = np.setdiff1d(np.arange(300), seen)
         found.append((day.p_occupied(belief) - truth)[rest])
@@ -54,7 +54,7 @@ def test_an_event_is_told_from_a_fuller_day():
     p, near, before = forecast_of(120, level=0.3)
     seen = np.flatnonzero((near > 0.3) | (near < -0.8))
     belief = before.update(seen, np.where(near[seen] > 0.0, True, np.arange(len(seen)) % 3 > 0))
-    day = DayBelief(before, near, 120)
+    day = DayBelief(before, near)
     day.update(belief)
     found = day.p_occupied(belief)
     assert found[(near < 0.3) & (near > 0.0)].min() > 0.99
@@ -65,7 +65,7 @@ def test_an_event_is_told_from_a_fuller_day():
 def test_a_certain_forecast_is_believed_whatever_is_observed():
     _, near, before = forecast_of(60)
     belief = before.update(np.arange(15), np.ones(15, dtype=bool))
-    day = DayBelief(before, near, 60, certain=True)
+    day = DayBelief(before, near, certain=True)
     day.update(belief)
     np.testing.assert_allclose(day.p_occupied(belief), belief.p_occupied)
 
@@ -74,8 +74,8 @@ def test_sensor_errors_and_repeated_observations_count_for_what_they_say():
     """Against Bayes' rule by enumeration of the states of three slots under each hypothesis."""
     p, near, belief = forecast_of(3, level=1.0)
 
-    weight, p_if = day_belief._hypotheses(p, near, 3, belief.day_error)
-    posterior, day = np.zeros((len(weight), 8)), DayBelief(belief, near, 3)
+    weight, p_if = day_belief._hypotheses(p, near, belief.day_error)
+    posterior, day = np.zeros((len(weight), 8)), DayBelief(belief, near)
     states = np.array(list(itertools.product((False, True), repeat=3)))
     for h in range(len(weight)):
         posterior[h] = weight[h] * np.prod(np.where(states, p_if[:, h], 1.0 - p_if[:, h]), axis=1)
@@ -99,7 +99,7 @@ def test_seen_again_at_once_says_nothing_and_after_long_says_as_much_as_another_
     unseen = np.arange(20, 40)
 
     def moved(*gaps):
-        belief, day = before, DayBelief(before, near, 40)
+        belief, day = before, DayBelief(before, near)
         for gap in gaps:
             belief = belief.decay(gap).update(np.arange(20), np.ones(20, dtype=bool))
             day.update(belief)
@@ -111,13 +111,14 @@ def test_seen_again_at_once_says_nothing_and_after_long_says_as_much_as_another_
     assert moved(1.0, 1e5) > 1.2 * once
 
 
-def test_another_part_of_the_lot_starts_with_what_is_known_of_the_day():
+def test_another_part_of_the_lot_starts_with_what_is_known_of_the_day(monkeypatch):
+    monkeypatch.setattr(day_belief, "EVENTS", {1.0: 1e-12})
     _, near, whole = forecast_of(80)
     seen = whole.update(np.arange(30), np.ones(30, dtype=bool))
     first, second = np.arange(0, 50), np.arange(20, 80)
     at_once, old, new = (
-        DayBelief(whole, near, 80),
-        *(DayBelief(whole.take(part), near[part], 80) for part in (first, second)),
+        DayBelief(whole, near),
+        *(DayBelief(whole.take(part), near[part]) for part in (first, second)),
     )
     at_once.update(seen)
     old.update(seen.take(first))

@@ -29,13 +29,13 @@ LEVELS, SLOPES = 9, 5
 REACH, FREEDOM = 4.2, 4.0
 """Largest value and degrees of freedom of the t-distribution of levels and slopes, before it is scaled."""
 EVENTS = dict.fromkeys((0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0), 0.08 / 7)
-"""Fraction of the lot, nearest to the goal, that an event fills -> its probability in a very large lot.
+"""Fraction of the slots, those nearest to the goal, that an event fills -> its probability among very many slots.
 
 With higher probabilities the car would turn round after fewer taken slots: sooner on the day of an event, and more
 often without need on other days.
 """
 HALF_EVENTS_AT = 40.0
-"""Number of slots of a lot with half the events of a very large one: small lots fill up on usual days."""
+"""Number of slots with half the events of very many: small lots fill up on usual days."""
 P_TAKEN_AT_EVENT = 0.998
 """P(taken) of the affected slots, unless the forecast is even higher."""
 WORTHLESS = 0.004
@@ -54,7 +54,6 @@ class DayBelief:
     Args:
         belief: belief about these slots before any observation.
         nearness: (n_slots,) see `parkenv.world.day_error.nearness`; over the whole lot.
-        whole: number of slots of the whole lot.
         certain: whether the forecast is right on every day, whatever is observed.
 
     Examples:
@@ -63,7 +62,7 @@ class DayBelief:
         >>> from parkenv.world.day_error import nearness
         >>> belief = SlotBelief.of_forecast(np.full(40, 0.6), np.zeros(40))
         >>> belief.day_error = np.array([0.8, 0.0])
-        >>> day = DayBelief(belief, nearness(np.arange(40.0)), 40)
+        >>> day = DayBelief(belief, nearness(np.arange(40.0)))
         >>> round(float(day.p_occupied(belief)[20]), 2)
         0.6
         >>> seen = belief.update(np.arange(10), np.full(10, True))
@@ -72,12 +71,12 @@ class DayBelief:
         True
     """
 
-    def __init__(self, belief: SlotBelief, nearness: FloatArray, whole: int, certain: bool = False) -> None:
+    def __init__(self, belief: SlotBelief, nearness: FloatArray, certain: bool = False) -> None:
         forecast = np.clip(belief.forecast.astype(np.float64), _LEAST, _MOST)
         if certain:
             weight, self._p_taken = np.ones(1), forecast[:, None]
         else:
-            weight, self._p_taken = _hypotheses(forecast, nearness, whole, belief.day_error)
+            weight, self._p_taken = _hypotheses(forecast, nearness, belief.day_error)
         self._log_weight = np.log(weight)
         # P(taken) at each slot's last observation under each hypothesis, when that was, and the result
         self._p_then = np.empty_like(self._p_taken)
@@ -85,8 +84,18 @@ class DayBelief:
         self._p_observed = forecast.copy()
 
     def carry_over(self, other: DayBelief, ours: IntArray, theirs: IntArray) -> None:
-        """Take over what is known about the day, and about the slots `theirs` of another part, here `ours`, (k,)."""
-        self._log_weight = other._log_weight.copy()
+        """Take over what is known about the day, and about the slots `theirs` of another part, here `ours`, (k,).
+
+        An event is one of a part: in another part it is as likely as at first, and if there was one, what was observed
+        there says nothing about the level.
+        """
+        usual = len(self._log_weight) - len(EVENTS)
+        if usual > 0:
+            prior, posterior = np.exp(self._log_weight), np.exp(other._log_weight - other._log_weight.max())
+            posterior /= posterior.sum()
+            event = posterior[usual:].sum()
+            share = posterior[:usual] + event * prior[:usual] / prior[:usual].sum()
+            self._log_weight[:usual] = np.log(np.maximum(share, 1e-300) * prior[:usual].sum())
         self._p_then[ours] = other._p_then[theirs]
         self._observed_at[ours] = other._observed_at[theirs]
         self._p_observed[ours] = other._p_observed[theirs]
@@ -124,15 +133,16 @@ class DayBelief:
 
 
 def _hypotheses(
-    forecast: FloatArray, nearness: FloatArray, whole: int, day_error: NDArray[np.floating]
+    forecast: FloatArray, nearness: FloatArray, day_error: NDArray[np.floating]
 ) -> tuple[FloatArray, FloatArray]:
     """Return prior weights, (k,), and P(taken), (n_slots, k), of the hypotheses about the day.
 
     A forecast describes the average day, so the usual days are chosen such that the mean over all days is the forecast.
     """
     error = DayError(*(float(e) for e in day_error))
-    within = nearness[:, None] > 1.0 - 2.0 * np.array(list(EVENTS))
-    event_weight = np.array(list(EVENTS.values())) * whole / (whole + HALF_EVENTS_AT)
+    n = len(forecast)
+    within = np.argsort(np.argsort(-nearness))[:, None] < n * np.array(list(EVENTS))
+    event_weight = np.array(list(EVENTS.values())) * n / (n + HALF_EVENTS_AT)
     at_event = np.maximum(forecast, P_TAKEN_AT_EVENT)
     share = within @ event_weight
     usual = np.maximum((forecast - share * at_event) / (1.0 - share), 0.5 * forecast)

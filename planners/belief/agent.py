@@ -114,7 +114,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
     def __init__(
         self,
         problem: SearchProblem,
-        budget_ms: float = 5.0,
+        budget_ms: float = 1.0,
         day: bool = True,
         most_vertices: int = MOST_VERTICES,
         explore: float = 0.0,
@@ -149,7 +149,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         return BeliefSearch(
             near=near,
             n_unobserved=n,
-            day=DayBelief(known, self._nearness[near.slots], len(self._nearness), certain=not self._day),
+            day=DayBelief(known, self._nearness[near.slots], certain=not self._day),
             state=np.full(n, UNOBSERVED, dtype=np.int8),
             missed_rate=np.zeros(n),
             time=belief.time,

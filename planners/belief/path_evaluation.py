@@ -89,13 +89,68 @@ def evaluate_path(
     """
     if n_stops < 2:
         return np.inf, np.inf
-    for j in range(path.stops[n_stops].first):
-        path.observations[j].parks = False
+    _set_costs(n_stops, options, fallback_s, graph, belief, path)
     value, then_s = np.inf, np.inf
     for _ in range(2 if len(belief.weights) > 1 else 1):
         _set_first_observations(n_stops, belief, path)
-        value, then_s = _stop_optimally(n_stops, left_s, options, fallback_s, graph, belief, path)
+        value, then_s = _stop_optimally(n_stops, left_s, path)
     return value, then_s
+
+
+@compiled(error_model="numpy")
+def _set_costs(
+    n_stops: int,
+    options: IntArray,
+    fallback_s: FloatArray,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    path: PathBuffer,
+) -> None:
+    """Set what does not depend on P(free) of the observations: `path.costs` and the scratch fields of the stops."""
+    stops, observations = path.stops, path.observations
+    # Lower bound on the time after any later observation. A slot that is better than the bound is taken at once. Others
+    # are remembered for some stops; their value cannot improve in the meantime.
+    ahead = np.inf
+    for k in range(n_stops - 1, 0, -1):
+        stops[k].ahead_s = ahead
+        for j in range(stops[k].first, stops[k + 1].first):
+            slot = observations[j].slot
+            ahead = min(ahead, graph.drive_s[stops[k].vertex, slot] + graph.cost_s[slot])
+        ahead += stops[k].time - stops[k - 1].time
+    n_costs = 0
+    for k in range(1, n_stops):
+        vertex, first, last = stops[k].vertex, stops[k].first, stops[k + 1].first
+        stop_s = np.inf
+        for s in options:
+            stop_s = min(
+                stop_s,
+                expected_cost_to_slot(
+                    vertex, s, belief.slots[s].p_free, stops[k].time, fallback_s[s], graph, belief
+                ),
+            )
+        stops[k].stop_s, stops[k].bonus_s = stop_s, 0.0
+        for j in range(first, last):
+            observation = observations[j]
+            slot = observation.slot
+            at_once = expected_cost_to_slot(vertex, slot, 1.0, 0.0, fallback_s[slot], graph, belief)
+            observation.kept_until = k if at_once <= stops[k].ahead_s else min(k + KEPT_IN_MIND, n_stops - 1)
+            observation.parks = False
+            if observation.is_first:
+                stops[k].bonus_s += belief.slots[slot].bonus_s
+            observation.expected_s = at_once
+        _sort_observations(first, last, path)
+        stops[k].first_cost = n_costs
+        for j in range(stops[max(k - KEPT_IN_MIND, 1)].first, last):
+            observation = observations[j]
+            if observation.kept_until < k:
+                continue
+            if j < first:
+                age, slot = stops[k].time - observation.time, observation.slot
+                back_s = expected_cost_to_slot(vertex, slot, 1.0, age, fallback_s[slot], graph, belief)
+            else:
+                back_s = observation.expected_s
+            path.costs[n_costs] = min(stop_s, back_s)
+            n_costs += 1
 
 
 @compiled(error_model="numpy")
@@ -111,61 +166,28 @@ def _set_first_observations(n_stops: int, belief: BeliefSnapshot, path: PathBuff
 
 
 @compiled(error_model="numpy")
-def _stop_optimally(
-    n_stops: int,
-    left_s: float,
-    options: IntArray,
-    fallback_s: FloatArray,
-    graph: PlanningGraph,
-    belief: BeliefSnapshot,
-    path: PathBuffer,
-) -> tuple[float, float]:
-    """Evaluate a path, given P(free) of all its observations."""
+def _stop_optimally(n_stops: int, left_s: float, path: PathBuffer) -> tuple[float, float]:
+    """Evaluate a path, given its costs and P(free) of all its observations."""
     stops, observations = path.stops, path.observations
-    # Lower bound on the time after any later observation. A slot that is better than the bound is taken at once. Others
-    # are remembered for some stops; their value cannot improve in the meantime.
-    ahead = np.inf
-    for k in range(n_stops - 1, 0, -1):
-        stops[k].ahead_s = ahead
-        for j in range(stops[k].first, stops[k + 1].first):
-            slot = observations[j].slot
-            ahead = min(ahead, graph.drive_s[stops[k].vertex, slot] + graph.cost_s[slot])
-        ahead += stops[k].time - stops[k - 1].time
-    for k in range(1, n_stops):
-        for j in range(stops[k].first, stops[k + 1].first):
-            slot = observations[j].slot
-            at_once = expected_cost_to_slot(stops[k].vertex, slot, 1.0, 0.0, fallback_s[slot], graph, belief)
-            observations[j].kept_until = (
-                k if at_once <= stops[k].ahead_s else min(k + KEPT_IN_MIND, n_stops - 1)
-            )
     nothing, onward, then_s = left_s, 0.0, left_s
     for k in range(n_stops - 1, 0, -1):
         # `value` of the observations and `nothing` hold the values at the next stop; `onward` is the drive there.
-        vertex, first, last = stops[k].vertex, stops[k].first, stops[k + 1].first
+        first, last, ahead_s, cost = stops[k].first, stops[k + 1].first, stops[k].ahead_s, stops[k].first_cost
         oldest = stops[max(k - KEPT_IN_MIND, 1)].first
-        stop_s = np.inf
-        for s in options:
-            stop_s = min(
-                stop_s,
-                expected_cost_to_slot(
-                    vertex, s, belief.slots[s].p_free, stops[k].time, fallback_s[s], graph, belief
-                ),
-            )
         for j in range(oldest, last):
             observation = observations[j]
             if observation.kept_until < k:
                 continue
-            age, slot = stops[k].time - observation.time, observation.slot
-            back_s = expected_cost_to_slot(vertex, slot, 1.0, age, fallback_s[slot], graph, belief)
-            observation.expected_s = min(stop_s, back_s)
+            expected_s = path.costs[cost]
+            cost += 1
             later = onward + (nothing if observation.kept_until == k else observation.value)
             # The stop at which the slot is observed is processed last and decides.
-            observation.parks = observation.expected_s <= max(stops[k].ahead_s, later)
-            observation.value = observation.expected_s if observation.parks else later
+            observation.parks = expected_s <= max(ahead_s, later)
+            observation.value = expected_s if observation.parks else later
+            observation.expected_s = expected_s
         then_s = onward + nothing
-        nothing = min(stop_s, then_s)
+        nothing = min(stops[k].stop_s, then_s)
         # Value before the observations at this stop: the best slot that they show replaces a worse one.
-        _sort_observations(first, last, path)
         for j in range(oldest, first):
             if observations[j].kept_until < k:
                 continue
@@ -181,10 +203,7 @@ def _stop_optimally(
             expected += rest * observations[i].p_free * observations[i].value
             rest *= 1.0 - observations[i].p_free
         nothing = expected + rest * nothing
-        bonus_s = 0.0
-        for i in range(first, last):
-            if observations[i].is_first:
-                bonus_s += belief.slots[observations[i].slot].bonus_s
+        bonus_s = stops[k].bonus_s
         if bonus_s > 0.0:
             nothing -= bonus_s
             for j in range(oldest, first):
@@ -200,12 +219,11 @@ def _sort_observations(first: int, last: int, path: PathBuffer) -> None:
     for i in range(first + 1, last):
         j = i
         while j > first and observations[j].expected_s < observations[j - 1].expected_s:
-            # Records are views, so swap them field by field. (Times at one stop are equal.)
+            # Records are views, so swap them field by field. Times at one stop are equal; the rest is not set yet.
             a, b = observations[j - 1], observations[j]
             a.slot, b.slot = b.slot, a.slot
             a.p_free, b.p_free = b.p_free, a.p_free
             a.expected_s, b.expected_s = b.expected_s, a.expected_s
-            a.value, b.value = b.value, a.value
+            a.kept_until, b.kept_until = b.kept_until, a.kept_until
             a.is_first, b.is_first = b.is_first, a.is_first
-            a.parks, b.parks = b.parks, a.parks
             j -= 1

@@ -47,6 +47,9 @@ STOP = np.dtype(
         ("time", np.float64),
         ("first", np.int64),  # index of its first observation; the last precedes the next stop's first
         ("ahead_s", np.float64),  # scratch: least time to the goal after any later observation
+        ("stop_s", np.float64),  # scratch: expected time of driving to the best slot that is known now
+        ("bonus_s", np.float64),  # scratch: value of its first observations for later searches
+        ("first_cost", np.int64),  # scratch: index in `PathBuffer.costs` of the first slot remembered here
     ]
 )
 """A stop of a path."""
@@ -100,6 +103,9 @@ class PathBuffer(NamedTuple):
     observations: Records  # `OBSERVATION` records in order
     marks: Records  # (n_slots,) `MARK` records
     weights: FloatArray  # float64, scratch: probabilities of the hypotheses along the path
+    # float64, scratch: expected time of driving from each stop to the best of the slots known before and each slot
+    # observed along the path that is remembered there
+    costs: FloatArray
 
 
 def path_buffer(n_slots: int, n_vertices: int) -> PathBuffer:
@@ -111,6 +117,7 @@ def path_buffer(n_slots: int, n_vertices: int) -> PathBuffer:
         np.zeros(most_observations, OBSERVATION),
         np.zeros(n_slots, MARK),
         np.zeros(MOST_HYPOTHESES),
+        np.empty(most_stops * most_observations),
     )
 
 
@@ -125,10 +132,10 @@ def copy_weights(belief: BeliefSnapshot, path: PathBuffer) -> FloatArray:
 
 @compiled(error_model="numpy")
 def decayed_part(rate: float, seconds: float) -> float:
-    """Return 1 - exp(-rate · seconds), with a fast approximation for small values."""
+    """Return 1 - exp(-rate · seconds); a series up to 0.05, where its relative error stays below 1e-7."""
     x = rate * seconds
-    if x < 1e-3:
-        return x
+    if x < 0.05:
+        return x * (1.0 - x / 2.0 * (1.0 - x / 3.0 * (1.0 - x / 4.0)))
     return 1.0 - math.exp(-x)
 
 
