@@ -16,8 +16,8 @@ from parkenv.world.week import DAY_S, HOUR_S
 if TYPE_CHECKING:
     from parkenv.world.occupancy_log import OccupancyLog
 
-# The day error of 99 German car parks over two years: median, and the weight of days at which the prior spreads from 0.50
-# to 1.07 in its middle 80 %, as they do. Of a few days, none may have been unusual.
+# The day error of 99 German car parks over two years: its median, and as many days as give the prior their middle 80 %,
+# 0.50 to 1.07. Of a few days, none may have been unusual.
 PRIOR_LEVEL, PRIOR_DAYS = 0.77, 5.7
 _FAR = 15.0  # logits
 _SMALL = 1e-3  # logits
@@ -34,9 +34,9 @@ def fit_day_error(log: OccupancyLog, process: OccupancyProcess) -> DayError:
         process: fitted to them, without a day error.
 
     Returns:
-        The level: the square root of the variance of the shifts over days, less the variance that they would have if
-        every day followed the process, pooled with that of other car parks (a scaled inverse χ² prior). No slope: a log
-        has no order of slots.
+        The level: the square root of the variance of the shifts over days, less the variance that they have by
+        chance, pooled with that of other car parks (a scaled inverse χ² prior). Levels well above
+        1 come out a tenth too low, as the centring of days is left out. No slope: a log has no order of slots.
     """
     shifts, variances = [], []
     for day in np.unique(log.day):
@@ -51,8 +51,10 @@ def fit_day_error(log: OccupancyLog, process: OccupancyProcess) -> DayError:
         shift = brentq(_surplus, -_FAR, _FAR, (process, moments, count, share), xtol=1e-6)
         sides = [_surplus(shift + side, process, moments, count, share) for side in (_SMALL, -_SMALL)]
         shifts.append(shift)
-        variances.append(_variance(process, moments, count) / ((sides[0] - sides[1]) / (2.0 * _SMALL)) ** 2)
-    own = max(np.var(shifts, ddof=1) - np.mean(variances), 0.0) if len(shifts) > 1 else 0.0
+        variances.append(
+            _variance(shift, process, moments, count) / ((sides[0] - sides[1]) / (2.0 * _SMALL)) ** 2
+        )
+    own = max(float(np.var(shifts, ddof=1) - np.mean(variances)), 0.0) if len(shifts) > 1 else 0.0
     days = len(shifts) - 1
     level = np.sqrt((PRIOR_DAYS * PRIOR_LEVEL**2 + days * own) / (PRIOR_DAYS + days))
     return DayError(min(level, MAX_LOGITS))
@@ -66,9 +68,9 @@ def _surplus(
     return float((count * p).sum() - share * count.sum())
 
 
-def _variance(process: OccupancyProcess, moments: FloatArray, count: FloatArray) -> float:
-    """Return the variance of the number of observations of taken slots on days that follow the process."""
-    p, kept = _day(process, moments, 0.0)
+def _variance(shift: float, process: OccupancyProcess, moments: FloatArray, count: FloatArray) -> float:
+    """Return the variance of the number of observations of taken slots on days with this shift."""
+    p, kept = _day(process, moments, shift)
     total, later = 0.0, np.zeros(process.n_slots)
     for k in range(moments.size - 1, -1, -1):
         # Two states of a slot have the covariance p(1 - p) of the earlier one, decayed.
