@@ -114,7 +114,8 @@ def draw_day(process: Any, world: Any) -> None:
         radius = math.sqrt(-2.0 * math.log(keyed_uniform(world.key, DAY_STREAM, 0, 0)))
         angle = 2.0 * math.pi * keyed_uniform(world.key, DAY_STREAM, 0, 1)
         world.day_odds = math.exp(process.day_error[0] * radius * math.cos(angle))
-        world.day_slope = process.day_error[1] * radius * math.sin(angle)
+        if process.day_error[1] > 0.0:
+            world.day_slope = process.day_error[1] * radius * math.sin(angle)
 
 
 @inlined
