@@ -152,11 +152,15 @@ def evaluate(
     hour-mean, of all weekdays or weekend days before; gradient-boosting. The variances of ours are fitted to the days
     before --from. Differences of log-losses are to ours, with 95 % intervals over car parks and weeks.
 
+    Of a log of slots, every slot is forecast in each half-hour, by slot-days (ours), and all models are of the slots.
+
     Examples:
         parkenv occupancy evaluate car_parks.csv.gz --from 2024-01-01
+        parkenv occupancy evaluate CNR-EXT.csv.gz --from 2015-12-03
 
     Options:
-        log (FILE): Counts, car_park,capacity,hour,free (or hour_utc), as .csv or .csv.gz.
+        log (FILE): Counts, car_park,capacity,hour,free (or hour_utc), or a log of slots,
+            datetime,camera,slot_id,weather,occupied, as .csv or .csv.gz.
         from_ (DATE): First day that is scored.  [default: halfway]
         car_parks (NAME[,...]): Car parks.  [default: all]
         timezone (NAME): Local time of hour_utc.
@@ -170,12 +174,15 @@ def evaluate(
     from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.figures.forecast_picture import save_forecast, shown_week
     from parkenv.forecast.comparison import MODELS, compare
-    from parkenv.forecast.counts import Counts
+    from parkenv.forecast.counts import Counts, is_counts
     from parkenv.forecast.day_curves import FIT_STEPS, fit_settings
     from parkenv.forecast.scores import mean_where, paired_intervals
 
     make_folder(out)
     console = make_console()
+    if not is_counts(log):
+        _evaluate_log(log, from_, out, console)
+        return
     with console.status("Reading"):
         counts = Counts.read(log, timezone)
     if car_parks is not None:
@@ -258,6 +265,34 @@ def _print_notes(counts: Counts, console: Console) -> None:
     console.print(f"Faults: {faults or 'none'}", soft_wrap=True)
     for name, what in counts.idle().items():
         console.print(f"{name}: {what}", soft_wrap=True)
+
+
+def _evaluate_log(log: Path, from_: str | None, out: Path, console: Console) -> None:
+    from dataclasses import asdict
+
+    import numpy as np
+
+    from parkenv.forecast.slot_comparison import compare_slot_days
+    from parkenv.world.occupancy_log import OccupancyLog
+
+    recorded = OccupancyLog.read(log)
+    first = recorded.days[len(recorded.days) // 2] if from_ is None else str(iso_date("--from", from_))
+    classes = [np.flatnonzero(recorded.weekend == weekend) for weekend in (False, True)]
+    days = [recorded.slot_days(days) for days in classes if days.size]
+    with progress_bar(console) as progress:
+        done = progress.add_task("Forecast days", total=sum(day >= first for day in recorded.days))
+        found = compare_slot_days(days, iso_date("--from", first).toordinal(), lambda: progress.advance(done))
+    if not found:
+        raise InputError(f"--from is {first}: {log} has no day from then on with one of its class before it")
+    rows = [asdict(row) | {"car_parks": 1} for row in found]
+    save_summary(out, None, rows, first_day=first)
+    scores = ("log_loss", "brier", "crps")
+    cells = [
+        [row["model"], *(f"{row[name]:.4f}" for name in scores), f"{row['coverage_90']:.0%}"] for row in rows
+    ]
+    title = f"{len(recorded.slot_ids)} slots, {rows[0]['days']} days from {first}"
+    console.print(make_table(title, ("model", "log-loss", "Brier", "CRPS", "90 %: days"), cells))
+    console.print(f"The summary is in {out}")
 
 
 app = group("occupancy", "Fit models to recorded occupancy, and score forecasts.")

@@ -147,9 +147,14 @@ def _lot(spec: LotSpec) -> ParkingLot:
 
 def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyModel:
     if spec.log is not None:
+        from parkenv.forecast.counts import is_counts
         from parkenv.world.occupancy_log import OccupancyLog
         from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
 
+        if is_counts(spec.log[0]):
+            raise InputError(
+                f"{spec.log[0]}: has counts of car parks, want --car-park with it, or a table `counts`"
+            )
         log = OccupancyLog.read_all(spec.log)
         mapped = None if spec.mapping is None else read_mapping(spec.mapping, lot.slot_ids, log)
         return RecordedOccupancy(
