@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
+from parkenv.world.sensor_model import SensorRates
 from planners.belief.planning_graph import VIEW, PlanningGraph
 from planners.road_table import RoadTable
 from planners.thesis.heap import pop, push
@@ -47,7 +48,7 @@ class Neighborhood:
         """Make the subgraph of some vertices, (k,) ascending."""
         lot = problem.lot
         whole, n_slots = len(vertices) == lot.n_vertices, int(np.searchsorted(vertices, lot.n_slots))
-        neighbors, (starts, slots), rates = lot.neighbors, problem.slots_in_view, problem.sensor_rates.seen
+        neighbors, (starts, slots), rates = lot.neighbors, problem.slots_in_view, problem.sensor_rates
         if not whole:
             neighbors = _renumber(vertices, lot.neighbors[vertices]).astype(np.int32)
             first, last = starts[vertices], starts[vertices + 1]
@@ -55,14 +56,14 @@ class Neighborhood:
             row = np.arange(len(viewer)) - np.repeat(np.cumsum(last - first) - last, last - first)
             seen = _renumber(vertices, slots[row])
             starts = np.searchsorted(viewer[seen >= 0], np.arange(len(vertices) + 1)).astype(np.int64)
-            slots, rates = seen[seen >= 0], rates[row][seen >= 0]
+            slots, rates = seen[seen >= 0], SensorRates(*(rate[row][seen >= 0] for rate in rates))
         views = np.empty(len(slots), VIEW)
-        views["slot"], views["rate"] = slots, rates
+        views["slot"], views["rate"], views["hit"], views["false_alarm"] = slots, *rates
         # Copies: the lot's arrays are read-only, for which numba would compile every function again.
         neighbors, starts = neighbors.copy(), starts.copy()
         table, own_rate = RoadTable.over(neighbors, problem.move_s[vertices]), np.zeros(n_slots)
         own = slots == np.repeat(np.arange(len(vertices)), np.diff(starts))
-        own_rate[slots[own]] = rates[own]
+        own_rate[slots[own]] = rates.seen[own]
         cost_s = problem.arrival_cost_s[vertices[:n_slots]]
         return cls(vertices, n_slots, whole, entry, table, starts, views, own_rate, cost_s)
 

@@ -52,7 +52,9 @@ def process_taken(process, key, arrival, slot, time):
         while True:  # hour by hour, in which the rate is constant
             rate, hour_ends = factor * profile[int(now // 3600) % 168], (now // 3600 + 1) * 3600
             if not taken:
-                rate *= day_factor(process, key, slot, process.marginal(now // 3600 * 3600.0)[slot])
+                rate *= day_factor(
+                    process, key, slot, process.marginal(max(now // 3600 * 3600.0, arrival))[slot]
+                )
             if rate * (hour_ends - now) >= left:
                 now += left / rate
                 break

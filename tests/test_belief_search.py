@@ -120,6 +120,16 @@ def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong():
     assert ours.mean() < 92.0
 
 
+def test_knowing_the_day_helps_the_planner_of_the_thesis_too():
+    scenario = make_scenario("jam")
+    plain, learning = (
+        np.array([r["total_s"] for r in Case(scenario, "mdp", options={"day": day}).run(range(40))[0]])
+        for day in (False, True)
+    )
+    _, _, high = mean_interval(learning - plain)
+    assert high < -20.0
+
+
 @pytest.mark.parametrize("level", [0.3, 0.7])
 def test_doubt_costs_nothing_where_cars_drive_past_what_is_free(level):
     """A free slot far from the goal is driven past, so having come so far does not mean that it was taken."""

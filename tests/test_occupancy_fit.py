@@ -5,10 +5,12 @@ import pytest
 from scipy.optimize import check_grad
 
 from parkenv.errors import InputError
+from parkenv.world.day_error import DayError
+from parkenv.world.day_error_fit import PRIOR_LEVEL, fit_day_error
 from parkenv.world.keyed_random import world_key
 from parkenv.world.occupancy import Arrival, OccupancyProcess
 from parkenv.world.occupancy_fit import Intervals, fit_constant_rates, fit_process, log_likelihood
-from parkenv.world.occupancy_log import OccupancyLog
+from parkenv.world.occupancy_log import OccupancyLog, weekday_of
 from parkenv.world.week import DAY_S, HOUR_S
 
 REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
@@ -208,3 +210,70 @@ def test_the_real_logs_process_follows_the_day_and_survives_its_file(tmp_path):
         assert np.abs(recorded - fitted).mean() < 0.05
     fit.process.to_file(tmp_path / "cnr.json")
     assert np.array_equal(OccupancyProcess.from_file(tmp_path / "cnr.json").factors, fit.process.factors)
+
+
+def seen_in_worlds(log, process, seed):
+    """States of a process at the times and slots of a log's observations, a world for every day, (k,) bool."""
+    states = np.empty(log.slot.size, bool)
+    for day, name in enumerate(log.days):
+        of_day, midnight = np.flatnonzero(log.day == day), weekday_of(name) * DAY_S
+        world = process.world(world_key(seed, day), Arrival(midnight + log.second[of_day].min()))
+        for second in np.unique(log.second[of_day]):
+            these = of_day[log.second[of_day] == second]
+            states[these] = world.occupied(log.slot[these], midnight + second)
+    return states
+
+
+def with_states(log, states):
+    return OccupancyLog(log.slot_ids, log.days, log.slot, log.day, log.second, states, log.max_gap_s)
+
+
+@pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
+def test_the_day_error_of_many_days_is_recovered(level):
+    rng = np.random.default_rng(0)
+    n, weeks = 60, 15
+    usual = OccupancyProcess.from_demand(
+        rng.normal(0.5, 1.0, n), np.tile(np.linspace(-1.0, 1.0, 24), 7), 5400.0
+    )
+    looks = simulated_log(usual, weeks, 3600.0)
+    log = with_states(looks, seen_in_worlds(looks, usual.with_day_error(DayError(level)), seed=1))
+    fitted = fit_day_error(log, usual)
+    # The prior counts as much as 5.7 of the 105 days.
+    assert fitted.level == pytest.approx(np.hypot(level, PRIOR_LEVEL * 0.23), rel=0.12)
+    assert fitted.slope == 0.0
+
+
+def days_of(log, days):
+    chosen = np.isin(log.day, days)
+    return OccupancyLog(
+        log.slot_ids,
+        tuple(log.days[day] for day in days),
+        log.slot[chosen],
+        np.searchsorted(days, log.day[chosen]),
+        log.second[chosen],
+        log.occupied[chosen],
+        log.max_gap_s,
+    )
+
+
+def summary(log):
+    """Mean occupancy, its standard deviation between days, and changes a slot and hour."""
+    each = np.array([log.occupied[log.day == day].mean() for day in range(len(log.days))])
+    looks = log.intervals()
+    changes = (looks.before != looks.after).sum() / (looks.end - looks.start).sum() * HOUR_S
+    return np.array([log.occupied.mean(), each.std(ddof=1), changes])
+
+
+def test_worlds_fitted_to_the_first_days_of_the_real_log_are_like_its_later_days():
+    """Weekdays, in order of time: the fit has seen none of the days that its worlds are compared with."""
+    if not REAL_LOG.exists():
+        pytest.skip("the CNRPark-EXT log is not in shared/data")
+    log = OccupancyLog.read(REAL_LOG)
+    process = fit_process(days_of(log, np.arange(8))).process
+    later = days_of(log, 8 + np.flatnonzero(~log.weekend[8:]))
+    worlds = [summary(with_states(later, seen_in_worlds(later, process, seed))) for seed in range(20)]
+    mean, spread, changes = np.mean(worlds, axis=0)
+    real_mean, real_spread, real_changes = summary(later)
+    assert abs(mean - real_mean) < 0.03
+    assert spread == pytest.approx(real_spread, rel=0.2)
+    assert changes == pytest.approx(real_changes, rel=0.1)

@@ -5,9 +5,11 @@ import numpy as np
 import pytest
 from small_lots import small_lot
 
-from parkenv import InputError, OccupancyProcess, make_scenario
+from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
+from parkenv.lots import packaged_lot
+from parkenv.world.day_error import DayError
 from planners import make_agent
 from planners.bounds.expected_time import expected_time
 from planners.thesis.tuning import tune_failure_cost
@@ -23,6 +25,28 @@ def test_the_simulation_agrees_with_the_planner_itself(seed):
     exact = [expected_time(make_agent("mdp", problem, failure_s=c), problem, p, entry) for c in COSTS]
     np.testing.assert_allclose(found.mean_s, exact, rtol=0.05)
     assert exact[COSTS.index(found.best)] <= min(exact) * 1.03
+
+
+@pytest.mark.parametrize(
+    ("level", "sensor"), [(1.5, SensorModel()), (0.0, SensorModel(hit_rate=0.8, false_alarm_rate=0.1))]
+)
+def test_the_simulation_has_days_and_errors_of_the_sensor_as_the_environment_has(level, sensor):
+    lot, p = packaged_lot("mini"), 0.6
+    lasting = OccupancyProcess.from_demand(
+        np.full(lot.n_slots, np.log(p / (1.0 - p))), np.zeros(168), 1e9
+    ).with_day_error(DayError(level))
+    scenario = Scenario(name="lasting", lot=lot, occupancy=lasting, give_up_s=300.0, sensor_model=sensor)
+    forecast, entry = np.full(lot.n_slots, p), int(lot.entry_vertices[0])
+    found = tune_failure_cost(
+        scenario.public(), forecast, entry, costs=[4.0], worlds=4000, day_error=DayError(level)
+    ).mean_s[0]
+    runner = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario, failure_s=4.0, gamma=1.0))
+    times = np.array([runner.run(seed).row["total_s"] for seed in range(800)])
+    assert abs(times.mean() - found) < 2.5 * times.std() / np.sqrt(len(times))
+    plain = tune_failure_cost(
+        scenario.replace(sensor_model=SensorModel()).public(), forecast, entry, costs=[4.0], worlds=4000
+    )
+    assert abs(times.mean() - plain.mean_s[0]) > 3.0 * times.std() / np.sqrt(len(times)), "it matters here"
 
 
 def test_the_same_seed_gives_the_same_choice_and_another_one_other_worlds():

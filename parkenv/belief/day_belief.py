@@ -219,10 +219,13 @@ def _p_occupied(
 ) -> FloatArray:
     p_occupied = np.zeros(len(observed_at))
     for s in range(len(observed_at)):
-        leaving = parts[1, s] * (1.0 - parts[0, s])
+        leaving, first = parts[1, s] * (1.0 - parts[0, s]), 0.0
         for h in range(len(weight)):
             p = p_taken[s, h]
             if observed_at[s] >= 0.0:
                 p = decay_to_prior(p, leaving / (1.0 - p), p_then[s, h], now - observed_at[s])
-            p_occupied[s] += weight[h] * p
+            # Differences from the first one: where all agree, so does their mean, to the bit.
+            first = first if h else p
+            p_occupied[s] += weight[h] * (p - first)
+        p_occupied[s] = min(max(p_occupied[s] + first, 0.0), 1.0)
     return p_occupied

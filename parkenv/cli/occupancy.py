@@ -26,7 +26,8 @@ def fit(
 
     A log of slots: arrival and departure rates. Every slot is a two-state Markov chain. Its rates depend on the hour,
     separately for weekdays and weekends, and on a factor per slot. The log shows a slot only at single times; the
-    likelihood covers all possible changes in between. Use the result, process.json, as --occupancy of `parkenv
+    likelihood covers all possible changes in between. Days differ from these rates by the day error, which is estimated
+    along. Use the result, process.json, as --occupancy of `parkenv
     compare`: unchanged on a lot with the same number of slots, on any other lot with the fullest slots nearest to the
     goal.
 
@@ -56,6 +57,8 @@ def fit(
 
 
 def _fit_log(log: Path, max_gap_h: float, out: Path, console: Console) -> None:
+    from dataclasses import asdict
+
     import numpy as np
 
     from parkenv.evaluation.figures.rates_picture import save_rates
@@ -86,10 +89,13 @@ def _fit_log(log: Path, max_gap_h: float, out: Path, console: Console) -> None:
             )  # fmt: skip
             cells.append((name, f"{hour:02d}", f"{arrive:.3f}", f"{leave:.3f}", f"{occupied:.0%}"))
     counts = {"log_likelihood": fitted.log_likelihood, "intervals": fitted.n_intervals}
-    save_summary(out, None, rows, **counts)
+    save_summary(out, None, rows, **counts, day_error=asdict(process.day_error))
     title = f"{log.name}: {len(fitted.slot_ids)} slots, {fitted.n_intervals} intervals"
     headings = ("day", "hour", "arrivals an hour", "departures an hour", "occupied")
     console.print(make_table(title, headings, cells))
+    console.print(
+        f"Days differ from the process by a standard deviation of {process.day_error.level:.2f} logits"
+    )
     console.print(f"Process, picture and summary are in {out}")
 
 

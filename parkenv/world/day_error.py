@@ -114,7 +114,7 @@ def centred_logit(p: float, deviation: float) -> float:
     return x
 
 
-TABLE_STEPS, TABLE_ROWS = 512, 8
+TABLE_STEPS, TABLE_ROWS = 256, 8
 
 
 @lru_cache(maxsize=64)
@@ -122,7 +122,7 @@ def centring_table(day_error: DayError) -> FloatArray:
     """Tabulate by which factor centring changes the odds of a slot, for compiled code.
 
     Returns:
-        (rows, 513) float64, exp(centred_logits(p) - logit(p)). Column k is for p = k / 512; row j is for
+        (rows, 257) float64, exp(centred_logits(p) - logit(p)). Column k is for p = k / 256; row j is for
         nearness² = j / 8. Without a slope there is one row for all.
     """
     if not day_error:

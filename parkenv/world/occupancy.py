@@ -239,7 +239,8 @@ class OccupancyProcess:
     With a day error, every episode draws the level L and the slope S of its day. The odds that a slot is taken at the
     arrival are those of its forecast times c·exp(L + S·nearness), and its arrival rate is multiplied by the same factor
     throughout the episode, so that its equilibrium moves along. The centring c makes the forecast the mean over days
-    (see `parkenv.world.day_error`); in the arrival rate of an hour, it is that of the forecast when the hour begins.
+    (see `parkenv.world.day_error`); in the arrival rate of an hour, it is that of the forecast when the hour begins, or
+    at the arrival if that is later.
 
     Args:
         arrival_factor: (n,) float64, no unit, >= 0.

@@ -15,6 +15,7 @@ from scipy.optimize import brentq, minimize
 from scipy.special import expit
 
 from parkenv.errors import InputError
+from parkenv.world.day_error_fit import fit_day_error
 from parkenv.world.occupancy import BoolArray, FloatArray, IntArray, OccupancyProcess
 from parkenv.world.week import HOUR_S
 from sim_sensors.compilation import compiled
@@ -231,7 +232,7 @@ def _information(theta: FloatArray, intervals: Intervals) -> FloatArray:
 
 
 def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float = 2.0) -> FittedProcess:
-    """Fit an `OccupancyProcess` to a log by maximum likelihood.
+    """Fit an `OccupancyProcess` and its day error to a log by maximum likelihood.
 
     A rate is a factor per slot times a profile per hour, with one profile for weekdays and one for weekend days. All
     pairs of consecutive observations on a day at most `max_gap_s` apart are used, split exactly at full hours. A weak
@@ -243,6 +244,8 @@ def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float 
     equally near). Before a day's first and after its last observed hour, the lot relaxes to the mean state of the days'
     first observations, fast enough that e⁻⁵ of the evening's state is left in the morning: the night is unknown, but
     the morning is right. A class of day that was never observed gets the other's profile.
+
+    The level of the day error is that of days around the process; it has no slope, as a log has no order of slots.
 
     Args:
         log: the observations.
@@ -295,6 +298,7 @@ def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float 
             profile[:, 1 - k] = profile[:, k]
     week, week_se = _week(np.exp(profile)), _week(profile_se)
     process = OccupancyProcess(np.exp(factor[0]), week[0], np.exp(factor[1]), week[1])
+    process = process.with_day_error(fit_day_error(log, process))
     errors = factor_se[0], week_se[0], factor_se[1], week_se[1]
     return FittedProcess(process, log.slot_ids, float(value), pairs.slot.size, *errors)
 

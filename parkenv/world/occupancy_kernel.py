@@ -114,7 +114,8 @@ def draw_day(process: Any, world: Any) -> None:
         radius = math.sqrt(-2.0 * math.log(keyed_uniform(world.key, DAY_STREAM, 0, 0)))
         angle = 2.0 * math.pi * keyed_uniform(world.key, DAY_STREAM, 0, 1)
         world.day_odds = math.exp(process.day_error[0] * radius * math.cos(angle))
-        world.day_slope = process.day_error[1] * radius * math.sin(angle)
+        if process.day_error[1] > 0.0:
+            world.day_slope = process.day_error[1] * radius * math.sin(angle)
 
 
 @inlined
@@ -126,28 +127,36 @@ def has_days(process: Any) -> bool:
 @inlined
 def _odds_of_day(process: Any, world: Any, slot: int) -> float:
     """Return the factor exp(L + S·nearness) of a slot's odds on the world's day."""
-    if process.day_error[1] == 0.0:
-        return float(world.day_odds)
-    return float(world.day_odds * math.exp(world.day_slope * float64s(process.nearness)[slot]))
+    if process.day_error[1] > 0.0:
+        return float(world.day_odds * math.exp(world.day_slope * float64s(process.nearness)[slot]))
+    return float(world.day_odds)
 
 
 @inlined
 def _centring_odds(process: Any, slot: int, p: float) -> float:
     """Return the factor of a slot's odds that makes `p` the mean over days, from the table."""
-    centring = float64s(process.centring)
-    column = p * TABLE_STEPS
-    k = min(int(column), TABLE_STEPS - 1)
-    part = column - k
-    factor = centring[k] + part * (centring[k + 1] - centring[k])
     if process.day_error[1] > 0.0:
-        near = float64s(process.nearness)[slot]
-        row = near * near * TABLE_ROWS
-        j = min(int(row), TABLE_ROWS - 1)
-        low = j * (TABLE_STEPS + 1) + k
-        high = low + TABLE_STEPS + 1
-        factor = centring[low] + part * (centring[low + 1] - centring[low])
-        factor += (row - j) * (centring[high] + part * (centring[high + 1] - centring[high]) - factor)
-    return float(factor)
+        return float(_centring_with_slope(process, slot, p))
+    return float(_between(process.centring, p * TABLE_STEPS))
+
+
+@kernel
+def _centring_with_slope(process: Any, slot: int, p: float) -> float:
+    near = float64s(process.nearness)[slot]
+    row = near * near * TABLE_ROWS
+    j = min(int(row), TABLE_ROWS - 1)
+    below = process.centring + 8 * j * (TABLE_STEPS + 1)
+    low = _between(below, p * TABLE_STEPS)
+    high = _between(below + 8 * (TABLE_STEPS + 1), p * TABLE_STEPS)
+    return float(low + (row - j) * (high - low))
+
+
+@inlined
+def _between(table: int, place: float) -> float:
+    """Interpolate in a row of the table."""
+    k = min(int(place), TABLE_STEPS - 1)
+    low = float64s(table)[k]
+    return float(low + (place - k) * (float64s(table)[k + 1] - low))
 
 
 @kernel
@@ -178,6 +187,7 @@ def _enter_first_sojourn(process: Any, world: Any, slot: int, cursor: Any) -> No
     """Draw the state at the arrival from the marginal on the day, and bound its end from below."""
     key, arrival, hour, second = world.key, world.arrival, world.hour, world.second_of_hour
     p, _ = process_forecast(process, hour, second, slot)
+    odds = 1.0
     if has_days(process):
         odds = _centring_odds(process, slot, p) * _odds_of_day(process, world, slot)
         occupied = keyed_uniform(key, OCCUPANCY_STREAM, slot, 0) * (p * odds + (1.0 - p)) < p * odds
@@ -188,10 +198,7 @@ def _enter_first_sojourn(process: Any, world: Any, slot: int, cursor: Any) -> No
     # constant. This bound is usually late enough, so the exact end need not be computed.
     state = 1 if occupied else 0
     factor = float64s(process.factors)[state * process.n_slots + slot]
-    if has_days(process) and not occupied:
-        rate = _odds_of_day(process, world, slot) * factor * _day_profile(process, hour, slot)
-    else:
-        rate = factor * float64s(process.profiles)[state * WEEK_HOURS + hour]
+    rate = factor * float64s(process.profiles)[state * WEEK_HOURS + hour] * (1.0 if occupied else odds)
     lasts = HOUR_S - second
     hazard = (1.0 - keyed_uniform(key, OCCUPANCY_STREAM, slot, 1)) * _SAFE
     if hazard < rate * lasts:
@@ -212,7 +219,7 @@ def find_sojourn_end(process: Any, world: Any, slot: int, cursor: Any) -> None:
     if factor * float64s(hazards)[WEEK_HOURS] > 0.0:
         hazard = keyed_exponential(world.key, OCCUPANCY_STREAM, slot, np.int64(cursor.sojourn)) / factor
         if has_days(process) and not cursor.occupied:
-            end = _taken_on_day(process, slot, cursor.since, hazard / _odds_of_day(process, world, slot))
+            end = _taken_on_day(process, world, slot, cursor.since, hazard)
         else:
             end = _time_after(profile, hazards, cursor.since, hazard)
     cursor.valid_until, cursor.end_known = end, True
@@ -242,23 +249,22 @@ def _time_after(profile: int, hazards: int, since: float, hazard: float) -> floa
     return end
 
 
-@inlined
-def _day_profile(process: Any, hour: int, slot: int) -> float:
-    """Return a slot's arrival rate, 1/s, in an hour of a day with level and slope 0, but for its factor.
-
-    It is centred for the forecast at the beginning of the hour, and constant in the hour.
-    """
-    p = _marginal_at_full_hour(process, hour, slot)
-    return float(float64s(process.profiles)[hour] * _centring_odds(process, slot, p))
-
-
 @kernel
-def _taken_on_day(process: Any, slot: int, since: float, hazard: float) -> float:
-    """As `_time_after`, with the arrival rates of `_day_profile`, hour by hour."""
+def _taken_on_day(process: Any, world: Any, slot: int, since: float, hazard: float) -> float:
+    """As `_time_after`, for arrivals in the world of a day, hour by hour.
+
+    The rate of an hour is centred for the forecast when the hour begins, or at the arrival if that is later.
+    """
     _, hour, second = hour_of_week(since)
+    hazard /= _odds_of_day(process, world, slot)
+    in_first_hour = since < world.arrival - world.second_of_hour + HOUR_S
     time, end, weekly = since, since + (HOUR_S - second), 0.0
     for passed in range(3 * WEEK_HOURS):
-        rate = _day_profile(process, hour, slot)
+        if passed == 0 and in_first_hour:
+            p, _ = process_forecast(process, world.hour, world.second_of_hour, slot)
+        else:
+            p = _marginal_at_full_hour(process, hour, slot)
+        rate = float64s(process.profiles)[hour] * _centring_odds(process, slot, p)
         gathered = rate * (end - time)
         if rate > 0.0 and gathered >= hazard:
             return float(min(time + max(hazard, 0.0) / rate, end))

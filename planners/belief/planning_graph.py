@@ -24,8 +24,15 @@ Records = NDArray[Any]
 MOST_HYPOTHESES = 64  # maximum number of hypotheses of the forecast error model
 MOST_STOPS = 400  # maximum number of vertices of a path
 
-VIEW = np.dtype([("slot", np.int64), ("rate", np.float64)])
-"""A slot in view of a vertex, and P(the slot can be detected from there)."""
+VIEW = np.dtype(
+    [
+        ("slot", np.int64),
+        ("rate", np.float64),  # P(the slot can be detected from there)
+        ("hit", np.float64),  # P(observed taken | taken, detected)
+        ("false_alarm", np.float64),  # P(observed taken | free, detected)
+    ]
+)
+"""A slot in view of a vertex."""
 
 SLOT = np.dtype(
     [

@@ -8,8 +8,10 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
+from parkenv.world.day_error import nearness
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent
@@ -38,6 +40,7 @@ class Plan:
 
     graph: StoppingGraph  # the stopping problem
     labels: Labels  # cost and move of each vertex, and the probabilities of the plan
+    day: DayBelief | None = None  # belief about the day, for an agent that learns it
     replans: int = 0  # number of times that the agent has replanned in this episode
 
     @property
@@ -157,14 +160,46 @@ class ReplanningAgent(StaticAgent):
 
     It searches until it has parked or the lot is proven full. If no reachable slot can be free, waiting is optimal in
     the model, and the agent waits.
+
+    Args:
+        problem: lot, goal, speeds and costs.
+        failure_s: s, the planner's cost of a failed attempt. None: the actual cost (`problem.failure_s`).
+        gamma: discount per decision.
+        solver: one of `SOLVERS`.
+        day: whether to plan with the belief of `belief`: the observations of some slots tell how the day differs from
+            its forecast, and so change P(taken) of the others (`DayBelief`).
+
+    Raises:
+        InputError: as for `mdp-static`.
     """
 
     name: ClassVar[str] = "mdp"
 
+    def __init__(
+        self,
+        problem: SearchProblem,
+        failure_s: float | None = None,
+        gamma: float = 0.9999,
+        solver: str = "label_setting",
+        day: bool = False,
+    ) -> None:
+        super().__init__(problem, failure_s, gamma, solver)
+        self._nearness = nearness(self.problem.walk_s) if day else None
+
+    def begin(self, observation: Observation, belief: SlotBelief) -> Plan:
+        """Plan with the belief at the start."""
+        plan = super().begin(observation, belief)
+        if self._nearness is not None:
+            plan.day = DayBelief(belief, self._nearness)
+        return plan
+
     def decide(self, observation: Observation, belief: SlotBelief, memory: Plan) -> int:
         """Repair the plan if the belief has changed; then follow it."""
-        labels = memory.labels
-        slots, p_free = _changed_slots(belief.p_occupied, labels.p_free, RELEVANT_CHANGE)
+        labels, p_occupied = memory.labels, belief.p_occupied
+        if memory.day is not None:
+            memory.day.update(belief)
+            p_occupied = memory.day.p_occupied(belief)
+        slots, p_free = _changed_slots(p_occupied, labels.p_free, RELEVANT_CHANGE)
         if len(slots):
             if self.solver == "policy_iteration":
                 labels.p_free[slots] = p_free

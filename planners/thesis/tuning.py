@@ -1,8 +1,9 @@
 """`mdp-tuned`: the thesis's planner with a failure cost that is tuned to the forecast by simulation.
 
 The failure cost is the one parameter of the thesis's planner without a right value (T §4.3 shows that 10 s is too bold
-and 90 s too cautious). Here it is chosen by simulation: worlds with independent, constant slots are drawn from the
-forecast, the planner searches all of them at each cost, and the cost with the lowest mean time is chosen.
+and 90 s too cautious). Here it is chosen by simulation: days are drawn from the forecast and its day error, with
+independent, constant slots given the day; the planner searches all of them at each cost with the sensor's errors, and
+the cost with the lowest mean time is chosen.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
+from parkenv.world.day_error import EXACT, DayError, centred_logits, nearness
+from parkenv.world.keyed_random import OBSERVATION_STREAM, VIEW_STREAM, keyed_uniform
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
 from planners.belief.planning_graph import PlanningGraph
@@ -56,11 +59,13 @@ def tune_failure_cost(
     worlds: int = WORLDS,
     seed: int = 0,
     near: Neighborhood | None = None,
+    day_error: DayError = EXACT,
 ) -> Tuning:
     """Simulate the thesis's planner in worlds drawn from a forecast.
 
-    Slots are observed without error when they come in view, and do not change; a lot that is proven full costs
-    `give_up_s`. Of a large lot only the part where the search takes place is simulated (`Neighborhoods`).
+    Slots are observed with the errors of the problem's sensor while they are in view, and do not change; a lot that is
+    proven full costs `give_up_s`. Of a large lot only the part where the search takes place is simulated
+    (`Neighborhoods`).
 
     Args:
         problem: lot, goal, speeds and costs.
@@ -70,6 +75,7 @@ def tune_failure_cost(
         worlds: number of worlds; they are the same for each cost.
         seed: seed of the worlds.
         near: the part of the lot to simulate; None: choose it.
+        day_error: how far days differ from the forecast; each world has a day of its own.
 
     Raises:
         InputError: a cost or the number of worlds is not positive, or the probabilities have the wrong shape or values.
@@ -85,27 +91,40 @@ def tune_failure_cost(
     near = near or Neighborhoods(problem).toward(vertex)
     here = near.index(vertex)
     start = here if here >= 0 else near.index(near.entry)
-    p = p[near.slots]
-    taken = np.random.default_rng(seed).random((worlds, len(p))) < p
+    p, near_goal = p[near.slots], nearness(problem.walk_s)[near.slots]
+    rng = np.random.default_rng(seed)
+    uniform = rng.random((worlds, len(p)))
+    if day_error:
+        level, slope = rng.standard_normal((2, worlds, 1)) * [[[day_error.level]], [[day_error.slope]]]
+        centre = centred_logits(np.clip(p, 1e-9, 1.0 - 1e-9), day_error.deviations(near_goal))
+        taken = uniform < 1.0 / (1.0 + np.exp(-(centre + level + slope * near_goal)))
+    else:
+        taken = uniform < p
+    keys = rng.integers(1 << 63, size=worlds, dtype=np.uint64)
     # The actual cost of a failed attempt in these worlds; the costs that are compared are the planner's.
     graph = near.planning_graph(problem, problem.failure_s)
-    return Tuning(compared, _mean_times(start, taken, p, compared, graph))
+    return Tuning(compared, _mean_times(start, taken, keys, p, compared, graph))
 
 
 @compiled
 def _mean_times(
-    vertex: int, taken: NDArray[np.bool_], p_occupied: FloatArray, costs: FloatArray, graph: PlanningGraph
+    vertex: int,
+    taken: NDArray[np.bool_],
+    keys: NDArray[np.uint64],
+    p_occupied: FloatArray,
+    costs: FloatArray,
+    graph: PlanningGraph,
 ) -> FloatArray:
     """Return the planner's mean total time, (k,) s, at each failure cost over worlds, (n_worlds, n_slots) bool."""
     n_worlds, n = taken.shape
     mean = np.zeros(len(costs))
-    odds, observed = np.empty(n), np.empty(n, np.bool_)
+    odds, seen_taken = np.empty(n), np.empty(n, np.bool_)
     for c in range(len(costs)):
         for w in range(n_worlds):
-            observed[:] = False
+            seen_taken[:] = False
             for s in range(n):
                 odds[s] = p_occupied[s] / (1.0 - p_occupied[s]) if p_occupied[s] < 1.0 else np.inf
-            mean[c] += _total_time(vertex, taken[w], costs[c], graph, odds, observed) / n_worlds
+            mean[c] += _total_time(vertex, taken[w], keys[w], costs[c], graph, odds, seen_taken) / n_worlds
     return mean
 
 
@@ -113,39 +132,49 @@ def _mean_times(
 def _total_time(
     vertex: int,
     taken: NDArray[np.bool_],
+    key: np.uint64,
     cost: float,
     graph: PlanningGraph,
     odds: FloatArray,
-    observed: NDArray[np.bool_],
+    seen_taken: NDArray[np.bool_],
 ) -> float:
     """Return the total time, s, of the thesis's planner in one world.
 
-    The belief `odds` = P(taken)/P(free) and `observed` are changed in place.
+    The belief `odds` = P(taken)/P(free) and `seen_taken`, whether each slot's last observation showed it taken, are
+    changed in place.
     """
-    total, n_unobserved, found = 0.0, len(taken), False
-    for _ in range(_MOST_STEPS):
+    total, n_taken = 0.0, 0
+    for step in range(_MOST_STEPS):
         target, value = _best_target(vertex, cost, graph, odds)
         if target < 0 or not value < np.inf:
             break
-        if target == vertex and observed[target]:
-            return float(total + graph.cost_s[target])
         if target == vertex:
-            # The search begins at this slot: attempt it without an observation.
             if not taken[target]:
                 return float(total + graph.cost_s[target])
             total += graph.failure_s
+            odds[target] = np.inf
+            n_taken += not seen_taken[target]
+            seen_taken[target] = True
         else:
             following = int(graph.next_vertex[vertex, target])
             total += graph.drive_s[vertex, following]
             vertex = following
         for i in range(graph.view_starts[vertex], graph.view_starts[vertex + 1]):
-            s = graph.views[i].slot
-            if not observed[s]:
-                observed[s] = True
-                n_unobserved -= 1
-                found = found or not taken[s]
-                odds[s] = np.inf if taken[s] else 0.0
-        if n_unobserved == 0 and not found:
+            view = graph.views[i]
+            s = view.slot
+            # What is certain stays so: slots do not change. Occlusions persist, as in the environment.
+            if odds[s] == 0.0 or odds[s] == np.inf or keyed_uniform(key, VIEW_STREAM, s, 0) >= view.rate:
+                continue
+            reported = keyed_uniform(key, OBSERVATION_STREAM, s, step) < (
+                view.hit if taken[s] else view.false_alarm
+            )
+            if_taken, if_free = view.hit, view.false_alarm
+            if not reported:
+                if_taken, if_free = 1.0 - if_taken, 1.0 - if_free
+            odds[s] = odds[s] * if_taken / if_free if if_free > 0.0 else np.inf
+            n_taken += reported - seen_taken[s]
+            seen_taken[s] = reported
+        if n_taken == len(taken):
             break
     return total + graph.give_up_s
 
@@ -218,14 +247,19 @@ class TunedAgent(SearchAgent[TunedPlan]):
         self._neighborhoods = Neighborhoods(self.problem, most_vertices)
         self._routes = DriveRoutes(self.problem)
         self._planners: dict[float, ReplanningAgent] = {}
-        self._tuned: OrderedDict[tuple[int, bytes], Tuning] = OrderedDict()
+        self._tuned: OrderedDict[tuple[int, DayError, bytes], Tuning] = OrderedDict()
 
-    def tuning(self, p_occupied: NDArray[np.floating], vertex: int) -> Tuning:
+    def tuning(
+        self,
+        p_occupied: NDArray[np.floating],
+        vertex: int,
+        day_error: DayError = EXACT,
+    ) -> Tuning:
         """Return the simulation for a forecast, (n_slots,), and a start vertex; results are cached."""
         # Forecasts are rounded to a percent, so arrivals within minutes of each other share a result.
         near = self._neighborhoods.toward(vertex)
         rounded = np.round(np.asarray(p_occupied, dtype=np.float64), 2)
-        key = vertex, rounded[near.slots].tobytes()
+        key = vertex, day_error, rounded[near.slots].tobytes()
         if key not in self._tuned:
             self._tuned[key] = tune_failure_cost(
                 self.problem,
@@ -234,6 +268,7 @@ class TunedAgent(SearchAgent[TunedPlan]):
                 worlds=self.worlds,
                 seed=self.seed,
                 near=near,
+                day_error=day_error,
             )
             if len(self._tuned) > _KEPT:
                 self._tuned.popitem(last=False)
@@ -242,7 +277,7 @@ class TunedAgent(SearchAgent[TunedPlan]):
     def begin(self, observation: Observation, belief: SlotBelief) -> TunedPlan:
         """Choose the failure cost, and plan with it."""
         vertex = int(observation["vertex"])
-        best = self.tuning(belief.p_occupied, vertex).best
+        best = self.tuning(belief.p_occupied, vertex, DayError(*map(float, belief.day_error))).best
         if best not in self._planners:
             self._planners[best] = ReplanningAgent(self.problem, failure_s=best, gamma=self.gamma)
         near = self._neighborhoods.toward(vertex)
