@@ -1,8 +1,9 @@
 """The exact optimum of a parking search over belief states, on small lots.
 
-In this model slots do not change: each is free with a known probability, independently of the others, and is revealed
-as soon as it is in view. The belief state is then the set of observed slots and the subset of these that are free.
-Dynamic programming finds the optimum over the states
+In this model slots do not change: given the day, each is free with a known probability, independently of the others,
+and is revealed as soon as it is in view. The day is hidden: what was observed gives its posterior, and so P(free) of
+the other slots. The belief state is then the set of observed slots and the subset of these that are free. Dynamic
+programming finds the optimum over the states
 
     (vertex of the car, observed, observed free).
 
@@ -12,6 +13,7 @@ between two slots):
 - Vertices that show nothing new need no decision: the car chooses among the *frontier*, the vertices that show
   something new and are reachable through vertices that do not.
 - A slot f' observed free can be left out if another free slot f is at least as good from there: w_f + D(f', f) <= w_f'.
+  (Not where days differ from their forecast: what was observed of f' tells of the day.)
 - The search ends when the best slot observed free, reached by a route that shows nothing new, costs no more than any
   other slot possibly could.
 """
@@ -26,9 +28,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
+from parkenv.world.day_error import EXACT, DayError
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
+from planners.bounds.days import Days
 from planners.road_table import RoadTable
 from sim_sensors.compilation import compiled
 
@@ -53,7 +57,8 @@ class _SmallLot(NamedTuple):
     drive_s: FloatArray  # (n_vertices, n_vertices) shortest drives
     cost_s: FloatArray  # (n_slots,) arrival cost
     dominated_by: IntArray  # (n_slots,) the slots that are at least as good as each one
-    p_free: FloatArray
+    day_chance: FloatArray  # (k,) probability of each day
+    p_free: FloatArray  # (n_slots, k) on each day
     give_up_s: float
     stay_s: FloatArray  # (n_vertices,) time of a wait that shows the view of the start vertex
 
@@ -69,6 +74,7 @@ class ExactSolution:
         free: (n_slots,) bool, slots that were observed free.
         most_states: maximum number of belief states.
         table: shortest drives of the lot; None: compute them.
+        day_error: how far days differ from the forecast.
 
     Attributes:
         expected_s: s, the least expected time from here to the goal.
@@ -96,13 +102,15 @@ class ExactSolution:
         *,
         most_states: int = MOST_STATES,
         table: RoadTable | None = None,
+        day_error: DayError = EXACT,
     ) -> None:
         n = problem.lot.n_slots
         require_small(problem)
         p = np.asarray(p_occupied, dtype=np.float64)
         if p.shape != (n,) or not ((p >= 0.0) & (p <= 1.0)).all():
             raise InputError(f"p_occupied: want {n} probabilities, got shape {p.shape}")
-        self._lot = _small_lot(problem, p, table or RoadTable.of(problem))
+        days = Days.of(p, problem.walk_s, day_error)
+        self._lot = _small_lot(problem, days, table or RoadTable.of(problem))
         seen_bits = 0 if seen is None else bits_of(seen)
         free_bits = 0 if free is None else bits_of(free) & seen_bits
         root = _key(seen_bits, vertex, _without_dominated(free_bits, self._lot.dominated_by), n)
@@ -161,7 +169,8 @@ class ExactSolution:
             if total > most_states:
                 raise InputError(
                     f"this lot has over {most_states} belief states, the limit of the exact planner: want fewer "
-                    f"slots than {n} (about 20 along one aisle, 16 along two), or a higher most_states"
+                    f"slots than {n} (about 20 along one aisle, 16 along two, 11 where days differ), or a higher "
+                    "most_states"
                 )
         self._keys = np.concatenate(found)
         self._levels = np.concatenate([[0], np.cumsum([len(keys) for keys in found])]).astype(np.int64)
@@ -184,7 +193,7 @@ def bits_of(slots: NDArray[np.bool_]) -> int:
     return int(sum(1 << int(s) for s in np.flatnonzero(slots)))
 
 
-def _small_lot(problem: SearchProblem, p_occupied: FloatArray, table: RoadTable) -> _SmallLot:
+def _small_lot(problem: SearchProblem, days: Days, table: RoadTable) -> _SmallLot:
     lot = problem.lot
     starts, slots = problem.slots_in_view
     shows = np.zeros(lot.n_vertices, dtype=np.int64)
@@ -194,10 +203,12 @@ def _small_lot(problem: SearchProblem, p_occupied: FloatArray, table: RoadTable)
     as_good = (gain > 1e-9) | ((np.abs(gain) <= 1e-9) & (np.arange(n)[None, :] < np.arange(n)[:, None]))
     np.fill_diagonal(as_good, val=False)
     # Of two equally good slots keep the one with the lower number; else each would remove the other.
+    # What was observed of a slot also tells of the day: then all count.
+    as_good &= len(days.chance) == 1
     dominated_by = np.array([bits_of(row) for row in as_good], dtype=np.int64)
     stay_s = np.where((lot.neighbors < 0).any(axis=1), problem.wait_s, np.inf)
     edges = lot.neighbors, problem.move_s, table.seconds
-    return _SmallLot(shows, *edges, cost, dominated_by, 1.0 - p_occupied, problem.give_up_s, stay_s)
+    return _SmallLot(shows, *edges, cost, dominated_by, *days, problem.give_up_s, stay_s)
 
 
 @compiled
@@ -310,6 +321,16 @@ def _successors(keys: IntArray, lot: _SmallLot) -> IntArray:
 
 
 @compiled
+def _weigh_days(before: FloatArray, seen: int, free: int, lot: _SmallLot, after: FloatArray) -> None:
+    """Multiply the weights of the days by the probability of observing `free` of the slots `seen` on each."""
+    after[:] = before
+    for s in range(len(lot.cost_s)):
+        if (seen >> s) & 1:
+            for d in range(len(before)):
+                after[d] *= lot.p_free[s, d] if (free >> s) & 1 else 1.0 - lot.p_free[s, d]
+
+
+@compiled
 def _back_up(
     keys: IntArray,
     levels: IntArray,
@@ -323,8 +344,14 @@ def _back_up(
     low, high = np.empty(n_vertices, np.int64), np.empty(n_vertices, np.int64)
     all_slots = (1 << n) - 1
     previous, least, reach = -1, np.inf, np.empty(0)
+    day, day_then = np.empty_like(lot.day_chance), np.empty_like(lot.day_chance)
     for i in range(levels[level], levels[level + 1]):
         seen, vertex, free = _state(keys[i], n)
+        # With a single day, what was observed says nothing, and dominated free slots are missing from `free`.
+        day[:] = lot.day_chance
+        if len(day) > 1:
+            _weigh_days(lot.day_chance, seen, free, lot, day)
+            day /= day.sum()
         if keys[i] >> n != previous:
             previous = keys[i] >> n
             reach, _ = _drive_within_known(vertex, seen, lot)
@@ -351,10 +378,8 @@ def _back_up(
                 expected = reach[v]
                 revealed = new
                 while True:
-                    chance = 1.0
-                    for s in range(n):
-                        if (new >> s) & 1:
-                            chance *= lot.p_free[s] if (revealed >> s) & 1 else 1.0 - lot.p_free[s]
+                    _weigh_days(day, new, revealed, lot, day_then)
+                    chance = day_then.sum()
                     if chance > 0.0:
                         key = _key(after, v, _without_dominated(free | revealed, lot.dominated_by), n)
                         at = low[v] + np.searchsorted(keys[low[v] : high[v]], key)
@@ -373,7 +398,7 @@ def _back_up(
 class ExactState:
     """Memory of the exact agent."""
 
-    forecast: NDArray[np.floating]  # (n_slots,) float, P(taken) before the first observation
+    before: SlotBelief  # belief before the first observation
     solution: ExactSolution  # the most recent solution
     seen: int = 0  # slots observed, as a bit mask
     free: int = 0  # slots that were free when last observed, as a bit mask
@@ -405,13 +430,17 @@ class ExactAgent(SearchAgent[ExactState]):
 
     def begin(self, observation: Observation, belief: SlotBelief) -> ExactState:
         """Solve from the forecast."""
-        return ExactState(belief.forecast, self._solve(belief.forecast, int(observation["vertex"])))
+        return ExactState(belief, self._solve(belief, int(observation["vertex"])))
 
-    def _solve(
-        self, forecast: NDArray[np.floating], vertex: int, *observed: NDArray[np.bool_]
-    ) -> ExactSolution:
+    def _solve(self, before: SlotBelief, vertex: int, *observed: NDArray[np.bool_]) -> ExactSolution:
         return ExactSolution(
-            self.problem, forecast, vertex, *observed, most_states=self.most_states, table=self.table
+            self.problem,
+            before.forecast,
+            vertex,
+            *observed,
+            most_states=self.most_states,
+            table=self.table,
+            day_error=DayError(*map(float, before.day_error)),
         )
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: ExactState) -> int:
@@ -423,7 +452,7 @@ class ExactAgent(SearchAgent[ExactState]):
             memory.seen, memory.free = seen, free
             decision = memory.solution.decide(seen, vertex, free)
             if decision is None:
-                memory.solution = self._solve(memory.forecast, vertex, belief.observed, belief.observed_free)
+                memory.solution = self._solve(memory.before, vertex, belief.observed, belief.observed_free)
                 decision = memory.solution.decide(seen, vertex, free)
                 assert decision is not None
             memory.target = decision[1]

@@ -11,25 +11,30 @@ from numpy.typing import ArrayLike
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
+from parkenv.world.day_error import EXACT, DayError
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Agent
+from planners.bounds.days import Days, FloatArray
 
 MOST_STEPS = 2000  # decisions after which a search is truncated at a cost of `give_up_s`, as in comparisons
 
 
-def expected_time(agent: Agent, problem: SearchProblem, p_occupied: ArrayLike, vertex: int) -> float:
-    """Return the mean total time, s, of an agent's search where slots do not change and the forecast is right.
+def expected_time(
+    agent: Agent, problem: SearchProblem, p_occupied: ArrayLike, vertex: int, day_error: DayError = EXACT
+) -> float:
+    """Return the mean total time, s, of an agent's search where slots do not change and days differ as forecast.
 
-    The rules are those of `parkenv/Search-v2`. Each slot is taken with its forecast probability, independently of the
-    others, and does not change. Every possible history of observations is enumerated, so lots can have about a dozen
-    slots.
+    The rules are those of `parkenv/Search-v2`. Given the day, each slot is taken with a probability of its own,
+    independently of the others, and does not change. Every possible history of observations is enumerated, so lots can
+    have about a dozen slots.
 
     Args:
         agent: an agent whose memory can be copied.
         problem: lot, goal, speeds, costs and view range; the sensor must not err.
         p_occupied: (n_slots,) the forecast.
         vertex: where the search begins.
+        day_error: how far days differ from the forecast.
 
     Raises:
         InputError: a sensor that errs, or an invalid forecast.
@@ -51,18 +56,28 @@ def expected_time(agent: Agent, problem: SearchProblem, p_occupied: ArrayLike, v
         raise InputError(f"p_occupied: want {n} probabilities, got shape {p.shape}")
     if not problem.sensor_model.perfect:
         raise InputError("expected_time wants a sensor model that never errs")
-    return _Histories(agent, problem).mean(vertex, SlotBelief.of_forecast(p, np.zeros(n)), 0, None)
+    days = Days.of(p, problem.walk_s, day_error)
+    belief = SlotBelief.of_forecast(p, np.zeros(n), (day_error.level, day_error.slope))
+    return _Histories(agent, problem, days.p_free).mean(vertex, belief, days.chance, 0, None)
 
 
 class _Histories:
     """The tree of all histories of observations."""
 
-    def __init__(self, agent: Agent, problem: SearchProblem) -> None:
-        self.agent, self.problem = agent, problem
+    def __init__(self, agent: Agent, problem: SearchProblem, p_free: FloatArray) -> None:
+        self.agent, self.problem, self.p_free = agent, problem, p_free
         self.masks = problem.action_masks
 
-    def mean(self, vertex: int, belief: SlotBelief, steps: int, memory: Any) -> float:
-        """Return the expected time, s, from here; `belief` contains the time, and `memory` belongs to this history."""
+    def mean(self, vertex: int, belief: SlotBelief, day: FloatArray, steps: int, memory: Any) -> float:
+        """Return the expected time, s, from here.
+
+        Args:
+            vertex: where the car is.
+            belief: the agent's belief, with the time.
+            day: (k,) float64, probability of each day after this history.
+            steps: decisions so far.
+            memory: the agent's memory of this history.
+        """
         problem, begun = self.problem, belief.time
         while True:
             if steps >= MOST_STEPS:
@@ -71,12 +86,14 @@ class _Histories:
             chosen = int(action)
             steps += 1
             if chosen == PARK and vertex < problem.lot.n_slots:
-                p_free = 1.0 - belief.p_occupied[vertex]
+                known = belief.observed[vertex]
+                p_free = float(belief.observed_free[vertex]) if known else float(day @ self.p_free[vertex])
                 parked_s = belief.time - begun + problem.arrival_cost_s[vertex]
                 if p_free == 1.0:
                     return float(parked_s)
                 failed = belief.decay(problem.failure_s).update([vertex], [True])
-                failed_s = failed.time - begun + self._observe(vertex, failed, steps, memory)
+                then = day if known else day * (1.0 - self.p_free[vertex]) / (1.0 - p_free)
+                failed_s = failed.time - begun + self._observe(vertex, failed, then, steps, memory)
                 return float(p_free * parked_s + (1.0 - p_free) * failed_s)
             if not self.masks[vertex, chosen]:
                 belief = belief.decay(problem.wait_s)
@@ -84,23 +101,24 @@ class _Histories:
                 belief = belief.decay(float(problem.move_s[vertex, chosen]))
                 vertex = int(problem.lot.neighbors[vertex, chosen])
             if not belief.observed[self.problem.in_view(vertex)].all():
-                return belief.time - begun + self._observe(vertex, belief, steps, memory)
+                return belief.time - begun + self._observe(vertex, belief, day, steps, memory)
 
-    def _observe(self, vertex: int, belief: SlotBelief, steps: int, memory: Any) -> float:
+    def _observe(self, vertex: int, belief: SlotBelief, day: FloatArray, steps: int, memory: Any) -> float:
         """Return the expected time, s, from the moment of an observation at a vertex."""
         in_view = self.problem.in_view(vertex)
         new = in_view[~belief.observed[in_view]]
         total = 0.0
         for outcome in itertools.product((False, True), repeat=len(new)):
             taken = np.array(outcome, dtype=np.bool_)
-            chance = float(np.prod(np.where(taken, belief.p_occupied[new], 1.0 - belief.p_occupied[new])))
+            then = day * np.where(taken[:, None], 1.0 - self.p_free[new], self.p_free[new]).prod(axis=0)
+            chance = float(then.sum())
             if chance == 0.0:
                 continue
             after = belief.update(new, taken)
             if after.observed_taken.all():
                 total += chance * self.problem.give_up_s
             else:
-                total += chance * self.mean(vertex, after, steps, copy.deepcopy(memory))
+                total += chance * self.mean(vertex, after, then / chance, steps, copy.deepcopy(memory))
         return total
 
     def _observation(self, vertex: int, belief: SlotBelief) -> dict[str, Any]:
