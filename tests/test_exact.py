@@ -20,6 +20,7 @@ from parkenv import (
 )
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.lots import packaged_lot
+from parkenv.world.day_error import DayError
 from parkenv.world.scenario import SearchProblem
 from planners import make_agent
 from planners.bounds.exact import ExactSolution
@@ -208,3 +209,22 @@ def test_the_agent_runs_from_any_entry_of_the_environment():
         over = terminated or truncated
     assert terminated
     assert info["failed_parks"] == 0
+
+
+def test_a_hidden_day_is_solved_exactly_and_belief_is_within_a_percent_of_it():
+    """Small lots whose day has a hidden level, and on every second one a hidden slope."""
+    times = []
+    for seed in range(24):
+        problem, p, entry = small_lot(seed, ((1, 6), (2, 4), (1, 7)))
+        day_error = DayError(0.8, 0.3 * (seed % 2))
+        best = ExactSolution(problem, p, entry, day_error=day_error).expected_s
+        exact, belief, mdp = (
+            expected_time(make_agent(name, problem), problem, p, entry, day_error)
+            for name in ("exact", "belief", "mdp")
+        )
+        # Observations hold the day error in single precision.
+        assert exact == pytest.approx(best, rel=1e-5)
+        assert min(belief, mdp) > best * (1 - 1e-5)
+        times.append((exact, belief))
+    exact, belief = np.mean(times, axis=0)
+    assert belief < 1.01 * exact
