@@ -372,6 +372,7 @@ def test_what_was_found_is_refused(tmp_path, name, content):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Generating overly large repr")
 @pytest.mark.parametrize("kind", FORMATS, ids=str)
 def test_many_damaged_files_are_read_or_refused(kind):
     fuzz(kind, max_examples=1000)

@@ -280,7 +280,8 @@ class OccupancyProcess:
         factors = np.stack([arrival, _checked("departure_factor", self.departure_factor, arrival.size)])
         names = ("arrival_profile", "departure_profile")
         profiles = np.stack([_checked(name, getattr(self, name), WEEK_HOURS) for name in names])
-        fastest = float((factors.max(axis=1) * profiles.max(axis=1)).max())
+        with np.errstate(over="ignore"):
+            fastest = float((factors.max(axis=1) * profiles.max(axis=1)).max())
         if not fastest <= MAX_RATE:
             raise InputError(
                 f"OccupancyProcess: got a rate of {fastest:g}/s, wanted factor * profile <= {MAX_RATE:g}"
