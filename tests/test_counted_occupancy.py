@@ -1,11 +1,11 @@
 """Worlds that follow the counts of a car park."""
 
 import json
-from datetime import date, timedelta
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from car_park_counts import CURVE, write_counts
 from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -21,8 +21,6 @@ from parkenv.world.occupancy import Arrival, ArrivalWindow
 
 N = 120
 ATTRACTION = 1.6 * np.linspace(1.0, -1.0, N) + np.random.default_rng(4).normal(0.0, 0.6, N)
-CURVE = np.array([0.1] * 6 + [0.15, 0.3, 0.6, 0.85, 0.95, 0.97, 0.97, 0.96, 0.95, 0.9, 0.8, 0.6, 0.4, 0.3]
-                 + [0.2, 0.15, 0.12, 0.1])  # fmt: skip
 MONDAY, TUESDAY = "2024-01-01", "2024-01-02"
 
 
@@ -131,21 +129,6 @@ def test_searches_meet_the_counted_days():
     assert days == {MONDAY, TUESDAY}
     for _ in range(40):
         together, *_ = batch.step(np.random.default_rng(1).integers(0, 4, 6))
-
-
-def write_counts(path, days=40, change=lambda park, day, taken: taken):
-    """Counts of three car parks of 100 places, one of them never used, from Monday 2024-01-01 on."""
-    noise = np.random.default_rng(3).normal(0.0, 0.5, (2, days))
-    lines = ["car_park,capacity,hour,free"]
-    for day in range(days):
-        for hour, mean in enumerate(CURVE):
-            moment = f"{date(2024, 1, 1) + timedelta(day)}T{hour:02d}:00"
-            for park in range(2):
-                taken = change(park, day, expit(logit(mean) + noise[park, day]))
-                lines.append(f"P{park},100,{moment},{round(100 * (1 - taken))}")
-            lines.append(f"empty,100,{moment},100")
-    path.write_text("\n".join(lines) + "\n")
-    return path
 
 
 def spec_of(file, mode):

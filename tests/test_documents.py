@@ -5,10 +5,12 @@ import re
 import shlex
 import subprocess
 import sys
+from datetime import date
 from pathlib import Path
 
 import pytest
 import typer
+from car_park_counts import write_counts
 
 from parkenv.cli import app
 
@@ -75,6 +77,7 @@ PROGRAMS = {
 def test_the_code_of_a_page_runs_from_top_to_bottom(name, tmp_path):
     """Run each page in a separate process, with its own folder, modules and registered environments."""
     (tmp_path / "examples").symlink_to(ROOT / "examples")
+    write_counts(tmp_path / "car_parks.csv.gz", first=date(2023, 12, 1))
     path = os.pathsep.join(filter(None, [str(ROOT / "tests"), os.environ.get("PYTHONPATH")]))
     done = subprocess.run(
         [sys.executable, "-c", f"from command_line import parkenv as run_parkenv\n{PROGRAMS[name]}"],

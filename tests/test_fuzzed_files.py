@@ -371,6 +371,12 @@ def test_what_was_found_is_refused(tmp_path, name, content):
     read(kind, content, tmp_path)
 
 
+def test_a_map_whose_schema_is_no_text_is_refused(tmp_path):
+    (kind,) = (k for k in FORMATS if k.name == "map.sqlite")
+    assert kind.good.count(b"y REAL") == 1
+    read(kind, kind.good.replace(b"y REAL", b"y\xffREAL"), tmp_path)
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:Generating overly large repr")
 @pytest.mark.parametrize("kind", FORMATS, ids=str)

@@ -380,6 +380,8 @@ class MapStore:
             yield
         except sqlite3.DatabaseError as error:
             raise InputError(f"{self.path}: {_reason(error)}") from error
+        except UnicodeDecodeError as error:  # SQLite quotes a damaged schema in its message
+            raise InputError(f"{self.path}: is damaged: its tables' names are no UTF-8") from error
 
 
 def lot_digest(lot: ParkingLot) -> str:
