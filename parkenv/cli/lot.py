@@ -13,6 +13,9 @@ from parkenv.cli.tables import make_console
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
 
+AUTO = "auto"
+"""Value of `--entry` and `--goal` that allows a guess."""
+
 if TYPE_CHECKING:
     from parkenv.world.lot import ParkingLot
 
@@ -107,11 +110,14 @@ def import_place(
     """
     from parkenv.lots import import_lot, write_lot
     from parkenv.lots.importers.import_options import ImportOptions
+    from parkenv.lots.provenance import Provenance
 
     corners = None if bounds is None else args.numbers("--bounds", bounds, 4)
     options = ImportOptions(
-        goals=tuple((p[0], p[1]) for p in (args.numbers("--goal", text, 2) for text in goal or ())),
-        entries=tuple((p[0], p[1]) for p in (args.numbers("--entry", text, 2) for text in entry or ())),
+        goals=_points("--goal", goal),
+        entries=_points("--entry", entry),
+        guess_entry=AUTO in (entry or ()),
+        guess_goal=AUTO in (goal or ()),
         bounds=None if corners is None else ((corners[0], corners[1]), (corners[2], corners[3])),
         with_disabled=disabled,
     )
@@ -119,6 +125,8 @@ def import_place(
     console = make_console(soft_wrap=True)
     for line in draft.found:
         console.print(line)
+    for guess in draft.guesses:
+        console.print(f"guessed: {guess}", style="cyan")
     for left in draft.left_out:
         console.print(f"left out: {left}", style="yellow")
     if picture is not None:
@@ -130,8 +138,15 @@ def import_place(
         lot = draft.lot()
     except InputError as error:
         raise InputError(f"{place}: {error}") from error
-    write_lot(lot, out)
+    provenance = Provenance(place.name, draft.guesses, draft.doubts) if draft.guesses else None
+    write_lot(lot, out, provenance)
     console.print(f"Wrote {out}. {_summary(lot)}")
+
+
+def _points(option: str, texts: list[str] | None) -> tuple[tuple[float, float], ...]:
+    """Return the points of an option; `auto` stands for none."""
+    numbers = (args.numbers(option, text, 2) for text in texts or () if text != AUTO)
+    return tuple((p[0], p[1]) for p in numbers)
 
 
 def convert(lot: str, /, out: Path) -> None:

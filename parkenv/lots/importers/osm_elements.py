@@ -291,7 +291,15 @@ def elements_of_json(document: Any) -> list[OsmElement]:
     if isinstance(document.get("elements"), list):
         return _overpass_elements(document["elements"])
     if isinstance(document.get("features"), list):
-        return [e for i, f in enumerate(document["features"]) if (e := _feature_element(i, f)) is not None]
+        elements: dict[str, tuple[int, OsmElement]] = {}
+        for index, feature in enumerate(document["features"]):
+            element = _feature_element(index, feature)
+            if element is None:
+                continue
+            first = elements.setdefault(element.id, (index, element))[0]
+            if first != index:
+                raise InputError(f"{element.id} appears twice, as features[{first}] and features[{index}]")
+        return [element for _, element in elements.values()]
     raise InputError("no elements and no features, want Overpass JSON or a GeoJSON FeatureCollection")
 
 

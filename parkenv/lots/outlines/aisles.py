@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
-from parkenv.lots.outlines.openings import WIDEST_SHARED, OpenRow
+from parkenv.lots.outlines.openings import WIDEST_SHARED, OpenRow, is_on_road
 from parkenv.lots.outlines.spaces import Spaces
 
 FloatArray = NDArray[np.float64]
@@ -45,15 +45,22 @@ class Aisle:
         return shapely.LineString(self.points)
 
 
-def find_aisles(spaces: Spaces, rows: Sequence[OpenRow], blocked: Sequence[shapely.Geometry]) -> list[Aisle]:
-    """Return the aisles that serve the rows.
+def find_aisles(
+    spaces: Spaces,
+    rows: Sequence[OpenRow],
+    blocked: Sequence[shapely.Geometry],
+    roads: Sequence[FloatArray] = (),
+) -> list[Aisle]:
+    """Return the aisles that serve the rows; rows along a road need none.
 
     Args:
         spaces: all spaces.
         rows: rows with their open sides.
         blocked: polygons that no car drives over: spaces, buildings.
+        roads: centre lines, (k, 2) m each.
     """
-    if not rows:
+    on_road = [bool(is_on_road(spaces, p.row, p.side, p.view, roads).mean() > 0.5) for p in rows]
+    if all(on_road):
         return []
     tree = shapely.STRtree(list(blocked))
     owner = np.full(len(spaces), -1)
@@ -74,7 +81,9 @@ def find_aisles(spaces: Spaces, rows: Sequence[OpenRow], blocked: Sequence[shape
     aisles = []
     for part in range(int(label.max()) + 1):
         members = np.flatnonzero(label == part)
-        aisles.append(_aisle(rows, members, stops, faced))
+        # A row that faces a row along a road uses the road.
+        if not any(on_road[r] for r in members):
+            aisles.append(_aisle(rows, members, stops, faced))
     return _extended(aisles, tree)
 
 

@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from parkenv.lots.outlines.rows import Row
 from parkenv.lots.outlines.spaces import Spaces
+from parkenv.world.drive_graph import SLOT_REACH
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -24,6 +25,7 @@ LEAST_KERBSIDE, LEAST_PERPENDICULAR = 2.8, 4.2
 """Least width, m, of an aisle along kerbside and along perpendicular spaces; oblique ones are in between."""
 TOLERATED = 0.75  # fraction of that width that is enough before single spaces
 EXHAUSTIVE = 14  # undecided rows up to which all combinations of sides are tried
+ON_ROAD = 4.0  # gain per space of a row that opens to a road of the map
 ALONE, UNUSED, SHARED = 0.55, 0.45, 1.0
 """Costs per space of a row that opens to free ground, of a gap as wide as an aisle that nothing opens to, and the gain
 per space of two rows that share an aisle."""
@@ -53,7 +55,10 @@ def least_aisle(row: Row) -> float:
 
 
 def open_rows(
-    spaces: Spaces, rows: Sequence[Row], obstacles: Sequence[shapely.Geometry]
+    spaces: Spaces,
+    rows: Sequence[Row],
+    obstacles: Sequence[shapely.Geometry],
+    roads: Sequence[FloatArray] = (),
 ) -> tuple[list[OpenRow], IntArray]:
     """Return the rows with their open sides, and the spaces that no aisle can reach.
 
@@ -63,6 +68,7 @@ def open_rows(
         spaces: all spaces.
         rows: rows of them.
         obstacles: polygons that no aisle crosses, besides the spaces.
+        roads: centre lines, (k, 2) m each; a row opens to a road before it.
     """
     scene = _Scene(spaces, obstacles)
     parts: list[tuple[Row, list[View]]] = []
@@ -80,7 +86,7 @@ def open_rows(
                 part = row.part(index)
                 parts.append((part, [View(v.clear[index], v.hit[index]) for v in views]))
         lost += row.members[~is_open.any(axis=1)].tolist()
-    sides, certainty = _choose(spaces, parts)
+    sides, certainty = _choose(spaces, parts, roads)
     opened = [
         OpenRow(row, side, views[side], sure)
         for (row, views), side, sure in zip(parts, sides, certainty, strict=True)
@@ -134,6 +140,19 @@ def _runs(is_open: NDArray[np.bool_]) -> list[IntArray]:
     return [np.array(run) for run in runs]
 
 
+def is_on_road(
+    spaces: Spaces, row: Row, side: int, view: View, roads: Sequence[FloatArray]
+) -> NDArray[np.bool_]:
+    """Whether a road lies before each mouth, (k,), within reach and in view."""
+    if not len(roads):
+        return np.zeros(len(row), dtype=bool)
+    mouths = row.mouths(spaces, side)
+    reach = np.minimum(view.clear, SLOT_REACH - 0.1)[:, None]
+    rays = np.asarray(shapely.linestrings(np.stack([mouths, mouths + reach * row.normal(side)], axis=1)))
+    lines = shapely.multilinestrings([shapely.LineString(road) for road in roads])
+    return np.asarray(shapely.intersects(rays, lines))
+
+
 def _is_open(clear: FloatArray, need: float) -> NDArray[np.bool_]:
     """Whether cars reach spaces from a side, (k,): where most of a row has the width that it needs, less is enough."""
     return clear >= (TOLERATED * need if np.median(clear) >= need else need)
@@ -144,7 +163,9 @@ def _aisle_likeness(gap: FloatArray, need: float) -> FloatArray:
     return np.interp(gap, [need - 0.01, need, 5.2, 7.5, WIDEST_SHARED, LOOK], [0.0, 0.45, 1.0, 1.0, 0.35, 0.2])
 
 
-def _choose(spaces: Spaces, parts: Sequence[tuple[Row, list[View]]]) -> tuple[list[int], list[float]]:
+def _choose(
+    spaces: Spaces, parts: Sequence[tuple[Row, list[View]]], roads: Sequence[FloatArray]
+) -> tuple[list[int], list[float]]:
     """Choose sides of least cost: rows share aisles where they can, and no gap like an aisle stays unused."""
     n = len(parts)
     owner = np.full(len(spaces), -1)
@@ -177,6 +198,7 @@ def _choose(spaces: Spaces, parts: Sequence[tuple[Row, list[View]]]) -> tuple[li
                 table += change if r < other else change.T
             unary[r, side] += ALONE * float((~facing & (view.clear > 9.0)).sum())
             unary[r, side] += 0.3 * float((~facing & (view.clear <= 9.0)).sum())
+            unary[r, side] -= ON_ROAD * float(is_on_road(spaces, row, side, view, roads).sum())
             # A wider view costs less than a narrow one, all else being equal.
             unary[r, side] += 0.25 * float((1.0 - like).sum()) - 0.01 * float(np.minimum(view.clear, 8.0).sum())
     links = np.array(list(pairs), dtype=np.int64).reshape(-1, 2)

@@ -18,8 +18,6 @@ IntArray = NDArray[np.int64]
 
 LEAST_AREA, GREATEST_AREA = 4.0, 250.0
 """Areas, m², outside which an outline is a mistake of drawing."""
-NARROWEST = 1.7
-"""Least width, m, of a space that a car fits into."""
 DRAWN_TWICE = 0.5
 """Fraction of a space's area from which an overlap means that it was drawn twice."""
 STRAIGHTENED = 0.2  # tolerance, m, for further corners on the sides of an outline
@@ -70,13 +68,10 @@ def spaces_from_outlines(ids: Sequence[str], outlines: NDArray[np.object_]) -> S
     narrowed to the outline's area. Rectangles that overlap a little are narrowed until they do not.
 
     Raises:
-        InputError: an area out of bounds, a space too narrow for a car, or two spaces on top of each other.
+        InputError: an area out of bounds, or two spaces on top of each other.
     """
     area = shapely.area(outlines)
-    for i in np.flatnonzero((area < LEAST_AREA) | (area > GREATEST_AREA)).tolist():
-        raise InputError(
-            f"{ids[i]}: a parking space of {area[i]:.1f} m², want {LEAST_AREA:g} to {GREATEST_AREA:g} m²"
-        )
+    refuse_areas(ids, area)
     corners = np.stack([_corners(outline) for outline in outlines])
     sides = np.roll(corners, -1, axis=1) - corners
     size = np.hypot(sides[..., 0], sides[..., 1])
@@ -91,13 +86,15 @@ def spaces_from_outlines(ids: Sequence[str], outlines: NDArray[np.object_]) -> S
         np.minimum(np.where(turn, size[:, 0], size[:, 1]), area / length),
     )
     _refuse_drawn_twice(ids, outlines, area)
-    spaces = _without_overlaps(spaces)
-    for i in np.flatnonzero(spaces.width < NARROWEST).tolist():
+    return _without_overlaps(spaces)
+
+
+def refuse_areas(ids: Sequence[str], area: FloatArray) -> None:
+    """Raise an error for areas, (n,) m², that are no parking space's."""
+    for i in np.flatnonzero((area < LEAST_AREA) | (area > GREATEST_AREA)).tolist():
         raise InputError(
-            f"{ids[i]}: a parking space {spaces.width[i]:.2f} m wide and {spaces.length[i]:.2f} m long, "
-            f"want a width of at least {NARROWEST:g} m"
+            f"{ids[i]}: a parking space of {area[i]:.1f} m², want {LEAST_AREA:g} to {GREATEST_AREA:g} m²"
         )
-    return spaces
 
 
 def _corners(outline: shapely.Geometry) -> FloatArray:
