@@ -31,6 +31,8 @@ WIDEST = 8.0  # width of an aisle, m, from which more makes no difference
 TWO_WAY_WIDTH = 4.5
 """Least distance, m, between the obstacles on both sides of a two-way lane with slots."""
 APPROACH = 9.0  # distance, m, before the slot at which a manoeuvre starts
+MOST_CHANGES = 4  # largest number of changes of direction of a manoeuvre
+PARKED = 4  # number of cars parked on either side of the slot
 NAMED = 3  # number of slots named in a message
 
 
@@ -124,14 +126,18 @@ def survey_lot(
 def manoeuvre_kinds(lot: ParkingLot) -> tuple[list[ManoeuvreKind], IntArray]:
     """Return the kinds of manoeuvres of a lot, and the kind of each slot, (n_slots,)."""
     mouth = lot.mouth_xy()
-    nearest, tangent, oneway = nearest_on_lanes(lot.lanes, mouth)
+    nearest, tangent, _ = nearest_on_lanes(lot.lanes, mouth)
     heading = mouth_heading(lot.slot_yaw, lot.slot_mouth)
     outward = np.stack([np.cos(heading), np.sin(heading)], axis=1)
     left = np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
     across = left * np.where((left * outward).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
+    # A lane may end before a slot, or bend around it.
+    to_lane = nearest - mouth
+    distance = np.hypot(to_lane[:, 0], to_lane[:, 1])
+    is_apart = (distance > 0.3)[:, None]
+    across = np.where(is_apart, to_lane / np.maximum(distance, 0.3)[:, None], across)
     sine = np.clip(np.abs((across * outward).sum(axis=1)), 0.0, 1.0)
     slant = np.where(lot.slot_mouth == Mouth.REAR, np.degrees(np.arcsin(sine)), 0.0)
-    del nearest, oneway
     along = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
     boxes = shapely.polygons(corner_points(lot.slot_xy, lot.slot_yaw, lot.slot_length - 0.1, lot.slot_width - 0.1))
     scene = np.concatenate([np.atleast_1d(np.asarray(boxes)), _walls(lot)])
@@ -153,7 +159,7 @@ def manoeuvre_kinds(lot: ParkingLot) -> tuple[list[ManoeuvreKind], IntArray]:
         [
             np.round(slant / 5.0) * 5.0,
             np.floor(np.clip(aisle, 0.0, WIDEST) * 4.0 + 0.2) * 25.0,
-            np.floor(np.minimum(lot.slot_width, 3.0) * 10.0 + 0.2) * 10.0,
+            np.floor(np.minimum(lot.slot_width, 2.6) * 20.0 + 0.2) * 5.0,
             np.floor(np.clip(lot.slot_length, 4.4, 6.6) * 5.0 + 0.1) * 20.0,
         ],
         axis=1,
@@ -179,22 +185,25 @@ def can_park(kind: ManoeuvreKind, vehicle: VehicleParameters) -> bool:
         nose = np.array([np.cos(angle), np.sin(angle)])
         center, step = nose * length / 2, np.array([width / np.sin(angle), 0.0])
     yaw = angle if kind.slant >= 10 else 0.0
-    beside = np.array([center - step, center + step])
-    cars = corner_points(beside, np.full(2, yaw), np.full(2, vehicle.length), np.full(2, vehicle.width))
-    reach = 30.0
-    wall = np.array([[-reach, -aisle], [reach, -aisle]])
-    outlines = np.zeros((3, 4, 2))
-    outlines[:2], outlines[2, :2] = cars, wall
-    corners = np.array([4, 4, 2])
+    # Neighbours as far as the car can swing.
+    beside = center + np.array([k for k in range(-PARKED, PARKED + 1) if k])[:, None] * step
+    n = len(beside)
+    outlines = np.zeros((n + 1, 4, 2))
+    outlines[:n] = corner_points(
+        beside, np.full(n, yaw), np.full(n, vehicle.length), np.full(n, vehicle.width)
+    )
+    outlines[n, :2] = [[-30.0, -aisle], [30.0, -aisle]]
+    corners = np.r_[np.full(n, 4), 2]
     lane = -float(np.clip(aisle / 2, vehicle.width / 2 + 0.15, 2.0))
     start = vehicle.at_rear_axle(np.array([-APPROACH, lane, 0.0]))
     settings = SearchSettings(attempts=((0.10, 0.5), (0.05, 0.5), (0.02, 0.25)), most_expansions=8000, patience=0.0)
     ways = (0.0, np.pi) if kind.slant >= 10 else (0.0,)
-    return any(
-        plan_path(vehicle, outlines, corners, start, vehicle.at_rear_axle(np.array([*center, yaw + way])), settings)
-        is not None
-        for way in ways
-    )
+    for way in ways:
+        target = vehicle.at_rear_axle(np.array([*center, yaw + way]))
+        path = plan_path(vehicle, outlines, corners, start, target, settings)
+        if path is not None and path.direction_changes <= MOST_CHANGES:
+            return True
+    return False
 
 
 def _named(lot: ParkingLot, slots: IntArray) -> str:

@@ -18,7 +18,8 @@ FloatArray = NDArray[np.float64]
 WAY_OUT = 8.0  # length, m, of the road from the edge of the car park to the entry
 LONGEST_WAY_OUT = 30.0  # m, from a lane to the edge
 BEYOND_ENTRY = 12.0  # distance, m, from the entry to the goal that lies on its side
-CORRIDOR = 1.5  # half the width, m, that a way out needs
+CORRIDOR, NARROW_CORRIDOR = 1.5, 1.1
+"""Half the width, m, that a way out needs, and half of that of the narrowest."""
 DEAD_END_GAIN = 15.0  # metres of driving that an aisle's free end is preferred by
 
 
@@ -39,6 +40,20 @@ def guess_entry(lines: Sequence[Line], spaces_xy: FloatArray, blocked: Sequence[
         spaces_xy: (n, 2) m, stops before the spaces.
         blocked: polygons that no car drives over.
     """
+    for corridor, longest in ((CORRIDOR, LONGEST_WAY_OUT), (NARROW_CORRIDOR, 3 * LONGEST_WAY_OUT)):
+        entry = _best_way_out(lines, spaces_xy, blocked, corridor, longest)
+        if entry is not None:
+            return entry
+    return None
+
+
+def _best_way_out(
+    lines: Sequence[Line],
+    spaces_xy: FloatArray,
+    blocked: Sequence[shapely.Geometry],
+    corridor: float,
+    longest: float,
+) -> Entry | None:
     tree = shapely.STRtree(list(blocked))
     ground = shapely.concave_hull(
         shapely.union_all([*blocked, *(shapely.LineString(line.points).buffer(2.0) for line in lines)]), ratio=0.3
@@ -62,12 +77,12 @@ def guess_entry(lines: Sequence[Line], spaces_xy: FloatArray, blocked: Sequence[
         reach = nx.single_source_dijkstra_path_length(graph, name, weight="weight")
         drive = float(sum(weight[i] * reach.get(other, 1e3) for i, other in enumerate(names)) / weight.sum())
         for way, is_end in ways:
-            length = _length_out(nodes[number], way, ground)
+            length = _length_out(nodes[number], way, ground, longest)
             if length is None:
                 continue
             length += WAY_OUT
             road = shapely.LineString([nodes[number], nodes[number] + length * way])
-            if len(tree.query(road, predicate="dwithin", distance=CORRIDOR)):
+            if len(tree.query(road, predicate="dwithin", distance=corridor)):
                 continue
             score = drive + 2.0 * length - DEAD_END_GAIN * is_end
             found.append((round(score, 3), *np.round(nodes[number], 3), np.array([nodes[number], nodes[number] + length * way]), is_end))
@@ -103,14 +118,14 @@ def _ways_out(
     return ways
 
 
-def _length_out(xy: FloatArray, way: FloatArray, ground: shapely.Geometry) -> float | None:
+def _length_out(xy: FloatArray, way: FloatArray, ground: shapely.Geometry, longest: float) -> float | None:
     """Return the distance, m, from a point to where a ray leaves the car park for good; None if that is too far."""
     ray = shapely.LineString([xy, xy + 150.0 * way])
     inside = shapely.intersection(ray, ground)
     if inside.is_empty:
         return 0.0
     far = float(((shapely.get_coordinates(inside) - xy) @ way).max())
-    return far if far <= LONGEST_WAY_OUT else None
+    return far if far <= longest else None
 
 
 def goal_beyond(entry: FloatArray, before: FloatArray) -> FloatArray:

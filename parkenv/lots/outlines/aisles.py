@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -26,7 +26,10 @@ SAME_DIRECTION = np.cos(np.radians(20.0))
 BENT = 0.7  # deviation, m, from which an aisle is a curve and not a straight line
 SMOOTH = 0.25  # tolerance, m, of a curve's corners
 CAR_HALF_WIDTH = 1.1  # half the width, m, of a car with its mirrors
+AHEAD = 1.3  # distance, m, that a lane's end keeps from obstacles
 BEYOND = 3.0  # length, m, by which an aisle continues beyond its last space, to turn there
+RECENTRED = 5.5  # width, m, up to which an aisle runs exactly in the middle between obstacles
+SHORTEST = 1.5  # m, of the drivable parts of an aisle
 MEETING = 12.0  # distance, m, within which an aisle continues straight on to another
 
 
@@ -83,7 +86,9 @@ def find_aisles(
         members = np.flatnonzero(label == part)
         # A row that faces a row along a road uses the road.
         if not any(on_road[r] for r in members):
-            aisles.append(_aisle(rows, members, stops, faced))
+            aisle = _aisle(rows, members, stops, faced)
+            points = _centred(aisle.points, tree) if aisle.width < RECENTRED else aisle.points
+            aisles += [replace(aisle, points=part) for part in _clear_parts(points, tree)]
     return _extended(aisles, tree)
 
 
@@ -245,6 +250,54 @@ def _lengthened(line: FloatArray, by: float) -> FloatArray:
     )
 
 
+def _centred(points: FloatArray, tree: shapely.STRtree) -> FloatArray:
+    """Move a line to the middle between the obstacles on its two sides."""
+    line = shapely.LineString(points)
+    count = max(int(line.length / 1.5), 1) + 1
+    station = np.linspace(0.0, line.length, count)
+    xy = shapely.get_coordinates(shapely.line_interpolate_point(line, station))
+    if len(xy) < 4:
+        return points
+    step = np.gradient(xy, axis=0)
+    left = np.stack([-step[:, 1], step[:, 0]], axis=1) / np.hypot(step[:, 0], step[:, 1])[:, None]
+    room = np.stack([_distances(xy, sign * left, RECENTRED, tree) for sign in (1.0, -1.0)])
+    # The nearest obstacle within half a car's length counts.
+    window = np.lib.stride_tricks.sliding_window_view(np.pad(room, ((0, 0), (2, 2)), mode="edge"), 5, axis=1)
+    room = window.min(axis=2)
+    between = (room < RECENTRED).all(axis=0)
+    shift = np.where(between, (room[0] - room[1]) / 2, 0.0)
+    window = np.lib.stride_tricks.sliding_window_view(np.pad(shift, 2, mode="edge"), 5)
+    moved = xy + np.clip(window.mean(axis=1), -1.5, 1.5)[:, None] * left
+    return shapely.get_coordinates(shapely.simplify(shapely.LineString(moved), 0.12))
+
+
+def _distances(xy: FloatArray, way: FloatArray, most: float, tree: shapely.STRtree) -> FloatArray:
+    """Return the distances, (n,) m, from points to the first obstacle in a direction, at most `most`."""
+    rays = np.asarray(shapely.linestrings(np.stack([xy, xy + most * way], axis=1)))
+    ray, shape = tree.query(rays, predicate="intersects")
+    far = shapely.distance(
+        np.asarray(shapely.points(xy))[ray], shapely.intersection(rays[ray], tree.geometries[shape])
+    )
+    result = np.full(len(xy), most)
+    np.minimum.at(result, ray, far)
+    return result
+
+
+def _clear_parts(points: FloatArray, tree: shapely.STRtree) -> list[FloatArray]:
+    """Return the parts of a line that a car can drive, without the ends that run against something."""
+    line = shapely.LineString(points)
+    near = tree.query(line, predicate="dwithin", distance=CAR_HALF_WIDTH + 0.05)
+    if not len(near):
+        return [points]
+    shut = shapely.union_all(shapely.buffer(tree.geometries[near], CAR_HALF_WIDTH + 0.05))
+    parts = [
+        shapely.get_coordinates(part)
+        for part in shapely.get_parts(shapely.difference(line, shut))
+        if part.length > SHORTEST
+    ]
+    return parts or [points]
+
+
 def _extended(aisles: Sequence[Aisle], tree: shapely.STRtree) -> list[Aisle]:
     """Continue every aisle straight on beyond its ends: to an aisle that it meets, or as far as cars turn."""
     lines = np.array([aisle.line for aisle in aisles])
@@ -271,11 +324,11 @@ def _extended(aisles: Sequence[Aisle], tree: shapely.STRtree) -> list[Aisle]:
 
 
 def _free_length(start: FloatArray, way: FloatArray, most: float, tree: shapely.STRtree) -> float:
-    """Return how far a car can drive straight on, m, with half a metre to spare, at most `most`."""
-    corridor = shapely.LineString([start, start + (most + 0.5) * way]).buffer(CAR_HALF_WIDTH + 0.3, cap_style="flat")
+    """Return how far a car can drive straight on, m, with some room to spare, at most `most`."""
+    corridor = shapely.LineString([start, start + (most + AHEAD) * way]).buffer(CAR_HALF_WIDTH + 0.3, cap_style="flat")
     hits = tree.query(corridor, predicate="intersects")
     if not len(hits):
         return most
     near = shapely.intersection(tree.geometries[hits], corridor)
     corners = shapely.get_coordinates(near) - start
-    return float(np.clip((corners @ way).min() - 0.5, 0.0, most))
+    return float(np.clip((corners @ way).min() - AHEAD, 0.0, most))

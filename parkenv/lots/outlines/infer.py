@@ -27,7 +27,7 @@ from parkenv.lots.outlines.aisles import Aisle, find_aisles
 from parkenv.lots.outlines.connections import Connection, connect
 from parkenv.lots.outlines.free_space import FreeSpace
 from parkenv.lots.outlines.network import Line, directed, largest_part, lanes_of, noded, without_stubs
-from parkenv.lots.outlines.openings import OpenRow, open_rows
+from parkenv.lots.outlines.openings import OpenRow, View, open_rows
 from parkenv.lots.outlines.rows import find_rows
 from parkenv.lots.outlines.spaces import Spaces
 from parkenv.lots.slot_polygons import nearest_on_lanes
@@ -38,6 +38,8 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 LONGEST_CONNECTION = 120.0  # m
+NARROWEST, KERB_LENGTH = 1.9, 4.8
+"""Least width, m, of a slot across which cars park, and least length of one along which they park."""
 KERB_WIDTH = 2.0
 """Least width, m, of a kerbside slot; narrower outlines are widened towards the lane, since cars stand out of them."""
 
@@ -79,7 +81,9 @@ def infer_lot(
     """
     blocked = [*spaces.boxes(), *obstacles]
     rows, lost = open_rows(spaces, find_rows(spaces), obstacles, [road.points for road in roads])
-    left_out = {"spaces that only another space leads to": lost.tolist()} if len(lost) else {}
+    left_out = {"spaces that only another space leads to": lost.tolist()}
+    rows, small = _large_enough(spaces, rows)
+    left_out.update(small)
     aisles = find_aisles(spaces, rows, blocked, [road.points for road in roads])
     if not aisles and not roads:
         raise InputError("no aisle: no space has free ground in front")
@@ -120,8 +124,26 @@ def infer_lot(
         entry=entry,
         two_way=tuple(two_way),
         widened=widened,
-        left_out=left_out,
+        left_out={reason: members for reason, members in left_out.items() if members},
     )
+
+
+def _large_enough(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[list[OpenRow], dict[str, list[int]]]:
+    """Return the rows without spaces that a car does not fit into, and those spaces by reason."""
+    kept: list[OpenRow] = []
+    small: dict[str, list[int]] = {}
+    for part in rows:
+        members = part.row.members
+        if part.row.kerbside:
+            fits, reason = spaces.length[members] >= KERB_LENGTH, f"kerbside spaces shorter than {KERB_LENGTH:g} m"
+        else:
+            fits, reason = spaces.width[members] >= NARROWEST, f"spaces narrower than {NARROWEST:g} m"
+        small.setdefault(reason, []).extend(members[~fits].tolist())
+        if fits.any():
+            index = np.flatnonzero(fits)
+            view = View(part.view.clear[index], part.view.hit[index])
+            kept.append(OpenRow(part.row.part(index), part.side, view, part.certainty))
+    return kept, small
 
 
 def _lane_before(entry: Entry | None, xy: FloatArray, lines: Sequence[Line]) -> FloatArray:

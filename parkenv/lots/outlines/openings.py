@@ -21,7 +21,7 @@ IntArray = NDArray[np.int64]
 
 LOOK = 18.0  # how far ahead of a mouth obstacles are looked for, m
 WIDEST_SHARED = 13.0  # widest aisle, m, that two facing rows share
-LEAST_KERBSIDE, LEAST_PERPENDICULAR = 2.8, 4.2
+LEAST_KERBSIDE, LEAST_PERPENDICULAR = 2.7, 3.8
 """Least width, m, of an aisle along kerbside and along perpendicular spaces; oblique ones are in between."""
 TOLERATED = 0.75  # fraction of that width that is enough before single spaces
 EXHAUSTIVE = 14  # undecided rows up to which all combinations of sides are tried
@@ -160,7 +160,7 @@ def _is_open(clear: FloatArray, need: float) -> NDArray[np.bool_]:
 
 def _aisle_likeness(gap: FloatArray, need: float) -> FloatArray:
     """How much a gap between rows is like an aisle, 0 to 1: most from 5 to 7.5 m."""
-    return np.interp(gap, [need - 0.01, need, 5.2, 7.5, WIDEST_SHARED, LOOK], [0.0, 0.45, 1.0, 1.0, 0.35, 0.2])
+    return np.interp(gap, [need - 0.01, need, 4.5, 5.2, 7.5, WIDEST_SHARED, LOOK], [0.0, 0.25, 0.8, 1.0, 1.0, 0.35, 0.2])
 
 
 def _choose(

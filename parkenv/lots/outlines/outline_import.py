@@ -25,8 +25,6 @@ from parkenv.world.drive_graph import SLOT_REACH
 
 FloatArray = NDArray[np.float64]
 
-NARROWEST = 1.7
-"""Least width, m, of a slot across which cars park; narrower outlines are left out."""
 MOST_SPACES = 20_000
 """Maximum number of spaces of one lot."""
 MOST_LOST = 0.2
@@ -88,11 +86,6 @@ def _draft(
     if not polygons:
         raise InputError(f"no parking space for cars: {_listed(left_out)}")
     spaces = spaces_from_outlines(ids, np.array(polygons, dtype=object))
-    narrow = np.flatnonzero((spaces.width < NARROWEST) & (spaces.length < 2.4 * spaces.width))
-    if len(narrow):
-        left_out[f"spaces narrower than {NARROWEST:g} m"] = [ids[i] for i in narrow]
-        unused += list(spaces.boxes()[narrow])
-        spaces = spaces.subset(np.setdiff1d(np.arange(len(spaces)), narrow))
     obstacles = [*(a.polygon for a in buildings), *unused]
     entries, goals = (points_in_frame(frame, given) for given in (options.entries, options.goals))
     lot = infer_lot(spaces, obstacles, roads, entries)

@@ -19,7 +19,7 @@ TOUCHING = 0.7  # widest gap, m, between neighbours in a row
 SAME_AXIS = np.cos(np.radians(25.0))  # least |cosine| of the angle between the axes of neighbours
 STEP = 0.62
 """Largest offset of neighbours along their axes, as a fraction of their length: 45° rows have 0.5."""
-KERB_LENGTH, KERB_SHAPE = 4.6, 1.75
+KERB_LENGTH, KERB_SHAPE = 4.9, 1.9
 """Least length, m, and least ratio of length to width of a kerbside space."""
 SQUARE = np.radians(12.0)  # largest deviation from a right angle of a perpendicular row
 RIGHT = np.pi / 2
