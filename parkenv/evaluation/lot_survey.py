@@ -33,6 +33,7 @@ TWO_WAY_WIDTH = 4.5
 APPROACH = 9.0  # distance, m, before the slot at which a manoeuvre starts
 MOST_CHANGES = 4  # largest number of changes of direction of a manoeuvre
 PARKED = 4  # number of cars parked on either side of the slot
+FAR, KERB_GAP = 30.0, 0.3  # half the length of the scene, and the room to its kerbs, m
 NAMED = 3  # number of slots named in a message
 
 
@@ -78,6 +79,8 @@ def survey_lot(
     doubts: tuple[Doubt, ...] = (),
     vehicle: VehicleParameters | None = None,
     seconds: float = 20.0,
+    *,
+    drive: bool = True,
 ) -> LotSurvey:
     """Survey a lot.
 
@@ -85,9 +88,10 @@ def survey_lot(
         lot: the lot.
         doubts: reasons to doubt it that are known from its import.
         vehicle: the car that parks.
-        seconds: time for planning manoeuvres; the kinds of the most slots come first.
+        seconds: time for planning manoeuvres.
+        drive: whether manoeuvres are planned.
     """
-    kinds, member = manoeuvre_kinds(lot)
+    kinds, member = manoeuvre_kinds(lot) if drive else ([], np.zeros(lot.n_slots, dtype=np.int64))
     problems = [*_open_loops(lot), *_blocked_lanes(lot)]
     car = vehicle or VehicleParameters()
     count = np.bincount(member, minlength=len(kinds))
@@ -187,13 +191,24 @@ def can_park(kind: ManoeuvreKind, vehicle: VehicleParameters) -> bool:
     yaw = angle if kind.slant >= 10 else 0.0
     # Neighbours as far as the car can swing.
     beside = center + np.array([k for k in range(-PARKED, PARKED + 1) if k])[:, None] * step
-    n = len(beside)
-    outlines = np.zeros((n + 1, 4, 2))
-    outlines[:n] = corner_points(
-        beside, np.full(n, yaw), np.full(n, vehicle.length), np.full(n, vehicle.width)
+    cars = corner_points(
+        np.concatenate([beside, center[None]]),
+        np.full(len(beside) + 1, yaw),
+        np.full(len(beside) + 1, vehicle.length),
+        np.full(len(beside) + 1, vehicle.width),
     )
-    outlines[n, :2] = [[-30.0, -aisle], [30.0, -aisle]]
-    corners = np.r_[np.full(n, 4), 2]
+    # An obstacle across the aisle, kerbs behind the slots and along the aisle beyond the parked cars.
+    behind = max(float(cars[-1, :, 1].max()), length * np.sin(angle)) + KERB_GAP
+    row = (PARKED + 0.5) * float(step[0])
+    kerbs = [
+        [[-FAR, -aisle], [FAR, -aisle]],
+        [[-FAR, behind], [FAR, behind]],
+        [[-FAR, KERB_GAP], [-row, KERB_GAP]],
+        [[row, KERB_GAP], [FAR, KERB_GAP]],
+    ]
+    outlines = np.zeros((len(beside) + len(kerbs), 4, 2))
+    outlines[: len(beside)], outlines[len(beside) :, :2] = cars[:-1], kerbs
+    corners = np.r_[np.full(len(beside), 4), np.full(len(kerbs), 2)]
     lane = -float(np.clip(aisle / 2, vehicle.width / 2 + 0.15, 2.0))
     start = vehicle.at_rear_axle(np.array([-APPROACH, lane, 0.0]))
     settings = SearchSettings(attempts=((0.10, 0.5), (0.05, 0.5), (0.02, 0.25)), most_expansions=8000, patience=0.0)

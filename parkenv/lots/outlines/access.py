@@ -32,7 +32,7 @@ class Entry:
     certainty: float  # 0 to 1
 
 
-def guess_entry(lines: Sequence[Line], spaces_xy: FloatArray, blocked: Sequence[shapely.Geometry]) -> Entry | None:
+def guess_entry(lines: Sequence[Line], spaces_xy: FloatArray, blocked: Sequence[shapely.Geometry]) -> Entry:
     """Return the most plausible entry: a lane that can be continued out of the car park, with short drives to spaces.
 
     Args:
@@ -44,7 +44,19 @@ def guess_entry(lines: Sequence[Line], spaces_xy: FloatArray, blocked: Sequence[
         entry = _best_way_out(lines, spaces_xy, blocked, corridor, longest)
         if entry is not None:
             return entry
-    return None
+    return _outermost(lines)
+
+
+def _outermost(lines: Sequence[Line]) -> Entry:
+    """Return an entry at the end or crossing of lanes that is farthest out, for a car park closed on all sides."""
+    ends = np.concatenate([line.points[[0, -1]] for line in lines])
+    hull = shapely.convex_hull(shapely.MultiPoint(np.concatenate([line.points for line in lines])))
+    inside = shapely.distance(shapely.boundary(hull), shapely.points(ends))
+    degree = np.bincount(node_labels(ends))[node_labels(ends)]
+    k = int(np.lexsort((ends[:, 1], ends[:, 0], np.round(inside, 1), degree))[0])
+    line = lines[k // 2].points
+    before = line[1] if k % 2 == 0 else line[-2]
+    return Entry(np.array([before, ends[k]]), "the outermost end of a lane: no free way leads out", 0.0)
 
 
 def _best_way_out(

@@ -26,6 +26,7 @@ SAME_DIRECTION = np.cos(np.radians(20.0))
 BENT = 0.7  # deviation, m, from which an aisle is a curve and not a straight line
 SMOOTH = 0.25  # tolerance, m, of a curve's corners
 CAR_HALF_WIDTH = 1.1  # half the width, m, of a car with its mirrors
+LEAST_ROOM = 0.95  # distance, m, of an aisle from obstacles at its narrowest
 AHEAD = 1.3  # distance, m, that a lane's end keeps from obstacles
 BEYOND = 3.0  # length, m, by which an aisle continues beyond its last space, to turn there
 RECENTRED = 5.5  # width, m, up to which an aisle runs exactly in the middle between obstacles
@@ -286,10 +287,10 @@ def _distances(xy: FloatArray, way: FloatArray, most: float, tree: shapely.STRtr
 def _clear_parts(points: FloatArray, tree: shapely.STRtree) -> list[FloatArray]:
     """Return the parts of a line that a car can drive, without the ends that run against something."""
     line = shapely.LineString(points)
-    near = tree.query(line, predicate="dwithin", distance=CAR_HALF_WIDTH + 0.05)
+    near = tree.query(line, predicate="dwithin", distance=LEAST_ROOM)
     if not len(near):
         return [points]
-    shut = shapely.union_all(shapely.buffer(tree.geometries[near], CAR_HALF_WIDTH + 0.05))
+    shut = shapely.union_all(shapely.buffer(tree.geometries[near], LEAST_ROOM))
     parts = [
         shapely.get_coordinates(part)
         for part in shapely.get_parts(shapely.difference(line, shut))

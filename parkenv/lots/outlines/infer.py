@@ -32,14 +32,15 @@ from parkenv.lots.outlines.rows import find_rows
 from parkenv.lots.outlines.spaces import Spaces
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.drive_graph import SLOT_REACH
-from parkenv.world.lot import Lane, Mouth, mouth_heading, mouth_points
+from parkenv.world.lot import Lane, Mouth, corner_points, mouth_heading, mouth_points
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 LONGEST_CONNECTION = 120.0  # m
-NARROWEST, KERB_LENGTH = 1.9, 4.8
+NARROWEST, KERB_LENGTH = 1.95, 4.8
 """Least width, m, of a slot across which cars park, and least length of one along which they park."""
+CAR_ROOM = 1.0  # half the width, m, that a car needs on a lane
 KERB_WIDTH = 2.0
 """Least width, m, of a kerbside slot; narrower outlines are widened towards the lane, since cars stand out of them."""
 
@@ -105,13 +106,12 @@ def infer_lot(
     entry = None
     if entries is None or not len(entries):
         entry = guess_entry(lines, mouths, blocked)
-        if entry is None:
-            raise InputError("no lane can be continued to the edge of the car park; give the entry by --entry X,Y")
         lines = noded([*lines, Line(entry.points)])
         entries = entry.points[1:]
-    served = _is_served(slots, lines)
-    if not served.all():
-        left_out["spaces that no aisle passes in front"] = index[~served].tolist()
+    served, clear = _is_served(slots, lines), _is_clear(slots, lines)
+    left_out["spaces that no aisle passes in front"] = index[~served].tolist()
+    left_out["spaces beside which the only way is too narrow"] = index[served & ~clear].tolist()
+    served &= clear
     return InferredLot(
         index=index[served],
         slots=slots[served],
@@ -163,6 +163,16 @@ def _is_served(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
     ahead = to_lane[:, 0] * np.cos(heading) + to_lane[:, 1] * np.sin(heading)
     distance = np.hypot(to_lane[:, 0], to_lane[:, 1])
     return np.asarray((ahead >= 0.0) & (distance <= SLOT_REACH - 0.05))
+
+
+def _is_clear(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
+    """Whether no lane, (n,), leads closer past a slot than a car can drive."""
+    corners = corner_points(slots.xy, slots.yaw, slots.length - 0.2, slots.width - 0.2)
+    tree = shapely.STRtree([shapely.LineString(line.points) for line in lines])
+    hit = tree.query(np.atleast_1d(np.asarray(shapely.polygons(corners))), predicate="dwithin", distance=CAR_ROOM)[0]
+    clear = np.ones(len(slots), dtype=bool)
+    clear[hit] = False
+    return clear
 
 
 def _slots(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[IntArray, Slots, int]:

@@ -36,7 +36,7 @@ def noded(lines: Sequence[Line]) -> list[Line]:
     points = _joined_ends([np.round(line.points / GRID) * GRID for line in lines])
     lines = [line for line, part in zip(lines, points, strict=True) if len(part) > 1]
     original = np.array([shapely.LineString(part) for part in points if len(part) > 1])
-    merged = shapely.line_merge(shapely.union_all(original, grid_size=GRID))
+    merged = shapely.union_all(original, grid_size=GRID)
     pieces = [part for part in shapely.get_parts(merged) if part.length > GRID]
     # Where lines coincide, the one that is one-way decides, then the first.
     result = []

@@ -21,7 +21,7 @@ IntArray = NDArray[np.int64]
 
 LOOK = 18.0  # how far ahead of a mouth obstacles are looked for, m
 WIDEST_SHARED = 13.0  # widest aisle, m, that two facing rows share
-LEAST_KERBSIDE, LEAST_PERPENDICULAR = 2.7, 3.8
+LEAST_KERBSIDE, LEAST_PERPENDICULAR = 2.7, 3.9
 """Least width, m, of an aisle along kerbside and along perpendicular spaces; oblique ones are in between."""
 TOLERATED = 0.75  # fraction of that width that is enough before single spaces
 EXHAUSTIVE = 14  # undecided rows up to which all combinations of sides are tried

@@ -64,6 +64,7 @@ def _draft(
     refuse_number(len(drawn))
     box = options.box(frame)
     areas = [area for e in drawn if (area := _area(e, frame)) is not None and _is_within(area.polygon, box)]
+    _refuse_swapped(areas)
     refuse_areas([a.element.id for a in areas], np.array([a.polygon.area for a in areas]))
     buildings = _shapes(elements, frame, lambda e: e.tags.get("building", "no") != "no")
     parking = _shapes(elements, frame, lambda e: e.tags.get("amenity") == "parking")
@@ -149,6 +150,29 @@ def _area(element: OsmElement, frame: LocalFrame) -> Area | None:
         reason = shapely.is_valid_reason(polygon).split("[")[0]
         raise InputError(f"{element.id}: its outline is not a simple one: {reason}")
     return Area(element, polygon)
+
+
+def _refuse_swapped(areas: Sequence[Area]) -> None:
+    """Raise an error if the spaces have the size of parked cars only with latitude and longitude exchanged."""
+    if not areas:
+        return
+    lonlat = [area.element.lines[0] for area in areas]
+    plausible = []
+    for positions in (lonlat, [line[:, ::-1] for line in lonlat]):
+        if max(np.abs(line[:, 1]).max() for line in positions) > 89.0:
+            return
+        frame = LocalFrame.around(np.concatenate(positions))
+        boxes = shapely.minimum_rotated_rectangle([shapely.Polygon(frame.to_xy(line)) for line in positions])
+        corners = [shapely.get_coordinates(box)[:3] for box in boxes]
+        sides = [np.sort(np.hypot(*np.diff(three, axis=0).T)) for three in corners if len(three) == 3]
+        fits = [1.8 < width < 3.3 and 4.0 < length < 6.4 for width, length in sides]
+        plausible.append(float(np.mean(fits)) if fits else 0.0)
+    if plausible[0] < 0.3 and plausible[1] > 0.6:
+        lon, lat = lonlat[0][0].tolist()
+        raise InputError(
+            f"{areas[0].element.id} is at {lat:.4f}, {lon:.4f}, where few spaces have the size of a car, want positions "
+            "at which they have (are latitude and longitude swapped?)"
+        )
 
 
 def _shapes(elements: Sequence[OsmElement], frame: LocalFrame, wanted: object) -> list[Area]:
