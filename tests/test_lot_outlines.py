@@ -3,6 +3,7 @@
 import copy
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,10 +11,10 @@ import shapely
 from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_outlines import document, double_row, kerb, row, write
+from made_outlines import document, double_row, kerb, row, town, write
 
-from parkenv.errors import InputError
 from parkenv.driving.vehicle import VehicleParameters
+from parkenv.errors import InputError
 from parkenv.evaluation.lot_survey import ManoeuvreKind, can_park, survey_lot
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.importers.import_options import ImportOptions
@@ -41,7 +42,9 @@ def clean(lot, tmp_path):
     """Whether a lot has no problem after it was written, neither in its file nor for a driver."""
     path = tmp_path / "lot.geojson"
     write_lot(lot, path)
-    return [p.message for p in check_lot(path)] + [p.message for p in survey_lot(read_lot(path)).problems] == []
+    return [p.message for p in check_lot(path)] + [
+        p.message for p in survey_lot(read_lot(path)).problems
+    ] == []
 
 
 class TestLayouts:
@@ -57,7 +60,9 @@ class TestLayouts:
             ("dead end", [row((0.0, 6.0), 0.0, 9), row((22.5, 0.0), 180.0, 9), row((25.0, 0.0), 90.0, 2)], 1),
         ],
     )
-    def test_every_space_has_a_lane_before_it_and_a_driver_gets_there_and_back(self, tmp_path, name, rows, n_aisles):
+    def test_every_space_has_a_lane_before_it_and_a_driver_gets_there_and_back(
+        self, tmp_path, name, rows, n_aisles
+    ):
         draft = imported(tmp_path, rows)
         lot = draft.lot()
         assert lot.n_slots == sum(map(len, rows)), (name, draft.left_out)
@@ -73,7 +78,12 @@ class TestLayouts:
 
     def test_a_row_opens_to_the_aisle_that_it_shares_and_not_to_the_verge_behind_it(self):
         # Gaps of 6, 3.9 and 6 m: the middle one separates backs.
-        rows = [row((20.0, 0.0), 180.0, 8), row((0.0, 6.0), 0.0, 8), row((20.0, 19.9), 180.0, 8), row((0.0, 25.9), 0.0, 8)]
+        rows = [
+            row((20.0, 0.0), 180.0, 8),
+            row((0.0, 6.0), 0.0, 8),
+            row((20.0, 19.9), 180.0, 8),
+            row((0.0, 25.9), 0.0, 8),
+        ]
         lot = inferred(rows)
         assert sorted(round(float(np.median(a.points[:, 1])), 1) for a in lot.aisles) == [3.0, 22.9]
 
@@ -113,7 +123,9 @@ class TestLayouts:
         ]
 
     def test_a_car_park_of_landlocked_spaces_is_refused(self, tmp_path):
-        with pytest.raises(InputError, match="32 of 64 spaces have no aisle: spaces that only another space leads to"):
+        with pytest.raises(
+            InputError, match="32 of 64 spaces have no aisle: spaces that only another space leads to"
+        ):
             imported(tmp_path, [row((0.0, 5.0 * k), 0.0, 16) for k in range(4)])
 
     def test_no_lane_leads_over_a_building(self, tmp_path):
@@ -126,7 +138,10 @@ class TestLayouts:
 
 class TestRoads:
     def test_a_service_road_wins_with_its_direction(self, tmp_path):
-        aisle = ({"highway": "service", "service": "parking_aisle", "oneway": "yes"}, [(30.0, 3.4), (-8.0, 3.4)])
+        aisle = (
+            {"highway": "service", "service": "parking_aisle", "oneway": "yes"},
+            [(30.0, 3.4), (-8.0, 3.4)],
+        )
         street = ({"highway": "residential"}, [(-8.0, -20.0), (-8.0, 50.0)])
         back = ({"highway": "service"}, [(30.0, 3.4), (30.0, 30.0), (-8.0, 30.0)])
         draft = imported(tmp_path, double_row(), more=[aisle, street, back])
@@ -156,7 +171,9 @@ class TestGuesses:
         options = ImportOptions(entries=(tuple(free.entries[0].tolist()),), guess_goal=True)
         with pytest.raises(InputError, match="entry is"):
             imported(tmp_path, double_row(), ImportOptions(entries=((500.0, 500.0),), guess_goal=True)).lot()
-        assert not any(guess.startswith("entry") for guess in imported(tmp_path, double_row(), options).guesses)
+        assert not any(
+            guess.startswith("entry") for guess in imported(tmp_path, double_row(), options).guesses
+        )
 
     def test_the_file_keeps_guesses_and_doubts(self, tmp_path):
         draft = imported(tmp_path, double_row())
@@ -177,7 +194,9 @@ class TestGuesses:
 class TestInvariance:
     @settings(max_examples=6, deadline=None)
     @given(turned=st.floats(0.0, 360.0), east=st.floats(-3000.0, 3000.0), north=st.floats(-3000.0, 3000.0))
-    def test_turning_and_moving_the_map_changes_nothing_but_the_frame(self, tmp_path_factory, turned, east, north):
+    def test_turning_and_moving_the_map_changes_nothing_but_the_frame(
+        self, tmp_path_factory, turned, east, north
+    ):
         folder = tmp_path_factory.mktemp("turned")
         rows = [*double_row(6), kerb((25.0, 0.0), 90.0, 3)]
         here = imported(folder, rows).lot()
@@ -213,7 +232,9 @@ def spoiled(made, kind):
         made["features"][5]["geometry"]["coordinates"] = [[[lat, lon] for lon, lat in ring]]
     elif kind == "all swapped":
         for each in made["features"]:
-            each["geometry"]["coordinates"] = [[[lat, lon] for lon, lat in each["geometry"]["coordinates"][0]]]
+            each["geometry"]["coordinates"] = [
+                [[lat, lon] for lon, lat in each["geometry"]["coordinates"][0]]
+            ]
     elif kind == "flat":
         ring[1:4] = [ring[0]] * 3
     elif kind == "huge":
@@ -307,7 +328,17 @@ class TestSurvey:
 
 
 def columns(lot):
-    names = ("slot_ids", "slot_xy", "slot_yaw", "slot_length", "slot_width", "slot_mouth", "lanes", "entries", "goals")
+    names = (
+        "slot_ids",
+        "slot_xy",
+        "slot_yaw",
+        "slot_length",
+        "slot_width",
+        "slot_mouth",
+        "lanes",
+        "entries",
+        "goals",
+    )
     return {name: getattr(lot, name) for name in ("name", *names)}
 
 
@@ -337,6 +368,10 @@ class TestTown:
         shown = parkenv("lot", "show", out / f"{rows[0]['lot']}.geojson", "--out", tmp_path / "lot.png")
         assert "guessed: entry at" in shown.stdout
         assert (tmp_path / "lot.png").stat().st_size > 10_000
+
+    def test_the_example_is_what_its_generator_makes(self):
+        path = Path(__file__).parents[1] / "examples" / "outlined_town.geojson"
+        assert json.loads(path.read_text(encoding="utf-8")) == town()
 
     def test_split_takes_no_single_entry(self, tmp_path):
         path = write(tmp_path / "town.geojson", self.town())

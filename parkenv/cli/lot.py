@@ -155,7 +155,9 @@ def import_place(
     console = make_console(soft_wrap=True)
     if split:
         if options.goals or options.entries or options.bounds or picture:
-            raise InputError("--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --picture")
+            raise InputError(
+                "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --picture"
+            )
         _import_town(place, out, options, least)
         return
     draft = import_lot(place, options)
@@ -181,8 +183,8 @@ def import_place(
 
 def _import_town(place: Path, out: Path, options: ImportOptions, least: int) -> None:
     """Write every car park of a town, a table of what became of each, and contact sheets."""
-    from parkenv.evaluation.figures.contact_sheet import LARGEST, save_contact_sheet
     from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.evaluation.figures.contact_sheet import LARGEST, save_contact_sheet
     from parkenv.evaluation.lot_survey import survey_lot
     from parkenv.lots import write_lot
     from parkenv.lots.outlines.town import import_town

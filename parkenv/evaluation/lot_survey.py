@@ -113,9 +113,7 @@ def survey_lot(
             continue
         slots = np.flatnonzero(member == k)
         stuck += len(slots)
-        problems.append(
-            LotProblem("warning", None, f"the car gets into no {kind}: {_named(lot, slots)}")
-        )
+        problems.append(LotProblem("warning", None, f"the car gets into no {kind}: {_named(lot, slots)}"))
     reasons = list(doubts)
     if stuck:
         reasons.append(Doubt("slots that the car does not get into", min(0.9, 0.1 + stuck / lot.n_slots)))
@@ -143,7 +141,9 @@ def manoeuvre_kinds(lot: ParkingLot) -> tuple[list[ManoeuvreKind], IntArray]:
     sine = np.clip(np.abs((across * outward).sum(axis=1)), 0.0, 1.0)
     slant = np.where(lot.slot_mouth == Mouth.REAR, np.degrees(np.arcsin(sine)), 0.0)
     along = np.stack([-outward[:, 1], outward[:, 0]], axis=1)
-    boxes = shapely.polygons(corner_points(lot.slot_xy, lot.slot_yaw, lot.slot_length - 0.1, lot.slot_width - 0.1))
+    boxes = shapely.polygons(
+        corner_points(lot.slot_xy, lot.slot_yaw, lot.slot_length - 0.1, lot.slot_width - 0.1)
+    )
     scene = np.concatenate([np.atleast_1d(np.asarray(boxes)), _walls(lot)])
     tree = shapely.STRtree(scene)
     mouth_side = np.where(lot.slot_mouth == Mouth.REAR, lot.slot_width, lot.slot_length)
@@ -211,7 +211,9 @@ def can_park(kind: ManoeuvreKind, vehicle: VehicleParameters) -> bool:
     corners = np.r_[np.full(len(beside), 4), np.full(len(kerbs), 2)]
     lane = -float(np.clip(aisle / 2, vehicle.width / 2 + 0.15, 2.0))
     start = vehicle.at_rear_axle(np.array([-APPROACH, lane, 0.0]))
-    settings = SearchSettings(attempts=((0.10, 0.5), (0.05, 0.5), (0.02, 0.25)), most_expansions=8000, patience=0.0)
+    settings = SearchSettings(
+        attempts=((0.10, 0.5), (0.05, 0.5), (0.02, 0.25)), most_expansions=8000, patience=0.0
+    )
     ways = (0.0, np.pi) if kind.slant >= 10 else (0.0,)
     for way in ways:
         target = vehicle.at_rear_axle(np.array([*center, yaw + way]))
@@ -255,7 +257,9 @@ def _open_loops(lot: ParkingLot) -> list[LotProblem]:
 def _blocked_lanes(lot: ParkingLot) -> list[LotProblem]:
     """Return warnings about lanes that lead over slots or walls."""
     boxes = np.asarray(
-        shapely.polygons(corner_points(lot.slot_xy, lot.slot_yaw, lot.slot_length - 0.2, lot.slot_width - 0.2))
+        shapely.polygons(
+            corner_points(lot.slot_xy, lot.slot_yaw, lot.slot_length - 0.2, lot.slot_width - 0.2)
+        )
     )
     things = np.concatenate([np.atleast_1d(boxes), _walls(lot)])
     lanes = linestrings([lane.points for lane in lot.lanes])
@@ -266,6 +270,8 @@ def _blocked_lanes(lot: ParkingLot) -> list[LotProblem]:
         x, y = lot.lanes[k].points.mean(axis=0)
         what = f"the slot {lot.slot_ids[int(slots[0])]!r:.40}" if len(slots) else "a wall"
         problems.append(
-            LotProblem("warning", None, f"the lane at ({x:.1f}, {y:.1f}) m leaves less than {CAR_ROOM:g} m to {what}")
+            LotProblem(
+                "warning", None, f"the lane at ({x:.1f}, {y:.1f}) m leaves less than {CAR_ROOM:g} m to {what}"
+            )
         )
     return problems

@@ -50,7 +50,9 @@ def save_contact_sheet(lots: Sequence[tuple[str, ParkingLot]], path: str | Path)
         )
         for lane in lot.lanes:
             if lane.oneway:
-                ax.annotate("", lane.points[-1], lane.points[-2], arrowprops={"arrowstyle": "->", "color": ONE_WAY})
+                ax.annotate(
+                    "", lane.points[-1], lane.points[-2], arrowprops={"arrowstyle": "->", "color": ONE_WAY}
+                )
         ax.plot(*lot.entries.T, "^", color=ENTRY, markersize=5)
         ax.plot(*lot.goals.T, "*", color=GOAL, markeredgecolor=INK, markeredgewidth=0.4, markersize=7)
         ax.autoscale_view()

@@ -164,7 +164,13 @@ def _draw_guesses(lot: ParkingLot, ax: Axes, guesses: Sequence[str]) -> None:
         if any(guess.startswith(start) for guess in guesses):
             for xy in points:
                 ax.annotate(
-                    f"guessed {start}", xy, (0, 14), textcoords="offset points", ha="center", fontsize=9, color=INK
+                    f"guessed {start}",
+                    xy,
+                    (0, 14),
+                    textcoords="offset points",
+                    ha="center",
+                    fontsize=9,
+                    color=INK,
                 )
     if guesses:
         lines = [line for guess in guesses for line in wrap(f"guessed: {guess}", 100)]

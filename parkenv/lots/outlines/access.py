@@ -68,7 +68,8 @@ def _best_way_out(
 ) -> Entry | None:
     tree = shapely.STRtree(list(blocked))
     ground = shapely.concave_hull(
-        shapely.union_all([*blocked, *(shapely.LineString(line.points).buffer(2.0) for line in lines)]), ratio=0.3
+        shapely.union_all([*blocked, *(shapely.LineString(line.points).buffer(2.0) for line in lines)]),
+        ratio=0.3,
     )
     shapely.prepare(ground)
     ends = np.concatenate([line.points[[0, -1]] for line in lines])
@@ -79,7 +80,9 @@ def _best_way_out(
         graph.add_edge(a, b, weight=shapely.LineString(line.points).length)
     nodes = np.array([place[k] for k in sorted(place)])
     names = sorted(place)
-    nearest = shapely.STRtree(np.asarray(shapely.points(nodes))).nearest(np.asarray(shapely.points(spaces_xy)))
+    nearest = shapely.STRtree(np.asarray(shapely.points(nodes))).nearest(
+        np.asarray(shapely.points(spaces_xy))
+    )
     weight = np.bincount(np.asarray(nearest), minlength=len(names))
     found: list[tuple[float, float, float, FloatArray, bool]] = []
     for number, name in enumerate(names):
@@ -97,7 +100,14 @@ def _best_way_out(
             if len(tree.query(road, predicate="dwithin", distance=corridor)):
                 continue
             score = drive + 2.0 * length - DEAD_END_GAIN * is_end
-            found.append((round(score, 3), *np.round(nodes[number], 3), np.array([nodes[number], nodes[number] + length * way]), is_end))
+            found.append(
+                (
+                    round(score, 3),
+                    *np.round(nodes[number], 3),
+                    np.array([nodes[number], nodes[number] + length * way]),
+                    is_end,
+                )
+            )
     if not found:
         return None
     found.sort(key=lambda guess: guess[:3])
@@ -119,7 +129,11 @@ def _ways_out(
         arms.append((inner - xy) / np.hypot(*(inner - xy)))
     if len(arms) >= 4:
         return []
-    turns = [0.0, np.pi / 4, -np.pi / 4, np.pi / 2, -np.pi / 2] if len(arms) == 1 else [0.0, np.pi / 2, -np.pi / 2]
+    turns = (
+        [0.0, np.pi / 4, -np.pi / 4, np.pi / 2, -np.pi / 2]
+        if len(arms) == 1
+        else [0.0, np.pi / 2, -np.pi / 2]
+    )
     ways = []
     for arm in arms:
         for turn in turns:
@@ -143,4 +157,4 @@ def _length_out(xy: FloatArray, way: FloatArray, ground: shapely.Geometry, longe
 def goal_beyond(entry: FloatArray, before: FloatArray) -> FloatArray:
     """Return a goal, (1, 2) m, beyond an entry, as seen from the lane point before it."""
     way = (entry - before) / np.hypot(*(entry - before))
-    return (entry + BEYOND_ENTRY * way)[None]
+    return np.asarray((entry + BEYOND_ENTRY * way)[None])

@@ -41,7 +41,9 @@ class Aisle:
     points: FloatArray  # (k, 2) m
     rows: IntArray  # (m,) indices of the rows it serves
     width: float  # m, median width between facing rows or obstacles; at most twice the look ahead
-    one_way: int = 0  # 1 or -1: cars drive in or against the order of the points, by the slant of spaces; 0: both
+    one_way: int = (
+        0  # 1 or -1: cars drive in or against the order of the points, by the slant of spaces; 0: both
+    )
 
     @property
     def line(self) -> shapely.LineString:
@@ -80,11 +82,12 @@ def find_aisles(
     links |= _continuations(rows, stops, tree)
     edges = np.array(sorted(links), dtype=np.int64).reshape(-1, 2)
     _, label = connected_components(
-        coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(rows), len(rows))), directed=False
+        coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(rows), len(rows))),
+        directed=False,
     )
     aisles = []
-    for part in range(int(label.max()) + 1):
-        members = np.flatnonzero(label == part)
+    for group in range(int(label.max()) + 1):
+        members = np.flatnonzero(label == group)
         # A row that faces a row along a road uses the road.
         if not any(on_road[r] for r in members):
             aisle = _aisle(rows, members, stops, faced)
@@ -200,7 +203,7 @@ def _centre_line(xy: FloatArray, along: FloatArray, pitch: FloatArray) -> FloatA
     half = pitch / 2
     bent = np.abs(off - np.median(off))
     if abs(double) > 0.97 and np.quantile(bent, 0.9) <= BENT and bent.max() <= 2 * BENT:
-        return middle + np.outer([(station - half).min(), (station + half).max()], way)
+        return np.asarray(middle + np.outer([(station - half).min(), (station + half).max()], way))
     return _curve(xy, float(np.median(half)))
 
 
@@ -209,7 +212,9 @@ def _curve(xy: FloatArray, half: float) -> FloatArray:
     near = [np.flatnonzero(mask) for mask in _groups(xy, 1.6)]
     nodes = np.array([xy[group].mean(axis=0) for group in near])
     if len(nodes) < 3:
-        far = np.unravel_index(np.argmax(np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))), (len(xy),) * 2)
+        far = np.unravel_index(
+            np.argmax(np.hypot(*(xy[:, None] - xy[None]).transpose(2, 0, 1))), (len(xy),) * 2
+        )
         line = xy[list(far)]
         if np.hypot(*(line[1] - line[0])) < 0.5:
             line = line + np.array([[-half, 0.0], [half, 0.0]])
@@ -217,9 +222,10 @@ def _curve(xy: FloatArray, half: float) -> FloatArray:
     distance = np.hypot(*(nodes[:, None] - nodes[None]).transpose(2, 0, 1))
     tree = minimum_spanning_tree(distance)
     reach = dijkstra(tree, directed=False)
-    start, end = np.unravel_index(int(np.argmax(reach)), reach.shape)
-    _, before = dijkstra(tree, directed=False, indices=start, return_predecessors=True)
-    path = [int(end)]
+    start, end = (int(i) for i in np.unravel_index(int(np.argmax(reach)), reach.shape))
+    _, before = dijkstra(tree, directed=False, return_predecessors=True)
+    before = before[start]
+    path = [end]
     while path[-1] != start:
         path.append(int(before[path[-1]]))
     line = nodes[path]
@@ -326,7 +332,9 @@ def _extended(aisles: Sequence[Aisle], tree: shapely.STRtree) -> list[Aisle]:
 
 def _free_length(start: FloatArray, way: FloatArray, most: float, tree: shapely.STRtree) -> float:
     """Return how far a car can drive straight on, m, with some room to spare, at most `most`."""
-    corridor = shapely.LineString([start, start + (most + AHEAD) * way]).buffer(CAR_HALF_WIDTH + 0.3, cap_style="flat")
+    corridor = shapely.LineString([start, start + (most + AHEAD) * way]).buffer(
+        CAR_HALF_WIDTH + 0.3, cap_style="flat"
+    )
     hits = tree.query(corridor, predicate="intersects")
     if not len(hits):
         return most

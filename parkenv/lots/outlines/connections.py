@@ -44,7 +44,7 @@ def connect(lines: Sequence[FloatArray], space: FreeSpace, longest: float) -> li
     cells = space.cells(xy)
     distance, before, source, pairs = space.spread(np.unique(cells))
     at_cell: dict[int, int] = {}
-    for i in _by_importance(stations, owner, lines):
+    for i in _by_importance(stations, owner):
         at_cell.setdefault(int(cells[i]), i)
     graph = _road_graph(lines, stations, xy, owner)
     length = [shapely.LineString(line).length for line in lines]
@@ -110,10 +110,10 @@ def _samples(lines: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray, IntAr
     return np.concatenate(stations), np.concatenate(xy), np.concatenate(owner)
 
 
-def _by_importance(stations: FloatArray, owner: IntArray, lines: Sequence[FloatArray]) -> list[int]:
+def _by_importance(stations: FloatArray, owner: IntArray) -> list[int]:
     """Return the samples, ends of lines first."""
     is_end = np.r_[True, owner[1:] != owner[:-1]] | np.r_[owner[1:] != owner[:-1], True]
-    return np.lexsort((stations, owner, ~is_end)).tolist()
+    return [int(i) for i in np.lexsort((stations, owner, ~is_end))]
 
 
 def _road_graph(
@@ -130,9 +130,7 @@ def _road_graph(
     first = np.searchsorted(owner, np.arange(len(lines)))
     for a, b in zip(one[one < other].tolist(), other[one < other].tolist(), strict=True):
         meeting = shapely.get_coordinates(shapely.shortest_line(shapes[a], shapes[b]))[0]
-        i, j = (
-            int(first[k] + np.argmin(np.hypot(*(xy[owner == k] - meeting).T))) for k in (a, b)
-        )
+        i, j = (int(first[k] + np.argmin(np.hypot(*(xy[owner == k] - meeting).T))) for k in (a, b))
         graph.add_edge(i, j, weight=0.1)
     return graph
 

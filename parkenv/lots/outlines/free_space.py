@@ -36,9 +36,14 @@ class FreeSpace:
         self.low = np.array([x0, y0]) - MARGIN
         nx, ny = np.ceil((np.array([x1, y1]) + MARGIN - self.low) / self.cell).astype(int)
         self.shape = (int(nx), int(ny))
-        self.xy = self.low + (np.stack(np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"), -1) + 0.5) * self.cell
+        self.xy = (
+            self.low
+            + (np.stack(np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij"), -1) + 0.5) * self.cell
+        )
         shapely.prepare(whole)
-        covered = shapely.contains_xy(whole, self.xy[..., 0].ravel(), self.xy[..., 1].ravel()).reshape(self.shape)
+        covered = shapely.contains_xy(whole, self.xy[..., 0].ravel(), self.xy[..., 1].ravel()).reshape(
+            self.shape
+        )
         self.clearance = np.asarray(distance_transform_edt(~covered)) * self.cell - 0.5 * self.cell
         self._whole = whole
         self._boundary = shapely.STRtree(shapely.get_parts(whole))
@@ -79,7 +84,8 @@ class FreeSpace:
             graph, directed=False, indices=start, min_only=True, return_predecessors=True
         )
         apart = (source[tail] != source[head]) & np.isfinite(distance[tail]) & np.isfinite(distance[head])
-        return distance, before, source, np.stack([tail[apart], head[apart]], axis=1)
+        pairs = np.stack([tail[apart], head[apart]], axis=1).astype(np.int64)
+        return np.asarray(distance), before.astype(np.int64), source.astype(np.int64), pairs
 
     def is_clear(self, points: FloatArray, clearance: float) -> bool:
         """Whether a polyline, (k, 2) m, keeps a distance from all obstacles."""
@@ -97,7 +103,11 @@ class FreeSpace:
         while at < len(path) - 1:
             ahead = len(path) - 1
             while ahead > at + 1:
-                least = float(np.clip(wide[at : ahead + 1].min() - 0.6 * self.cell, LEAST_CLEARANCE - 0.1, COMFORTABLE - 0.3))
+                least = float(
+                    np.clip(
+                        wide[at : ahead + 1].min() - 0.6 * self.cell, LEAST_CLEARANCE - 0.1, COMFORTABLE - 0.3
+                    )
+                )
                 if self.is_clear(path[[at, ahead]], least):
                     break
                 ahead -= max(1, (ahead - at) // 12)

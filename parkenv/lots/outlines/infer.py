@@ -26,7 +26,7 @@ from parkenv.lots.outlines.access import Entry, goal_beyond, guess_entry
 from parkenv.lots.outlines.aisles import Aisle, find_aisles
 from parkenv.lots.outlines.connections import Connection, connect
 from parkenv.lots.outlines.free_space import FreeSpace
-from parkenv.lots.outlines.network import Line, directed, largest_part, lanes_of, noded, without_stubs
+from parkenv.lots.outlines.network import Line, directed, lanes_of, largest_part, noded, without_stubs
 from parkenv.lots.outlines.openings import OpenRow, View, open_rows
 from parkenv.lots.outlines.rows import find_rows
 from parkenv.lots.outlines.spaces import Spaces
@@ -135,7 +135,10 @@ def _large_enough(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[list[OpenRow
     for part in rows:
         members = part.row.members
         if part.row.kerbside:
-            fits, reason = spaces.length[members] >= KERB_LENGTH, f"kerbside spaces shorter than {KERB_LENGTH:g} m"
+            fits, reason = (
+                spaces.length[members] >= KERB_LENGTH,
+                f"kerbside spaces shorter than {KERB_LENGTH:g} m",
+            )
         else:
             fits, reason = spaces.width[members] >= NARROWEST, f"spaces narrower than {NARROWEST:g} m"
         small.setdefault(reason, []).extend(members[~fits].tolist())
@@ -149,7 +152,7 @@ def _large_enough(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[list[OpenRow
 def _lane_before(entry: Entry | None, xy: FloatArray, lines: Sequence[Line]) -> FloatArray:
     """Return a point, (2,) m, of the network that cars come by from the entry."""
     if entry is not None:
-        return entry.points[0]
+        return np.asarray(entry.points[0])
     corners = np.concatenate([line.points for line in lines])
     away = np.hypot(*(corners - xy).T)
     return np.asarray(corners[int(np.argmin(np.where(away > 1.0, away, np.inf)))])
@@ -169,7 +172,9 @@ def _is_clear(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
     """Whether no lane, (n,), leads closer past a slot than a car can drive."""
     corners = corner_points(slots.xy, slots.yaw, slots.length - 0.2, slots.width - 0.2)
     tree = shapely.STRtree([shapely.LineString(line.points) for line in lines])
-    hit = tree.query(np.atleast_1d(np.asarray(shapely.polygons(corners))), predicate="dwithin", distance=CAR_ROOM)[0]
+    hit = tree.query(
+        np.atleast_1d(np.asarray(shapely.polygons(corners))), predicate="dwithin", distance=CAR_ROOM
+    )[0]
     clear = np.ones(len(slots), dtype=bool)
     clear[hit] = False
     return clear

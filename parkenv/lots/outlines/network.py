@@ -83,7 +83,9 @@ def _joined_ends(points: list[FloatArray]) -> list[FloatArray]:
         ]
         if near:
             j = min(near)[1]
-            at = shapely.get_coordinates(shapely.line_interpolate_point(shapes[j], shapes[j].project(here)))[0]
+            at = shapely.get_coordinates(shapely.line_interpolate_point(shapes[j], shapes[j].project(here)))[
+                0
+            ]
             nodes[n] = np.round(at / GRID) * GRID
             corners.setdefault(j, []).append(nodes[n])
     moved = [part.copy() for part in points]
@@ -111,7 +113,7 @@ def without_stubs(lines: Sequence[Line], needed: FloatArray) -> list[Line]:
             if k in serving or degree[k].min() > 1 or shapes[k].length >= SHORTEST_STUB
         ]
         if len(lines) == len(kept) or not lines:
-            return kept if not lines else lines
+            return lines if lines else kept
 
 
 def directed(lines: Sequence[Line], wanted: dict[int, int]) -> tuple[list[Line], list[int]]:

@@ -160,7 +160,9 @@ def _is_open(clear: FloatArray, need: float) -> NDArray[np.bool_]:
 
 def _aisle_likeness(gap: FloatArray, need: float) -> FloatArray:
     """How much a gap between rows is like an aisle, 0 to 1: most from 5 to 7.5 m."""
-    return np.interp(gap, [need - 0.01, need, 4.5, 5.2, 7.5, WIDEST_SHARED, LOOK], [0.0, 0.25, 0.8, 1.0, 1.0, 0.35, 0.2])
+    return np.interp(
+        gap, [need - 0.01, need, 4.5, 5.2, 7.5, WIDEST_SHARED, LOOK], [0.0, 0.25, 0.8, 1.0, 1.0, 0.35, 0.2]
+    )
 
 
 def _choose(
@@ -186,7 +188,7 @@ def _choose(
                 other = int(owner[view.hit[k]])
                 if other < 0 or other == r:
                     continue
-                across, its_side = _faced_side(spaces, row, side, k, parts[other][0], int(view.hit[k]))
+                across, its_side = _faced_side(row, side, k, parts[other][0], int(view.hit[k]))
                 if across is None:
                     continue
                 facing[k] = True
@@ -200,11 +202,17 @@ def _choose(
             unary[r, side] += 0.3 * float((~facing & (view.clear <= 9.0)).sum())
             unary[r, side] -= ON_ROAD * float(is_on_road(spaces, row, side, view, roads).sum())
             # A wider view costs less than a narrow one, all else being equal.
-            unary[r, side] += 0.25 * float((1.0 - like).sum()) - 0.01 * float(np.minimum(view.clear, 8.0).sum())
+            unary[r, side] += 0.25 * float((1.0 - like).sum()) - 0.01 * float(
+                np.minimum(view.clear, 8.0).sum()
+            )
     links = np.array(list(pairs), dtype=np.int64).reshape(-1, 2)
-    _, label = connected_components(
-        coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n)), directed=False
-    ) if n else (0, np.empty(0))
+    _, label = (
+        connected_components(
+            coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n)), directed=False
+        )
+        if n
+        else (0, np.empty(0))
+    )
     sides, sure = np.zeros(n, dtype=int), np.ones(n)
     for part in range(int(label.max()) + 1 if n else 0):
         members = np.flatnonzero(label == part)
@@ -222,9 +230,7 @@ def _choose(
     return sides.tolist(), sure.tolist()
 
 
-def _faced_side(
-    spaces: Spaces, row: Row, side: int, k: int, other: Row, space: int
-) -> tuple[float | None, int]:
+def _faced_side(row: Row, side: int, k: int, other: Row, space: int) -> tuple[float | None, int]:
     """Return the cosine between two facing rows, None if the view ends at a flank, and the side that is faced."""
     j = int(np.flatnonzero(other.members == space)[0])
     cosine = float(row.normal(side)[k] @ other.normal(0)[j])
@@ -233,9 +239,7 @@ def _faced_side(
     return cosine, int(cosine > 0.0)
 
 
-def _least_cost(
-    unary: FloatArray, members: IntArray, pairs: dict[tuple[int, int], FloatArray]
-) -> IntArray:
+def _least_cost(unary: FloatArray, members: IntArray, pairs: dict[tuple[int, int], FloatArray]) -> IntArray:
     """Return the sides of least total cost: all combinations for few rows, otherwise by changes of one or two rows."""
     where = {int(r): i for i, r in enumerate(members)}
     tables = [(where[a], where[b], table) for (a, b), table in pairs.items()]
@@ -270,7 +274,7 @@ def _least_cost(
                         sides, cost, changed = trial, trial_cost, True
         if cost < best_cost:
             best, best_cost = sides, cost
-    return best
+    return np.asarray(best)
 
 
 def _with(sides: IntArray, free: IntArray, value: int) -> IntArray:

@@ -35,7 +35,11 @@ TWO_WAY_WIDTH, ONE_WAY_WIDTH = 4.5, 2.8
 
 
 def outline_draft(
-    path: Path, elements: Sequence[OsmElement], roads: Sequence[Road], frame: LocalFrame, options: ImportOptions
+    path: Path,
+    elements: Sequence[OsmElement],
+    roads: Sequence[Road],
+    frame: LocalFrame,
+    options: ImportOptions,
 ) -> LotDraft:
     """Draft a lot from the outlines of its spaces; `parkenv.lots.outlines.infer` has the rules.
 
@@ -58,14 +62,20 @@ def outline_draft(
 
 
 def _draft(
-    name: str, elements: Sequence[OsmElement], roads: Sequence[Road], frame: LocalFrame, options: ImportOptions
+    name: str,
+    elements: Sequence[OsmElement],
+    roads: Sequence[Road],
+    frame: LocalFrame,
+    options: ImportOptions,
 ) -> LotDraft:
     drawn = [e for e in elements if e.tags.get("amenity") == "parking_space" and not e.is_node]
     refuse_number(len(drawn))
     box = options.box(frame)
     areas = [area for e in drawn if (area := _area(e, frame)) is not None and _is_within(area.polygon, box)]
     _refuse_swapped(areas)
-    refuse_areas([a.element.id for a in areas], np.array([a.polygon.area for a in areas]))
+    refuse_areas(
+        [a.element.id for a in areas], shapely.area(np.array([a.polygon for a in areas], dtype=object))
+    )
     buildings = _shapes(elements, frame, lambda e: e.tags.get("building", "no") != "no")
     parking = _shapes(elements, frame, lambda e: e.tags.get("amenity") == "parking")
     private = [a.polygon for a in parking if closed_to_cars(a.element.tags)]
@@ -105,7 +115,9 @@ def _draft(
         goals, goal_note = (found, note or "") if len(found) else (lot.goal, "on the side of the entry")
         if not options.guess_goal and not len(found):
             goals = goals[:0]
-    kept_entries = lot.entries if len(entries) or options.guess_entry or lot.entry is None else lot.entries[:0]
+    kept_entries = (
+        lot.entries if len(entries) or options.guess_entry or lot.entry is None else lot.entries[:0]
+    )
     return LotDraft(
         name=name,
         slot_ids=tuple(spaces.ids[i] for i in lot.index),
@@ -170,8 +182,8 @@ def _refuse_swapped(areas: Sequence[Area]) -> None:
     if plausible[0] < 0.3 and plausible[1] > 0.6:
         lon, lat = lonlat[0][0].tolist()
         raise InputError(
-            f"{areas[0].element.id} is at {lat:.4f}, {lon:.4f}, where few spaces have the size of a car, want positions "
-            "at which they have (are latitude and longitude swapped?)"
+            f"{areas[0].element.id} is at {lat:.4f}, {lon:.4f}, where few spaces have the size of a car, want "
+            "positions at which they have (are latitude and longitude swapped?)"
         )
 
 
@@ -242,7 +254,11 @@ def _guesses(lot: InferredLot, options: ImportOptions, goal_note: str) -> Iterat
 
 def _doubts(lot: InferredLot, spaces: Spaces, drawn: int, options: ImportOptions) -> Iterator[Doubt]:
     n = len(spaces)
-    unsure = sum(len(part.row) * (SHARE_UNSURE - part.certainty) / SHARE_UNSURE for part in lot.rows if part.certainty < SHARE_UNSURE)
+    unsure = sum(
+        len(part.row) * (SHARE_UNSURE - part.certainty) / SHARE_UNSURE
+        for part in lot.rows
+        if part.certainty < SHARE_UNSURE
+    )
     if unsure:
         yield Doubt("rows could open to either side", min(0.6, 0.6 * float(unsure) / n + 0.02))
     lost = sum(len(members) for members in lot.left_out.values()) + drawn - n

@@ -48,7 +48,7 @@ class Row:
         """Unit vectors, (k, 2), across the row toward a side."""
         left = np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
         sign = np.sign((left * self.out).sum(axis=1)) * (1.0 - 2.0 * side)
-        return left * sign[:, None]
+        return np.asarray(left * sign[:, None])
 
     def outward(self, side: int) -> FloatArray:
         """Unit vectors, (k, 2), from the centres to the mouths of a side."""
@@ -79,7 +79,12 @@ def find_rows(spaces: Spaces) -> list[Row]:
     parallel = np.abs((axis * spaces.axis[other]).sum(axis=1)) > SAME_AXIS
     width = (spaces.width[one] + spaces.width[other]) / 2
     length = (spaces.length[one] + spaces.length[other]) / 2
-    beside = parallel & (np.abs(v) > 0.55 * width) & (np.abs(v) < width + TOUCHING + 0.3) & (np.abs(u) < STEP * length)
+    beside = (
+        parallel
+        & (np.abs(v) > 0.55 * width)
+        & (np.abs(v) < width + TOUCHING + 0.3)
+        & (np.abs(u) < STEP * length)
+    )
     links = _mutual(one[beside], other[beside], v[beside] > 0, np.abs(u[beside]) + np.abs(v[beside]))
     has_beside = np.zeros(len(spaces), dtype=bool)
     has_beside[links.ravel()] = True
@@ -125,7 +130,8 @@ def _chains(links: IntArray, n: int, used: NDArray[np.bool_]) -> list[IntArray]:
     for part in np.unique(label[used]).tolist():
         members = np.flatnonzero(label == part).tolist()
         ends = [i for i in members if len(near[i]) == 1]
-        at, before, order = (ends or members)[0], -1, []
+        order: list[int] = []
+        at, before = (ends or members)[0], -1
         while at >= 0 and (not order or at != order[0]):
             order.append(at)
             before, at = at, next((j for j in near[at] if j not in (before, *order[-2:])), -1)
@@ -169,7 +175,7 @@ def _chain(spaces: Spaces, order: IntArray, *, kerbside: bool) -> Row:
 def _one_way(vectors: FloatArray) -> FloatArray:
     """Signs, (k,), that make every vector point the way of its predecessor."""
     turns = np.sign((vectors[1:] * vectors[:-1]).sum(axis=1))
-    return np.cumprod(np.r_[1.0, np.where(turns == 0.0, 1.0, turns)])
+    return np.asarray(np.cumprod(np.r_[1.0, np.where(turns == 0.0, 1.0, turns)]), dtype=np.float64)
 
 
 def _bearing(vectors: FloatArray) -> FloatArray:
@@ -178,4 +184,4 @@ def _bearing(vectors: FloatArray) -> FloatArray:
 
 def _turned(vectors: FloatArray, angle: float) -> FloatArray:
     cos, sin = np.cos(angle), np.sin(angle)
-    return vectors @ np.array([[cos, sin], [-sin, cos]])
+    return np.asarray(vectors @ np.array([[cos, sin], [-sin, cos]]))

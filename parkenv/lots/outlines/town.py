@@ -62,7 +62,9 @@ def import_town(path: str | Path, options: ImportOptions, least: int = LEAST_SPA
             yield CarPark(name, count, draft)
 
 
-def split_town(path: Path, elements: Sequence[OsmElement], least: int) -> Iterator[tuple[str, list[OsmElement]]]:
+def split_town(
+    path: Path, elements: Sequence[OsmElement], least: int
+) -> Iterator[tuple[str, list[OsmElement]]]:
     """Yield the name and the elements of each group of at least `least` spaces, the largest first.
 
     Raises:
@@ -93,7 +95,7 @@ def split_town(path: Path, elements: Sequence[OsmElement], least: int) -> Iterat
     for number, k in enumerate(chosen, start=1):
         members = np.flatnonzero(label == k)
         ground = shapely.union_all(shapes[members])
-        near = np.sort(tree.query(ground, predicate="dwithin", distance=AROUND)) if len(others) else []
+        near: list[int] = np.sort(tree.query(ground, predicate="dwithin", distance=AROUND)).tolist()
         yield (
             f"{path.stem}-{number:0{digits}d}",
             [spaces[i] for i in members.tolist()] + [others[i] for i in near],
