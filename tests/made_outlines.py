@@ -1,6 +1,7 @@
 """Made car parks as outlines of parking spaces, in the form in which overpass-turbo exports them."""
 
 import json
+import sys
 
 import numpy as np
 
@@ -106,4 +107,4 @@ def town():
 
 
 if __name__ == "__main__":
-    print(",\n{".join(json.dumps(town()).split(", {")))
+    sys.stdout.write(",\n{".join(json.dumps(town()).split(", {")) + "\n")
