@@ -3,6 +3,7 @@
 import copy
 import json
 import re
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -151,6 +152,17 @@ class TestRoads:
         assert one_way
         assert all(lane.points[-1][0] < lane.points[0][0] for lane in one_way)
 
+    def test_rows_that_no_road_reaches_get_aisles_and_cars_enter_from_the_street(self, tmp_path):
+        aisle = ({"highway": "service", "service": "parking_aisle"}, [(-8.0, 3.2), (30.0, 3.2)])
+        street = ({"highway": "residential"}, [(-8.0, -40.0), (-8.0, 3.2), (-8.0, 60.0)])
+        draft = imported(tmp_path, double_row(), more=[aisle, street])
+        lot = draft.lot()
+        assert lot.n_slots == 32
+        assert "1 aisles along the rows' fronts" in draft.guesses
+        assert any("where a lane meets a street" in guess for guess in draft.guesses)
+        assert lot.entries[:, 0] == pytest.approx(lot.slot_xy[:, 0].min() - 9.25, abs=0.1)
+        assert clean(lot, tmp_path)
+
     def test_the_goal_is_a_buildings_entrance(self, tmp_path):
         door = ({"entrance": "main"}, (40.0, 12.0))
         draft = imported(tmp_path, double_row(), more=[door])
@@ -281,6 +293,39 @@ class TestFaults:
     def test_lorry_parks_are_no_car_parks(self, tmp_path):
         with pytest.raises(InputError, match="no parking space for cars: spaces larger than 30 m²"):
             imported(tmp_path, [row((0.0, 0.0), 0.0, 8, size=(16.0, 3.5))])
+
+
+class TestExtracts:
+    def test_without_osmium_a_line_says_what_to_install(self, monkeypatch, tmp_path):
+        monkeypatch.setitem(sys.modules, "osmium", None)
+        done = parkenv("lot", "import", tmp_path / "town.osm.pbf", "--split", "--out", tmp_path / "lots")
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
+        assert "pip install 'parkenv[osm]'" in done.stderr
+
+    def test_an_extract_gives_the_lot_of_its_geojson(self, tmp_path):
+        osmium = pytest.importorskip("osmium", reason="the extra osm is not installed")
+        made, mutable = document(double_row()), osmium.osm.mutable
+        path = tmp_path / "made.osm.pbf"
+        ways, count = [], 0
+        with osmium.SimpleWriter(str(path)) as writer:
+            for number, each in enumerate(made["features"], start=1):
+                corners = each["geometry"]["coordinates"][0][:-1]
+                nodes = list(range(count + 1, count + 5))
+                count += 4
+                for node, place in zip(nodes, corners, strict=True):
+                    writer.add_node(mutable.Node(id=node, location=tuple(place)))
+                ways.append(
+                    mutable.Way(id=number, nodes=[*nodes, nodes[0]], tags={"amenity": "parking_space"})
+                )
+            for way in ways:
+                writer.add_way(way)
+        lots = [import_lot(p, AUTO).lot() for p in (path, write(tmp_path / "made.geojson", made))]
+        assert lots[0].slot_ids == lots[1].slot_ids
+        assert lots[0].slot_xy == pytest.approx(lots[1].slot_xy, abs=0.02)
+        path.write_bytes(b"no extract" * 100)
+        with pytest.raises(InputError, match="not an OpenStreetMap extract"):
+            import_lot(path, AUTO)
 
 
 class TestSurvey:

@@ -61,8 +61,8 @@ def check(place: Path, /, drive: bool = True) -> None:
         parkenv lot check map.osm
 
     Options:
-        place (FILE): OpenStreetMap (.osm, Overpass .json, overpass-turbo .geojson), slot centres (.csv), a Dragon Lake
-            map (.yml) or a lot.
+        place (FILE): OpenStreetMap (.osm, .osm.pbf, Overpass .json, overpass-turbo .geojson), slot centres (.csv), a
+            Dragon Lake map (.yml) or a lot.
         drive: Plan how the car drives into each kind of slot.
     """
     from parkenv.evaluation.lot_survey import survey_lot
@@ -126,8 +126,8 @@ def import_place(
         parkenv lot import town.geojson --split --out lots
 
     Options:
-        place (FILE): OpenStreetMap (.osm, Overpass .json, overpass-turbo .geojson), slot centres (.csv), a Dragon Lake
-            map (.yml) or a lot.
+        place (FILE): OpenStreetMap (.osm, .osm.pbf, Overpass .json, overpass-turbo .geojson), slot centres (.csv), a
+            Dragon Lake map (.yml) or a lot.
         out, -o (FILE.geojson|DIR): Lot file to write, or folder with --split.
         picture (FILE.png): Picture to check the import by.
         goal (POINT): Place that people walk to: LAT,LON, or X,Y in metres, or auto: guess it. Repeatable.  [default:

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from parkenv.lots.outlines.network import Line
+from parkenv.lots.outlines.network import STREET, Line, largest_part
 from parkenv.world.drive_graph import node_labels
 
 FloatArray = NDArray[np.float64]
@@ -45,6 +45,42 @@ def guess_entry(lines: Sequence[Line], spaces_xy: FloatArray, blocked: Sequence[
         if entry is not None:
             return entry
     return _outermost(lines)
+
+
+def entries_from_streets(
+    lines: Sequence[Line], mouths: FloatArray
+) -> tuple[list[Line], FloatArray, Entry] | None:
+    """Return the lanes, the entries, (k, 2) m, and a description of the first where the map has public streets.
+
+    Cars enter where lanes meet a street. A street remains a lane if spaces open to it or only it connects other lanes;
+    then cars enter where it leaves the map.
+
+    Args:
+        lines: pieces of the network, cut at crossings.
+        mouths: (n, 2) m, middles of the slots' open sides.
+    """
+    is_street = np.array([line.source == STREET for line in lines])
+    if not is_street.any():
+        return None
+    label = node_labels(np.concatenate([line.points[[0, -1]] for line in lines])).reshape(-1, 2)
+    shapes = np.array([shapely.LineString(line.points) for line in lines])
+    used = np.unique(np.asarray(shapely.STRtree(shapes).nearest(shapely.points(mouths))))
+    inner = [line for line, street in zip(lines, is_street, strict=True) if not street]
+    on_street, on_lane = (np.unique(label[mask]) for mask in (is_street, ~is_street))
+    if not is_street[used].any() and inner and len(largest_part(inner)) == 1:
+        nodes, kept, reason = np.intersect1d(on_street, on_lane), inner, "where a lane meets a street"
+    else:
+        degree = np.bincount(label.ravel())
+        nodes, kept = on_street[degree[on_street] == 1], list(lines)
+        reason = "where a street leaves the map"
+    ends = np.concatenate([line.points[[0, -1]] for line in lines])
+    places = np.array([ends[np.flatnonzero(label.ravel() == node)[0]] for node in nodes]).reshape(-1, 2)
+    if not len(places):
+        return None
+    corners = np.concatenate([line.points for line in kept])
+    away = np.hypot(*(corners - places[0]).T)
+    before = corners[int(np.argmin(np.where(away > 1.0, away, np.inf)))]
+    return kept, places, Entry(np.stack([before, places[0]]), reason, 1.0)
 
 
 def _outermost(lines: Sequence[Line]) -> Entry:

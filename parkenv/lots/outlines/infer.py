@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.lots.generators import Slots
-from parkenv.lots.importers.osm_roads import Road
-from parkenv.lots.outlines.access import Entry, goal_beyond, guess_entry
+from parkenv.lots.importers.osm_roads import Rank, Road
+from parkenv.lots.outlines.access import Entry, entries_from_streets, goal_beyond, guess_entry
 from parkenv.lots.outlines.aisles import Aisle, find_aisles
 from parkenv.lots.outlines.connections import Connection, connect
 from parkenv.lots.outlines.free_space import FreeSpace
-from parkenv.lots.outlines.network import Line, directed, lanes_of, largest_part, noded, without_stubs
+from parkenv.lots.outlines.network import STREET, Line, directed, lanes_of, largest_part, noded, without_stubs
 from parkenv.lots.outlines.openings import OpenRow, View, open_rows
 from parkenv.lots.outlines.rows import find_rows
 from parkenv.lots.outlines.spaces import Spaces
@@ -40,6 +40,7 @@ IntArray = NDArray[np.int64]
 LONGEST_CONNECTION = 120.0  # m
 NARROWEST, KERB_LENGTH = 1.95, 4.8
 """Least width, m, of a slot across which cars park, and least length of one along which they park."""
+FACING = 0.5  # least cosine of the angle between a slot's open side and the way to its lane
 CAR_ROOM = 1.0  # half the width, m, that a car needs on a lane
 KERB_WIDTH = 2.0
 """Least width, m, of a kerbside slot; narrower outlines are widened towards the lane, since cars stand out of them."""
@@ -87,14 +88,15 @@ def infer_lot(
     left_out.update(small)
     aisles = find_aisles(spaces, rows, blocked, [road.points for road in roads])
     if not aisles and not roads:
-        raise InputError("no aisle: no space has free ground in front")
+        reasons = "; ".join(f"{len(members)} {reason}" for reason, members in left_out.items() if members)
+        raise InputError(f"no aisle serves any of {len(spaces)} spaces: {reasons}")
     lines = [
         Line(aisle.points if aisle.one_way >= 0 else aisle.points[::-1], aisle.one_way != 0, a)
         for a, aisle in enumerate(aisles)
     ]
-    known = [Line(road.points, road.oneway) for road in roads]
+    known = [Line(road.points, road.oneway, STREET if road.rank is Rank.STREET else -1) for road in roads]
     connections = connect([line.points for line in lines + known], FreeSpace(blocked), LONGEST_CONNECTION)
-    lines = noded([*lines, *known, *(Line(connection.points) for connection in connections)])
+    lines = noded(noded([*lines, *known, *(Line(connection.points) for connection in connections)]))
     index, slots, widened = _slots(spaces, rows)
     mouths = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
     lines = without_stubs([lines[k] for k in largest_part(lines)[0]], mouths)
@@ -105,9 +107,13 @@ def infer_lot(
 
     entry = None
     if entries is None or not len(entries):
-        entry = guess_entry(lines, mouths, blocked)
-        lines = noded([*lines, Line(entry.points)])
-        entries = entry.points[1:]
+        on_street = entries_from_streets(lines, mouths)
+        if on_street is not None:
+            lines, entries, entry = on_street
+        else:
+            entry = guess_entry(lines, mouths, blocked)
+            lines = noded([*lines, Line(entry.points)])
+            entries = entry.points[1:]
     served, clear = _is_served(slots, lines), _is_clear(slots, lines)
     left_out["spaces that no aisle passes in front"] = index[~served].tolist()
     left_out["spaces beside which the only way is too narrow"] = index[served & ~clear].tolist()
@@ -165,7 +171,7 @@ def _is_served(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
     heading = mouth_heading(slots.yaw, slots.mouth)
     ahead = to_lane[:, 0] * np.cos(heading) + to_lane[:, 1] * np.sin(heading)
     distance = np.hypot(to_lane[:, 0], to_lane[:, 1])
-    return np.asarray((ahead >= 0.0) & (distance <= SLOT_REACH - 0.05))
+    return np.asarray((ahead >= FACING * distance) & (distance <= SLOT_REACH - 0.05))
 
 
 def _is_clear(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:

@@ -17,7 +17,9 @@ from parkenv.world.lot import Lane
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
+STREET = -2  # source of a public street
 GRID = 0.01  # precision, m, of crossings
+LEAST_DIRECTED = 0.3  # m, least length of a one-way piece
 LOOSE = 1.2  # ends closer to another line than this, m, are moved onto it
 SHORTEST_STUB = 6.0  # dead ends shorter than this, m, are dropped if no space needs them
 
@@ -28,7 +30,7 @@ class Line:
 
     points: FloatArray  # (k, 2) m
     one_way: bool = False  # in the order of the points
-    source: int = -1  # index of its aisle; -1 for connections and roads
+    source: int = -1  # index of its aisle; -1 for connections and service roads, `STREET` for public streets
 
 
 def noded(lines: Sequence[Line]) -> list[Line]:
@@ -41,14 +43,16 @@ def noded(lines: Sequence[Line]) -> list[Line]:
     # Where lines coincide, the one that is one-way decides, then the first.
     result = []
     for piece in pieces:
-        distance = shapely.distance(original, shapely.line_interpolate_point(piece, 0.5, normalized=True))
-        near = np.flatnonzero(distance <= distance.min() + 0.05)
+        probes = shapely.line_interpolate_point(piece, np.linspace(0.0, 1.0, 5), normalized=True)
+        distance = shapely.distance(original[:, None], probes[None]).max(axis=1)
+        near = np.flatnonzero(distance <= distance.min() + 0.03)
         k = int(min(near, key=lambda i: (not lines[i].one_way, lines[i].source < 0, i)))
         coordinates = shapely.get_coordinates(piece)
         stations = shapely.line_locate_point(original[k], shapely.points(coordinates[[0, -1]]))
         if lines[k].one_way and stations[0] > stations[1]:
             coordinates = coordinates[::-1]
-        result.append(Line(coordinates, lines[k].one_way, lines[k].source))
+        # The direction of a piece that is hardly longer than the grid is lost in rounding.
+        result.append(Line(coordinates, lines[k].one_way and piece.length > LEAST_DIRECTED, lines[k].source))
     return result
 
 

@@ -23,7 +23,8 @@ LOOK = 18.0  # how far ahead of a mouth obstacles are looked for, m
 WIDEST_SHARED = 13.0  # widest aisle, m, that two facing rows share
 LEAST_KERBSIDE, LEAST_PERPENDICULAR = 2.7, 3.9
 """Least width, m, of an aisle along kerbside and along perpendicular spaces; oblique ones are in between."""
-TOLERATED = 0.75  # fraction of that width that is enough before single spaces
+TOLERATED, TOLERATED_ACROSS = 0.75, 0.95
+"""Fraction of that width that is enough before single spaces of an oblique and of a perpendicular row."""
 EXHAUSTIVE = 14  # undecided rows up to which all combinations of sides are tried
 ON_ROAD = 4.0  # gain per space of a row that opens to a road of the map
 ALONE, UNUSED, SHARED = 0.55, 0.45, 1.0
@@ -75,8 +76,7 @@ def open_rows(
     lost: list[int] = []
     for row in rows:
         views = [scene.view(row, side) for side in (0, 1)]
-        need = least_aisle(row)
-        is_open = np.stack([_is_open(view.clear, need) for view in views], axis=1)
+        is_open = np.stack([_is_open(view.clear, row) for view in views], axis=1)
         if len(row) == 1 and not is_open.any():
             lost += row.members.tolist()
             continue
@@ -153,9 +153,11 @@ def is_on_road(
     return np.asarray(shapely.intersects(rays, lines))
 
 
-def _is_open(clear: FloatArray, need: float) -> NDArray[np.bool_]:
+def _is_open(clear: FloatArray, row: Row) -> NDArray[np.bool_]:
     """Whether cars reach spaces from a side, (k,): where most of a row has the width that it needs, less is enough."""
-    return clear >= (TOLERATED * need if np.median(clear) >= need else need)
+    need = least_aisle(row)
+    tolerated = TOLERATED if row.slant < np.radians(75.0) else TOLERATED_ACROSS
+    return clear >= (tolerated * need if np.median(clear) >= need else need)
 
 
 def _aisle_likeness(gap: FloatArray, need: float) -> FloatArray:
@@ -178,7 +180,7 @@ def _choose(
     for r, (row, views) in enumerate(parts):
         need = least_aisle(row)
         for side, view in enumerate(views):
-            shut = ~_is_open(view.clear, need)
+            shut = ~_is_open(view.clear, row)
             if shut.any():
                 unary[r, side] += np.inf
                 continue

@@ -19,7 +19,7 @@ from parkenv.lots.importers.osm_spaces import split_space, why_no_slot
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.outlines.infer import KERB_WIDTH, InferredLot, infer_lot
 from parkenv.lots.outlines.openings import least_aisle
-from parkenv.lots.outlines.spaces import Spaces, refuse_areas, spaces_from_outlines
+from parkenv.lots.outlines.spaces import Spaces, rectangle_corners, refuse_areas, spaces_from_outlines
 from parkenv.lots.provenance import Doubt
 from parkenv.world.drive_graph import SLOT_REACH
 
@@ -174,9 +174,9 @@ def _refuse_swapped(areas: Sequence[Area]) -> None:
         if max(np.abs(line[:, 1]).max() for line in positions) > 89.0:
             return
         frame = LocalFrame.around(np.concatenate(positions))
-        boxes = shapely.minimum_rotated_rectangle([shapely.Polygon(frame.to_xy(line)) for line in positions])
-        corners = [shapely.get_coordinates(box)[:3] for box in boxes]
-        sides = [np.sort(np.hypot(*np.diff(three, axis=0).T)) for three in corners if len(three) == 3]
+        outlines = [shapely.Polygon(frame.to_xy(line)) for line in positions]
+        corners = [rectangle_corners(outline) for outline in outlines if shapely.area(outline) > 0.1]
+        sides = [np.sort(np.hypot(*np.diff(four[:3], axis=0).T)) for four in corners]
         fits = [1.8 < width < 3.3 and 4.0 < length < 6.4 for width, length in sides]
         plausible.append(float(np.mean(fits)) if fits else 0.0)
     if plausible[0] < 0.3 and plausible[1] > 0.6:

@@ -19,8 +19,8 @@ TOUCHING = 0.7  # widest gap, m, between neighbours in a row
 SAME_AXIS = np.cos(np.radians(25.0))  # least |cosine| of the angle between the axes of neighbours
 STEP = 0.62
 """Largest offset of neighbours along their axes, as a fraction of their length: 45° rows have 0.5."""
-KERB_LENGTH, KERB_SHAPE = 4.9, 1.9
-"""Least length, m, and least ratio of length to width of a kerbside space."""
+SLIM, KERB_LENGTH, KERB_SHAPE = 1.6, 4.9, 1.9
+"""Least ratio of length to width of spaces end to end along a kerb; of just two of them, least length, m, and ratio."""
 SQUARE = np.radians(12.0)  # largest deviation from a right angle of a perpendicular row
 RIGHT = np.pi / 2
 
@@ -89,14 +89,20 @@ def find_rows(spaces: Spaces) -> list[Row]:
     has_beside = np.zeros(len(spaces), dtype=bool)
     has_beside[links.ravel()] = True
 
-    slim = (spaces.length > KERB_LENGTH) & (spaces.length > KERB_SHAPE * spaces.width) & ~has_beside
+    slim = (spaces.length > SLIM * spaces.width) & ~has_beside
     behind = parallel & (np.abs(v) < 0.5 * width) & (np.abs(u) < length + TOUCHING + 0.6)
     behind &= (np.abs(u) > 0.7 * length) & slim[one] & slim[other]
     kerb = _mutual(one[behind], other[behind], u[behind] > 0, np.abs(u[behind]) + np.abs(v[behind]))
     rows = [_chain(spaces, order, kerbside=False) for order in _chains(links, len(spaces), has_beside)]
+    in_line = np.zeros(len(spaces), dtype=bool)
+    in_line[kerb.ravel()] = True
     at_kerb = np.zeros(len(spaces), dtype=bool)
-    at_kerb[kerb.ravel()] = True
-    rows += [_chain(spaces, order, kerbside=True) for order in _chains(kerb, len(spaces), at_kerb)]
+    long = (spaces.length > KERB_LENGTH) & (spaces.length > KERB_SHAPE * spaces.width)
+    for order in _chains(kerb, len(spaces), in_line):
+        # Two spaces end to end may also stand back to back.
+        if len(order) > 2 or long[order].all():
+            rows.append(_chain(spaces, order, kerbside=True))
+            at_kerb[order] = True
     single = np.flatnonzero(~has_beside & ~at_kerb)
     return rows + [_chain(spaces, np.array([i]), kerbside=False) for i in single.tolist()]
 

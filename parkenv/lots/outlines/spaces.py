@@ -72,7 +72,7 @@ def spaces_from_outlines(ids: Sequence[str], outlines: NDArray[np.object_]) -> S
     """
     area = shapely.area(outlines)
     refuse_areas(ids, area)
-    corners = np.stack([_corners(outline) for outline in outlines])
+    corners = np.stack([rectangle_corners(outline) for outline in outlines])
     sides = np.roll(corners, -1, axis=1) - corners
     size = np.hypot(sides[..., 0], sides[..., 1])
     turn = size[:, 0] < size[:, 1]
@@ -97,8 +97,8 @@ def refuse_areas(ids: Sequence[str], area: FloatArray) -> None:
         )
 
 
-def _corners(outline: shapely.Geometry) -> FloatArray:
-    """Return the four corners of the rectangle of an outline."""
+def rectangle_corners(outline: shapely.Geometry) -> FloatArray:
+    """Return the corners, (4, 2) m, of the rectangle of an outline."""
     simple = shapely.simplify(outline, STRAIGHTENED)
     if len(shapely.get_coordinates(simple)) != 5 or shapely.area(simple) < 0.9 * shapely.area(outline):
         simple = shapely.minimum_rotated_rectangle(outline)
