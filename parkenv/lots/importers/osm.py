@@ -36,7 +36,8 @@ from parkenv.lots.importers import osm_network as network
 from parkenv.lots.importers.import_options import ImportOptions, points_in_frame
 from parkenv.lots.importers.lot_draft import LeftOut, LotDraft
 from parkenv.lots.importers.osm_buildings import BUILDING_REACH, ENTRANCE_REACH, Area, find_goals, split_walls
-from parkenv.lots.importers.osm_elements import OsmElement, read_elements
+from parkenv.lots.importers.osm_elements import OsmElement
+from parkenv.lots.importers.osm_files import read_map
 from parkenv.lots.importers.osm_junctions import limit_junctions
 from parkenv.lots.importers.osm_kerbs import Junctions, kerb_of, kerb_slots
 from parkenv.lots.importers.osm_outlines import CORRIDOR, fill_outline
@@ -71,7 +72,7 @@ def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraf
         InputError: the file is incomplete, has another format or contains no parking, an outline crosses itself, or
             the elements are too far apart.
     """
-    return draft_of_elements(Path(path), read_elements(Path(path)), options or ImportOptions())
+    return draft_of_elements(Path(path), read_map(Path(path)), options or ImportOptions())
 
 
 def draft_of_elements(path: Path, elements: Sequence[OsmElement], options: ImportOptions) -> LotDraft:

@@ -1,8 +1,8 @@
 """Read OpenStreetMap files: nodes, ways and multipolygons with their tags and positions.
 
-Four formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `out;`), Overpass
+Three formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `out;`), Overpass
 JSON (`elements`, with node references or `out geom;`), and GeoJSON as overpass-turbo and osmtogeojson write
-it (an element's id in `id` or `@id`, its tags in `properties` or `properties.tags`); PBF has its own module, `osm_pbf`.
+it (an element's id in `id` or `@id`, its tags in `properties` or `properties.tags`); `osm_pbf` reads PBF.
 
 OSM XML has no document type. A file that declares one is rejected before its entities are read, so entities cannot
 expand into gigabytes or fetch other files.
@@ -60,10 +60,6 @@ def read_elements(path: Path) -> list[OsmElement]:
         InputError: the file cannot be read, is incomplete or has another format; a position is not on the globe; a
             tagged way refers to a node that is not in the file; or an element appears twice with different content.
     """
-    if path.suffix.lower() == ".pbf":
-        from parkenv.lots.importers.osm_pbf import read_pbf
-
-        return read_pbf(path)
     is_xml = path.suffix.lower() in (".osm", ".xml")
     content = read_bytes(path) if is_xml else read_json(path)
     try:

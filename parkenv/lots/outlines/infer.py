@@ -99,7 +99,8 @@ def infer_lot(
     lines = noded(noded([*lines, *known, *(Line(connection.points) for connection in connections)]))
     index, slots, widened = _slots(spaces, rows)
     mouths = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
-    lines = without_stubs([lines[k] for k in largest_part(lines)[0]], mouths)
+    main = [lines[k] for k in largest_part(lines)[0]]
+    lines = without_stubs(main, lambda some: int(_is_served(slots, some).sum()))
     wanted = {
         a: int(sum(len(rows[r].row) for r in aisle.rows)) for a, aisle in enumerate(aisles) if aisle.one_way
     }

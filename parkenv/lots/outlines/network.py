@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import networkx as nx
@@ -103,21 +103,36 @@ def _joined_ends(points: list[FloatArray]) -> list[FloatArray]:
     return [part[np.r_[True, np.hypot(*np.diff(part, axis=0).T) > GRID / 2]] for part in moved]
 
 
-def without_stubs(lines: Sequence[Line], needed: FloatArray) -> list[Line]:
-    """Drop short dead ends, except those nearest to a needed point, (n, 2) m."""
-    while True:
-        kept = list(lines)
+def without_stubs(lines: Sequence[Line], count_served: Callable[[Sequence[Line]], int]) -> list[Line]:
+    """Drop short dead ends, the shortest first, unless fewer spaces have a lane before them without it.
+
+    Args:
+        lines: pieces of the network, cut at crossings.
+        count_served: returns the number of spaces with a lane before them.
+    """
+    kept = list(lines)
+    served = count_served(kept)
+    needed: set[int] = set()
+    while len(kept) > 1:
         label = node_labels(np.concatenate([line.points[[0, -1]] for line in kept]))
         degree = np.bincount(label)[label].reshape(-1, 2)
-        shapes = np.array([shapely.LineString(line.points) for line in kept])
-        serving = set(np.asarray(shapely.STRtree(shapes).nearest(shapely.points(needed))).tolist())
-        lines = [
-            line
+        stubs = [
+            (length, k)
             for k, line in enumerate(kept)
-            if k in serving or degree[k].min() > 1 or shapes[k].length >= SHORTEST_STUB
+            if degree[k].min() == 1
+            and id(line) not in needed
+            and (length := shapely.LineString(line.points).length) < SHORTEST_STUB
         ]
-        if len(lines) == len(kept) or not lines:
-            return lines if lines else kept
+        if not stubs:
+            break
+        k = min(stubs)[1]
+        without = kept[:k] + kept[k + 1 :]
+        left = count_served(without)
+        if left >= served:
+            kept, served = without, left
+        else:
+            needed.add(id(kept[k]))
+    return kept
 
 
 def directed(lines: Sequence[Line], wanted: dict[int, int]) -> tuple[list[Line], list[int]]:

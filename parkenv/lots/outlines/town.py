@@ -16,7 +16,8 @@ from parkenv.errors import InputError
 from parkenv.lots.importers.import_options import ImportOptions
 from parkenv.lots.importers.lot_draft import LotDraft
 from parkenv.lots.importers.osm import draft_of_elements, map_frame
-from parkenv.lots.importers.osm_elements import OsmElement, read_elements
+from parkenv.lots.importers.osm_elements import OsmElement
+from parkenv.lots.importers.osm_files import read_map
 
 FloatArray = NDArray[np.float64]
 
@@ -50,7 +51,7 @@ def import_town(path: str | Path, options: ImportOptions, least: int = LEAST_SPA
         InputError: the file cannot be read, has no parking spaces or an outline that is none.
     """
     path = Path(path)
-    elements = read_elements(path)
+    elements = read_map(path)
     for name, part in split_town(path, elements, least):
         count = sum(_is_space(e) for e in part)
         try:
