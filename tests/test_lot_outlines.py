@@ -296,6 +296,18 @@ class TestFaults:
 
 
 class TestExtracts:
+    def test_polygons_without_tags_are_parking_spaces(self, tmp_path):
+        made = document(double_row())
+        for each in made["features"]:
+            each["properties"] = {"fid": 1}
+            del each["id"]
+        path = write(tmp_path / "plain.geojson", made)
+        lot = import_lot(path, AUTO).lot()
+        assert lot.n_slots == 32
+        assert lot.slot_ids[0] == "feature/0"
+        with pytest.raises(InputError, match=r"`parkenv lot import .* makes a lot of it"):
+            read_lot(path)
+
     def test_without_osmium_a_line_says_what_to_install(self, monkeypatch, tmp_path):
         monkeypatch.setitem(sys.modules, "osmium", None)
         done = parkenv("lot", "import", tmp_path / "town.osm.pbf", "--split", "--out", tmp_path / "lots")

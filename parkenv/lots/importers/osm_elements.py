@@ -3,6 +3,7 @@
 Three formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `out;`), Overpass
 JSON (`elements`, with node references or `out geom;`), and GeoJSON as overpass-turbo and osmtogeojson write
 it (an element's id in `id` or `@id`, its tags in `properties` or `properties.tags`); `osm_pbf` reads PBF.
+GeoJSON of polygons without any such tag holds outlines of parking spaces.
 
 OSM XML has no document type. A file that declares one is rejected before its entities are read, so entities cannot
 expand into gigabytes or fetch other files.
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -77,9 +78,22 @@ def holds_osm(document: object) -> bool:
     features = document.get("features")
     if not isinstance(features, list) or "parkenv" in document or "frame" in document:
         return False
+    if _holds_outlines(features):
+        return True
     properties = [f["properties"] for f in features if isinstance(f, dict) and _is_object(f, "properties")]
     return not any("kind" in p for p in properties) and any(
         "@id" in p or _is_object(p, "tags") or any(key in p for key in MAPPED_KEYS) for p in properties
+    )
+
+
+def _holds_outlines(features: list[Any]) -> bool:
+    """Whether features are polygons alone, without a tag that says what they are: outlines of parking spaces."""
+    return bool(features) and all(
+        isinstance(f, dict)
+        and _is_object(f, "geometry")
+        and f["geometry"].get("type") == "Polygon"
+        and not any(key in (f.get("properties") or {}) for key in ("kind", "tags", "@id", *MAPPED_KEYS))
+        for f in features
     )
 
 
@@ -306,7 +320,10 @@ def elements_of_json(document: Any) -> list[OsmElement]:
             first = elements.setdefault(element.id, (index, element))[0]
             if first != index:
                 raise InputError(f"{element.id} appears twice, as features[{first}] and features[{index}]")
-        return [element for _, element in elements.values()]
+        found = [element for _, element in elements.values()]
+        if _holds_outlines(document["features"]):
+            return [replace(e, tags={"amenity": "parking_space"}) for e in found]
+        return found
     raise InputError("no elements and no features, want Overpass JSON or a GeoJSON FeatureCollection")
 
 

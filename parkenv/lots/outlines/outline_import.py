@@ -29,6 +29,7 @@ MOST_SPACES = 20_000
 """Maximum number of spaces of one lot."""
 MOST_LOST = 0.2
 """Largest fraction of the spaces that an import may leave out because no aisle reaches them."""
+LARGEST_USUAL = 18.0  # area, m², that few parking spaces for cars exceed
 SHARE_UNSURE = 0.35  # certainty below which the open side of a row counts as a guess
 TWO_WAY_WIDTH, ONE_WAY_WIDTH = 4.5, 2.8
 """Least width, m, of a two-way and of a one-way aisle."""
@@ -169,22 +170,38 @@ def _refuse_swapped(areas: Sequence[Area]) -> None:
     if not areas:
         return
     lonlat = [area.element.lines[0] for area in areas]
-    plausible = []
-    for positions in (lonlat, [line[:, ::-1] for line in lonlat]):
-        if max(np.abs(line[:, 1]).max() for line in positions) > 89.0:
-            return
-        frame = LocalFrame.around(np.concatenate(positions))
-        outlines = [shapely.Polygon(frame.to_xy(line)) for line in positions]
-        corners = [rectangle_corners(outline) for outline in outlines if shapely.area(outline) > 0.1]
-        sides = [np.sort(np.hypot(*np.diff(four[:3], axis=0).T)) for four in corners]
-        fits = [1.8 < width < 3.3 and 4.0 < length < 6.4 for width, length in sides]
-        plausible.append(float(np.mean(fits)) if fits else 0.0)
-    if plausible[0] < 0.3 and plausible[1] > 0.6:
+    if np.abs(np.concatenate(lonlat)).max() > 89.0:
+        return
+    (size, skew), (other_size, other_skew) = (
+        _plausibility(positions) for positions in (lonlat, [line[:, ::-1] for line in lonlat])
+    )
+    if (size < 0.3 and other_size > 0.6) or (skew > 0.12 and other_skew < 0.06 and other_size > 0.6):
         lon, lat = lonlat[0][0].tolist()
         raise InputError(
             f"{areas[0].element.id} is at {lat:.4f}, {lon:.4f}, where few spaces have the size of a car, want "
             "positions at which they have (are latitude and longitude swapped?)"
         )
+
+
+def _plausibility(outlines: Sequence[FloatArray]) -> tuple[float, float]:
+    """Return the fraction of outlines, (k, 2) degrees, of a parked car's size, and their typical skew.
+
+    The skew is the cosine of the angle between two sides: 0 for a rectangle.
+    """
+    frame = LocalFrame.around(np.concatenate(outlines))
+    fits, skew = [], []
+    for outline in outlines:
+        polygon = shapely.Polygon(frame.to_xy(outline))
+        if shapely.area(polygon) < 0.1:
+            continue
+        one, other = np.diff(rectangle_corners(polygon)[:3], axis=0)
+        width, length = sorted((float(np.hypot(*one)), float(np.hypot(*other))))
+        fits.append(1.8 < width < 3.3 and 4.0 < length < 6.4 and width * length < LARGEST_USUAL)
+        corners = shapely.get_coordinates(shapely.simplify(polygon, 0.2))
+        if len(corners) == 5:
+            one, other = np.diff(corners[:3], axis=0)
+            skew.append(abs(float(one @ other)) / float(np.hypot(*one) * np.hypot(*other)))
+    return float(np.mean(fits)) if fits else 0.0, float(np.median(skew)) if skew else 0.0
 
 
 def _shapes(elements: Sequence[OsmElement], frame: LocalFrame, wanted: object) -> list[Area]:
