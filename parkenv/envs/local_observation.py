@@ -95,6 +95,11 @@ class Surroundings(NamedTuple):
     view_s: FloatArray  # s, straight-line drive plus walk for each slot in view of each vertex
     columns: NDArray[np.int32]  # int32, scratch space for the columns of a row's slots
 
+    @property
+    def n_bytes(self) -> int:
+        """Memory, bytes."""
+        return sum(array.nbytes for array in self)
+
     @classmethod
     def of(cls, problems: Sequence[SearchProblem], k: int) -> Surroundings:
         """Compute the surroundings of all vertices.
@@ -169,7 +174,7 @@ class LocalObservation(
         super().__init__(env)
         if not isinstance(env.unwrapped, SearchEnv):
             raise TypeError(f"LocalObservation wraps parkenv/Search-v2, not {type(env.unwrapped).__name__}")
-        self._surroundings = Surroundings.of([env.unwrapped.scenario], k)
+        self._surroundings = Surroundings.of(env.unwrapped.scenarios, k)
         self.observation_space = local_space(k)
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
@@ -183,12 +188,13 @@ class LocalObservation(
 @kernel
 def observe_surroundings_at(address: int, around: Surroundings, local: NDArray[np.float32]) -> None:
     """Call `observe_surroundings` for a single search."""
-    observe_surroundings(search_at(address, 0), around, 0, local)
+    observe_surroundings(search_at(address, 0), around, local)
 
 
 @kernel
-def observe_surroundings(search: Any, around: Surroundings, lot: int, local: NDArray[np.float32]) -> None:
+def observe_surroundings(search: Any, around: Surroundings, local: NDArray[np.float32]) -> None:
     """Write the local observation; must be called after each reset and each step."""
+    lot = search.place
     if search.n_steps == 0:
         _forecast_regions(search, around, lot)
     _remember(search, around, lot)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,6 @@ from parkenv.world.counted_occupancy import CountedOccupancy
 from parkenv.world.lot import MOVES, PARK
 from parkenv.world.occupancy import (
     Arrival,
-    IntArray,
     OccupancyModel,
     OccupancyProcess,
     PriorModel,
@@ -111,6 +110,8 @@ _PROGRESS = [
     # free, or -1.
     ("free_by_region", np.float64, (N_REGIONS,)),
     ("remembered_slot", np.int64),
+    # Index of the search's scenario.
+    ("place", np.int64),
 ]
 _EPISODES = [("episode", np.int64), ("seed_state", np.uint64), ("clock", np.float32, (2,))]
 
@@ -124,6 +125,9 @@ SEARCH = np.dtype(
         *_EPISODES[:2],
         # Time since Monday 00:00, and since the search began, as observed.
         _EPISODES[2],
+        # The SCENARIO records, and from how many of them, the first ones, the place of an episode is drawn.
+        ("scenarios", ADDRESS),
+        ("n_places", np.int64),
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
         # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; PROCESS
         # record of the world, if it is a process.
@@ -180,11 +184,12 @@ slot_at, block_at = record_at(SLOT), record_at(BLOCK)
 
 
 class ScenarioRecords:
-    """Scenarios as records, and the arrays that the records point to.
+    """Scenarios as records, and the arrays that the records point to: one set of tables for any number of searches.
 
     Attributes:
         records: (n,) of the dtype SCENARIO.
         scenarios: the scenarios.
+        n_bytes: memory of records and arrays, bytes.
 
     Raises:
         InputError: an occupancy that is neither a process nor a log.
@@ -197,6 +202,8 @@ class ScenarioRecords:
         for record, scenario in zip(self.records, scenarios, strict=True):
             self._write_search(record, scenario)
             self._write_occupancy(record, scenario)
+        arrays = {id(array): array for array in _arrays_in(self._kept)}
+        self.n_bytes = self.records.nbytes + sum(array.nbytes for array in arrays.values())
 
     def _keep(self, values: ArrayLike, dtype: Any = np.float64) -> int:
         array = np.ascontiguousarray(values, dtype)
@@ -277,12 +284,21 @@ class ScenarioRecords:
         return EXTERNAL_KIND, 0
 
 
+def _arrays_in(kept: Sequence[Any]) -> Iterator[NDArray[Any]]:
+    """Yield the arrays among what is kept, and those of its occupancy models."""
+    for one in kept:
+        if isinstance(one, np.ndarray):
+            yield one
+        else:
+            yield from (value for value in vars(one).values() if isinstance(value, np.ndarray))
+
+
 class Searches:
     """One or more running searches as records, and the arrays that the records point to.
 
     Args:
-        scenarios: scenarios of the searches.
-        scenario_of: (n,) index into `scenarios` for each search.
+        scenarios: scenarios of the searches; if there are several, one is drawn for each episode.
+        n: number of searches.
         full_belief: whether to keep `p_occupied` and `belief` up to date.
 
     Attributes:
@@ -291,15 +307,18 @@ class Searches:
             first use; the first column is the sentinel. m is the number of slots of the largest lot.
         external_forecast: (n, 2, m) float64, forecast and decay rate of priors that only Python can compute; else
             (0, 2, 0).
+        needs_python: whether an arrival is complete only after `complete_arrival`.
         day_error: (n, 2) float32, logits, day error of each search's forecast: level and slope.
         p_occupied: (n, m) float32, current belief in every slot; (0, 0) if not kept.
         belief: (n, 4, m) float32: forecast, decay rate, belief after the last observation, and its time; (0, 4, 0) if
             not kept.
     """
 
-    def __init__(self, scenarios: ScenarioRecords, scenario_of: IntArray, full_belief: bool) -> None:
-        n, m = len(scenario_of), int(scenarios.records["n_slots"].max())
+    def __init__(self, scenarios: ScenarioRecords, n: int, full_belief: bool) -> None:
+        m = int(scenarios.records["n_slots"].max())
         external = bool((scenarios.records["prior_kind"] == EXTERNAL_KIND).any())
+        counted = any(isinstance(one.occupancy, CountedOccupancy) for one in scenarios.scenarios)
+        self.needs_python = external or counted
         self.scenarios = scenarios
         self.records = np.zeros(n, SEARCH)
         self.slots = np.zeros((n, m + 1), SLOT)
@@ -314,28 +333,38 @@ class Searches:
         self.belief[:, [FORECAST, P_OBSERVED]] = 1.0
         self.belief[:, OBSERVED_AT] = NEVER_OBSERVED
         self.records["width"] = m
-        self.records["scenario"] = address_of(scenarios.records, SCENARIO) + scenario_of * SCENARIO.itemsize
-        self.records["process"] = scenarios.records["world"][scenario_of]
-        self._scenario_of = scenario_of
+        self.records["scenarios"] = address_of(scenarios.records, SCENARIO)
+        self.records["n_places"] = len(scenarios.records)
+        self._find_scenarios()
         for name, array in self._arrays().items():
             first = address_of(array, array.dtype)
             self.records[name] = first + np.arange(n) * array.strides[0] if len(array) else 0
 
     def complete_arrival(self, search: int) -> None:
         """Add what only Python can compute about a search that has just begun: an external forecast, a counted day."""
-        if not len(self.external_forecast):
-            return
-        scenario, record = self.scenarios.scenarios[self._scenario_of[search]], self.records[search]
-        arrival = arrival_of(scenario, record)
+        scenario, record = self.scenario_of(search), self.records[search]
         self._find_process(search)
+        if self.scenarios.records["prior_kind"][record["place"]] != EXTERNAL_KIND:
+            return
+        arrival = arrival_of(scenario, record)
         forecast = scenario.forecast(arrival)
         n = len(forecast.p_occupied)
         self.external_forecast[search, :, :n] = forecast.p_occupied, forecast.decay_rate
         self.day_error[search] = forecast.day_error.level, forecast.day_error.slope
 
+    def scenario_of(self, search: int) -> Scenario:
+        """Return the scenario of a search's episode."""
+        return self.scenarios.scenarios[int(self.records["place"][search])]
+
+    def _find_scenarios(self) -> None:
+        """Write the addresses that follow from the places."""
+        place = self.records["place"]
+        self.records["scenario"] = self.records["scenarios"] + place * SCENARIO.itemsize
+        self.records["process"] = self.scenarios.records["world"][place]
+
     def _find_process(self, search: int) -> None:
         """Write the address of the process of a counted day; it differs from computer process to process."""
-        scenario = self.scenarios.scenarios[self._scenario_of[search]]
+        scenario = self.scenario_of(search)
         if isinstance(scenario.occupancy, CountedOccupancy):
             day = arrival_of(scenario, self.records[search]).day
             self.records[search]["process"] = address_of(scenario.occupancy.process_of(day).record, PROCESS)
@@ -379,9 +408,12 @@ class Searches:
             raise InputError(f"state is of a lot with {width} slots, this one has {self.records['width'][0]}")
         for name in PROGRESS_FIELDS:
             self.records[name] = records[name]
+        if not ((self.records["place"] >= 0) & (self.records["place"] < len(self.scenarios.records))).all():
+            raise InputError("state is of other scenarios")
+        self._find_scenarios()
         for mine, array in zip(self._arrays().values(), arrays, strict=True):
             mine[...] = array.view(mine.dtype)
-        if len(self.external_forecast):
+        if self.needs_python:
             for search in range(len(self.records)):
                 self._find_process(search)
 
