@@ -28,6 +28,7 @@ from parkenv.envs.search_records import (
     SCENARIO,
     SENTINEL,
     block_at,
+    edge_at,
     scenario_at,
     search_at,
     slot_at,
@@ -286,10 +287,10 @@ def write_clock(search: Any) -> None:
 def drive_or_park(search: Any, action: int) -> None:
     """Move the car, or attempt to park."""
     scenario, vertex = scenario_at(search.scenario, 0), search.vertex
-    edge = vertex * N_ACTIONS + action
-    drive_s, failed_s, walk_s, parking_cost_s = float64s(scenario.seconds)[edge], 0.0, 0.0, 0.0
-    search.driven_m += float64s(scenario.metres)[edge]
-    target = int64s(scenario.targets)[edge]
+    edge = edge_at(scenario.edges, vertex * N_ACTIONS + action)
+    drive_s, failed_s, walk_s, parking_cost_s = edge.seconds, 0.0, 0.0, 0.0
+    search.driven_m += edge.metres
+    target = edge.target
     if target != vertex:
         search.previous_vertex, search.vertex = vertex, target
     elif action == PARK and vertex < scenario.n_slots:

@@ -19,13 +19,19 @@ from parkenv.world.occupancy import (
 )
 from parkenv.world.occupancy_kernel import CURSOR_FIELDS, PROCESS, RECORDED_DAY, WORLD_FIELDS
 from parkenv.world.occupancy_log import weekday_of
-from parkenv.world.pointers import ADDRESS, address_of, record_at
+from parkenv.world.pointers import ADDRESS, address_of, in_one_block, record_at
 from parkenv.world.recorded_occupancy import RecordedOccupancy
 from parkenv.world.scenario import Scenario
 
 N_ACTIONS = PARK + 1
 PROCESS_KIND, LOG_KIND, EXTERNAL_KIND = range(3)
 """Kinds of world and prior: a generating process; a replayed log; a forecast computed in Python at every arrival."""
+
+EDGE = np.dtype([("target", np.int64), ("seconds", np.float64), ("metres", np.float64)], align=True)
+"""Result of an action at a vertex: the vertex that it leads to, s, m.
+
+Parking, and actions that the graph does not have, lead back to the same vertex.
+"""
 
 SCENARIO = np.dtype(
     [
@@ -40,11 +46,8 @@ SCENARIO = np.dtype(
         ("weekdays", ADDRESS),
         ("n_entries", np.int64),
         ("entries", ADDRESS),
-        # Results of actions, (n_vertices, 5) each: int64 vertices; float64 s; float64 m. Parking, and actions that the
-        # graph does not have, lead back to the same vertex.
-        ("targets", ADDRESS),
-        ("seconds", ADDRESS),
-        ("metres", ADDRESS),
+        # (n_vertices, 5) EDGE records.
+        ("edges", ADDRESS),
         # (n_vertices, 5) uint8, mask of the actions that the graph has.
         ("action_masks", ADDRESS),
         # (n_slots,) float64: walk to the goal, s and m; parking cost, s.
@@ -69,6 +72,13 @@ SCENARIO = np.dtype(
 )
 """The constant part of the searches in a scenario; the comments describe the arrays at the addresses."""
 
+_TABLES = tuple(
+    name
+    for name in SCENARIO.names or ()
+    if SCENARIO[name] == ADDRESS
+    and name not in ("n_slots", "n_weekdays", "n_entries", "world_kind", "prior_kind")
+)
+_PROCESS_TABLES = ("factors", "profiles", "hazards", "hourly_marginals")
 N_REGIONS = 4
 
 _PROGRESS = [
@@ -179,7 +189,7 @@ A few vector instructions update a block, and the data of a search stay close to
 FORECAST, DECAY_RATE, P_OBSERVED, OBSERVED_AT = range(4)  # the parts of the observation's `belief`
 NEVER_OBSERVED = -1.0  # `observed_at` of a slot not observed in this search
 
-scenario_at, search_at = record_at(SCENARIO), record_at(SEARCH)
+scenario_at, search_at, edge_at = record_at(SCENARIO), record_at(SEARCH), record_at(EDGE)
 slot_at, block_at = record_at(SLOT), record_at(BLOCK)
 
 
@@ -202,24 +212,48 @@ class ScenarioRecords:
         for record, scenario in zip(self.records, scenarios, strict=True):
             self._write_search(record, scenario)
             self._write_occupancy(record, scenario)
+        if len(scenarios) > 1:
+            self._join()
         arrays = {id(array): array for array in _arrays_in(self._kept)}
         self.n_bytes = self.records.nbytes + sum(array.nbytes for array in arrays.values())
 
+    def _join(self) -> None:
+        """Move the tables of all scenarios into one block of memory."""
+        processes = [one for one in self._kept if isinstance(one, OccupancyProcess)]
+        tables = [one for one in self._kept if isinstance(one, np.ndarray)]
+        others = [one for one in self._kept if not any(one is known for known in (*processes, *tables))]
+        tables += [getattr(one, name) for one in processes for name in _PROCESS_TABLES]
+        copies = in_one_block(tables)
+        moved = {
+            address_of(old, old.dtype): address_of(new, new.dtype)
+            for old, new in zip(tables, copies, strict=True)
+        }
+        for one in processes:
+            record = one.record.copy()
+            for name in _PROCESS_TABLES:
+                record[name] = moved[int(record[name][0])]
+            moved[address_of(one.record, PROCESS)] = address_of(record, PROCESS)
+            others += [record, *(value for value in (one.nearness, one._centring) if value is not None)]
+        for name in _TABLES:
+            self.records[name] = [moved.get(int(address), int(address)) for address in self.records[name]]
+        self._kept = [*copies, *others]
+
     def _keep(self, values: ArrayLike, dtype: Any = np.float64) -> int:
         array = np.ascontiguousarray(values, dtype)
+        array.flags.writeable = False
         self._kept.append(array)
         return address_of(array, dtype)
 
     def _write_search(self, record: np.void, scenario: Scenario) -> None:
         lot, masks = scenario.lot, scenario.action_masks
-        targets = np.repeat(np.arange(lot.n_vertices)[:, None], N_ACTIONS, axis=1)
-        seconds = np.full(targets.shape, scenario.wait_s)
-        metres = np.zeros(targets.shape)
+        edges = np.zeros(masks.shape, EDGE)
+        edges["target"] = np.arange(lot.n_vertices)[:, None]
+        edges["seconds"] = scenario.wait_s
         moves = masks[:, : len(MOVES)] == 1
-        targets[:, :PARK][moves] = lot.neighbors[moves]
-        seconds[:, :PARK][moves] = scenario.move_s[moves]
-        metres[:, :PARK][moves] = lot.edge_length[moves]
-        seconds[: lot.n_slots, PARK] = 0.0
+        edges["target"][:, :PARK][moves] = lot.neighbors[moves]
+        edges["seconds"][:, :PARK][moves] = scenario.move_s[moves]
+        edges["metres"][:, :PARK][moves] = lot.edge_length[moves]
+        edges["seconds"][: lot.n_slots, PARK] = 0.0
         entries = lot.entry_vertices if scenario.entry is None else lot.entry_vertices[[scenario.entry]]
         starts, viewed = scenario.slots_in_view
         rates = scenario.sensor_rates
@@ -232,9 +266,7 @@ class ScenarioRecords:
             "window_end": scenario.arrival.end_s,
             "n_entries": len(entries),
             "entries": self._keep(entries, np.int64),
-            "targets": self._keep(targets, np.int64),
-            "seconds": self._keep(seconds),
-            "metres": self._keep(metres),
+            "edges": self._keep(edges, EDGE),
             "action_masks": self._keep(masks, np.uint8),
             "walk_s": self._keep(scenario.walk_s),
             "walk_m": self._keep(lot.walk_m(scenario.goal)),

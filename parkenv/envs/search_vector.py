@@ -24,6 +24,7 @@ from parkenv.envs.search_kernel import (
     take_step,
     write_clock,
 )
+from parkenv.envs.search_prefetch import prefetch_searches
 from parkenv.envs.search_records import N_ACTIONS, ScenarioRecords, Searches, scenario_at, search_at
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSources, make_scenarios
@@ -123,6 +124,7 @@ def step_local(
 ) -> None:
     """As `step_full`, with the local observation."""
     for e in range(len(actions)):
+        prefetch_searches(address, around, actions, e)
         if idle[e]:
             continue
         search = search_at(address, e)
