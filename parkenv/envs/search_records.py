@@ -221,7 +221,7 @@ class ScenarioRecords:
         """Move the tables of all scenarios into one block of memory."""
         processes = [one for one in self._kept if isinstance(one, OccupancyProcess)]
         tables = [one for one in self._kept if isinstance(one, np.ndarray)]
-        others = [one for one in self._kept if not any(one is known for known in (*processes, *tables))]
+        others = [one for one in self._kept if not isinstance(one, np.ndarray | OccupancyProcess)]
         tables += [getattr(one, name) for one in processes for name in _PROCESS_TABLES]
         copies = in_one_block(tables)
         moved = {

@@ -41,7 +41,7 @@ def lot_share(lot: ParkingLot) -> float:
     Examples:
         >>> from parkenv.lots import packaged_lot
         >>> round(lot_share(packaged_lot("campus")), 3)
-        0.0
+        0.475
     """
     # Whole decimetres: readers of other formats may differ by rounding.
     centres = np.round(10.0 * lot.slot_xy).astype("<i8")

@@ -418,8 +418,6 @@ class ScenarioSpec(Spec):
 _PACKAGED = Path(__file__).with_name("packaged")
 
 
-SCENARIO_SUFFIXES, FOLDER_LOTS = (".toml",), (".geojson",)
-"""Suffixes of the scenario files and the lot files that a folder of scenarios is searched for."""
 LOT_DAY_ERROR = 0.8
 """Day error of a lot without a scenario file, as in the packaged scenarios."""
 
@@ -487,10 +485,13 @@ def lot_scenario(lot: str | Path, source: str | None = None) -> ScenarioSpec:
 
 def _in_folder(folder: Path) -> list[ScenarioSpec]:
     """Return the scenarios of the files in a folder."""
-    files = sorted(path for path in folder.iterdir() if path.suffix in (*SCENARIO_SUFFIXES, *FOLDER_LOTS))
-    specs = {path: scenario_spec(path) for path in files if path.suffix in SCENARIO_SUFFIXES}
-    used = {spec.lot.file for spec in specs.values()}
-    specs |= {path: lot_scenario(path) for path in files if path not in specs and path.absolute() not in used}
+    try:
+        files = sorted(path for path in folder.iterdir() if path.suffix in (".toml", ".geojson"))
+    except OSError as error:
+        raise InputError(f"{folder}: {error.strerror}") from error
+    specs = {path: scenario_spec(path) for path in files if path.suffix == ".toml"}
+    used = {spec.lot.file.resolve() for spec in specs.values() if spec.lot.file is not None}
+    specs |= {path: lot_scenario(path) for path in files if path not in specs and path.resolve() not in used}
     if not specs:
         raise InputError(f"{folder}: holds no scenario (.toml) and no lot (.geojson)")
     return [specs[path] for path in files if path in specs]
