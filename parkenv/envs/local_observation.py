@@ -123,11 +123,11 @@ class Surroundings(NamedTuple):
         fixed, slots, near, ahead, total_s, crow_s, samples = rest
         views = [_view_s(problem) for problem in problems]
         first_view = np.concatenate([[0], np.cumsum([len(seconds) for seconds in views])[:-1]])
-        parts = (
+        arrays: list[NDArray[Any]] = [
             first.astype(np.int64), fixed, starts, slots, near, ahead, total_s, crow_s, samples,
             first_view.astype(np.int64), np.concatenate(views), np.zeros(int(count.max()), dtype=np.int32),
-        )  # fmt: skip
-        return cls(*in_one_block(parts))
+        ]  # fmt: skip
+        return cls(*in_one_block(arrays))
 
 
 def local_space(k: int) -> spaces.Dict:
@@ -172,7 +172,7 @@ class LocalObservation(
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Return the local observation."""
-        local = np.empty(self.observation_space["local"].shape, dtype=np.float32)
+        local = np.empty(self._surroundings.fixed.shape[1], dtype=np.float32)
         assert isinstance(self.env.unwrapped, SearchEnv)
         observe_surroundings_at(self.env.unwrapped.searches.address, self._surroundings, local)
         return {"local": local, "action_mask": observation["action_mask"]}
