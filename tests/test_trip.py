@@ -399,6 +399,7 @@ class StandingTraffic:
     """One car across the lane of a car that drives east from the origin, which waits for that for ever."""
 
     outlines = ((ObstacleKind.MOVING_CAR, np.array([[2.0, 0.9], [-2.0, 0.9], [-2.0, -0.9], [2.0, -0.9]])),)
+    corners = outlines[0][1][None]
 
     def __init__(self, x):
         self.at = np.array([[x, 0.0, 0.5 * math.pi]])

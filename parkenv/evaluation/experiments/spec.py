@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, mod
 from pydantic_core import PydanticCustomError
 
 from parkenv.evaluation.experiments.agent_spec import AgentItem, AgentSpec
-from parkenv.files.names import SCENARIO_NAMES, BackendName, MapName, RigName, WeatherName
+from parkenv.files.known_names import SCENARIO_NAMES, BackendName, MapName, RigName, WeatherName
 from parkenv.files.spec_file import Axis, FilePath, OrText, Several, Spec
 from parkenv.scenarios.spec import (
     Cost,
