@@ -150,7 +150,8 @@ class _Loops:
 
     def stations(self, times: FloatArray) -> FloatArray:
         """Stations on the paths, (n,) m, each at its own time, s."""
-        return (self._start + self._speed * times) % self._length
+        station: FloatArray = (self._start + self._speed * times) % self._length
+        return station
 
     def poses(self, station: FloatArray) -> FloatArray:
         """Poses, (n, 3) x, y in m and yaw in rad, at stations, (n,) m."""
@@ -169,7 +170,8 @@ class _Loops:
         i = np.minimum((self._station <= s[:, None]).sum(axis=1), self._last)
         start, end = self._corners[row, i - 1], self._corners[row, i]
         low, high = self._station[row, i - 1], self._station[row, i]
-        return (end - start) / (high - low)[:, None] * (s - low)[:, None] + start
+        point: FloatArray = (end - start) / (high - low)[:, None] * (s - low)[:, None] + start
+        return point
 
 
 def _measured(path: FloatArray) -> tuple[FloatArray, FloatArray]:
