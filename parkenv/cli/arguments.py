@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
-from parkenv.files.names import BackendName, ForecastFrom
+from parkenv.files.known_names import BackendName, ForecastFrom
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import Grid, Workplace
@@ -258,11 +258,20 @@ class RunFolder:
     Results:
         resume: Go on with the run in --out. Options that are given change it, such as more --episodes.
         overwrite: Replace the run in --out.
-        report: Also write report.html, as `parkenv report` does.
     """
 
     resume: bool = False
     overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class ReportedRun(RunFolder):
+    """A run that writes a report on request.
+
+    Results:
+        report: Also write report.html, as `parkenv report` does.
+    """
+
     report: bool = False
 
 

@@ -38,7 +38,7 @@ def commute(
     figures: bool | None = None,
     trust: bool = False,
     trust_model: bool = False,
-    folder: args.RunFolder,
+    folder: args.ReportedRun,
     machines: args.Machines,
 ) -> None:
     """Let drivers come day after day, with a map that learns from every trip.
@@ -108,7 +108,7 @@ def commute(
         run_commute_of(spec, out, folder)
 
 
-def run_commute_of(spec: CommuteSpec, out: Path, folder: args.RunFolder) -> None:
+def run_commute_of(spec: CommuteSpec, out: Path, folder: args.ReportedRun) -> None:
     """Run a commute with a progress bar, print its tables and draw its picture.
 
     Raises:

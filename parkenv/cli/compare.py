@@ -19,7 +19,7 @@ from parkenv.cli.tables import (
 )
 from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
-from parkenv.files.names import RigName
+from parkenv.files.known_names import RigName
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -53,7 +53,7 @@ def compare(
     rerun: Path | None = None,
     trust: bool = False,
     trust_model: bool = False,
-    folder: args.RunFolder,
+    folder: args.ReportedRun,
     machines: args.Machines,
 ) -> None:
     """Compare agents over failure costs and speeds, all in the same worlds.
@@ -120,7 +120,7 @@ def compare(
 
 
 def run_comparison(
-    spec: ExperimentSpec, out: Path, folder: args.RunFolder, rerun: Path | None = None
+    spec: ExperimentSpec, out: Path, folder: args.ReportedRun, rerun: Path | None = None
 ) -> None:
     """Run an experiment with a progress bar, print its tables and draw its figures.
 

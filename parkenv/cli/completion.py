@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from parkenv.files.names import LOT_SUFFIXES, PACKAGED_LOTS, SCENARIO_NAMES, SENSOR_MODELS, WEATHERS
+from parkenv.files.known_names import LOT_SUFFIXES, PACKAGED_LOTS, SCENARIO_NAMES, SENSOR_MODELS, WEATHERS
 from planners.names import AGENTS
 
 Completer = Callable[[str], list[str]]

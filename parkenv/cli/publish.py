@@ -12,7 +12,7 @@ from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console
 from parkenv.cli.trust import require_trust
 from parkenv.errors import InputError
-from parkenv.files.names import SCENARIO_NAMES
+from parkenv.files.known_names import SCENARIO_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

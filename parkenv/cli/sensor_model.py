@@ -6,7 +6,7 @@ from pathlib import Path
 
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table, progress_bar
-from parkenv.files.names import RigName, WeatherName
+from parkenv.files.known_names import RigName, WeatherName
 
 SCENARIOS = "campus,street"
 

@@ -48,7 +48,7 @@ def train(
     beside: str | None = None,
     lot: str | None = None,
     tensorboard: bool = False,
-    folder: args.RunFolder,
+    folder: args.ReportedRun,
     machines: args.Machines,
 ) -> None:
     """Train agents by reinforcement learning with several seeds, and draw their learning curves beside the planners.
@@ -129,7 +129,7 @@ def _task_of(spec: TrainingSpec) -> TrainingTask:
     return DriveTask(spec) if spec.env == "drive" else SearchTask(spec)
 
 
-def run_training(spec: TrainingSpec, out: Path, folder: args.RunFolder, beside: Sequence[str] = ()) -> None:
+def run_training(spec: TrainingSpec, out: Path, folder: args.ReportedRun, beside: Sequence[str] = ()) -> None:
     """Train, test and draw; see `train`.
 
     Raises:
@@ -162,7 +162,7 @@ def run_training(spec: TrainingSpec, out: Path, folder: args.RunFolder, beside: 
         make_report(out, spec)
 
 
-def _require_free(out: Path, settings: Row, folder: args.RunFolder) -> None:
+def _require_free(out: Path, settings: Row, folder: args.ReportedRun) -> None:
     """Check that the folder holds no training, or one to resume or replace."""
     from parkenv.evaluation.experiments.results import read_settings, require_same_settings
 

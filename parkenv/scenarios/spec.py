@@ -15,8 +15,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from parkenv.errors import InputError, nearest
-from parkenv.files.limited_reading import is_there
-from parkenv.files.names import (
+from parkenv.files.known_names import (
     LOT_SUFFIXES,
     PACKAGED_LOTS,
     SCENARIO_NAMES,
@@ -26,6 +25,7 @@ from parkenv.files.names import (
     RigName,
     SensorModelName,
 )
+from parkenv.files.limited_reading import is_there
 from parkenv.files.spec_file import FilePath, OrText, Several, Spec, read_tables
 from parkenv.world.day_error import MAX_LOGITS
 from parkenv.world.occupancy import ArrivalWindow

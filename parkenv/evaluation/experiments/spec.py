@@ -9,8 +9,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, mod
 from pydantic_core import PydanticCustomError
 
 from parkenv.evaluation.experiments.agent_spec import AgentItem, AgentSpec
+from parkenv.files.known_names import SCENARIO_NAMES, BackendName, MapName, RigName, WeatherName
 from parkenv.files.limited_reading import is_there
-from parkenv.files.names import SCENARIO_NAMES, BackendName, MapName, RigName, WeatherName
 from parkenv.files.spec_file import Axis, FilePath, OrText, Several, Spec
 from parkenv.scenarios.spec import (
     Cost,

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
@@ -133,6 +134,9 @@ class Training(ABC):
             tensorboard_log=str(folder / "tensorboard") if tensorboard else None,
             **self.settings(),
         )
+        if not tensorboard:
+            # Otherwise stable-baselines3 makes a new folder for logs in the system's folder of temporary files.
+            model.set_logger(Logger(None, []))
         # stable-baselines3 has seeded the environment with the network's seed.
         env.seed(TRAINING_SEEDS * (seed + 1))
         if checkpoint.exists():
