@@ -88,7 +88,8 @@ def check(place: Path, /, drive: bool = True) -> None:
     if not problems:
         console.print(f"{place}: no errors, no warnings")
     else:
-        console.print(f"{place}: {errors} errors, {len(problems) - errors} warnings")
+        counts = (errors, "error"), (len(problems) - errors, "warning")
+        console.print(f"{place}: " + ", ".join(f"{n} {word}{'s' * (n != 1)}" for n, word in counts))
     if errors:
         raise Exit(2)
     if survey is not None:
