@@ -65,7 +65,6 @@ class Candidate(NamedTuple):
     next_vertex: int
 
 
-@compiled(error_model="numpy")
 def best_path(
     vertex: int,
     targets: IntArray,
@@ -93,6 +92,21 @@ def best_path(
         belief: the belief.
         paths: buffers, one more than there are failure costs.
     """
+    return PathChoice(*_best_path(vertex, targets, failure_s, remaining_s, budget, graph, belief, paths))
+
+
+@compiled(error_model="numpy")
+def _best_path(
+    vertex: int,
+    targets: IntArray,
+    failure_s: float,
+    remaining_s: float,
+    budget: Budget,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    paths: PathBuffers,
+) -> tuple[float, float, float, int, int, IntArray, float, int]:
+    """Return the fields of `PathChoice`."""
     costs = budget.failure_costs
     plans = _plans(vertex, failure_s, costs, graph, belief, paths)
     options, fallback_s = _options_at_hand(vertex, plans.search_s.min(), graph, belief)
@@ -125,7 +139,7 @@ def best_path(
                 plans.n_stops[c],
             )
     if best.onward_s == np.inf:
-        return PathChoice(np.inf, np.inf, at_hand_s, slot, NOWHERE, targets[:0], failure_s, 0)
+        return np.inf, np.inf, at_hand_s, slot, NOWHERE, targets[:0], failure_s, 0
 
     # Nearest vertices first: with a small budget they matter most for the next step.
     nearest_first = np.argsort(graph.drive_s[vertex])
@@ -153,9 +167,7 @@ def best_path(
             break
         chosen = path
         n_stops, _ = rollout_path(vertex, targets, failure_s, graph, belief, path)
-    return PathChoice(
-        best.onward_s, best.remaining_s, at_hand_s, slot, best.next_vertex, targets, failure_s, work
-    )
+    return best.onward_s, best.remaining_s, at_hand_s, slot, best.next_vertex, targets, failure_s, work
 
 
 class Plans(NamedTuple):
