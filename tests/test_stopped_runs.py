@@ -231,6 +231,33 @@ def test_an_invalid_command_leaves_no_folder(tmp_path):
     assert not out.parent.exists()
 
 
+def test_a_file_system_that_is_read_only_is_named(tmp_path, monkeypatch):
+    def refuse(self, *_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))
+
+    path = tmp_path / "a.json"
+    with monkeypatch.context() as patched, pytest.raises(InputError) as refused:
+        for action in ("write_text", "unlink"):
+            patched.setattr(Path, action, refuse)
+        with atomic_write.atomic_write(path) as beside:
+            beside.write_text("{}")
+    assert str(refused.value) == f"{path}: cannot be written: Read-only file system"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("report", "run"), ("fit-sensor-model", "--scenario", "mini", "-n", "1")],
+    ids=lambda command: command[0],
+)
+def test_what_cannot_be_written_is_refused_before_the_work(tmp_path, command):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "summary.json").write_text(json.dumps({"command": [], "version": "0.1.0", "rows": []}))
+    (tmp_path / "file").touch()
+    refused = parkenv(*command, "--out", "file/made", cwd=tmp_path)
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert refused.stderr == "parkenv: error: --out file: cannot be written (File exists)\n"
+
+
 def test_a_full_disk_leaves_files_as_they_were(tmp_path):
     path = tmp_path / "episodes.csv"
     path.write_text("one\n")
