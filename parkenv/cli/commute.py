@@ -61,7 +61,8 @@ def commute(
     Options:
         agents (NAME[,...]): Agents, with any options in brackets; differences in `weeks` of summary.json are to the
             first that uses no map.  [default: belief,mdp,first-free,greedy-drive]
-        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus]
+        scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
+            campus]
         map (empty|right|wrong[,...]): The map on the first day. empty: 50 % for every slot. right: the forecast of the
             scenario's occupancy. wrong: the forecast of the scenario where it differs from that (jam), else the right
             one with near and far slots exchanged.  [default: empty]

@@ -70,7 +70,8 @@ def compare(
         parkenv compare --resume --episodes 1000
 
     Options:
-        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus]
+        scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
+            campus]
         episodes, -n (N >= 1): Episodes of each agent in each setting.  [default: 200]
         seed (N >= 0): First seed; episode i uses seed + i.  [default: 0]
         out, -o (DIR): Folder for experiment.json, episodes.csv, summary.json and the figures.

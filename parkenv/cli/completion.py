@@ -52,6 +52,7 @@ COMPLETERS: dict[str, Completer] = {
     "calibrated": completer((), (".json",)),
     "clone": completer(tuple(AGENTS)),
     "detector": completer(("hog", "side", "front"), (".npz",)),
+    "evaluate_on": completer(SCENARIO_NAMES, (*_TABLES, ".geojson"), several=True),
     "experiment": completer((), _TABLES),
     "lot": completer(PACKAGED_LOTS, LOT_SUFFIXES, several=True),
     "log": completer((), (".csv", ".csv.gz")),

@@ -44,7 +44,8 @@ def publish(
     Options:
         trained (DIR|FILE): The folder of a finished training, or a model file.
         out, -o (DIR): The folder to make.
-        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: those of the training's test]
+        scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
+            those of the training's test]
         episodes, -n (N >= 2): Episodes of the evaluation in each scenario.
         seed (N >= 0): First seed; episode i uses seed + i.  [default: 3000000, as in the tests of trainings]
     """

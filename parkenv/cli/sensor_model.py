@@ -32,7 +32,8 @@ def fit_sensor_model(
         parkenv compare --sensor-model stereo.json
 
     Options:
-        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus,street]
+        scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
+            campus,street]
         episodes, -n (1 <= N <= 1000000): Episodes of each of three agents in each scenario.
         rig (laser|stereo|both_sides): Whose errors to measure.  [default: the scenario's, laser]
         out, -o (FILE.json): The file to write.

@@ -102,6 +102,10 @@ class Training(ABC):
         """Prepare a new model before training; subclasses may pretrain it."""
         del model, seed
 
+    def before_rollout(self, model: Any) -> None:
+        """Called before each rollout; subclasses may make the environment harder. It must depend on the steps alone."""
+        del model
+
     def train(self, seed: int, folder: Path, *, tensorboard: bool = False) -> list[Row]:
         """Train with one seed; resume from the folder's checkpoint if there is one, as if there had been no stop.
 
@@ -195,6 +199,7 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
         return self.subject.evaluate_every * (1 + steps // self.subject.evaluate_every)
 
     def _on_rollout_start(self) -> None:
+        self.subject.before_rollout(self.model)
         # Between rollouts, so that a checkpoint loses no samples.
         if not self.curve or self.num_timesteps >= self._due:
             self._due = self._due_after(self.num_timesteps)
