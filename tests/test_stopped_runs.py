@@ -236,10 +236,10 @@ def test_a_file_system_that_is_read_only_is_named(tmp_path, monkeypatch):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))
 
     path = tmp_path / "a.json"
-    with monkeypatch.context() as patched, pytest.raises(InputError) as refused:
+    with monkeypatch.context() as patched:
         for action in ("write_text", "unlink"):
             patched.setattr(Path, action, refuse)
-        with atomic_write.atomic_write(path) as beside:
+        with pytest.raises(InputError) as refused, atomic_write.atomic_write(path) as beside:
             beside.write_text("{}")
     assert str(refused.value) == f"{path}: cannot be written: Read-only file system"
 
@@ -251,7 +251,9 @@ def test_a_file_system_that_is_read_only_is_named(tmp_path, monkeypatch):
 )
 def test_what_cannot_be_written_is_refused_before_the_work(tmp_path, command):
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "summary.json").write_text(json.dumps({"command": [], "version": "0.1.0", "rows": []}))
+    (tmp_path / "run" / "summary.json").write_text(
+        json.dumps({"command": ["parkenv", "compare"], "version": "0.1.0", "rows": []})
+    )
     (tmp_path / "file").touch()
     refused = parkenv(*command, "--out", "file/made", cwd=tmp_path)
     assert (refused.returncode, refused.stdout) == (2, "")
