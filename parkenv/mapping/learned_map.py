@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from parkenv.errors import InputError
 from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior, mean_probability
 from parkenv.mapping.inference import RELAXATION_S, MapPrior, SessionLog
-from parkenv.mapping.trips import Trip, state_likelihoods
+from parkenv.mapping.trips import DayMemory, Trip, state_likelihoods
 from parkenv.world.day_error import MAX_LOGITS, DayError, centred_logits, nearness
 from parkenv.world.occupancy import Arrival, Forecast, PriorModel
 from parkenv.world.occupancy_kernel import MAX_PROBABILITY, MIN_PROBABILITY
@@ -176,13 +176,14 @@ class LearnedMap:
 
     def _learn_day(self, trips: Sequence[Trip]) -> None:
         slots, hours, likelihood, p, day_error = [], [], [], [], DayError()
+        memory = DayMemory(self.n_slots)
         for trip in trips:
             base = self._base.forecast(Arrival(trip.time % WEEK_S, trip.date))
-            its_slots, its_likelihood = state_likelihoods(trip, base)
-            slots.append(its_slots)
-            likelihood.append(its_likelihood)
-            hours.append(np.full(len(its_slots), trip.time / HOUR_S))
-            p.append(base.p_occupied[its_slots])
+            states = state_likelihoods(trip, base)
+            slots.append(states.slots)
+            likelihood.append(memory.add(states, base))
+            hours.append(np.full(len(states.slots), trip.time / HOUR_S))
+            p.append(base.p_occupied[states.slots])
             day_error = base.day_error
         evidence = Evidence(np.concatenate(slots), np.concatenate(hours), np.concatenate(likelihood))
         day = day_error.deviations(self._nearness[evidence.slots])

@@ -60,7 +60,23 @@ class Trip:
                 )
 
 
-def state_likelihoods(trip: Trip, forecast: Forecast) -> tuple[NDArray[np.int64], FloatArray]:
+@dataclass(frozen=True, eq=False)
+class SlotStates:
+    """What a trip says about the states of the k slots that it observed, each when it was first observed.
+
+    Attributes:
+        slots: (k,) int64, in the order of their first observations.
+        time: (k,) float64, time of the first observation, on the clock of `Trip.time`.
+        likelihood: (k, 2) float64, probability of all observations of the slot if it was free then, and if it was
+            taken.
+    """
+
+    slots: NDArray[np.int64]
+    time: FloatArray
+    likelihood: FloatArray
+
+
+def state_likelihoods(trip: Trip, forecast: Forecast) -> SlotStates:
     """Return what a trip says about each observed slot's state when it was first observed.
 
     A slot changes between its observations as a two-state Markov chain with the forecast's decay rate.
@@ -70,12 +86,10 @@ def state_likelihoods(trip: Trip, forecast: Forecast) -> tuple[NDArray[np.int64]
         forecast: the forecast of all slots for the trip.
 
     Returns:
-        (k,) int64, the slots, in the order of their first observations; and (k, 2) float64, the probability of all
-        observations of a slot if it was free at the first, and if it was taken. Slots with contradictory observations
-        are left out.
+        The states; slots with contradictory observations are left out.
     """
     slots, first = np.unique(trip.slots, return_index=True)
-    slots = slots[np.argsort(first)]
+    slots, first = slots[np.argsort(first)], np.sort(first)
     likelihood = np.ones((forecast.p_occupied.size, 2))
     later_s = np.full(forecast.p_occupied.size, np.nan)
     # Backward from the last observation to the first.
@@ -89,4 +103,49 @@ def state_likelihoods(trip: Trip, forecast: Forecast) -> tuple[NDArray[np.int64]
         likelihood[slot] = of_slot * (rates if trip.taken[i] else 1.0 - rates)
         later_s[slot] = trip.after_s[i]
     possible = likelihood[slots].sum(axis=1) > 0.0
-    return slots[possible], likelihood[slots[possible]]
+    slots, time = slots[possible], trip.time + trip.after_s[first[possible]]
+    return SlotStates(slots, time, likelihood[slots])
+
+
+class DayMemory:
+    """The states of slots on earlier trips of one day.
+
+    A slot that stays taken over two trips is one car, not two: a state that was observed before says less about how
+    often the slot is taken. Given the earlier state, a slot is taken with probability `stays·earlier + (1 - stays)·p`,
+    which is linear in p, as a single observation's probability is.
+
+    Args:
+        n_slots: number of slots.
+    """
+
+    def __init__(self, n_slots: int) -> None:
+        self._time, self._p_taken = np.full((2, n_slots), np.nan)
+
+    def add(self, states: SlotStates, forecast: Forecast) -> FloatArray:
+        """Add the states of a trip.
+
+        Args:
+            states: the states.
+            forecast: the forecast of all slots for the trip.
+
+        Returns:
+            (k, 2) float64, the probability of the observations of each slot, given those of earlier trips, if the
+            slot were always free, and if it were always taken but for its earlier state.
+        """
+        slots, if_free, if_taken = states.slots, states.likelihood[:, 0], states.likelihood[:, 1]
+        seen = np.isfinite(self._time[slots])
+        # The chain is reversible, so trips that overlap in time need no order.
+        apart = np.abs(states.time - np.where(seen, self._time[slots], 0.0))
+        stays = np.where(seen, np.exp(-forecast.decay_rate[slots] * apart), 0.0)
+        kept = stays * np.where(seen, self._p_taken[slots], 0.0)
+        fresh = kept + (1.0 - stays)
+        p_taken = kept + (1.0 - stays) * forecast.p_occupied[slots]
+        given = np.column_stack(
+            [if_taken * kept + if_free * (1.0 - kept), if_taken * fresh + if_free * (1.0 - fresh)]
+        )
+        # A slot that never changes by the forecast has changed: the later trip says nothing about p.
+        impossible = given.sum(axis=1) == 0.0
+        given[impossible], p_taken[impossible] = 1.0, 0.5
+        self._p_taken[slots] = if_taken * p_taken / (if_taken * p_taken + if_free * (1.0 - p_taken))
+        self._time[slots] = states.time
+        return given
