@@ -47,7 +47,7 @@ FIXED, NONE = "fixed", "none"
 KEYS = ("scenario", "map", "agent", "course", "day_number", "driver")
 COLUMNS = ("seed", *OUTCOME_COLUMNS, "forecast_error")
 MAPS_FOLDER = "maps"
-BLOCK_DAYS = 5
+BLOCK_DAYS = 10
 """Days per task: an interruption loses few of them, and the map of a course is seldom rebuilt from its trips."""
 _COURSES_APART, _DRIVERS_APART = 1_000_000, 1_000
 _MOST_TRIES = 100_000
