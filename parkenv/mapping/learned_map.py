@@ -175,17 +175,18 @@ class LearnedMap:
         )
 
     def _learn_day(self, trips: Sequence[Trip]) -> None:
-        slots, hours, likelihood, p, day_error = [], [], [], [], DayError()
+        slots, hours, likelihood, weight, p, day_error = [], [], [], [], [], DayError()
         memory = DayMemory(self.n_slots)
         for trip in trips:
             base = self._base.forecast(Arrival(trip.time % WEEK_S, trip.date))
             states = state_likelihoods(trip, base)
             slots.append(states.slots)
-            likelihood.append(memory.add(states, base))
+            likelihood.append(states.likelihood)
+            weight.append(memory.add(states, base))
             hours.append(np.full(len(states.slots), trip.time / HOUR_S))
             p.append(base.p_occupied[states.slots])
             day_error = base.day_error
-        evidence = Evidence(np.concatenate(slots), np.concatenate(hours), np.concatenate(likelihood))
+        evidence = Evidence(*map(np.concatenate, (slots, hours, likelihood, weight)))
         day = day_error.deviations(self._nearness[evidence.slots])
         deviation = np.hypot(self._error.prior_sd()[:, evidence.slots], day)
         logits = self._error.trust[:, None] * centred_logits(np.concatenate(p), deviation)

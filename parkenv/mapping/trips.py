@@ -108,18 +108,18 @@ def state_likelihoods(trip: Trip, forecast: Forecast) -> SlotStates:
 
 
 class DayMemory:
-    """The states of slots on earlier trips of one day.
+    """When slots were observed on earlier trips of one day.
 
-    A slot that stays taken over two trips is one car, not two: a state that was observed before says less about how
-    often the slot is taken. Given the earlier state, a slot is taken with probability `stays·earlier + (1 - stays)·p`,
-    which is linear in p, as a single observation's probability is.
+    A slot that is taken on two trips may hold one car, not two. A later observation counts by the probability that
+    the slot has changed in between, 1 - exp(-decay rate · time). If the decay rate is wrong, the map is too sure or too
+    unsure of the slot, but not biased, as it would be if changes themselves were modelled.
 
     Args:
         n_slots: number of slots.
     """
 
     def __init__(self, n_slots: int) -> None:
-        self._time, self._p_taken = np.full((2, n_slots), np.nan)
+        self._time = np.full(n_slots, -np.inf)
 
     def add(self, states: SlotStates, forecast: Forecast) -> FloatArray:
         """Add the states of a trip.
@@ -129,23 +129,11 @@ class DayMemory:
             forecast: the forecast of all slots for the trip.
 
         Returns:
-            (k, 2) float64, the probability of the observations of each slot, given those of earlier trips, if the
-            slot were always free, and if it were always taken but for its earlier state.
+            (k,) float64, by how much each state counts, 0 to 1.
         """
-        slots, if_free, if_taken = states.slots, states.likelihood[:, 0], states.likelihood[:, 1]
-        seen = np.isfinite(self._time[slots])
-        # The chain is reversible, so trips that overlap in time need no order.
-        apart = np.abs(states.time - np.where(seen, self._time[slots], 0.0))
-        stays = np.where(seen, np.exp(-forecast.decay_rate[slots] * apart), 0.0)
-        kept = stays * np.where(seen, self._p_taken[slots], 0.0)
-        fresh = kept + (1.0 - stays)
-        p_taken = kept + (1.0 - stays) * forecast.p_occupied[slots]
-        given = np.column_stack(
-            [if_taken * kept + if_free * (1.0 - kept), if_taken * fresh + if_free * (1.0 - fresh)]
-        )
-        # A slot that never changes by the forecast has changed: the later trip says nothing about p.
-        impossible = given.sum(axis=1) == 0.0
-        given[impossible], p_taken[impossible] = 1.0, 0.5
-        self._p_taken[slots] = if_taken * p_taken / (if_taken * p_taken + if_free * (1.0 - p_taken))
-        self._time[slots] = states.time
-        return given
+        # Trips may overlap in time.
+        apart = np.abs(states.time - self._time[states.slots])
+        changed = 1.0 - np.exp(-np.minimum(forecast.decay_rate[states.slots] * apart, 700.0))
+        changed[np.isinf(apart)] = 1.0
+        self._time[states.slots] = states.time
+        return np.asarray(changed)
