@@ -24,7 +24,7 @@ from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.experiment import agent_fingerprints, fingerprints, flat_tables
 from parkenv.evaluation.experiments.results import OUTCOME_COLUMNS, ResultFolder, Row
 from parkenv.evaluation.experiments.spec import SPEC_FILE, CommuteSpec
-from parkenv.evaluation.experiments.statistics import mean_interval
+from parkenv.evaluation.experiments.statistics import mean_interval, trimmed_mean_interval
 from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.evaluation.trip_recorder import TripRecorder
 from parkenv.files.file_names import file_name
@@ -49,6 +49,8 @@ COLUMNS = ("seed", *OUTCOME_COLUMNS, "forecast_error")
 MAPS_FOLDER = "maps"
 BLOCK_DAYS = 10
 """Days per task: an interruption loses few of them, and the map of a course is seldom rebuilt from its trips."""
+TRIMMED = 0.1
+"""Share of the courses, at either end, that a robust mean leaves out."""
 _COURSES_APART, _DRIVERS_APART = 1_000_000, 1_000
 _MOST_TRIES = 100_000
 
@@ -384,7 +386,8 @@ def day_rows(episodes: Sequence[Row]) -> list[Row]:
 
     The forecast error is the Brier score of the forecast at the arrival: the mean squared difference of P(taken) and
     the true state, over slots. The excess is the time beyond that of the first agent with the right map, which does not
-    learn, in the same worlds. Intervals are over courses: a fleet's drivers meet the same day.
+    learn, in the same worlds: a 10 % trimmed mean, since a full lot may add the give-up penalty to one of the two.
+    Intervals are over courses: a fleet's drivers meet the same day.
     """
     cases = _grouped(episodes, lambda row: row["day_number"])
     return [
@@ -394,7 +397,7 @@ def day_rows(episodes: Sequence[Row]) -> list[Row]:
             "courses": len(by_course),
             **_mean("total_s", its),
             **_mean("forecast_error", its),
-            **_difference("excess_s", by_course, _reference(cases, case[0], FIXED).get(day, {})),
+            **_difference("excess_s", by_course, _reference(cases, case[0], FIXED).get(day, {}), _robust),
         }
         for case, by_day in cases.items()
         for day, by_course in sorted(by_day.items())
@@ -417,7 +420,7 @@ def week_rows(episodes: Sequence[Row]) -> list[Row]:
             **_mean("total_s", its),
             **_mean("forecast_error", its),
             **_difference("difference_s", by_course, _reference(cases, case[0], NONE).get(week, {})),
-            **_difference("excess_s", by_course, _reference(cases, case[0], FIXED).get(week, {})),
+            **_difference("excess_s", by_course, _reference(cases, case[0], FIXED).get(week, {}), _robust),
         }
         for case, by_week in cases.items()
         for week, by_course in sorted(by_week.items())
@@ -434,14 +437,21 @@ def _reference(cases: _Cases, scenario: str, map: str) -> dict[int, _Courses]:
     return next((its for case, its in cases.items() if case[0] == scenario and case[1] == map), {})
 
 
-def _difference(name: str, courses: _Courses, reference: _Courses) -> Row:
+def _difference(
+    name: str,
+    courses: _Courses,
+    reference: _Courses,
+    interval: Callable[[Sequence[float]], tuple[float, float, float]] = mean_interval,
+) -> Row:
     paired = [
         _course_mean("total_s", its) - _course_mean("total_s", reference[course])
         for course, its in courses.items()
         if len(reference.get(course, ())) == len(its)
     ]
-    mean, low, high = mean_interval(paired)
-    return {name: mean, f"{name}_ci95": [low, high]} if paired else {}
+    if not paired:
+        return {}
+    mean, low, high = interval(paired)
+    return {name: mean, f"{name}_ci95": [low, high]}
 
 
 def _grouped(episodes: Sequence[Row], period: Callable[[Row], int]) -> _Cases:
@@ -454,6 +464,10 @@ def _grouped(episodes: Sequence[Row], period: Callable[[Row], int]) -> _Cases:
 
 def _course_mean(name: str, episodes: Sequence[Mapping[str, Any]]) -> float:
     return float(np.mean([np.nan if row[name] is None else row[name] for row in episodes]))
+
+
+def _robust(values: Sequence[float]) -> tuple[float, float, float]:
+    return trimmed_mean_interval(values, TRIMMED)
 
 
 def _mean(name: str, courses: Iterable[Sequence[Row]]) -> Row:

@@ -1,4 +1,4 @@
-"""Curves of a commute: time beyond the right map's, and forecast error, against the day."""
+"""Curves of a commute: excess time and forecast error against the day."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _FIXED_LINE, _NONE_LINE = (0, (1, 1)), (0, (4, 2))
 def save_commute_curves(rows: Sequence[Row], path: Path) -> None:
     """Draw a column of panels for each scenario and map: time and forecast error of each agent against the day.
 
-    Time is what a search takes beyond that of the first agent with the right map, which does not learn, in the same
-    worlds: days differ, and this difference does not. Shaded are 95 % intervals.
+    Excess time is what a search takes beyond that of the first agent with the right map, which does not learn, in the
+    same worlds (10 % trimmed mean). Shaded are 95 % intervals. The scale is the first agent's: others may leave it.
 
     Args:
         rows: rows of `commute.day_rows`.
@@ -56,7 +56,7 @@ def save_commute_curves(rows: Sequence[Row], path: Path) -> None:
             below.set_xlabel("day")
             below.xaxis.set_major_locator(MaxNLocator(integer=True))
             if i == 0:
-                above.set_ylabel("time beyond the right map's, s")
+                above.set_ylabel("excess time, s (trimmed mean)")
                 below.set_ylabel("forecast error (Brier score)")
         figure.legend(
             handles=_legend(rows), loc="outside lower center", ncols=max(2, int(figure.get_figwidth() // 2.2))
@@ -69,9 +69,10 @@ def _draw_excess(axes: Axes, rows: Sequence[Row], start: str) -> None:
     learned = [row for row in rows if row["map"] == start]
     others = [row for row in rows if row["map"] == NONE]
     levels = {agent: _level(others, agent) for agent in dict.fromkeys(row["agent"] for row in others)}
-    top = max(max(row["excess_s"] for row in learned), min(levels.values(), default=0.0), 1.0)
-    bottom = min(min(row["excess_s"] for row in learned), min(levels.values(), default=0.0), 0.0)
-    margin = 0.15 * (top - bottom)
+    first = [row["excess_s"] for row in learned if row["agent"] == learned[0]["agent"]]
+    nearest = min(levels.values(), default=0.0)
+    top, bottom = max(*first, nearest, 1.0), min(*first, nearest, 0.0)
+    margin = 0.2 * (top - bottom)
     axes.axhline(0.0, color="#444444", lw=0.9, zorder=1)
     for agent in dict.fromkeys(row["agent"] for row in learned):
         its = [row for row in learned if row["agent"] == agent]
