@@ -28,7 +28,8 @@ def save_commute_curves(rows: Sequence[Row], path: Path) -> None:
     """Draw a column of panels for each scenario and map: time and forecast error of each agent against the day.
 
     Excess time is what a search takes beyond that of the first agent with the right map, which does not learn, in the
-    same worlds (10 % trimmed mean). Shaded are 95 % intervals. The scale is the first agent's: others may leave it.
+    same worlds (10 % trimmed mean). Shaded are 95 % intervals. All of the first agent's curve is in the panel; others
+    may leave it.
 
     Args:
         rows: rows of `commute.day_rows`.
@@ -71,7 +72,8 @@ def _draw_excess(axes: Axes, rows: Sequence[Row], start: str) -> None:
     levels = {agent: _level(others, agent) for agent in dict.fromkeys(row["agent"] for row in others)}
     first = [row["excess_s"] for row in learned if row["agent"] == learned[0]["agent"]]
     nearest = min(levels.values(), default=0.0)
-    top, bottom = max(*first, nearest, 1.0), min(*first, nearest, 0.0)
+    most = float(np.percentile([row["excess_s"] for row in learned], 90.0))
+    top, bottom = max(*first, nearest, most, 1.0), min(*first, nearest, 0.0)
     margin = 0.2 * (top - bottom)
     axes.axhline(0.0, color="#444444", lw=0.9, zorder=1)
     for agent in dict.fromkeys(row["agent"] for row in learned):
