@@ -168,10 +168,10 @@ def test_a_bonus_for_observations_lets_the_car_see_more():
 def test_a_week_of_trips_closes_the_gap_of_a_wrong_map(monkeypatch):
     """On jam, where the map is wrong, against drivers without a map (greedy-drive) and with the right one."""
     scenario = make_scenario("jam")
-    days = calendar(scenario, 9)
+    days = calendar(scenario, 8)
 
     def total_s(agent, start):
-        courses = [Course(scenario, AgentSpec(name=agent), start, number, 1, 0) for number in range(16)]
+        courses = [Course(scenario, AgentSpec(name=agent), start, number, 1, 0) for number in range(12)]
         return np.array([[row["total_s"] for row in course.run(days, [])[0]] for course in courses])
 
     learning, right, without = (
