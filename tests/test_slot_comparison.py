@@ -1,6 +1,7 @@
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from command_line import parkenv
 from test_slot_days import simulated
@@ -16,7 +17,7 @@ def test_ours_is_first_where_slots_have_habits_and_the_lot_drifts():
     first, done = int(weekdays.days.number[14]), []
     rows = compare_slot_days([weekdays, weekend], first, lambda: done.append(1))
     assert rows[0].model == OURS
-    assert {row.days for row in rows} == {6} == {len(done)}
+    assert {len(row.days) for row in rows} == {6} == {len(done)}
     for row in rows[1:]:
         # The slots of this lot differ in one thing only, which suits gradient boosting.
         margin = 0.02 if row.model == "gradient-boosting" else 0.0
@@ -24,6 +25,17 @@ def test_ours_is_first_where_slots_have_habits_and_the_lot_drifts():
         assert rows[0].brier < (1 + margin) * row.brier
         assert rows[0].crps < 1.1 * row.crps
     assert rows[0].coverage_90 >= 4 / 6
+    numbers = [day.number for day in rows[0].days]
+    assert numbers == sorted(numbers)
+    for bands in (rows[0].coverage_by_band(), rows[0].coverage_by_band(observed=True)):
+        assert sum(band["days"] for band in bands) == 6
+    forecast, observed, weight = rows[0].reliability()
+    assert weight.sum() == pytest.approx(sum(day.states for day in rows[0].days))
+    # Over all slots and half-hours, six days of one level each are not far from their forecast.
+    assert abs(np.average(forecast - observed, weights=weight)) < 0.1
+    mean, low, high = rows[1].log_loss_beyond(rows[0], np.random.default_rng(0))
+    assert low < mean < high
+    assert mean == pytest.approx(rows[1].log_loss - rows[0].log_loss)
 
 
 @pytest.mark.slow  # fits five models to ten days of a real log
@@ -37,6 +49,8 @@ def test_the_real_logs_slots_are_forecast_better_than_by_simple_models(tmp_path)
     assert rows[0]["days"] == 10
     assert rows[0]["log_loss"] < 0.96 * min(row["log_loss"] for row in rows[1:])
     assert rows[0]["brier"] < min(row["brier"] for row in rows[1:])
+    assert min(row["difference_ci95"][0] for row in rows[1:]) > 0
+    assert all((tmp_path / f"{row['model']}.png").exists() for row in rows)
     done = parkenv("occupancy", "evaluate", REAL_LOG, "--from", "2017-01-01", "--out", tmp_path)
     assert done.returncode == 2
     assert "has no day from then on with one of its class before it" in done.stderr

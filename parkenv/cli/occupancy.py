@@ -178,7 +178,7 @@ def evaluate(
     import numpy as np
 
     from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.figures.forecast_picture import save_forecast, shown_week
+    from parkenv.evaluation.figures.forecast_picture import save_forecast, shown_counts, shown_week
     from parkenv.forecast.comparison import MODELS, compare
     from parkenv.forecast.counts import Counts, is_counts
     from parkenv.forecast.day_curves import FIT_STEPS, fit_settings
@@ -187,7 +187,7 @@ def evaluate(
     make_folder(out)
     console = make_console()
     if not is_counts(log):
-        _evaluate_log(log, from_, out, console)
+        _evaluate_log(log, from_, seed, out, console)
         return
     with console.status("Reading"):
         counts = Counts.read(log, timezone)
@@ -208,7 +208,7 @@ def evaluate(
         settings = fit_settings(counts, first, lambda: progress.advance(steps))
         week = shown_week(counts, first)
         for compared in compare(counts, first, settings, lambda day: progress.update(days, completed=day)):
-            save_forecast(compared, counts, week, out / f"{compared.model}.png")
+            save_forecast(shown_counts(compared, counts, week), out / f"{compared.model}.png")
             models.append(compared)
             progress.advance(done)
     differences = paired_intervals(
@@ -273,11 +273,10 @@ def _print_notes(counts: Counts, console: Console) -> None:
         console.print(f"{name}: {what}", soft_wrap=True)
 
 
-def _evaluate_log(log: Path, from_: str | None, out: Path, console: Console) -> None:
-    from dataclasses import asdict
-
+def _evaluate_log(log: Path, from_: str | None, seed: int, out: Path, console: Console) -> None:
     import numpy as np
 
+    from parkenv.evaluation.figures.forecast_picture import save_forecast, shown_slots
     from parkenv.forecast.slot_comparison import compare_slot_days
     from parkenv.world.occupancy_log import OccupancyLog
 
@@ -290,15 +289,32 @@ def _evaluate_log(log: Path, from_: str | None, out: Path, console: Console) -> 
         found = compare_slot_days(days, iso_date("--from", first).toordinal(), lambda: progress.advance(done))
     if not found:
         raise InputError(f"--from is {first}: {log} has no day from then on with one of its class before it")
-    rows = [asdict(row) | {"car_parks": 1} for row in found]
-    save_summary(out, None, rows, first_day=first)
-    scores = ("log_loss", "brier", "crps")
-    cells = [
-        [row["model"], *(f"{row[name]:.4f}" for name in scores), f"{row['coverage_90']:.0%}"] for row in rows
-    ]
+    rows, cells = [], []
+    for scores in found:
+        difference, *interval = scores.log_loss_beyond(found[0], np.random.default_rng(seed))
+        row: dict[str, Any] = {
+            "model": scores.model,
+            "log_loss": scores.log_loss,
+            "brier": scores.brier,
+            "crps": scores.crps,
+            "coverage_90": scores.coverage_90,
+            "days": len(scores.days),
+            "car_parks": 1,
+            "difference": difference,
+            "difference_ci95": interval,
+            "coverage_90_by_band": scores.coverage_by_band(),
+            "coverage_90_by_observed_band": scores.coverage_by_band(observed=True),
+        }
+        rows.append(row)
+        shown = [f"{row[key]:.4f}" for key in ("log_loss", "brier", "crps")]
+        shown += [f"{row['coverage_90']:.0%}", f"{difference:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]"]
+        cells.append([scores.model, *shown])
+        save_forecast(shown_slots(scores, log.name), out / f"{scores.model}.png")
+    save_summary(out, seed, rows, first_day=first)
+    headings = ("model", "log-loss", "Brier", "CRPS", "90 %: days", "log-loss more than ours")
     title = f"{len(recorded.slot_ids)} slots, {rows[0]['days']} days from {first}"
-    console.print(make_table(title, ("model", "log-loss", "Brier", "CRPS", "90 %: days"), cells))
-    console.print(f"The summary is in {out}")
+    console.print(make_table(title, headings, cells))
+    console.print(f"Pictures and summary are in {out}")
 
 
 app = group("occupancy", "Fit models to recorded occupancy, and score forecasts.")

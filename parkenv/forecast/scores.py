@@ -20,6 +20,9 @@ from parkenv.forecast.day_forecast import INTERVAL, DayForecast, draw_days, quan
 BANDS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)
 """Bands of fullness."""
 
+Band = dict[str, float | int | None]
+"""A band of fullness: from, to, days, coverage_90."""
+
 
 def log_losses(forecast: DayForecast, occupied: FloatArray, capacity: FloatArray) -> FloatArray:
     """Return the log-loss (c, d, 24) of a place that is taken or not, in the mean over the places; NaN if unobserved.
@@ -109,37 +112,56 @@ class Scores:
             ),
         )
 
-    def coverage_by_band(self, *, observed: bool = False) -> list[dict[str, float | int | None]]:
+    def coverage_by_band(self, *, observed: bool = False) -> list[Band]:
         """Return how many days each band of fullness has, and how many of them the 90 % intervals hold.
 
         Args:
             observed: whether the day's observed fullness gives the band. Days of unexpected fullness are missed then by
                 construction; the forecast fullness does not know the day.
         """
-        fullness = self.day_observed if observed else self.day_forecast
-        rows: list[dict[str, float | int | None]] = []
-        for low, high in pairwise(BANDS):
-            held = self.day_held[(fullness >= low) & ((fullness < high) | (high == BANDS[-1]))]
-            held = held[np.isfinite(held)]
-            rows.append(
-                {
-                    "from": low,
-                    "to": high,
-                    "days": held.size,
-                    "coverage_90": float(held.mean()) if held.size else None,
-                }
-            )
-        return rows
+        return coverage_by_band(self.day_observed if observed else self.day_forecast, self.day_held)
 
-    def reliability(self, bins: int = 20) -> FloatArray:
-        """Return mean forecast, mean occupancy and number of hours (3, k) of equally wide bins of the forecast."""
-        seen = np.isfinite(self.observed)
-        p, y = self.occupancy[seen], self.observed[seen]
-        cell = np.minimum((p * bins).astype(int), bins - 1)
-        n = np.bincount(cell, minlength=bins)
-        used = n > 0
-        means = (np.bincount(cell, values, bins)[used] / n[used] for values in (p, y))
-        return np.stack([*means, n[used].astype(float)])
+    def reliability(self) -> FloatArray:
+        """Return `reliability` of the hours."""
+        return reliability(self.occupancy, self.observed, np.isfinite(self.observed).astype(float))
+
+
+def coverage_by_band(fullness: FloatArray, held: FloatArray) -> list[Band]:
+    """Return the number of days in each band of fullness, and the share of them that is held.
+
+    Args:
+        fullness: mean occupancy of each day.
+        held: alike, 1 where the day's interval holds what was observed, NaN where nothing was.
+    """
+    rows: list[Band] = []
+    for low, high in pairwise(BANDS):
+        inside = held[(fullness >= low) & ((fullness < high) | (high == BANDS[-1])) & np.isfinite(held)]
+        rows.append(
+            {
+                "from": low,
+                "to": high,
+                "days": inside.size,
+                "coverage_90": float(inside.mean()) if inside.size else None,
+            }
+        )
+    return rows
+
+
+def reliability(p: FloatArray, observed: FloatArray, weight: FloatArray, bins: int = 20) -> FloatArray:
+    """Return mean forecast, mean of what was observed, and weight (3, k) of equally wide bins of the forecast.
+
+    Args:
+        p: forecasts, any shape.
+        observed: what was observed, alike.
+        weight: of each, 0 where nothing was observed.
+        bins: number of bins; empty ones are left out.
+    """
+    seen = weight > 0
+    cell = np.minimum((p[seen] * bins).astype(int), bins - 1)
+    n = np.bincount(cell, weight[seen], bins)
+    used = n > 0
+    sums = (np.bincount(cell, weight[seen] * values[seen], bins) for values in (p, observed))
+    return np.stack([*(total[used] / n[used] for total in sums), n[used]])
 
 
 def paired_intervals(

@@ -9,6 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit, logit
 
+from parkenv.forecast.day_forecast import INTERVAL
+from parkenv.forecast.scores import Band, coverage_by_band, crps_of_equally_likely, reliability
 from parkenv.forecast.slot_days import Days, FloatArray, IntArray, SlotDays, fit_slot_days
 
 OURS = "slot-days"
@@ -28,16 +30,122 @@ class DayForecast(NamedTuple):
     curve_covariance: FloatArray  # (p, p) of the level's error over the day, logits²
 
 
+@dataclass(frozen=True, eq=False)
+class ScoredDay:
+    """A day's forecast of m slots, and what was recorded, in the t half-hours in which something was.
+
+    Args:
+        number: of the day (`date.toordinal`).
+        p_taken: (m, t) forecast.
+        taken: (m, t) fraction of the observed time in which a slot was taken.
+        seen: (m, t) observed fraction of the half-hour.
+        draws: (k, t) equally likely days of the lot's mean occupancy, over the observed slots.
+    """
+
+    number: int
+    p_taken: FloatArray
+    taken: FloatArray
+    seen: FloatArray
+    draws: FloatArray
+
+    @property
+    def log_loss(self) -> float:
+        """Sum over the observed states."""
+        return -float(
+            (
+                self.seen * (self.taken * np.log(self.p_taken) + (1 - self.taken) * np.log1p(-self.p_taken))
+            ).sum()
+        )
+
+    @property
+    def brier(self) -> float:
+        """Sum over the observed states."""
+        taken, p = self.taken, self.p_taken
+        return float((self.seen * (taken * (1 - p) ** 2 + (1 - taken) * p**2)).sum())
+
+    @property
+    def states(self) -> float:
+        """Weight of the observed states."""
+        return float(self.seen.sum())
+
+    @property
+    def forecast(self) -> FloatArray:
+        """Forecast of the lot's mean occupancy, (t,)."""
+        return _lot_means(self.p_taken, self.seen)
+
+    @property
+    def observed(self) -> FloatArray:
+        """Recorded mean occupancy of the lot, (t,)."""
+        return _lot_means(self.taken, self.seen)
+
+    @property
+    def crps(self) -> FloatArray:
+        """Of the lot's mean occupancy, (t,)."""
+        return crps_of_equally_likely(np.sort(self.draws, axis=0), self.observed)
+
+    @property
+    def held(self) -> bool:
+        """Whether the 90 % interval of the day's mean occupancy holds the recorded one."""
+        low, high = np.quantile(self.draws.mean(axis=1), INTERVAL)
+        return bool(low <= self.observed.mean() <= high)
+
+
 @dataclass(frozen=True)
 class SlotScores:
-    """Scores of one model."""
+    """Scores of one model.
+
+    Args:
+        model: its name.
+        days: the scored days, in order of time.
+    """
 
     model: str
-    log_loss: float  # of a slot that is taken or not
-    brier: float
-    crps: float  # of the lot's occupancy in a half-hour
-    coverage_90: float  # of the lot's mean occupancy over a day
-    days: int
+    days: tuple[ScoredDay, ...]
+
+    @property
+    def log_loss(self) -> float:
+        """Of a slot that is taken or not."""
+        return self._per_state([day.log_loss for day in self.days])
+
+    @property
+    def brier(self) -> float:
+        """Of a slot that is taken or not."""
+        return self._per_state([day.brier for day in self.days])
+
+    @property
+    def crps(self) -> float:
+        """Of the lot's occupancy in a half-hour."""
+        return float(np.concatenate([day.crps for day in self.days]).mean())
+
+    @property
+    def coverage_90(self) -> float:
+        """Of the lot's mean occupancy over a day."""
+        return float(np.mean([day.held for day in self.days]))
+
+    def coverage_by_band(self, *, observed: bool = False) -> list[Band]:
+        """Return `parkenv.forecast.scores.coverage_by_band` of the days, by forecast or by recorded fullness."""
+        fullness = [(day.observed if observed else day.forecast).mean() for day in self.days]
+        return coverage_by_band(np.array(fullness), np.array([float(day.held) for day in self.days]))
+
+    def reliability(self) -> FloatArray:
+        """Return `parkenv.forecast.scores.reliability` of the slots' states."""
+        p, taken, seen = (
+            np.concatenate([getattr(day, name).ravel() for day in self.days])
+            for name in ("p_taken", "taken", "seen")
+        )
+        return reliability(p, taken, seen)
+
+    def log_loss_beyond(self, ours: SlotScores, rng: np.random.Generator) -> tuple[float, float, float]:
+        """Return the log-loss minus that of `ours` on the same days, and its 95 % interval (bootstrap over days)."""
+        difference = [a.log_loss - b.log_loss for a, b in zip(self.days, ours.days, strict=True)]
+        states = [day.states for day in self.days]
+        chosen = rng.integers(len(states), size=(1000, len(states)))
+        means = np.array(difference)[chosen].sum(axis=1) / np.array(states)[chosen].sum(axis=1)
+        low, high = np.quantile(means, (0.025, 0.975))
+        return self._per_state(difference), float(low), float(high)
+
+    def _per_state(self, sums: list[float]) -> float:
+        return sum(sums) / sum(day.states for day in self.days)
 
 
 def compare_slot_days(
@@ -65,35 +173,30 @@ def compare_slot_days(
     }
     if not any((data.days.number[1:] >= first).any() for data in classes):
         return []
-    sums: dict[str, list[FloatArray]] = {name: [] for name in (OURS, *models)}
+    scored: dict[str, list[ScoredDay]] = {name: [] for name in (OURS, *models)}
     for data in classes:
         errors: dict[str, list[float]] = {name: [] for name in models}
         for d in range(1, len(data.days.number)):
-            past, day, seen, taken = _days(data, slice(d)), data.days, data.seen[:, d], data.taken[:, d]
-            new, scored = Days(day.number[d : d + 1], day.weekday[d : d + 1]), day.number[d] >= first
+            past, day = _days(data, slice(d)), _days(data, slice(d, d + 1))
+            taken, seen, counts = day.taken[:, 0], day.seen[:, 0], int(day.days.number[0]) >= first
             for name, model in models.items():
-                if name == "gradient-boosting" and not scored:
+                if name == "gradient-boosting" and not counts:
                     continue
-                p = np.clip(model(past, new), _EDGE, 1 - _EDGE)
+                p = np.clip(model(past, day.days), _EDGE, 1 - _EDGE)
                 variance = (np.sum(np.square(errors[name])) + _LEVEL_DAYS * _LEVEL_SD**2) / (
                     len(errors[name]) + _LEVEL_DAYS
                 )
                 errors[name].append(_level_error(p, taken, seen))
-                if scored:
-                    sums[name].append(
-                        _scores(DayForecast(p, np.full((p.shape[1],) * 2, variance)), taken, seen)
-                    )
-            if scored:
-                found = fit_slot_days(past).forecast(new)
+                if counts:
+                    scored[name].append(_score(DayForecast(p, np.full((p.shape[1],) * 2, variance)), day))
+            if counts:
+                found = fit_slot_days(past).forecast(day.days)
                 p = np.clip(found.p_taken[0], _EDGE, 1 - _EDGE)
-                sums[OURS].append(_scores(DayForecast(p, found.curve_covariance[0]), taken, seen))
+                scored[OURS].append(_score(DayForecast(p, found.curve_covariance[0]), day))
                 on_day()
-    rows = []
-    for name, scores in sums.items():
-        log_loss, brier, crps, states, periods, held = np.sum(scores, axis=0).tolist()
-        n = len(scores)
-        rows.append(SlotScores(name, log_loss / states, brier / states, crps / periods, held / n, n))
-    return rows
+    return [
+        SlotScores(name, tuple(sorted(days, key=lambda day: day.number))) for name, days in scored.items()
+    ]
 
 
 def _days(data: SlotDays, which: slice | IntArray) -> SlotDays:
@@ -152,19 +255,16 @@ def _level_error(p: FloatArray, taken: FloatArray, seen: FloatArray) -> float:
     return float(logit(means[0]) - logit(means[1]))
 
 
-def _scores(forecast: DayForecast, taken: FloatArray, seen: FloatArray) -> FloatArray:
-    """Return sums over a day: log-loss, Brier score, CRPS, weight of the states, number of half-hours, days held."""
-    p, used = forecast.p_taken, np.flatnonzero(seen.sum(axis=0) > 0)
-    log_loss = -(seen * (taken * np.log(p) + (1 - taken) * np.log1p(-p))).sum()
-    brier = (seen * (taken * (1 - p) ** 2 + (1 - taken) * p**2)).sum()
-    observed = _lot_means(taken, seen)
-    draws = _drawn_occupancy(forecast, seen, used)
-    crps = np.abs(draws - observed).mean(axis=0) - 0.5 * np.abs(draws[::2, None] - draws[1::2]).mean(
-        axis=(0, 1)
+def _score(forecast: DayForecast, day: SlotDays) -> ScoredDay:
+    taken, seen = day.taken[:, 0], day.seen[:, 0]
+    used = np.flatnonzero(seen.sum(axis=0) > 0)
+    return ScoredDay(
+        int(day.days.number[0]),
+        forecast.p_taken[:, used],
+        taken[:, used],
+        seen[:, used],
+        _drawn_occupancy(forecast, seen, used),
     )
-    low, high = np.quantile(draws.mean(axis=1), (0.05, 0.95))
-    held = low <= observed.mean() <= high
-    return np.array([log_loss, brier, crps.sum(), seen.sum(), used.size, held])
 
 
 def _drawn_occupancy(forecast: DayForecast, seen: FloatArray, used: IntArray) -> FloatArray:
