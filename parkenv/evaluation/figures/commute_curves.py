@@ -72,8 +72,8 @@ def _draw_excess(axes: Axes, rows: Sequence[Row], start: str) -> None:
     levels = {agent: _level(others, agent) for agent in dict.fromkeys(row["agent"] for row in others)}
     first = [row["excess_s"] for row in learned if row["agent"] == learned[0]["agent"]]
     nearest = min(levels.values(), default=0.0)
-    most = float(np.percentile([row["excess_s"] for row in learned], 90.0))
-    top, bottom = max(*first, nearest, most, 1.0), min(*first, nearest, 0.0)
+    low, high = np.percentile([row["excess_s"] for row in learned], [10.0, 90.0])
+    top, bottom = max(*first, nearest, high, 1.0), min(*first, nearest, low, 0.0)
     margin = 0.2 * (top - bottom)
     axes.axhline(0.0, color="#444444", lw=0.9, zorder=1)
     for agent in dict.fromkeys(row["agent"] for row in learned):
