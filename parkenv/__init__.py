@@ -22,7 +22,7 @@ from gymnasium.envs.registration import register, registry
 
 if TYPE_CHECKING:
     from parkenv.errors import InputError
-    from parkenv.scenarios.build import make_scenario
+    from parkenv.scenarios.build import make_scenario, make_scenarios
     from parkenv.world.lot import Lane, Mouth, ParkingLot
     from parkenv.world.occupancy import ArrivalWindow, OccupancyProcess
     from parkenv.world.occupancy_log import OccupancyLog
@@ -48,6 +48,7 @@ _EXPORTS = {
     "SensorModel": "parkenv.world.sensor_model",
     "Traffic": "parkenv.world.traffic",
     "make_scenario": "parkenv.scenarios.build",
+    "make_scenarios": "parkenv.scenarios.build",
 }
 
 __all__ = [
@@ -65,6 +66,7 @@ __all__ = [
     "SensorModel",
     "Traffic",
     "make_scenario",
+    "make_scenarios",
 ]
 
 

@@ -118,6 +118,7 @@ class ModelCard(Spec):
     observation_space: Annotated[dict[str, BoxSpace], Field(max_length=16)]
     action_space: BoxSpace | Annotated[int, Field(ge=1, le=1_000)]
     scenarios: Several[str] = Field((), description="Trained on; for driving, lots.")
+    held_out: Several[str] = Field((), description="Places never trained on, which it was evaluated in.")
     seed: int | None = Field(None, description="Of the training.")
     steps: int = Field(0, ge=0, description="Decisions of the training.")
     settings: dict[str, JsonValue] = Field({}, description="Of the algorithm.")
@@ -184,6 +185,7 @@ def save_model(
     path: str | os.PathLike[str],
     *,
     scenarios: Sequence[str] = (),
+    held_out: Sequence[str] = (),
     settings: Mapping[str, Any] | None = None,
     results: Mapping[str, float] | None = None,
     command: Sequence[str] = (),
@@ -195,6 +197,7 @@ def save_model(
             on the driving observation of `planners.driving.policy_interface`.
         path: file to write; its name should end in `.safetensors`.
         scenarios: names of the training scenarios; for driving, of the lots.
+        held_out: names of the places that it was evaluated in, and never trained on.
         settings: settings of the algorithm, for the card.
         results: results of an evaluation, for the card.
         command: command line of the training, for the card.
@@ -224,8 +227,9 @@ def save_model(
             "policy": aliases.get(model.policy_class, model.policy_class.__name__), "policy_options": options,
             "observation_space": {key: BoxSpace.of(space) for key, space in model.observation_space.items()},
             "action_space": int(action.n) if isinstance(action, spaces.Discrete) else BoxSpace.of(action),
-            "scenarios": tuple(scenarios), "seed": model.seed, "steps": model.num_timesteps,
-            "settings": to_jsonable_python(dict(settings or {})), "results": found, "command": tuple(command),
+            "scenarios": tuple(scenarios), "held_out": tuple(held_out), "seed": model.seed,
+            "steps": model.num_timesteps, "settings": to_jsonable_python(dict(settings or {})),
+            "results": found, "command": tuple(command),
         },
         "model",
     )  # fmt: skip

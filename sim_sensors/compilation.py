@@ -47,6 +47,9 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]: ...
 def compiled(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
     """Compile the decorated function on its first call, once for all processes and sessions.
 
+    A function that Python calls returns no named tuple: numba makes one by calling Python, which is slow, and the
+    process crashes if a signal handler, such as that of Ctrl-C, raises an exception there.
+
     Args:
         function: the function, if the decorator has no options.
         options: options of `numba.njit`, except `cache`.

@@ -63,6 +63,16 @@ class Movers:
         """Number of pedestrians."""
         return len(self.walker_pose)
 
+    def only(self, vehicles: NDArray[np.bool_], walkers: NDArray[np.bool_]) -> Movers:
+        """Return those that the masks, (m,) and (p,), select."""
+        return Movers(
+            self.vehicle_pose[vehicles],
+            self.vehicle_model[vehicles],
+            self.walker_pose[walkers],
+            self.walker_stride[walkers],
+            self.walker_look[walkers],
+        )
+
     @property
     def gait(self) -> IntArray:
         """Phase of each pedestrian's stride, (p,) int64, 0 to `GAITS` - 1."""

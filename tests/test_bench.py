@@ -89,9 +89,9 @@ def test_steps_are_measured_and_peers_that_are_not_there_are_named(monkeypatch):
     from parkenv.evaluation.bench import env as bench_env
 
     monkeypatch.setattr(bench_env, "find_spec", lambda name: None)
-    rows = bench_env.env_rows(seed=0, seconds=0.0, batch=4, large=300)
+    rows = bench_env.env_rows(seed=0, seconds=0.0, batch=4, large=300, places=3)
     measured = [row for row in rows if row["part"] in ("batch", "single") and row["value"] is not None]
-    assert len(measured) == 8
+    assert len(measured) == 9
     assert all(row["value"] > 0 and row["ratio"] == row["value"] / row["peer_value"] for row in measured)
     absent = [row["case"] for row in rows if row["value"] is None]
     assert absent == [
@@ -101,3 +101,7 @@ def test_steps_are_measured_and_peers_that_are_not_there_are_named(monkeypatch):
     memory = {row["case"]: row["value"] for row in rows if row["part"] == "memory"}
     # Of each slot 40 + 32 + 4 bytes, and 4 + 16 of the full belief.
     assert memory["batch of 4, 200 slots, full belief"] == pytest.approx(200 * 96 / 1024, rel=0.1)
+    tables, whole = (
+        memory[f"batch of 4, 3 places, tables {what}"] for what in ("of the places", "and environments")
+    )
+    assert 0.0 < tables < whole

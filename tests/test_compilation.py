@@ -6,6 +6,7 @@ import os
 import pkgutil
 import subprocess
 import sys
+import typing
 from pathlib import Path
 
 import numba
@@ -174,22 +175,30 @@ def one_over(x):
     return 1.0 / x
 
 
+def compiled_functions():
+    for package in (sim_sensors, parkenv, planners):
+        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            for function in vars(importlib.import_module(found.name)).values():
+                if isinstance(function, Dispatcher) and function.__module__ == found.name:
+                    yield function
+
+
 def test_every_compiled_function_is_kept_under_a_key_of_all_functions_that_it_calls():
     """Else an edit of the callee would go unnoticed."""
     checked = 0
-    for package in (sim_sensors, parkenv, planners):
-        for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-            module = importlib.import_module(found.name)
-            for function in vars(module).values():
-                if not isinstance(function, Dispatcher) or function.__module__ != found.name:
-                    continue
-                sources = compilation._closure(Path(module.__file__).resolve())
-                for name in function.py_func.__code__.co_names:
-                    called = function.py_func.__globals__.get(name)
-                    if isinstance(called, Dispatcher):
-                        assert Path(called.py_func.__code__.co_filename).resolve() in sources, (
-                            function,
-                            name,
-                        )
-                        checked += 1
+    for function in compiled_functions():
+        sources = compilation._closure(Path(function.py_func.__code__.co_filename).resolve())
+        for name in function.py_func.__code__.co_names:
+            called = function.py_func.__globals__.get(name)
+            if isinstance(called, Dispatcher):
+                assert Path(called.py_func.__code__.co_filename).resolve() in sources, (function, name)
+                checked += 1
     assert checked > 50
+
+
+def test_no_compiled_function_gives_python_a_named_tuple():
+    """Numba calls Python to make one; an exception of a signal handler ends the process there with a segfault."""
+    for function in compiled_functions():
+        returned = typing.get_type_hints(function.py_func).get("return")
+        for kind in (returned, *typing.get_args(returned)):
+            assert function.__name__.startswith("_") or not hasattr(kind, "_fields"), function

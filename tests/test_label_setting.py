@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from parkenv import InputError, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.files.names import SCENARIO_NAMES
+from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import city_lot, grid_lot
 from parkenv.world.lot import PARK
 from planners import ParkingMDP, label_setting, make_agent, policy_iteration, value_iteration

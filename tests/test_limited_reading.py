@@ -7,6 +7,7 @@ import struct
 import tarfile
 import zipfile
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -124,6 +125,13 @@ def test_pipes_and_devices_are_refused_and_not_waited_for(tmp_path):
             read_bytes(tmp_path / name)
     with pytest.raises(InputError, match="is no file"):
         MapStore(tmp_path / "pipe", packaged_lot("mini"), create=False)
+
+
+@pytest.mark.skipif(not Path("/proc/version").exists(), reason="has no /proc")
+def test_files_that_state_no_size_are_empty_and_not_waited_for(tmp_path):
+    for name in ("link", "link.gz"):
+        (tmp_path / name).symlink_to("/proc/version")  # /proc/kmsg, which waits, needs rights
+        assert read_bytes(tmp_path / name) == b""
 
 
 def test_csv_rows_have_one_width_and_a_torn_end_is_left_out(tmp_path):

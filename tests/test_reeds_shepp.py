@@ -13,6 +13,7 @@ from planners.driving.reeds_shepp import (
     MOST_WORDS,
     RIGHT,
     STRAIGHT,
+    Words,
     reeds_shepp,
     word_cost,
     words_between,
@@ -41,7 +42,7 @@ def same_pose(a, b, tolerance):
 @given(goal=poses)
 @settings(max_examples=300)
 def test_every_word_leads_to_the_goal(goal):
-    words = words_buffer()
+    words = Words(*words_buffer())
     n = words_between(*goal, words)
     assert 1 <= n <= MOST_WORDS
     for k in range(n):

@@ -6,7 +6,7 @@ import pytest
 
 from parkenv import InputError, make_scenario
 from parkenv.cli.arguments import World
-from parkenv.files.names import SCENARIO_NAMES
+from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.mapping.inference import MapPrior
 from parkenv.mapping.store import MapStore, Session

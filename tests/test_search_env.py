@@ -19,7 +19,7 @@ from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorMo
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.envs.search_kernel import COUNT_METRICS, REWARD_TERMS, STEP_RESULT, TIME_METRICS
 from parkenv.envs.wrappers import ThesisReward
-from parkenv.files.names import SCENARIO_NAMES
+from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot
 from parkenv.world.decay import decay_factor
 from parkenv.world.lot import PARK

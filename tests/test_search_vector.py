@@ -62,29 +62,25 @@ def make_batch(n, scenario, **options):
 
 
 def assert_parity(scenarios, observation="full", n=4, steps=250, k=5, **changes):
-    """Whole episodes, several in a row, of each search of a batch and of the single environment of its seed."""
+    """Whole episodes, several in a row, of each search of a batch and of the single environment of its seed.
+
+    Returns the names of the places of the episodes that ended.
+    """
     envs = make_batch(n, scenarios, observation=observation, max_episode_steps=LIMIT, k=k, **changes)
-    each = scenarios if isinstance(scenarios, list) else [scenarios]
     singles = [
-        gym.make("parkenv/Search-v2", scenario=each[i % len(each)], max_episode_steps=LIMIT, **changes)
-        for i in range(n)
+        gym.make("parkenv/Search-v2", scenario=scenarios, max_episode_steps=LIMIT, **changes)
+        for _ in range(n)
     ]
     if observation == "local":
         singles = [LocalObservation(env, k) for env in singles]
     batch, _ = envs.reset(seed=7)
     alone = [env.reset(seed=7 + i)[0] for i, env in enumerate(singles)]
     rng = np.random.default_rng(0)
-    done, episodes = np.zeros(n, dtype=bool), 0
+    done, episodes = np.zeros(n, dtype=bool), []
     for _ in range(steps):
         for i in range(n):
             for name, value in alone[i].items():
-                there = batch[name][i]
-                if name in ("p_occupied", "belief"):
-                    past_the_last = {"p_occupied": [[1.0]], "belief": [[1.0], [0.0], [1.0], [-1.0]]}[name]
-                    there, n_slots = there.reshape(len(past_the_last), -1), len(alone[i]["p_occupied"])
-                    assert (there[:, n_slots:] == past_the_last).all()
-                    there = there[:, :n_slots].ravel()
-                np.testing.assert_array_equal(there, value, err_msg=name)
+                np.testing.assert_array_equal(batch[name][i], value, err_msg=name)
         # Mostly valid actions, and sometimes invalid ones.
         actions = np.array(
             [
@@ -105,12 +101,12 @@ def assert_parity(scenarios, observation="full", n=4, steps=250, k=5, **changes)
             assert {name: values[i] for name, values in terms.items()} == metrics["reward_terms"]
             done[i] = any(ends)
             if done[i]:
-                episodes += 1
+                episodes.append(metrics["place"])
                 for name, value in metrics.items():
                     assert info[f"_{name}"][i]
                     if name != "reward_terms":
                         assert info[name][i] == value, name
-    assert episodes >= n
+    assert len(episodes) >= n
     return episodes
 
 
@@ -118,17 +114,26 @@ def assert_parity(scenarios, observation="full", n=4, steps=250, k=5, **changes)
 def test_different_lots_in_one_batch(observation):
     mini = make_scenario("mini", sensor_model=SensorModel(8.0, hit_rate=0.9, false_alarm_rate=0.2))
     foretold = make_scenario("street").replace(prior=Rumour(make_scenario("street").lot.n_slots))
-    assert_parity([recorded_scenario(), mini, make_scenario("jam"), foretold], observation, n=8)
+    places = [recorded_scenario(), mini, make_scenario("jam"), foretold]
+    assert set(assert_parity(places, observation, n=8)) == {"log", "mini", "jam", "street"}
 
 
 def test_different_lots_share_one_space():
     small, large = make_scenario("mini"), make_scenario("street")
-    envs = make_batch(3, [small, large])
+    envs = make_batch(16, [small, large], max_episode_steps=LIMIT)
     observation, _ = envs.reset(seed=0)
-    assert observation["p_occupied"].shape == (3, large.lot.n_slots)
-    assert (observation["p_occupied"][[0, 2], small.lot.n_slots :] == 1.0).all()
+    was_large = np.zeros(16, dtype=bool)
+    for _ in range(3 * LIMIT):
+        in_small = envs.place_of == 0
+        padding = observation["p_occupied"][in_small, small.lot.n_slots :]
+        assert (padding == 1.0).all()
+        padding = observation["belief"].reshape(16, 4, -1)[in_small, :, small.lot.n_slots :]
+        assert (padding == np.array([1.0, 0.0, 1.0, -1.0])[:, None]).all()
+        assert envs.observation_space.contains(observation)
+        was_large |= ~in_small
+        observation, *_ = envs.step(np.random.default_rng(0).integers(0, 4, 16))
+    assert (was_large & in_small).any(), "a small lot after a large one"
     assert envs.single_observation_space["vertex"].n == max(small.lot.n_vertices, large.lot.n_vertices)
-    assert envs.observation_space.contains(observation)
 
 
 def test_occupancy_is_the_full_observation_without_what_it_was_computed_from():

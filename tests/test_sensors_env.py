@@ -11,8 +11,9 @@ from gymnasium.utils.env_checker import data_equivalence
 import parkenv  # noqa: F401
 from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
 from parkenv.envs.sensor_sampler import SensorSampler
+from parkenv.lots import grid_lot
 from parkenv.world.lot_scene import LotScenes, slot_lot
-from parkenv.world.traffic import LotTraffic
+from parkenv.world.traffic import LotTraffic, _Loops
 from sim_sensors.camera.models import PinholeCamera
 from sim_sensors.errors import SensorError
 from sim_sensors.ground_truth import vehicle_boxes
@@ -223,6 +224,49 @@ def test_people_walk_to_the_goal_and_back():
     assert (away.max(axis=0) > 5.0).all()
     strides = np.array([traffic.at(t).walker_stride for t in np.arange(0.0, 2.0, 0.1)])
     assert len(np.unique(strides)) > 20
+
+
+def pose_on(loop, time):
+    """x, y and yaw on a closed path, one number at a time."""
+    corners = np.concatenate([loop.path, loop.path[:1]])
+    station = np.r_[0.0, np.cumsum(np.hypot(*np.diff(corners, axis=0).T))]
+    at = (loop.start * station[-1] + loop.speed * time) % station[-1]
+
+    def point(s):
+        return np.array([np.interp(s % station[-1], station, corners[:, i]) for i in (0, 1)])
+
+    behind, ahead = point(at - loop.reach), point(at + loop.reach)
+    chord = ahead - behind
+    if np.hypot(*chord) < 0.3:
+        chord = point(at + 0.01) - point(at)
+    yaw = np.arctan2(chord[1], chord[0])
+    return np.array([*(0.5 * (behind + ahead) + loop.aside * np.array([np.sin(yaw), -np.cos(yaw)])), yaw])
+
+
+@pytest.mark.parametrize("name", ["street", "mini"])
+def test_all_road_users_are_where_each_would_be_alone(name, monkeypatch):
+    loops = []
+
+    class Noted(_Loops):
+        def __init__(self, given):
+            loops.extend(given)
+            super().__init__(given)
+
+    monkeypatch.setattr("parkenv.world.traffic._Loops", Noted)
+    lot = make_scenario(name).lot
+    several = LotTraffic(lot, 0, Traffic(cars=3, pedestrians=9), np.uint64(5), slot_lot(lot))
+    for time in np.linspace(0.0, 900.0, 40):
+        times = time + np.arange(12.0)
+        alone = [pose_on(loop, t) for loop, t in zip(loops, times, strict=True)]
+        np.testing.assert_allclose(several.poses_at(times), alone, atol=1e-9)
+
+
+def test_road_users_stand_where_there_is_nowhere_to_go():
+    lot = grid_lot(1, 1)
+    alone = LotTraffic(lot, 0, Traffic(cars=1, pedestrians=1), np.uint64(5), slot_lot(lot))
+    there, later = (alone.poses_at(np.full(2, time)) for time in (0.0, 99.0))
+    assert np.isfinite(there).all()
+    np.testing.assert_array_equal(there[0], later[0])
 
 
 def test_nobody_is_in_the_searching_cars_way():

@@ -111,6 +111,33 @@ def test_a_signal_during_compiled_code_stops_it():
     assert (done.returncode, done.stdout) == (0, "stopped\n"), done.stderr
 
 
+def test_a_signal_while_a_compiled_module_is_imported_stops_after_it():
+    """Modules in C++ end the process if an exception passes through their code."""
+    script = (
+        "import os, signal, sys\n"
+        "from importlib.machinery import ExtensionFileLoader\n"
+        "from parkenv.cli.stop_signals import stop_signals\n"
+        "def of_compiled(frame):\n"
+        "    return frame and (frame.f_code is ExtensionFileLoader.exec_module.__code__ or of_compiled(frame.f_back))\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path, target=None):\n"
+        "        if of_compiled(sys._getframe()):\n"
+        "            sys.meta_path.remove(self)\n"
+        "            os.kill(os.getpid(), signal.SIGTERM)\n"
+        "            print('sent')\n"
+        "sys.meta_path.insert(0, Finder())\n"
+        "try:\n"
+        "    with stop_signals() as received:\n"
+        "        import scipy.linalg\n"
+        "        while True:\n"
+        "            pass\n"
+        "except KeyboardInterrupt:\n"
+        "    print('stopped', received, 'scipy.linalg._cythonized_array_utils' in sys.modules)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, "sent\nstopped [15] True\n"), done.stderr
+
+
 @pytest.mark.parametrize("thread", ["main", "other"])
 def test_workers_end_with_their_killed_parent(tmp_path, thread):
     """Linux kills them; the workers of a thread that may end before the process watch for themselves."""

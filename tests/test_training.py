@@ -11,6 +11,7 @@ import resource
 import shutil
 import signal
 import subprocess
+import tempfile
 import time
 import zipfile
 
@@ -146,8 +147,11 @@ def test_seeds_decide_networks_and_worlds(tmp_path, monkeypatch):
     seeds = []
     monkeypatch.setattr(SearchVecEnv, "seed", lambda self, seed: seeds.append(seed))
     training = SearchTraining("ppo", 400, 400, (SCENARIO,), EVALUATED[:4])
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    (tmp_path / "temporary").mkdir()
     for seed in (0, 1):
         train_one(training, seed, tmp_path / str(seed))
+    assert not list((tmp_path / "temporary").iterdir()), "stable-baselines3 keeps a folder of logs"
     assert seeds[1::2] == [TRAINING_SEEDS, 2 * TRAINING_SEEDS], "worlds apart from those of evaluations"
     models = [(tmp_path / seed / "model.safetensors").read_bytes() for seed in "01"]
     assert models[0] != models[1]

@@ -386,6 +386,11 @@ def test_among_others_trips_take_longer_and_end_parked_without_a_contact(name, c
     assert lost > 0.0
 
 
+def test_a_crowd_is_refused():
+    with pytest.raises(InputError, match="has 201 cars and pedestrians; a driven trip takes at most 200"):
+        DrivenSearch(busy("mini", 1, 200))
+
+
 def test_among_others_equal_seeds_give_equal_trips():
     scenario = busy("mini", 1, 2)
     search = DrivenSearch(scenario)
@@ -399,6 +404,7 @@ class StandingTraffic:
     """One car across the lane of a car that drives east from the origin, which waits for that for ever."""
 
     outlines = ((ObstacleKind.MOVING_CAR, np.array([[2.0, 0.9], [-2.0, 0.9], [-2.0, -0.9], [2.0, -0.9]])),)
+    corners = outlines[0][1][None]
 
     def __init__(self, x):
         self.at = np.array([[x, 0.0, 0.5 * math.pi]])

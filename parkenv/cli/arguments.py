@@ -3,7 +3,7 @@
 Dataclasses are groups of options: a command that has one as a parameter has all of its options.
 
 Options:
-    scenario (NAME|FILE): {scenarios}, or a scenario file (.toml).  [default: campus]
+    scenario (NAME|FILE): {scenarios}, a scenario file (.toml), or a lot (.geojson).  [default: campus]
     agents (NAME[,...]): Agents, with any options in brackets, mdp(failure_s=90): {agents}; ALGORITHM:FILE for a
         trained model; MODULE:CLASS for your own. Differences are to the first.  [default: all but exact]
     seed (N >= 0): First seed; episode i uses seed + i.
@@ -20,8 +20,8 @@ Sensors:
     weather (NAME): {weathers}.  [default: drawn each time]
 
 World:
-    lot (NAME|FILE[,...]): Instead of a scenario: a typical week on this lot. A packaged lot, GeoJSON, or a Dragon Lake
-        map (.yml).
+    lot (NAME|FILE[,...]): Instead of a scenario: a typical week on this lot, with a day error of 0.8. A packaged lot,
+        GeoJSON, or a Dragon Lake map (.yml).
 
 Results:
     rerun (FILE.rrd): Also record images, boxes, scans, grid, slots and path for the Rerun viewer (extra viewer; then:
@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
-from parkenv.files.names import BackendName, ForecastFrom
+from parkenv.files.known_names import BackendName, ForecastFrom
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import Grid, Workplace
@@ -258,11 +258,20 @@ class RunFolder:
     Results:
         resume: Go on with the run in --out. Options that are given change it, such as more --episodes.
         overwrite: Replace the run in --out.
-        report: Also write report.html, as `parkenv report` does.
     """
 
     resume: bool = False
     overwrite: bool = False
+
+
+@dataclass(frozen=True)
+class ReportedRun(RunFolder):
+    """A run that writes a report on request.
+
+    Results:
+        report: Also write report.html, as `parkenv report` does.
+    """
+
     report: bool = False
 
 
@@ -342,14 +351,13 @@ def changed_axis(grid: Grid, axis: str, option: str, text: str | None) -> Grid:
 
 
 def scenario_specs(scenario: str, lot: str | None = None) -> list[ScenarioSpec]:
-    """Return scenarios by their names and files, or else those of a typical week on lots."""
-    from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
+    """Return the scenarios of names, files and folders, or else those of lots alone."""
+    from parkenv.scenarios.spec import lot_scenario
+    from parkenv.scenarios.spec import scenario_specs as specs_of
 
     if lot is None:
-        return [scenario_spec(word) for word in words("--scenario", scenario)]
-    return [
-        ScenarioSpec.parse({"name": Path(word).stem, "lot": word}, "--lot") for word in words("--lot", lot)
-    ]
+        return [spec for word in words("--scenario", scenario) for spec in specs_of(word)]
+    return [lot_scenario(word, "--lot") for word in words("--lot", lot)]
 
 
 def one_scenario(specs: list[ScenarioSpec]) -> ScenarioSpec:

@@ -31,7 +31,7 @@ def run(
     by: str | None = None,
     trust: bool = False,
     trust_model: bool = False,
-    folder: args.RunFolder,
+    folder: args.ReportedRun,
     machines: args.Machines,
 ) -> None:
     """Run agents through all episodes of a suite, and write a result that others can check.
@@ -61,7 +61,7 @@ def run(
         run_suite(spec, out, folder)
 
 
-def run_suite(spec: BenchmarkSpec, out: Path, folder: args.RunFolder) -> None:
+def run_suite(spec: BenchmarkSpec, out: Path, folder: args.ReportedRun) -> None:
     """Run a suite with a progress bar, write its result and print the scores.
 
     Raises:

@@ -12,7 +12,7 @@ from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
-from parkenv.files.names import RigName
+from parkenv.files.known_names import RigName
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -44,7 +44,7 @@ def commute(
     figures: bool | None = None,
     trust: bool = False,
     trust_model: bool = False,
-    folder: args.RunFolder,
+    folder: args.ReportedRun,
     machines: args.Machines,
 ) -> None:
     """Let drivers come day after day, with a map that learns from every trip.
@@ -67,7 +67,8 @@ def commute(
     Options:
         agents (NAME[,...]): Agents, with any options in brackets; differences in `weeks` of summary.json are to the
             first that uses no map.  [default: belief,mdp,first-free,greedy-drive]
-        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus]
+        scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
+            campus]
         map (empty|right|wrong[,...]): The map on the first day. empty: 50 % for every slot. right: the forecast of the
             scenario's occupancy. wrong: the forecast of the scenario where it differs from that (jam), else the right
             one with near and far slots exchanged.  [default: empty]
@@ -131,7 +132,7 @@ def commute(
         run_commute_of(spec, out, folder)
 
 
-def run_commute_of(spec: CommuteSpec, out: Path, folder: args.RunFolder) -> None:
+def run_commute_of(spec: CommuteSpec, out: Path, folder: args.ReportedRun) -> None:
     """Run a commute with a progress bar, print its tables and draw its picture.
 
     Raises:

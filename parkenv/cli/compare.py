@@ -19,7 +19,7 @@ from parkenv.cli.tables import (
 )
 from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
-from parkenv.files.names import RigName
+from parkenv.files.known_names import RigName
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -53,7 +53,7 @@ def compare(
     rerun: Path | None = None,
     trust: bool = False,
     trust_model: bool = False,
-    folder: args.RunFolder,
+    folder: args.ReportedRun,
     machines: args.Machines,
 ) -> None:
     """Compare agents over failure costs and speeds, all in the same worlds.
@@ -70,7 +70,8 @@ def compare(
         parkenv compare --resume --episodes 1000
 
     Options:
-        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus]
+        scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
+            campus]
         episodes, -n (N >= 1): Episodes of each agent in each setting.  [default: 200]
         seed (N >= 0): First seed; episode i uses seed + i.  [default: 0]
         out, -o (DIR): Folder for experiment.json, episodes.csv, summary.json and the figures.
@@ -119,7 +120,7 @@ def compare(
 
 
 def run_comparison(
-    spec: ExperimentSpec, out: Path, folder: args.RunFolder, rerun: Path | None = None
+    spec: ExperimentSpec, out: Path, folder: args.ReportedRun, rerun: Path | None = None
 ) -> None:
     """Run an experiment with a progress bar, print its tables and draw its figures.
 

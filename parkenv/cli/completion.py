@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from parkenv.files.names import LOT_SUFFIXES, PACKAGED_LOTS, SCENARIO_NAMES, SENSOR_MODELS, WEATHERS
+from parkenv.files.known_names import LOT_SUFFIXES, PACKAGED_LOTS, SCENARIO_NAMES, SENSOR_MODELS, WEATHERS
 from planners.names import AGENTS
 
 Completer = Callable[[str], list[str]]
@@ -52,6 +52,7 @@ COMPLETERS: dict[str, Completer] = {
     "calibrated": completer((), (".json",)),
     "clone": completer(tuple(AGENTS)),
     "detector": completer(("hog", "side", "front"), (".npz",)),
+    "evaluate_on": completer(SCENARIO_NAMES, (*_TABLES, ".geojson"), several=True),
     "experiment": completer((), _TABLES),
     "lot": completer(PACKAGED_LOTS, LOT_SUFFIXES, several=True),
     "log": completer((), (".csv", ".csv.gz")),

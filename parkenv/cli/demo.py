@@ -77,9 +77,6 @@ def demo(
 
     Sensors:
         every (M >= 0.1): Metres between captures.  [default: 2.5]
-
-    Results:
-        report: The demo writes its report in any case.
     """
     from parkenv.evaluation.experiments.demo import QUICK
     from parkenv.evaluation.experiments.spec import DemoSpec

@@ -49,7 +49,8 @@ def park(
     Options:
         agents (NAME[,...]): Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of
             `parkenv train --env drive`.
-        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus,street]
+        scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
+            campus,street]
         episodes, -n (1 <= N <= 1000000): Episodes per lot.
         out, -o (DIR): Folder for pictures, episodes.csv and summary.json.
 

@@ -12,7 +12,7 @@ from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console
 from parkenv.cli.trust import require_trust
 from parkenv.errors import InputError
-from parkenv.files.names import SCENARIO_NAMES
+from parkenv.files.known_names import SCENARIO_NAMES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,7 +44,8 @@ def publish(
     Options:
         trained (DIR|FILE): The folder of a finished training, or a model file.
         out, -o (DIR): The folder to make.
-        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: those of the training's test]
+        scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
+            those of the training's test]
         episodes, -n (N >= 2): Episodes of the evaluation in each scenario.
         seed (N >= 0): First seed; episode i uses seed + i.  [default: 3000000, as in the tests of trainings]
     """
@@ -104,7 +105,7 @@ def _best(folder: Path, trust: bool) -> tuple[Path, Sequence[ScenarioSpec] | Non
     rows = run.summary["rows"]
     key = "total_s" if spec.env == "search" else "success"
     best = (min if spec.env == "search" else max)(rows, key=lambda row: float(row[key]))
-    return folder / f"seed_{int(best['seed'])}" / MODEL, spec.test_on or spec.scenarios
+    return folder / f"seed_{int(best['seed'])}" / MODEL, spec.test_on or spec.evaluate_on or spec.scenarios
 
 
 def _trained_on(model: Path, names: Sequence[str]) -> list[ScenarioSpec]:

@@ -33,7 +33,7 @@ def run(
     out: Path | None = None,
     *,
     trust: bool = False,
-    folder: args.RunFolder,
+    folder: args.ReportedRun,
     machines: args.Machines,
 ) -> None:
     """Run an experiment file: agents, scenarios, and a grid of settings.

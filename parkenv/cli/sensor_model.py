@@ -6,7 +6,7 @@ from pathlib import Path
 
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table, progress_bar
-from parkenv.files.names import RigName, WeatherName
+from parkenv.files.known_names import RigName, WeatherName
 
 SCENARIOS = "campus,street"
 
@@ -32,7 +32,8 @@ def fit_sensor_model(
         parkenv compare --sensor-model stereo.json
 
     Options:
-        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus,street]
+        scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
+            campus,street]
         episodes, -n (1 <= N <= 1000000): Episodes of each of three agents in each scenario.
         rig (laser|stereo|both_sides): Whose errors to measure.  [default: the scenario's, laser]
         out, -o (FILE.json): The file to write.

@@ -9,7 +9,7 @@ from parkenv.cli.command import add, group
 from parkenv.cli.tables import make_console
 from parkenv.errors import InputError, nearest
 from parkenv.files.file_names import file_name
-from parkenv.files.names import WEATHERS
+from parkenv.files.known_names import WEATHERS
 
 
 def preview(

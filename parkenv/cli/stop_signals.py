@@ -8,19 +8,23 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.machinery import ExtensionFileLoader
 from types import FrameType
+
+_IMPORTS_COMPILED = (ExtensionFileLoader.create_module.__code__, ExtensionFileLoader.exec_module.__code__)
 
 
 @contextmanager
 def stop_signals() -> Iterator[list[int]]:
     """Raise KeyboardInterrupt on each of the signals during the block; yield the list of signals received so far.
 
-    Signals that the caller of the process ignores, such as SIGHUP under `nohup`, stay ignored.
+    Signals that the caller of the process ignores, such as SIGHUP under `nohup`, stay ignored. A signal that comes
+    where an exception would crash the process is sent again until it comes elsewhere.
     """
     received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
-        if _returns_from_compiled_code(frame):
+        if _would_crash(frame):
             _thread.start_new_thread(os.kill, (os.getpid(), number))
             return
         received.append(number)
@@ -39,10 +43,13 @@ def stop_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def _returns_from_compiled_code(frame: FrameType | None) -> bool:
-    """Whether numba is making the Python objects that a compiled function returns: it crashes if its helper raises."""
+def _would_crash(frame: FrameType | None) -> bool:
+    """Whether compiled code has called this code, and would end the process if it raised an exception.
+
+    So do modules in C++ while they are imported, and numba while it makes the Python objects that a function returns.
+    """
     while frame is not None:
-        if frame.f_code.co_name == "_numba_unpickle":
+        if frame.f_code in _IMPORTS_COMPILED or frame.f_code.co_name == "_numba_unpickle":
             return True
         frame = frame.f_back
     return False

@@ -11,7 +11,7 @@ from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError, nearest
 from parkenv.files.file_names import file_name
-from parkenv.files.names import RigName, WeatherName
+from parkenv.files.known_names import RigName, WeatherName
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import SurveySpec
@@ -35,7 +35,7 @@ def survey(
     weather: WeatherName | None = None,
     pose_noise: float = 0.0,
     rerun: Path | None = None,
-    folder: args.RunFolder,
+    folder: args.ReportedRun,
     machines: args.Machines,
 ) -> None:
     """Drive past every slot with simulated sensors, and write which slots are taken to a map file.
@@ -75,7 +75,7 @@ def survey(
         run_survey_of(spec, out, folder, rerun)
 
 
-def run_survey_of(spec: SurveySpec, out: Path, folder: args.RunFolder, rerun: Path | None = None) -> None:
+def run_survey_of(spec: SurveySpec, out: Path, folder: args.ReportedRun, rerun: Path | None = None) -> None:
     """Drive the sessions that the map in the folder does not hold yet, print errors and draw figures.
 
     Raises:

@@ -40,12 +40,15 @@ def train(
     k: int | None = None,
     evaluate_every: int | None = None,
     evaluation_episodes: int | None = None,
+    held_out: float | None = None,
+    evaluate_on: str | None = None,
+    curriculum: Literal["size"] | None = None,
     test_on: str | None = None,
     agents: str | None = None,
     beside: str | None = None,
     lot: str | None = None,
     tensorboard: bool = False,
-    folder: args.RunFolder,
+    folder: args.ReportedRun,
     machines: args.Machines,
 ) -> None:
     """Train agents by reinforcement learning with several seeds, and draw their learning curves beside the planners.
@@ -58,6 +61,7 @@ def train(
     Examples:
         parkenv train maskable-ppo --scenario campus
         parkenv train ppo --scenario my_lot.toml --steps 200000 --trainings 1
+        parkenv train maskable-ppo --scenario lots --held-out 0.2 --curriculum size
         parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
         parkenv train ppo --beside results/maskable-ppo,results/dqn
         parkenv train sac --env drive --scenario campus,street --trainings 3
@@ -67,7 +71,8 @@ def train(
         algorithm (ALGORITHM): To search: dqn, ppo, maskable-ppo (default), recurrent-ppo. To drive: sac, tqc, ppo
             (default).
         env (search|drive): Learn to search (parkenv/Search-v2), or to drive into slots (parkenv/Drive-v1).
-        scenario (NAME|FILE[,...]): {scenarios}, or scenario files (.toml).  [default: campus; to drive, campus,street]
+        scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
+            campus; to drive, campus,street]
         steps (N >= 1): Decisions of a training.  [default: 2000000; to drive, the training config's]
         trainings (N >= 1): How many, with one seed each from --seed on.
         seed (N >= 0): First seed of the trainings.
@@ -77,14 +82,20 @@ def train(
         clone (AGENT): Start with behaviour cloning of this planner (search; ppo, maskable-ppo).
         demonstrations (N >= 1): Episodes of the planner to clone.  [default: 2000]
         k (N >= 1): Slots in an observation (search).  [default: 5]
+        curriculum (size): Begin with the smallest tenth of the places, and add larger ones evenly until half of --steps
+            (search).  [default: all places from the start]
 
     Evaluation:
         evaluate_every (N >= 1): Decisions between evaluations.  [default: 100000; to drive, a twentieth of --steps]
         evaluation_episodes (N >= 2): Episodes of an evaluation, in held-out worlds; to drive, on each lot for each kind
             of slot.  [default: 256; to drive, 64]
-        test_on (NAME|FILE[,...]): Scenarios to test in at the end.  [default: those of the training]
+        held_out (0 < X < 1): Train on other places than evaluations are in: hold out this share of --scenario, by a
+            hash of each lot (search).  [default: none]
+        evaluate_on (NAME|FILE|DIR[,...]): Hold out these places instead (search).  [default: none]
+        test_on (NAME|FILE|DIR[,...]): Scenarios to test in at the end.  [default: those of the training; with held-out
+            places, all of either side together]
         agents (NAME[,...]|none): Agents that are drawn for comparison.  [default: belief, mdp-tuned, mdp, first-free,
-            greedy-drive, greedy-goal; to drive, planner]
+            greedy-drive, greedy-goal; with held-out places, belief, mdp, first-free, greedy-drive; to drive, planner]
         beside (DIR[,...]): Folders of other trainings with the same evaluations, to draw in the same figure.
 
     Results:
@@ -96,12 +107,14 @@ def train(
 
     given = {
         "scenarios": tuple(args.World(lot=lot).specs(scenario)) if scenario or lot else None,
+        "evaluate_on": tuple(args.scenario_specs(evaluate_on)) if evaluate_on else None,
         "test_on": tuple(args.scenario_specs(test_on)) if test_on else None,
         "agents": None if agents is None else [] if agents == "none" else split_agents(agents),
     }
     spec = TrainingSpec().changed(
         env=env, algorithm=algorithm, steps=steps, trainings=trainings, seed=seed, clone=clone,
-        demonstrations=demonstrations, k=k, evaluate_every=evaluate_every, evaluation_episodes=evaluation_episodes,
+        demonstrations=demonstrations, k=k, held_out=held_out, curriculum=curriculum, evaluate_every=evaluate_every,
+        evaluation_episodes=evaluation_episodes,
         tensorboard=tensorboard, **given, **machines.given,
     )  # fmt: skip
     out = out or Path("results") / _task_of(spec).folder
@@ -116,7 +129,7 @@ def _task_of(spec: TrainingSpec) -> TrainingTask:
     return DriveTask(spec) if spec.env == "drive" else SearchTask(spec)
 
 
-def run_training(spec: TrainingSpec, out: Path, folder: args.RunFolder, beside: Sequence[str] = ()) -> None:
+def run_training(spec: TrainingSpec, out: Path, folder: args.ReportedRun, beside: Sequence[str] = ()) -> None:
     """Train, test and draw; see `train`.
 
     Raises:
@@ -132,6 +145,8 @@ def run_training(spec: TrainingSpec, out: Path, folder: args.RunFolder, beside: 
     others = curves_beside(beside, out, task)
     _require_free(out, settings, folder)
     console = make_console()
+    if task.announcement:
+        console.print(task.announcement)
     with args.workers_of(spec) as workers:
         training = dataclasses.replace(task.training(console.status), command=tuple(command_line()))
         _claim(out, settings, folder.overwrite)
@@ -147,7 +162,7 @@ def run_training(spec: TrainingSpec, out: Path, folder: args.RunFolder, beside: 
         make_report(out, spec)
 
 
-def _require_free(out: Path, settings: Row, folder: args.RunFolder) -> None:
+def _require_free(out: Path, settings: Row, folder: args.ReportedRun) -> None:
     """Check that the folder holds no training, or one to resume or replace."""
     from parkenv.evaluation.experiments.results import read_settings, require_same_settings
 

@@ -35,6 +35,7 @@ class ObstacleKind(IntEnum):
 
 
 _EGO = 100
+_OTHERS = 1  # group of all other shapes, which are not checked against each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,6 +157,8 @@ class CollisionWorld:
             pymunk.Segment(body, points[0], points[1], 0.0) if len(points) == 2 else pymunk.Poly(body, points)
         )
         shape.collision_type = kind
+        if kind != _EGO:
+            shape.filter = pymunk.ShapeFilter(group=_OTHERS)
         self.space.add(shape)
 
     def _touch(self, arbiter: pymunk.Arbiter, space: pymunk.Space, kind: Any) -> None:

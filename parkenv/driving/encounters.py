@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,28 +27,27 @@ def to_car_frame(poses: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def encounter_times(
-    vehicle: VehicleParameters, own: FloatArray, outlines: Sequence[FloatArray], velocity: FloatArray
+    vehicle: VehicleParameters, own: FloatArray, outlines: FloatArray, velocity: FloatArray
 ) -> FloatArray:
     """Return the time until each road user comes too close to the car, at constant velocity.
 
     Args:
         vehicle: the car.
         own: (6, 3) x, y in m and yaw in rad of its middle after `PREDICTION_TIMES_S`.
-        outlines: current outline of each road user, (k, 2) m.
+        outlines: (n, k, 2) m, current outline of each road user; shorter ones repeat their last corner.
         velocity: (n, 2) velocity of each road user, m/s.
 
     Returns:
         (n,) s, one of `PREDICTION_TIMES_S`; infinity for road users that stay far enough away.
     """
     when = np.full(len(outlines), np.inf)
-    half = 0.5 * np.array([vehicle.length, vehicle.width])
-    for i, outline in enumerate(outlines):
-        if np.hypot(*(outline.mean(axis=0) - own[0, :2])) >= _NEAR_M:
-            continue
-        # Overlap with the car's box, enlarged by the clearance.
-        local = to_car_frame(own, outline + PREDICTION_TIMES_S[:, None, None] * velocity[i])
-        margin = half + (MOVING_CLEARANCE_M if np.hypot(*velocity[i]) > MOVES else STANDING_CLEARANCE_M)
-        meets = ((local.min(axis=1) < margin) & (local.max(axis=1) > -margin)).all(axis=1)
-        if meets.any():
-            when[i] = PREDICTION_TIMES_S[meets.argmax()]
+    near = np.hypot(*(outlines.mean(axis=1) - own[0, :2]).T) < _NEAR_M
+    # Overlap with the car's box, enlarged by the clearance; (n, 6, k, 2).
+    moved = PREDICTION_TIMES_S[:, None, None] * velocity[near, None, None]
+    local = to_car_frame(own, outlines[near, None] + moved)
+    moves = np.hypot(*velocity[near].T) > MOVES
+    clearance = np.where(moves, MOVING_CLEARANCE_M, STANDING_CLEARANCE_M)
+    margin = 0.5 * np.array([vehicle.length, vehicle.width]) + clearance[:, None, None]
+    meets = ((local.min(axis=2) < margin) & (local.max(axis=2) > -margin)).all(axis=2)
+    when[near] = np.where(meets.any(axis=1), PREDICTION_TIMES_S[meets.argmax(axis=1)], np.inf)
     return when

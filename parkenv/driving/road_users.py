@@ -85,9 +85,7 @@ class RoadUsers:
         Args:
             own: (6, 3) m and rad, poses of the car's centre after `PREDICTION_TIMES_S`.
         """
-        outlines = [
-            placed(corners, pose) for (_, corners), pose in zip(self.outlines, self.poses, strict=True)
-        ]
+        outlines = placed(self._traffic.corners, self.poses)
         when = encounter_times(self._vehicle, own, outlines, self._velocity)
         ahead = float(to_car_frame(own[0], own[-1:, :2])[0, 0])
         for i in np.flatnonzero(np.isfinite(when)).tolist():

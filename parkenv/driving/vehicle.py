@@ -123,11 +123,11 @@ class VehicleParameters:
 
 
 def placed(points: FloatArray, pose: FloatArray) -> FloatArray:
-    """Transform points of a body, (k, 2) m, to poses, (..., 3); returns (..., k, 2) m."""
+    """Transform points of one body, (k, 2) m, or of each, (..., k, 2) m, to poses, (..., 3); returns (..., k, 2) m."""
     pose = np.asarray(pose, dtype=np.float64)
     cosine, sine = np.cos(pose[..., 2, None]), np.sin(pose[..., 2, None])
-    x = pose[..., 0, None] + cosine * points[:, 0] - sine * points[:, 1]
-    y = pose[..., 1, None] + sine * points[:, 0] + cosine * points[:, 1]
+    x = pose[..., 0, None] + cosine * points[..., 0] - sine * points[..., 1]
+    y = pose[..., 1, None] + sine * points[..., 0] + cosine * points[..., 1]
     return np.stack([x, y], axis=-1)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,6 +42,7 @@ class YieldingTraffic:
 
     Attributes:
         outlines: kind and outline, (k, 2) m in its own frame, of each road user, cars first.
+        corners: (n, k, 2) m, these outlines; shorter ones repeat their last corner.
     """
 
     def __init__(self, lot: ParkingLot, traffic: Traffic, key: np.uint64, slots: SlotLot) -> None:
@@ -57,6 +57,12 @@ class YieldingTraffic:
                 *((ObstacleKind.PEDESTRIAN, outline) for outline in people),
             ]
 
+        longest = max((len(outline) for _, outline in self.outlines), default=0)
+        padded = [
+            np.pad(outline, ((0, longest - len(outline)), (0, 0)), "edge") for _, outline in self.outlines
+        ]
+        self.corners = np.array(padded).reshape(-1, longest, 2)
+
     def poses(self, clocks: FloatArray) -> FloatArray:
         """Return poses, (n, 3) x, y in m and yaw in rad, at clocks, (n,) s."""
         return self._rounds.poses_at(clocks)
@@ -66,23 +72,11 @@ class YieldingTraffic:
 
         Road users whose clock is NaN are left out.
         """
-        there = np.isfinite(clocks)
-        known = np.where(there, clocks, 0.0)
-        at = [self._rounds.at(clock) for clock in known.tolist()]
-        seen = [movers for movers in at if movers is not None]
-        if not seen:
+        if not self.outlines:
             return None
-        poses, n = self.poses(known), seen[0].n_vehicles
-        stride = np.array([movers.walker_stride[k] for k, movers in enumerate(seen[n:])])
-        drives, walks = there[:n], there[n:]
-        return replace(
-            seen[0],
-            vehicle_pose=poses[:n][drives],
-            vehicle_model=seen[0].vehicle_model[drives],
-            walker_pose=poses[n:][walks],
-            walker_stride=stride[walks],
-            walker_look=seen[0].walker_look[walks],
-        )
+        there = np.isfinite(clocks)
+        every = self._rounds.movers_at(np.where(there, clocks, 0.0))
+        return every.only(there[: every.n_vehicles], there[every.n_vehicles :])
 
     def initial_clocks(self, car: FloatArray) -> FloatArray:
         """Return clocks, (n,) s, at which no road user is close to a car with these corners, (4, 2) m."""
@@ -106,9 +100,10 @@ class YieldingTraffic:
         for later in ahead:
             poses = self.poses(clocks + later)
             close = np.hypot(*(poses[:, :2] - middle).T) < _FAR_M
-            for i in np.flatnonzero(close & clear).tolist():
-                outline = shapely.Polygon(placed(self.outlines[i][1], poses[i]))
-                clear[i] = shapely.distance(body, outline) > GAP_M
+            asked = np.flatnonzero(close & clear)
+            if len(asked):
+                outlines = shapely.polygons(placed(self.corners[asked], poses[asked]))
+                clear[asked] = shapely.distance(body, outlines) > GAP_M
             if not close.any():
                 break  # at these speeds no road user comes close within the prediction time
         return clear

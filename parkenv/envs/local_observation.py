@@ -51,16 +51,18 @@ from parkenv.envs.search_records import (
     BLOCK_SIZE,
     N_ACTIONS,
     N_REGIONS,
+    PROCESS_KIND,
     SENTINEL,
     block_at,
+    edge_at,
     scenario_at,
     search_at,
     slot_at,
 )
 from parkenv.errors import InputError
 from parkenv.world.lot import MOVES
-from parkenv.world.occupancy_kernel import inlined, kernel
-from parkenv.world.pointers import float64s, int32s, int64s
+from parkenv.world.occupancy_kernel import inlined, kernel, prefetch_forecast
+from parkenv.world.pointers import float64s, in_one_block, int32s, int64s
 from parkenv.world.scenario import SearchProblem
 from sim_sensors.compilation import compiled
 
@@ -84,16 +86,21 @@ class Surroundings(NamedTuple):
     fixed: NDArray[np.float32]  # (n, 46 + 8k) float32, the constant part of the observation
     starts: NDArray[np.int32]  # (n + 1,) int32, start of each row's slots in `slots`
     slots: NDArray[np.int32]  # int32, the near or ahead slots of each row, without repeats
-    # (n, k) int32, indices of the nearest ones into the row's slots; -1 past the last
-    near: NDArray[np.int32]
-    # (n, 4, k) int32, indices of those ahead of each move, least drive plus walk first; -1 past the last
-    ahead: NDArray[np.int32]
+    # (n, k) int16, indices of the nearest ones into the row's slots; -1 past the last
+    near: NDArray[np.int16]
+    # (n, 4, k) int16, indices of those ahead of each move, least drive plus walk first; -1 past the last
+    ahead: NDArray[np.int16]
     total_s: FloatArray  # (n, 4, k) s, drive plus walk via each slot of `ahead`
     crow_s: FloatArray  # (n, 2) s, coordinates divided by the driving speed
     samples: NDArray[np.int32]  # (n_lots, 4, 4) int32, sample slots from each quarter of the lot by walk
     first_view: NDArray[np.int64]  # (n_lots,) int64, start of each lot in `view_s`
     view_s: FloatArray  # s, straight-line drive plus walk for each slot in view of each vertex
     columns: NDArray[np.int32]  # int32, scratch space for the columns of a row's slots
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory, bytes."""
+        return sum(array.nbytes for array in self)
 
     @classmethod
     def of(cls, problems: Sequence[SearchProblem], k: int) -> Surroundings:
@@ -116,20 +123,11 @@ class Surroundings(NamedTuple):
         fixed, slots, near, ahead, total_s, crow_s, samples = rest
         views = [_view_s(problem) for problem in problems]
         first_view = np.concatenate([[0], np.cumsum([len(seconds) for seconds in views])[:-1]])
-        return cls(
-            first.astype(np.int64),
-            fixed,
-            starts,
-            slots,
-            near,
-            ahead,
-            total_s,
-            crow_s,
-            samples,
-            first_view.astype(np.int64),
-            np.concatenate(views),
-            np.zeros(int(count.max()), dtype=np.int32),
-        )
+        arrays: list[NDArray[Any]] = [
+            first.astype(np.int64), fixed, starts, slots, near, ahead, total_s, crow_s, samples,
+            first_view.astype(np.int64), np.concatenate(views), np.zeros(int(count.max()), dtype=np.int32),
+        ]  # fmt: skip
+        return cls(*in_one_block(arrays))
 
 
 def local_space(k: int) -> spaces.Dict:
@@ -169,7 +167,7 @@ class LocalObservation(
         super().__init__(env)
         if not isinstance(env.unwrapped, SearchEnv):
             raise TypeError(f"LocalObservation wraps parkenv/Search-v2, not {type(env.unwrapped).__name__}")
-        self._surroundings = Surroundings.of([env.unwrapped.scenario], k)
+        self._surroundings = Surroundings.of(env.unwrapped.scenarios, k)
         self.observation_space = local_space(k)
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
@@ -183,12 +181,13 @@ class LocalObservation(
 @kernel
 def observe_surroundings_at(address: int, around: Surroundings, local: NDArray[np.float32]) -> None:
     """Call `observe_surroundings` for a single search."""
-    observe_surroundings(search_at(address, 0), around, 0, local)
+    observe_surroundings(search_at(address, 0), around, local)
 
 
 @kernel
-def observe_surroundings(search: Any, around: Surroundings, lot: int, local: NDArray[np.float32]) -> None:
+def observe_surroundings(search: Any, around: Surroundings, local: NDArray[np.float32]) -> None:
     """Write the local observation; must be called after each reset and each step."""
+    lot = search.place
     if search.n_steps == 0:
         _forecast_regions(search, around, lot)
     _remember(search, around, lot)
@@ -217,7 +216,7 @@ def observe_surroundings(search: Any, around: Surroundings, lot: int, local: NDA
         at = HERE + PER_MOVE * move
         if local[at] == 0.0:
             continue
-        target = int64s(scenario.targets)[search.vertex * N_ACTIONS + move]
+        target = edge_at(scenario.edges, search.vertex * N_ACTIONS + move).target
         local[at + 3] = 1.0 if target == search.previous_vertex else 0.0
         if remembered != _NOWHERE:
             local[at + 7] = _squashed(_crow_s(around, first + target, first + remembered))
@@ -287,6 +286,11 @@ def _crow_s(around: Surroundings, one: int, other: int) -> float:
 @kernel
 def _forecast_regions(search: Any, around: Surroundings, lot: int) -> None:
     """Average the forecast of a few slots in each quarter of the lot."""
+    scenario = scenario_at(search.scenario, 0)
+    if scenario.prior_kind == PROCESS_KIND:
+        for region in range(N_REGIONS):
+            for i in range(SAMPLES):
+                prefetch_forecast(scenario.prior, search.hour, np.int64(around.samples[lot, region, i]))
     for region in range(N_REGIONS):
         free = 0.0
         for i in range(SAMPLES):
@@ -365,7 +369,8 @@ def _around(problem: SearchProblem, k: int) -> tuple[NDArray[Any], ...]:
     shares = (np.arange(N_REGIONS)[:, None] + (np.arange(SAMPLES) + 0.5) / SAMPLES) / N_REGIONS
     samples = by_walk[(shares * lot.n_slots).astype(np.int64)].astype(np.int32)
     finite = np.where(ahead_index >= 0, total_s, 0.0)
-    return count, fixed, slots, near_index, ahead_index, finite, crow_s, samples[None]
+    indices = near_index.astype(np.int16), ahead_index.astype(np.int16)
+    return count, fixed, slots, *indices, finite, crow_s, samples[None]
 
 
 @compiled

@@ -14,7 +14,7 @@ from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector import Detector
 from parkenv.perception.pipeline import PerceptionPipeline, PerceptionResult
 from parkenv.perception.slot_filter import SlotObservation
-from parkenv.scenarios.build import make_scenario
+from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 from sim_sensors.rig import SensorRig
@@ -142,7 +142,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
 
     def __init__(
         self,
-        scenario: str | Scenario = "campus",
+        scenario: ScenarioSource = "campus",
         render_mode: str | None = None,
         rig: str | SensorRig | None = None,
         weather: str | None = None,

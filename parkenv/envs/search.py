@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from operator import index
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -19,18 +20,21 @@ from parkenv.envs.search_kernel import (
 from parkenv.envs.search_records import NEVER_OBSERVED, ScenarioRecords, Searches
 from parkenv.envs.search_state import SearchState
 from parkenv.errors import InputError
-from parkenv.scenarios.build import make_scenario
+from parkenv.scenarios.build import ScenarioSources, make_scenarios
 from parkenv.world.day_error import MAX_LOGITS
 from parkenv.world.keyed_random import seed_state
 from parkenv.world.lot import ACTIONS, PARK
-from parkenv.world.scenario import Scenario
+from parkenv.world.scenario import Scenario, SearchProblem
 
 if TYPE_CHECKING:
     from parkenv.envs.rendering import SearchRenderer
 
 LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no search takes three years
 MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
-_REBUILT = {"searches", "_state", "_address", "_copies", "_copy_mask", "_seeded_with", "_begun", "_over"}
+_REBUILT = {
+    "searches", "scenario", "_state", "_address", "_copies", "_place", "_step", "_copy_mask", "_copy_masks",
+    "_seeded_with", "_begun", "_over",
+}  # fmt: skip
 
 
 class SavedSearch(NamedTuple):
@@ -109,12 +113,30 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     walked_m, failed_parks, slots_passed (slots whose vertex the car stopped at) and parked. The step count of a
     time-limit wrapper is not part of `get_state`.
 
+    ## Places
+    With several scenarios, each episode is in one of them, drawn from the seed and the number of the episode: the same
+    seed gives the same places, whatever the agent does. `info["place"]` names the scenario after each reset and step,
+    and `env.unwrapped.scenario` is it. The observation space fits the largest lot: in smaller ones, slots past the last
+    are taken (1) and never observed. `parkenv.envs.local_observation.LocalObservation` has the same size on every lot.
+
+    ```python
+    >>> import gymnasium as gym
+    >>> import parkenv
+    >>> from parkenv.envs.local_observation import LocalObservation
+    >>> env = LocalObservation(gym.make("parkenv/Search-v2", scenario=["campus", "street", "mini"]))
+    >>> [env.reset(seed=seed)[1]["place"] for seed in range(5)]
+    ['mini', 'campus', 'street', 'campus', 'campus']
+
+    ```
+
     ## Keys
     For `gymnasium.utils.play.play(env, wait_on_player=True, noop=4)` (needs the extra `human`): w, s, a, d drive up,
     down, left, right; space parks.
 
     ## Arguments
-    - `scenario`: a `Scenario`, or the name of a packaged one: campus, jam, street, mini.
+    - `scenario`: a `Scenario`; the name of a packaged one: campus, jam, street, mini; a scenario file (.toml); a lot
+      (.geojson), with a typical week and days that differ from it by 0.8 logits; a folder of such files; or a sequence
+      of these. See `parkenv.make_scenarios`.
     - `render_mode`: `rgb_array` (480, 640, 3), `human` (needs the extra `human`), or `ansi`.
     - further keywords replace fields of the scenario, e.g. `failure_s=90.0`; unknown ones raise an error.
 
@@ -155,28 +177,25 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         "render_fps": 8,
     }
     observation_space: spaces.Dict
+    scenario: Scenario
 
     def __init__(
-        self, scenario: str | Scenario = "campus", render_mode: str | None = None, **changes: Any
+        self, scenario: ScenarioSources = "campus", render_mode: str | None = None, **changes: Any
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise InputError(f"render_mode is {render_mode!r}, want one of {self.metadata['render_modes']}")
-        self.scenario = make_scenario(scenario, **changes)
+        self.scenarios = tuple(make_scenarios(scenario, **changes))
         self.render_mode = render_mode
-        lot = self.scenario.lot
         self.action_space = spaces.Discrete(len(ACTIONS))
-        self.observation_space = search_space(lot.n_slots, lot.n_vertices)
-        self._step = step_exact_at if self.scenario.sensor_model.perfect else step_noisy_at
-        self._vertices = list(np.arange(lot.n_vertices))
+        self.observation_space = space_of(self.scenarios)
+        self._vertices = list(np.arange(max(one.lot.n_vertices for one in self.scenarios)))
         self._renderer: SearchRenderer | None = None
         self._make_search()
 
     def _make_search(self) -> None:
-        self.searches = Searches(
-            ScenarioRecords([self.scenario]), np.zeros(1, dtype=np.int64), full_belief=True
-        )
+        self.searches = Searches(ScenarioRecords(self.scenarios), 1, full_belief=True)
         self._address = self.searches.address
-        self._state = SearchState(self.scenario, self.searches)
+        self._state = SearchState(self.searches)
         # Bound methods that copy the parts of an observation: looking them up takes a tenth of a step.
         self._copies = (
             self.searches.records["clock"][0].copy,
@@ -184,9 +203,21 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self.searches.belief[0].reshape(-1).copy,
             self.searches.day_error[0].copy,
         )
-        self._copy_mask = [mask.copy for mask in self.scenario.action_masks]
+        self._copy_masks = [[mask.copy for mask in one.action_masks] for one in self.scenarios]
+        self._place = -1
+        self._enter_place()
         self._seeded_with: int | None = None
         self._begun, self._over = False, True
+
+    def _enter_place(self) -> None:
+        """Take the scenario of the episode."""
+        place = int(self.searches.records["place"][0])
+        if place == self._place:
+            return
+        self._place, self.scenario = place, self.scenarios[place]
+        self._step = step_exact_at if self.scenario.sensor_model.perfect else step_noisy_at
+        self._copy_mask = self._copy_masks[place]
+        self.close()
 
     @property
     def state(self) -> SearchState:
@@ -207,6 +238,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         """Continue from a state returned by `get_state` of an environment with the same scenario."""
         self.searches.restore(state.arrays)
         self._state.path = list(state.path)
+        self._enter_place()
         self._begun, self._over = True, self._state.over
 
     def __getstate__(self) -> dict[str, Any]:
@@ -236,14 +268,15 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self._seeded_with = self.np_random_seed
             record["seed_state"] = seed_state(self.np_random_seed)
         begin_search_at(self._address)
-        if len(self.searches.external_forecast):
+        if self.searches.needs_python:
             self.searches.complete_arrival(0)
             init_external_forecast_at(self._address)
+        self._enter_place()
         self._begun, self._over = True, False
         self._state.path = [self._state.vertex]
         if self.render_mode == "human":
             self.render()
-        return self._observation(self._state.vertex), {}
+        return self._observation(self._state.vertex), {"place": self.scenario.name}
 
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Drive along an edge, or attempt to park; see the class."""
@@ -284,6 +317,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             "failed_parks": failed_parks,
             "slots_passed": slots_passed,
             "parked": parked,
+            "place": self.scenario.name,
         }
         if self.render_mode == "human":
             self.render()
@@ -345,6 +379,12 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             "day_error": day_error(),
             "action_mask": self._copy_mask[vertex](),
         }
+
+
+def space_of(scenarios: Sequence[SearchProblem]) -> spaces.Dict:
+    """The observation space that fits the lots of all scenarios."""
+    lots = [one.lot for one in scenarios]
+    return search_space(max(lot.n_slots for lot in lots), max(lot.n_vertices for lot in lots))
 
 
 def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:

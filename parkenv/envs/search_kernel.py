@@ -25,8 +25,10 @@ from parkenv.envs.search_records import (
     OBSERVED_AT,
     P_OBSERVED,
     PROCESS_KIND,
+    SCENARIO,
     SENTINEL,
     block_at,
+    edge_at,
     scenario_at,
     search_at,
     slot_at,
@@ -36,6 +38,7 @@ from parkenv.world.keyed_random import (
     ARRIVAL_STREAM,
     ENTRY_STREAM,
     OBSERVATION_STREAM,
+    PLACE_STREAM,
     VIEW_STREAM,
     episode_key,
     keyed_uniform,
@@ -60,6 +63,7 @@ TIME_METRICS = (
 COUNT_METRICS = ("failed_parks", "slots_passed")
 STEP_RESULT = ("reward", *REWARD_TERMS, *TIME_METRICS, *COUNT_METRICS, "parked", "over", "vertex")
 """Names of the numbers that a step returns; metrics are those of the episode so far."""
+SCENARIO_BYTES = SCENARIO.itemsize
 
 # ---- one search, from Python
 
@@ -209,9 +213,13 @@ def step_result(search: Any) -> tuple[Any, ...]:
 
 @kernel
 def arrive(search: Any) -> None:
-    """Begin a search in the world of its seed and episode, without observations."""
-    scenario = scenario_at(search.scenario, 0)
+    """Begin a search in the place and the world of its seed and episode, without observations."""
     key = episode_key(search.seed_state, search.episode)
+    clear_slots(search)
+    search.place = int(keyed_uniform(key, PLACE_STREAM, 0, 0) * search.n_places)
+    search.scenario = search.scenarios + search.place * SCENARIO_BYTES
+    scenario = scenario_at(search.scenario, 0)
+    search.process = scenario.world
     day = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * scenario.n_weekdays)
     midnight = int64s(scenario.weekdays)[day] * DAY_S
     second_of_window = keyed_uniform(key, ARRIVAL_STREAM, 0, 1) * (
@@ -220,7 +228,6 @@ def arrive(search: Any) -> None:
     arrival = midnight + (scenario.window_start + second_of_window)
     entry = int(keyed_uniform(key, ENTRY_STREAM, 0, 0) * scenario.n_entries)
     _, hour, second = hour_of_week(arrival)
-    clear_slots(search)
     search.key, search.day, search.hour, search.second_of_hour = key, day, hour, second
     search.arrival, search.time, search.second_of_day = arrival, arrival, arrival - midnight
     if scenario.world_kind == PROCESS_KIND:
@@ -280,10 +287,10 @@ def write_clock(search: Any) -> None:
 def drive_or_park(search: Any, action: int) -> None:
     """Move the car, or attempt to park."""
     scenario, vertex = scenario_at(search.scenario, 0), search.vertex
-    edge = vertex * N_ACTIONS + action
-    drive_s, failed_s, walk_s, parking_cost_s = float64s(scenario.seconds)[edge], 0.0, 0.0, 0.0
-    search.driven_m += float64s(scenario.metres)[edge]
-    target = int64s(scenario.targets)[edge]
+    edge = edge_at(scenario.edges, vertex * N_ACTIONS + action)
+    drive_s, failed_s, walk_s, parking_cost_s = edge.seconds, 0.0, 0.0, 0.0
+    search.driven_m += edge.metres
+    target = edge.target
     if target != vertex:
         search.previous_vertex, search.vertex = vertex, target
     elif action == PARK and vertex < scenario.n_slots:
@@ -533,6 +540,11 @@ def init_prior(search: Any) -> None:
             belief[FORECAST * width + slot], belief[DECAY_RATE * width + slot] = forecast_of(search, slot)
     for slot in range(n):
         p_occupied[slot] = belief[P_OBSERVED * width + slot] = belief[FORECAST * width + slot]
+        belief[OBSERVED_AT * width + slot] = NEVER_OBSERVED
+    # Padding past the last slot; the previous place may have been larger.
+    for slot in range(n, width):
+        p_occupied[slot] = belief[FORECAST * width + slot] = belief[P_OBSERVED * width + slot] = 1.0
+        belief[DECAY_RATE * width + slot] = 0.0
         belief[OBSERVED_AT * width + slot] = NEVER_OBSERVED
 
 

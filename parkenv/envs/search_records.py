@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,20 +13,25 @@ from parkenv.world.counted_occupancy import CountedOccupancy
 from parkenv.world.lot import MOVES, PARK
 from parkenv.world.occupancy import (
     Arrival,
-    IntArray,
     OccupancyModel,
     OccupancyProcess,
     PriorModel,
 )
 from parkenv.world.occupancy_kernel import CURSOR_FIELDS, PROCESS, RECORDED_DAY, WORLD_FIELDS
 from parkenv.world.occupancy_log import weekday_of
-from parkenv.world.pointers import ADDRESS, address_of, record_at
+from parkenv.world.pointers import ADDRESS, address_of, in_one_block, record_at
 from parkenv.world.recorded_occupancy import RecordedOccupancy
 from parkenv.world.scenario import Scenario
 
 N_ACTIONS = PARK + 1
 PROCESS_KIND, LOG_KIND, EXTERNAL_KIND = range(3)
 """Kinds of world and prior: a generating process; a replayed log; a forecast computed in Python at every arrival."""
+
+EDGE = np.dtype([("target", np.int64), ("seconds", np.float64), ("metres", np.float64)], align=True)
+"""Result of an action at a vertex: the vertex that it leads to, s, m.
+
+Parking, and actions that the graph does not have, lead back to the same vertex.
+"""
 
 SCENARIO = np.dtype(
     [
@@ -41,11 +46,8 @@ SCENARIO = np.dtype(
         ("weekdays", ADDRESS),
         ("n_entries", np.int64),
         ("entries", ADDRESS),
-        # Results of actions, (n_vertices, 5) each: int64 vertices; float64 s; float64 m. Parking, and actions that the
-        # graph does not have, lead back to the same vertex.
-        ("targets", ADDRESS),
-        ("seconds", ADDRESS),
-        ("metres", ADDRESS),
+        # (n_vertices, 5) EDGE records.
+        ("edges", ADDRESS),
         # (n_vertices, 5) uint8, mask of the actions that the graph has.
         ("action_masks", ADDRESS),
         # (n_slots,) float64: walk to the goal, s and m; parking cost, s.
@@ -70,6 +72,13 @@ SCENARIO = np.dtype(
 )
 """The constant part of the searches in a scenario; the comments describe the arrays at the addresses."""
 
+_TABLES = tuple(
+    name
+    for name in SCENARIO.names or ()
+    if SCENARIO[name] == ADDRESS
+    and name not in ("n_slots", "n_weekdays", "n_entries", "world_kind", "prior_kind")
+)
+_PROCESS_TABLES = ("factors", "profiles", "hazards", "hourly_marginals")
 N_REGIONS = 4
 
 _PROGRESS = [
@@ -111,6 +120,8 @@ _PROGRESS = [
     # free, or -1.
     ("free_by_region", np.float64, (N_REGIONS,)),
     ("remembered_slot", np.int64),
+    # Index of the search's scenario.
+    ("place", np.int64),
 ]
 _EPISODES = [("episode", np.int64), ("seed_state", np.uint64), ("clock", np.float32, (2,))]
 
@@ -124,6 +135,9 @@ SEARCH = np.dtype(
         *_EPISODES[:2],
         # Time since Monday 00:00, and since the search began, as observed.
         _EPISODES[2],
+        # The SCENARIO records, and from how many of them, the first ones, the place of an episode is drawn.
+        ("scenarios", ADDRESS),
+        ("n_places", np.int64),
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
         # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; PROCESS
         # record of the world, if it is a process.
@@ -175,16 +189,17 @@ A few vector instructions update a block, and the data of a search stay close to
 FORECAST, DECAY_RATE, P_OBSERVED, OBSERVED_AT = range(4)  # the parts of the observation's `belief`
 NEVER_OBSERVED = -1.0  # `observed_at` of a slot not observed in this search
 
-scenario_at, search_at = record_at(SCENARIO), record_at(SEARCH)
+scenario_at, search_at, edge_at = record_at(SCENARIO), record_at(SEARCH), record_at(EDGE)
 slot_at, block_at = record_at(SLOT), record_at(BLOCK)
 
 
 class ScenarioRecords:
-    """Scenarios as records, and the arrays that the records point to.
+    """Scenarios as records, and the arrays that the records point to: one set of tables for any number of searches.
 
     Attributes:
         records: (n,) of the dtype SCENARIO.
         scenarios: the scenarios.
+        n_bytes: memory of records and arrays, bytes.
 
     Raises:
         InputError: an occupancy that is neither a process nor a log.
@@ -197,22 +212,48 @@ class ScenarioRecords:
         for record, scenario in zip(self.records, scenarios, strict=True):
             self._write_search(record, scenario)
             self._write_occupancy(record, scenario)
+        if len(scenarios) > 1:
+            self._join()
+        arrays = {id(array): array for array in _arrays_in(self._kept)}
+        self.n_bytes = self.records.nbytes + sum(array.nbytes for array in arrays.values())
+
+    def _join(self) -> None:
+        """Move the tables of all scenarios into one block of memory."""
+        processes = [one for one in self._kept if isinstance(one, OccupancyProcess)]
+        tables = [one for one in self._kept if isinstance(one, np.ndarray)]
+        others = [one for one in self._kept if not isinstance(one, np.ndarray | OccupancyProcess)]
+        tables += [getattr(one, name) for one in processes for name in _PROCESS_TABLES]
+        copies = in_one_block(tables)
+        moved = {
+            address_of(old, old.dtype): address_of(new, new.dtype)
+            for old, new in zip(tables, copies, strict=True)
+        }
+        for one in processes:
+            record = one.record.copy()
+            for name in _PROCESS_TABLES:
+                record[name] = moved[int(record[name][0])]
+            moved[address_of(one.record, PROCESS)] = address_of(record, PROCESS)
+            others += [record, *(value for value in (one.nearness, one._centring) if value is not None)]
+        for name in _TABLES:
+            self.records[name] = [moved.get(int(address), int(address)) for address in self.records[name]]
+        self._kept = [*copies, *others]
 
     def _keep(self, values: ArrayLike, dtype: Any = np.float64) -> int:
         array = np.ascontiguousarray(values, dtype)
+        array.flags.writeable = False
         self._kept.append(array)
         return address_of(array, dtype)
 
     def _write_search(self, record: np.void, scenario: Scenario) -> None:
         lot, masks = scenario.lot, scenario.action_masks
-        targets = np.repeat(np.arange(lot.n_vertices)[:, None], N_ACTIONS, axis=1)
-        seconds = np.full(targets.shape, scenario.wait_s)
-        metres = np.zeros(targets.shape)
+        edges = np.zeros(masks.shape, EDGE)
+        edges["target"] = np.arange(lot.n_vertices)[:, None]
+        edges["seconds"] = scenario.wait_s
         moves = masks[:, : len(MOVES)] == 1
-        targets[:, :PARK][moves] = lot.neighbors[moves]
-        seconds[:, :PARK][moves] = scenario.move_s[moves]
-        metres[:, :PARK][moves] = lot.edge_length[moves]
-        seconds[: lot.n_slots, PARK] = 0.0
+        edges["target"][:, :PARK][moves] = lot.neighbors[moves]
+        edges["seconds"][:, :PARK][moves] = scenario.move_s[moves]
+        edges["metres"][:, :PARK][moves] = lot.edge_length[moves]
+        edges["seconds"][: lot.n_slots, PARK] = 0.0
         entries = lot.entry_vertices if scenario.entry is None else lot.entry_vertices[[scenario.entry]]
         starts, viewed = scenario.slots_in_view
         rates = scenario.sensor_rates
@@ -225,9 +266,7 @@ class ScenarioRecords:
             "window_end": scenario.arrival.end_s,
             "n_entries": len(entries),
             "entries": self._keep(entries, np.int64),
-            "targets": self._keep(targets, np.int64),
-            "seconds": self._keep(seconds),
-            "metres": self._keep(metres),
+            "edges": self._keep(edges, EDGE),
             "action_masks": self._keep(masks, np.uint8),
             "walk_s": self._keep(scenario.walk_s),
             "walk_m": self._keep(lot.walk_m(scenario.goal)),
@@ -277,12 +316,21 @@ class ScenarioRecords:
         return EXTERNAL_KIND, 0
 
 
+def _arrays_in(kept: Sequence[Any]) -> Iterator[NDArray[Any]]:
+    """Yield the arrays among what is kept, and those of its occupancy models."""
+    for one in kept:
+        if isinstance(one, np.ndarray):
+            yield one
+        else:
+            yield from (value for value in vars(one).values() if isinstance(value, np.ndarray))
+
+
 class Searches:
     """One or more running searches as records, and the arrays that the records point to.
 
     Args:
-        scenarios: scenarios of the searches.
-        scenario_of: (n,) index into `scenarios` for each search.
+        scenarios: scenarios of the searches; if there are several, one is drawn for each episode.
+        n: number of searches.
         full_belief: whether to keep `p_occupied` and `belief` up to date.
 
     Attributes:
@@ -291,15 +339,18 @@ class Searches:
             first use; the first column is the sentinel. m is the number of slots of the largest lot.
         external_forecast: (n, 2, m) float64, forecast and decay rate of priors that only Python can compute; else
             (0, 2, 0).
+        needs_python: whether an arrival is complete only after `complete_arrival`.
         day_error: (n, 2) float32, logits, day error of each search's forecast: level and slope.
         p_occupied: (n, m) float32, current belief in every slot; (0, 0) if not kept.
         belief: (n, 4, m) float32: forecast, decay rate, belief after the last observation, and its time; (0, 4, 0) if
             not kept.
     """
 
-    def __init__(self, scenarios: ScenarioRecords, scenario_of: IntArray, full_belief: bool) -> None:
-        n, m = len(scenario_of), int(scenarios.records["n_slots"].max())
+    def __init__(self, scenarios: ScenarioRecords, n: int, full_belief: bool) -> None:
+        m = int(scenarios.records["n_slots"].max())
         external = bool((scenarios.records["prior_kind"] == EXTERNAL_KIND).any())
+        counted = any(isinstance(one.occupancy, CountedOccupancy) for one in scenarios.scenarios)
+        self.needs_python = external or counted
         self.scenarios = scenarios
         self.records = np.zeros(n, SEARCH)
         self.slots = np.zeros((n, m + 1), SLOT)
@@ -314,28 +365,38 @@ class Searches:
         self.belief[:, [FORECAST, P_OBSERVED]] = 1.0
         self.belief[:, OBSERVED_AT] = NEVER_OBSERVED
         self.records["width"] = m
-        self.records["scenario"] = address_of(scenarios.records, SCENARIO) + scenario_of * SCENARIO.itemsize
-        self.records["process"] = scenarios.records["world"][scenario_of]
-        self._scenario_of = scenario_of
+        self.records["scenarios"] = address_of(scenarios.records, SCENARIO)
+        self.records["n_places"] = len(scenarios.records)
+        self._find_scenarios()
         for name, array in self._arrays().items():
             first = address_of(array, array.dtype)
             self.records[name] = first + np.arange(n) * array.strides[0] if len(array) else 0
 
     def complete_arrival(self, search: int) -> None:
         """Add what only Python can compute about a search that has just begun: an external forecast, a counted day."""
-        if not len(self.external_forecast):
-            return
-        scenario, record = self.scenarios.scenarios[self._scenario_of[search]], self.records[search]
-        arrival = arrival_of(scenario, record)
+        scenario, record = self.scenario_of(search), self.records[search]
         self._find_process(search)
+        if self.scenarios.records["prior_kind"][record["place"]] != EXTERNAL_KIND:
+            return
+        arrival = arrival_of(scenario, record)
         forecast = scenario.forecast(arrival)
         n = len(forecast.p_occupied)
         self.external_forecast[search, :, :n] = forecast.p_occupied, forecast.decay_rate
         self.day_error[search] = forecast.day_error.level, forecast.day_error.slope
 
+    def scenario_of(self, search: int) -> Scenario:
+        """Return the scenario of a search's episode."""
+        return self.scenarios.scenarios[int(self.records["place"][search])]
+
+    def _find_scenarios(self) -> None:
+        """Write the addresses that follow from the places."""
+        place = self.records["place"]
+        self.records["scenario"] = self.records["scenarios"] + place * SCENARIO.itemsize
+        self.records["process"] = self.scenarios.records["world"][place]
+
     def _find_process(self, search: int) -> None:
         """Write the address of the process of a counted day; it differs from computer process to process."""
-        scenario = self.scenarios.scenarios[self._scenario_of[search]]
+        scenario = self.scenario_of(search)
         if isinstance(scenario.occupancy, CountedOccupancy):
             day = arrival_of(scenario, self.records[search]).day
             self.records[search]["process"] = address_of(scenario.occupancy.process_of(day).record, PROCESS)
@@ -379,9 +440,12 @@ class Searches:
             raise InputError(f"state is of a lot with {width} slots, this one has {self.records['width'][0]}")
         for name in PROGRESS_FIELDS:
             self.records[name] = records[name]
+        if not ((self.records["place"] >= 0) & (self.records["place"] < len(self.scenarios.records))).all():
+            raise InputError("state is of other scenarios")
+        self._find_scenarios()
         for mine, array in zip(self._arrays().values(), arrays, strict=True):
             mine[...] = array.view(mine.dtype)
-        if len(self.external_forecast):
+        if self.needs_python:
             for search in range(len(self.records)):
                 self._find_process(search)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,11 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.envs.shared_vec_env import SharedVecEnv
 from parkenv.errors import InputError
-from parkenv.world.scenario import Scenario
+from parkenv.scenarios.build import ScenarioSources
 
 METRICS = (
     "drive_s", "failed_s", "walk_s", "gave_up_s", "total_s", "driven_m", "walked_m", "failed_parks",
-    "slots_passed", "parked",
+    "slots_passed", "parked", "place",
 )  # fmt: skip
 
 
@@ -29,7 +29,8 @@ class SearchVecEnv(SharedVecEnv):
 
     Args:
         num_envs: number of searches.
-        scenario: a scenario or its name, or a sequence of them, assigned to the searches in rotation.
+        scenario: a scenario, its name, a file, a folder of files, or a sequence of these; if there are several, one is
+            drawn for each episode, and `info["place"]` names it at the end.
         reward_scale: factor of the rewards in seconds; returns near one are easiest to learn.
         k: number of slots in the `local` observation.
         observation: `local`, or for a single lot `full`.
@@ -49,7 +50,7 @@ class SearchVecEnv(SharedVecEnv):
     def __init__(
         self,
         num_envs: int,
-        scenario: str | Scenario | Sequence[str | Scenario] = "campus",
+        scenario: ScenarioSources = "campus",
         reward_scale: float = 1.0,
         k: int = 5,
         observation: str = "local",

@@ -18,11 +18,16 @@ class SearchState:
         path: vertices where the car has stopped, in order.
     """
 
-    def __init__(self, scenario: Scenario, searches: Searches) -> None:
-        self._scenario, self._searches = scenario, searches
+    def __init__(self, searches: Searches) -> None:
+        self._searches = searches
         self._record = searches.records[0]
         self.path: list[int] = []
         self._world: tuple[np.uint64, World] | None = None
+
+    @property
+    def scenario(self) -> Scenario:
+        """Scenario of the episode."""
+        return self._searches.scenario_of(0)
 
     def extend_path(self) -> None:
         """Add the car's vertex to the path if the car has moved."""
@@ -37,19 +42,19 @@ class SearchState:
     @property
     def arrival(self) -> Arrival:
         """When the search began."""
-        return arrival_of(self._scenario, self._record)
+        return arrival_of(self.scenario, self._record)
 
     @property
     def world(self) -> World:
         """The true occupancy; queries do not change it."""
         if self._world is None or self._world[0] != self.key:
-            self._world = self.key, self._scenario.occupancy.world(self.key, self.arrival)
+            self._world = self.key, self.scenario.occupancy.world(self.key, self.arrival)
         return self._world[1]
 
     @property
     def belief(self) -> SlotBelief:
         """A float64 copy of the current belief about the slots."""
-        forecast = self._scenario.forecast(self.arrival)
+        forecast = self.scenario.forecast(self.arrival)
         belief = SlotBelief.of_forecast(
             forecast.p_occupied, forecast.decay_rate, (forecast.day_error.level, forecast.day_error.slope)
         )

@@ -13,7 +13,7 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
 from parkenv.envs.local_observation import Surroundings, local_space, observe_surroundings
-from parkenv.envs.search import search_space
+from parkenv.envs.search import space_of
 from parkenv.envs.search_kernel import (
     COUNT_METRICS,
     REWARD_TERMS,
@@ -24,21 +24,21 @@ from parkenv.envs.search_kernel import (
     take_step,
     write_clock,
 )
+from parkenv.envs.search_prefetch import prefetch_searches
 from parkenv.envs.search_records import N_ACTIONS, ScenarioRecords, Searches, scenario_at, search_at
 from parkenv.errors import InputError
-from parkenv.scenarios.build import make_scenario
+from parkenv.scenarios.build import ScenarioSources, make_scenarios
 from parkenv.world.keyed_random import seed_state
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy import BoolArray, FloatArray, IntArray
 from parkenv.world.occupancy_kernel import kernel
 from parkenv.world.pointers import uint8s
-from parkenv.world.scenario import Scenario
 
 OBSERVATIONS = ("full", "occupancy", "local")
 MAX_ENVS = 1_000_000
 """Maximum number of environments."""
 # Gymnasium's names of the masks that say which searches have a metric.
-_WHICH = tuple(f"_{name}" for name in ("reward_terms", "parked", *TIME_METRICS, *COUNT_METRICS))
+_WHICH = tuple(f"_{name}" for name in ("reward_terms", "parked", "place", *TIME_METRICS, *COUNT_METRICS))
 _WHICH_TERMS = tuple(f"_{name}" for name in REWARD_TERMS)
 
 
@@ -114,7 +114,6 @@ def step_full(
 def step_local(
     address: int,
     around: Surroundings,
-    scenario_of: IntArray,
     actions: IntArray,
     fresh: BoolArray,
     idle: BoolArray,
@@ -125,13 +124,14 @@ def step_local(
 ) -> None:
     """As `step_full`, with the local observation."""
     for e in range(len(actions)):
+        prefetch_searches(address, around, actions, e)
         if idle[e]:
             continue
         search = search_at(address, e)
         if not fresh[e]:
             take_step(search, actions[e])
         _report(search, e, fresh[e], limit, steps, mask)
-        observe_surroundings(search, around, scenario_of[e], local[e])
+        observe_surroundings(search, around, local[e])
 
 
 @kernel
@@ -181,9 +181,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     `MultiDiscrete([5, ...])`: up, down, left, right, park.
 
     ## Observation space
-    - `observation="full"`: the `Dict` of `parkenv/Search-v2`, with a row for each search. If lots differ in size,
-      smaller lots are padded with slots that are taken (1) and never observed; the four parts of `belief` have the
-      largest lot's size.
+    - `observation="full"`: the `Dict` of `parkenv/Search-v2`, with a row for each search.
     - `observation="occupancy"`: the same without `belief`, which saves copying it.
     - `observation="local"`: a `Dict` of `local` and `action_mask`; see `parkenv.envs.local_observation`. Its size and
       cost are the same on every lot.
@@ -194,6 +192,13 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     ## Starting state
     As in `parkenv/Search-v2`. `reset(seed=s)` gives search i the seed s + i; a sequence gives one seed to each.
     Without a seed, every search continues with the next world of its seed.
+
+    ## Places
+    With several scenarios, each search draws the place of each of its episodes, also at automatic resets, as
+    `parkenv/Search-v2` does with its seed. `place_of` are the indices into `scenarios`; `info["place"]` names the
+    places after `reset`, and those of the searches that have ended. All searches share one set of tables of the places;
+    `table_bytes` and `memory_bytes` say how large they are. `n_places` limits the draw to the first scenarios, from the
+    next episodes on.
 
     ## Episode end
     As in `parkenv/Search-v2`; truncated after `max_episode_steps`. `autoreset_mode` then applies:
@@ -208,8 +213,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     ## Arguments
     - `num_envs`: number of environments.
-    - `scenario`: a `Scenario` or the name of a packaged one; or a sequence of them, assigned to the searches in
-      rotation.
+    - `scenario`: as in `parkenv/Search-v2`: a scenario, its name, a file, a folder of files, or a sequence of these.
     - `observation`: full, occupancy or local.
     - `k`: number of slots that `local` describes.
     - `max_episode_steps`: 2000 from `make_vec`.
@@ -242,7 +246,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     def __init__(
         self,
         num_envs: int = 1,
-        scenario: str | Scenario | Sequence[str | Scenario] = "campus",
+        scenario: ScenarioSources = "campus",
         observation: str = "full",
         k: int = 5,
         max_episode_steps: int | None = 2000,
@@ -263,19 +267,14 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         except ValueError:
             known = ", ".join(m.value for m in AutoresetMode)
             raise InputError(f"autoreset_mode is {autoreset_mode!r}, want one of {known}") from None
-        given = [scenario] if isinstance(scenario, (str, Scenario)) else list(scenario)
-        if not given:
-            raise InputError("scenario is an empty sequence, want at least one scenario")
-        self.scenarios = [make_scenario(one, **changes) for one in given]
+        self.scenarios = tuple(make_scenarios(scenario, **changes))
         self.num_envs = int(num_envs)
         self.max_episode_steps = max_episode_steps
         self.metadata = self.metadata | {"autoreset_mode": mode}
         self.single_action_space = spaces.Discrete(N_ACTIONS)
         self._full = observation != "local"
         if self._full:
-            lots = [one.lot for one in self.scenarios]
-            n_slots, n_vertices = max(lot.n_slots for lot in lots), max(lot.n_vertices for lot in lots)
-            space = search_space(n_slots, n_vertices)
+            space = space_of(self.scenarios)
             if observation == "occupancy":
                 space = spaces.Dict({name: one for name, one in space.items() if name != "belief"})
             self.single_observation_space = space
@@ -286,8 +285,9 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         n = self.num_envs
-        self._scenario_of = np.arange(n) % len(self.scenarios)
-        self._searches = Searches(ScenarioRecords(self.scenarios), self._scenario_of, self._full)
+        self._tables = ScenarioRecords(self.scenarios)
+        self._searches = Searches(self._tables, n, self._full)
+        self._names = np.array([one.name for one in self.scenarios])
         empty: Any = create_empty_array(self.single_observation_space, n)
         self._seen: dict[str, NDArray[Any]] = empty
         if self._full:
@@ -311,10 +311,41 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         }
 
     @property
+    def place_of(self) -> IntArray:
+        """Index into `scenarios` of the place of each search, (n_envs,)."""
+        place: IntArray = self._searches.records["place"].copy()
+        return place
+
+    @property
+    def n_places(self) -> int:
+        """Number of scenarios, the first ones, from which the places of the next episodes are drawn; settable."""
+        return int(self._searches.records["n_places"][0])
+
+    @n_places.setter
+    def n_places(self, n: int) -> None:
+        _require_count("n_places", n, len(self.scenarios))
+        self._searches.records["n_places"] = n
+
+    @property
     def bytes_each(self) -> float:
         """Memory of one search, bytes, after observing every slot; without the shared tables of the scenarios."""
         own = (a for name, a in self._seen.items() if name not in ("p_occupied", "belief", "day_error"))
         return (self._searches.n_bytes + sum(a.nbytes for a in (*own, *self._steps))) / self.num_envs
+
+    @property
+    def table_bytes(self) -> int:
+        """Memory of the tables of all scenarios, bytes, which all searches share."""
+        around = self._surroundings
+        return self._tables.n_bytes + (0 if around is None else around.n_bytes)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Memory of the batch, bytes: tables and searches, at most; what is never used takes none."""
+        return self.table_bytes + round(self.bytes_each * self.num_envs)
+
+    def __repr__(self) -> str:
+        places = f"{len(self.scenarios)} place{'s' * (len(self.scenarios) > 1)}"
+        return f"{type(self).__name__}({self.num_envs} searches, {places}, {self.memory_bytes / 1e6:.1f} MB)"
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
@@ -354,7 +385,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._arrive(which)
         self._step(np.zeros(self.num_envs, dtype=np.int64), which, ~which)
         self._done = self._done & ~which
-        return self._observations(), {}
+        return self._observations(), {"place": self._names[self.place_of], "_place": which}
 
     def get_state(self) -> tuple[NDArray[Any], ...]:
         """Return a copy of the state of all searches, for `set_state`."""
@@ -417,7 +448,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             )  # fmt: skip
         else:
             step_local(
-                self._searches.address, self._surroundings, self._scenario_of, actions, fresh, idle, self._limit, steps,
+                self._searches.address, self._surroundings, actions, fresh, idle, self._limit, steps,
                 seen["local"], seen["action_mask"],
             )  # fmt: skip
 
@@ -425,7 +456,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         """Put the selected cars at the entries of their next worlds."""
         searches = self._searches
         arrive_all(searches.address, which)
-        if not len(searches.external_forecast):
+        if not searches.needs_python:
             return
         for i in np.flatnonzero(which):
             searches.complete_arrival(int(i))
@@ -446,7 +477,11 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         if self._copy:
             terms, times, tallies, parked = terms.copy(), times.copy(), tallies.copy(), parked.copy()
         of_terms = dict(zip(REWARD_TERMS, terms, strict=True)) | dict.fromkeys(_WHICH_TERMS, done)
-        metrics: dict[str, Any] = {"reward_terms": of_terms, "parked": parked}
+        metrics: dict[str, Any] = {
+            "reward_terms": of_terms,
+            "parked": parked,
+            "place": self._names[self.place_of],
+        }
         metrics |= zip(TIME_METRICS, times, strict=True)
         metrics |= zip(COUNT_METRICS, tallies, strict=True)
         return metrics | dict.fromkeys(_WHICH, done)

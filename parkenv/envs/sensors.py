@@ -14,7 +14,7 @@ from parkenv.envs.search import LATEST, SearchEnv
 from parkenv.envs.search_state import SearchState
 from parkenv.envs.sensor_sampler import SensorSampler
 from parkenv.perception.capture import TimedCapture
-from parkenv.world.scenario import Scenario
+from parkenv.scenarios.build import ScenarioSource, make_scenario
 from sim_sensors.rig import SensorRig
 
 FARTHEST = 1e7  # bound, m, of the observed positions: Gymnasium requires one, and every lot is smaller
@@ -122,7 +122,7 @@ class SearchSensorsEnv(SensingSearchEnv):
 
     def __init__(
         self,
-        scenario: str | Scenario = "campus",
+        scenario: ScenarioSource = "campus",
         render_mode: str | None = None,
         rig: str | SensorRig | None = None,
         weather: str | None = None,
@@ -130,7 +130,7 @@ class SearchSensorsEnv(SensingSearchEnv):
         every: float = 1.0,
         **changes: Any,
     ) -> None:
-        super().__init__(scenario, render_mode, **changes)
+        super().__init__(make_scenario(scenario, **changes), render_mode)
         self._sampler = SensorSampler(self.scenario, rig, weather, captures, every)
         self._captures: list[TimedCapture] = []
         k = self._sampler.captures

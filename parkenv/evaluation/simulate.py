@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 
 from parkenv.envs.local_observation import LocalObservation
-from parkenv.world.scenario import Scenario
 from planners.agent import Agent, ClairvoyantAgent
 from sim_sensors.compilation import seconds_spent
 
@@ -94,24 +93,24 @@ def simulate(
     scenario = getattr(env.unwrapped, "scenario", None)
     if truncated and scenario is not None:
         info = dict(info)
-        charge_truncation(info, scenario)
+        charge_truncation(info, scenario.give_up_s)
     result = EpisodeResult(seed, info, truncated, decision_s, memory)
     for observer in observers:
         observer.on_end(result)
     return result
 
 
-def charge_truncation(metrics: MutableMapping[str, Any], scenario: Scenario, truncated: Any = 1.0) -> None:
+def charge_truncation(metrics: MutableMapping[str, Any], give_up_s: Any, truncated: Any = 1.0) -> None:
     """Charge truncated searches the give-up penalty, like searches that give up in a full lot.
 
     Otherwise an agent that never parks would seem cheap.
 
     Args:
         metrics: metrics of a search, or arrays with one element per search; `gave_up_s` and `total_s` are increased.
-        scenario: the scenario, with the penalty `give_up_s`.
+        give_up_s: the penalty of the scenario, or of each search's, s.
         truncated: which searches were truncated, as a number or a bool array.
     """
-    penalty = truncated * scenario.give_up_s
+    penalty = truncated * give_up_s
     metrics["gave_up_s"] = metrics["gave_up_s"] + penalty
     metrics["total_s"] = metrics["total_s"] + penalty
 

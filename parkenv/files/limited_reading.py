@@ -10,6 +10,7 @@ import errno
 import gzip
 import io
 import json
+import os
 import re
 import stat
 import tomllib
@@ -65,6 +66,9 @@ def is_there(path: str | Path) -> bool:
 def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]:
     """Open a file for reading at most `most` bytes; a name that ends in `.gz` is unpacked.
 
+    What states that it has no bytes is read as empty. Files of /proc state so whatever they hold, and some of them wait
+    for news when read, such as /proc/kmsg.
+
     Raises:
         InputError: the file cannot be read or unpacked, or more bytes were asked for; the message names it.
     """
@@ -81,7 +85,8 @@ def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]
     with file:
         try:
             packed = str(path).endswith((".gz", ".tgz"))
-            stream: io.BufferedIOBase = gzip.GzipFile(fileobj=file) if packed else file
+            stored: io.BufferedIOBase = file if os.fstat(file.fileno()).st_size else io.BytesIO()
+            stream = gzip.GzipFile(fileobj=stored) if packed else stored
             yield io.BufferedReader(_Counted(stream, most, path), 1 << 20)
         except (EOFError, gzip.BadGzipFile, zlib.error) as error:
             raise InputError(f"{path}: not a whole gzip file ({error})") from error

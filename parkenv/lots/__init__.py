@@ -3,7 +3,7 @@
 `ParkingLot` is independent of file formats; the functions here create it from files and rules.
 """
 
-from parkenv.files.names import PACKAGED_LOTS
+from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.lots.checks import check_lot
 from parkenv.lots.generators import city_lot, grid_lot
 from parkenv.lots.geojson import write_lot

@@ -6,8 +6,8 @@ from importlib import resources
 from pathlib import Path
 
 from parkenv.errors import InputError
+from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.files.limited_reading import is_there
-from parkenv.files.names import PACKAGED_LOTS
 from parkenv.lots.dragon_lake import dragon_lake_lot
 from parkenv.lots.file_formats import LotFormat, lot_format
 from parkenv.lots.geojson import read_contents

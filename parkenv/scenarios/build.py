@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from datetime import date, timedelta
 from functools import lru_cache
 from pathlib import Path
@@ -20,7 +21,7 @@ from parkenv.scenarios.spec import (
     ScenarioSpec,
     SensorModelSpec,
     TypicalWeek,
-    scenario_spec,
+    scenario_specs,
 )
 from parkenv.world.day_error import DayError
 from parkenv.world.flat_map import FlatMap
@@ -39,42 +40,70 @@ if TYPE_CHECKING:
 MIN_PAST_DAYS = 7
 """Days of counts that a forecast needs at least."""
 ScenarioSource = str | Path | ScenarioSpec | ParkingLot | Scenario
+ScenarioSources = ScenarioSource | Sequence[ScenarioSource]
 
 
 def make_scenario(source: ScenarioSource, **changes: Any) -> Scenario:
-    """Make a scenario.
-
-    Args:
-        source: name of a packaged scenario (campus, jam, street, mini), a scenario file (.toml), a lot file, a
-            `ScenarioSpec`, a `ParkingLot` (with the occupancy of a typical week), or a `Scenario`.
-        changes: fields of `Scenario` to replace, and `day_error`, how far whole days differ from the forecast (a
-            `DayError`, or a number, its level): 0 for days that are as forecast.
+    """Make one scenario; see `make_scenarios`.
 
     Raises:
-        InputError: an unknown name or field, or an invalid file; the message is one line.
+        InputError: see `make_scenarios`; or the source has more than one scenario.
 
     Examples:
         >>> scenario = make_scenario("campus", failure_s=90.0)
         >>> scenario.lot.name, scenario.failure_s
         ('campus', 90.0)
     """
+    made = make_scenarios(source, **changes)
+    if len(made) > 1:
+        raise InputError(f"scenario has {len(made)} scenarios, want one")
+    return made[0]
+
+
+def make_scenarios(source: ScenarioSources, **changes: Any) -> list[Scenario]:
+    """Make the scenarios that `scenario=` of an environment, or `--scenario`, stands for.
+
+    Args:
+        source: name of a packaged scenario (campus, jam, street, mini); a scenario file (.toml); a lot file
+            (.geojson, .yml), which has the occupancy of a typical week and days that differ from it by 0.8; a folder
+            of scenario and lot files; a `ScenarioSpec`; a `ParkingLot` (with a typical week, and days as forecast);
+            a `Scenario`; or a sequence of these.
+        changes: fields of `Scenario` to replace in all of them, and `day_error`, how far whole days differ from the
+            forecast (a `DayError`, or a number, its level): 0 for days that are as forecast.
+
+    Raises:
+        InputError: an unknown name or field, or an invalid file; the message is one line.
+
+    Examples:
+        >>> [scenario.name for scenario in make_scenarios(["campus", "mini"])]
+        ['campus', 'mini']
+    """
     if "day_error" in changes:
         day_error = changes.pop("day_error")
-        return _with_day_error(make_scenario(source, **changes), day_error)
+        return [_with_day_error(made, day_error) for made in make_scenarios(source, **changes)]
     if isinstance(source, Scenario):
-        return source.replace(**changes)
+        return [source.replace(**changes)]
     if isinstance(source, ParkingLot):
-        goal = changes.get("goal", 0)
-        occupancy = changes.get("occupancy") or typical_occupancy(source, goal=goal)
-        made = Scenario(name=source.name, lot=source, goal=goal, occupancy=occupancy)
-        return made.replace(**changes | {"occupancy": occupancy})
+        return [_of_lot(source, changes)]
     if isinstance(source, ScenarioSpec):
-        return build(source).replace(**changes)
-    if not isinstance(source, str | Path):
+        return [build(source).replace(**changes)]
+    if isinstance(source, str | Path):
+        return [build(spec).replace(**changes) for spec in scenario_specs(source)]
+    if not isinstance(source, Sequence):
         raise InputError(
-            f"scenario is a {type(source).__name__}, want a Scenario, its name or file, a ScenarioSpec or a ParkingLot"
+            f"scenario is a {type(source).__name__}, want a Scenario, its name or file, a ScenarioSpec, a ParkingLot, "
+            "or a sequence of these"
         )
-    return build(scenario_spec(source)).replace(**changes)
+    if not source:
+        raise InputError("scenario is an empty sequence, want at least one scenario")
+    return [made for one in source for made in make_scenarios(one, **changes)]
+
+
+def _of_lot(lot: ParkingLot, changes: dict[str, Any]) -> Scenario:
+    goal = changes.get("goal", 0)
+    occupancy = changes.get("occupancy") or typical_occupancy(lot, goal=goal)
+    made = Scenario(name=lot.name, lot=lot, goal=goal, occupancy=occupancy)
+    return made.replace(**changes | {"occupancy": occupancy})
 
 
 def build(spec: ScenarioSpec) -> Scenario:
@@ -115,7 +144,14 @@ def build(spec: ScenarioSpec) -> Scenario:
         error = spec.occupancy.day_error
         return made if error is None else _with_day_error(made, DayError(error.level, error.slope))
     except InputError as error:
-        raise InputError(f"{spec.source}: {error}") from error
+        message = str(error)
+        for kind in ("goal", "entry"):
+            if spec.lot.file is not None and f"no {kind}:" in message:
+                message += f'; add one to the file: a Point with the properties {{"kind": "{kind}"}}'
+                break
+        # A scenario that is a lot alone has the lot's file.
+        source = "" if message.startswith(f"{spec.source}: ") else f"{spec.source}: "
+        raise InputError(f"{source}{message}") from error
 
 
 def _with_day_error(scenario: Scenario, day_error: DayError | float) -> Scenario:

@@ -15,8 +15,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from parkenv.errors import InputError, nearest
-from parkenv.files.limited_reading import is_there
-from parkenv.files.names import (
+from parkenv.files.known_names import (
     LOT_SUFFIXES,
     PACKAGED_LOTS,
     SCENARIO_NAMES,
@@ -26,6 +25,7 @@ from parkenv.files.names import (
     RigName,
     SensorModelName,
 )
+from parkenv.files.limited_reading import is_there
 from parkenv.files.spec_file import FilePath, OrText, Several, Spec, read_tables
 from parkenv.world.day_error import MAX_LOGITS
 from parkenv.world.occupancy import ArrivalWindow
@@ -418,26 +418,84 @@ class ScenarioSpec(Spec):
 _PACKAGED = Path(__file__).with_name("packaged")
 
 
-def scenario_spec(source: str | Path) -> ScenarioSpec:
-    """Return the specification of a packaged scenario, a scenario file, or a typical week on a lot file.
+LOT_DAY_ERROR = 0.8
+"""Day error of a lot without a scenario file, as in the packaged scenarios."""
 
-    Args:
-        source: name of a packaged scenario, or a file.
+
+def scenario_spec(source: str | Path) -> ScenarioSpec:
+    """Return the specification of one scenario; see `scenario_specs`.
 
     Raises:
-        InputError: the source is neither, or the file is invalid.
+        InputError: see `scenario_specs`; or the source is a folder with more than one scenario.
 
     Examples:
         >>> scenario_spec("jam").occupancy.event
         Event(share=0.75, factor=200.0)
     """
+    specs = scenario_specs(source)
+    if len(specs) > 1:
+        raise InputError(f"{source}: holds {len(specs)} scenarios, want one")
+    return specs[0]
+
+
+def scenario_specs(source: str | Path) -> list[ScenarioSpec]:
+    """Return the specifications that a name, a file or a folder stands for.
+
+    Args:
+        source: name of a packaged scenario; a scenario file (.toml, .json); a lot file (.geojson, .yml), which has a
+            typical week with a day error of 0.8 (`lot_scenario`); or a folder with scenario files (.toml) and lot
+            files (.geojson), in order of their names. A lot that a scenario file of the folder names is that
+            scenario's.
+
+    Raises:
+        InputError: the source is none of these, or a file is invalid; the message names the file.
+
+    Examples:
+        >>> [spec.title for spec in scenario_specs("mini")]
+        ['mini']
+    """
     if str(source) in SCENARIO_NAMES:
-        return ScenarioSpec.read(_PACKAGED / f"{source}.toml")._of_file("")
+        return [ScenarioSpec.read(_PACKAGED / f"{source}.toml")._of_file("")]
     path = Path(source)
-    if path.suffix in LOT_SUFFIXES and path.suffix != ".json":
-        return ScenarioSpec.parse({"name": path.stem, "lot": str(path)}, str(path))
+    if is_there(path) and path.is_dir():
+        return _in_folder(path)
+    if path.suffix in LOT_SUFFIXES and (path.suffix != ".json" or _is_geojson(path)):
+        return [lot_scenario(path)]
     if path.suffix in (".toml", ".json") or is_there(path):
-        return ScenarioSpec.read(path)
+        return [ScenarioSpec.read(path)]
     raise InputError(
         f"unknown scenario {str(source)!r}, and no such file; {nearest(str(source), SCENARIO_NAMES)}"
     )
+
+
+def lot_scenario(lot: str | Path, source: str | None = None) -> ScenarioSpec:
+    """Return the scenario of a lot alone: a typical week, days that differ from it by 0.8, the lot's goal and entries.
+
+    Args:
+        lot: name of a packaged lot, or a lot file.
+        source: source of the name for messages.  [default: the lot]
+
+    Raises:
+        InputError: neither a packaged lot nor a file.
+    """
+    name = "".join(c if c.isprintable() and c not in "/\\," else " " for c in Path(lot).stem)[:80]
+    tables = {"name": name, "lot": str(lot), "occupancy": {"day_error": LOT_DAY_ERROR}}
+    return ScenarioSpec.parse(tables, str(lot) if source is None else source)._of_file(lot)
+
+
+def _in_folder(folder: Path) -> list[ScenarioSpec]:
+    """Return the scenarios of the files in a folder."""
+    try:
+        files = sorted(path for path in folder.iterdir() if path.suffix in (".toml", ".geojson"))
+    except OSError as error:
+        raise InputError(f"{folder}: {error.strerror}") from error
+    specs = {path: scenario_spec(path) for path in files if path.suffix == ".toml"}
+    used = {spec.lot.file.resolve() for spec in specs.values() if spec.lot.file is not None}
+    specs |= {path: lot_scenario(path) for path in files if path not in specs and path.resolve() not in used}
+    if not specs:
+        raise InputError(f"{folder}: holds no scenario (.toml) and no lot (.geojson)")
+    return [specs[path] for path in files if path in specs]
+
+
+def _is_geojson(path: Path) -> bool:
+    return is_there(path) and read_tables(path).get("type") == "FeatureCollection"

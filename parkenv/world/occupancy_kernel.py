@@ -18,7 +18,7 @@ import numpy as np
 from parkenv.world.day_error import TABLE_ROWS, TABLE_STEPS
 from parkenv.world.decay import decay_factor
 from parkenv.world.keyed_random import DAY_STREAM, OCCUPANCY_STREAM, keyed_exponential, keyed_uniform
-from parkenv.world.pointers import ADDRESS, float64s, int64s, record_at, uint8s
+from parkenv.world.pointers import ADDRESS, float64s, int64s, prefetch, record_at, uint8s
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, HOUR_S, PERIOD_S, WEEK_HOURS, WEEK_S, hour_of_week
 from sim_sensors.compilation import compiled
 
@@ -293,6 +293,15 @@ def _count_below(address: int, begin: int, end: int, value: float, equal_too: bo
         else:
             high = middle
     return low - begin
+
+
+@inlined
+def prefetch_forecast(address: int, hour: int, slot: int) -> None:
+    """Load what `process_forecast` will read, without waiting for it; `address` is that of the PROCESS record."""
+    process = process_at(address, 0)
+    prefetch(process.factors + 8 * slot)
+    prefetch(process.factors + 8 * (process.n_slots + slot))
+    prefetch(process.hourly_marginals + 8 * (hour * process.n_slots + slot))
 
 
 @inlined

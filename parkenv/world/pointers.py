@@ -6,14 +6,18 @@ dozen arrays, and is cheap to call from Python. Code that writes an address into
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numba
 import numpy as np
+from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+_LINE = 64  # bytes of a cache line
+_SMALL = 4096  # bytes
 ADDRESS = np.int64  # type of the fields of a record that hold addresses
 
 
@@ -30,6 +34,28 @@ def address_of(array: NDArray[Any], dtype: Any) -> int:
     return int(array.ctypes.data)
 
 
+def in_one_block(arrays: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
+    """Copy arrays into one block of memory; small read-only ones that are equal share a copy.
+
+    Systems keep large blocks in large pages, so compiled code finds its way through many small tables faster.
+    """
+    keys: list[Any] = [
+        i
+        if array.flags.writeable or array.nbytes > _SMALL
+        else (array.tobytes(), array.dtype.str, array.shape)
+        for i, array in enumerate(arrays)
+    ]
+    different = dict(zip(keys, arrays, strict=True))
+    begins = np.cumsum([0, *(-(-array.nbytes // _LINE) * _LINE for array in different.values())])
+    block = np.zeros(int(begins[-1]), np.uint8)
+    copies = {}
+    for (key, array), begin in zip(different.items(), begins, strict=False):
+        copies[key] = copy = block[begin : begin + array.nbytes].view(array.dtype).reshape(array.shape)
+        if array.dtype.names or array.any():  # pages of zeros that are never written take no memory
+            copy[...] = array
+    return [copies[key] for key in keys]
+
+
 def _elements(item: Any) -> Any:
     @intrinsic
     def elements(_: Any, address: Any) -> Any:  # noqa: ARG001 - numba passes it
@@ -44,6 +70,21 @@ def _elements(item: Any) -> Any:
 # In compiled code, `float64s(address)[i]` reads and writes element i of the array of float64 at an address.
 float64s, float32s = _elements(types.float64), _elements(types.float32)
 int64s, int32s, uint8s = _elements(types.int64), _elements(types.int32), _elements(types.uint8)
+
+
+@intrinsic
+def prefetch(_: Any, address: Any) -> Any:  # noqa: ARG001 - numba passes it
+    """Load the cache line of an address, which may be any number, without waiting for it."""
+
+    def code(_: Any, builder: Any, __: Any, values: Any) -> Any:
+        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+        fetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
+        # For reading, into all caches, data.
+        settings = (number(setting) for setting in (0, 3, 1))
+        builder.call(fetch, [builder.inttoptr(values[0], byte), *settings])
+
+    return types.void(types.int64), code
 
 
 def record_at(dtype: Any) -> Any:

@@ -16,8 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.special import logit
 
 from parkenv.errors import InputError
+from parkenv.files.known_names import FORECAST_FROM, ForecastFrom
 from parkenv.files.limited_reading import csv_rows
-from parkenv.files.names import FORECAST_FROM, ForecastFrom
 from parkenv.forecast.slot_days import MAX_DAYS, FittedSlotDays, fit_slot_days
 from parkenv.world.day_error import MAX_LOGITS, DayError
 from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,13 +68,17 @@ class LotTraffic:
     """
 
     def __init__(self, lot: ParkingLot, goal: int, traffic: Traffic, key: np.uint64, slots: SlotLot) -> None:
-        self._routes = _Routes(lot, goal) if traffic.cars or traffic.pedestrians else None
-        self._cars = [
-            self._car(np.random.default_rng([int(key), _CARS, k]), slots) for k in range(traffic.cars)
+        self._n_cars, self._n = traffic.cars, traffic.cars + traffic.pedestrians
+        if self._n == 0:
+            return
+        routes = _Routes(lot, goal)
+        cars = [_car(routes, np.random.default_rng([int(key), _CARS, k]), slots) for k in range(traffic.cars)]
+        people = [
+            _person(routes, np.random.default_rng([int(key), _PEOPLE, k])) for k in range(traffic.pedestrians)
         ]
-        self._people = [
-            self._person(np.random.default_rng([int(key), _PEOPLE, k])) for k in range(traffic.pedestrians)
-        ]
+        self._loops = _Loops([loop for loop, _ in (*cars, *people)])
+        self._models = np.array([number for _, number in cars], dtype=np.int64)
+        self._looks = np.array([number for _, number in people], dtype=np.int64)
 
     def at(self, time: float, ego: FloatArray | None = None) -> Movers | None:
         """Return the road users at a time.
@@ -87,25 +91,23 @@ class LotTraffic:
         Returns:
             The road users; None without traffic.
         """
+        if self._n == 0:
+            return None
+        every = self.movers_at(np.full(self._n, time))
+        if ego is None:
+            return every
+        clear = _clear_of(ego, every.vehicle_pose, _HALF_CAR)
+        free = _clear_of(ego, every.walker_pose, _HALF_PERSON)
+        return every.only(clear, free)
+
+    def movers_at(self, times: FloatArray) -> Movers:
+        """Return all road users, each at its own time: (n,) s, cars first."""
         from sim_sensors.movers import LOOKS, Movers
 
-        if self._routes is None:
-            return None
-        cars = np.array([loop.pose(time) for loop, _ in self._cars]).reshape(-1, 3)
-        people = np.array([loop.pose(time) for loop, _ in self._people]).reshape(-1, 3)
-        stride = np.array([loop.station(time) / STRIDE_M % 1.0 for loop, _ in self._people])
-        model = np.array([number for _, number in self._cars], dtype=np.int64)
-        look = np.array([number % LOOKS for _, number in self._people], dtype=np.int64)
-        if ego is not None:
-            clear, free = _clear_of(ego, cars, _HALF_CAR), _clear_of(ego, people, _HALF_PERSON)
-            cars, model, people, stride, look = (
-                cars[clear],
-                model[clear],
-                people[free],
-                stride[free],
-                look[free],
-            )
-        return Movers(cars, model, people, stride, look)
+        n, station = self._n_cars, self._loops.stations(times)
+        poses = self._loops.poses(station)
+        stride = station[n:] / STRIDE_M % 1.0
+        return Movers(poses[:n], self._models, poses[n:], stride, self._looks % LOOKS)
 
     def poses_at(self, times: FloatArray) -> FloatArray:
         """Return the poses of all road users, each at its own time, for traffic that waits.
@@ -116,62 +118,84 @@ class LotTraffic:
         Returns:
             (cars + pedestrians, 3) x, y in m and yaw in rad.
         """
-        loops = [loop for loop, _ in (*self._cars, *self._people)]
-        poses = [loop.pose(time) for loop, time in zip(loops, np.asarray(times).tolist(), strict=True)]
-        return np.array(poses).reshape(-1, 3)
-
-    def _car(self, rng: np.random.Generator, slots: SlotLot) -> tuple[_Loop, int]:
-        assert self._routes is not None
-        path = self._routes.round_trip(rng)
-        loop = _Loop(path, _AXLE_M, rng.uniform(*CAR_SPEEDS), 0.0, rng.random())
-        slot = int(rng.integers(len(slots.fitting)))
-        return loop, int(rng.choice(slots.fitting[slot]))
-
-    def _person(self, rng: np.random.Generator) -> tuple[_Loop, int]:
-        assert self._routes is not None
-        path = self._routes.walk(rng)
-        loop = _Loop(path, 0.5, rng.uniform(*WALK_SPEEDS), rng.uniform(-0.4, 0.9), rng.random())
-        return loop, int(rng.integers(1 << 30))
+        if self._n == 0:
+            return np.empty((0, 3))
+        return self._loops.poses(self._loops.stations(times))
 
 
-class _Loop:
-    """Motion along a closed path at constant speed.
+class _Loop(NamedTuple):
+    """Motion along a closed path at constant speed."""
 
-    Args:
-        path: (k, 2) m, corners; the last one connects to the first.
-        reach: the heading is that of the chord from this far behind to this far ahead, m.
-        speed: m/s.
-        aside: lateral offset to the right of the path, m.
-        start: position on the path at time 0, as a fraction of its length.
-    """
+    path: FloatArray  # (k, 2) m, corners; the last one connects to the first
+    reach: float  # m; the heading is that of the chord from this far behind to this far ahead
+    speed: float  # m/s
+    aside: float  # m, lateral offset to the right of the path
+    start: float  # position on the path at time 0, as a fraction of its length
 
-    def __init__(self, path: FloatArray, reach: float, speed: float, aside: float, start: float) -> None:
-        corners = np.concatenate([path, path[:1]])
-        leg = np.hypot(*np.diff(corners, axis=0).T)
-        corners = corners[np.r_[True, leg > 0.0]]
-        self._corners = corners
-        self._station = np.r_[0.0, np.cumsum(leg[leg > 0.0])]
-        self._reach, self._speed, self._aside = reach, speed, aside
-        self._start = start * self._station[-1]
 
-    def station(self, time: float) -> float:
-        """Station on the path, m."""
-        return float((self._start + self._speed * time) % self._station[-1])
+class _Loops:
+    """Several loops, a row each, padded to the longest."""
 
-    def pose(self, time: float) -> FloatArray:
-        """Pose, (3,) x, y in m and yaw in rad."""
-        s = self.station(time)
-        behind, ahead = self._point(s - self._reach), self._point(s + self._reach)
+    def __init__(self, loops: list[_Loop]) -> None:
+        corners, stations = zip(*(_measured(loop.path) for loop in loops), strict=True)
+        widest = max(map(len, stations))
+        # A point lies before the first corner whose station is beyond its own.
+        self._station = np.stack([np.pad(s, (0, widest - len(s)), constant_values=np.inf) for s in stations])
+        self._corners = np.stack([np.pad(c, ((0, widest - len(c)), (0, 0)), "edge") for c in corners])
+        self._length = np.array([s[-1] for s in stations])
+        self._last = np.array([len(s) - 1 for s in stations])
+        self._row = np.arange(len(loops))
+        self._reach, self._speed, self._aside, start = np.array([loop[1:] for loop in loops]).T
+        self._start = start * self._length
+
+    def stations(self, times: FloatArray) -> FloatArray:
+        """Stations on the paths, (n,) m, each at its own time, s."""
+        station: FloatArray = (self._start + self._speed * times) % self._length
+        return station
+
+    def poses(self, station: FloatArray) -> FloatArray:
+        """Poses, (n, 3) x, y in m and yaw in rad, at stations, (n,) m."""
+        behind, ahead = self._points(station - self._reach), self._points(station + self._reach)
         chord = ahead - behind
-        if np.hypot(*chord) < _STEP_M:  # it turns in place
-            chord = self._point(s + 0.01) - self._point(s)
-        yaw = np.arctan2(chord[1], chord[0])
-        right = np.array([np.sin(yaw), -np.cos(yaw)])
-        return np.array([*(0.5 * (behind + ahead) + self._aside * right), yaw])
+        turning = np.hypot(chord[:, 0], chord[:, 1]) < _STEP_M  # in place
+        if turning.any():
+            chord[turning] = (self._points(station + 0.01) - self._points(station))[turning]
+        yaw = np.arctan2(chord[:, 1], chord[:, 0])
+        right = np.stack([np.sin(yaw), -np.cos(yaw)], axis=1)
+        return np.column_stack([0.5 * (behind + ahead) + self._aside[:, None] * right, yaw])
 
-    def _point(self, station: float) -> FloatArray:
-        s = station % self._station[-1]
-        return np.array([np.interp(s, self._station, self._corners[:, i]) for i in (0, 1)])
+    def _points(self, station: FloatArray) -> FloatArray:
+        """Points on the paths, (n, 2) m."""
+        row, s = self._row, station % self._length
+        i = np.minimum((self._station <= s[:, None]).sum(axis=1), self._last)
+        start, end = self._corners[row, i - 1], self._corners[row, i]
+        low, high = self._station[row, i - 1], self._station[row, i]
+        point: FloatArray = (end - start) / (high - low)[:, None] * (s - low)[:, None] + start
+        return point
+
+
+def _measured(path: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the corners of a closed path, the first one once more at the end, and their stations, m."""
+    corners = np.concatenate([path, path[:1]])
+    leg = np.hypot(*np.diff(corners, axis=0).T)
+    if not leg.any():
+        return corners[[0, 0]], np.array([0.0, 1.0])  # it stands
+    return corners[np.r_[True, leg > 0.0]], np.r_[0.0, np.cumsum(leg[leg > 0.0])]
+
+
+def _car(routes: _Routes, rng: np.random.Generator, slots: SlotLot) -> tuple[_Loop, int]:
+    """Draw a drive and a vehicle model."""
+    path = routes.round_trip(rng)
+    loop = _Loop(path, _AXLE_M, rng.uniform(*CAR_SPEEDS), 0.0, rng.random())
+    slot = int(rng.integers(len(slots.fitting)))
+    return loop, int(rng.choice(slots.fitting[slot]))
+
+
+def _person(routes: _Routes, rng: np.random.Generator) -> tuple[_Loop, int]:
+    """Draw a walk and a number for the looks."""
+    path = routes.walk(rng)
+    loop = _Loop(path, 0.5, rng.uniform(*WALK_SPEEDS), rng.uniform(-0.4, 0.9), rng.random())
+    return loop, int(rng.integers(1 << 30))
 
 
 class _Routes:
@@ -188,7 +212,8 @@ class _Routes:
         """Draw a drive past some slots and back to the first: corners, (k, 2) m."""
         stops = rng.choice(self._lot.n_slots, size=min(_STOPS, self._lot.n_slots), replace=False).tolist()
         legs = [self._shortest_path(a, b) for a, b in zip(stops, [*stops[1:], stops[0]], strict=True)]
-        return np.concatenate(legs)
+        path = np.concatenate(legs)
+        return path if len(path) else np.asarray(self._lot.vertex_xy[stops[:1]])
 
     def walk(self, rng: np.random.Generator) -> FloatArray:
         """Draw a walk from a slot to the goal and back: corners, (k, 2) m."""

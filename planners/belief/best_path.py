@@ -63,7 +63,6 @@ class Candidate(NamedTuple):
     work: int
 
 
-@compiled(error_model="numpy")
 def best_path(
     vertex: int,
     targets: IntArray,
@@ -91,6 +90,21 @@ def best_path(
         belief: the belief.
         path: buffer for one path.
     """
+    return PathChoice(*_best_path(vertex, targets, failure_s, remaining_s, budget, graph, belief, path))
+
+
+@compiled(error_model="numpy")
+def _best_path(
+    vertex: int,
+    targets: IntArray,
+    failure_s: float,
+    remaining_s: float,
+    budget: Budget,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    path: PathBuffer,
+) -> tuple[float, float, float, int, int, IntArray, float, int]:
+    """Return the fields of `PathChoice`."""
     options, fallback_s = _options_at_hand(vertex, budget, graph, belief, path)
     at_hand_s, slot = np.inf, -1
     for s in options:
@@ -107,7 +121,7 @@ def best_path(
         if found.onward_s < best.onward_s - _ROUNDING_S:
             best, targets, failure_s = found, none, cost
     if best.onward_s == np.inf:
-        return PathChoice(np.inf, np.inf, at_hand_s, slot, NOWHERE, targets[:0], failure_s, 0)
+        return np.inf, np.inf, at_hand_s, slot, NOWHERE, targets[:0], failure_s, 0
 
     # Nearest vertices first: with a small budget they matter most for the next step.
     nearest_first = np.argsort(graph.drive_s[vertex])
@@ -131,9 +145,7 @@ def best_path(
         )
         if len(targets) == n_before:
             break
-    return PathChoice(
-        best.onward_s, best.remaining_s, at_hand_s, slot, best.next_vertex, targets, failure_s, work
-    )
+    return best.onward_s, best.remaining_s, at_hand_s, slot, best.next_vertex, targets, failure_s, work
 
 
 @compiled(error_model="numpy")

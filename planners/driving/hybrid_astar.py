@@ -20,7 +20,7 @@ from planners.driving.car_path import CarPath
 from planners.driving.clearance import CELL_M, Clearance, clearance, room_at
 from planners.driving.grid_distances import GRID_CELLS, grid_distances
 from planners.driving.path_shortening import shorten_path
-from planners.driving.reeds_shepp import PIECES, distance_between, words_buffer
+from planners.driving.reeds_shepp import PIECES, Words, distance_between, words_buffer
 from planners.driving.reeds_shepp_shots import DriveCosts, arc_is_free, cheapest_shot
 from planners.thesis.heap import pop, push
 from sim_sensors.compilation import compiled
@@ -166,7 +166,7 @@ def _search(
     way, steering = np.empty(_MOST_NODES), np.empty(_MOST_NODES)
     closed = np.zeros(_MOST_NODES, np.bool_)
     keys, queue = np.empty(_MOST_NODES + 1), np.empty(_MOST_NODES + 1, np.int32)
-    words, radius = words_buffer(), costs.radius
+    words, radius = Words(*words_buffer()), costs.radius
     shot_piece, shot_turn = np.zeros(PIECES), np.zeros(PIECES, np.int64)
     shot_count, shot_node, best = 0, -1, math.inf
     coarse = CELL_M * GRID_CELLS

@@ -183,7 +183,7 @@ class ParkingAgent:
         velocity = np.zeros_like(at) if before is None else (at - before) / _CONTROL_S
         assert memory.tracker is not None
         own = memory.tracker.poses_ahead(PREDICTION_TIMES_S * max(abs(speed), START_SPEED))
-        when = encounter_times(self.vehicle, self.vehicle.at_middle(own), list(outlines), velocity)
+        when = encounter_times(self.vehicle, self.vehicle.at_middle(own), outlines, velocity)
         return bool(np.isfinite(when).any())
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from parkenv.driving.vehicle import move_along
 from planners.driving.car_path import SHORTEST_ARC
 from planners.driving.clearance import Clearance
-from planners.driving.reeds_shepp import words_buffer
+from planners.driving.reeds_shepp import Words, words_buffer
 from planners.driving.reeds_shepp_shots import DriveCosts, cheapest_shot
 from sim_sensors.compilation import compiled
 
@@ -24,7 +24,7 @@ def shorten_path(
     costs: DriveCosts,
 ) -> tuple[FloatArray, FloatArray]:
     """Replace parts of a path by collision-free Reeds-Shepp words where that lowers its cost."""
-    words, radius = words_buffer(), costs.radius
+    words, radius = Words(*words_buffer()), costs.radius
     for _ in range(3):
         better = False
         first = 0

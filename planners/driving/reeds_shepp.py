@@ -39,11 +39,10 @@ _HALF = 0.5 * math.pi
 
 
 @compiled(error_model="numpy")
-def words_buffer() -> Words:
-    """Allocate a buffer."""
+def words_buffer() -> tuple[FloatArray, IntArray, IntArray, FloatArray]:
+    """Allocate a buffer, for `Words`."""
     shape = (MOST_WORDS, PIECES)
-    count, cost = np.zeros(MOST_WORDS, np.int64), np.zeros(MOST_WORDS)
-    return Words(np.zeros(shape), np.zeros(shape, np.int64), count, cost)
+    return np.zeros(shape), np.zeros(shape, np.int64), np.zeros(MOST_WORDS, np.int64), np.zeros(MOST_WORDS)
 
 
 @compiled(error_model="numpy")
@@ -245,7 +244,7 @@ def reeds_shepp(
     step = np.asarray(end, dtype=np.float64) - start
     c, s = math.cos(start[2]), math.sin(start[2])
     x, y = (c * step[0] + s * step[1]) / radius, (c * step[1] - s * step[0]) / radius
-    words = words_buffer()
+    words = Words(*words_buffer())
     n = words_between(float(x), float(y), float(step[2]), words)
     costs = [word_cost(words.piece[k], int(words.n_pieces[k]), radius, change_m) for k in range(n)]
     best = int(np.argmin(costs))

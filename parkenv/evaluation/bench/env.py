@@ -14,9 +14,9 @@ import numpy as np
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.evaluation.bench.rows import BenchRow, absent, rate
 from parkenv.lots import city_lot, grid_lot
-from parkenv.scenarios.build import make_scenario
+from parkenv.scenarios.build import ScenarioSources, make_scenario
 from parkenv.world.day_error import DayError
-from parkenv.world.lot import ACTIONS, PARK
+from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.scenario import Scenario
 from parkenv.world.typical_week import typical_occupancy
 
@@ -24,6 +24,8 @@ BATCH = 1024
 SLOTS = (10, 20)
 LARGE = 10_000
 NEAREST = 5
+PLACES, SIZES = 100, ((2, 16), (6, 34))
+"""Places of the batch with many, and the bounds of their rows and columns of slots."""
 _BLOCK = 200
 _DRAWN = 100
 _DRIVE_STEPS = 60
@@ -32,7 +34,7 @@ Stepper = Callable[[], int]  # runs some steps and returns their number
 
 
 def env_rows(
-    seed: int = 0, seconds: float = 0.6, *, batch: int = BATCH, large: int = LARGE
+    seed: int = 0, seconds: float = 0.6, *, batch: int = BATCH, large: int = LARGE, places: int = PLACES
 ) -> list[BenchRow]:
     """Return the rows of `parkenv bench env`, on one core, with random actions.
 
@@ -43,6 +45,9 @@ def env_rows(
     Days that differ from their forecast are compared with days that do not, in the same run. These batches drive
     without parking, 60 steps an episode: otherwise searches would be longer on full days, and remember more slots.
 
+    Many places are grids of slots of different sizes, made by rule, of which every episode draws one; their peer is one
+    grid of the same mean size.
+
     Environments take turns. The value of each is the median over its turns, in CPU seconds of this process, so that
     other load on the machine affects all equally.
 
@@ -51,6 +56,7 @@ def env_rows(
         seconds: duration of each measurement.
         batch: number of searches in a batch.
         large: number of slots of the large lot.
+        places: number of lots of the batch that changes place.
     """
     import parkenv  # noqa: F401 - registers the environments
 
@@ -70,11 +76,17 @@ def env_rows(
         ),
         f"batch of {batch}, {city.lot.n_slots:,} slots, local k={NEAREST}": _ours(city, batch, "local", True),
     }
+    lots = grids(places, seed)
+    mean = round(float(np.mean([lot.n_slots for lot in lots])))
+    changing = _ours([make_scenario(lot, day_error=0.8) for lot in lots], batch, "local", True)
+    staying = _ours(make_scenario(grid_lot(8, mean // 8), day_error=0.8), batch, "local", True)
     cart_pole = gym.make_vec("CartPole-v1", batch, vectorization_mode="vector_entry_point")
     steppers = {case: batch_stepper(envs, len(ACTIONS), seed) for case, envs in batches.items()}
     steppers |= {"CartPole batch": batch_stepper(cart_pole, 2, seed)}
     steppers |= {
         "batch with days": batch_stepper(_driving(days, batch), PARK, seed),
+        "batch of places": batch_stepper(changing, len(ACTIONS), seed),
+        "batch of one place": batch_stepper(staying, len(ACTIONS), seed),
         "batch without days": batch_stepper(_driving(scenario, batch), PARK, seed),
         "Search-v2": single_stepper(gym.make("parkenv/Search-v2", scenario=scenario), seed),
         "Search-v2 with days": single_stepper(gym.make("parkenv/Search-v2", scenario=days), seed),
@@ -96,14 +108,28 @@ def env_rows(
     ):
         peer = {"the same without": rates[without]}
         rows += rate(part, f"{name}, day error 0.8", rates[name], "steps/s", **peer)
+    case = f"batch of {batch}, {places} places of {mean} slots on average, local k={NEAREST}"
+    rows += rate(
+        "batch", case, rates["batch of places"], "steps/s", **{"one place": rates["batch of one place"]}
+    )
     for name in missing:
         rows += absent("single", f"{name}: not installed", "steps/s")
     for case, envs in batches.items():
         rows += rate("memory", case, envs.bytes_each / 1024, "KiB an environment")
+    case = f"batch of {batch}, {places} places"
+    rows += rate("memory", f"{case}, tables of the places", changing.table_bytes / 2**20, "MiB")
+    rows += rate("memory", f"{case}, tables and environments", changing.memory_bytes / 2**20, "MiB")
     return rows
 
 
-def _ours(scenario: Scenario, batch: int, observation: str, copy: bool) -> ParkSearchVectorEnv:
+def grids(n: int, seed: int) -> list[ParkingLot]:
+    """Make grids of slots with different numbers of rows and columns."""
+    rng = np.random.default_rng(seed)
+    rows, columns = (rng.integers(*bounds, n) for bounds in SIZES)
+    return [grid_lot(int(r), int(c)) for r, c in zip(rows, columns, strict=True)]
+
+
+def _ours(scenario: ScenarioSources, batch: int, observation: str, copy: bool) -> ParkSearchVectorEnv:
     return ParkSearchVectorEnv(batch, scenario, observation=observation, k=NEAREST, copy=copy)
 
 

@@ -18,6 +18,7 @@ from parkenv.evaluation.experiments.episodes import EpisodeRunner, SearchTrace
 from parkenv.evaluation.experiments.results import SETTING_COLUMNS, ResultFolder, Row, episode_key
 from parkenv.evaluation.experiments.statistics import mean_interval, summarize
 from parkenv.evaluation.experiments.workers import HERE, Workers
+from parkenv.scenarios.places import seeds_by_place
 from parkenv.world.keyed_random import world_key
 from parkenv.world.occupancy import ArrivalWindow, OccupancyProcess
 from parkenv.world.scenario import KMH, Scenario
@@ -190,18 +191,37 @@ def run_cases(
 
 
 def rows_of(
-    agents: Sequence[AgentSpec], scenario: Scenario, seeds: Sequence[int], workers: Workers
+    agents: Sequence[AgentSpec],
+    places: Scenario | Sequence[Scenario],
+    seeds: Sequence[int],
+    workers: Workers,
+    name: str | None = None,
 ) -> list[Row]:
-    """Run searches without saving them, and return the `table` row of each agent."""
-    cases = [Case(scenario, agent.name, options=agent.options) for agent in agents]
-    require_distinct(cases)
-    blocks = [(case, block) for case in cases for block in _blocks(seeds, 5 * BLOCK)]
+    """Run searches without saving them, and return the `table` row of each agent.
+
+    Args:
+        agents: the agents.
+        places: a scenario; or several, of which each seed draws one as the environment does.
+        seeds: one search each.
+        workers: where they run.
+        name: name of the places in the rows; that of the first if absent.
+    """
+    places = [places] if isinstance(places, Scenario) else places
+    work: list[tuple[Case, Sequence[int]]] = []
+    for place, its in zip(places, seeds_by_place(seeds, len(places)), strict=True):
+        cases = [Case(place, agent.name, options=agent.options) for agent in agents]
+        require_distinct(cases)
+        work += [(case, block) for case in cases for block in _blocks(its, 5 * BLOCK)]
     episodes: dict[str, list[Row]] = {case.label: [] for case in cases}
-    for number, (rows, _) in workers.results([partial(case.run, block) for case, block in blocks]):
-        episodes[blocks[number][0].label] += rows
-    by_seed = {name: sorted(rows, key=lambda row: row["seed"]) for name, rows in episodes.items()}
+    for number, (rows, _) in workers.results([partial(case.run, block) for case, block in work]):
+        episodes[work[number][0].label] += rows
+    by_seed = {label: sorted(rows, key=lambda row: row["seed"]) for label, rows in episodes.items()}
     first = by_seed[cases[0].label]
-    return [summarize(c.columns, by_seed[c.label], None if i == 0 else first) for i, c in enumerate(cases)]
+    columns = {"scenario": places[0].name if name is None else name}
+    return [
+        summarize(case.columns | columns, by_seed[case.label], None if i == 0 else first)
+        for i, case in enumerate(cases)
+    ]
 
 
 def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:

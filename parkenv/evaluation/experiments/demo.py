@@ -7,7 +7,7 @@ from typing import Any
 from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.spec import DemoSpec, SurveySpec
 from parkenv.evaluation.experiments.surveys import survey_of
-from parkenv.files.names import RigName
+from parkenv.files.known_names import RigName
 from parkenv.mapping.inference import MapPrior, SessionLog
 from parkenv.mapping.survey import SurveySettings
 from parkenv.world.scenario import Scenario

@@ -103,7 +103,9 @@ class EpisodeRunner:
         """Run one search in the world of `seed`."""
         scenario, first_plan = self.scenario, FirstPlan()
         result = simulate(self.env, self.agent, seed, (first_plan, *observers))
-        metrics = {name: value for name, value in result.info.items() if name != "reward_terms"}
+        metrics = {
+            name: value for name, value in result.info.items() if name not in ("reward_terms", "place")
+        }
         metrics["replans"] = int(getattr(result.memory, "replans", 0))
         state = self._state
         occupied = state.world.occupied(np.arange(scenario.lot.n_slots), state.arrival.time)

@@ -9,7 +9,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, mod
 from pydantic_core import PydanticCustomError
 
 from parkenv.evaluation.experiments.agent_spec import AgentItem, AgentSpec
-from parkenv.files.names import SCENARIO_NAMES, BackendName, MapName, RigName, WeatherName
+from parkenv.files.known_names import SCENARIO_NAMES, BackendName, MapName, RigName, WeatherName
+from parkenv.files.limited_reading import is_there
 from parkenv.files.spec_file import Axis, FilePath, OrText, Several, Spec
 from parkenv.scenarios.spec import (
     Cost,
@@ -19,6 +20,7 @@ from parkenv.scenarios.spec import (
     Speed,
     TrafficSpec,
     scenario_spec,
+    scenario_specs,
 )
 
 MAX_EPISODES = 10_000_000
@@ -45,6 +47,24 @@ def _scenario_tables(value: object, info: ValidationInfo) -> object:
 
 ScenarioItem = Annotated[ScenarioSpec, BeforeValidator(_scenario_tables), OrText()]
 """A scenario in a file: a name, a file, or an inline table."""
+
+
+def _with_folders(value: object, info: ValidationInfo) -> object:
+    """Replace folders in a list of scenarios by the scenarios in them."""
+    if not isinstance(value, list | tuple):
+        return value
+    folder = Path((info.context or {}).get("folder", Path()))
+    listed: list[object] = []
+    for one in value:
+        at = folder / one if isinstance(one, str | Path) and str(one) not in SCENARIO_NAMES else None
+        listed += scenario_specs(at) if at is not None and is_there(at) and at.is_dir() else [one]
+    return listed
+
+
+Scenarios = Annotated[
+    Several[ScenarioItem], BeforeValidator(_with_folders), Field(min_length=1, max_length=1_000)
+]
+"""Scenarios in a file: names, files, folders of scenario and lot files, or inline tables."""
 
 
 def _listed(value: object) -> object:
@@ -108,7 +128,7 @@ class ExperimentSpec(Workplace):
         tuple(AgentSpec(name=name) for name in DEFAULT_AGENTS), min_length=1, max_length=1_000,
         description="Differences are to the first.",
     )  # fmt: skip
-    scenarios: Several[ScenarioItem] = Field((scenario_spec("campus"),), min_length=1, max_length=1_000)
+    scenarios: Scenarios = (scenario_spec("campus"),)
     grid: Grid = Grid()
     episodes: int = Field(200, ge=1, le=MAX_EPISODES, description="Searches of each agent in each setting.")
     seed: int = Field(0, ge=0, lt=2**31, description="Episode i has the seed `seed` + i.")
@@ -150,7 +170,7 @@ class CommuteSpec(Workplace):
         min_length=1,
         max_length=1_000,
     )
-    scenarios: Several[ScenarioItem] = Field((scenario_spec("campus"),), min_length=1, max_length=1_000)
+    scenarios: Scenarios = (scenario_spec("campus"),)
     maps: Annotated[Axis[MapName], BeforeValidator(_listed)] = Field(
         ("empty",), description="Maps to start from: empty, right or wrong."
     )
@@ -238,12 +258,21 @@ class TrainingSpec(Workplace):
     kind: Literal["train"] = "train"
     env: Literal["search", "drive"] = Field("search", description="Search for a slot, or drive into one.")
     algorithm: str | None = Field(None, description="maskable-ppo for search, ppo for drive if absent.")
-    scenarios: Several[ScenarioItem] | None = Field(
-        None, min_length=1, max_length=1_000, description="Trained on in turns; evaluations use the first."
+    scenarios: Scenarios | None = Field(None, description="Trained on, drawn for each search.")
+    held_out: Level | None = Field(
+        None,
+        description="Share of the places that is kept for evaluation: a place is held out by a hash of its lot, "
+        "whatever other places there are (search).",
     )
-    test_on: Several[ScenarioItem] | None = Field(
-        None, min_length=1, max_length=1_000, description="Tested on in the end; the same if absent."
+    evaluate_on: Scenarios | None = Field(
+        None, description="Also evaluated on, during training and in the end; no place to train on (search)."
     )
+    curriculum: Literal["size"] | None = Field(
+        None,
+        description="size: begin with the smallest tenth of the places, and add larger ones evenly until half of the "
+        "steps (search).",
+    )
+    test_on: Scenarios | None = Field(None, description="Tested on in the end; the same if absent.")
     steps: int | None = Field(None, ge=1, le=10**12, description="Decisions of a training.")
     trainings: int = Field(5, ge=1, le=10_000, description="How many, one for each seed.")
     seed: int = Field(0, ge=0, lt=2**31, description="Of the first.")
@@ -267,9 +296,11 @@ class TrainingSpec(Workplace):
     @model_validator(mode="after")
     def _of_env(self) -> Self:
         if self.env == "drive":
-            for name in ("clone", "demonstrations", "k"):
+            for name in ("clone", "demonstrations", "k", "held_out", "evaluate_on", "curriculum"):
                 if getattr(self, name) is not None:
                     raise PydanticCustomError("whole", "{name} goes with env search", {"name": name})
+        if self.held_out is not None and self.evaluate_on is not None:
+            raise PydanticCustomError("whole", "at most one of held_out, evaluate_on")
         if self.demonstrations is not None and self.clone is None:
             raise PydanticCustomError("whole", "demonstrations goes with clone")
         return self

@@ -25,7 +25,7 @@ from joblib.externals.loky import process_executor
 from joblib.externals.loky.backend import resource_tracker
 
 from parkenv.errors import InputError
-from parkenv.files.names import BackendName
+from parkenv.files.known_names import BackendName
 
 BACKENDS = get_args(BackendName)
 CONNECT_S = 5.0

@@ -107,8 +107,8 @@ def _trained(run: RunFolder, spec: specs.TrainingSpec) -> Cases:
     task = SearchTask(spec)
     seeds = range(TEST_SEED, TEST_SEED + int(run.summary["transfer"][0]["episodes"]))
     cases: Cases = []
-    for scenario in task.tested:
-        planners = [row for row in run.summary.get("planners", []) if row["scenario"] == scenario.name]
+    for name, (scenario, *_) in task.tests.items():
+        planners = [row for row in run.summary.get("planners", []) if row["scenario"] == name]
         beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
         cases.append((Case(scenario, f"{task.algorithm}:{model}"), seeds))
         made = {

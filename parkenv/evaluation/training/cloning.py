@@ -16,6 +16,7 @@ from parkenv.envs.local_observation import LocalObservation
 from parkenv.errors import InputError
 from parkenv.evaluation.simulate import EpisodeResult, Observer, Step, simulate
 from parkenv.evaluation.training.configs import MAX_STEPS, REWARD_SCALE
+from parkenv.scenarios.places import seeds_by_place
 from parkenv.world.scenario import Scenario
 from planners.agent import ClairvoyantAgent, make_agent
 
@@ -60,23 +61,30 @@ class Demonstrations:
     times: NDArray[np.float64]
 
     @classmethod
-    def collect(cls, agent: str, scenario: Scenario, seeds: Sequence[int], k: int = 5) -> Demonstrations:
-        """Simulate an agent, one search per seed; truncated searches are left out.
+    def collect(
+        cls, agent: str, places: Scenario | Sequence[Scenario], seeds: Sequence[int], k: int = 5
+    ) -> Demonstrations:
+        """Simulate an agent, one search per seed, in a scenario or in the one of several that the seed draws.
+
+        Truncated searches are left out.
 
         Raises:
             InputError: all searches were truncated.
         """
-        planner = make_agent(agent, scenario)
-        env = gym.make("parkenv/Search-v2", scenario=scenario, max_episode_steps=MAX_STEPS)
-        recorder = _DecisionRecorder(LocalObservation(env, k))
-        for seed in seeds:
-            simulate(env, planner, seed, (recorder,))
-        if not recorder.finished:
-            raise InputError(
-                f"{agent} finished none of {len(seeds)} searches on {scenario.name}: nothing to clone"
-            )
-        local, masks, actions, rewards = zip(*itertools.chain.from_iterable(recorder.finished), strict=True)
-        lengths = np.cumsum([len(decisions) for decisions in recorder.finished])[:-1]
+        places = [places] if isinstance(places, Scenario) else places
+        finished = []
+        for place, its in zip(places, seeds_by_place(seeds, len(places)), strict=True):
+            planner = make_agent(agent, place)
+            env = gym.make("parkenv/Search-v2", scenario=place, max_episode_steps=MAX_STEPS)
+            recorder = _DecisionRecorder(LocalObservation(env, k))
+            for seed in its:
+                simulate(env, planner, seed, (recorder,))
+            finished += recorder.finished
+        if not finished:
+            names = ", ".join(place.name for place in places)
+            raise InputError(f"{agent} finished none of {len(seeds)} searches on {names}: nothing to clone")
+        local, masks, actions, rewards = zip(*itertools.chain.from_iterable(finished), strict=True)
+        lengths = np.cumsum([len(decisions) for decisions in finished])[:-1]
         times = [-np.cumsum(r[::-1])[::-1] for r in np.split(np.array(rewards), lengths)]
         return cls(agent, np.stack(local), np.stack(masks), np.array(actions), np.concatenate(times))
 

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
@@ -101,6 +102,10 @@ class Training(ABC):
         """Prepare a new model before training; subclasses may pretrain it."""
         del model, seed
 
+    def before_rollout(self, model: Any) -> None:
+        """Called before each rollout; subclasses may make the environment harder. It must depend on the steps alone."""
+        del model
+
     def train(self, seed: int, folder: Path, *, tensorboard: bool = False) -> list[Row]:
         """Train with one seed; resume from the folder's checkpoint if there is one, as if there had been no stop.
 
@@ -129,6 +134,9 @@ class Training(ABC):
             tensorboard_log=str(folder / "tensorboard") if tensorboard else None,
             **self.settings(),
         )
+        if not tensorboard:
+            # Otherwise stable-baselines3 makes a new folder for logs in the system's folder of temporary files.
+            model.set_logger(Logger(None, []))
         # stable-baselines3 has seeded the environment with the network's seed.
         env.seed(TRAINING_SEEDS * (seed + 1))
         if checkpoint.exists():
@@ -191,6 +199,7 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
         return self.subject.evaluate_every * (1 + steps // self.subject.evaluate_every)
 
     def _on_rollout_start(self) -> None:
+        self.subject.before_rollout(self.model)
         # Between rollouts, so that a checkpoint loses no samples.
         if not self.curve or self.num_timesteps >= self._due:
             self._due = self._due_after(self.num_timesteps)

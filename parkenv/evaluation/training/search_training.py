@@ -24,8 +24,12 @@ from parkenv.evaluation.training.configs import (
     config_of,
 )
 from parkenv.evaluation.training.rl_training import Row, Training
+from parkenv.scenarios.places import by_size, open_places
 from parkenv.world.scenario import Scenario
 from planners.learned import LearnedAgent
+
+_METRICS = ("total_s", "low_s", "high_s", "parked_fraction")
+_HELD_OUT = ("held_out_s", "held_out_low_s", "held_out_high_s", "held_out_parked_fraction")
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,10 +40,12 @@ class SearchTraining(Training):
         algorithm: one of `SEARCH_CONFIGS`.
         steps: decisions in total.
         evaluate_every: decisions between evaluations.
-        scenarios: scenarios to train on, in rotation.
-        evaluation_seeds: seeds of the held-out worlds in the first scenario.
+        scenarios: scenarios to train on; each search is in one of them, drawn from its seed.
+        evaluation_seeds: seeds of the held-out worlds: in the first scenario, or with `held_out` in all of them.
         k: number of slots in the observation.
         demonstrations: demonstrations to clone before training; None for no cloning.
+        held_out: further places to evaluate in. They do not decide which model is kept.
+        curriculum: `size`: begin in the smallest lots; see `parkenv.scenarios.places.open_places`.
 
     Raises:
         InputError: an unknown algorithm, one that does not support behaviour cloning, or a number out of range.
@@ -49,6 +55,8 @@ class SearchTraining(Training):
     evaluation_seeds: range
     k: int = 5
     demonstrations: Demonstrations | None = None
+    held_out: tuple[Scenario, ...] = ()
+    curriculum: str | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,20 +70,32 @@ class SearchTraining(Training):
 
     @property
     def metrics(self) -> tuple[str, ...]:
-        """Mean total time, s, its 95 % interval, and the fraction of episodes that ended parked."""
-        return ("total_s", "low_s", "high_s", "parked_fraction")
+        """Mean total time, s, its 95 % interval, and the fraction of episodes that ended parked; also held out."""
+        return _METRICS + (_HELD_OUT if self.held_out else ())
 
     def make_env(self) -> SearchVecEnv:
         """Make a batch of search environments over all scenarios."""
-        return SearchVecEnv(
-            self.config.n_envs, self.scenarios, REWARD_SCALE, self.k, max_episode_steps=MAX_STEPS
-        )
+        places = self.scenarios if self.curriculum is None else by_size(self.scenarios)
+        env = SearchVecEnv(self.config.n_envs, places, REWARD_SCALE, self.k, max_episode_steps=MAX_STEPS)
+        self._open_places(env, 0.0)
+        return env
+
+    def before_rollout(self, model: Any) -> None:
+        """Add the places that the curriculum has come to."""
+        self._open_places(model.env, model.num_timesteps / self.steps)
+
+    def _open_places(self, env: SearchVecEnv, progress: float) -> None:
+        if self.curriculum is not None:
+            env.batch.n_places = open_places(len(self.scenarios), progress)
 
     def evaluate(self, policy: Any, env: VecEnv) -> Row:
-        """Run one episode in each held-out world."""
+        """Run one episode in each held-out world, in the places trained on and in those held out."""
         del env
-        times, parked = episode_times(policy, self.scenarios[0], self.evaluation_seeds, self.k)
-        return dict(zip(self.metrics, (*mean_interval(times), float(parked.mean())), strict=True))
+        found: list[float] = []
+        for places in (self.scenarios, self.held_out) if self.held_out else (self.scenarios[:1],):
+            times, parked = episode_times(policy, places, self.evaluation_seeds, self.k)
+            found += [*mean_interval(times), float(parked.mean())]
+        return dict(zip(self.metrics, found, strict=True))
 
     def score(self, row: Row) -> tuple[float, ...]:
         """Return minus the mean total time."""
@@ -91,12 +111,18 @@ class SearchTraining(Training):
         config = self.config
         settings = {"n_envs": config.n_envs, "policy": config.policy, **config.settings}
         settings["clone"] = None if self.demonstrations is None else self.demonstrations.agent
-        return {"scenarios": [scenario.name for scenario in self.scenarios], "settings": settings}
+        settings["curriculum"] = self.curriculum
+        names = [scenario.name for scenario in self.scenarios]
+        return {"scenarios": names, "held_out": [one.name for one in self.held_out], "settings": settings}
 
 
-def search_times(agent: LearnedAgent, scenario: Scenario, seeds: Sequence[int]) -> Row:
+def search_times(agent: LearnedAgent, places: Scenario | Sequence[Scenario], seeds: Sequence[int]) -> Row:
     """Run a model, and return its total times as columns of `parkenv compare`."""
-    times, parked = episode_times(agent.model, scenario, seeds, agent.local_k)
+    return times_row(*episode_times(agent.model, places, seeds, agent.local_k))
+
+
+def times_row(times: NDArray[np.float64], parked: NDArray[np.bool_]) -> Row:
+    """Return the total times of episodes as columns of `parkenv compare`."""
     mean, low, high = mean_interval(times)
     return {
         "episodes": len(times),
@@ -107,7 +133,7 @@ def search_times(agent: LearnedAgent, scenario: Scenario, seeds: Sequence[int]) 
 
 
 def episode_times(
-    model: Any, scenario: Scenario, seeds: Sequence[int], k: int
+    model: Any, places: Scenario | Sequence[Scenario], seeds: Sequence[int], k: int
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Run episodes; return their total times, (n,) s, and whether the car parked, (n,) bool.
 
@@ -115,20 +141,21 @@ def episode_times(
 
     Args:
         model: a stable-baselines3 or sb3-contrib model of the `local` observation.
-        scenario: scenario to search in.
+        places: scenario to search in; or several, of which each seed draws one.
         seeds: one episode each.
         k: number of slots in the observation.
     """
     n = len(seeds)
     batch = ParkSearchVectorEnv(
         n,
-        scenario,
+        places,
         observation="local",
         k=k,
         max_episode_steps=MAX_STEPS,
         autoreset_mode=AutoresetMode.NEXT_STEP,
     )
     observation, _ = batch.reset(seed=list(seeds))
+    give_up_s = np.array([scenario.give_up_s for scenario in batch.scenarios])[batch.place_of]
     times, parked = np.full(n, np.nan), np.zeros(n, dtype=np.bool_)
     state, start = None, np.ones(n, dtype=np.bool_)
     masked = "action_masks" in model.predict.__code__.co_varnames
@@ -141,7 +168,7 @@ def episode_times(
         start = terminated | truncated
         first = start & np.isnan(times)
         if first.any():
-            charge_truncation(info, scenario, truncated & ~terminated)
+            charge_truncation(info, give_up_s, truncated & ~terminated)
             times[first] = info["total_s"][first]
             parked[first] = info["parked"][first]
     return times, parked

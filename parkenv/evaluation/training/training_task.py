@@ -76,6 +76,11 @@ class TrainingTask(ABC):
     def measures(self) -> tuple[str, ...]:
         """Columns of `curve.csv` to draw."""
 
+    @property
+    def announcement(self) -> str | None:
+        """What is said before the training begins."""
+        return None
+
     @abstractmethod
     def check(self) -> None:
         """Check, before training, that everything can be trained, tested and drawn.
@@ -90,11 +95,12 @@ class TrainingTask(ABC):
     @abstractmethod
     def settings(self) -> Row:
         """Return the settings that a resumed training must share with this one."""
+        given = (*self.scenarios, *(self.spec.evaluate_on or ()))
         return {
             "algorithm": self.algorithm,
             "evaluation_episodes": self.evaluation_episodes,
-            "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in self.scenarios},
-            "files": fingerprints([file for s in self.scenarios for file in s.files()]),
+            "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in given},
+            "files": fingerprints([file for s in given for file in s.files()]),
         }
 
     @abstractmethod

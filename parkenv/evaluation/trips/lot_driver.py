@@ -39,6 +39,7 @@ FloatArray = NDArray[np.float64]
 
 RESCUE_S = 60.0  # time until a stuck car is back on the lane, s
 PATIENCE_S = 3.0  # time for which the car and a waiting road user both stand until the other gives way, s
+MOST_ROAD_USERS = 200  # maximum number of other cars and pedestrians
 TURN_IN_M = 9.0  # distance from the rear axle to the middle of a junction at which the turn begins, m
 
 _LEAD_M = 1.5
@@ -123,6 +124,9 @@ class LotDriver:
         vehicle: the car.
         style: driving style.
 
+    Raises:
+        InputError: the car cannot drive that fast, or there are more than `MOST_ROAD_USERS` road users.
+
     Attributes:
         log: record of the drive since `begin`.
         state: (6,) state of the vehicle, see `parkenv.driving.vehicle`.
@@ -143,6 +147,11 @@ class LotDriver:
         if speed > self.vehicle.max_speed:
             raise InputError(
                 f"the speed on lanes is {speed:g} m/s, want at most {self.vehicle.max_speed:g}, the car's own"
+            )
+        others = scenario.traffic.cars + scenario.traffic.pedestrians
+        if others > MOST_ROAD_USERS:
+            raise InputError(
+                f"traffic has {others} cars and pedestrians; a driven trip takes at most {MOST_ROAD_USERS}"
             )
         lot = scenario.lot
         self._lines = DrivenLines(lot)

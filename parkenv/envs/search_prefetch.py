@@ -1,0 +1,115 @@
+"""Prefetching for the batch: load what the next searches will read while this one is stepped.
+
+With many places, their tables do not fit the processor's inner caches; waiting for them would double a step's time.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from parkenv.envs.local_observation import Surroundings
+from parkenv.envs.search_records import (
+    EDGE,
+    N_ACTIONS,
+    PROCESS_KIND,
+    SEARCH,
+    SENTINEL,
+    edge_at,
+    scenario_at,
+    search_at,
+)
+from parkenv.world.lot import MOVES
+from parkenv.world.occupancy import IntArray
+from parkenv.world.occupancy_kernel import inlined, prefetch_forecast
+from parkenv.world.pointers import int32s, int64s, prefetch
+
+_APART = 2  # searches between two stages
+_LINE = 64  # bytes of a cache line
+_SEARCH_BYTES, _EDGE_BYTES = SEARCH.itemsize, EDGE.itemsize
+_N_MOVES = len(MOVES)
+
+
+@inlined
+def prefetch_searches(address: int, around: Surroundings, actions: IntArray, e: int) -> None:
+    """Prefetch for the searches after search e, in stages: each reads what the one before it has loaded."""
+    n = len(actions)
+    if e + 5 * _APART < n:
+        _prefetch(address + (e + 5 * _APART) * _SEARCH_BYTES, _SEARCH_BYTES)
+    if e + 4 * _APART < n:
+        search = search_at(address, e + 4 * _APART)
+        edge = search.vertex * N_ACTIONS + actions[e + 4 * _APART]
+        prefetch(scenario_at(search.scenario, 0).edges + edge * _EDGE_BYTES)
+    if e + 3 * _APART < n:
+        _prefetch_vertex(search_at(address, e + 3 * _APART), around, actions[e + 3 * _APART])
+    if e + 2 * _APART < n:
+        _prefetch_lists(search_at(address, e + 2 * _APART), around, actions[e + 2 * _APART])
+    if e + _APART < n:
+        _prefetch_slots(search_at(address, e + _APART), around, actions[e + _APART])
+
+
+@inlined
+def _target(search: Any, action: int) -> int:
+    """Return the vertex that an action leads to."""
+    edges = scenario_at(search.scenario, 0).edges
+    return int(edge_at(edges, search.vertex * N_ACTIONS + action).target)
+
+
+@inlined
+def _prefetch_vertex(search: Any, around: Surroundings, action: int) -> None:
+    """Prefetch the rows of the vertex that an action leads to."""
+    scenario = scenario_at(search.scenario, 0)
+    target = _target(search, action)
+    prefetch(scenario.action_masks + target * N_ACTIONS)
+    prefetch(scenario.view_starts + 8 * target)
+    _prefetch(scenario.edges + target * N_ACTIONS * _EDGE_BYTES, _N_MOVES * _EDGE_BYTES)
+    row, k = around.first[search.place] + target, around.near.shape[1]
+    width = 4 * around.fixed.shape[1]
+    _prefetch(around.fixed.ctypes.data + row * width, width)
+    _prefetch(around.near.ctypes.data + row * 2 * k, 2 * k)
+    _prefetch(around.ahead.ctypes.data + row * 8 * k, 8 * k)
+    _prefetch(around.total_s.ctypes.data + row * 32 * k, 32 * k)
+    prefetch(around.starts.ctypes.data + 4 * row)
+    prefetch(around.crow_s.ctypes.data + 16 * row)
+
+
+@inlined
+def _prefetch_lists(search: Any, around: Surroundings, action: int) -> None:
+    """Prefetch the lists of slots in view of, and near, that vertex."""
+    scenario = scenario_at(search.scenario, 0)
+    target = _target(search, action)
+    first = int64s(scenario.view_starts)[target]
+    _prefetch(scenario.viewed + 8 * first, _LINE)
+    _prefetch(around.view_s.ctypes.data + 8 * (around.first_view[search.place] + first), _LINE)
+    start = around.starts[around.first[search.place] + target]
+    _prefetch(around.slots.ctypes.data + 4 * start, _LINE)
+
+
+@inlined
+def _prefetch_slots(search: Any, around: Surroundings, action: int) -> None:
+    """Prefetch what is known of these slots, of the remembered one, and of the neighbours of that vertex."""
+    scenario = scenario_at(search.scenario, 0)
+    target, first = _target(search, action), around.first[search.place]
+    crow_s, remembered = around.crow_s.ctypes.data, search.remembered_slot
+    for move in range(_N_MOVES):
+        to = edge_at(scenario.edges, target * N_ACTIONS + move).target
+        prefetch(crow_s + 16 * (first + to))
+    prefetch(crow_s + 16 * (first + remembered))
+    prefetch(scenario.walk_s + 8 * remembered)
+    prefetch(scenario.parking_cost_s + 8 * remembered)
+    if scenario.prior_kind != PROCESS_KIND:
+        return
+    row, columns = first + target, int32s(search.columns)
+    for i in range(around.starts[row], around.starts[row + 1]):
+        slot = np.int64(around.slots[i])
+        if columns[slot] == SENTINEL:
+            prefetch_forecast(scenario.prior, search.hour, slot)
+
+
+@inlined
+def _prefetch(begin: int, size: int) -> None:
+    """Prefetch the bytes from an address on."""
+    for offset in range(0, size, _LINE):
+        prefetch(begin + offset)
+    prefetch(begin + size - 1)

@@ -1,0 +1,97 @@
+"""Places: which of several scenarios an episode is in, and which are held out from training."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from parkenv.errors import InputError
+from parkenv.world.keyed_random import PLACE_STREAM, keyed_uniform, world_key
+from parkenv.world.lot import ParkingLot
+from parkenv.world.scenario import Scenario
+
+FIRST_SHARE, ALL_AT = 0.1, 0.5
+"""A curriculum begins with this share of the places, and has all of them after this share of the training."""
+
+
+def place_of_episode(seed: int, episode: int, n: int) -> int:
+    """Return the index of the place, of n, that an environment draws for an episode of a seed.
+
+    Examples:
+        >>> [place_of_episode(seed, 0, 3) for seed in range(5)]
+        [2, 0, 1, 0, 0]
+    """
+    return int(keyed_uniform(world_key(seed, episode), PLACE_STREAM, 0, 0) * n)
+
+
+def seeds_by_place(seeds: Sequence[int], n: int) -> list[list[int]]:
+    """Return the seeds whose first episode is in each of n places."""
+    its: list[list[int]] = [[] for _ in range(n)]
+    for seed in seeds:
+        its[place_of_episode(seed, 0, n)].append(seed)
+    return its
+
+
+def lot_share(lot: ParkingLot) -> float:
+    """Return a number from 0 to 1 by a hash of the lot's slots, whatever their order and the lot's name.
+
+    Examples:
+        >>> from parkenv.lots import packaged_lot
+        >>> round(lot_share(packaged_lot("campus")), 3)
+        0.475
+    """
+    # Whole decimetres: readers of other formats may differ by rounding.
+    centres = np.round(10.0 * lot.slot_xy).astype("<i8")
+    digest = hashlib.sha256(centres[np.lexsort(centres.T)].tobytes()).digest()
+    return int.from_bytes(digest[:8], "little") / 2.0**64
+
+
+def split_places(scenarios: Sequence[Scenario], held_out: float) -> tuple[list[Scenario], list[Scenario]]:
+    """Split scenarios by their lots: those to train on, and those held out.
+
+    A lot is held out if its `lot_share` is below `held_out`. So scenarios on one lot are on one side, and further lots
+    change nothing for those that were there before.
+
+    Raises:
+        InputError: all are on one side.
+    """
+    sides: tuple[list[Scenario], list[Scenario]] = ([], [])
+    for scenario in scenarios:
+        sides[lot_share(scenario.lot) < held_out].append(scenario)
+    for side, what in zip(sides, ("leaves none to train on", "holds out none"), strict=True):
+        if not side:
+            raise InputError(
+                f"held_out is {held_out:g}, which {what} of {len(scenarios)} places: name the others with evaluate_on"
+            )
+    return sides
+
+
+def by_size(scenarios: Sequence[Scenario]) -> list[Scenario]:
+    """Return scenarios in order of their numbers of slots, and of their names."""
+    return sorted(scenarios, key=lambda scenario: (scenario.lot.n_slots, scenario.name))
+
+
+def open_places(n: int, progress: float) -> int:
+    """Return how many of n places a curriculum draws from after a share of the training.
+
+    Examples:
+        >>> [open_places(100, progress) for progress in (0.0, 0.25, 0.5, 1.0)]
+        [10, 55, 100, 100]
+    """
+    share = FIRST_SHARE + (1.0 - FIRST_SHARE) * min(progress / ALL_AT, 1.0)
+    return max(1, math.ceil(round(n * share, 6)))
+
+
+def require_different_names(scenarios: Sequence[Scenario]) -> None:
+    """Check that tables can tell places apart.
+
+    Raises:
+        InputError: two have one name.
+    """
+    names = [scenario.name for scenario in scenarios]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            raise InputError(f"scenarios has {name!r} twice, want places of different names")

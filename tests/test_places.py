@@ -1,0 +1,449 @@
+"""Environments that change place: what `scenario=` says, the place of an episode, trainings with held-out places."""
+
+import json
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from command_line import parkenv
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
+
+from parkenv import InputError, SensorModel, make_scenario, make_scenarios
+from parkenv.envs.local_observation import LocalObservation
+from parkenv.envs.search_vector import ParkSearchVectorEnv
+from parkenv.evaluation.bench.env import grids
+from parkenv.evaluation.experiments.spec import ExperimentSpec, TrainingSpec
+from parkenv.evaluation.training.search_task import SearchTask
+from parkenv.evaluation.training.search_training import SearchTraining, episode_times
+from parkenv.lots import write_lot
+from parkenv.scenarios.places import by_size, lot_share, open_places, place_of_episode, split_places
+from parkenv.scenarios.spec import lot_scenario, scenario_spec, scenario_specs
+from parkenv.world.day_error import DayError
+from parkenv.world.typical_week import typical_occupancy
+from planners.model_file import ModelCard
+
+LOTS = grids(6, seed=1)
+PLACES = [
+    make_scenario(lot, name=f"lot{i}", give_up_s=100.0 * (i + 1), day_error=0.5 * (i % 2))
+    for i, lot in enumerate(LOTS)
+]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder of lots, one of them with a scenario file."""
+    for i, lot in enumerate(LOTS):
+        write_lot(lot, tmp_path / f"lot{i}.geojson")
+    (tmp_path / "busy.toml").write_text('lot = "lot2.geojson"\n[occupancy.typical]\ndemand = 1.0\n')
+    (tmp_path / "notes.txt").write_text("not a lot")
+    return tmp_path
+
+
+# ---- what `scenario=` says
+
+
+def test_names_files_folders_and_sequences_of_them_are_scenarios(folder):
+    in_folder = ["busy", "lot0", "lot1", "lot3", "lot4", "lot5"]
+    assert [spec.title for spec in scenario_specs(folder)] == in_folder, "lot2 is that of a scenario"
+    assert [one.name for one in make_scenarios(str(folder))] == in_folder
+    several = ["mini", folder / "lot1.geojson", scenario_spec("jam"), PLACES[0], LOTS[1], folder]
+    assert [one.name for one in make_scenarios(several)] == [
+        "mini",
+        "lot1",
+        "jam",
+        "lot0",
+        "grid",
+        *in_folder,
+    ]
+    assert {one.failure_s for one in make_scenarios(several, failure_s=7.0)} == {7.0}
+    # Experiment files and the command line say it in the same way.
+    spec = ExperimentSpec.parse({"scenarios": ["mini", "."]}, "test", folder)
+    assert [one.title for one in spec.scenarios] == ["mini", *in_folder]
+    done = parkenv("compare", "--scenario", f"mini,{folder}", "--agents", "first-free", "-n", 1, "--jobs", 1,
+                   "--occupancy-levels", "none", "--no-figures", "--out", folder / "out")  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((folder / "out" / "summary.json").read_text())["rows"]
+    assert [row["scenario"] for row in rows] == ["mini", *in_folder]
+
+
+def test_a_lot_alone_is_a_scenario_with_days(folder):
+    made = make_scenario(folder / "lot3.geojson")
+    assert made.occupancy.day_error == DayError(0.8)
+    usual = typical_occupancy(made.lot)
+    np.testing.assert_array_equal(made.occupancy.arrival_factor, usual.arrival_factor)
+    (folder / "lot3.geojson").rename(folder / "lot3.json")
+    np.testing.assert_array_equal(make_scenario(folder / "lot3.json").lot.slot_xy, made.lot.slot_xy)
+    assert lot_scenario(folder / "lot3.json").title == "lot3"
+    write_lot(LOTS[0], folder / "Market, north.geojson")
+    assert scenario_spec(folder / "Market, north.geojson").title == "Market  north"
+
+
+@pytest.mark.parametrize("kind", ["goal", "entry"])
+def test_a_lot_without_goal_or_entry_says_how_to_give_them(folder, kind):
+    file = folder / "lot0.geojson"
+    content = json.loads(file.read_text())
+    content["features"] = [f for f in content["features"] if f["properties"]["kind"] != kind]
+    file.write_text(json.dumps(content))
+    for source in (file, folder, [file]):
+        with pytest.raises(InputError) as caught:
+            gym.make("parkenv/Search-v2", scenario=source)
+        message = str(caught.value)
+        assert message.startswith(f"{file}: no {kind}: ")
+        assert message.endswith(f'add one to the file: a Point with the properties {{"kind": "{kind}"}}')
+        assert "\n" not in message
+
+
+@pytest.mark.parametrize(
+    ("source", "message"),
+    [
+        ("nowhere", "unknown scenario 'nowhere', and no such file"),
+        ([], "scenario is an empty sequence"),
+        (["mini", 3], "scenario is a int, want a Scenario"),
+        (
+            ["mini", "none.geojson"],
+            r"none\.geojson: lot\.file is 'none\.geojson', want a file; there is none at",
+        ),
+    ],
+)
+@pytest.mark.parametrize("vectorization", ["sync", "vector_entry_point"])
+def test_what_is_no_scenario_is_refused_in_a_line(source, message, vectorization):
+    with pytest.raises(InputError, match=message) as caught:
+        gym.make_vec("parkenv/Search-v2", 2, vectorization_mode=vectorization, scenario=source)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_in_a_folder_are_named_by_their_faults(folder, tmp_path_factory):
+    (folder / "bad.toml").write_text('lot = "lot0.geojson"\ngoal = -1\n')
+    with pytest.raises(InputError, match=r"bad\.toml: goal is -1, want the index"):
+        make_scenarios(folder)
+    empty = tmp_path_factory.mktemp("empty")
+    with pytest.raises(InputError, match=r"holds no scenario \(\.toml\) and no lot \(\.geojson\)"):
+        make_scenarios(empty)
+    with pytest.raises(InputError, match="holds 4 scenarios, want one"):
+        scenario_spec("parkenv/lots/packaged")
+    with pytest.raises(InputError, match="scenario has 6 scenarios, want one"):
+        gym.make("parkenv/SearchSensors-v2", scenario=PLACES)
+
+
+# ---- the place of an episode
+
+
+def places_of(env, seed, n=12, act=None):
+    """Places of the first n episodes of a seed."""
+    names = []
+    for episode in range(n):
+        _, info = env.reset(seed=seed if episode == 0 else None)
+        names.append(info["place"])
+        assert env.unwrapped.scenario.name == info["place"]
+        if act is not None:
+            *_, info = env.step(act)
+            assert info["place"] == names[-1]
+    return names
+
+
+def test_a_seed_decides_the_places_whatever_was_done_before():
+    env = gym.make("parkenv/Search-v2", scenario=PLACES).unwrapped
+    first = places_of(env, 3)
+    assert set(first) == {one.name for one in PLACES} or len(set(first)) > 3
+    assert first == [PLACES[place_of_episode(3, episode, 6)].name for episode in range(12)]
+    places_of(env, 4, n=5, act=2)
+    assert places_of(env, 3, act=1) == first
+    assert places_of(env, 4) != first
+    counts = np.bincount([place_of_episode(seed, 0, 6) for seed in range(6_000)])
+    assert (np.abs(counts - 1_000) < 150).all(), "each place as often as the others"
+
+
+def test_an_episode_is_that_of_its_place_alone():
+    """Same world, rewards and observations, except for the padding."""
+    places = [
+        *PLACES[:4],
+        make_scenario("mini", sensor_model=SensorModel(8.0, hit_rate=0.9, false_alarm_rate=0.2)),
+    ]
+    env = gym.make("parkenv/Search-v2", scenario=places, max_episode_steps=40)
+    envs = {
+        place.name: gym.make("parkenv/Search-v2", scenario=place, max_episode_steps=40) for place in places
+    }
+    met = set()
+    rng = np.random.default_rng(0)
+    for seed in range(9):
+        observation, info = env.reset(seed=seed)
+        scenario = env.unwrapped.scenario
+        alone = envs[scenario.name]
+        expected, _ = alone.reset(seed=seed)
+        met.add(info["place"])
+        ended, n = False, scenario.lot.n_slots
+        while not ended:
+            assert env.observation_space.contains(observation)
+            np.testing.assert_array_equal(env.unwrapped.action_masks(), observation["action_mask"] == 1)
+            for name, value in expected.items():
+                seen = observation[name]
+                if name == "p_occupied":
+                    assert (seen[n:] == 1.0).all()
+                    seen = seen[:n]
+                elif name == "belief":
+                    parts = seen.reshape(4, -1)
+                    assert (parts[:, n:] == [[1.0], [0.0], [1.0], [-1.0]]).all()
+                    seen = parts[:, :n].ravel()
+                np.testing.assert_array_equal(seen, value, err_msg=name)
+            action = rng.choice(np.flatnonzero(observation["action_mask"]))
+            observation, reward, terminated, truncated, info = env.step(action)
+            expected, *others = alone.step(action)
+            assert [reward, terminated, truncated, info] == others
+            ended = terminated or truncated
+        assert env.unwrapped.state.belief.p_occupied.shape == (n,)
+    assert len(met) > 3
+
+
+@pytest.mark.filterwarnings("error")
+def test_checkers_accept_an_environment_that_changes_place():
+    check_env(gym.make("parkenv/Search-v2", scenario=PLACES).unwrapped, skip_render_check=True)
+    check_env_of_sb3(LocalObservation(gym.make("parkenv/Search-v2", scenario=PLACES)))
+
+
+def test_states_and_pickles_keep_the_place():
+    env = gym.make("parkenv/Search-v2", scenario=PLACES).unwrapped
+    env.reset(seed=0)
+    before, state = env.scenario.name, env.get_state()
+    copied = pickle.loads(pickle.dumps(env))
+    while env.scenario.name == before:
+        env.reset()
+    env.set_state(state)
+    assert env.scenario.name == copied.scenario.name == before
+    for action in (0, 1, 2, 3, 4):
+        ours, theirs = env.step(action), copied.step(action)
+        for name, value in ours[0].items():
+            np.testing.assert_array_equal(value, theirs[0][name])
+        assert ours[1:] == theirs[1:]
+        if ours[2]:
+            break
+    alone = gym.make("parkenv/Search-v2", scenario=PLACES[0]).unwrapped
+    alone.reset(seed=0)
+    with pytest.raises(InputError, match="state is of"):
+        alone.set_state(state)
+
+
+def test_a_batch_draws_a_place_at_each_automatic_reset():
+    envs = ParkSearchVectorEnv(5, PLACES, observation="local", max_episode_steps=8, autoreset_mode="SameStep")
+    _, info = envs.reset(seed=20)
+    assert info["_place"].all()
+    episode = np.zeros(5, dtype=int)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        names = [PLACES[i].name for i in envs.place_of]
+        assert envs.place_of.tolist() == [place_of_episode(20 + i, int(e), 6) for i, e in enumerate(episode)]
+        observation, _, terminated, truncated, info = envs.step(rng.integers(0, 5, 5))
+        assert envs.observation_space.contains(observation)
+        done = terminated | truncated
+        for i in np.flatnonzero(done):
+            assert info["final_info"]["place"][i] == names[i], "that of the episode that has ended"
+        episode += done
+    assert episode.min() >= 6
+
+
+def test_a_batch_can_be_kept_to_the_first_places():
+    envs = ParkSearchVectorEnv(32, PLACES, observation="local", max_episode_steps=3)
+    envs.n_places = 2
+    envs.reset(seed=0)
+    assert set(envs.place_of) == {0, 1}
+    envs.n_places = 6
+    assert set(envs.place_of) == {0, 1}, "from the next episodes on"
+    for _ in range(4):
+        envs.step(np.zeros(32, dtype=int))
+    assert len(set(envs.place_of)) > 4
+    for wrong in (0, 7, 1.5):
+        with pytest.raises(InputError, match="n_places is"):
+            envs.n_places = wrong
+
+
+def test_all_searches_share_the_tables_and_memory_is_told():
+    few, many = (ParkSearchVectorEnv(n, PLACES, observation="local") for n in (2, 64))
+    assert few.table_bytes == many.table_bytes
+    assert many.memory_bytes - many.table_bytes == pytest.approx(
+        32 * (few.memory_bytes - few.table_bytes), rel=0.01
+    )
+    assert repr(many) == f"ParkSearchVectorEnv(64 searches, 6 places, {many.memory_bytes / 1e6:.1f} MB)"
+    alone = [ParkSearchVectorEnv(2, one, observation="local").table_bytes for one in PLACES]
+    assert few.table_bytes < 1.1 * sum(alone)
+
+
+def test_tiny_lots_with_equal_tables_keep_their_own_forecasts():
+    """Tables that are written to must not be shared."""
+    tiny = grids(1, 0)[0]
+    places = [make_scenario(tiny), make_scenario(tiny, occupancy=typical_occupancy(tiny, demand=-3.0))]
+    envs = ParkSearchVectorEnv(40, places)
+    observation, _ = envs.reset(seed=0)
+    full = observation["p_occupied"].mean(axis=1)
+    assert full[envs.place_of == 0].min() > full[envs.place_of == 1].max()
+
+
+# ---- training with held-out places
+
+
+def test_the_split_is_by_lot_and_stable():
+    packaged = make_scenarios(["campus", "street", "jam", "mini"])
+    assert [round(lot_share(one.lot), 3) for one in packaged] == [0.475, 0.881, 0.292, 0.279]
+    learned, held_out = split_places(PLACES, 0.5)
+    assert {*learned, *held_out} == set(PLACES)
+    for further in (PLACES[1:], [*packaged, *PLACES[::-1]]):
+        more = split_places(further, 0.5)
+        for one in further:
+            if one in PLACES:
+                assert (one in more[1]) == (one in held_out), "whatever other places there are"
+    # Another scenario on a lot is the same place; the order of the slots does not matter.
+    renamed = PLACES[0].replace(name="other", failure_s=3.0)
+    assert lot_share(renamed.lot) == lot_share(PLACES[0].lot)
+    for share, what in (
+        (1e-9, "holds out none of 6 places"),
+        (1.0 - 1e-9, "leaves none to train on of 6 places"),
+    ):
+        with pytest.raises(InputError, match=what):
+            split_places(PLACES, share)
+
+
+def test_a_curriculum_opens_places_by_size():
+    sizes = [one.lot.n_slots for one in by_size(PLACES)]
+    assert sizes == sorted(sizes)
+    opened = [open_places(50, p) for p in np.linspace(0.0, 1.0, 21)]
+    assert opened[0] == 5
+    assert opened == sorted(opened)
+    assert opened[9] < 50
+    assert opened[10:] == [50] * 11
+    assert open_places(1, 0.0) == open_places(3, 0.0) == 1
+
+
+def small(monkeypatch):
+    import dataclasses
+
+    from parkenv.evaluation.training.configs import SEARCH_CONFIGS
+
+    config = SEARCH_CONFIGS["ppo"]
+    few = dataclasses.replace(
+        config, n_envs=16, settings={**config.settings, "batch_size": 256, "n_steps": 32}
+    )
+    monkeypatch.setitem(SEARCH_CONFIGS, "ppo", few)
+
+
+def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
+    small(monkeypatch)
+    met = []
+    training = SearchTraining(
+        "ppo",
+        2_048,
+        512,
+        tuple(PLACES[:4]),
+        range(2_000_000, 2_000_024),
+        held_out=tuple(PLACES[4:]),
+        curriculum="size",
+    )
+    before = SearchTraining.before_rollout
+
+    def watched(self, model):
+        before(self, model)
+        met.append((model.num_timesteps, model.env.batch.n_places))
+
+    monkeypatch.setattr(SearchTraining, "before_rollout", watched)
+    curve = training.train(0, tmp_path)
+    assert met == [(steps, open_places(4, steps / 2_048)) for steps in (0, 512, 1024, 1536)]
+    assert [n for _, n in met] == [1, 3, 4, 4]
+    card = ModelCard.of_file(tmp_path / "model.safetensors")
+    assert card.scenarios == ("lot0", "lot1", "lot2", "lot3")
+    assert card.held_out == ("lot4", "lot5")
+    assert card.settings["curriculum"] == "size"
+    row = curve[-1]
+    assert {"total_s", "held_out_s", "held_out_parked_fraction"} < set(row)
+    best = min(curve, key=lambda row: row["total_s"])
+    assert card.results["held_out_s"] == best["held_out_s"], (
+        "the places trained on decide which model is kept"
+    )
+    # The mean over drawn places, each with its own give-up penalty, is that of the searches one by one.
+    from planners.learned import LearnedAgent
+
+    agent = LearnedAgent(PLACES[0], "ppo", tmp_path / "model.safetensors")
+    seeds = range(2_000_000, 2_000_024)
+    together, _ = episode_times(agent.model, PLACES, seeds, 5)
+    apart = [episode_times(agent.model, PLACES[place_of_episode(s, 0, 6)], [s], 5)[0][0] for s in seeds]
+    np.testing.assert_array_equal(together, apart)
+
+
+def test_a_resumed_curriculum_equals_an_unbroken_one(tmp_path, monkeypatch):
+    small(monkeypatch)
+    training = SearchTraining("ppo", 1_536, 512, tuple(PLACES), range(8), curriculum="size")
+    calls = []
+
+    def stopped(*arguments):
+        calls.append(arguments)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        save(*arguments)
+
+    from parkenv.evaluation.training.checkpoint import save_checkpoint as save
+
+    with monkeypatch.context() as patch:
+        patch.setattr("parkenv.evaluation.training.rl_training.save_checkpoint", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            training.train(0, tmp_path / "resumed")
+    resumed, whole = training.train(0, tmp_path / "resumed"), training.train(0, tmp_path / "whole")
+    assert [row | {"wall_s": 0.0} for row in resumed] == [row | {"wall_s": 0.0} for row in whole]
+    files = [tmp_path / name / "model.safetensors" for name in ("resumed", "whole")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+
+
+def test_a_task_names_both_sides_and_keeps_them_apart(folder):
+    specs = tuple(scenario_specs(folder))
+    task = SearchTask(TrainingSpec().changed(scenarios=specs, held_out=0.5))
+    names = {one.name for one in task.worlds}, {one.name for one in task.held_out}
+    assert names[0] | names[1] == {spec.title for spec in specs}
+    assert not names[0] & names[1]
+    assert sorted(task.settings()["held_out"]) == sorted(names[1])
+    assert task.announcement.endswith(", ".join(one.name for one in task.held_out))
+    assert [len(places) for places in task.tests.values()] == [len(side) for side in names]
+    same = scenario_spec(folder / "busy.toml").changed(name="again")
+    for others, message in (
+        ((same,), "evaluate_on has 'again', whose lot is that of 'busy', which is trained on"),
+        (specs[1:2], "scenarios has 'lot0' twice, want places of different names"),
+    ):
+        with pytest.raises(InputError, match=message):
+            SearchTask(TrainingSpec().changed(scenarios=specs, evaluate_on=others)).settings()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--held-out", "0"], "held_out is 0.0, want a number above 0"),
+        (["--held-out", "0.5", "--evaluate-on", "mini"], "at most one of held_out, evaluate_on"),
+        (["--held-out", "0.2", "--env", "drive"], "held_out goes with env search"),
+        (["--curriculum", "age"], "--curriculum: 'age' is not one of"),
+        (["--evaluate-on", "nowhere"], "unknown scenario 'nowhere'"),
+    ],
+)
+def test_bad_options_of_held_out_places_are_one_line(tmp_path, options, message):
+    done = parkenv("train", "ppo", "--scenario", "campus,street,jam", *options, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_the_command_learns_on_some_places_and_tests_on_others(folder):
+    out = folder / "trained"
+    done = parkenv(
+        "train", "maskable-ppo", "--scenario", folder, "--held-out", 0.5, "--steps", 20_000, "--trainings", 1,
+        "--evaluate-every", 10_000, "--evaluation-episodes", 16, "--agents", "first-free", "--curriculum", "size",
+        "--clone", "first-free", "--demonstrations", 20, "--report", "--out", out,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "places held out:" in done.stdout.replace("\n", " ") or "held out:" in done.stdout
+    summary = json.loads((out / "summary.json").read_text())
+    (row,) = summary["rows"]
+    assert row["scenario"].endswith("held out")
+    tests = {r["test_scenario"] for r in summary["transfer"]}
+    assert len(tests) == 2
+    assert {r["scenario"] for r in summary["planners"]} == tests
+    held_out = set(summary["settings"]["held_out"])
+    tested = {r["place"] for r in summary["places"] if r["test_scenario"] == row["scenario"]}
+    assert tested <= held_out
+    assert (out / "learning_curve.png").stat().st_size > 10_000
+    assert (out / "report.html").exists()
