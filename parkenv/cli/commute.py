@@ -10,7 +10,7 @@ from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import command_line, make_console, make_table, progress_bar
 from parkenv.cli.trust import readable_models, require_trust
-from parkenv.files.names import ForecastFrom
+from parkenv.files.known_names import ForecastFrom
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
