@@ -854,7 +854,7 @@ FAULTS = [
         lambda: car_park().geojson().replace('"coordinates": [[', '"coordinates": [[200, ', 1),
         "way/1: lon is 200, want a number from -180 to 180",
     ),
-    ("a.pbf", lambda: "", r"unknown kind of file '\.pbf', want \.osm"),
+    ("a.shp", lambda: "", r"unknown kind of file '\.shp', want \.osm"),
 ]  # fmt: skip
 
 

@@ -9,16 +9,21 @@ from typer import Exit
 
 from parkenv.cli import arguments as args
 from parkenv.cli.command import add, group
-from parkenv.cli.tables import make_console
+from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
 
+AUTO = "auto"
+"""Value of `--entry` and `--goal` that allows a guess."""
+
 if TYPE_CHECKING:
+    from parkenv.lots.importers.import_options import ImportOptions
+    from parkenv.lots.provenance import Provenance
     from parkenv.world.lot import ParkingLot
 
 
 def show(lot: str, /, graph: bool = False, out: Path | None = None) -> None:
-    """Draw a lot and summarise it; slots with a parking cost are coloured by it.
+    """Draw a lot and summarise it; slots with a parking cost are coloured by it. Guesses of an import are listed.
 
     Examples:
         parkenv lot show campus --graph --out campus.png
@@ -34,12 +39,20 @@ def show(lot: str, /, graph: bool = False, out: Path | None = None) -> None:
 
     its_lot = load_lot(lot)
     picture = out or Path(file_name(its_lot.name, ".png"))
-    save_lot_picture(its_lot, picture, show_graph=graph)
-    make_console().print(f"{_summary(its_lot)}. Picture: {picture}")
+    origin = _provenance(Path(lot))
+    guesses = origin.guesses if origin is not None else ()
+    save_lot_picture(its_lot, picture, show_graph=graph, guesses=guesses)
+    console = make_console(soft_wrap=True)
+    for guess in guesses:
+        console.print(f"guessed: {guess}", style="cyan", markup=False)
+    console.print(f"{_summary(its_lot)}. Picture: {picture}")
 
 
-def check(place: Path, /) -> None:
+def check(place: Path, /, drive: bool = True) -> None:
     """List all errors and warnings of a lot file, by feature number (from 0), and summarise a valid lot.
+
+    A lot is surveyed: can a car reach every slot, drive into it and get back, and are the lanes clear? A score of
+    doubt from 0 (sure) to 1 sums up the reasons why an imported lot may differ from the place.
 
     The exit code is 2 if there are errors, else 0. Of a file to import it lists what an import would lack.
 
@@ -48,14 +61,22 @@ def check(place: Path, /) -> None:
         parkenv lot check map.osm
 
     Options:
-        place (FILE): OpenStreetMap (.osm, Overpass .json, overpass-turbo .geojson), slot centres (.csv), a Dragon Lake
-            map (.yml) or a lot.
+        place (FILE): OpenStreetMap (.osm, .osm.pbf, Overpass .json, overpass-turbo .geojson), slot centres (.csv), a
+            Dragon Lake map (.yml) or a lot.
+        drive: Plan how the car drives into each kind of slot.
     """
+    from parkenv.evaluation.lot_survey import survey_lot
     from parkenv.lots import check_lot, read_lot
     from parkenv.lots.file_formats import lot_format
 
     console = make_console(soft_wrap=True)
     problems = check_lot(place)
+    form = lot_format(place)
+    survey = None
+    if form is not None and form.is_complete and not any(p.severity == "error" for p in problems):
+        origin = _provenance(place)
+        survey = survey_lot(read_lot(place), origin.doubts if origin is not None else (), drive=drive)
+        problems += survey.problems
     for problem in problems:
         feature = "" if problem.feature is None else f"feature {problem.feature}: "
         console.print(
@@ -71,9 +92,12 @@ def check(place: Path, /) -> None:
         console.print(f"{place}: " + ", ".join(f"{n} {word}{'s' * (n != 1)}" for n, word in counts))
     if errors:
         raise Exit(2)
-    form = lot_format(place)
-    if form is not None and form.is_complete:
+    if survey is not None:
         console.print(_summary(read_lot(place)))
+        if drive:
+            console.print(f"{survey.planned} of {survey.kinds} kinds of manoeuvres planned")
+        reasons = "; ".join(map(str, survey.doubts))
+        console.print(f"doubt {survey.doubt:.2f}" + (f": {reasons}" if reasons else ""), markup=False)
 
 
 def import_place(
@@ -85,41 +109,63 @@ def import_place(
     entry: list[str] | None = None,
     bounds: str | None = None,
     disabled: bool = False,
+    split: bool = False,
+    least: int = 10,
 ) -> None:
-    """Import a lot of a real place; report what was found, left out and is missing.
+    """Import a lot of a real place; report what was found, guessed, left out and is missing.
+
+    Outlines of parking spaces are enough: without roads in the file, the rows, the aisles before them and the ways
+    between these are inferred. With --split, every car park of a town becomes a lot in a folder, with a table
+    (`summary.json`) and a contact sheet.
 
     If something is missing, the picture is still drawn, but no lot is written and the exit code is 2.
 
     Examples:
         parkenv lot import map.osm --out lot.geojson --picture lot.png
         parkenv lot import slots.csv --out lot.geojson --entry 0,0 --goal 40,25
+        parkenv lot import spaces.geojson --entry auto --goal auto --out lot.geojson
+        parkenv lot import town.geojson --split --out lots
 
     Options:
-        place (FILE): OpenStreetMap (.osm, Overpass .json, overpass-turbo .geojson), slot centres (.csv), a Dragon Lake
-            map (.yml) or a lot.
-        out, -o (FILE.geojson): Lot file to write.
+        place (FILE): OpenStreetMap (.osm, .osm.pbf, Overpass .json, overpass-turbo .geojson), slot centres (.csv), a
+            Dragon Lake map (.yml) or a lot.
+        out, -o (FILE.geojson|DIR): Lot file to write, or folder with --split.
         picture (FILE.png): Picture to check the import by.
-        goal (POINT): Place that people walk to: LAT,LON, or X,Y in metres. Repeatable.  [default: building entrances,
-            else the nearest building]
-        entry (POINT): Place where cars enter: LAT,LON, or X,Y in metres. Repeatable.  [default: where service roads
-            meet a public street, or where streets leave the map]
+        goal (POINT): Place that people walk to: LAT,LON, or X,Y in metres, or auto: guess it. Repeatable.  [default:
+            building entrances, else the nearest building]
+        entry (POINT): Place where cars enter: LAT,LON, or X,Y in metres, or auto: guess it. Repeatable.  [default:
+            where service roads meet a public street, or where streets leave the map]
         bounds (BOX): Import only this: SOUTH,WEST,NORTH,EAST, or X0,Y0,X1,Y1 in metres.
         disabled: Also import spaces for disabled drivers.
+        split: Find the car parks of a town and write a lot of each; entries and goals are guessed.
+        least (N >= 2): Number of spaces of the smallest car park, with --split.
     """
     from parkenv.lots import import_lot, write_lot
     from parkenv.lots.importers.import_options import ImportOptions
+    from parkenv.lots.provenance import Provenance
 
     corners = None if bounds is None else args.numbers("--bounds", bounds, 4)
     options = ImportOptions(
-        goals=tuple((p[0], p[1]) for p in (args.numbers("--goal", text, 2) for text in goal or ())),
-        entries=tuple((p[0], p[1]) for p in (args.numbers("--entry", text, 2) for text in entry or ())),
+        goals=_points("--goal", goal),
+        entries=_points("--entry", entry),
+        guess_entry=split or AUTO in (entry or ()),
+        guess_goal=split or AUTO in (goal or ()),
         bounds=None if corners is None else ((corners[0], corners[1]), (corners[2], corners[3])),
         with_disabled=disabled,
     )
-    draft = import_lot(place, options)
     console = make_console(soft_wrap=True)
+    if split:
+        if options.goals or options.entries or options.bounds or picture:
+            raise InputError(
+                "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --picture"
+            )
+        _import_town(place, out, options, least)
+        return
+    draft = import_lot(place, options)
     for line in draft.found:
         console.print(line)
+    for guess in draft.guesses:
+        console.print(f"guessed: {guess}", style="cyan", markup=False)
     for left in draft.left_out:
         console.print(f"left out: {left}", style="yellow")
     if picture is not None:
@@ -131,8 +177,73 @@ def import_place(
         lot = draft.lot()
     except InputError as error:
         raise InputError(f"{place}: {error}") from error
-    write_lot(lot, out)
+    provenance = Provenance(place.name, draft.guesses, draft.doubts) if draft.guesses else None
+    write_lot(lot, out, provenance)
     console.print(f"Wrote {out}. {_summary(lot)}")
+
+
+def _import_town(place: Path, out: Path, options: ImportOptions, least: int) -> None:
+    """Write every car park of a town, a table of what became of each, and contact sheets."""
+    from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.evaluation.figures.contact_sheet import LARGEST, save_contact_sheet
+    from parkenv.evaluation.lot_survey import survey_lot
+    from parkenv.lots import write_lot
+    from parkenv.lots.outlines.town import import_town
+    from parkenv.lots.provenance import Provenance
+
+    rows: list[dict[str, object]] = []
+    lots = []
+    console = make_console(soft_wrap=True)
+    parks = import_town(place, options, least)
+    with progress_bar(console) as bar:
+        task = bar.add_task("car parks", total=None)
+        for park in parks:
+            bar.advance(task)
+            row: dict[str, object] = {"lot": park.name, "spaces": park.spaces, "slots": 0, "lanes": 0}
+            if park.draft is None:
+                row |= {"result": "refused", "doubt": None, "reason": park.reason}
+            else:
+                lot = park.draft.lot()
+                survey = survey_lot(lot, park.draft.doubts)
+                left = "; ".join(map(str, park.draft.left_out))
+                problems = "; ".join(problem.message for problem in survey.problems)
+                row |= {
+                    "slots": lot.n_slots,
+                    "lanes": len(lot.lanes),
+                    "result": "doubtful" if survey.problems else "clean",
+                    "doubt": round(survey.doubt, 3),
+                    "reason": problems or (f"left out: {left}" if left else ""),
+                }
+                lots.append((lot, Provenance(place.name, park.draft.guesses, survey.doubts), survey.doubt))
+            rows.append(row)
+    make_folder(out)
+    for lot, provenance, _ in lots:
+        write_lot(lot, out / f"{lot.name}.geojson", provenance)
+    drawn = [(f"{lot.name}: {lot.n_slots}, doubt {doubt:.2f}", lot) for lot, _, doubt in lots]
+    sheets = []
+    for k in range(0, len(drawn), LARGEST):
+        sheets.append(out / f"contact-sheet-{k // LARGEST + 1}.png")
+        save_contact_sheet(drawn[k : k + LARGEST], sheets[-1])
+    save_summary(out, None, rows)
+    headings = ("car park", "spaces", "slots", "lanes", "doubt", "result", "reason")
+    table = make_table(None, headings)
+    for column in table.columns[-2:]:
+        column.justify, column.no_wrap = "left", False
+    for row in rows:
+        doubt = "" if row["doubt"] is None else f"{row['doubt']:.2f}"
+        cells = (row["lot"], row["spaces"], row["slots"], row["lanes"], doubt, row["result"], row["reason"])
+        table.add_row(*map(str, cells))
+    make_console().print(table)
+    became = {name: sum(row["result"] == name for row in rows) for name in ("clean", "doubtful", "refused")}
+    listed = ", ".join(f"{count} {name}" for name, count in became.items())
+    pictures = f" Pictures: {', '.join(map(str, sheets))}" if sheets else ""
+    console.print(f"{len(rows)} car parks in {place}: {listed}. Wrote {len(lots)} lots to {out}.{pictures}")
+
+
+def _points(option: str, texts: list[str] | None) -> tuple[tuple[float, float], ...]:
+    """Return the points of an option; `auto` stands for none."""
+    numbers = (args.numbers(option, text, 2) for text in texts or () if text != AUTO)
+    return tuple((p[0], p[1]) for p in numbers)
 
 
 def convert(lot: str, /, out: Path) -> None:
@@ -149,6 +260,14 @@ def convert(lot: str, /, out: Path) -> None:
 
     write_lot(load_lot(lot), out)
     make_console().print(f"Wrote {out}")
+
+
+def _provenance(path: Path) -> Provenance | None:
+    """Return what a lot file says of its import; None for a packaged lot or another format."""
+    from parkenv.lots.provenance import read_provenance
+
+    is_json = path.suffix.lower() in (".json", ".geojson") and path.exists()
+    return read_provenance(path) if is_json else None
 
 
 def _summary(lot: ParkingLot) -> str:

@@ -41,6 +41,7 @@ def lot_format(path: Path) -> LotFormat | None:
         ".yaml": LotFormat.DRAGON_LAKE,
         ".osm": LotFormat.OSM,
         ".xml": LotFormat.OSM,
+        ".pbf": LotFormat.OSM,
         ".csv": LotFormat.SLOT_LIST,
     }
     return by_suffix.get(suffix)

@@ -12,6 +12,8 @@ centre of the features. `properties.kind` is the kind of a feature:
 | `lane` | LineString | `oneway`, false if absent |
 | `entry`, `goal` | Point | |
 | `wall` | LineString or Polygon | |
+
+A file made by an import may have the member `import`: its source, what was guessed, and reasons to doubt it.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from parkenv.files.limited_reading import read_json
 from parkenv.lots.geojson_slots import SLOT_SHAPE, RawFeature, is_coordinate, read_slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_contents import KINDS, LotContents
+from parkenv.lots.provenance import Provenance
 from parkenv.world.lot import FARTHEST, Lane, Mouth, ParkingLot, is_building
 
 FloatArray = NDArray[np.float64]
@@ -38,8 +41,13 @@ FloatArray = NDArray[np.float64]
 LOT_VERSION = 1
 
 
-def write_lot(lot: ParkingLot, path: str | Path) -> None:
+def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None = None) -> None:
     """Write a lot as native GeoJSON, atomically; `read_lot` restores it exactly.
+
+    Args:
+        lot: the lot.
+        path: the file.
+        provenance: what an import guessed, kept in the member `import`.
 
     Raises:
         InputError: the name does not end in `.geojson` or `.json`, or the file cannot be written.
@@ -47,12 +55,14 @@ def write_lot(lot: ParkingLot, path: str | Path) -> None:
     path = Path(path)
     if path.suffix.lower() not in (".geojson", ".json"):
         raise InputError(f"{path}: a lot is written as .geojson or .json")
-    head = {
+    head: dict[str, Any] = {
         "type": "FeatureCollection",
         "name": lot.name,
         "parkenv": {"format": "lot", "version": LOT_VERSION},
         "frame": "local",
     }
+    if provenance is not None:
+        head["import"] = provenance.document()
     features = ",\n".join(json.dumps(feature) for feature in _features(lot))
     text = f'{json.dumps(head)[:-1]},\n"features": [\n{features}\n]}}\n'
     with atomic_write(path) as beside:

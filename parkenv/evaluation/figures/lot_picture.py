@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from textwrap import wrap
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -119,10 +120,13 @@ def points_per_m(ax: Axes) -> float:
     return float(min(box.width / across, box.height / down)) / ax.figure.dpi * 72
 
 
-def save_lot_picture(lot: ParkingLot, path: str | Path, *, show_graph: bool = False) -> None:
+def save_lot_picture(
+    lot: ParkingLot, path: str | Path, *, show_graph: bool = False, guesses: Sequence[str] = ()
+) -> None:
     """Draw a lot to a file in the format of its suffix (`.png`, `.pdf`, `.svg`).
 
-    Slots with a parking cost are filled with its colour, and a colour bar gives the scale.
+    Slots with a parking cost are filled with its colour, and a colour bar gives the scale. Guesses of an import are
+    marked and listed below the lot.
 
     Raises:
         InputError: the format is unknown, or the file cannot be written.
@@ -142,6 +146,7 @@ def save_lot_picture(lot: ParkingLot, path: str | Path, *, show_graph: bool = Fa
         figure.colorbar(scale, ax=ax, shrink=0.6, pad=0.01, label="parking cost, s")
     else:
         draw_lot(lot, ax, show_graph=show_graph)
+    _draw_guesses(lot, ax, guesses)
     formats = figure.canvas.get_supported_filetypes()
     if path.suffix.removeprefix(".") not in formats:
         raise InputError(
@@ -151,6 +156,25 @@ def save_lot_picture(lot: ParkingLot, path: str | Path, *, show_graph: bool = Fa
         figure.savefig(
             beside, format=path.suffix.removeprefix("."), dpi=160, bbox_inches="tight", pad_inches=0.0
         )
+
+
+def _draw_guesses(lot: ParkingLot, ax: Axes, guesses: Sequence[str]) -> None:
+    """Mark entries and goals that an import guessed, and list all of its guesses below the lot."""
+    for start, points in (("entry", lot.entries), ("goal", lot.goals)):
+        if any(guess.startswith(start) for guess in guesses):
+            for xy in points:
+                ax.annotate(
+                    f"guessed {start}",
+                    xy,
+                    (16, 0),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=9,
+                    color=INK,
+                )
+    if guesses:
+        lines = [line for guess in guesses for line in wrap(f"guessed: {guess}", 100)]
+        ax.text(0.0, -0.01, "\n".join(lines), transform=ax.transAxes, va="top", fontsize=9, color=INK)
 
 
 def draw_walls(ax: Axes, buildings: Sequence[FloatArray], walls: Sequence[FloatArray]) -> None:

@@ -30,6 +30,8 @@ class ImportOptions:
     entries: tuple[tuple[float, float], ...] = ()  # places where cars enter, in the same form
     # two corners, in the same form; elements outside are not read
     bounds: tuple[tuple[float, float], tuple[float, float]] | None = None
+    guess_entry: bool = False  # whether an entry that the file does not show may be guessed
+    guess_goal: bool = False  # the same for goals
     with_disabled: bool = False  # whether slots for disabled drivers count as slots
 
     def __post_init__(self) -> None:

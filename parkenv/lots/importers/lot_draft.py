@@ -11,6 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 from parkenv.errors import InputError
 from parkenv.lots.generators import Slots
 from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.provenance import Doubt
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.lot import Lane, ParkingLot
 
@@ -43,6 +44,8 @@ class LotDraft:
     walls: tuple[FloatArray, ...] = ()  # (k, 2) m each
     outlines: tuple[FloatArray, ...] = ()  # (k, 2) m each, parking areas in the file; for figures
     found: tuple[str, ...] = ()  # one line per finding
+    guesses: tuple[str, ...] = ()  # one sentence per thing that the file does not say
+    doubts: tuple[Doubt, ...] = ()  # reasons to doubt the result
     left_out: tuple[LeftOut, ...] = ()  # elements that were not used
     missing: tuple[str, ...] = ()  # one sentence per missing part that a search needs, with how to provide it
     frame: LocalFrame | None = None  # geographic frame of the lot; None if the file has none

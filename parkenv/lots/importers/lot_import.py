@@ -17,7 +17,7 @@ from parkenv.lots.lot_files import read_lot
 def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
     """Draft a lot from a file of a real place.
 
-    Supported formats are OpenStreetMap (`.osm`, `.xml`, Overpass JSON, overpass-turbo GeoJSON; see
+    Supported formats are OpenStreetMap (`.osm`, `.xml`, `.osm.pbf`, Overpass JSON, overpass-turbo GeoJSON; see
     `parkenv.lots.importers.osm`), lists of slot centres (`.csv`; see
     `parkenv.lots.importers.slot_list`), the Dragon Lake map and native lots.
     Latitudes and longitudes are projected to metres east and north of the file's centre.
@@ -41,7 +41,7 @@ def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDra
         return slot_list_draft(path, options)
     if file_format is None:
         raise InputError(
-            f"{path}: unknown kind of file {path.suffix!r}, want .osm or .xml (OpenStreetMap; convert .pbf first), "
+            f"{path}: unknown kind of file {path.suffix!r}, want .osm, .xml or .pbf (OpenStreetMap), "
             ".json or .geojson (Overpass, overpass-turbo, a native lot), .csv (slot centres) or a Dragon Lake .yml"
         )
     if options.bounds is not None:

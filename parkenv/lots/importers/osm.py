@@ -36,7 +36,8 @@ from parkenv.lots.importers import osm_network as network
 from parkenv.lots.importers.import_options import ImportOptions, points_in_frame
 from parkenv.lots.importers.lot_draft import LeftOut, LotDraft
 from parkenv.lots.importers.osm_buildings import BUILDING_REACH, ENTRANCE_REACH, Area, find_goals, split_walls
-from parkenv.lots.importers.osm_elements import OsmElement, read_elements
+from parkenv.lots.importers.osm_elements import OsmElement
+from parkenv.lots.importers.osm_files import read_map
 from parkenv.lots.importers.osm_junctions import limit_junctions
 from parkenv.lots.importers.osm_kerbs import Junctions, kerb_of, kerb_slots
 from parkenv.lots.importers.osm_outlines import CORRIDOR, fill_outline
@@ -44,6 +45,7 @@ from parkenv.lots.importers.osm_roads import Rank, Road, closed_to_cars, off_the
 from parkenv.lots.importers.osm_rows import ARRANGEMENTS, NO_SLOTS, boxes_of, without_overlaps
 from parkenv.lots.importers.osm_spaces import split_space, squared, why_no_slot
 from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.outlines.outline_import import outline_draft
 from parkenv.lots.slot_polygons import nearest_on_lanes, slots_from_polygons
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import mouth_points
@@ -54,6 +56,7 @@ OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "
 """Values of `parking` for slots that are not in the open at ground level."""
 FARTHEST = 100_000.0  # largest distance of parking and roads from the centre of a map, m
 STREETS_AROUND = 60.0  # distance beyond the slots, m, within which streets are lanes if no bounds are given
+NO_AISLE = f"slots that no aisle reaches within {SLOT_REACH:g} m"  # reason for leaving out
 MAPPED_OVERLAP, RULE_OVERLAP = 0.4, 0.1
 """Largest allowed overlap, m, of slots drawn by hand, and of slots created by rule."""
 
@@ -69,12 +72,47 @@ def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraf
         InputError: the file is incomplete, has another format or contains no parking, an outline crosses itself, or
             the elements are too far apart.
     """
-    path = Path(path)
-    importer = _OsmImporter(path, read_elements(path), options or ImportOptions())
+    return draft_of_elements(Path(path), read_map(Path(path)), options or ImportOptions())
+
+
+def draft_of_elements(path: Path, elements: Sequence[OsmElement], options: ImportOptions) -> LotDraft:
+    """Draft a lot from elements that were read from a file; see `osm_draft`.
+
+    Without a road for cars among them, the lanes are inferred from the spaces' outlines; the same holds if guesses are
+    allowed and the roads do not reach all spaces or lack an entry.
+    """
+    has_spaces = any(e.tags.get("amenity") == "parking_space" for e in elements)
+    if has_spaces and not any(_may_be_lane(e) for e in elements):
+        return outline_draft(path, elements, [], map_frame(path, elements), options)
+    importer = _OsmImporter(path, elements, options)
     importer.read_spaces()
     importer.fill_outlines()
     importer.line_kerbs()
-    return importer.draft()
+    draft = importer.draft()
+    incomplete = bool(draft.missing) or any(left.reason == NO_AISLE for left in draft.left_out)
+    if has_spaces and incomplete and (options.guess_entry or options.guess_goal):
+        edge = importer._edge(draft.slots)
+        roads = [part for road in importer.roads for part in network.clipped_road(road, edge)]
+        return outline_draft(path, elements, roads, importer.frame, options)
+    return draft
+
+
+def map_frame(path: Path, elements: Sequence[OsmElement]) -> LocalFrame:
+    """Return the frame around the parking of a map.
+
+    Raises:
+        InputError: the elements are too far apart for one plane.
+    """
+    parking = [e for e in elements if _is_parking(e)]
+    _refuse_far_away(path, parking)
+    return LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
+
+
+def _may_be_lane(element: OsmElement) -> bool:
+    """Whether an element is a road for cars."""
+    if element.is_node or "highway" not in element.tags:
+        return False
+    return isinstance(road_of(element.id, element.tags, element.lines[0] * 1e5), Road)
 
 
 @dataclass(eq=False)
@@ -229,7 +267,7 @@ class _OsmImporter:
             )
             left = left[~reached]
         for i in left:
-            self._leave_out(f"slots that no aisle reaches within {SLOT_REACH:g} m", names[i])
+            self._leave_out(NO_AISLE, names[i])
 
     def fill_outlines(self) -> None:
         """Fill the parking areas without mapped spaces with rows of slots by rule."""

@@ -2,7 +2,8 @@
 
 Three formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `out;`), Overpass
 JSON (`elements`, with node references or `out geom;`), and GeoJSON as overpass-turbo and osmtogeojson write
-it (an element's id in `id` or `@id`, its tags in `properties` or `properties.tags`).
+it (an element's id in `id` or `@id`, its tags in `properties` or `properties.tags`); `osm_pbf` reads PBF.
+GeoJSON of polygons without any such tag holds outlines of parking spaces.
 
 OSM XML has no document type. A file that declares one is rejected before its entities are read, so entities cannot
 expand into gigabytes or fetch other files.
@@ -12,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -77,9 +78,22 @@ def holds_osm(document: object) -> bool:
     features = document.get("features")
     if not isinstance(features, list) or "parkenv" in document or "frame" in document:
         return False
+    if _holds_outlines(features):
+        return True
     properties = [f["properties"] for f in features if isinstance(f, dict) and _is_object(f, "properties")]
     return not any("kind" in p for p in properties) and any(
         "@id" in p or _is_object(p, "tags") or any(key in p for key in MAPPED_KEYS) for p in properties
+    )
+
+
+def _holds_outlines(features: list[Any]) -> bool:
+    """Whether features are polygons alone, without a tag that says what they are: outlines of parking spaces."""
+    return bool(features) and all(
+        isinstance(f, dict)
+        and _is_object(f, "geometry")
+        and f["geometry"].get("type") == "Polygon"
+        and not any(key in (f.get("properties") or {}) for key in ("kind", "tags", "@id", *MAPPED_KEYS))
+        for f in features
     )
 
 
@@ -87,26 +101,30 @@ def holds_osm(document: object) -> bool:
 
 
 @dataclass
-class _Way:
+class RawWay:
+    """A way with references to its nodes, or with its line."""
+
     tags: dict[str, str]
     refs: list[int] = field(default_factory=list)
     line: FloatArray | None = None
 
 
 @dataclass
-class _Relation:
+class RawRelation:
+    """A relation with its member ways: reference, role, and line if it is known."""
+
     tags: dict[str, str]
     members: list[tuple[int, str, FloatArray | None]] = field(default_factory=list)
 
 
 @dataclass
-class _Raw:
+class RawElements:
     """Elements as read, with unresolved references."""
 
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
     node_tags: dict[int, dict[str, str]] = field(default_factory=dict)
-    ways: dict[int, _Way] = field(default_factory=dict)
-    relations: dict[int, _Relation] = field(default_factory=dict)
+    ways: dict[int, RawWay] = field(default_factory=dict)
+    relations: dict[int, RawRelation] = field(default_factory=dict)
 
     def add_node(self, number: int, position: tuple[float, float], tags: dict[str, str]) -> None:
         """Add a node; Overpass may write it again, with or without its tags."""
@@ -118,17 +136,18 @@ class _Raw:
         if tags:
             self.node_tags[number] = tags
 
-    def add_way(self, number: int, way: _Way) -> None:
+    def add_way(self, number: int, way: RawWay) -> None:
         """Add a way, which may also appear again."""
         before = self.ways.get(number)
         if before is not None:
             if before.refs and way.refs and before.refs != way.refs:
                 raise InputError(f"way/{number} appears twice, with other nodes")
             line = before.line if way.line is None else way.line
-            way = _Way(way.tags or before.tags, way.refs or before.refs, line)
+            way = RawWay(way.tags or before.tags, way.refs or before.refs, line)
         self.ways[number] = way
 
     def elements(self) -> list[OsmElement]:
+        """Return the tagged elements, with their references resolved."""
         nodes = [
             OsmElement(f"node/{i}", tags, (np.array([self.positions[i]]),))
             for i, tags in self.node_tags.items()
@@ -141,7 +160,8 @@ class _Raw:
         ]
         return nodes + ways + [self._area(i, relation) for i, relation in self.relations.items()]
 
-    def line_of(self, number: int, way: _Way) -> FloatArray:
+    def line_of(self, number: int, way: RawWay) -> FloatArray:
+        """Return the positions of a way, (k, 2) degrees."""
         if way.line is not None:
             return way.line
         absent = next((ref for ref in way.refs if ref not in self.positions), None)
@@ -152,7 +172,7 @@ class _Raw:
             )
         return np.array([self.positions[ref] for ref in way.refs]).reshape(-1, 2)
 
-    def _area(self, number: int, relation: _Relation) -> OsmElement:
+    def _area(self, number: int, relation: RawRelation) -> OsmElement:
         name = f"relation/{number}"
         parts: dict[str, list[FloatArray]] = {"outer": [], "inner": []}
         for ref, role, line in relation.members:
@@ -194,7 +214,8 @@ def _position(name: str, lat: object, lon: object) -> tuple[float, float]:
     return values[1], values[0]
 
 
-def _is_area_relation(tags: Mapping[str, str]) -> bool:
+def is_area_relation(tags: Mapping[str, str]) -> bool:
+    """Whether a relation is a multipolygon that an import reads."""
     return tags.get("type") == "multipolygon" and any(key in tags for key in ("amenity", "building"))
 
 
@@ -205,12 +226,12 @@ class _XmlReader:
     """Target of an `ElementTree.XMLParser` that collects elements without building a tree."""
 
     def __init__(self) -> None:
-        self.raw = _Raw()
+        self.raw = RawElements()
         self._root = ""
         self._tags: dict[str, str] = {}
         self._node: tuple[int, tuple[float, float]] | None = None
-        self._way: tuple[int, _Way] | None = None
-        self._relation: _Relation | None = None
+        self._way: tuple[int, RawWay] | None = None
+        self._relation: RawRelation | None = None
 
     def doctype(self, name: str, public_id: str | None, system: str | None) -> None:
         del public_id, system
@@ -231,10 +252,10 @@ class _XmlReader:
             self._node = number, _position(f"node/{number}", values.get("lat"), values.get("lon"))
         elif name == "way":
             self._tags = {}
-            self._way = self._number(name, values, "id"), _Way(self._tags)
+            self._way = self._number(name, values, "id"), RawWay(self._tags)
         elif name == "relation":
             self._tags = {}
-            self._relation = self.raw.relations[self._number(name, values, "id")] = _Relation(self._tags)
+            self._relation = self.raw.relations[self._number(name, values, "id")] = RawRelation(self._tags)
         elif name == "tag" and "k" in values and "v" in values:
             self._tags[values["k"]] = values["v"]
         elif name == "nd" and self._way is not None:
@@ -254,7 +275,7 @@ class _XmlReader:
             self._relation = None
 
     def close(self) -> None:
-        self.raw.relations = {i: r for i, r in self.raw.relations.items() if _is_area_relation(r.tags)}
+        self.raw.relations = {i: r for i, r in self.raw.relations.items() if is_area_relation(r.tags)}
 
     @staticmethod
     def _number(element: str, values: dict[str, str], key: str) -> int:
@@ -291,12 +312,23 @@ def elements_of_json(document: Any) -> list[OsmElement]:
     if isinstance(document.get("elements"), list):
         return _overpass_elements(document["elements"])
     if isinstance(document.get("features"), list):
-        return [e for i, f in enumerate(document["features"]) if (e := _feature_element(i, f)) is not None]
+        elements: dict[str, tuple[int, OsmElement]] = {}
+        for index, feature in enumerate(document["features"]):
+            element = _feature_element(index, feature)
+            if element is None:
+                continue
+            first = elements.setdefault(element.id, (index, element))[0]
+            if first != index:
+                raise InputError(f"{element.id} appears twice, as features[{first}] and features[{index}]")
+        found = [element for _, element in elements.values()]
+        if _holds_outlines(document["features"]):
+            return [replace(e, tags={"amenity": "parking_space"}) for e in found]
+        return found
     raise InputError("no elements and no features, want Overpass JSON or a GeoJSON FeatureCollection")
 
 
 def _overpass_elements(elements: Iterable[Any]) -> list[OsmElement]:
-    raw = _Raw()
+    raw = RawElements()
     for index, element in enumerate(elements):
         kind = element.get("type") if isinstance(element, dict) else None
         if kind not in ("node", "way", "relation"):
@@ -314,8 +346,8 @@ def _overpass_elements(elements: Iterable[Any]) -> list[OsmElement]:
                 raise InputError(f"{name}: neither nodes nor geometry, want `out geom;`")
             if not isinstance(refs, list) or not all(type(ref) is int for ref in refs):
                 refs = []
-            raw.add_way(number, _Way(tags, refs, line))
-        elif _is_area_relation(tags):
+            raw.add_way(number, RawWay(tags, refs, line))
+        elif is_area_relation(tags):
             listed = element.get("members")
             members = [
                 (
@@ -326,7 +358,7 @@ def _overpass_elements(elements: Iterable[Any]) -> list[OsmElement]:
                 for m in (listed if isinstance(listed, list) else ())
                 if isinstance(m, dict) and m.get("type") == "way"
             ]
-            raw.relations[number] = _Relation(tags, members)
+            raw.relations[number] = RawRelation(tags, members)
     return raw.elements()
 
 

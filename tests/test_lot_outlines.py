@@ -1,0 +1,443 @@
+"""Lots from outlines of parking spaces alone, and the survey of lots."""
+
+import copy
+import json
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from command_line import parkenv
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_outlines import document, double_row, kerb, row, town, write
+
+from parkenv.driving.vehicle import VehicleParameters
+from parkenv.errors import InputError
+from parkenv.evaluation.lot_survey import ManoeuvreKind, can_park, survey_lot
+from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
+from parkenv.lots.importers.import_options import ImportOptions
+from parkenv.lots.outlines.infer import infer_lot
+from parkenv.lots.outlines.spaces import spaces_from_outlines
+from parkenv.lots.provenance import Provenance, read_provenance
+from parkenv.world.lot import Lane, Mouth, ParkingLot
+
+AUTO = ImportOptions(guess_entry=True, guess_goal=True)
+
+
+def imported(tmp_path, rows, options=AUTO, **how):
+    """The draft of made rows."""
+    return import_lot(write(tmp_path / "made.geojson", document(rows, **how)), options)
+
+
+def inferred(rows, obstacles=()):
+    """What is inferred from made rows in metres."""
+    corners = np.concatenate(rows)
+    outlines = np.array([shapely.Polygon(space) for space in corners], dtype=object)
+    return infer_lot(spaces_from_outlines([f"s{k}" for k in range(len(corners))], outlines), list(obstacles))
+
+
+def clean(lot, tmp_path):
+    """Whether a lot has no problem after it was written, neither in its file nor for a driver."""
+    path = tmp_path / "lot.geojson"
+    write_lot(lot, path)
+    return [p.message for p in check_lot(path)] + [
+        p.message for p in survey_lot(read_lot(path)).problems
+    ] == []
+
+
+class TestLayouts:
+    @pytest.mark.parametrize(
+        ("name", "rows", "n_aisles"),
+        [
+            ("double row", double_row(), 2),
+            ("single row", [row((0.0, 0.0), 0.0, 12)], 1),
+            ("curve", [row((0.0, 0.0), 0.0, 24, bend=2.0), row((60.0, 6.0), 150.0, 6)], 2),
+            ("step", [np.concatenate([row((0.0, 0.0), 0.0, 8), row((20.0, 1.2), 0.0, 8)])], 1),
+            ("broken", [row((0.0, 0.0), 0.0, 6), row((20.0, 0.0), 0.0, 6)], 1),
+            ("kerbs", [kerb((0.0, 0.0), 0.0, 6), kerb((36.0, -5.5), 180.0, 6)], 1),
+            ("dead end", [row((0.0, 6.0), 0.0, 9), row((22.5, 0.0), 180.0, 9), row((25.0, 0.0), 90.0, 2)], 1),
+        ],
+    )
+    def test_every_space_has_a_lane_before_it_and_a_driver_gets_there_and_back(
+        self, tmp_path, name, rows, n_aisles
+    ):
+        draft = imported(tmp_path, rows)
+        lot = draft.lot()
+        assert lot.n_slots == sum(map(len, rows)), (name, draft.left_out)
+        assert clean(lot, tmp_path), name
+        if name not in ("curve", "dead end"):
+            assert len(inferred(rows).aisles) == n_aisles
+
+    def test_facing_rows_share_the_middle_of_their_aisle(self):
+        lot = inferred(double_row())
+        middle = sorted(float(np.median(aisle.points[:, 1])) for aisle in lot.aisles)
+        assert middle == pytest.approx([3.0, 19.0], abs=0.05)
+        assert all(aisle.width == pytest.approx(6.0, abs=0.15) for aisle in lot.aisles)
+
+    def test_a_row_opens_to_the_aisle_that_it_shares_and_not_to_the_verge_behind_it(self):
+        # Gaps of 6, 3.9 and 6 m: the middle one separates backs.
+        rows = [
+            row((20.0, 0.0), 180.0, 8),
+            row((0.0, 6.0), 0.0, 8),
+            row((20.0, 19.9), 180.0, 8),
+            row((0.0, 25.9), 0.0, 8),
+        ]
+        lot = inferred(rows)
+        assert sorted(round(float(np.median(a.points[:, 1])), 1) for a in lot.aisles) == [3.0, 22.9]
+
+    def test_an_oblique_row_makes_its_aisle_one_way_by_its_slant(self):
+        rows = [
+            row((0.0, 4.5), 0.0, 10, angle_deg=60.0),
+            row((29.0, 0.0), 180.0, 10, angle_deg=120.0),
+            row((30.0, 13.9), 180.0, 12),
+            row((0.0, 19.9), 0.0, 12),
+        ]
+        lot = inferred(rows)
+        assert sorted(abs(aisle.one_way) for aisle in lot.aisles) == [0, 1]
+        one_way = [lane for lane in lot.lanes if lane.oneway]
+        assert one_way
+        for lane in one_way:
+            assert lane.points[-1][0] > lane.points[0][0]
+            assert lane.points[:, 1] == pytest.approx(2.25, abs=0.3)
+
+    def test_an_oblique_dead_end_stays_two_way_and_says_so(self, tmp_path):
+        walls = [({"building": "yes"}, [(40.0, -8.0), (44.0, -8.0), (44.0, 9.0), (40.0, 9.0), (40.0, -8.0)])]
+        draft = imported(tmp_path, [row((0.0, 0.0), 0.0, 10, angle_deg=60.0)], more=walls)
+        assert not any(lane.oneway for lane in draft.lot().lanes)
+        assert any("two-way against the slant" in guess for guess in draft.guesses)
+
+    def test_kerbside_spaces_open_to_the_street_between_them(self):
+        lot = inferred([kerb((0.0, 0.0), 0.0, 6), kerb((36.0, -5.5), 180.0, 6)])
+        assert set(lot.slots.mouth.tolist()) == {int(Mouth.LEFT)}
+        assert len(lot.aisles) == 1
+
+    def test_spaces_behind_other_spaces_are_left_out_by_name(self, tmp_path):
+        rows = [row((0.0, 5.0 * k), 0.0, 8) for k in range(3)]
+        rows += [row((0.0, 21.0), 0.0, 16), row((40.0, 38.0), 180.0, 16)]
+        draft = imported(tmp_path, rows)
+        assert len(draft.slots) == sum(map(len, rows)) - 8
+        assert [str(left) for left in draft.left_out] == [
+            "spaces that only another space leads to: 8 (way/9, way/10, way/11, way/12, way/13, ...)"
+        ]
+
+    def test_a_car_park_of_landlocked_spaces_is_refused(self, tmp_path):
+        with pytest.raises(
+            InputError, match="32 of 64 spaces have no aisle: spaces that only another space leads to"
+        ):
+            imported(tmp_path, [row((0.0, 5.0 * k), 0.0, 16) for k in range(4)])
+
+    def test_no_lane_leads_over_a_building(self, tmp_path):
+        hut = [(24.0, 1.0), (28.0, 1.0), (28.0, 20.0), (24.0, 20.0), (24.0, 1.0)]
+        lot = imported(tmp_path, double_row(), more=[({"building": "yes"}, hut)]).lot()
+        wall = shapely.Polygon(lot.walls[0])
+        assert all(shapely.LineString(lane.points).distance(wall) > 1.0 for lane in lot.lanes)
+        assert clean(lot, tmp_path)
+
+
+class TestRoads:
+    def test_a_service_road_wins_with_its_direction(self, tmp_path):
+        aisle = (
+            {"highway": "service", "service": "parking_aisle", "oneway": "yes"},
+            [(30.0, 3.4), (-8.0, 3.4)],
+        )
+        street = ({"highway": "residential"}, [(-8.0, -20.0), (-8.0, 50.0)])
+        back = ({"highway": "service"}, [(30.0, 3.4), (30.0, 30.0), (-8.0, 30.0)])
+        draft = imported(tmp_path, double_row(), more=[aisle, street, back])
+        lot = draft.lot()
+        one_way = [lane for lane in lot.lanes if lane.oneway]
+        assert lot.n_slots == 32
+        assert one_way
+        assert all(lane.points[-1][0] < lane.points[0][0] for lane in one_way)
+
+    def test_rows_that_no_road_reaches_get_aisles_and_cars_enter_from_the_street(self, tmp_path):
+        aisle = ({"highway": "service", "service": "parking_aisle"}, [(-8.0, 3.2), (30.0, 3.2)])
+        street = ({"highway": "residential"}, [(-8.0, -40.0), (-8.0, 3.2), (-8.0, 60.0)])
+        draft = imported(tmp_path, double_row(), more=[aisle, street])
+        lot = draft.lot()
+        assert lot.n_slots == 32
+        assert "1 aisles along the rows' fronts" in draft.guesses
+        assert any("where a lane meets a street" in guess for guess in draft.guesses)
+        assert lot.entries[:, 0] == pytest.approx(lot.slot_xy[:, 0].min() - 9.25, abs=0.1)
+        assert clean(lot, tmp_path)
+
+    def test_the_goal_is_a_buildings_entrance(self, tmp_path):
+        door = ({"entrance": "main"}, (40.0, 12.0))
+        draft = imported(tmp_path, double_row(), more=[door])
+        middle = draft.slots.xy.mean(axis=0)
+        assert draft.goals - middle == pytest.approx(np.array([[30.0, 1.0]]), abs=0.3)
+        assert any("entrance node/" in guess for guess in draft.guesses)
+
+
+class TestGuesses:
+    def test_without_leave_to_guess_the_entry_is_missing_and_a_place_is_proposed(self, tmp_path):
+        draft = imported(tmp_path, double_row(), ImportOptions())
+        assert len(draft.missing) == 2
+        assert "--entry auto" in draft.missing[0]
+        assert "--goal auto" in draft.missing[1]
+
+    def test_a_given_entry_counts(self, tmp_path):
+        free = imported(tmp_path, double_row())
+        options = ImportOptions(entries=(tuple(free.entries[0].tolist()),), guess_goal=True)
+        with pytest.raises(InputError, match="entry is"):
+            imported(tmp_path, double_row(), ImportOptions(entries=((500.0, 500.0),), guess_goal=True)).lot()
+        assert not any(
+            guess.startswith("entry") for guess in imported(tmp_path, double_row(), options).guesses
+        )
+
+    def test_the_file_keeps_guesses_and_doubts(self, tmp_path):
+        draft = imported(tmp_path, double_row())
+        path = tmp_path / "lot.geojson"
+        write_lot(draft.lot(), path, Provenance("made.geojson", draft.guesses, draft.doubts))
+        kept = read_provenance(path)
+        assert kept.guesses == draft.guesses
+        assert [doubt.reason for doubt in kept.doubts] == [doubt.reason for doubt in draft.doubts]
+        assert read_lot(path) == draft.lot()
+
+    def test_damaged_guesses_are_refused(self, tmp_path):
+        path = tmp_path / "lot.geojson"
+        path.write_text(json.dumps({"import": [1]}), encoding="utf-8")
+        with pytest.raises(InputError, match="import is"):
+            read_provenance(path)
+
+
+class TestInvariance:
+    @settings(max_examples=6, deadline=None)
+    @given(turned=st.floats(0.0, 360.0), east=st.floats(-3000.0, 3000.0), north=st.floats(-3000.0, 3000.0))
+    def test_turning_and_moving_the_map_changes_nothing_but_the_frame(
+        self, tmp_path_factory, turned, east, north
+    ):
+        folder = tmp_path_factory.mktemp("turned")
+        rows = [*double_row(6), kerb((25.0, 0.0), 90.0, 3)]
+        here = imported(folder, rows).lot()
+        there = imported(folder, rows, turned_deg=turned, moved=(east, north)).lot()
+        assert there.slot_ids == here.slot_ids
+        assert np.array_equal(there.slot_mouth, here.slot_mouth)
+        turn = there.slot_yaw - here.slot_yaw
+        assert np.abs(np.exp(1j * (turn - turn[0])) - 1.0).max() < 0.02
+        assert there.n_vertices - there.n_slots == pytest.approx(here.n_vertices - here.n_slots, abs=2)
+        length = [sum(shapely.LineString(lane.points).length for lane in lot.lanes) for lot in (here, there)]
+        assert length[1] == pytest.approx(length[0], rel=0.1)
+
+    def test_the_order_of_spaces_does_not_matter(self, tmp_path):
+        made = document(double_row())
+        shuffled = copy.deepcopy(made)
+        order = np.random.default_rng(3).permutation(len(made["features"]))
+        shuffled["features"] = [made["features"][i] for i in order]
+        lots = [import_lot(write(tmp_path / "made.geojson", d), AUTO).lot() for d in (made, shuffled)]
+        one, other = (dict(zip(lot.slot_ids, lot.slot_yaw.round(6).tolist(), strict=True)) for lot in lots)
+        assert one == other
+
+
+def spoiled(made, kind):
+    """Spoil a document in one place."""
+    ring = made["features"][5]["geometry"]["coordinates"][0]
+    if kind == "same id":
+        made["features"][5]["id"] = made["features"][5]["properties"]["@id"] = "way/9"
+    elif kind == "open":
+        ring.pop()
+    elif kind == "crossing":
+        ring[1], ring[2] = ring[2], ring[1]
+    elif kind == "swapped":
+        made["features"][5]["geometry"]["coordinates"] = [[[lat, lon] for lon, lat in ring]]
+    elif kind == "all swapped":
+        for each in made["features"]:
+            each["geometry"]["coordinates"] = [
+                [[lat, lon] for lon, lat in each["geometry"]["coordinates"][0]]
+            ]
+    elif kind == "flat":
+        ring[1:4] = [ring[0]] * 3
+    elif kind == "huge":
+        corner, other = ring[0], ring[2]
+        scale = 6.0
+        made["features"][5]["geometry"]["coordinates"] = [
+            [[corner[0] + scale * (p[0] - corner[0]), corner[1] + scale * (p[1] - corner[1])] for p in ring]
+        ]
+        assert other
+    elif kind == "twice":
+        made["features"].append(copy.deepcopy(made["features"][5]))
+        made["features"][-1]["id"] = made["features"][-1]["properties"]["@id"] = "way/77"
+    return made
+
+
+class TestFaults:
+    @pytest.mark.parametrize(
+        ("kind", "says"),
+        [
+            ("same id", "way/9 appears twice"),
+            ("open", "way/6: its outline is open"),
+            ("crossing", "way/6: its outline is not a simple one"),
+            ("swapped", "latitude and longitude swapped"),
+            ("all swapped", "latitude and longitude swapped"),
+            ("flat", "way/6: .*(outline|0.0 m²)"),
+            ("huge", "way/6: a parking space of 450.0 m²|way/6: .*m²"),
+            ("twice", "way/77: lies on way/6"),
+        ],
+    )
+    def test_each_is_said_in_a_line_and_nothing_is_written(self, tmp_path, kind, says):
+        path = write(tmp_path / "made.geojson", spoiled(document(double_row()), kind))
+        out = tmp_path / "lot.geojson"
+        done = parkenv("lot", "import", path, "--entry", "auto", "--goal", "auto", "--out", out)
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
+        assert re.search(says, done.stderr), done.stderr
+        assert not out.exists()
+
+    def test_too_many_spaces(self, monkeypatch, tmp_path):
+        monkeypatch.setattr("parkenv.lots.outlines.outline_import.MOST_SPACES", 10)
+        with pytest.raises(InputError, match="32 parking spaces, want at most 10 in one lot"):
+            imported(tmp_path, double_row())
+
+    def test_lorry_parks_are_no_car_parks(self, tmp_path):
+        with pytest.raises(InputError, match="no parking space for cars: spaces larger than 30 m²"):
+            imported(tmp_path, [row((0.0, 0.0), 0.0, 8, size=(16.0, 3.5))])
+
+
+class TestExtracts:
+    def test_polygons_without_tags_are_parking_spaces(self, tmp_path):
+        made = document(double_row())
+        for each in made["features"]:
+            each["properties"] = {"fid": 1}
+            del each["id"]
+        path = write(tmp_path / "plain.geojson", made)
+        lot = import_lot(path, AUTO).lot()
+        assert lot.n_slots == 32
+        assert lot.slot_ids[0] == "feature/0"
+        with pytest.raises(InputError, match=r"`parkenv lot import .* makes a lot of it"):
+            read_lot(path)
+
+    def test_without_osmium_a_line_says_what_to_install(self, monkeypatch, tmp_path):
+        monkeypatch.setitem(sys.modules, "osmium", None)
+        done = parkenv("lot", "import", tmp_path / "town.osm.pbf", "--split", "--out", tmp_path / "lots")
+        assert done.returncode == 2
+        assert done.stderr.count("\n") == 1
+        assert "pip install 'parkenv[osm]'" in done.stderr
+
+    def test_an_extract_gives_the_lot_of_its_geojson(self, tmp_path):
+        osmium = pytest.importorskip("osmium", reason="the extra osm is not installed")
+        made, mutable = document(double_row()), osmium.osm.mutable
+        path = tmp_path / "made.osm.pbf"
+        ways, count = [], 0
+        with osmium.SimpleWriter(str(path)) as writer:
+            for number, each in enumerate(made["features"], start=1):
+                corners = each["geometry"]["coordinates"][0][:-1]
+                nodes = list(range(count + 1, count + 5))
+                count += 4
+                for node, place in zip(nodes, corners, strict=True):
+                    writer.add_node(mutable.Node(id=node, location=tuple(place)))
+                ways.append(
+                    mutable.Way(id=number, nodes=[*nodes, nodes[0]], tags={"amenity": "parking_space"})
+                )
+            for way in ways:
+                writer.add_way(way)
+        lots = [import_lot(p, AUTO).lot() for p in (path, write(tmp_path / "made.geojson", made))]
+        assert lots[0].slot_ids == lots[1].slot_ids
+        assert lots[0].slot_xy == pytest.approx(lots[1].slot_xy, abs=0.02)
+        path.write_bytes(b"no extract" * 100)
+        with pytest.raises(InputError, match="not an OpenStreetMap extract"):
+            import_lot(path, AUTO)
+
+
+class TestSurvey:
+    CAR = VehicleParameters()
+
+    def test_manoeuvres_that_a_driver_would_do_and_not(self):
+        assert can_park(ManoeuvreKind(90, 600, 250, 500), self.CAR)
+        assert can_park(ManoeuvreKind(0, 350, 210, 600), self.CAR)
+        assert not can_park(ManoeuvreKind(90, 600, 180, 500), self.CAR)
+        assert not can_park(ManoeuvreKind(90, 225, 250, 500), self.CAR)
+        assert not can_park(ManoeuvreKind(0, 600, 210, 440), self.CAR)
+
+    @pytest.mark.parametrize("name", ["mini", "campus", "street"])
+    def test_packaged_lots_are_clean(self, name):
+        survey = survey_lot(packaged_lot(name))
+        assert survey.problems == ()
+        assert survey.doubt == 0.0
+        assert survey.planned == survey.kinds
+
+    def test_one_way_lanes_without_a_loop(self):
+        mini = packaged_lot("mini")
+        lot = ParkingLot(**{**columns(mini), "lanes": (Lane(mini.lanes[0].points, oneway=True),)})
+        assert any("form no loop" in p.message for p in survey_lot(lot, drive=False).problems)
+
+    def test_a_lane_over_a_slot(self):
+        mini = packaged_lot("mini")
+        over = Lane(np.array([mini.lanes[0].points[1], mini.slot_xy[0]]))
+        lot = ParkingLot(**{**columns(mini), "lanes": (*mini.lanes, over)})
+        survey = survey_lot(lot, drive=False)
+        assert any("leaves less than 1 m to the slot" in p.message for p in survey.problems)
+        assert survey.doubt >= 0.5
+
+    def test_a_slot_too_narrow_to_drive_into_is_named(self, tmp_path):
+        mini = packaged_lot("mini")
+        width = mini.slot_width.copy()
+        width[3] = 1.7
+        lot = ParkingLot(**{**columns(mini), "slot_width": width})
+        path = tmp_path / "lot.geojson"
+        write_lot(lot, path)
+        said = parkenv("lot", "check", path).stdout
+        assert "the car gets into no slots of 5 × 1.7 m at 90°" in said
+        assert f"1 slots ('{mini.slot_ids[3]}')" in said
+        assert "doubt 0.2" in said
+        assert "gets into no" not in parkenv("lot", "check", path, "--no-drive").stdout
+
+
+def columns(lot):
+    names = (
+        "slot_ids",
+        "slot_xy",
+        "slot_yaw",
+        "slot_length",
+        "slot_width",
+        "slot_mouth",
+        "lanes",
+        "entries",
+        "goals",
+    )
+    return {name: getattr(lot, name) for name in ("name", *names)}
+
+
+class TestTown:
+    def town(self):
+        parts = [document(double_row(6), moved=(200.0 * k, 0.0), turned_deg=30.0 * k) for k in range(3)]
+        parts.append(document([row((0.0, 0.0), 0.0, 4)], moved=(0.0, 300.0)))
+        for k, part in enumerate(parts):
+            for each in part["features"]:
+                number = int(each["id"].split("/")[1]) + 1000 * k
+                each["id"] = each["properties"]["@id"] = f"way/{number}"
+        parts[1]["features"][3]["geometry"]["coordinates"][0].pop()
+        return {"type": "FeatureCollection", "features": [f for part in parts for f in part["features"]]}
+
+    def test_each_car_park_becomes_a_lot_or_says_why_not(self, tmp_path):
+        path, out = write(tmp_path / "town.geojson", self.town()), tmp_path / "lots"
+        done = parkenv("lot", "import", path, "--split", "--out", out)
+        assert done.returncode == 0, done.stderr
+        assert "3 car parks" in done.stdout
+        rows = json.loads((out / "summary.json").read_text(encoding="utf-8"))["rows"]
+        assert sorted(row["result"] for row in rows) == ["clean", "clean", "refused"]
+        refused = next(row for row in rows if row["result"] == "refused")
+        assert "way/1004: its outline is open" in refused["reason"]
+        assert sorted(p.name for p in out.iterdir()) == sorted(
+            ["summary.json", "contact-sheet-1.png", *(f"{r['lot']}.geojson" for r in rows if r["slots"])]
+        )
+        shown = parkenv("lot", "show", out / f"{rows[0]['lot']}.geojson", "--out", tmp_path / "lot.png")
+        assert "guessed: entry at" in shown.stdout
+        assert (tmp_path / "lot.png").stat().st_size > 10_000
+
+    def test_the_example_is_what_its_generator_makes(self):
+        path = Path(__file__).parents[1] / "examples" / "outlined_town.geojson"
+        assert json.loads(path.read_text(encoding="utf-8")) == town()
+
+    def test_split_takes_no_single_entry(self, tmp_path):
+        path = write(tmp_path / "town.geojson", self.town())
+        done = parkenv("lot", "import", path, "--split", "--entry", "0,0", "--out", tmp_path / "lots")
+        assert done.returncode == 2
+        assert "--split finds entries" in done.stderr
+
+    def test_no_group_large_enough(self, tmp_path):
+        path = write(tmp_path / "town.geojson", self.town())
+        done = parkenv("lot", "import", path, "--split", "--least", "50", "--out", tmp_path / "lots")
+        assert done.returncode == 2
+        assert "in groups of at most 24, want a group of 50" in done.stderr
