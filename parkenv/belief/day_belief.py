@@ -209,8 +209,8 @@ def _update(
 @compiled(inline="always")
 def _weights(log_weight: FloatArray) -> FloatArray:
     """Return the probabilities of the hypotheses, (k,)."""
-    weight = np.exp(log_weight - log_weight.max())
-    return weight / weight.sum()
+    weight: FloatArray = np.exp(log_weight - log_weight.max())
+    return np.asarray(weight / weight.sum())
 
 
 @compiled
