@@ -108,16 +108,17 @@ def test_it_parks_at_once_in_an_empty_lot_that_is_known_to_be():
     assert row["total_s"] == pytest.approx(row["bound_s"], abs=1.0)
 
 
-def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong():
+@pytest.mark.parametrize(("day_error", "ahead_s", "mean_s"), [(0.0, 50.0, 92.0), (0.8, 40.0, 105.0)])
+def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong(day_error, ahead_s, mean_s):
     """On jam the tuned planner trusts its map into every aisle; what the first slots show is enough to doubt it."""
-    scenario = make_scenario("jam", day_error=0.0)
+    scenario = make_scenario("jam", day_error=day_error)
     ours, theirs = (
         np.array([r["total_s"] for r in Case(scenario, name).run(range(10))[0]])
         for name in ("belief", "mdp-tuned")
     )
     _, _, high = mean_interval(ours - theirs)
-    assert high < -50.0
-    assert ours.mean() < 92.0
+    assert high < -ahead_s
+    assert ours.mean() < mean_s
 
 
 def test_knowing_the_day_helps_the_planner_of_the_thesis_too():
@@ -200,6 +201,7 @@ def test_a_prior_that_is_badly_wrong_does_not_keep_it_from_parking(prior_logit):
 @pytest.mark.parametrize("name", ["campus", "jam"])
 def test_what_a_worthless_map_costs(name, said):
     """The map has all slots free, or all taken. With all free, the thesis's planner is 90 s above the bound on jam."""
+    # Days that are as the world's process says: on a much fuller one, jam has no free slot for minutes.
     scenario = make_scenario(name, day_error=0.0)
     prior = OccupancyProcess.from_demand(np.full(scenario.lot.n_slots, said), np.zeros(168))
     rows = Case(scenario.replace(prior=prior), "belief").run(range(8))[0]
@@ -269,8 +271,8 @@ def test_hidden_slots_are_tried_where_nothing_better_is_left(seen_rate):
 
 def test_a_path_is_kept_to_until_something_is_seen_unless_another_is_better_than_it_was(monkeypatch):
     """Paths are valued by estimates, which differ by where the car is: it could turn round between two for ever."""
-    scenario, kept = at_occupancy(make_scenario("campus", day_error=0.0), 0.95), []
-    for seed in (5, 11, 17, 29):
+    scenario, kept = at_occupancy(make_scenario("campus"), 0.95), []
+    for seed in (5, 11, 17, 23, 29):
         made = choices(scenario, monkeypatch, seed=seed, budget_ms=10.0)
         kept += [(remaining_s, choice.onward_s) for remaining_s, choice in made if remaining_s < np.inf]
         last = [choice.remaining_s for _, choice in made]

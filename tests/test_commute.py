@@ -12,9 +12,10 @@ from command_line import parkenv
 from parkenv import make_scenario
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
-from parkenv.evaluation.experiments.commute import Course, calendar, run_commute
+from parkenv.evaluation.experiments.commute import Commute, Course, calendar, run_commute
 from parkenv.evaluation.experiments.spec import CommuteSpec
 from parkenv.files.spec_file import read_tables
+from parkenv.mapping.learned_map import LearnedMap
 from parkenv.mapping.store import MapStore
 from parkenv.world.occupancy import ArrivalWindow
 from parkenv.world.occupancy_log import OccupancyLog
@@ -164,14 +165,45 @@ def test_a_bonus_for_observations_lets_the_car_see_more():
 
 
 @pytest.mark.slow
-def test_a_week_of_trips_closes_the_gap_of_a_wrong_map():
-    """On jam, where the map is wrong: belief after a week, and on the first day, with and without learning."""
+def test_a_week_of_trips_closes_the_gap_of_a_wrong_map(monkeypatch):
+    """On jam, where the map is wrong, against drivers without a map (greedy-drive) and with the right one."""
     scenario = make_scenario("jam")
     days = calendar(scenario, 8)
-    totals = {}
-    for name in ("wrong", "fixed"):
-        courses = [Course(scenario, AgentSpec(name="belief"), name, number, 1, 0) for number in range(12)]
-        totals[name] = np.array([[row["total_s"] for row in course.run(days, [])[0]] for course in courses])
-    excess = totals["wrong"] - totals["fixed"]
-    assert excess[:, 0].mean() > 5.0
-    assert excess[:, 5:].mean() < 2.0
+
+    def total_s(agent, start):
+        courses = [Course(scenario, AgentSpec(name=agent), start, number, 1, 0) for number in range(12)]
+        return np.array([[row["total_s"] for row in course.run(days, [])[0]] for course in courses])
+
+    learning, right, without = (
+        total_s("belief", "wrong"),
+        total_s("belief", "fixed"),
+        total_s("greedy-drive", "none"),
+    )
+    first, later = slice(0, 1), slice(5, None)
+    assert (learning - without)[:, first].mean() > 5.0
+    assert (learning - without)[:, later].mean() < -2.0
+    assert (learning - right)[:, later].mean() < 2.0
+    monkeypatch.setattr(LearnedMap, "learn", lambda self, trips: None)
+    assert (total_s("belief", "wrong") - without)[:, later].mean() > 5.0
+
+
+def test_a_log_keeps_its_slots_on_all_days_of_a_commute(tmp_path):
+    """Without a mapping, a log's slots are ranked anew for every day; a map could not learn them."""
+    rng, lines = np.random.default_rng(0), ["slot_id,datetime,occupied"]
+    for date in ("2024-03-05", "2024-03-06", "2024-03-07", "2024-03-08"):
+        taken = rng.random(10) < 0.5
+        lines += [f"s{s},{date}T{hour:02}:00,{int(taken[s])}" for s in range(10) for hour in range(7, 20)]
+    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    (tmp_path / "recorded.toml").write_text('lot = "mini"\noccupancy = "log.csv"\n')
+    commute = Commute(spec(scenarios=[str(tmp_path / "recorded.toml")], drivers=1))
+    occupancy = commute.courses[0].scenario.occupancy
+    anew = make_scenario(tmp_path / "recorded.toml").occupancy
+    slots, ranked = (
+        np.array([its.mapped_log(day).log_slot for day in its.log.days]) for its in (occupancy, anew)
+    )
+    assert (slots == slots[0]).all()
+    assert not (ranked == ranked[0]).all()
+    # The fullest are nearest to the goal.
+    mean = occupancy.log.mean_occupancy("weekday")[slots[0]]
+    assert (np.diff(mean[np.argsort(occupancy.walk_m, kind="stable")]) <= 0.0).all()
+    assert occupancy.with_fixed_slots(ArrivalWindow()) is occupancy

@@ -13,7 +13,7 @@ from parkenv.evaluation.trip_recorder import TripRecorder
 from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior, mean_probability
 from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, ReversedMap, map_prior
 from parkenv.mapping.store import VERSION, MapStore
-from parkenv.mapping.trips import Trip, state_likelihoods
+from parkenv.mapping.trips import DayMemory, Trip, state_likelihoods
 from parkenv.world.day_error import DayError
 from parkenv.world.occupancy import Arrival, Forecast
 from parkenv.world.scenario import SearchProblem
@@ -31,7 +31,12 @@ def sigmoid(x):
 
 def evidence(slots, taken):
     states = np.asarray(taken, float)
-    return Evidence(np.asarray(slots), np.full(len(states), 9.0), np.column_stack([1.0 - states, states]))
+    return Evidence(
+        np.asarray(slots),
+        np.full(len(states), 9.0),
+        np.column_stack([1.0 - states, states]),
+        np.ones(len(states)),
+    )
 
 
 def trip(key, day, slots, taken, hit_rate=1.0, false_alarm_rate=0.0, after_s=None):
@@ -171,12 +176,73 @@ def test_what_a_trip_says_about_a_slot():
     ]
     for slots, taken, wanted in cases:
         its = trip("a", 0, slots, taken, 0.8, 0.1, after_s=np.arange(len(slots)) * 1e4)
-        found, likelihood = state_likelihoods(its, known)
-        assert found.tolist() == slots[:1]
+        states = state_likelihoods(its, known)
+        assert states.slots.tolist() == slots[:1]
+        assert states.time.tolist() == [its.time]
         np.testing.assert_allclose(
-            likelihood[:, 1] / likelihood[:, 0], np.array(wanted)[:, 1] / np.array(wanted)[:, 0], rtol=1e-9
+            states.likelihood[:, 1] / states.likelihood[:, 0],
+            np.array(wanted)[:, 1] / np.array(wanted)[:, 0],
+            rtol=1e-9,
         )
-    assert len(state_likelihoods(trip("a", 0, [0, 0], [True, False], after_s=np.zeros(2)), known)[0]) == 0
+    assert len(state_likelihoods(trip("a", 0, [0, 0], [True, False], after_s=np.zeros(2)), known).slots) == 0
+
+
+def test_a_car_that_several_drivers_see_counts_once():
+    """Ten trips of a day within a slot's memory say hardly more than one, ten far apart as much as ten."""
+    n, p = 12, {}
+    for apart_s in (0.0, 600.0, 1e5):
+        memory = DayMemory(n)
+        known = EmptyMap(n).forecast(MORNING)
+        weights = []
+        for i in range(3):
+            states = state_likelihoods(
+                trip("a", 0, np.arange(n), np.ones(n), after_s=np.full(n, i * apart_s)), known
+            )
+            weights.append(memory.add(states, known))
+        rate = known.decay_rate[0]
+        np.testing.assert_allclose(weights[0], 1.0)
+        np.testing.assert_allclose(weights[1:], 1.0 - np.exp(-rate * apart_s))
+    for name, gap_s in (("once", None), ("soon", 5.0), ("late", 3 * HOUR_S)):
+        learned = LearnedMap(EmptyMap(n), np.arange(n), NO_MAP)
+        its = [trip(f"{i}", 0, [3], [True]) for i in range(1 if gap_s is None else 4)]
+        moved = [
+            Trip(t.key, t.time + i * (gap_s or 0.0), *list(vars(t).values())[2:]) for i, t in enumerate(its)
+        ]
+        learned.learn(moved)
+        p[name] = learned.forecast(MORNING).p_occupied[3]
+    assert p["once"] < p["soon"] < p["once"] + 0.01 < p["late"]
+
+
+def test_intervals_of_what_is_learned_hold_the_truth():
+    """On days whose level differs by 1.2 logits, 90 % intervals of slots and of their mean hold about 90 %.
+
+    A map that takes the observations of one day as independent is too sure of the mean.
+    """
+    n, reach, marks, day_sd = 24, 14, (1, 3, 10), 1.2
+    inside = {assumed: {day: ([], []) for day in marks} for assumed in (day_sd, 0.0)}
+    prior = MapErrorPrior(0.7, 0.5, 0.5, 0.6, 0.3, memory_days=1e4)
+    near = np.linspace(1.0, -1.0, n)
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        errors = rng.multivariate_normal(np.zeros(n + 48), prior.covariance(near))
+        true = errors[:n] + 0.5 * (errors[n + 8] + errors[n + 9])
+        maps = {assumed: MapError(near, [prior]) for assumed in inside}
+        for day in range(1, max(marks) + 1):
+            slots = rng.integers(0, n - reach) + np.arange(reach)
+            taken = rng.random(reach) < sigmoid(true[slots] + day_sd * rng.standard_normal())
+            for assumed, error in maps.items():
+                error.observe(evidence(slots, taken), np.zeros((1, reach)), (assumed, 0.0))
+                if day in marks:
+                    mean, variance = error.predict(9.0)
+                    level = np.abs(true.mean() - mean[0].mean()) / error.common_sd(9.0)[0][0]
+                    of_slots, of_level = inside[assumed][day]
+                    of_slots.append(np.abs(true - mean[0]) < 1.645 * np.sqrt(variance[0]))
+                    of_level.append(level < 1.645)
+    for day in marks:
+        of_slots, of_level = inside[day_sd][day]
+        assert 0.85 < np.mean(of_slots) < 0.95
+        assert 0.8 < np.mean(of_level) <= 1.0
+    assert np.mean(inside[0.0][10][1]) < 0.75 < np.mean(inside[day_sd][10][1])
 
 
 @pytest.mark.parametrize(

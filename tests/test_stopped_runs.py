@@ -127,15 +127,38 @@ def test_a_signal_while_a_compiled_module_is_imported_stops_after_it():
         "            print('sent')\n"
         "sys.meta_path.insert(0, Finder())\n"
         "try:\n"
-        "    with stop_signals() as received:\n"
+        "    with stop_signals():\n"
         "        import scipy.linalg\n"
         "        while True:\n"
         "            pass\n"
         "except KeyboardInterrupt:\n"
-        "    print('stopped', received, 'scipy.linalg._cythonized_array_utils' in sys.modules)\n"
+        "    print('stopped')\n"
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
-    assert (done.returncode, done.stdout) == (0, "sent\nstopped [15] True\n"), done.stderr
+    assert (done.returncode, done.stdout) == (0, "sent\nstopped\n"), done.stderr
+
+
+def test_a_signal_while_numba_compiles_is_not_lost():
+    """LLVM calls Python for each module that it has compiled, and an exception there would be printed and ignored."""
+    script = (
+        "import os, signal, time, numba\n"
+        "from llvmlite.binding.executionengine import ExecutionEngine\n"
+        "from parkenv.cli.stop_signals import stop_signals\n"
+        "find = ExecutionEngine._find_module_ptr\n"
+        "def interrupted(*arguments):\n"
+        "    ExecutionEngine._find_module_ptr = find\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    return find(*arguments)\n"
+        "try:\n"
+        "    with stop_signals():\n"
+        "        ExecutionEngine._find_module_ptr = interrupted\n"
+        "        numba.njit(lambda x: x + 1)(1)\n"
+        "        time.sleep(30)\n"
+        "except KeyboardInterrupt:\n"
+        "    print('stopped')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "stopped\n", "")
 
 
 @pytest.mark.parametrize("thread", ["main", "other"])
@@ -206,6 +229,35 @@ def test_an_invalid_command_leaves_no_folder(tmp_path):
     out = tmp_path / "results" / "compare"
     assert parkenv("compare", "--scenario", "mini", "--agents", "nobody", "--out", out).returncode == 2
     assert not out.parent.exists()
+
+
+def test_a_file_system_that_is_read_only_is_named(tmp_path, monkeypatch):
+    def refuse(self, *_, **__):
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))
+
+    path = tmp_path / "a.json"
+    with monkeypatch.context() as patched:
+        for action in ("write_text", "unlink"):
+            patched.setattr(Path, action, refuse)
+        with pytest.raises(InputError) as refused, atomic_write.atomic_write(path) as beside:
+            beside.write_text("{}")
+    assert str(refused.value) == f"{path}: cannot be written: Read-only file system"
+
+
+@pytest.mark.parametrize(
+    "command",
+    [("report", "run"), ("fit-sensor-model", "--scenario", "mini", "-n", "1")],
+    ids=lambda command: command[0],
+)
+def test_what_cannot_be_written_is_refused_before_the_work(tmp_path, command):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "summary.json").write_text(
+        json.dumps({"command": ["parkenv", "compare"], "version": "0.1.0", "rows": []})
+    )
+    (tmp_path / "file").touch()
+    refused = parkenv(*command, "--out", "file/made", cwd=tmp_path)
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert refused.stderr == "parkenv: error: --out file: cannot be written (File exists)\n"
 
 
 def test_a_full_disk_leaves_files_as_they_were(tmp_path):

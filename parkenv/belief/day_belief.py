@@ -113,16 +113,14 @@ class DayBelief:
 
     def mixture(self) -> tuple[FloatArray, FloatArray]:
         """Return the weights, (k,), of the hypotheses that matter, and P(free) under each, (n_slots, k)."""
-        weight = np.exp(self._log_weight - self._log_weight.max())
-        kept = weight >= NEGLIGIBLE * weight.sum()
-        return weight[kept] / weight[kept].sum(), 1.0 - self._p_taken[:, kept]
+        weight, p_free = _mixture(self._log_weight, self._p_taken)
+        return weight, p_free
 
     def p_occupied(self, belief: SlotBelief) -> FloatArray:
         """P(taken) of each slot at the time of the belief, (n_slots,), observed or not."""
-        weight = np.exp(self._log_weight - self._log_weight.max())
         return np.asarray(
             _p_occupied(
-                weight / weight.sum(),
+                self._log_weight,
                 self._p_taken,
                 self._p_then,
                 self._observed_at,
@@ -208,16 +206,35 @@ def _update(
         observed_at[s], p_observed[s] = time, parts[2, s]
 
 
+@compiled(inline="always")
+def _weights(log_weight: FloatArray) -> FloatArray:
+    """Return the probabilities of the hypotheses, (k,)."""
+    weight: FloatArray = np.exp(log_weight - log_weight.max())
+    return np.asarray(weight / weight.sum())
+
+
+@compiled
+def _mixture(log_weight: FloatArray, p_taken: FloatArray) -> tuple[FloatArray, FloatArray]:
+    weight = _weights(log_weight)
+    kept = np.flatnonzero(weight >= NEGLIGIBLE)
+    p_free = np.empty((len(p_taken), len(kept)))
+    for s in range(len(p_taken)):
+        for k in range(len(kept)):
+            p_free[s, k] = 1.0 - p_taken[s, kept[k]]
+    weight = weight[kept]
+    return weight / weight.sum(), p_free
+
+
 @compiled
 def _p_occupied(
-    weight: FloatArray,
+    log_weight: FloatArray,
     p_taken: FloatArray,
     p_then: FloatArray,
     observed_at: FloatArray,
     parts: FloatArray,
     now: float,
 ) -> FloatArray:
-    p_occupied = np.zeros(len(observed_at))
+    weight, p_occupied = _weights(log_weight), np.zeros(len(observed_at))
     for s in range(len(observed_at)):
         leaving, first = parts[1, s] * (1.0 - parts[0, s]), 0.0
         for h in range(len(weight)):

@@ -105,7 +105,7 @@ def _best(folder: Path, trust: bool) -> tuple[Path, Sequence[ScenarioSpec] | Non
     rows = run.summary["rows"]
     key = "total_s" if spec.env == "search" else "success"
     best = (min if spec.env == "search" else max)(rows, key=lambda row: float(row[key]))
-    return folder / f"seed_{int(best['seed'])}" / MODEL, spec.test_on or spec.scenarios
+    return folder / f"seed_{int(best['seed'])}" / MODEL, spec.test_on or spec.evaluate_on or spec.scenarios
 
 
 def _trained_on(model: Path, names: Sequence[str]) -> list[ScenarioSpec]:

@@ -90,12 +90,14 @@ def make_report(
         InputError: the folder holds no finished run of this version, not the chosen searches, or names classes that
             are not trusted.
     """
+    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.report.page import page_data, write_page
     from parkenv.evaluation.report.repetition import Repetition, differences, drawable
     from parkenv.evaluation.report.run_folder import RunFolder
     from parkenv.evaluation.report.search_recording import choose, record
 
     run = RunFolder.read(folder)
+    make_folder(folder if out is None else out.parent)
     console = make_console()
     repeated = Repetition([])
     notes: list[str] = []

@@ -38,12 +38,14 @@ def fit_sensor_model(
         rig (laser|stereo|both_sides): Whose errors to measure.  [default: the scenario's, laser]
         out, -o (FILE.json): The file to write.
     """
+    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.experiments.sensor_model_fit import AGENTS, measure_sensors
     from parkenv.evaluation.experiments.spec import BUSY
     from parkenv.scenarios.build import build
 
     specs = [args.Traffic().on(spec, BUSY) for spec in world.specs(scenario, default=SCENARIOS)]
     scenarios = [build(spec) for spec in specs]
+    make_folder(out.parent)
     console = make_console()
     with machines.workers() as workers, progress_bar(console, "episodes") as progress:
         total = episodes * len(AGENTS) * len(scenarios)

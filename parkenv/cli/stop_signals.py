@@ -12,6 +12,8 @@ from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 
 _IMPORTS_COMPILED = (ExtensionFileLoader.create_module.__code__, ExtensionFileLoader.exec_module.__code__)
+_CALLED_BY_NUMBA = {"_numba_unpickle", "_raw_object_cache_notify", "_raw_object_cache_getbuffer"}
+"""Functions of numba and llvmlite that compiled code calls: for the result of a function, and while LLVM compiles."""
 
 
 @contextmanager
@@ -44,12 +46,12 @@ def stop_signals() -> Iterator[list[int]]:
 
 
 def _would_crash(frame: FrameType | None) -> bool:
-    """Whether compiled code has called this code, and would end the process if it raised an exception.
+    """Whether compiled code has called this code, and would end the process, or lose the exception, if it raised one.
 
-    So do modules in C++ while they are imported, and numba while it makes the Python objects that a function returns.
+    So do modules in C++ while they are imported, and numba while it compiles and while it makes Python objects.
     """
     while frame is not None:
-        if frame.f_code in _IMPORTS_COMPILED or frame.f_code.co_name == "_numba_unpickle":
+        if frame.f_code in _IMPORTS_COMPILED or frame.f_code.co_name in _CALLED_BY_NUMBA:
             return True
         frame = frame.f_back
     return False

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv import __version__
+from parkenv.files.file_names import is_plain
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,11 +20,24 @@ WIDE = 200
 
 
 def make_console(*, soft_wrap: bool = False) -> Console:
-    """Make a console on standard output, as wide as the terminal; it prints names as they are, without markup."""
+    """Make a console on standard output, as wide as the terminal.
+
+    It prints names as they are, without markup, and escapes characters that a terminal would obey.
+    """
     from rich.console import Console
+    from rich.text import Text
+
+    class NamesConsole(Console):
+        def render_str(self, text: str, **options: Any) -> Text:
+            return super().render_str(_escaped(text), **options)
 
     width = None if soft_wrap or sys.stdout.isatty() else WIDE
-    return Console(highlight=False, markup=False, emoji=False, soft_wrap=soft_wrap, width=width)
+    return NamesConsole(highlight=False, markup=False, emoji=False, soft_wrap=soft_wrap, width=width)
+
+
+def _escaped(text: str) -> str:
+    """Return a text with its control characters, except ends of lines, as they are written in Python."""
+    return "".join(c if c == "\n" or is_plain(c) else ascii(c)[1:-1] for c in text)
 
 
 def make_table(title: str | None, headings: Iterable[str], rows: Iterable[Sequence[str]] = ()) -> Table:

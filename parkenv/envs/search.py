@@ -125,7 +125,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     >>> from parkenv.envs.local_observation import LocalObservation
     >>> env = LocalObservation(gym.make("parkenv/Search-v2", scenario=["campus", "street", "mini"]))
     >>> [env.reset(seed=seed)[1]["place"] for seed in range(5)]
-    ['mini', 'mini', 'campus', 'mini', 'street']
+    ['mini', 'campus', 'street', 'campus', 'campus']
 
     ```
 

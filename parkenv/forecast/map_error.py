@@ -33,6 +33,7 @@ SMOOTH_REACH, HOUR_REACH = 0.3, 2.0
 NEGLIGIBLE = 1e-6
 """Priors with less weight are dropped."""
 SWEEPS = 3  # of expectation propagation; further ones change logits by less than 0.01
+UPDATES = 32  # of a covariance at once
 # A sum over equally spaced points converges faster here than Gauss-Hermite quadrature.
 _NODES = np.arange(-6.0, 6.1, 0.375)
 _NODE_WEIGHTS = np.exp(-0.5 * _NODES**2) / np.exp(-0.5 * _NODES**2).sum()
@@ -99,11 +100,13 @@ class Evidence:
         slots: (k,) int64.
         hours: (k,) float64, hours since Monday 00:00, when each state was observed.
         likelihood: (k, 2) float64, probability of its observations if the slot was free, and if it was taken.
+        weight: (k,) float64, by how much each counts, 0 to 1; below 1 if an earlier one already says a part of it.
     """
 
     slots: NDArray[np.int64]
     hours: FloatArray
     likelihood: FloatArray
+    weight: FloatArray
 
 
 class MapError:
@@ -121,7 +124,7 @@ class MapError:
         The map says 50 % for both slots. After slot 0 was taken on ten days, the map is corrected there most.
 
         >>> error = MapError(np.array([1.0, -1.0]), [MapErrorPrior(0.5, 0.0, 0.0, 1.0, 0.0, 1e3)])
-        >>> taken = Evidence(np.array([0]), np.array([9.0]), np.array([[0.0, 1.0]]))
+        >>> taken = Evidence(np.array([0]), np.array([9.0]), np.array([[0.0, 1.0]]), np.ones(1))
         >>> for _ in range(10):
         ...     error.observe(taken, np.zeros((1, 1)), (0.5, 0.0))
         >>> mean, _ = error.predict(9.0)
@@ -172,7 +175,7 @@ class MapError:
         among = _summed(with_all[:, at] * part[:, None] for at, part in parts)
         among += day_error[0] ** 2 + day_error[1] ** 2 * np.outer(nearness, nearness)
         mean = logits + _summed(self._mean[:, at] * part for at, part in parts)
-        precision, location, log_evidence = _approximate(mean, among, evidence.likelihood)
+        precision, location, log_evidence = _approximate(mean, among, evidence)
         # Condition on the approximate observations: their noise has the variance 1/precision.
         root = np.sqrt(precision)
         scaled = root[:, :, None] * among * root[:, None, :] + np.eye(len(nearness))
@@ -237,14 +240,14 @@ def mean_probability(logits: FloatArray, variance: FloatArray) -> FloatArray:
 
 
 def _approximate(
-    mean: FloatArray, covariance: FloatArray, likelihood: FloatArray
+    mean: FloatArray, covariance: FloatArray, evidence: Evidence
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Approximate likelihoods of k states by Gaussian ones, by expectation propagation.
 
     Args:
         mean: (p, k) prior means of the logits, for p priors.
         covariance: (p, k, k).
-        likelihood: (k, 2), probability of the observations of a state if free, and if taken.
+        evidence: the observations.
 
     Returns:
         (p, k) precisions, (p, k) precision times location, and (p,) log evidence (of the first sweep, in which each
@@ -253,15 +256,25 @@ def _approximate(
     mean, covariance = mean.copy(), covariance.copy()
     precision, location = np.zeros_like(mean), np.zeros_like(mean)
     log_evidence = np.zeros(len(mean))
+    # The last updates of the covariance, each column·column'·factor, which it does not hold yet: a matrix product of
+    # many is much faster than one by one.
+    columns, factors, pending = np.empty((*mean.shape, UPDATES)), np.empty((len(mean), UPDATES)), 0
     for sweep in range(SWEEPS):
-        for i, (if_free, if_taken) in enumerate(likelihood):
-            variance = covariance[:, i, i]
+        for i, ((if_free, if_taken), weight) in enumerate(
+            zip(evidence.likelihood, evidence.weight, strict=True)
+        ):
+            if pending == UPDATES:
+                covariance -= (columns * factors[:, None, :]) @ columns.transpose(0, 2, 1)
+                pending = 0
+            late, by = columns[:, :, :pending], factors[:, :pending]
+            column = covariance[:, :, i] - (late @ (late[:, i] * by)[:, :, None])[:, :, 0]
+            variance = column[:, i]
             # The distribution without this observation.
             without = 1.0 / np.maximum(1.0 / variance - precision[:, i], 1e-9)
             center = without * (mean[:, i] / variance - location[:, i])
             points = center[:, None] + np.sqrt(without)[:, None] * _NODES
             p = _sigmoid(points)
-            density = (if_taken * p + if_free * (1.0 - p)) * _NODE_WEIGHTS
+            density = (if_taken * p + if_free * (1.0 - p)) ** weight * _NODE_WEIGHTS
             total = np.maximum(density.sum(axis=1), 1e-300)
             if sweep == 0:
                 log_evidence += np.log(total)
@@ -272,10 +285,10 @@ def _approximate(
             added = 1.0 / narrower - 1.0 / without
             change = added - precision[:, i]
             shift = new_mean / narrower - center / without - location[:, i]
-            column = covariance[:, :, i].copy()
             scale = 1.0 + change * variance
             mean += column * ((shift - change * mean[:, i]) / scale)[:, None]
-            covariance -= (change / scale)[:, None, None] * column[:, :, None] * column[:, None, :]
+            columns[:, :, pending], factors[:, pending] = column, change / scale
+            pending += 1
             precision[:, i] += change
             location[:, i] += shift
     return precision, location, log_evidence

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from parkenv.errors import InputError
 from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior, mean_probability
 from parkenv.mapping.inference import RELAXATION_S, MapPrior, SessionLog
-from parkenv.mapping.trips import Trip, state_likelihoods
+from parkenv.mapping.trips import DayMemory, Trip, state_likelihoods
 from parkenv.world.day_error import MAX_LOGITS, DayError, centred_logits, nearness
 from parkenv.world.occupancy import Arrival, Forecast, PriorModel
 from parkenv.world.occupancy_kernel import MAX_PROBABILITY, MIN_PROBABILITY
@@ -175,16 +175,18 @@ class LearnedMap:
         )
 
     def _learn_day(self, trips: Sequence[Trip]) -> None:
-        slots, hours, likelihood, p, day_error = [], [], [], [], DayError()
+        slots, hours, likelihood, weight, p, day_error = [], [], [], [], [], DayError()
+        memory = DayMemory(self.n_slots)
         for trip in trips:
             base = self._base.forecast(Arrival(trip.time % WEEK_S, trip.date))
-            its_slots, its_likelihood = state_likelihoods(trip, base)
-            slots.append(its_slots)
-            likelihood.append(its_likelihood)
-            hours.append(np.full(len(its_slots), trip.time / HOUR_S))
-            p.append(base.p_occupied[its_slots])
+            states = state_likelihoods(trip, base)
+            slots.append(states.slots)
+            likelihood.append(states.likelihood)
+            weight.append(memory.add(states, base))
+            hours.append(np.full(len(states.slots), trip.time / HOUR_S))
+            p.append(base.p_occupied[states.slots])
             day_error = base.day_error
-        evidence = Evidence(np.concatenate(slots), np.concatenate(hours), np.concatenate(likelihood))
+        evidence = Evidence(*map(np.concatenate, (slots, hours, likelihood, weight)))
         day = day_error.deviations(self._nearness[evidence.slots])
         deviation = np.hypot(self._error.prior_sd()[:, evidence.slots], day)
         logits = self._error.trust[:, None] * centred_logits(np.concatenate(p), deviation)

@@ -22,7 +22,7 @@ def place_of_episode(seed: int, episode: int, n: int) -> int:
 
     Examples:
         >>> [place_of_episode(seed, 0, 3) for seed in range(5)]
-        [2, 2, 0, 2, 1]
+        [2, 0, 1, 0, 0]
     """
     return int(keyed_uniform(world_key(seed, episode), PLACE_STREAM, 0, 0) * n)
 

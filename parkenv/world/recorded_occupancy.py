@@ -1,5 +1,8 @@
 """Worlds that replay the days of a log on the slots of a lot."""
 
+from __future__ import annotations
+
+import dataclasses
 import math
 import os
 from collections.abc import Sequence
@@ -128,7 +131,7 @@ def _day_level(days: int, second: float) -> float:
 class RecordedWorld:
     """A replayed recorded day; after the end of the day its last state holds."""
 
-    def __init__(self, occupancy: "RecordedOccupancy", arrival: Arrival) -> None:
+    def __init__(self, occupancy: RecordedOccupancy, arrival: Arrival) -> None:
         self.arrival = arrival
         self._occupancy = occupancy  # keeps the record's arrays alive
         self._day = occupancy.day_records([arrival.day], forecast=False)
@@ -241,6 +244,19 @@ class RecordedOccupancy:
     def n_slots(self) -> int:
         """Number of slots of the lot."""
         return int(self.walk_m.size)
+
+    def with_fixed_slots(self, window: ArrivalWindow) -> RecordedOccupancy:
+        """Return the same days with the log's slots at the same slots of the lot on every day.
+
+        The ranks are those over all days of the class of the window's first day: before `replay_from`, or all with
+        `others`. A mapping is kept.
+        """
+        if self.mapping is not None:
+            return self
+        log, day = self.log, self.days_in(window)[0]
+        same_class = np.flatnonzero(log.weekend == log.weekend[log.days.index(day)])
+        known = same_class if self.forecast_from == "others" else same_class[same_class < self._first]
+        return dataclasses.replace(self, mapping=self._assign(day, known))
 
     @property
     def _first(self) -> int:

@@ -18,7 +18,14 @@ from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
 from planners.belief.best_path import ATTEMPT, NOWHERE, Budget, best_path
-from planners.belief.planning_graph import SLOT, BeliefSnapshot, IntArray, PathBuffer, path_buffer
+from planners.belief.planning_graph import (
+    SLOT,
+    BeliefSnapshot,
+    IntArray,
+    PathBuffers,
+    path_buffers,
+    set_slots,
+)
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.routes import DriveRoutes
 
@@ -54,9 +61,9 @@ class BeliefSearch:
     news_at: float
     # (k,) int64, the vertices that the path of the last decision passes first; up to `DEPTH`
     targets: IntArray
-    path: PathBuffer  # buffer for one path
+    paths: PathBuffers  # buffers of the path search
     entry: int = -1  # vertex to drive to before planning, or -1
-    failure_s: float = FAILURE_COSTS[1]  # s, failure cost of the thesis's planner on that path
+    failure_s: float = math.nan  # s, failure cost of the thesis's planner on that path; nan if there was none
     # s, time that was expected to remain on that path by now; inf if something has been observed since
     remaining_s: float = math.inf
     replans: int = 0  # number of times that the path ahead has changed
@@ -155,7 +162,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             time=belief.time,
             news_at=belief.time,
             targets=np.zeros(0, dtype=np.int64),
-            path=path_buffer(n, len(near.vertices)),
+            paths=path_buffers(len(FAILURE_COSTS) + 1, n, len(near.vertices)),
         )
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
@@ -212,10 +219,10 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             self._budget,
             near.planning_graph(self.problem, self._failure_s),
             _snapshot(here, known, memory, self._explore),
-            memory.path,
+            memory.paths,
         )
         kept = choice.failure_s == memory.failure_s and np.array_equal(choice.targets, memory.targets)
-        memory.replans += not kept
+        memory.replans += not (kept or math.isnan(memory.failure_s))
         memory.targets, memory.failure_s = choice.targets, choice.failure_s
         memory.remaining_s = choice.remaining_s
         memory.expected_s = min(choice.onward_s, choice.at_hand_s)
@@ -270,20 +277,12 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
 def _snapshot(here: int, known: SlotBelief, memory: BeliefSearch, explore: float) -> BeliefSnapshot:
     """Return the belief about the slots of a part as the path search uses it."""
     weights, p_free_if = memory.day.mixture()
-    n, state = len(memory.state), memory.state
-    # Cars leave as often as forecast; on a fuller day free slots are taken faster.
-    usual = np.maximum(p_free_if @ weights, 1e-6)
-    rate = known.decay_rate * (1.0 - known.forecast) / usual
-    p_free = 1.0 - memory.day.p_occupied(known)
-    drive_s = memory.near.table.seconds[here, :n]
-    on_arrival = usual + (p_free - usual) * np.exp(-rate * np.where(np.isfinite(drive_s), drive_s, 0.0))
-    slots = np.empty(n, SLOT)
-    slots["p_free"], slots["p_free_usual"], slots["decay_rate"] = p_free, usual, rate
-    slots["odds"] = np.divide(1.0 - on_arrival, on_arrival, out=np.full(n, np.inf), where=on_arrival > 0.0)
-    slots["least_odds"] = 1.0 / usual - 1.0
-    slots["bonus_s"] = 4.0 * explore * known.forecast * (1.0 - known.forecast)
-    slots["missed_rate"], slots["state"] = memory.missed_rate, state
-    return BeliefSnapshot(slots, weights, p_free_if)
+    slots = np.empty(len(memory.state), SLOT)
+    slots["missed_rate"], slots["state"] = memory.missed_rate, memory.state
+    belief = BeliefSnapshot(slots, weights, p_free_if)
+    drive_s = memory.near.table.seconds[here]
+    set_slots(belief, known.parts, memory.day.p_occupied(known), drive_s, explore)
+    return belief
 
 
 def _n_unobserved(state: NDArray[np.int8]) -> int:

@@ -15,8 +15,11 @@ from planners.belief.planning_graph import (
     FloatArray,
     IntArray,
     PathBuffer,
+    PathBuffers,
     PlanningGraph,
+    Records,
     is_hidden,
+    path_at,
 )
 from sim_sensors.compilation import compiled
 
@@ -60,7 +63,6 @@ class Candidate(NamedTuple):
     onward_s: float
     remaining_s: float
     next_vertex: int
-    work: int
 
 
 def best_path(
@@ -71,7 +73,7 @@ def best_path(
     budget: Budget,
     graph: PlanningGraph,
     belief: BeliefSnapshot,
-    path: PathBuffer,
+    paths: PathBuffers,
 ) -> PathChoice:
     """Search for the path with the least expected time, starting from the path of the last decision.
 
@@ -88,9 +90,9 @@ def best_path(
         budget: limits of the search.
         graph: the lot.
         belief: the belief.
-        path: buffer for one path.
+        paths: buffers, one more than there are failure costs.
     """
-    return PathChoice(*_best_path(vertex, targets, failure_s, remaining_s, budget, graph, belief, path))
+    return PathChoice(*_best_path(vertex, targets, failure_s, remaining_s, budget, graph, belief, paths))
 
 
 @compiled(error_model="numpy")
@@ -102,10 +104,12 @@ def _best_path(
     budget: Budget,
     graph: PlanningGraph,
     belief: BeliefSnapshot,
-    path: PathBuffer,
+    paths: PathBuffers,
 ) -> tuple[float, float, float, int, int, IntArray, float, int]:
     """Return the fields of `PathChoice`."""
-    options, fallback_s = _options_at_hand(vertex, budget, graph, belief, path)
+    costs = budget.failure_costs
+    plans = _plans(vertex, failure_s, costs, graph, belief, paths)
+    options, fallback_s = _options_at_hand(vertex, plans.search_s.min(), graph, belief)
     at_hand_s, slot = np.inf, -1
     for s in options:
         value = expected_cost_to_slot(vertex, s, belief.slots[s].p_free, 0.0, fallback_s[s], graph, belief)
@@ -114,12 +118,26 @@ def _best_path(
 
     if len(targets) and targets[0] == vertex and not is_worth_an_attempt(vertex, 0.0, -1.0, graph, belief):
         targets = targets[1:]
-    best = _evaluate(vertex, targets, failure_s, remaining_s, options, fallback_s, graph, belief, path)
-    for cost in budget.failure_costs:
-        none = targets[:0]
-        found = _evaluate(vertex, none, cost, np.inf, options, fallback_s, graph, belief, path)
+    path = path_at(len(costs), paths)
+    n_stops, left_s = rollout_path(vertex, targets, failure_s, graph, belief, path)
+    best = _evaluate(vertex, n_stops, left_s, remaining_s, options, fallback_s, graph, belief, path)
+    chosen = path
+    for c in np.argsort(plans.search_s):
+        # The known free slots make the others better, too, so these cannot become the best.
+        if plans.search_s[c] >= best.onward_s:
+            break
+        plan = path_at(c, paths)
+        found = _evaluate(
+            vertex, plans.n_stops[c], plans.left_s[c], np.inf, options, fallback_s, graph, belief, plan
+        )
         if found.onward_s < best.onward_s - _ROUNDING_S:
-            best, targets, failure_s = found, none, cost
+            best, targets, failure_s, chosen, n_stops = (
+                found,
+                targets[:0],
+                costs[c],
+                plan,
+                plans.n_stops[c],
+            )
     if best.onward_s == np.inf:
         return np.inf, np.inf, at_hand_s, slot, NOWHERE, targets[:0], failure_s, 0
 
@@ -128,9 +146,11 @@ def _best_path(
     work = 0
     for _ in range(budget.depth - len(targets)):
         n_before = len(targets)
+        on_route = _on_route(vertex, targets, n_stops, graph, chosen)
         best, targets, work = _insert_target(
             vertex,
             nearest_first,
+            on_route,
             best,
             targets,
             failure_s,
@@ -145,13 +165,99 @@ def _best_path(
         )
         if len(targets) == n_before:
             break
+        chosen = path
+        n_stops, _ = rollout_path(vertex, targets, failure_s, graph, belief, path)
     return best.onward_s, best.remaining_s, at_hand_s, slot, best.next_vertex, targets, failure_s, work
+
+
+class Plans(NamedTuple):
+    """Paths of the thesis's planner at several failure costs, rolled out into buffers of their own."""
+
+    n_stops: IntArray  # (k,) int64, number of stops
+    left_s: FloatArray  # (k,) float64, s, expected time after the end if nothing was found
+    # (k,) float64, s, expected time of the search if no slot is known to be free; inf for paths that were left out
+    search_s: FloatArray
+
+
+@compiled(error_model="numpy")
+def _plans(
+    vertex: int,
+    failure_s: float,
+    costs: FloatArray,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    paths: PathBuffers,
+) -> Plans:
+    """Roll out and evaluate paths of the thesis's planner.
+
+    From the failure cost of the last decision on, lower and higher costs are tried as long as they make the path
+    better; all of them where there was none. A path that another cost leads to as well is left out.
+    """
+    n = len(costs)
+    plans = Plans(np.zeros(n, np.int64), np.empty(n), np.full(n, np.inf))
+    start = n
+    for c in range(n):
+        if costs[c] == failure_s:
+            start = c
+    least_s = np.inf
+    for c in range(start, n):
+        value = _plan(c, vertex, costs, graph, belief, paths, plans)
+        if value > least_s:
+            break
+        least_s = min(least_s, value)
+    least_s = plans.search_s[start] if start < n else np.inf
+    for c in range(start - 1, -1, -1):
+        value = _plan(c, vertex, costs, graph, belief, paths, plans)
+        if value > least_s and start < n:
+            break
+        least_s = min(least_s, value)
+    return plans
+
+
+@compiled(error_model="numpy")
+def _plan(
+    c: int,
+    vertex: int,
+    costs: FloatArray,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    paths: PathBuffers,
+    plans: Plans,
+) -> float:
+    """Roll out and evaluate the path of one failure cost; return its expected time, s."""
+    path = path_at(c, paths)
+    n_stops, left_s = rollout_path(vertex, np.empty(0, np.int64), costs[c], graph, belief, path)
+    plans.n_stops[c], plans.left_s[c] = n_stops, left_s
+    for other in range(len(costs)):
+        if (
+            plans.search_s[other] < np.inf
+            and plans.n_stops[other] == n_stops
+            and plans.left_s[other] == left_s
+            and _are_equal(paths.stops[c, : n_stops + 1], paths.stops[other, : n_stops + 1])
+        ):
+            return float(plans.search_s[other])
+    no_options, no_fallback_s = np.empty(0, np.int64), np.zeros(len(belief.slots))
+    found = _evaluate(vertex, n_stops, left_s, np.inf, no_options, no_fallback_s, graph, belief, path)
+    plans.search_s[c] = found.onward_s
+    return float(found.onward_s)
+
+
+@compiled(error_model="numpy")
+def _are_equal(stops: Records, others: Records) -> bool:
+    """Return whether two paths observe the same slots at the same times, given equal numbers of stops."""
+    for k in range(len(stops)):
+        if stops[k].first != others[k].first:
+            return False
+        if k < len(stops) - 1 and (stops[k].vertex != others[k].vertex or stops[k].time != others[k].time):
+            return False
+    return True
 
 
 @compiled(error_model="numpy")
 def _insert_target(
     vertex: int,
     nearest_first: IntArray,
+    on_route: NDArray[np.bool_],
     best: Candidate,
     targets: IntArray,
     failure_s: float,
@@ -165,8 +271,6 @@ def _insert_target(
     path: PathBuffer,
 ) -> tuple[Candidate, IntArray, int]:
     """Return the best path with one more target, its targets and the work so far; the given path if none is better."""
-    n_stops, _ = rollout_path(vertex, targets, failure_s, graph, belief, path)
-    on_route = _on_route(vertex, targets, n_stops, graph, path)
     kept, trial = targets, np.empty(len(targets) + 1, np.int64)
     for place in range(len(trial)):
         before = vertex if place == 0 else targets[place - 1]
@@ -180,8 +284,9 @@ def _insert_target(
             ):
                 continue
             trial[place] = u
-            found = _evaluate(vertex, trial, failure_s, np.inf, options, fallback_s, graph, belief, path)
-            work += found.work
+            n_stops, left_s = rollout_path(vertex, trial, failure_s, graph, belief, path)
+            work += 30 * (n_stops + path.stops[n_stops].first) + len(belief.slots)
+            found = _evaluate(vertex, n_stops, left_s, np.inf, options, fallback_s, graph, belief, path)
             if found.onward_s < best.onward_s - _IMPROVEMENT_S:
                 best, kept = found, trial.copy()
     return best, kept, work
@@ -190,8 +295,8 @@ def _insert_target(
 @compiled(error_model="numpy")
 def _evaluate(
     vertex: int,
-    targets: IntArray,
-    failure_s: float,
+    n_stops: int,
+    left_s: float,
     remaining_s: float,
     options: IntArray,
     fallback_s: FloatArray,
@@ -199,38 +304,33 @@ def _evaluate(
     belief: BeliefSnapshot,
     path: PathBuffer,
 ) -> Candidate:
-    """Roll out and evaluate a path. If it was expected to take less, `remaining_s`, that is its value."""
-    n_stops, left_s = rollout_path(vertex, targets, failure_s, graph, belief, path)
+    """Evaluate a path. If it was expected to take less, `remaining_s`, that is its value."""
+    if n_stops < 2:
+        return Candidate(np.inf, np.inf, NOWHERE)
     value, onward_s = evaluate_path(n_stops, left_s, options, fallback_s, graph, belief, path)
     stops = path.stops
-    work = 30 * (n_stops + stops[n_stops].first) + len(belief.slots)
-    if n_stops < 2:
-        return Candidate(np.inf, np.inf, NOWHERE, work)
     if remaining_s < value:
         value, onward_s = remaining_s, remaining_s - stops[1].time
     if stops[1].time == 0.0 and stops[2].first > 0:
-        return Candidate(value, np.inf, ATTEMPT, work)  # only an attempt takes no time
+        return Candidate(value, np.inf, ATTEMPT)  # only an attempt takes no time
     following = stops[1].vertex
     if stops[2].first > 0 or following == vertex:
         onward_s = np.inf
-    return Candidate(value, onward_s, following, work)
+    return Candidate(value, onward_s, following)
 
 
 @compiled(error_model="numpy")
 def _options_at_hand(
-    vertex: int, budget: Budget, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
+    vertex: int, search_s: float, graph: PlanningGraph, belief: BeliefSnapshot
 ) -> tuple[IntArray, FloatArray]:
     """Return the best slots known to be free, and the remaining time if each slot is gone, s.
 
-    If a slot is gone on arrival, the search continues as if no slot were known to be free, or goes to another slot.
+    If a slot is gone on arrival, the search continues as if no slot were known to be free, for `search_s`, or goes to
+    another slot.
     """
     n = len(belief.slots)
     options, n_options = np.empty(MOST_OPTIONS, np.int64), 0
-    fallback_s = np.zeros(n)
-    search_s = graph.give_up_s
-    for cost in budget.failure_costs:
-        found = _evaluate(vertex, options[:0], cost, np.inf, options[:0], fallback_s, graph, belief, path)
-        search_s = min(search_s, found.onward_s)
+    fallback_s, search_s = np.zeros(n), min(search_s, graph.give_up_s)
     expected_s = np.full(MOST_OPTIONS, np.inf)
     for s in range(n):
         if belief.slots[s].state != OBSERVED_FREE:

@@ -91,8 +91,13 @@ def evaluate_path(
         return np.inf, np.inf
     _set_costs(n_stops, options, fallback_s, graph, belief, path)
     value, then_s = np.inf, np.inf
-    for _ in range(2 if len(belief.weights) > 1 else 1):
-        _set_first_observations(n_stops, belief, path)
+    for j in range(path.stops[n_stops].first):
+        observation = path.observations[j]
+        if observation.is_first:
+            observation.p_free = belief.slots[observation.slot].p_free_usual
+    value, then_s = _stop_optimally(n_stops, left_s, path)
+    if len(belief.weights) > 1:
+        _learn_on_the_way(n_stops, belief, path)
         value, then_s = _stop_optimally(n_stops, left_s, path)
     return value, then_s
 
@@ -106,8 +111,8 @@ def _set_costs(
     belief: BeliefSnapshot,
     path: PathBuffer,
 ) -> None:
-    """Set what does not depend on P(free) of the observations: `path.costs` and the scratch fields of the stops."""
-    stops, observations = path.stops, path.observations
+    """Set what does not depend on P(free) of the observations: `path.kept` and the scratch fields of the stops."""
+    stops, observations, kept = path.stops, path.observations, path.kept
     # Lower bound on the time after any later observation. A slot that is better than the bound is taken at once. Others
     # are remembered for some stops; their value cannot improve in the meantime.
     ahead = np.inf
@@ -117,44 +122,50 @@ def _set_costs(
             slot = observations[j].slot
             ahead = min(ahead, graph.drive_s[stops[k].vertex, slot] + graph.cost_s[slot])
         ahead += stops[k].time - stops[k - 1].time
-    n_costs = 0
+    n_kept, oldest = 0, 0
     for k in range(1, n_stops):
-        vertex, first, last = stops[k].vertex, stops[k].first, stops[k + 1].first
+        vertex, time, first, last = stops[k].vertex, stops[k].time, stops[k].first, stops[k + 1].first
         stop_s = np.inf
         for s in options:
-            stop_s = min(
-                stop_s,
-                expected_cost_to_slot(
-                    vertex, s, belief.slots[s].p_free, stops[k].time, fallback_s[s], graph, belief
-                ),
-            )
-        stops[k].stop_s, stops[k].bonus_s = stop_s, 0.0
+            # Most are farther than the best so far, whatever becomes of them in the meantime.
+            if graph.drive_s[vertex, s] + min(graph.cost_s[s], fallback_s[s] + graph.failure_s) < stop_s:
+                p_free = belief.slots[s].p_free
+                option_s = expected_cost_to_slot(vertex, s, p_free, time, fallback_s[s], graph, belief)
+                stop_s = min(stop_s, option_s)
+        stops[k].stop_s, stops[k].bonus_s, stops[k].first_kept = stop_s, 0.0, n_kept
+        newest = n_kept
+        for i in range(oldest, newest):
+            observation = observations[kept[i].observation]
+            if observation.kept_until < k:
+                continue
+            drive = graph.drive_s[vertex, observation.slot]
+            decayed = decayed_part(observation.decay_rate, time - observation.time + drive)
+            back_s = drive + observation.cost_s + observation.loss_s * decayed if drive < np.inf else np.inf
+            kept[n_kept].observation, kept[n_kept].stop_s = kept[i].observation, min(stop_s, back_s)
+            n_kept += 1
         for j in range(first, last):
             observation = observations[j]
             slot = observation.slot
-            at_once = expected_cost_to_slot(vertex, slot, 1.0, 0.0, fallback_s[slot], graph, belief)
+            at, cost_s, drive = belief.slots[slot], graph.cost_s[slot], graph.drive_s[vertex, slot]
+            # As in `expected_cost_to_slot` for P(free) = 1
+            observation.cost_s, observation.decay_rate = cost_s, at.decay_rate
+            observation.loss_s = (1.0 - at.p_free_usual) * (fallback_s[slot] + graph.failure_s - cost_s)
+            at_once = drive + cost_s + observation.loss_s * decayed_part(at.decay_rate, drive)
             observation.kept_until = k if at_once <= stops[k].ahead_s else min(k + KEPT_IN_MIND, n_stops - 1)
             observation.parks = False
             if observation.is_first:
                 stops[k].bonus_s += belief.slots[slot].bonus_s
             observation.expected_s = at_once
         _sort_observations(first, last, path)
-        stops[k].first_cost = n_costs
-        for j in range(stops[max(k - KEPT_IN_MIND, 1)].first, last):
-            observation = observations[j]
-            if observation.kept_until < k:
-                continue
-            if j < first:
-                age, slot = stops[k].time - observation.time, observation.slot
-                back_s = expected_cost_to_slot(vertex, slot, 1.0, age, fallback_s[slot], graph, belief)
-            else:
-                back_s = observation.expected_s
-            path.costs[n_costs] = min(stop_s, back_s)
-            n_costs += 1
+        for j in range(first, last):
+            kept[n_kept].observation, kept[n_kept].stop_s = j, min(stop_s, observations[j].expected_s)
+            n_kept += 1
+        oldest = newest
+    stops[n_stops].first_kept = n_kept
 
 
 @compiled(error_model="numpy")
-def _set_first_observations(n_stops: int, belief: BeliefSnapshot, path: PathBuffer) -> None:
+def _learn_on_the_way(n_stops: int, belief: BeliefSnapshot, path: PathBuffer) -> None:
     """Set P(free) of the first observations along a path, given that the car has not parked before."""
     weights = copy_weights(belief, path)
     for j in range(path.stops[n_stops].first):
@@ -168,18 +179,14 @@ def _set_first_observations(n_stops: int, belief: BeliefSnapshot, path: PathBuff
 @compiled(error_model="numpy")
 def _stop_optimally(n_stops: int, left_s: float, path: PathBuffer) -> tuple[float, float]:
     """Evaluate a path, given its costs and P(free) of all its observations."""
-    stops, observations = path.stops, path.observations
+    stops, observations, kept = path.stops, path.observations, path.kept
     nothing, onward, then_s = left_s, 0.0, left_s
     for k in range(n_stops - 1, 0, -1):
         # `value` of the observations and `nothing` hold the values at the next stop; `onward` is the drive there.
-        first, last, ahead_s, cost = stops[k].first, stops[k + 1].first, stops[k].ahead_s, stops[k].first_cost
-        oldest = stops[max(k - KEPT_IN_MIND, 1)].first
-        for j in range(oldest, last):
-            observation = observations[j]
-            if observation.kept_until < k:
-                continue
-            expected_s = path.costs[cost]
-            cost += 1
+        first, last, ahead_s = stops[k].first, stops[k + 1].first, stops[k].ahead_s
+        first_kept, last_kept = stops[k].first_kept, stops[k + 1].first_kept
+        for i in range(first_kept, last_kept):
+            observation, expected_s = observations[kept[i].observation], kept[i].stop_s
             later = onward + (nothing if observation.kept_until == k else observation.value)
             # The stop at which the slot is observed is processed last and decides.
             observation.parks = expected_s <= max(ahead_s, later)
@@ -188,16 +195,15 @@ def _stop_optimally(n_stops: int, left_s: float, path: PathBuffer) -> tuple[floa
         then_s = onward + nothing
         nothing = min(stops[k].stop_s, then_s)
         # Value before the observations at this stop: the best slot that they show replaces a worse one.
-        for j in range(oldest, first):
-            if observations[j].kept_until < k:
-                continue
+        for i in range(first_kept, last_kept - (last - first)):
+            before = observations[kept[i].observation]
             rest, expected = 1.0, 0.0
-            for i in range(first, last):
-                if observations[i].expected_s >= observations[j].expected_s:
+            for j in range(first, last):
+                if observations[j].expected_s >= before.expected_s:
                     break
-                expected += rest * observations[i].p_free * observations[i].value
-                rest *= 1.0 - observations[i].p_free
-            observations[j].value = expected + rest * observations[j].value
+                expected += rest * observations[j].p_free * observations[j].value
+                rest *= 1.0 - observations[j].p_free
+            before.value = expected + rest * before.value
         rest, expected = 1.0, 0.0
         for i in range(first, last):
             expected += rest * observations[i].p_free * observations[i].value
@@ -206,8 +212,8 @@ def _stop_optimally(n_stops: int, left_s: float, path: PathBuffer) -> tuple[floa
         bonus_s = stops[k].bonus_s
         if bonus_s > 0.0:
             nothing -= bonus_s
-            for j in range(oldest, first):
-                observations[j].value -= bonus_s
+            for i in range(first_kept, last_kept - (last - first)):
+                observations[kept[i].observation].value -= bonus_s
         onward = stops[k].time - stops[k - 1].time
     return onward + nothing, then_s
 
@@ -224,6 +230,9 @@ def _sort_observations(first: int, last: int, path: PathBuffer) -> None:
             a.slot, b.slot = b.slot, a.slot
             a.p_free, b.p_free = b.p_free, a.p_free
             a.expected_s, b.expected_s = b.expected_s, a.expected_s
+            a.cost_s, b.cost_s = b.cost_s, a.cost_s
+            a.loss_s, b.loss_s = b.loss_s, a.loss_s
+            a.decay_rate, b.decay_rate = b.decay_rate, a.decay_rate
             a.kept_until, b.kept_until = b.kept_until, a.kept_until
             a.is_first, b.is_first = b.is_first, a.is_first
             j -= 1

@@ -18,6 +18,7 @@ from planners.belief.planning_graph import (
     copy_weights,
     decayed_part,
     is_hidden,
+    mean_over_days,
     needs_attempt,
 )
 from sim_sensors.compilation import compiled
@@ -104,7 +105,10 @@ def rollout_path(
             else:
                 view = graph.views[graph.view_starts[vertex] + i]
                 s = view.slot
-                if marks[s].observed_at == -np.inf or is_hidden(s, view.rate, belief):
+                observed_at = marks[s].observed_at
+                if observed_at == -np.inf or (observed_at >= 0.0 and time - observed_at < OBSERVE_AGAIN_S):
+                    continue
+                if is_hidden(s, view.rate, belief):
                     continue
             is_first = belief.slots[s].state == UNOBSERVED and marks[s].observed_at < 0.0
             if is_first:
@@ -112,7 +116,7 @@ def rollout_path(
                 n_unproven -= 1
                 n_unobserved -= 1
             else:
-                p_free = _p_free_again(s, time, marks[s].observed_at, belief)
+                p_free = p_free_again(s, time, marks[s].observed_at, belief)
                 if p_free == 0.0 and not attempts:
                     continue
             observation = observations[n_observations]
@@ -170,7 +174,7 @@ def is_worth_an_attempt(
         return False
     if belief.slots[vertex].state == UNOBSERVED and observed_at < 0.0:
         return True
-    return bool(_p_free_again(vertex, time, observed_at, belief) > 0.0)
+    return bool(p_free_again(vertex, time, observed_at, belief) > 0.0)
 
 
 @compiled(error_model="numpy")
@@ -201,6 +205,10 @@ def _repeat_path(
     if leaving > 0.0:
         # Alternatively the car stands and waits for a slot in view.
         best = (1.0 + cost_s) / leaving
+    weights = path.weights[: len(belief.weights)]
+    for j in range(n_observations):
+        observation = path.observations[j]
+        observation.value = mean_over_days(weights, belief.p_free_if[observation.slot])
     for quarter in range(4):
         best = min(best, _repeat_part(quarter * last // 4, last, n_observations, graph, belief, path))
     return best
@@ -232,10 +240,7 @@ def _repeat_part(
             else period - (marks[s].observed_at - observations[j].time)
         )
         marks[s].scratch = observations[j].time
-        usual = 0.0
-        for h in range(len(belief.weights)):
-            usual += path.weights[h] * belief.p_free_if[s, h]
-        at = belief.slots[s]
+        at, usual = belief.slots[s], observations[j].value
         p_free = usual * decayed_part(at.decay_rate * at.p_free_usual / usual, gap)
         found += p_free
         cost_s += p_free * graph.cost_s[s]
@@ -255,7 +260,7 @@ def _extrapolate(last: int, n_observations: int, graph: PlanningGraph, path: Pat
 
 
 @compiled(error_model="numpy")
-def _p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnapshot) -> float:
+def p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnapshot) -> float:
     """Return P(free) at a given time of a slot observed taken, in fact or along the path; 0 if too low."""
     at = belief.slots[slot]
     if observed_at >= 0.0:
@@ -289,7 +294,7 @@ def _next_target(
         else:
             if value + failure_s * at.least_odds >= best:
                 continue
-            p_free = _p_free_again(s, time + drive_s[s], observed_at, belief)
+            p_free = p_free_again(s, time + drive_s[s], observed_at, belief)
             value += failure_s * (1.0 - p_free) / p_free if p_free > 0.0 else np.inf
         if value < best:
             best, chosen = value, s
@@ -301,18 +306,16 @@ def p_free_when_first_observed(weights: FloatArray, p_free_if: FloatArray, taken
     """Return P(free) of a slot at its first observation, averaged over the hypotheses.
 
     Args:
-        weights: (k,) weights of the hypotheses; with `taken_follows`, updated for a taken slot.
+        weights: (k,) probabilities of the hypotheses; with `taken_follows`, updated for a taken slot.
         p_free_if: (k,) P(free) under each.
         taken_follows: whether the path continues only if the slot is taken.
     """
-    free, taken = 0.0, 0.0
-    for h in range(len(weights)):
-        free += weights[h] * p_free_if[h]
-        taken += weights[h] * (1.0 - p_free_if[h])
+    p_free: float = mean_over_days(weights, p_free_if)
     if taken_follows:
+        scale = 1.0 / (1.0 - p_free)
         for h in range(len(weights)):
-            weights[h] *= (1.0 - p_free_if[h]) / taken
-    return free / (free + taken)
+            weights[h] *= (1.0 - p_free_if[h]) * scale
+    return p_free
 
 
 @compiled(error_model="numpy")

@@ -56,7 +56,10 @@ STOP = np.dtype(
         ("ahead_s", np.float64),  # scratch: least time to the goal after any later observation
         ("stop_s", np.float64),  # scratch: expected time of driving to the best slot that is known now
         ("bonus_s", np.float64),  # scratch: value of its first observations for later searches
-        ("first_cost", np.int64),  # scratch: index in `PathBuffer.costs` of the first slot remembered here
+        (
+            "first_kept",
+            np.int64,
+        ),  # scratch: index of the first slot remembered here; the rest as with `first`
     ]
 )
 """A stop of a path."""
@@ -67,6 +70,12 @@ OBSERVATION = np.dtype(
         ("p_free", np.float64),  # given that the search has reached this stop
         ("time", np.float64),
         ("expected_s", np.float64),  # scratch: expected time of driving to the slot
+        ("cost_s", np.float64),  # scratch: the slot's arrival cost
+        (
+            "loss_s",
+            np.float64,
+        ),  # scratch: how much longer the search is expected to take once the slot has decayed
+        ("decay_rate", np.float64),  # scratch: the slot's
         ("value", np.float64),  # scratch: value of what follows
         ("kept_until", np.int64),  # scratch: the last stop at which the slot is remembered
         ("is_first", np.bool_),  # whether the slot was not observed before, in fact or along the path
@@ -74,6 +83,10 @@ OBSERVATION = np.dtype(
     ]
 )
 """An observation of a slot along a path."""
+
+KEPT = np.dtype([("observation", np.int64), ("stop_s", np.float64)])
+"""A slot observed along a path that is remembered at a stop: its observation, and the expected time of driving from
+that stop to this slot or to the best of those known before."""
 
 MARK = np.dtype([("observed_at", np.float64), ("scratch", np.float64)])
 """Time at which a path last observed a slot; -1: not yet; -inf: not needed, the slot is known to be free."""
@@ -103,29 +116,69 @@ class BeliefSnapshot(NamedTuple):
     p_free_if: FloatArray  # (n_slots, k) float64, P(free) of an unobserved slot under each of them
 
 
+@compiled(error_model="numpy")
+def set_slots(
+    belief: BeliefSnapshot, parts: FloatArray, p_occupied: FloatArray, drive_s: FloatArray, explore: float
+) -> None:
+    """Fill in the records of the slots, except what was observed of them.
+
+    Args:
+        belief: the belief; output: its slots.
+        parts: (4 * n_slots,) float64, see `SlotBelief`.
+        p_occupied: (n_slots,) P(taken) now.
+        drive_s: (n_vertices,) s, drive time from the car.
+        explore: s, value of the first observation of a slot with a forecast of 50 % for later searches.
+    """
+    n = len(belief.slots)
+    for s in range(n):
+        forecast, decay_rate, at = parts[s], parts[n + s], belief.slots[s]
+        p_free, usual = 1.0 - p_occupied[s], max(mean_over_days(belief.weights, belief.p_free_if[s]), 1e-6)
+        # Cars leave as often as forecast; on a fuller day free slots are taken faster.
+        rate = decay_rate * (1.0 - forecast) / usual
+        on_arrival = usual + (p_free - usual) * math.exp(-rate * drive_s[s] if drive_s[s] < np.inf else 0.0)
+        at.p_free, at.p_free_usual, at.decay_rate = p_free, usual, rate
+        at.odds = (1.0 - on_arrival) / on_arrival if on_arrival > 0.0 else np.inf
+        at.least_odds = 1.0 / usual - 1.0
+        at.bonus_s = 4.0 * explore * forecast * (1.0 - forecast)
+
+
 class PathBuffer(NamedTuple):
-    """Buffer for one path, reused by all rollouts."""
+    """Buffer for one path."""
 
     stops: Records  # `STOP` records, one more than there are stops
     observations: Records  # `OBSERVATION` records in order
     marks: Records  # (n_slots,) `MARK` records
     weights: FloatArray  # float64, scratch: probabilities of the hypotheses along the path
-    # float64, scratch: expected time of driving from each stop to the best of the slots known before and each slot
-    # observed along the path that is remembered there
-    costs: FloatArray
+    kept: Records  # `KEPT` records, scratch: the slots remembered at each stop, oldest first
 
 
-def path_buffer(n_slots: int, n_vertices: int) -> PathBuffer:
-    """Allocate the buffer for a path on a lot of a given size."""
+class PathBuffers(NamedTuple):
+    """Buffers for several paths that are kept during a decision; fields as in `PathBuffer`."""
+
+    stops: Records  # (n_paths, ...)
+    observations: Records  # (n_paths, ...)
+    marks: Records
+    weights: FloatArray
+    kept: Records
+
+
+def path_buffers(n_paths: int, n_slots: int, n_vertices: int) -> PathBuffers:
+    """Allocate the buffers for paths on a lot of a given size."""
     most_stops = min(4 * n_vertices + 16, MOST_STOPS)
     most_observations = n_slots + min(n_slots + 64, MOST_STOPS)
-    return PathBuffer(
-        np.zeros(most_stops + 1, STOP),
-        np.zeros(most_observations, OBSERVATION),
+    return PathBuffers(
+        np.zeros((n_paths, most_stops + 1), STOP),
+        np.zeros((n_paths, most_observations), OBSERVATION),
         np.zeros(n_slots, MARK),
         np.zeros(MOST_HYPOTHESES),
-        np.empty(most_stops * most_observations),
+        np.zeros(most_stops * most_observations, KEPT),
     )
+
+
+@compiled(error_model="numpy")
+def path_at(index: int, paths: PathBuffers) -> PathBuffer:
+    """Return the buffer of one path. Paths share their scratch arrays."""
+    return PathBuffer(paths.stops[index], paths.observations[index], paths.marks, paths.weights, paths.kept)
 
 
 @compiled(error_model="numpy")
@@ -135,6 +188,25 @@ def copy_weights(belief: BeliefSnapshot, path: PathBuffer) -> FloatArray:
     for h in range(len(weights)):
         weights[h] = belief.weights[h]
     return weights
+
+
+@compiled(error_model="numpy")
+def mean_over_days(weights: FloatArray, values: FloatArray) -> float:
+    """Return the mean of values, (k,), over the hypotheses with weights (k,).
+
+    Four sums at once take a fraction of the time of one, and unlike sums that the compiler splits up, they are the same
+    on every machine.
+    """
+    n = len(weights)
+    first, second, third, fourth = 0.0, 0.0, 0.0, 0.0
+    for h in range(0, n - 3, 4):
+        first += weights[h] * values[h]
+        second += weights[h + 1] * values[h + 1]
+        third += weights[h + 2] * values[h + 2]
+        fourth += weights[h + 3] * values[h + 3]
+    for h in range(n - n % 4, n):
+        first += weights[h] * values[h]
+    return (first + second) + (third + fourth)
 
 
 @compiled(error_model="numpy")

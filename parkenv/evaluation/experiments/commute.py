@@ -24,7 +24,7 @@ from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.experiment import agent_fingerprints, fingerprints, flat_tables
 from parkenv.evaluation.experiments.results import OUTCOME_COLUMNS, ResultFolder, Row
 from parkenv.evaluation.experiments.spec import SPEC_FILE, CommuteSpec
-from parkenv.evaluation.experiments.statistics import mean_interval
+from parkenv.evaluation.experiments.statistics import mean_interval, trimmed_mean_interval
 from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.evaluation.trip_recorder import TripRecorder
 from parkenv.files.file_names import file_name
@@ -33,6 +33,7 @@ from parkenv.mapping.store import MapStore
 from parkenv.mapping.trips import Trip
 from parkenv.scenarios.build import build
 from parkenv.world.counted_occupancy import CountedOccupancy
+from parkenv.world.flat_map import FlatMap
 from parkenv.world.keyed_random import world_key
 from parkenv.world.occupancy import ArrivalWindow, PriorModel
 from parkenv.world.recorded_occupancy import RecordedOccupancy
@@ -46,8 +47,10 @@ FIXED, NONE = "fixed", "none"
 KEYS = ("scenario", "map", "agent", "course", "day_number", "driver")
 COLUMNS = ("seed", *OUTCOME_COLUMNS, "forecast_error")
 MAPS_FOLDER = "maps"
-BLOCK_DAYS = 5
+BLOCK_DAYS = 10
 """Days per task: an interruption loses few of them, and the map of a course is seldom rebuilt from its trips."""
+TRIMMED = 0.1
+"""Share of the courses, at either end, that a robust mean leaves out."""
 _COURSES_APART, _DRIVERS_APART = 1_000_000, 1_000
 _MOST_TRIES = 100_000
 
@@ -210,7 +213,9 @@ class Commute:
     _scenarios: list[Scenario] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "_scenarios", [build(spec) for spec in self.spec.scenarios])
+        object.__setattr__(
+            self, "_scenarios", [_with_fixed_slots(build(spec)) for spec in self.spec.scenarios]
+        )
         for scenario in self._scenarios:
             for agent in self.spec.agents:
                 make_agent(agent.name, scenario, **agent.options)
@@ -248,6 +253,17 @@ class Commute:
             "files": fingerprints(spec.files()),
             "agent files": agent_fingerprints(agent.name for agent in spec.agents),
         }
+
+
+def _with_fixed_slots(scenario: Scenario) -> Scenario:
+    """Return a scenario in which every slot is the same one on all days of a log."""
+    occupancy, prior = scenario.occupancy, scenario.prior
+    if not isinstance(occupancy, RecordedOccupancy):
+        return scenario
+    fixed = occupancy.with_fixed_slots(scenario.arrival)
+    if isinstance(prior, FlatMap):
+        prior = FlatMap(prior.p_occupied, fixed)
+    return scenario.replace(occupancy=fixed, prior=prior)
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,8 +385,11 @@ def day_rows(episodes: Sequence[Row]) -> list[Row]:
     """Return a row per scenario, map, agent and day: mean total time and forecast error, with 95 % intervals.
 
     The forecast error is the Brier score of the forecast at the arrival: the mean squared difference of P(taken) and
-    the true state, over slots. Intervals are over courses: a fleet's drivers meet the same day.
+    the true state, over slots. The excess is the time beyond that of the first agent with the right map, which does not
+    learn, in the same worlds: a 10 % trimmed mean, since a full lot may add the give-up penalty to one of the two.
+    Intervals are over courses: a fleet's drivers meet the same day.
     """
+    cases = _grouped(episodes, lambda row: row["day_number"])
     return [
         {
             **dict(zip(("scenario", "map", "agent"), case, strict=True)),
@@ -378,8 +397,9 @@ def day_rows(episodes: Sequence[Row]) -> list[Row]:
             "courses": len(by_course),
             **_mean("total_s", its),
             **_mean("forecast_error", its),
+            **_difference("excess_s", by_course, _reference(cases, case[0], FIXED).get(day, {}), _robust),
         }
-        for case, by_day in _grouped(episodes, lambda row: row["day_number"]).items()
+        for case, by_day in cases.items()
         for day, by_course in sorted(by_day.items())
         for its in [list(by_course.values())]
     ]
@@ -392,34 +412,49 @@ def week_rows(episodes: Sequence[Row]) -> list[Row]:
     """
     cases = _grouped(episodes, lambda row: (row["day_number"] - 1) // 5 + 1)
     last = max((row["day_number"] for row in episodes), default=0)
-    reference = {case[0]: by_week for case, by_week in reversed(cases.items()) if case[1] == NONE}
-    rows = []
-    for case, by_week in cases.items():
-        for week, by_course in sorted(by_week.items()):
-            its = list(by_course.values())
-            row = {
-                **dict(zip(("scenario", "map", "agent"), case, strict=True)),
-                "days": f"{5 * week - 4}-{min(5 * week, last)}",
-                "courses": len(by_course),
-                **_mean("total_s", its),
-                **_mean("forecast_error", its),
-            }
-            theirs = reference.get(case[0], {}).get(week, {})
-            paired = [
-                _course_mean("total_s", e) - _course_mean("total_s", theirs[course])
-                for course, e in by_course.items()
-                if course in theirs and len(theirs[course]) == len(e)
-            ]
-            if paired:
-                mean, low, high = mean_interval(paired)
-                row |= {"difference_s": mean, "difference_s_ci95": [low, high]}
-            rows.append(row)
-    return rows
+    return [
+        {
+            **dict(zip(("scenario", "map", "agent"), case, strict=True)),
+            "days": f"{5 * week - 4}-{min(5 * week, last)}",
+            "courses": len(by_course),
+            **_mean("total_s", its),
+            **_mean("forecast_error", its),
+            **_difference("difference_s", by_course, _reference(cases, case[0], NONE).get(week, {})),
+            **_difference("excess_s", by_course, _reference(cases, case[0], FIXED).get(week, {}), _robust),
+        }
+        for case, by_week in cases.items()
+        for week, by_course in sorted(by_week.items())
+        for its in [list(by_course.values())]
+    ]
 
 
-def _grouped(
-    episodes: Sequence[Row], period: Callable[[Row], int]
-) -> dict[tuple[str, str, str], dict[int, dict[int, list[Row]]]]:
+_Courses = dict[int, list[Row]]
+_Cases = dict[tuple[str, str, str], dict[int, _Courses]]
+
+
+def _reference(cases: _Cases, scenario: str, map: str) -> dict[int, _Courses]:
+    """Return the first agent with a map in a scenario, by period."""
+    return next((its for case, its in cases.items() if case[0] == scenario and case[1] == map), {})
+
+
+def _difference(
+    name: str,
+    courses: _Courses,
+    reference: _Courses,
+    interval: Callable[[Sequence[float]], tuple[float, float, float]] = mean_interval,
+) -> Row:
+    paired = [
+        _course_mean("total_s", its) - _course_mean("total_s", reference[course])
+        for course, its in courses.items()
+        if len(reference.get(course, ())) == len(its)
+    ]
+    if not paired:
+        return {}
+    mean, low, high = interval(paired)
+    return {name: mean, f"{name}_ci95": [low, high]}
+
+
+def _grouped(episodes: Sequence[Row], period: Callable[[Row], int]) -> _Cases:
     """Group episodes by scenario, map and agent; then by period; then by course."""
     found: dict[Any, Any] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
     for row in episodes:
@@ -429,6 +464,10 @@ def _grouped(
 
 def _course_mean(name: str, episodes: Sequence[Mapping[str, Any]]) -> float:
     return float(np.mean([np.nan if row[name] is None else row[name] for row in episodes]))
+
+
+def _robust(values: Sequence[float]) -> tuple[float, float, float]:
+    return trimmed_mean_interval(values, TRIMMED)
 
 
 def _mean(name: str, courses: Iterable[Sequence[Row]]) -> Row:

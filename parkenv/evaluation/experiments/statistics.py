@@ -46,6 +46,29 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, f
     return mean, float(interval.low), float(interval.high)
 
 
+def trimmed_mean_interval(values: ArrayLike, cut: float) -> tuple[float, float, float]:
+    """Compute a trimmed mean and its 95 % bootstrap interval (percentiles).
+
+    Args:
+        values: (n,) numbers, n >= 1.
+        cut: share of the numbers that is left out at either end, rounded down.
+
+    Returns:
+        Mean, lower and upper end. The ends are NaN for fewer than two values. The resampling has a fixed seed.
+
+    Examples:
+        >>> trimmed_mean_interval([1.0] * 9 + [1000.0], cut=0.1)[0]
+        1.0
+    """
+    sample = np.asarray(values, dtype=np.float64)
+    mean = float(stats.trim_mean(sample, cut))
+    if len(sample) < 2:
+        return mean, np.nan, np.nan
+    drawn = sample[np.random.default_rng(0).integers(0, len(sample), (RESAMPLES, len(sample)))]
+    low, high = np.percentile(stats.trim_mean(drawn, cut, axis=1), [2.5, 97.5])
+    return mean, float(low), float(high)
+
+
 MEANS = (
     "drive_s",
     "failed_s",

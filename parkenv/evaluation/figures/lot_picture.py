@@ -166,9 +166,9 @@ def _draw_guesses(lot: ParkingLot, ax: Axes, guesses: Sequence[str]) -> None:
                 ax.annotate(
                     f"guessed {start}",
                     xy,
-                    (0, 14),
+                    (16, 0),
                     textcoords="offset points",
-                    ha="center",
+                    va="center",
                     fontsize=9,
                     color=INK,
                 )
