@@ -90,7 +90,9 @@ def scenario(path):
 
 
 def resumed(path):
-    ResultFolder(path.parent, {"seed": 0, "agents": {}}, resume=True)
+    folder = ResultFolder(path.parent, {"seed": 0, "agents": {}}, resume=True)
+    for key in folder.episodes:
+        folder.decision_s(key)
 
 
 def resumed_trips(path):
@@ -206,6 +208,10 @@ EPISODE_ROWS = (
     "mini,,mdp,10.0,4.0,10.0,0,mon,3600.0,0.5,A1,True,False,50.0,30.0,0.0,20.0,0.0,0.0,49.0,80.0,20.0,0,3,1,9\n"
     "mini,,mdp,10.0,4.0,10.0,1,tue,3600.0,0.5,A2,True,False,50.0,30.0,0.0,20.0,0.0,0.0,,80.0,20.0,0,3,1,9\n"
 )
+TIMING_ROWS = (
+    "scenario,occupancy_level,agent,failure_cost_s,v_walk_kmh,v_drive_kmh,seed,decisions_us\n"
+    "mini,,mdp,10.0,4.0,10.0,0,12 3 4\nmini,,mdp,10.0,4.0,10.0,1,5 6\n"
+)
 SUMMARY = {
     "command": ["parkenv", "compare", "--episodes", "2"], "version": "0.1.0", "seed": 0,
     "rows": [SUMMARY_ROW, SUMMARY_ROW | {"agent": "random", "total_s": 70.0}],
@@ -293,6 +299,7 @@ FORMATS = [
     Format("result.json", RESULT, mutated_json, benchmark),
     Format("summary.json", SUMMARY, mutated_json, reported),
     Format("episodes.csv", EPISODE_ROWS, mutated_text, resumed),
+    Format("timings.csv", TIMING_ROWS, mutated_text, resumed),
     Format("settings.json", {"seed": 0, "agents": {"mdp": {"failure_s": 1.0}}}, mutated_json, resumed),
     Format(
         "trips.jsonl",
@@ -303,6 +310,7 @@ FORMATS = [
 ]
 BESIDE = {
     "episodes.csv": {"settings.json": '{"seed": 0, "agents": {}}'},
+    "timings.csv": {"settings.json": '{"seed": 0, "agents": {}}', "episodes.csv": EPISODE_ROWS},
     "trips.jsonl": {"settings.json": '{"seed": 0}'},
     "summary.json": {"episodes.csv": EPISODE_ROWS},
 }
@@ -359,6 +367,8 @@ FOUND = [
     ("summary.json", json.dumps(SUMMARY | {"seed": 1e300, "rows": [SUMMARY_ROW | {"drive_s": 1e300}]}).encode()),
     ("summary.json", json.dumps(SUMMARY).replace("30.0", "1e999").encode()),
     ("settings.json", json.dumps({"seed": "x" * 5000}).encode()),
+    ("timings.csv", TIMING_ROWS.replace("12 3", "12 <").encode()),
+    ("timings.csv", TIMING_ROWS.replace("12 3", "12 " + "9" * 400).encode()),
     ("map.yml", b"PARKING_AREAS: {A: {areas: [{shape: [2, 2015-11-12]}]}}"),
     ("experiment.json", json.dumps({"kind": "compare", "agents": ["mdp"], "scenarios": ["x" * 5000]}).encode()),
 ]  # fmt: skip

@@ -244,6 +244,15 @@ def test_a_file_system_that_is_read_only_is_named(tmp_path, monkeypatch):
     assert str(refused.value) == f"{path}: cannot be written: Read-only file system"
 
 
+@pytest.mark.parametrize("name", ["", ".", "/"])
+def test_what_is_no_name_of_a_file_is_refused(name):
+    with (
+        pytest.raises(InputError, match="cannot be written: is no name of a file"),
+        atomic_write.atomic_write(name),
+    ):
+        pass
+
+
 @pytest.mark.parametrize(
     "command",
     [("report", "run"), ("fit-sensor-model", "--scenario", "mini", "-n", "1")],

@@ -20,6 +20,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         InputError: the file cannot be written; the message names it.
     """
     path = Path(path)
+    if not path.name:
+        raise InputError(f"{path}: cannot be written: is no name of a file")
     beside = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         yield beside

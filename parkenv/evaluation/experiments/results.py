@@ -259,6 +259,8 @@ def _read(path: Path, columns: Sequence[str]) -> list[Row]:
 
 
 def _parse(name: str, value: str) -> Any:
+    if name == "decisions_us" and not all(us.isdecimal() and len(us) < 16 for us in value.split()):
+        raise ValueError(f"{name} is {value!r:.80}, want microseconds")
     if name in _TEXT:
         return value
     if name in _BOOL:
