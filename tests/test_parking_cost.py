@@ -112,7 +112,7 @@ def test_a_comparison_shows_what_parking_cost(tmp_path):
     write_lot(priced(lot, np.where(np.arange(lot.n_slots) % 2 == 0, 30.0, 5.0)), tmp_path / "dear.geojson")
     done = command(
         "compare", "--lot", tmp_path / "dear.geojson", "--agents", "mdp,greedy-goal", "--episodes", 5,
-        "--occupancy-levels", "none", "--no-figures", "--out", tmp_path / "run",
+        "--day-error", 0, "--occupancy-levels", "none", "--no-figures", "--out", tmp_path / "run",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "parking" in done.stdout

@@ -113,6 +113,9 @@ def main() -> None:
         except (Exception, KeyboardInterrupt) as error:
             # Libraries turn an interruption into errors of their own, such as failed imports.
             code = None if received else _report(error)
+            if received:
+                # What was interrupted could not close its files.
+                warnings.simplefilter("ignore", ResourceWarning)
     if received:
         code = 128 + received[0]
     sys.exit(code if isinstance(code, int) else 0)

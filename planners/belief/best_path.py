@@ -19,7 +19,6 @@ from planners.belief.planning_graph import (
     PlanningGraph,
     Records,
     is_hidden,
-    path_at,
 )
 from sim_sensors.compilation import compiled
 
@@ -118,7 +117,7 @@ def _best_path(
 
     if len(targets) and targets[0] == vertex and not is_worth_an_attempt(vertex, 0.0, -1.0, graph, belief):
         targets = targets[1:]
-    path = path_at(len(costs), paths)
+    path = _path_at(len(costs), paths)
     n_stops, left_s = rollout_path(vertex, targets, failure_s, graph, belief, path)
     best = _evaluate(vertex, n_stops, left_s, remaining_s, options, fallback_s, graph, belief, path)
     chosen = path
@@ -126,7 +125,7 @@ def _best_path(
         # The known free slots make the others better, too, so these cannot become the best.
         if plans.search_s[c] >= best.onward_s:
             break
-        plan = path_at(c, paths)
+        plan = _path_at(c, paths)
         found = _evaluate(
             vertex, plans.n_stops[c], plans.left_s[c], np.inf, options, fallback_s, graph, belief, plan
         )
@@ -225,7 +224,7 @@ def _plan(
     plans: Plans,
 ) -> float:
     """Roll out and evaluate the path of one failure cost; return its expected time, s."""
-    path = path_at(c, paths)
+    path = _path_at(c, paths)
     n_stops, left_s = rollout_path(vertex, np.empty(0, np.int64), costs[c], graph, belief, path)
     plans.n_stops[c], plans.left_s[c] = n_stops, left_s
     for other in range(len(costs)):
@@ -386,3 +385,9 @@ def _on_route(
         if time - since <= graph.drive_s[origin, v] + _ROUNDING_S:
             on_route[passed, v] = True
     return on_route
+
+
+@compiled(error_model="numpy")
+def _path_at(index: int, paths: PathBuffers) -> PathBuffer:
+    """Return the buffer of one path. Paths share their scratch arrays."""
+    return PathBuffer(paths.stops[index], paths.observations[index], paths.marks, paths.weights, paths.kept)

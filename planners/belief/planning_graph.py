@@ -176,12 +176,6 @@ def path_buffers(n_paths: int, n_slots: int, n_vertices: int) -> PathBuffers:
 
 
 @compiled(error_model="numpy")
-def path_at(index: int, paths: PathBuffers) -> PathBuffer:
-    """Return the buffer of one path. Paths share their scratch arrays."""
-    return PathBuffer(paths.stops[index], paths.observations[index], paths.marks, paths.weights, paths.kept)
-
-
-@compiled(error_model="numpy")
 def copy_weights(belief: BeliefSnapshot, path: PathBuffer) -> FloatArray:
     """Return the scratch weights of a path, set to those of the belief."""
     weights = path.weights[: len(belief.weights)]
