@@ -9,12 +9,12 @@ from scipy.special import expit, logit
 
 from parkenv.errors import InputError
 from parkenv.forecast.counts import Counts
-from parkenv.forecast.typical_week_fit import fit_typical_week
+from parkenv.forecast.typical_week_fit import LEVEL_SHARES, fit_typical_week
 from parkenv.lots import grid_lot, packaged_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.world import real_week
-from parkenv.world.real_week import LEVEL_SHARES, LEVELS, OCCUPIED, real_week_occupancy
+from parkenv.world.real_week import LEVELS, OCCUPIED, real_week_occupancy
 
 GERMAN = Path(__file__).parents[2] / "shared" / "data" / "german_car_parks" / "hourly_2023_2024.csv.gz"
 
@@ -70,11 +70,12 @@ def test_the_fit_finds_the_week_the_levels_and_the_days():
     names = tuple(f"park {i}" for i in range(9))
     counts = Counts(names, days, np.full((9, len(days)), 100.0), occupied, occupied, ({},) * 9)
     fitted = fit_typical_week(counts)
+    assert fitted is not None
     assert np.isnan(fitted.occupied[:, 3]).all()
     open_hours = np.delete(np.arange(24), 3)
     apart = logit(fitted.occupied[:, open_hours]) - week[:, open_hours]
     assert np.abs(apart - np.median(apart)).max() < 0.25
-    np.testing.assert_allclose(fitted.levels[[0, 3, -1]], [-1.0, 0.0, 1.0], atol=0.12)
+    np.testing.assert_allclose(fitted.levels[[0, 3, -1]], [-1.0, 0.0, 1.0], atol=0.2)
     np.testing.assert_allclose(fitted.day_errors, 0.5, atol=0.08)
 
 
@@ -82,6 +83,7 @@ def test_the_fit_finds_the_week_the_levels_and_the_days():
 @pytest.mark.skipif(not GERMAN.exists(), reason="the counts of German car parks are not here")
 def test_the_table_is_that_of_the_counts():
     fitted = fit_typical_week(Counts.read(GERMAN))
+    assert fitted is not None
     np.testing.assert_allclose(100.0 * fitted.occupied.ravel(), OCCUPIED, atol=0.51)
     np.testing.assert_allclose(fitted.levels, LEVELS, atol=0.006)
     assert np.nanmedian(fitted.day_errors) == pytest.approx(real_week.DAY_ERROR, abs=0.05)

@@ -111,8 +111,7 @@ def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
     import numpy as np
 
     from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
-    from parkenv.forecast.typical_week_fit import fit_typical_week
-    from parkenv.world.real_week import LEVEL_SHARES
+    from parkenv.forecast.typical_week_fit import LEVEL_SHARES, fit_typical_week
 
     n = len(counts.days)
     with progress_bar(console) as progress:
@@ -137,12 +136,10 @@ def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
     idle = counts.idle()
     drift = float(np.sqrt(7 * settings.level_drift))
     week = fit_typical_week(counts)
-    typical_week = {
-        "occupied": [[None if np.isnan(p) else round(float(p), 3) for p in day] for day in week.occupied],
+    typical_week = week and {
+        "occupied": week.occupied.round(3).tolist(),
         "levels": dict(zip(map(str, LEVEL_SHARES), week.levels.round(3).tolist(), strict=True)),
-        "day_error": None
-        if np.isnan(week.day_errors).all()
-        else round(float(np.nanmedian(week.day_errors)), 3),
+        "day_error": float(np.nanmedian(week.day_errors).round(3)),
     }
     save_summary(
         out,

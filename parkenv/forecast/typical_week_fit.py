@@ -11,8 +11,9 @@ from scipy.optimize import brentq
 from scipy.special import expit, logit
 
 from parkenv.forecast.counts import Counts, FloatArray
-from parkenv.world.real_week import LEVEL_SHARES
 
+LEVEL_SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
+"""Shares of all car parks whose levels are reported."""
 LEAST_READINGS = 20
 """Number of readings below which an hour of the week has no mean."""
 BY_DAY = slice(8, 20)
@@ -37,13 +38,19 @@ class TypicalWeekFit:
     day_errors: FloatArray
 
 
-def fit_typical_week(counts: Counts) -> TypicalWeekFit:
-    """Fit logit P(taken) = week[hour] + level[car park] by medians, which closing hours hardly move."""
+def fit_typical_week(counts: Counts) -> TypicalWeekFit | None:
+    """Fit logit P(taken) = week[hour] + level[car park] by medians, which closing hours hardly move.
+
+    Returns:
+        None if no hour of the week has `LEAST_READINGS`.
+    """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "(Mean of empty slice|All-NaN)", RuntimeWarning)
         mean = _weeks(counts)
         logits = logit(np.clip(mean, _CLIP, 1.0 - _CLIP))
         level, week = np.zeros(len(mean)), np.nanmedian(logits, axis=0)
+        if np.isnan(week).all():
+            return None
         for _ in range(_ITERATIONS):
             level = np.nanmedian((logits - week)[:, :6, BY_DAY].reshape(len(mean), -1), axis=1)
             level -= np.nanmedian(level)

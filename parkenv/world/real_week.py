@@ -16,6 +16,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
+from parkenv.forecast.typical_week_fit import LEVEL_SHARES
 from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy import FloatArray, OccupancyProcess
 from parkenv.world.typical_week import attraction
@@ -33,7 +34,6 @@ OCCUPIED = np.array(
         *(25, 25, 24, 20, 20, 25, 23, 25, 23, 25, 27, 27, 28, 29, 31, 31, 30, 30, 29, 28, 24, 22, 21, 19),
     ]
 )
-LEVEL_SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 LEVELS = (-1.65, -0.98, -0.40, 0.00, 0.38, 1.01, 1.87)
 """Logits above that week of the car park that is fuller than each of `LEVEL_SHARES` of all."""
 FULLER_THAN = 0.9
