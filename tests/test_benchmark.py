@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 
 import jsonschema
@@ -11,10 +12,18 @@ from command_line import parkenv
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments import benchmark
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
-from parkenv.evaluation.experiments.benchmark import Suite, check_result, result_of
+from parkenv.evaluation.experiments.benchmark import Suite, by_group, check_result, result_of, suite_lots
 from parkenv.evaluation.experiments.compare import run_cases
 from parkenv.evaluation.experiments.results import ResultFolder, write_summary
+from parkenv.evaluation.experiments.spec import TrainingSpec
+from parkenv.evaluation.lot_census import slots_by_kind
 from parkenv.evaluation.report.page import SCHEMA
+from parkenv.evaluation.training.search_task import SearchTask
+from parkenv.lots import grid_lot, read_lot, write_lot
+from parkenv.lots.lot_files import PLACES
+from parkenv.lots.provenance import combined, read_provenance
+from parkenv.scenarios.places import lot_share
+from parkenv.scenarios.spec import scenario_specs
 from parkenv.world.day_error import DayError
 from parkenv.world.occupancy import Arrival
 
@@ -143,12 +152,70 @@ def test_the_days_of_the_second_suite_differ_from_their_forecast():
     assert (sizes["campus-slope"], sizes["campus-as-forecast"]) == (DayError(0.6, 0.6), DayError())
 
 
+@pytest.mark.slow  # reads 24 lots
+def test_the_places_are_sure_real_lots_of_stated_kinds():
+    suite = Suite.named("v2-places")
+    assert [task.name for task in suite.tasks] == [f"place-{n:02d}" for n in range(1, 25)]
+    groups = {}
+    for task in suite.tasks:
+        path = PLACES / f"{task.scenario}.geojson"
+        lot, origin = read_lot(path), read_provenance(path)
+        assert origin.source.startswith("zuid-holland_")
+        assert combined(origin.doubts) <= 0.3
+        assert lot.slot_ids[0].startswith(("way/", "relation/"))
+        assert suite_lots()[lot_share(lot)] == task.name
+        counts = slots_by_kind(lot)
+        kind, share = max(counts.items(), key=lambda one: one[1])
+        kind = kind if share >= 0.9 * lot.n_slots else "mixed"
+        size = "small" if lot.n_slots < 80 else "medium" if lot.n_slots < 200 else "large"
+        assert task.group == (f"{kind}, {size}" if kind == "perpendicular" else kind)
+        groups[task.group] = groups.get(task.group, 0) + 1
+    assert list(groups.values()) == [4, 4, 4, 2, 4, 6]
+    made = suite.tasks[0].made(suite.arrival)
+    assert (made.name, made.occupancy.day_error, made.arrival) == ("place-01", DayError(0.7), suite.arrival)
+    notice = (PLACES / "LICENSE").read_text(encoding="utf-8")
+    assert "Open Database License" in notice
+    assert "OpenStreetMap contributors" in notice
+    assert suite_lots().keys() == {lot_share(read_lot(path)) for path in PLACES.glob("*.geojson")}
+
+
+def test_results_in_places_are_shown_by_kind(tmp_path, monkeypatch):
+    suite = Suite.named("v2-places")
+    few = replace(suite, seeds=suite.seeds[:2], tasks=(*suite.tasks[:2], suite.tasks[14]))
+    monkeypatch.setattr(benchmark.Suite, "named", classmethod(lambda cls, name: few))
+    ran = parkenv(
+        "benchmark", "run", "v2", "--places", "--agents", "first-free", "--jobs", 1, "--out", tmp_path
+    )
+    assert (ran.returncode, ran.stderr) == (0, "")
+    result = check_result(tmp_path / "result.json")
+    assert result["suite"] == "v2-places"
+    means = {group: (total, score) for _, group, total, score in by_group(result)}
+    assert list(means) == ["perpendicular, small", "kerbside"]
+    rows = result["rows"]
+    assert means["perpendicular, small"][0] == pytest.approx((rows[0]["total_s"] + rows[1]["total_s"]) / 2)
+    assert means["kerbside"] == pytest.approx((rows[2]["total_s"], rows[2]["score"]))
+    assert "perpendicular, small" in ran.stdout
+    assert "place-01" not in ran.stdout
+
+
+def test_no_agent_is_trained_on_a_place_of_the_suite(tmp_path):
+    for name in ("a", "b", "c"):
+        write_lot(grid_lot(2, ord(name) - 80), tmp_path / f"{name}.geojson")
+    shutil.copy(PLACES / "place-15.geojson", tmp_path / "mine.geojson")
+    specs = tuple(scenario_specs(tmp_path))
+    with pytest.raises(InputError, match="scenario 'mine' is place-15 of benchmark suite v2, which no agent"):
+        SearchTask(TrainingSpec(scenarios=specs)).check()
+    split = SearchTask(TrainingSpec(scenarios=specs, held_out=0.001))
+    assert [scenario.name for scenario in split.held_out] == ["mine"]
+    assert SearchTask(TrainingSpec(scenarios=specs[:3], evaluate_on=specs[3:])).held_out[0].name == "mine"
+
+
 def test_the_command_tells_of_suites_and_refuses_what_is_none(tmp_path):
     shown = parkenv("benchmark", "show", "v1")
     assert shown.returncode == 0
     assert "campus-full" in shown.stdout
     unknown = parkenv("benchmark", "run", "v7", "--out", tmp_path / "out")
-    assert (unknown.returncode, "known: v1, v2" in unknown.stderr) == (2, True)
+    assert (unknown.returncode, "known: v1, v2, v2-places" in unknown.stderr) == (2, True)
     for content in ('{"format": "park', "[" * 100_000):
         (tmp_path / "torn.json").write_text(content)
         torn = parkenv("benchmark", "check", tmp_path / "torn.json")

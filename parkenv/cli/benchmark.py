@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import BenchmarkSpec
 
 RESULT = "result.json"
+PLACES = "-places"
+"""End of the name of a suite of places."""
 
 
 def run(
@@ -28,6 +30,7 @@ def run(
     agents: str | None = None,
     out: Path | None = None,
     *,
+    places: bool = False,
     by: str | None = None,
     trust: bool = False,
     trust_model: bool = False,
@@ -41,16 +44,20 @@ def run(
 
     Examples:
         parkenv benchmark run v2 --agents belief,mdp --out results/v2
+        parkenv benchmark run v2 --places --agents belief,mdp --out results/v2-places
         parkenv benchmark check results/v2/result.json
 
     Options:
         suite (SUITE): The suite.  [default: v2]
         out, -o (DIR): Folder for result.json and the episodes.  [default: results/SUITE]
+        places: Run the places of the suite instead of its packaged scenarios: 24 real car parks that agents are never
+            trained on (the suite v2-places).
         by (TEXT): Who submits the result: a name, an address of the code.  [default: nobody]
     """
     from parkenv.evaluation.experiments.agent_spec import split_agents
     from parkenv.evaluation.experiments.spec import BenchmarkSpec
 
+    suite += PLACES if places else ""
     out = out or Path("results") / suite
     base = args.saved(out, BenchmarkSpec) if folder.resume else BenchmarkSpec()
     require_trust(base, out, trust, given=args.not_none(agents=agents) | machines.given)
@@ -159,18 +166,20 @@ def page(results: list[Path], /, out: Path = Path("results/benchmark.html")) -> 
     console.print(f"Written: {out}, {agents} agents in {len(checked)} results")
 
 
-def show(suite: str = "v2", /) -> None:
+def show(suite: str = "v2", /, places: bool = False) -> None:
     """Show the tasks and settings of a suite.
 
     Examples:
         parkenv benchmark show v2
+        parkenv benchmark show v2 --places
 
     Options:
         suite (SUITE): The suite.  [default: v2]
+        places: Show the places of the suite instead of its packaged scenarios.
     """
-    from parkenv.evaluation.experiments.benchmark import Suite
+    from parkenv.evaluation.experiments.benchmark import SUITES, Suite
 
-    its = Suite.named(suite)
+    its = Suite.named(suite + PLACES if places else suite)
     console = make_console()
     console.print(f"{its.name}: {its.description}")
     cells = []
@@ -179,24 +188,41 @@ def show(suite: str = "v2", /) -> None:
         level = "as it comes" if task.occupancy_level is None else f"{task.occupancy_level:.0%}"
         walk = f"{made.v_walk * 3.6:g} km/h"
         days = ", ".join(f"{size:g}" for size in task.day_error)
-        cells.append((task.name, task.scenario, str(made.lot.n_slots), level, days, task.sensor_model, walk))
-    headings = ["task", "scenario", "slots", "mean occupancy", "day error", "sensor model", "walking"]
+        cells.append(
+            (
+                task.name,
+                task.group or task.scenario,
+                str(made.lot.n_slots),
+                level,
+                days,
+                task.sensor_model,
+                walk,
+            )
+        )
+    scenario = "scenario" if its.tasks[0].group is None else "kind of place"
+    headings = ["task", scenario, "slots", "mean occupancy", "day error", "sensor model", "walking"]
     console.print(make_table(None, headings, cells))
     console.print(
         f"{len(its.seeds)} episodes a task, seeds {its.seeds[0]} to {its.seeds[-1]}; suite {its.fingerprint[:16]}"
     )
+    if its.name + PLACES in SUITES:
+        console.print(f"Its places, real car parks: parkenv benchmark show {its.name} --places")
 
 
 def _print(console: Console, results: list[dict[str, Any]]) -> None:
-    tasks = list(dict.fromkeys(row["task"] for result in results for row in result["rows"]))
+    from parkenv.evaluation.experiments.benchmark import by_group
+
     lines = []
+    columns: list[str] = []
     for result in results:
-        mean = {(row["agent"], row["task"]): row["total_s"] for row in result["rows"]}
+        mean = {(agent, group): time for agent, group, time, _ in by_group(result)}
+        mean = mean or {(row["agent"], row["task"]): row["total_s"] for row in result["rows"]}
+        columns = list(dict.fromkeys(column for _, column in mean))
         for agent, score in result["scores"].items():
-            lines.append((score, agent, [f"{mean[agent, task]:.1f}" for task in tasks]))
+            lines.append((score, agent, [f"{mean[agent, column]:.1f}" for column in columns]))
     lines.sort(key=lambda line: -line[0])
     cells = ((agent, *times, f"{score:.4f}") for score, agent, times in lines)
-    console.print(make_table("Mean total time, s, and the score", ["agent", *tasks, "score"], cells))
+    console.print(make_table("Mean total time, s, and the score", ["agent", *columns, "score"], cells))
 
 
 app = group("benchmark", "Run a fixed benchmark suite, and check the results of others.")

@@ -105,7 +105,11 @@ def _best(folder: Path, trust: bool) -> tuple[Path, Sequence[ScenarioSpec] | Non
     rows = run.summary["rows"]
     key = "total_s" if spec.env == "search" else "success"
     best = (min if spec.env == "search" else max)(rows, key=lambda row: float(row[key]))
-    return folder / f"seed_{int(best['seed'])}" / MODEL, spec.test_on or spec.evaluate_on or spec.scenarios
+    tested = spec.test_on or spec.evaluate_on or spec.scenarios
+    if spec.test_on is None and spec.held_out is not None and spec.scenarios is not None:
+        kept = set(run.summary["settings"]["held_out"])
+        tested = tuple(each for each in spec.scenarios if each.title in kept)
+    return folder / f"seed_{int(best['seed'])}" / MODEL, tested
 
 
 def _trained_on(model: Path, names: Sequence[str]) -> list[ScenarioSpec]:

@@ -36,6 +36,10 @@ def load_lot(name_or_path: str | Path) -> ParkingLot:
     return read_lot(path)
 
 
+PLACES = Path(__file__).parent / "places"
+"""Folder with the places of benchmark suites: real car parks, © OpenStreetMap contributors, ODbL (see its README)."""
+
+
 def packaged_lot(name: str) -> ParkingLot:
     """Load a packaged lot: campus, jam, street, mini.
 

@@ -1,7 +1,8 @@
 """Benchmark suites: fixed scenarios, seeds and metrics that make results of different groups comparable.
 
-A suite is a JSON file in the folder `suites`. A published suite never changes; improvements go into a new suite. A
-result file names its suite, contains the total time of every search, and can be checked by anybody.
+A suite is a JSON file in the folder `suites`. The places of a suite, real car parks, are a suite of their own
+(`v2-places`), so that a result of either part can be complete. A published suite never changes; improvements go into a
+new suite. A result file names its suite, contains the total time of every search, and can be checked by anybody.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from parkenv.evaluation.experiments.compare import Case, at_occupancy, require_d
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.results import ResultFolder, Row
 from parkenv.files.limited_reading import read_json
+from parkenv.lots.lot_files import PLACES
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.day_error import DayError
 from parkenv.world.occupancy import ArrivalWindow
@@ -34,7 +36,7 @@ from planners.agent import make_agent
 
 RESULT_FORMAT = "parkenv-benchmark-result"
 RESULT_VERSION = 1
-SUITES = ("v1", "v2")
+SUITES = ("v1", "v2", "v2-places")
 METRICS = (
     "episodes", "parked_fraction", "total_s", "total_s_ci95", "regret_s", "regret_s_ci95", "failed_parks",
     "decision_ms", "decision_ms_p99",
@@ -50,18 +52,20 @@ class Task:
     """One scenario of a suite."""
 
     name: str  # name of the task
-    scenario: str  # a packaged scenario
+    scenario: str  # a packaged scenario, or the name of a file in `parkenv.lots.lot_files.PLACES`
     occupancy_level: float | None = None  # mean occupancy of the world; None for the scenario's own
     # `perfect`, or the rig whose fitted sensor model is used; `sight` in the suite's file
     sensor_model: str = "perfect"
     v_walk_kmh: float | None = None  # walking speed; None for the scenario's own
     # how far days differ from the forecast, logits: (level,) or (level, slope)
     day_error: tuple[float, ...] = (0.0,)
+    group: str | None = None  # kind of place, for tables; None in suites of packaged scenarios
 
     def made(self, arrival: ArrivalWindow) -> Scenario:
         """Make the scenario, named after the task."""
         days = DayError(*self.day_error)
-        made = make_scenario(self.scenario, name=self.name, arrival=arrival, day_error=days)
+        source = self.scenario if self.group is None else PLACES / f"{self.scenario}.geojson"
+        made = make_scenario(source, name=self.name, arrival=arrival, day_error=days)
         if self.sensor_model != "perfect":
             made = made.replace(sensor_model=SensorModel.named(self.sensor_model))
         if self.v_walk_kmh is not None:
@@ -121,8 +125,11 @@ class Suite:
         return [(case, self.seeds) for case in cases]
 
 
-def _task(sight: str = "perfect", day_error: Sequence[float] = (0.0,), **fields: Any) -> Task:
+def _task(
+    sight: str = "perfect", day_error: Sequence[float] = (0.0,), lot_share: float | None = None, **fields: Any
+) -> Task:
     """Return a task of a suite's file; v1 is older than days that differ from their forecast."""
+    del lot_share  # see `suite_lots`
     return Task(sensor_model=sight, day_error=tuple(day_error), **fields)
 
 
@@ -240,6 +247,29 @@ def _bounds(task: Task, suite: Suite) -> list[float]:
     scenario = task.made(suite.arrival)
     runner = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario))
     return [runner.bound_s(seed) for seed in suite.seeds]
+
+
+@functools.cache
+def suite_lots() -> Mapping[float, str]:
+    """Return the places of all suites, which no agent is trained on: names by the `lot_share` of their lots."""
+    suites = (_packaged(name) for name in SUITES)
+    return {
+        task["lot_share"]: task["name"] for suite in suites for task in suite["tasks"] if "lot_share" in task
+    }
+
+
+def by_group(result: Row) -> list[tuple[str, str, float, float]]:
+    """Return a suite's result by kind of place: agent, kind, mean total time, s, and mean score, over its places."""
+    groups: dict[str, list[str]] = {}
+    for task in Suite.named(result["suite"]).tasks:
+        if task.group is not None:
+            groups.setdefault(task.group, []).append(task.name)
+    rows = {(row["agent"], row["task"]): row for row in result["rows"]}
+    return [
+        (agent, group, *(float(np.mean([rows[agent, name][key] for name in names])) for key in ("total_s", "score")))
+        for agent in result["scores"]
+        for group, names in groups.items()
+    ]  # fmt: skip
 
 
 def _score(searches: Mapping[str, Sequence[float]]) -> float:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
+from parkenv.evaluation.experiments.benchmark import suite_lots
 from parkenv.evaluation.experiments.compare import rows_of
 from parkenv.evaluation.experiments.spec import TrainingSpec
 from parkenv.evaluation.experiments.workers import Workers
@@ -66,10 +67,11 @@ class SearchTask(TrainingTask):
         """Scenarios to train in, and held-out ones."""
         given = [build(scenario) for scenario in self.scenarios]
         if self.spec.held_out is not None:
-            sides = split_places(given, self.spec.held_out)
+            sides = split_places(given, self.spec.held_out, suite_lots())
         else:
             sides = given, [build(scenario) for scenario in self.spec.evaluate_on or ()]
         require_apart(*sides)
+        require_trainable(sides[0])
         return sides
 
     @property
@@ -96,7 +98,7 @@ class SearchTask(TrainingTask):
     @property
     def _evaluated(self) -> list[Scenario]:
         """Scenarios of the evaluations that decide which model is kept."""
-        return self.worlds if self._holds_out else self.worlds[:1]
+        return self.worlds
 
     @property
     def measures(self) -> tuple[str, ...]:
@@ -134,11 +136,9 @@ class SearchTask(TrainingTask):
 
     def evaluation_settings(self, settings: Row) -> Row:
         """See `TrainingTask`."""
-        first, *_ = settings.get("scenario") or [None]
-        held_out = settings.get("held_out") or []
         return {
-            "scenario": settings.get("scenario") if held_out else first,
-            "held_out": held_out,
+            "scenario": settings.get("scenario"),
+            "held_out": settings.get("held_out") or [],
             "evaluation_episodes": settings.get("evaluation_episodes"),
         }
 
@@ -194,7 +194,9 @@ class SearchTask(TrainingTask):
                 own = {c: main[c] for c in ("total_s", "total_s_ci95")}
                 rows.append(row_of(self.algorithm, main["test_scenario"], number, curve, own, model))
         name = name_of(self.settings())
-        where = f"{_places(self.held_out)} held out" if self._holds_out else self.worlds[0].name
+        where = self.worlds[0].name if len(self.worlds) == 1 else _places(self.worlds)
+        if self._holds_out:
+            where = f"{_places(self.held_out)} held out"
         title = f"{where}: {self.evaluation_episodes} searches in held-out worlds"
         save_learning_curves(self._curves(name, trained.curves) | trained.beside, lines, title, figure)
         heading = "Mean total time, s, in held-out worlds"
@@ -238,6 +240,21 @@ def require_apart(learned: list[Scenario], held_out: list[Scenario]) -> None:
         if (same := shares.get(lot_share(scenario.lot))) is not None:
             raise InputError(
                 f"evaluate_on has {scenario.name!r}, whose lot is that of {same!r}, which is trained on"
+            )
+
+
+def require_trainable(learned: list[Scenario]) -> None:
+    """Check that none of the places to train on is one of a benchmark suite.
+
+    Raises:
+        InputError: one is.
+    """
+    kept = suite_lots()
+    for scenario in learned:
+        if (name := kept.get(lot_share(scenario.lot))) is not None:
+            raise InputError(
+                f"scenario {scenario.name!r} is {name} of benchmark suite v2, which no agent is trained on: leave it "
+                "out, or add --held-out"
             )
 
 

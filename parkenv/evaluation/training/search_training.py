@@ -41,7 +41,7 @@ class SearchTraining(Training):
         steps: decisions in total.
         evaluate_every: decisions between evaluations.
         scenarios: scenarios to train on; each search is in one of them, drawn from its seed.
-        evaluation_seeds: seeds of the held-out worlds: in the first scenario, or with `held_out` in all of them.
+        evaluation_seeds: seeds of the held-out worlds; each draws one of the scenarios.
         k: number of slots in the observation.
         demonstrations: demonstrations to clone before training; None for no cloning.
         held_out: further places to evaluate in. They do not decide which model is kept.
@@ -92,7 +92,7 @@ class SearchTraining(Training):
         """Run one episode in each held-out world, in the places trained on and in those held out."""
         del env
         found: list[float] = []
-        for places in (self.scenarios, self.held_out) if self.held_out else (self.scenarios[:1],):
+        for places in (self.scenarios, self.held_out) if self.held_out else (self.scenarios,):
             times, parked = episode_times(policy, places, self.evaluation_seeds, self.k)
             found += [*mean_interval(times), float(parked.mean())]
         return dict(zip(self.metrics, found, strict=True))
