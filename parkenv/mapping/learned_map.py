@@ -48,8 +48,10 @@ GIVEN_MAP = (
     *_priors({2.0: 0.002}, trust=0.0),
 )
 """Priors for a given map: right, a little off, quite wrong, or worthless; with or without drift over weeks."""
-NO_MAP = _priors({1.0: 0.5, 2.0: 0.5}, shape={**_SHAPE, "hour": 1.0})
-"""Priors for a lot of which nothing is known, not even its busy hours."""
+NO_MAP = _priors({1.0: 0.5, 2.0: 0.5})
+"""Priors for a lot of which nothing is known."""
+SURVEYED = _priors({1.0: 0.5, 2.0: 0.5}, shape={**_SHAPE, "hour": 1.0})
+"""Priors for a lot of which survey sessions alone are known; unlike a driver's trips, they are spread over the day."""
 
 
 class EmptyMap:
@@ -118,10 +120,10 @@ def map_prior(log: SessionLog, trips: Sequence[Trip], walk: ArrayLike) -> PriorM
     counted = log.n_slots > MOST_SURVEYED_SLOTS and len(log.time) > 0
     if counted and not trips:
         return MapPrior(log)
-    learned = LearnedMap(
-        MapPrior(log) if counted else EmptyMap(log.n_slots), walk, GIVEN_MAP if counted else NO_MAP
-    )
-    if not counted:
+    if counted:
+        learned = LearnedMap(MapPrior(log), walk, GIVEN_MAP)
+    else:
+        learned = LearnedMap(EmptyMap(log.n_slots), walk, SURVEYED if len(log.time) else NO_MAP)
         learned.learn_sessions(log)
     learned.learn(trips)
     return learned
