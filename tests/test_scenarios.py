@@ -118,7 +118,7 @@ def test_a_file_says_it_all(tmp_path):
     env.reset(seed=3)
     assert env.unwrapped.scenario.failure_s == 7.0
     assert env.unwrapped.scenario.lot.n_slots == 12
-    assert make_scenario(tmp_path / "lot.geojson").name == "lot", "a typical week on a lot file"
+    assert make_scenario(tmp_path / "lot.geojson").name == "lot", "a lot file alone"
 
     # What was read can be written and read again, from anywhere.
     scenario_spec(file).write(tmp_path / "copy.json")
@@ -194,7 +194,7 @@ def test_logs_and_maps(tmp_path):
         ('lot = "mini"\ngoal = [1.0]', "goal is [1.0], want the index of one of the lot's goals, or a point [x, y]"),
         ('lot = "mini"\narrivals = { days = "mo" }', "arrivals.days is 'mo', want weekdays, weekend, all, or names"),
         ('lot = "mini"\narrivals = { hours = "8-9" }', "arrivals.hours is '8-9', want HH:MM-HH:MM within one day"),
-        ('lot = "mini"\noccupancy = "busy"', "occupancy is 'busy', want typical, a process (.json), a recorded log"),
+        ('lot = "mini"\noccupancy = "busy"', "occupancy is 'busy', want typical, real-week, a process (.json)"),
         ('lot = "mini"\noccupancy = { mapping = "mine.toml" }', "want mapping only together with a log"),
         ('lot = "mini"\noccupancy = { replay_from = 2016-01-01 }', "want replay_from only together with a log"),
         ('lot = "mini"\noccupancy = { forecast_from = "past" }', "want forecast_from only together with replay_from"),
