@@ -37,7 +37,8 @@ def fit(
     compare`: unchanged on a lot with the same number of slots, on any other lot with the fullest slots nearest to the
     goal.
 
-    Counts of whole car parks: by how much days differ from their forecasts, and which readings are faulty.
+    Counts of whole car parks: by how much days differ from their forecasts, which readings are faulty, and the week of
+    the car park of median level.
 
     Examples:
         parkenv occupancy fit CNR-EXT.csv.gz --out results/pisa
@@ -111,6 +112,7 @@ def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
     import numpy as np
 
     from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
+    from parkenv.forecast.typical_week_fit import LEVEL_SHARES, fit_typical_week
 
     n = len(counts.days)
     with progress_bar(console) as progress:
@@ -134,6 +136,12 @@ def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
         cells.append([f"{value:.2f}" if isinstance(value, float) else str(value) for value in row.values()])
     idle = counts.idle()
     drift = float(np.sqrt(7 * settings.level_drift))
+    week = fit_typical_week(counts)
+    typical_week = week and {
+        "occupied": week.occupied.round(3).tolist(),
+        "levels": dict(zip(map(str, LEVEL_SHARES), week.levels.round(3).tolist(), strict=True)),
+        "day_error": float(np.nanmedian(week.day_errors).round(3)),
+    }
     save_summary(
         out,
         None,
@@ -142,6 +150,7 @@ def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
         variances=asdict(settings),
         level_drift_per_week=drift,
         faults=counts.total_faults(),
+        typical_week=typical_week,
     )
     headings = [str(key).replace("_", " ") for key in rows[0]]
     console.print(make_table(f"{counts.source}: {plural(n, 'day')}", headings, cells))
