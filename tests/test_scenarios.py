@@ -8,7 +8,7 @@ from parkenv import InputError, make_scenario
 from parkenv.cli.arguments import World
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot, packaged_lot, write_lot
-from parkenv.mapping.inference import MapPrior
+from parkenv.mapping.learned_map import LearnedMap
 from parkenv.mapping.store import MapStore, Session
 from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
 from parkenv.world.day_error import DayError, nearness
@@ -150,7 +150,7 @@ def test_logs_and_maps(tmp_path):
         )
     )
     assert isinstance(made.occupancy, RecordedOccupancy)
-    assert isinstance(made.prior, MapPrior)
+    assert isinstance(made.prior, LearnedMap)
     assert made.forecast(TUESDAY_NOON).p_occupied.shape == (10,)
     (tmp_path / "later.csv").write_text((tmp_path / "log.csv").read_text().replace("2016-01-1", "2016-01-2"))
     for log in ("'log.csv,later.csv'", "['log.csv', 'later.csv']"):
