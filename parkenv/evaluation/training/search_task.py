@@ -136,8 +136,9 @@ class SearchTask(TrainingTask):
 
     def evaluation_settings(self, settings: Row) -> Row:
         """See `TrainingTask`."""
+        first, *others = settings.get("scenario") or [None]
         return {
-            "scenario": settings.get("scenario"),
+            "scenario": [first, *others] if others else first,
             "held_out": settings.get("held_out") or [],
             "evaluation_episodes": settings.get("evaluation_episodes"),
         }
