@@ -20,8 +20,8 @@ Sensors:
     weather (NAME): {weathers}.  [default: drawn each time]
 
 World:
-    lot (NAME|FILE[,...]): Instead of a scenario: a typical week on this lot, with a day error of 0.8. A packaged lot,
-        GeoJSON, or a Dragon Lake map (.yml).
+    lot (NAME|FILE[,...]): Instead of a scenario: a week as in busy real car parks on this lot. A packaged lot, GeoJSON,
+        or a Dragon Lake map (.yml).
 
 Results:
     rerun (FILE.rrd): Also record images, boxes, scans, grid, slots and path for the Rerun viewer (extra viewer; then:
@@ -65,7 +65,7 @@ class World:
             scenario's; others, with counts rolling]
         day_error (X[,Y]): How far whole days differ from the forecast: standard deviations, logits, of their level and
             of their slope to the goal; 0 for days that are as forecast.  [default: the scenario's, 0.8 in the packaged
-            ones]
+            ones, 0.7 for a lot alone]
         mapping (FILE): CSV slot_id,log_slot_id that assigns the log's slots to the lot's.  [default: the log's fullest
             slots are nearest to the goal]
         goal (X,Y): Walk to this point, m, or to the lot's goal of this index.  [default: the scenario's]

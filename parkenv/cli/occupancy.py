@@ -9,6 +9,7 @@ from parkenv.cli.arguments import iso_date, words
 from parkenv.cli.command import add, group
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
+from parkenv.evaluation.plurals import plural
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -36,7 +37,8 @@ def fit(
     compare`: unchanged on a lot with the same number of slots, on any other lot with the fullest slots nearest to the
     goal.
 
-    Counts of whole car parks: by how much days differ from their forecasts, and which readings are faulty.
+    Counts of whole car parks: by how much days differ from their forecasts, which readings are faulty, and the week of
+    the car park of median level.
 
     Examples:
         parkenv occupancy fit CNR-EXT.csv.gz --out results/pisa
@@ -110,6 +112,7 @@ def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
     import numpy as np
 
     from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
+    from parkenv.forecast.typical_week_fit import LEVEL_SHARES, fit_typical_week
 
     n = len(counts.days)
     with progress_bar(console) as progress:
@@ -133,6 +136,12 @@ def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
         cells.append([f"{value:.2f}" if isinstance(value, float) else str(value) for value in row.values()])
     idle = counts.idle()
     drift = float(np.sqrt(7 * settings.level_drift))
+    week = fit_typical_week(counts)
+    typical_week = week and {
+        "occupied": week.occupied.round(3).tolist(),
+        "levels": dict(zip(map(str, LEVEL_SHARES), week.levels.round(3).tolist(), strict=True)),
+        "day_error": float(np.nanmedian(week.day_errors).round(3)),
+    }
     save_summary(
         out,
         None,
@@ -141,9 +150,10 @@ def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
         variances=asdict(settings),
         level_drift_per_week=drift,
         faults=counts.total_faults(),
+        typical_week=typical_week,
     )
     headings = [str(key).replace("_", " ") for key in rows[0]]
-    console.print(make_table(f"{counts.source}: {n} days", headings, cells))
+    console.print(make_table(f"{counts.source}: {plural(n, 'day')}", headings, cells))
     _print_notes(counts, console)
     console.print(f"Levels drift by {drift:.2f} logits a week. The summary is in {out}")
 
@@ -243,7 +253,7 @@ def evaluate(
         *band_names,
         "log-loss more than ours",
     )
-    title = f"{rows[0]['car_parks']} car parks, {rows[0]['days']} days from {counts.days[first]}"
+    title = f"{plural(rows[0]['car_parks'], 'car park')}, {plural(rows[0]['days'], 'day')} from {counts.days[first]}"
     console.print(make_table(title, headings, cells))
     console.print(
         "90 %: days whose mean lies in its 90 % interval, in all and by forecast fullness.", soft_wrap=True
@@ -306,7 +316,7 @@ def _evaluate_log(log: Path, from_: str | None, seed: int, out: Path, console: C
         save_forecast(shown_slots(scores, log.name), out / f"{scores.model}.png")
     save_summary(out, seed, rows, first_day=first)
     headings = ("model", "log-loss", "Brier", "CRPS", "90 %: days", "log-loss more than ours")
-    title = f"{len(recorded.slot_ids)} slots, {rows[0]['days']} days from {first}"
+    title = f"{plural(len(recorded.slot_ids), 'slot')}, {plural(rows[0]['days'], 'day')} from {first}"
     console.print(make_table(title, headings, cells))
     console.print(f"Pictures and summary are in {out}")
 
