@@ -181,9 +181,8 @@ class SearchTask(TrainingTask):
         rows, transfer, by_place = [], [], []
         with status("Testing"):
             for (number, model), curve in zip(trained.models.items(), trained.curves, strict=True):
-                agent = LearnedAgent(self.worlds[0], self.algorithm, model)
                 for name, places in self.tests.items():
-                    times, parked = episode_times(agent.model, places, self.test_seeds, agent.local_k)
+                    times, parked = self.times_of(model, places)
                     test = {"agent": self.algorithm, "seed": number, "test_scenario": name}
                     transfer.append({**test, **times_row(times, parked)})
                     if len(places) > 1:
@@ -204,6 +203,11 @@ class SearchTask(TrainingTask):
             "curve": across_seeds(trained.curves),
             "beside": {name: across_seeds(its) for name, its in trained.beside.items()},
         }, table_of_tests(heading, self.algorithm, transfer, planners, _interval)  # fmt: skip
+
+    def times_of(self, model: Path, places: list[Scenario]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Test a model: return the times of the test's episodes, s, and whether the car parked."""
+        agent = LearnedAgent(self.worlds[0], self.algorithm, model)
+        return episode_times(agent.model, places, self.test_seeds, agent.local_k)
 
     def _curves(self, name: str, curves: list[list[Row]]) -> dict[str, list[list[Row]]]:
         """Return the curves to draw: in places trained on, and in those held out."""
