@@ -76,7 +76,7 @@ def train(
         scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
             campus; to drive, campus,street; for network, made lots]
         steps (N >= 1): Decisions of a training; for network, those that belief labels.  [default: 2000000; for network,
-            20000; to drive, the training config's]
+            10000; to drive, the training config's]
         trainings (N >= 1): How many, with one seed each from --seed on.
         seed (N >= 0): First seed of the trainings.
         out, -o (DIR): Folder for models, curves and figures.  [default: results/ALGORITHM, results/drive-ALGORITHM]

@@ -138,8 +138,8 @@ class NetworkAgent(BeliefAgent):
             self.problem.failure_s,
             known.time,
             memory.visited_at,
-            known.forecast,
-            known.observed_at,
+            known.forecast.astype(np.float64),
+            known.observed_at.astype(np.float64),
         )
         belief = snapshot(here, known, memory, 0.0)
         observe(now, memory.by_cost, self._failure_costs, memory.graph, belief, memory.scratch, out)

@@ -108,8 +108,8 @@ def label_searches(places: Sequence[Place], decisions: int, seed: int, student_d
         place = places[episode % len(places)]
         observation, _ = place.env.reset(seed=seed + episode)
         episode += 1
-        teacher_memory: BeliefSearch | None = None
-        memory: NetworkSearch | None = None
+        teacher_memory: Any = None
+        memory: Any = None
         for _ in range(LONGEST):
             wanted, teacher_memory = place.teacher.predict(observation, teacher_memory)
             chosen, memory = place.student.predict(observation, memory)  # also writes the features
@@ -121,7 +121,7 @@ def label_searches(places: Sequence[Place], decisions: int, seed: int, student_d
             action = int(chosen) if student_drives else int(wanted)
             if not student_drives and rng.random() < EXPLORATION:
                 action = int(rng.choice(np.flatnonzero(observation["action_mask"][:PARK])))
-            observation, _, terminated, _, _ = place.env.step(np.int64(action))
+            observation, _, terminated, _, _ = place.env.step(action)
             if terminated:
                 break
     return Labelled(*(np.stack(column) for column in zip(*rows, strict=True)))
@@ -172,23 +172,23 @@ def play_pairs(places: Sequence[Place], count: int, seed: int, closest: float) -
         place = places[episode % len(places)]
         observation, _ = place.env.reset(seed=seed + episode)
         episode += 1
-        memory: NetworkSearch | None = None
+        memory: Any = None
         branch: _Branch | None = None
         rewards: list[float] = []
         n_close, terminated = 0, False
         while not terminated and len(rewards) < LONGEST:
             chosen, memory = place.student.predict(observation, memory)
-            scores = place.student.last_scores
-            if scores is not None:
+            scores, observed = place.student.last_scores, place.student.last_features
+            if scores is not None and observed is not None:
                 first, second = (int(a) for a in np.argsort(-scores, kind="stable")[:2])
                 if scores[first] - scores[second] < closest:
                     n_close += 1
                     # Each close decision is chosen with the same probability.
                     if rng.random() < 1.0 / n_close:
-                        features = Features(*(a.copy() for a in place.student.last_features))
+                        features = Features._make(a.copy() for a in observed)
                         saved = place.env.get_state(), observation, _forked(memory)
                         branch = _Branch(len(rewards), *saved, features, first, second)
-            observation, reward, terminated, _, _ = place.env.step(chosen)
+            observation, reward, terminated, _, _ = place.env.step(int(chosen))
             rewards.append(float(reward))
         if branch is None:
             continue
@@ -221,15 +221,15 @@ def _forked(memory: NetworkSearch) -> NetworkSearch:
 def _play(place: Place, branch: _Branch) -> tuple[float, int]:
     """Take the second action and follow the student to the end of the search; return the time, s, and the decisions."""
     place.env.set_state(branch.state)
-    action, memory = branch.second, branch.memory
+    action, memory = branch.second, branch.memory  # type: int, Any
     if action == WAITING:
         action = place.student.wait(int(branch.observation["vertex"]))
-    observation, reward, terminated, _, _ = place.env.step(np.int64(action))
+    observation, reward, terminated, _, _ = place.env.step(action)
     total = -float(reward)
     for n_played in range(LONGEST):
         if terminated:
             return total, n_played
         chosen, memory = place.student.predict(observation, memory)
-        observation, reward, terminated, _, _ = place.env.step(chosen)
+        observation, reward, terminated, _, _ = place.env.step(int(chosen))
         total -= float(reward)
     return total + place.env.scenario.give_up_s, LONGEST

@@ -35,11 +35,11 @@ class Network(nn.Module):
                 nn.init.kaiming_uniform_(weight.T, a=5**0.5)
             self.layers[name.replace(".", "_")] = nn.Parameter(weight)
         actions, tokens = feature_masks(card.without)
-        self.register_buffer("of_actions", torch.tensor(actions))
-        self.register_buffer("of_tokens", torch.tensor(tokens))
+        self.of_actions, self.of_tokens = torch.tensor(actions), torch.tensor(tokens)
 
     def _layer(self, name: str, x: Tensor) -> Tensor:
-        return x @ self.layers[f"{name}_weight"] + self.layers[f"{name}_bias"]
+        y: Tensor = x @ self.layers[f"{name}_weight"] + self.layers[f"{name}_bias"]
+        return y
 
     def forward(self, actions: Tensor, tokens: Tensor, allowed: Tensor) -> Tensor:
         """Score the actions, (n, 6); -1e4 for those that there are not."""
@@ -131,7 +131,7 @@ def fit(
             loss = loss + pairs_weight * found
             parts["pairs"] = float(found)
         optimizer.zero_grad()
-        loss.backward()
+        torch.autograd.backward(loss)
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
         schedule.step()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.spec import TrainingSpec
 from parkenv.evaluation.training.made_lots import made_places, varied
-from parkenv.evaluation.training.network_training import NETWORK, STEPS, NetworkTraining, network_times
+from parkenv.evaluation.training.network_training import NETWORK, STEPS, Evaluation, NetworkTraining
 from parkenv.evaluation.training.search_task import SearchTask
 from parkenv.evaluation.training.training_task import Row, Status
 from parkenv.world.scenario import Scenario
@@ -26,7 +27,7 @@ class NetworkTask(SearchTask):
     """Training of `network` in made lots, and in the given places if there are any."""
 
     default_algorithm = NETWORK
-    default_scenarios = ()
+    default_scenarios: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, spec: TrainingSpec) -> None:
         super().__init__(spec)
@@ -71,4 +72,4 @@ class NetworkTask(SearchTask):
 
     def times_of(self, model: Path, places: list[Scenario]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """See `SearchTask`."""
-        return network_times(NetworkPolicy.load(model), places, self.test_seeds)
+        return Evaluation(places, self.test_seeds).times(NetworkPolicy.load(model))

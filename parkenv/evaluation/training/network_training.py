@@ -32,7 +32,7 @@ from planners.network.policy import NetworkCard, NetworkPolicy, Part
 
 NETWORK = "network"
 """Name of the algorithm, and of the agent."""
-STEPS = 20_000
+STEPS = 10_000
 """Default number of labelled decisions of a training."""
 PAIR_ROUNDS = 2
 CLOSEST = 0.05  # time scales, difference of two scores that are about equal
@@ -94,12 +94,15 @@ class NetworkTraining(AnyTraining):
         places = [Place.of(self.places[i], network.policy()) for i in order]
         worlds, decisions = TRAINING_SEEDS * (seed + 1), 0
 
+        sides = (self.places, self.held_out) if self.held_out else (self.places,)
+        evaluations = [Evaluation(side, self.evaluation_seeds) for side in sides]
+
         def evaluate() -> None:
             for place in places:
                 place.student.policy = network.policy()
             found: list[float] = []
-            for where in (self.places, self.held_out) if self.held_out else (self.places,):
-                times, parked = network_times(network.policy(), where, self.evaluation_seeds)
+            for evaluation in evaluations:
+                times, parked = evaluation.times(network.policy())
                 found += [*mean_interval(times), float(parked.mean())]
             row = {"steps": decisions, **dict(zip(self.metrics, found, strict=True))}
             curve.append({**row, "wall_s": time.monotonic() - begin})
@@ -145,29 +148,41 @@ class NetworkTraining(AnyTraining):
         return curve
 
 
-def network_times(
-    policy: NetworkPolicy, places: Sequence[Scenario], seeds: Sequence[int]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Run episodes; return their total times, (n,) s, and whether the car parked, (n,) bool.
+class Evaluation:
+    """Searches in some places, to run a network in again and again.
 
     Args:
-        policy: the network.
         places: scenarios, of which each seed draws one.
         seeds: one episode each.
     """
-    times, parked = dict[int, float](), dict[int, bool]()
-    for place, its in zip(places, seeds_by_place(seeds, len(places)), strict=True):
-        env, agent = SearchEnv(place), NetworkAgent(place, policy)
-        for seed in its:
-            observation, _ = env.reset(seed=seed)
-            memory: Any = None
-            terminated, info = False, dict[str, Any]()
-            for _ in range(STEP_LIMIT):
-                action, memory = agent.predict(observation, memory)
-                observation, _, terminated, _, info = env.step(action)
-                if terminated:
-                    break
-            if not terminated:
-                charge_truncation(info, place.give_up_s)
-            times[seed], parked[seed] = float(info["total_s"]), bool(info["parked"])
-    return np.array([times[seed] for seed in seeds]), np.array([parked[seed] for seed in seeds])
+
+    def __init__(self, places: Sequence[Scenario], seeds: Sequence[int]) -> None:
+        self._seeds = seeds
+        self._places = [
+            (SearchEnv(place), NetworkAgent(place), its)
+            for place, its in zip(places, seeds_by_place(seeds, len(places)), strict=True)
+            if its
+        ]
+
+    def times(self, policy: NetworkPolicy) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Run the episodes; return their total times, (n,) s, and whether the car parked, (n,) bool.
+
+        A search that has not ended after `STEP_LIMIT` decisions is charged `give_up_s`, as in `parkenv compare`.
+        """
+        times, parked = dict[int, float](), dict[int, bool]()
+        for env, agent, seeds in self._places:
+            agent.policy = policy
+            for seed in seeds:
+                observation, _ = env.reset(seed=seed)
+                memory: Any = None
+                terminated, info = False, dict[str, Any]()
+                for _ in range(STEP_LIMIT):
+                    action, memory = agent.predict(observation, memory)
+                    observation, _, terminated, _, info = env.step(int(action))
+                    if terminated:
+                        break
+                if not terminated:
+                    charge_truncation(info, env.scenario.give_up_s)
+                times[seed], parked[seed] = float(info["total_s"]), bool(info["parked"])
+        found = [times[seed] for seed in self._seeds], [parked[seed] for seed in self._seeds]
+        return np.array(found[0]), np.array(found[1])

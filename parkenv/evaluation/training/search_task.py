@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from parkenv.evaluation.experiments.workers import Workers
 from parkenv.evaluation.figures.learning_curves import across_seeds, save_learning_curves
 from parkenv.evaluation.training.cloning import Demonstrations, require_cloneable
 from parkenv.evaluation.training.configs import SEARCH_CONFIGS, config_of
+from parkenv.evaluation.training.rl_training import AnyTraining
 from parkenv.evaluation.training.search_training import SearchTraining, episode_times, times_row
 from parkenv.evaluation.training.training_task import (
     Row,
@@ -48,7 +50,7 @@ class SearchTask(TrainingTask):
     """Training of search agents in some scenarios."""
 
     default_algorithm = "maskable-ppo"
-    default_scenarios = ("campus",)
+    default_scenarios: ClassVar[tuple[str, ...]] = ("campus",)
     default_episodes = 256
 
     def __init__(self, spec: TrainingSpec) -> None:
@@ -142,7 +144,7 @@ class SearchTask(TrainingTask):
             "evaluation_episodes": settings.get("evaluation_episodes"),
         }
 
-    def training(self, status: Status) -> SearchTraining:
+    def training(self, status: Status) -> AnyTraining:
         """See `TrainingTask`."""
         demonstrations = None
         if self.spec.clone is not None:
