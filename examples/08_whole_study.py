@@ -14,7 +14,7 @@ from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.experiments.surveys import run_survey, summarize
 from parkenv.lots import grid_lot
-from parkenv.mapping.inference import MapPrior
+from parkenv.mapping.learned_map import map_prior
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SurveySettings
 from parkenv.world.flat_map import FlatMap
@@ -34,7 +34,11 @@ with tempfile.TemporaryDirectory() as folder:
 found, right = surveyed["car_detection_rate"], surveyed["slot_accuracy"]
 print(f"3 drives: {found:.1%} of the cars found, {right:.1%} of the slots judged right")
 
-maps = {"no map": FlatMap(0.5, world.occupancy), "3 drives": MapPrior(log), "the truth": None}
+maps = {
+    "no map": FlatMap(0.5, world.occupancy),
+    "3 drives": map_prior(log, (), lot.walk_m(world.goal)),
+    "the truth": None,
+}
 totals = {}
 for name, prior in maps.items():
     for agent in ("first-free", "mdp", "belief"):

@@ -12,7 +12,7 @@ from parkenv.forecast.comparison import MODELS, compare
 from parkenv.forecast.counts import Counts
 from parkenv.forecast.day_curves import CurveSettings, fit_settings, forecast_days
 from parkenv.forecast.day_forecast import DayForecast
-from parkenv.forecast.scores import Scores, crps_of_equally_likely, mean_where, paired_intervals
+from parkenv.forecast.scores import Scores, crps_of_equally_likely, mean_where
 
 GERMAN = Path(__file__).parents[2] / "shared" / "data" / "german_car_parks" / "hourly_2023_2024.csv.gz"
 HOLIDAY = (5, 1)
@@ -154,8 +154,7 @@ def test_our_model_is_ahead_of_every_baseline():
     counts, _ = car_parks(6, 160, level_sd=0.3, drift=0.1)
     compared = list(compare(counts, 110, fit_settings(counts, 110)))
     assert [c.model for c in compared] == list(MODELS)
-    losses = [c.scores.log_loss for c in compared]
-    ours, *others = paired_intervals(losses[0], losses, np.random.default_rng(0))
+    ours, *others = (c.scores.log_loss_beyond(compared[0].scores, np.random.default_rng(0)) for c in compared)
     assert ours == (0.0, 0.0, 0.0)
     assert all(low > 0 for _, low, _ in others)
     assert all(c.scores.crps.mean() > compared[0].scores.crps.mean() for c in compared[1:])

@@ -11,10 +11,12 @@ from parkenv.errors import InputError
 from parkenv.evaluation.simulate import simulate
 from parkenv.evaluation.trip_recorder import TripRecorder
 from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior, mean_probability
+from parkenv.mapping.inference import MapPrior, SessionLog
 from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, ReversedMap, map_prior
 from parkenv.mapping.store import VERSION, MapStore
 from parkenv.mapping.trips import DayMemory, Trip, state_likelihoods
 from parkenv.world.day_error import DayError
+from parkenv.world.keyed_random import episode_key, seed_state
 from parkenv.world.occupancy import Arrival, Forecast
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.sensor_model import SensorModel
@@ -293,6 +295,59 @@ def test_map_files_keep_trips(tmp_path):
         assert len(store.log().time) == 0
         learned = map_prior(store.log(), read, lot.walk_m(0)).forecast(MORNING).p_occupied
     assert learned[3] > 0.5 > learned[1]
+
+
+def surveyed(scenario, seeds):
+    """Sessions that observe every slot exactly, on days of their own."""
+    slots, arrivals, states = np.arange(scenario.lot.n_slots), [], []
+    for seed in seeds:
+        key = np.uint64(episode_key(seed_state(seed), 0))
+        arrivals.append(scenario.occupancy.draw_arrival(scenario.arrival, key))
+        states.append(scenario.occupancy.world(key, arrivals[-1]).occupied(slots, arrivals[-1].time))
+    states = np.array(states)
+    return SessionLog(np.array([arrival.time for arrival in arrivals]), states, np.ones_like(states))
+
+
+def log_loss(prior, log):
+    p = np.array([prior.forecast(Arrival(time)).p_occupied for time in log.time])
+    return -np.log(np.where(log.occupied, p, 1.0 - p)).mean()
+
+
+@pytest.mark.parametrize("n", [1, 4, 12])
+@pytest.mark.parametrize("name", ["campus", "street"])
+def test_sessions_forecast_new_days_better_than_their_counts(name, n):
+    scenario = make_scenario(name)
+    walk, new_days = scenario.lot.walk_m(scenario.goal), surveyed(scenario, range(100, 140))
+    log = surveyed(scenario, range(n))
+    assert log_loss(map_prior(log, (), walk), new_days) < log_loss(MapPrior(log), new_days)
+
+
+def test_more_sessions_make_a_surer_map():
+    scenario = make_scenario("campus")
+    walk, levels = scenario.lot.walk_m(scenario.goal), []
+    for n in (1, 4, 12):
+        forecast = map_prior(surveyed(scenario, range(n)), (), walk).forecast(MORNING)
+        levels.append(forecast.day_error.level)
+    # What is left is the day's own error.
+    assert levels[0] > levels[1] > levels[2] > 0.8
+
+
+def test_trips_correct_what_sessions_said():
+    log = SessionLog(np.full(3, 9 * HOUR_S), np.zeros((3, 4), bool), np.ones((3, 4), bool))
+    walk = np.arange(4.0)
+    free = map_prior(log, (), walk).forecast(MORNING).p_occupied
+    trips = [trip(f"{day}", day, [0, 1, 2, 3], [True] * 4) for day in range(3)]
+    taken = map_prior(log, trips, walk).forecast(MORNING).p_occupied
+    assert (free < 0.3).all()
+    assert (taken > free + 0.2).all()
+
+
+def test_large_lots_count_their_sessions_and_an_empty_map_is_refused():
+    log = SessionLog(np.zeros(1), np.ones((1, 1_001), bool), np.ones((1, 1_001), bool))
+    assert isinstance(map_prior(log, (), np.arange(1_001.0)), MapPrior)
+    empty = SessionLog(np.empty(0), np.empty((0, 4), bool), np.empty((0, 4), bool))
+    with pytest.raises(InputError, match="the map holds no session"):
+        map_prior(empty, (), np.arange(4.0))
 
 
 def test_map_files_of_version_1_are_read_and_gain_trips(tmp_path):

@@ -21,6 +21,7 @@ from parkenv.lots import write_lot
 from parkenv.scenarios.places import by_size, lot_share, open_places, place_of_episode, split_places
 from parkenv.scenarios.spec import lot_scenario, scenario_spec, scenario_specs
 from parkenv.world.day_error import DayError
+from parkenv.world.real_week import DAY_ERROR, real_week_occupancy
 from parkenv.world.typical_week import typical_occupancy
 from planners.model_file import ModelCard
 
@@ -70,9 +71,10 @@ def test_names_files_folders_and_sequences_of_them_are_scenarios(folder):
 
 def test_a_lot_alone_is_a_scenario_with_days(folder):
     made = make_scenario(folder / "lot3.geojson")
-    assert made.occupancy.day_error == DayError(0.8)
-    usual = typical_occupancy(made.lot)
-    np.testing.assert_array_equal(made.occupancy.arrival_factor, usual.arrival_factor)
+    assert made.occupancy.day_error == DayError(DAY_ERROR)
+    usual = real_week_occupancy(made.lot)
+    np.testing.assert_array_equal(made.occupancy.arrival_profile, usual.arrival_profile)
+    assert not make_scenario(folder / "lot3.geojson", day_error=0.0).occupancy.day_error
     (folder / "lot3.geojson").rename(folder / "lot3.json")
     np.testing.assert_array_equal(make_scenario(folder / "lot3.json").lot.slot_xy, made.lot.slot_xy)
     assert lot_scenario(folder / "lot3.json").title == "lot3"

@@ -8,7 +8,7 @@ from parkenv import InputError, make_scenario
 from parkenv.cli.arguments import World
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot, packaged_lot, write_lot
-from parkenv.mapping.inference import MapPrior
+from parkenv.mapping.learned_map import LearnedMap
 from parkenv.mapping.store import MapStore, Session
 from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
 from parkenv.world.day_error import DayError, nearness
@@ -118,7 +118,7 @@ def test_a_file_says_it_all(tmp_path):
     env.reset(seed=3)
     assert env.unwrapped.scenario.failure_s == 7.0
     assert env.unwrapped.scenario.lot.n_slots == 12
-    assert make_scenario(tmp_path / "lot.geojson").name == "lot", "a typical week on a lot file"
+    assert make_scenario(tmp_path / "lot.geojson").name == "lot", "a lot file alone"
 
     # What was read can be written and read again, from anywhere.
     scenario_spec(file).write(tmp_path / "copy.json")
@@ -150,7 +150,7 @@ def test_logs_and_maps(tmp_path):
         )
     )
     assert isinstance(made.occupancy, RecordedOccupancy)
-    assert isinstance(made.prior, MapPrior)
+    assert isinstance(made.prior, LearnedMap)
     assert made.forecast(TUESDAY_NOON).p_occupied.shape == (10,)
     (tmp_path / "later.csv").write_text((tmp_path / "log.csv").read_text().replace("2016-01-1", "2016-01-2"))
     for log in ("'log.csv,later.csv'", "['log.csv', 'later.csv']"):
@@ -194,7 +194,7 @@ def test_logs_and_maps(tmp_path):
         ('lot = "mini"\ngoal = [1.0]', "goal is [1.0], want the index of one of the lot's goals, or a point [x, y]"),
         ('lot = "mini"\narrivals = { days = "mo" }', "arrivals.days is 'mo', want weekdays, weekend, all, or names"),
         ('lot = "mini"\narrivals = { hours = "8-9" }', "arrivals.hours is '8-9', want HH:MM-HH:MM within one day"),
-        ('lot = "mini"\noccupancy = "busy"', "occupancy is 'busy', want typical, a process (.json), a recorded log"),
+        ('lot = "mini"\noccupancy = "busy"', "occupancy is 'busy', want typical, real-week, a process (.json)"),
         ('lot = "mini"\noccupancy = { mapping = "mine.toml" }', "want mapping only together with a log"),
         ('lot = "mini"\noccupancy = { replay_from = 2016-01-01 }', "want replay_from only together with a log"),
         ('lot = "mini"\noccupancy = { forecast_from = "past" }', "want forecast_from only together with replay_from"),

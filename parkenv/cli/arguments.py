@@ -20,8 +20,8 @@ Sensors:
     weather (NAME): {weathers}.  [default: drawn each time]
 
 World:
-    lot (NAME|FILE[,...]): Instead of a scenario: a typical week on this lot, with a day error of 0.8. A packaged lot,
-        GeoJSON, or a Dragon Lake map (.yml).
+    lot (NAME|FILE[,...]): Instead of a scenario: a week as in busy real car parks on this lot. A packaged lot, GeoJSON,
+        or a Dragon Lake map (.yml).
 
 Results:
     rerun (FILE.rrd): Also record images, boxes, scans, grid, slots and path for the Rerun viewer (extra viewer; then:
@@ -65,11 +65,10 @@ class World:
             scenario's; others, with counts rolling]
         day_error (X[,Y]): How far whole days differ from the forecast: standard deviations, logits, of their level and
             of their slope to the goal; 0 for days that are as forecast.  [default: the scenario's, 0.8 in the packaged
-            ones]
+            ones, 0.7 for a lot alone]
         mapping (FILE): CSV slot_id,log_slot_id that assigns the log's slots to the lot's.  [default: the log's fullest
             slots are nearest to the goal]
         goal (X,Y): Walk to this point, m, or to the lot's goal of this index.  [default: the scenario's]
-        days (DAYS): weekdays, weekend, all, or names such as mon,tue.  [default: the scenario's, weekdays]
     """
 
     lot: str | None = None
@@ -80,7 +79,6 @@ class World:
     day_error: str | None = None
     mapping: str | None = None
     goal: str | None = None
-    days: str | None = None
 
     def specs(
         self,
@@ -153,14 +151,29 @@ class World:
         if self.goal is not None:
             index = int(self.goal) if self.goal.isdecimal() else numbers("--goal", self.goal, 2)
             spec = spec.changed("--goal", goal=index)
-        if self.days is not None:
-            spec = spec.changed("--days", arrivals={"hours": spec.arrivals.hours, "days": self.days})
         return spec
 
 
 @dataclass(frozen=True)
-class Searches(World):
-    """Where and when searches take place.
+class Weekdays(World):
+    """Where, and on which days of the week.
+
+    World:
+        days (DAYS): weekdays, weekend, all, or names such as mon,tue.  [default: the scenario's, weekdays]
+    """
+
+    days: str | None = None
+
+    def _changed(self, spec: ScenarioSpec) -> ScenarioSpec:
+        spec = super()._changed(spec)
+        if self.days is None:
+            return spec
+        return spec.changed("--days", arrivals={"hours": spec.arrivals.hours, "days": self.days})
+
+
+@dataclass(frozen=True)
+class Hours(World):
+    """Where, and at what time of day.
 
     World:
         hours (HH:MM-HH:MM): Searches begin between these hours.  [default: the scenario's, 08:00-13:00]
@@ -176,8 +189,8 @@ class Searches(World):
 
 
 @dataclass(frozen=True)
-class ObservedSearches(Searches):
-    """Where and when searches take place, and how slots are observed.
+class Observed(World):
+    """Where, and how slots are observed.
 
     Sensors:
         sensor_model (NAME|FILE): How slots are observed. perfect: without error; blind: by attempts alone; laser,
@@ -197,6 +210,21 @@ class ObservedSearches(Searches):
             return spec
         model = spec.sensor_model.changed("--view-range", view_range=self.view_range)
         return spec.changed("--view-range", sensor_model=model)
+
+
+@dataclass(frozen=True)
+class Searches(Hours, Weekdays):
+    """Where and when searches take place."""
+
+
+@dataclass(frozen=True)
+class ObservedSearches(Observed, Searches):
+    """Where and when searches take place, and how slots are observed."""
+
+
+@dataclass(frozen=True)
+class Commutes(Observed, Hours):
+    """Where and at what time drivers come day after day, and how slots are observed."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import command_line, make_console, make_table, progress_bar
 from parkenv.cli.trust import readable_models, require_trust
-from parkenv.files.known_names import ForecastFrom
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -31,16 +30,7 @@ def commute(
     seed: int | None = None,
     out: Path = Path("results/commute"),
     *,
-    lot: str | None = None,
-    occupancy: str | None = None,
-    car_park: str | None = None,
-    replay_from: str | None = None,
-    forecast_from: ForecastFrom | None = None,
-    day_error: str | None = None,
-    mapping: str | None = None,
-    goal: str | None = None,
-    hours: str | None = None,
-    sensor_model: str | None = None,
+    world: args.Commutes,
     figures: bool | None = None,
     trust: bool = False,
     trust_model: bool = False,
@@ -80,24 +70,16 @@ def commute(
         out, -o (DIR): Folder for experiment.json, episodes.csv, summary.json, commute.png and the maps.
 
     World:
-        occupancy (FILE[,FILE...]): Which slots are taken when: recorded logs (.csv, .csv.gz) of the same slots, or a
-            process (.json).  [default: the scenario's]
-        car_park (NAME[,NAME...]|all): --occupancy is a file of hourly counts, car_park,capacity,hour,free; the days of
-            these car parks on the lot, each as a scenario of its own. all: those that show some use.
-        replay_from (DATE): First day of the log or the counts.  [default: the scenario's, all]
         forecast_from (past|rolling|others): Days that the right map's forecast is made from. past: those before
             --replay-from; rolling: those before the earliest that a world replays; others: all that it does not replay.
             [default: the scenario's; others, with counts rolling]
-        day_error (X[,Y]): How far whole days differ from the forecast: standard deviations, logits, of their level and
-            of their slope to the goal.  [default: the scenario's, 0.8 in the packaged ones]
         mapping (FILE): CSV slot_id,log_slot_id that assigns the log's slots to the lot's.  [default: the log's fullest
             slots are nearest to the goal; the same slots on every day]
-        goal (X,Y): Walk to this point, m, or to the lot's goal of this index.  [default: the scenario's]
         hours (HH:MM-HH:MM): Drivers come between these hours.  [default: the scenario's, 08:00-13:00]
 
     Sensors:
-        sensor_model (NAME|FILE): How slots are observed. perfect, blind, laser, stereo, or a file of `parkenv
-            fit-sensor-model`.  [default: the scenario's]
+        sensor_model (NAME|FILE): How slots are observed. perfect: without error; blind: by attempts alone; laser,
+            stereo: as measured with that rig; a file of `parkenv fit-sensor-model`.  [default: the scenario's]
 
     Results:
         figures: Draw the picture.  [default: figures]
@@ -115,18 +97,6 @@ def commute(
         given["agents"] = readable_models(split_agents(agents), trust_model)
     if map is not None:
         given["maps"] = tuple(args.words("--map", map))
-    world = args.ObservedSearches(
-        lot=lot,
-        occupancy=occupancy,
-        car_park=car_park,
-        replay_from=replay_from,
-        forecast_from=forecast_from,
-        day_error=day_error,
-        mapping=mapping,
-        goal=goal,
-        hours=hours,
-        sensor_model=sensor_model,
-    )
     spec = base.changed(scenarios=tuple(world.specs(scenario, base.scenarios)), **given, **machines.given)
     with writing_into(out, f"--resume --out {out}"):
         run_commute_of(spec, out, folder)

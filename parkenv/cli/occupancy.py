@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from parkenv.cli.arguments import iso_date, words
 from parkenv.cli.command import add, group
@@ -15,7 +15,12 @@ if TYPE_CHECKING:
 
     from parkenv.forecast.comparison import Compared
     from parkenv.forecast.counts import Counts
+    from parkenv.forecast.scores import Scores
+    from parkenv.forecast.slot_comparison import SlotScores
 
+    ScoresT = TypeVar("ScoresT", Scores, SlotScores)
+
+Row = dict[str, Any]
 TIMEZONE = "Europe/Berlin"
 
 
@@ -31,7 +36,8 @@ def fit(
     compare`: unchanged on a lot with the same number of slots, on any other lot with the fullest slots nearest to the
     goal.
 
-    Counts of whole car parks: by how much days differ from their forecasts, and which readings are faulty.
+    Counts of whole car parks: by how much days differ from their forecasts, which readings are faulty, and the week of
+    the car park of median level.
 
     Examples:
         parkenv occupancy fit CNR-EXT.csv.gz --out results/pisa
@@ -105,6 +111,7 @@ def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
     import numpy as np
 
     from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
+    from parkenv.forecast.typical_week_fit import LEVEL_SHARES, fit_typical_week
 
     n = len(counts.days)
     with progress_bar(console) as progress:
@@ -128,6 +135,12 @@ def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
         cells.append([f"{value:.2f}" if isinstance(value, float) else str(value) for value in row.values()])
     idle = counts.idle()
     drift = float(np.sqrt(7 * settings.level_drift))
+    week = fit_typical_week(counts)
+    typical_week = week and {
+        "occupied": week.occupied.round(3).tolist(),
+        "levels": dict(zip(map(str, LEVEL_SHARES), week.levels.round(3).tolist(), strict=True)),
+        "day_error": float(np.nanmedian(week.day_errors).round(3)),
+    }
     save_summary(
         out,
         None,
@@ -136,6 +149,7 @@ def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
         variances=asdict(settings),
         level_drift_per_week=drift,
         faults=counts.total_faults(),
+        typical_week=typical_week,
     )
     headings = [str(key).replace("_", " ") for key in rows[0]]
     console.print(make_table(f"{counts.source}: {n} days", headings, cells))
@@ -182,7 +196,6 @@ def evaluate(
     from parkenv.forecast.comparison import MODELS, compare
     from parkenv.forecast.counts import Counts, is_counts
     from parkenv.forecast.day_curves import FIT_STEPS, fit_settings
-    from parkenv.forecast.scores import mean_where, paired_intervals
 
     make_folder(out)
     console = make_console()
@@ -195,8 +208,7 @@ def evaluate(
         counts = counts.chosen(words("--car-parks", car_parks))
     n = len(counts.days)
     first = n // 2 if from_ is None else counts.day_index(iso_date("--from", from_))
-    scored = np.isfinite(counts.occupied[:, first:])
-    if not scored.any():
+    if not np.isfinite(counts.occupied[:, first:]).any():
         raise InputError(f"--from is {from_}: {log} has no usable readings from then on")
     models: list[Compared] = []
     rows, cells = [], []
@@ -211,30 +223,14 @@ def evaluate(
             save_forecast(shown_counts(compared, counts, week), out / f"{compared.model}.png")
             models.append(compared)
             progress.advance(done)
-    differences = paired_intervals(
-        models[0].scores.log_loss, [m.scores.log_loss for m in models], np.random.default_rng(seed)
-    )
-    for (model, _, scores), (difference, *interval) in zip(models, differences, strict=True):
-        bands = scores.coverage_by_band()
-        row: dict[str, Any] = {
-            "model": model,
-            "log_loss": mean_where(scores.log_loss),
-            "brier": mean_where(scores.brier),
-            "crps": mean_where(scores.crps),
-            "coverage_90": mean_where(scores.day_held),
-            "coverage_90_hours": mean_where(scores.hour_held),
-            "days": int(scored.any(axis=(0, 2)).sum()),
-            "car_parks": int(scored.any(axis=(1, 2)).sum()),
-            "difference": difference,
-            "difference_ci95": interval,
-            "coverage_90_by_band": bands,
-            "coverage_90_by_observed_band": scores.coverage_by_band(observed=True),
-        }
+    for model, _, scores in models:
+        row = _row(model, scores, models[0].scores, seed)
+        shown = [f"{row[key]:.1%}" for key in ("coverage_90", "coverage_90_hours")]
+        shown += [
+            f"{band['coverage_90']:.1%}" if band["days"] else "-" for band in row["coverage_90_by_band"]
+        ]
         rows.append(row)
-        shown = [f"{row[key]:.4f}" for key in ("log_loss", "brier", "crps")]
-        shown += [f"{row[key]:.1%}" for key in ("coverage_90", "coverage_90_hours")]
-        shown += [f"{band['coverage_90']:.1%}" if band["days"] else "-" for band in bands]
-        cells.append([model, *shown, f"{difference:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]"])
+        cells.append(_cells(row, shown))
     save_summary(
         out,
         seed,
@@ -265,6 +261,28 @@ def evaluate(
     console.print(f"Pictures and summary are in {out}")
 
 
+def _row(model: str, scores: ScoresT, ours: ScoresT, seed: int) -> Row:
+    """Return the row of a model in the summary; differences are to `ours`."""
+    import numpy as np
+
+    difference = scores.log_loss_beyond(ours, np.random.default_rng(seed))
+    return {
+        "model": model,
+        **scores.means(),
+        "difference": difference.value,
+        "difference_ci95": [difference.low, difference.high],
+        "coverage_90_by_band": scores.coverage_by_band(),
+        "coverage_90_by_observed_band": scores.coverage_by_band(observed=True),
+    }
+
+
+def _cells(row: Row, coverage: list[str]) -> list[str]:
+    """Return the row as the table shows it."""
+    low, high = row["difference_ci95"]
+    losses = [f"{row[key]:.4f}" for key in ("log_loss", "brier", "crps")]
+    return [row["model"], *losses, *coverage, f"{row['difference']:+.4f} [{low:+.4f}, {high:+.4f}]"]
+
+
 def _print_notes(counts: Counts, console: Console) -> None:
     """Print what was wrong with the counts."""
     faults = ", ".join(f"{name.replace('_', ' ')} {n:,}" for name, n in counts.total_faults().items() if n)
@@ -291,24 +309,9 @@ def _evaluate_log(log: Path, from_: str | None, seed: int, out: Path, console: C
         raise InputError(f"--from is {first}: {log} has no day from then on with one of its class before it")
     rows, cells = [], []
     for scores in found:
-        difference, *interval = scores.log_loss_beyond(found[0], np.random.default_rng(seed))
-        row: dict[str, Any] = {
-            "model": scores.model,
-            "log_loss": scores.log_loss,
-            "brier": scores.brier,
-            "crps": scores.crps,
-            "coverage_90": scores.coverage_90,
-            "days": len(scores.days),
-            "car_parks": 1,
-            "difference": difference,
-            "difference_ci95": interval,
-            "coverage_90_by_band": scores.coverage_by_band(),
-            "coverage_90_by_observed_band": scores.coverage_by_band(observed=True),
-        }
+        row = _row(scores.model, scores, found[0], seed)
         rows.append(row)
-        shown = [f"{row[key]:.4f}" for key in ("log_loss", "brier", "crps")]
-        shown += [f"{row['coverage_90']:.0%}", f"{difference:+.4f} [{interval[0]:+.4f}, {interval[1]:+.4f}]"]
-        cells.append([scores.model, *shown])
+        cells.append(_cells(row, [f"{row['coverage_90']:.0%}"]))
         save_forecast(shown_slots(scores, log.name), out / f"{scores.model}.png")
     save_summary(out, seed, rows, first_day=first)
     headings = ("model", "log-loss", "Brier", "CRPS", "90 %: days", "log-loss more than ours")

@@ -27,7 +27,7 @@ def survey(
     seed: int = 0,
     out: Path = Path("results/survey"),
     *,
-    world: args.World,
+    world: args.Weekdays,
     hours: str | None = None,
     traffic: args.Traffic,
     rig: RigName | None = None,

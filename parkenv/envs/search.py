@@ -135,8 +135,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     ## Arguments
     - `scenario`: a `Scenario`; the name of a packaged one: campus, jam, street, mini; a scenario file (.toml); a lot
-      (.geojson), with a typical week and days that differ from it by 0.8 logits; a folder of such files; or a sequence
-      of these. See `parkenv.make_scenarios`.
+      (.geojson), with a week and days as in busy real car parks; a folder of such files; or a sequence of
+      these. See `parkenv.make_scenarios`.
     - `render_mode`: `rgb_array` (480, 640, 3), `human` (needs the extra `human`), or `ansi`.
     - further keywords replace fields of the scenario, e.g. `failure_s=90.0`; unknown ones raise an error.
 

@@ -6,9 +6,9 @@ References:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import expit
@@ -22,6 +22,8 @@ BANDS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)
 
 Band = dict[str, float | int | None]
 """A band of fullness: from, to, days, coverage_90."""
+
+_WEEK = 7  # days
 
 
 def log_losses(forecast: DayForecast, occupied: FloatArray, capacity: FloatArray) -> FloatArray:
@@ -125,6 +127,30 @@ class Scores:
         """Return `reliability` of the hours."""
         return reliability(self.occupancy, self.observed, np.isfinite(self.observed).astype(float))
 
+    def means(self) -> dict[str, float]:
+        """Return each score in the mean, and the numbers of days and car parks with readings."""
+        observed = np.isfinite(self.observed)
+        return {
+            "log_loss": mean_where(self.log_loss),
+            "brier": mean_where(self.brier),
+            "crps": mean_where(self.crps),
+            "coverage_90": mean_where(self.day_held),
+            "coverage_90_hours": mean_where(self.hour_held),
+            "days": int(observed.any(axis=(0, 2)).sum()),
+            "car_parks": int(observed.any(axis=(1, 2)).sum()),
+        }
+
+    def log_loss_beyond(self, ours: Scores, rng: np.random.Generator) -> Estimate:
+        """Return the mean log-loss minus that of `ours`; its interval is over car parks and weeks."""
+        difference = self.log_loss - ours.log_loss
+        both = np.isfinite(difference)
+        weeks = np.arange(0, difference.shape[1], _WEEK)
+        total, n = (
+            np.add.reduceat(values.sum(axis=2), weeks, axis=1, dtype=float)
+            for values in (np.where(both, difference, 0.0), both)
+        )
+        return ratio_of_sums(total, n, rng)
+
 
 def coverage_by_band(fullness: FloatArray, held: FloatArray) -> list[Band]:
     """Return the number of days in each band of fullness, and the share of them that is held.
@@ -164,36 +190,39 @@ def reliability(p: FloatArray, observed: FloatArray, weight: FloatArray, bins: i
     return np.stack([*(total[used] / n[used] for total in sums), n[used]])
 
 
-def paired_intervals(
-    ours: FloatArray, others: Sequence[FloatArray], rng: np.random.Generator, repetitions: int = 1000
-) -> list[tuple[float, float, float]]:
-    """Return the mean of others - ours with its 95 % interval, by a bootstrap over car parks and weeks.
+class Estimate(NamedTuple):
+    """A value with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+def ratio_of_sums(
+    total: FloatArray, n: FloatArray, rng: np.random.Generator, repetitions: int = 1000
+) -> Estimate:
+    """Return sum(total) / sum(n), with its interval by a bootstrap over rows and columns.
 
     Args:
-        ours: (c, d, 24) losses, NaN where unobserved.
-        others: of other models, alike.
-        rng: draws the car parks and weeks.
+        total: (r, c) sums of what is averaged, such as losses by car park and week.
+        n: (r, c) their weights, such as numbers of readings.
+        rng: draws the rows and columns of each resample.
         repetitions: number of resamples.
+
+    >>> ratio_of_sums(np.array([[1.0, 2.0]]), np.array([[2.0, 4.0]]), np.random.default_rng(0))
+    Estimate(value=0.5, low=0.5, high=0.5)
     """
-    c, d, _ = ours.shape
-    weeks = -(-d // 7)
-    week = np.arange(d) // 7
-    parks = rng.multinomial(c, np.full(c, 1.0 / c), repetitions).astype(float)
-    times = rng.multinomial(weeks, np.full(weeks, 1.0 / weeks), repetitions).astype(float)
-    results = []
-    for other in others:
-        difference = other - ours
-        both = np.isfinite(difference)
-        total, n = np.zeros((c, weeks)), np.zeros((c, weeks))
-        np.add.at(total.T, week, np.where(both, difference, 0.0).sum(axis=2).T)
-        np.add.at(n.T, week, both.sum(axis=2).T)
-        drawn_n = np.einsum("rc,cw,rw->r", parks, n, times, optimize=True)
-        means = np.einsum("rc,cw,rw->r", parks, total, times, optimize=True) / np.maximum(drawn_n, 1.0)
-        low, high = (
-            np.quantile(means[drawn_n > 0], (0.025, 0.975)) if (drawn_n > 0).any() else (np.nan, np.nan)
-        )
-        results.append((float(total.sum() / max(n.sum(), 1.0)), float(low), float(high)))
-    return results
+    rows, columns = (
+        rng.multinomial(size, np.full(size, 1.0 / size), repetitions).astype(float) for size in total.shape
+    )
+    drawn_total, drawn_n = (
+        np.einsum("kr,rc,kc->k", rows, values, columns, optimize=True) for values in (total, n)
+    )
+    drawn = drawn_n > 0
+    if not drawn.any():
+        return Estimate(float("nan"), float("nan"), float("nan"))
+    low, high = np.quantile(drawn_total[drawn] / drawn_n[drawn], (0.025, 0.975))
+    return Estimate(float(total.sum() / n.sum()), float(low), float(high))
 
 
 def mean_where(values: FloatArray, mask: BoolArray | None = None) -> float:

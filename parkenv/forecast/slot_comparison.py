@@ -10,7 +10,14 @@ import numpy as np
 from scipy.special import expit, logit
 
 from parkenv.forecast.day_forecast import INTERVAL
-from parkenv.forecast.scores import Band, coverage_by_band, crps_of_equally_likely, reliability
+from parkenv.forecast.scores import (
+    Band,
+    Estimate,
+    coverage_by_band,
+    crps_of_equally_likely,
+    ratio_of_sums,
+    reliability,
+)
 from parkenv.forecast.slot_days import Days, FloatArray, IntArray, SlotDays, fit_slot_days
 
 OURS = "slot-days"
@@ -135,14 +142,22 @@ class SlotScores:
         )
         return reliability(p, taken, seen)
 
-    def log_loss_beyond(self, ours: SlotScores, rng: np.random.Generator) -> tuple[float, float, float]:
-        """Return the log-loss minus that of `ours` on the same days, and its 95 % interval (bootstrap over days)."""
+    def means(self) -> dict[str, float]:
+        """Return each score, and the numbers of days and car parks."""
+        return {
+            "log_loss": self.log_loss,
+            "brier": self.brier,
+            "crps": self.crps,
+            "coverage_90": self.coverage_90,
+            "days": len(self.days),
+            "car_parks": 1,
+        }
+
+    def log_loss_beyond(self, ours: SlotScores, rng: np.random.Generator) -> Estimate:
+        """Return the log-loss minus that of `ours` on the same days; its interval is over days."""
         difference = [a.log_loss - b.log_loss for a, b in zip(self.days, ours.days, strict=True)]
         states = [day.states for day in self.days]
-        chosen = rng.integers(len(states), size=(1000, len(states)))
-        means = np.array(difference)[chosen].sum(axis=1) / np.array(states)[chosen].sum(axis=1)
-        low, high = np.quantile(means, (0.025, 0.975))
-        return self._per_state(difference), float(low), float(high)
+        return ratio_of_sums(np.array([difference]), np.array([states]), rng)
 
     def _per_state(self, sums: list[float]) -> float:
         return sum(sums) / sum(day.states for day in self.days)

@@ -21,6 +21,10 @@ FloatArray = NDArray[np.float64]
 
 MOST_SLOTS = 3_000
 """Largest lot: memory and time grow with the square of the slots."""
+MOST_SURVEYED_SLOTS = 1_000
+"""Largest lot whose survey sessions, which observe every slot, are learned from; that takes a second a session."""
+SURVEY_ERROR = 0.03
+"""Share of the slots that a survey session judges wrong."""
 USUAL_DAY = DayError(0.8)
 """Day error of a map that states none: the median of 99 car parks over two years is 0.77 logits."""
 _MEMORY = (30.0, 365.0)
@@ -28,10 +32,12 @@ _SHAPE = {"level": 1.0, "slope": 0.8, "smooth": 0.8, "own": 0.6, "hour": 0.5}
 """Standard deviations, relative to that of the level."""
 
 
-def _priors(scales: dict[float, float], trust: float = 1.0) -> tuple[MapErrorPrior, ...]:
+def _priors(
+    scales: dict[float, float], trust: float = 1.0, shape: dict[str, float] = _SHAPE
+) -> tuple[MapErrorPrior, ...]:
     return tuple(
         MapErrorPrior(
-            **{part: scale * sd for part, sd in _SHAPE.items()}, memory_days=days, weight=weight, trust=trust
+            **{part: scale * sd for part, sd in shape.items()}, memory_days=days, weight=weight, trust=trust
         )
         for (scale, weight), days in product(scales.items(), _MEMORY)
     )
@@ -44,6 +50,8 @@ GIVEN_MAP = (
 """Priors for a given map: right, a little off, quite wrong, or worthless; with or without drift over weeks."""
 NO_MAP = _priors({1.0: 0.5, 2.0: 0.5})
 """Priors for a lot of which nothing is known."""
+SURVEYED = _priors({1.0: 0.5, 2.0: 0.5}, shape={**_SHAPE, "hour": 1.0})
+"""Priors for a lot of which survey sessions alone are known; unlike a driver's trips, they are spread over the day."""
 
 
 class EmptyMap:
@@ -93,7 +101,11 @@ class ReversedMap:
 
 
 def map_prior(log: SessionLog, trips: Sequence[Trip], walk: ArrayLike) -> PriorModel:
-    """Return the forecast of a map file: its survey sessions, corrected by the trips after them.
+    """Return the forecast of a map file, from its survey sessions and the trips after them.
+
+    Both go into one posterior: few sessions give a forecast that is not sure of itself, with a day error to say so,
+    and a row that is full near the goal says something of the slots beside it that were not observed. In lots of more
+    than 1,000 slots, sessions without trips are counted (`MapPrior`).
 
     Args:
         log: the sessions.
@@ -103,12 +115,16 @@ def map_prior(log: SessionLog, trips: Sequence[Trip], walk: ArrayLike) -> PriorM
     Raises:
         InputError: neither sessions nor trips, or a lot that is too large to learn from trips.
     """
-    if not trips:
+    if not trips and not len(log.time):
+        raise InputError("the map holds no session, want at least one")
+    counted = log.n_slots > MOST_SURVEYED_SLOTS and len(log.time) > 0
+    if counted and not trips:
         return MapPrior(log)
-    surveyed = len(log.time) > 0
-    learned = LearnedMap(
-        MapPrior(log) if surveyed else EmptyMap(log.n_slots), walk, GIVEN_MAP if surveyed else NO_MAP
-    )
+    if counted:
+        learned = LearnedMap(MapPrior(log), walk, GIVEN_MAP)
+    else:
+        learned = LearnedMap(EmptyMap(log.n_slots), walk, SURVEYED if len(log.time) else NO_MAP)
+        learned.learn_sessions(log)
     learned.learn(trips)
     return learned
 
@@ -157,6 +173,16 @@ class LearnedMap:
             self.pass_time(day)
             self._learn_day(list(its))
 
+    def learn_sessions(self, log: SessionLog) -> None:
+        """Add survey sessions; each counts as a day of its own, and as older than any trip, since none has a date."""
+        rates = np.array([[SURVEY_ERROR, 1.0 - SURVEY_ERROR], [1.0 - SURVEY_ERROR, SURVEY_ERROR]])
+        for time, occupied, known in zip(log.time, log.occupied, log.known, strict=True):
+            slots = np.flatnonzero(known)
+            hours, weight = np.full(len(slots), time / HOUR_S), np.ones(len(slots))
+            base = self._base.forecast(Arrival(time))
+            likelihood = rates[(~occupied[slots]).astype(np.int64)]
+            self._observe(Evidence(slots, hours, likelihood, weight), base.p_occupied[slots], base.day_error)
+
     def forecast(self, arrival: Arrival) -> Forecast:
         """Return the forecast of the corrected map."""
         base, hour = self._base.forecast(arrival), arrival.time / HOUR_S
@@ -187,9 +213,13 @@ class LearnedMap:
             p.append(base.p_occupied[states.slots])
             day_error = base.day_error
         evidence = Evidence(*map(np.concatenate, (slots, hours, likelihood, weight)))
+        self._observe(evidence, np.concatenate(p), day_error)
+
+    def _observe(self, evidence: Evidence, p: FloatArray, day_error: DayError) -> None:
+        """Add the observations of a day; p is the base map's P(taken) of their slots."""
         day = day_error.deviations(self._nearness[evidence.slots])
         deviation = np.hypot(self._error.prior_sd()[:, evidence.slots], day)
-        logits = self._error.trust[:, None] * centred_logits(np.concatenate(p), deviation)
+        logits = self._error.trust[:, None] * centred_logits(p, deviation)
         self._error.observe(evidence, logits, (day_error.level, day_error.slope))
 
     def _day_error(self, day: DayError, weights: FloatArray, logits: FloatArray, hour: float) -> DayError:

@@ -27,6 +27,7 @@ from parkenv.world.day_error import DayError
 from parkenv.world.flat_map import FlatMap
 from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy import OccupancyModel, OccupancyProcess, PriorModel
+from parkenv.world.real_week import real_week_occupancy
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
 from parkenv.world.traffic import Traffic
@@ -65,9 +66,9 @@ def make_scenarios(source: ScenarioSources, **changes: Any) -> list[Scenario]:
 
     Args:
         source: name of a packaged scenario (campus, jam, street, mini); a scenario file (.toml); a lot file
-            (.geojson, .yml), which has the occupancy of a typical week and days that differ from it by 0.8; a folder
-            of scenario and lot files; a `ScenarioSpec`; a `ParkingLot` (with a typical week, and days as forecast);
-            a `Scenario`; or a sequence of these.
+            (.geojson, .yml), which has a week and days as in busy real car parks; a folder of scenario and
+            lot files; a `ScenarioSpec`; a `ParkingLot` (with a typical week, and days as forecast); a `Scenario`; or a
+            sequence of these.
         changes: fields of `Scenario` to replace in all of them, and `day_error`, how far whole days differ from the
             forecast (a `DayError`, or a number, its level): 0 for days that are as forecast.
 
@@ -199,11 +200,12 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
     if spec.counts is not None:
         assert spec.replay_from is not None
         return _counted(spec.counts, spec.replay_from, spec.forecast_from == "past", lot, goal)
-    process = (
-        _typical(spec.typical or TypicalWeek(), lot, goal)
-        if spec.process is None
-        else _process(spec.process, lot, goal)
-    )
+    if spec.process is not None:
+        process = _process(spec.process, lot, goal)
+    elif spec.real_week is not None:
+        process = real_week_occupancy(lot, goal=goal, **spec.real_week.model_dump())
+    else:
+        process = _typical(spec.typical or TypicalWeek(), lot, goal)
     if spec.event is None:
         return process
     return with_event(process, lot, goal=goal, share=spec.event.share, factor=spec.event.factor)

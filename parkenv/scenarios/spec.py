@@ -27,6 +27,7 @@ from parkenv.files.known_names import (
 )
 from parkenv.files.limited_reading import is_there
 from parkenv.files.spec_file import FilePath, OrText, Several, Spec, read_tables
+from parkenv.world import real_week
 from parkenv.world.day_error import MAX_LOGITS
 from parkenv.world.occupancy import ArrivalWindow
 
@@ -116,6 +117,22 @@ class TypicalWeek(Spec):
     )
 
 
+class RealWeek(Spec):
+    """A week as counted in real car parks: what a lot file alone has."""
+
+    fuller_than: Probability = Field(
+        real_week.FULLER_THAN,
+        description="Fraction of real car parks that are less full; 0.5 for the typical one.",
+    )
+    pull: float = Field(
+        real_week.PULL, ge=-10, le=10, description="Logits by which demand rises from the middle to the goal."
+    )
+    unevenness: float = Field(
+        real_week.UNEVENNESS, ge=0, le=5, description="Standard deviation between equally near slots, logits."
+    )
+    mean_stay_s: float = Field(7200.0, ge=60.0, le=1e7)
+
+
 class Event(Spec):
     """A day on which the slots nearest to the goal fill up."""
 
@@ -130,11 +147,13 @@ def _occupancy_tables(value: object) -> object:
         return value
     if value == "typical":
         return {"typical": {}}
+    if value == "real-week":
+        return {"real_week": {}}
     if value.endswith(".json"):
         return {"process": value}
     if value.endswith((".csv", ".csv.gz")):
         return {"log": value}
-    raise ValueError("typical, a process (.json), a recorded log (.csv, .csv.gz), or a table")
+    raise ValueError("typical, real-week, a process (.json), a recorded log (.csv, .csv.gz), or a table")
 
 
 def _several(value: object) -> object:
@@ -198,6 +217,7 @@ class OccupancySpec(Spec):
     """When slots are taken: a typical week by default."""
 
     typical: TypicalWeek | None = None
+    real_week: RealWeek | None = None
     process: FilePath | None = Field(None, description="Rates that `parkenv occupancy fit` wrote (.json).")
     log: Annotated[Several[FilePath], BeforeValidator(_several), Field(min_length=1), OrText()] | None = (
         Field(
@@ -226,7 +246,7 @@ class OccupancySpec(Spec):
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        _require_one(self, ("typical", "process", "log", "counts"), least=0)
+        _require_one(self, ("typical", "real_week", "process", "log", "counts"), least=0)
         recorded = self.log is not None or self.counts is not None
         if self.day_error is not None and recorded:
             raise ValueError("day_error only without a log or counts: recorded days differ as they did")
@@ -418,10 +438,6 @@ class ScenarioSpec(Spec):
 _PACKAGED = Path(__file__).with_name("packaged")
 
 
-LOT_DAY_ERROR = 0.8
-"""Day error of a lot without a scenario file, as in the packaged scenarios."""
-
-
 def scenario_spec(source: str | Path) -> ScenarioSpec:
     """Return the specification of one scenario; see `scenario_specs`.
 
@@ -443,7 +459,7 @@ def scenario_specs(source: str | Path) -> list[ScenarioSpec]:
 
     Args:
         source: name of a packaged scenario; a scenario file (.toml, .json); a lot file (.geojson, .yml), which has a
-            typical week with a day error of 0.8 (`lot_scenario`); or a folder with scenario files (.toml) and lot
+            week as counted in real car parks (`lot_scenario`); or a folder with scenario files (.toml) and lot
             files (.geojson), in order of their names. A lot that a scenario file of the folder names is that
             scenario's.
 
@@ -469,7 +485,10 @@ def scenario_specs(source: str | Path) -> list[ScenarioSpec]:
 
 
 def lot_scenario(lot: str | Path, source: str | None = None) -> ScenarioSpec:
-    """Return the scenario of a lot alone: a typical week, days that differ from it by 0.8, the lot's goal and entries.
+    """Return the scenario of a lot alone: the lot's first goal, any of its entries, a week as in busy real car parks.
+
+    The week and how days differ from it are derived from counts of real car parks, see `parkenv.world.real_week`: on
+    workdays fuller than nine in ten of them, 55 % at 8:00 and 82 % at 11:00, more near the goal.
 
     Args:
         lot: name of a packaged lot, or a lot file.
@@ -479,7 +498,7 @@ def lot_scenario(lot: str | Path, source: str | None = None) -> ScenarioSpec:
         InputError: neither a packaged lot nor a file.
     """
     name = "".join(c if c.isprintable() and c not in "/\\," else " " for c in Path(lot).stem)[:80]
-    tables = {"name": name, "lot": str(lot), "occupancy": {"day_error": LOT_DAY_ERROR}}
+    tables = {"name": name, "lot": str(lot), "occupancy": {"real_week": {}, "day_error": real_week.DAY_ERROR}}
     return ScenarioSpec.parse(tables, str(lot) if source is None else source)._of_file(lot)
 
 

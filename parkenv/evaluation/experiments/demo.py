@@ -8,7 +8,8 @@ from parkenv.evaluation.experiments.compare import Case
 from parkenv.evaluation.experiments.spec import DemoSpec, SurveySpec
 from parkenv.evaluation.experiments.surveys import survey_of
 from parkenv.files.known_names import RigName
-from parkenv.mapping.inference import MapPrior, SessionLog
+from parkenv.mapping.inference import SessionLog
+from parkenv.mapping.learned_map import map_prior
 from parkenv.mapping.survey import SurveySettings
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
@@ -50,7 +51,8 @@ def demo_cases(spec: DemoSpec, scenario: Scenario, log: SessionLog) -> list[tupl
         scenario: scenario from `demo_survey`.
         log: the sessions of the map.
     """
-    known = scenario.replace(prior=MapPrior(log), sensor_model=SensorModel.named(RIG))
+    prior = map_prior(log, (), scenario.lot.walk_m(scenario.goal))
+    known = scenario.replace(prior=prior, sensor_model=SensorModel.named(RIG))
     seeds = range(spec.seed + _APART, spec.seed + _APART + spec.episodes)
     sensors: dict[str, Any] = {"rig": RIG, "detector": spec.detector, "every": spec.every}
     return [(Case(known, name, **({} if name == "oracle" else sensors)), seeds) for name in AGENTS]

@@ -1,0 +1,83 @@
+"""Condense counts of many car parks to a typical week, and how car parks and days differ from it."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import expit, logit
+
+from parkenv.forecast.counts import Counts, FloatArray
+
+LEVEL_SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
+"""Shares of all car parks whose levels are reported."""
+LEAST_READINGS = 20
+"""Number of readings below which an hour of the week has no mean."""
+BY_DAY = slice(8, 20)
+"""Hours that the level of a car park, or of a day, is measured by."""
+WORKDAYS = 5
+_CLIP = 0.005  # a mean of exactly 0 or 1 has no logit
+_ITERATIONS = 50
+
+
+@dataclass(frozen=True, eq=False)
+class TypicalWeekFit:
+    """The week of the typical car park, and how others differ from it.
+
+    Args:
+        occupied: (7, 24) float64, fraction that is taken at the end of each hour, in the car park of median level.
+        levels: (7,) float64, logits above that week, of the car parks fuller than `LEVEL_SHARES` of all.
+        day_errors: (c,) float64, logits, standard deviation over weekdays of a car park's level around its own week.
+    """
+
+    occupied: FloatArray
+    levels: FloatArray
+    day_errors: FloatArray
+
+
+def fit_typical_week(counts: Counts) -> TypicalWeekFit | None:
+    """Fit logit P(taken) = week[hour] + level[car park] by medians, which closing hours hardly move.
+
+    Returns:
+        None if no hour of the week has `LEAST_READINGS`.
+    """
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "(Mean of empty slice|All-NaN)", RuntimeWarning)
+        mean = _weeks(counts)
+        logits = logit(np.clip(mean, _CLIP, 1.0 - _CLIP))
+        level, week = np.zeros(len(mean)), np.nanmedian(logits, axis=0)
+        if np.isnan(week).all():
+            return None
+        for _ in range(_ITERATIONS):
+            level = np.nanmedian((logits - week)[:, :6, BY_DAY].reshape(len(mean), -1), axis=1)
+            level -= np.nanmedian(level)
+            week = np.nanmedian(logits - level[:, None, None], axis=0)
+    errors = [_day_error(y, its, counts.weekday) for y, its in zip(counts.occupied, mean, strict=True)]
+    known = level[np.isfinite(level)]
+    return TypicalWeekFit(expit(week), np.quantile(known, LEVEL_SHARES), np.array(errors))
+
+
+def _weeks(counts: Counts) -> FloatArray:
+    """Return the mean week of each car park, (c, 7, 24); NaN for hours with few readings."""
+    weeks = np.full((len(counts.car_parks), 7, 24), np.nan)
+    for day in range(7):
+        readings = counts.occupied[:, counts.weekday == day]
+        enough = np.isfinite(readings).sum(axis=1) >= LEAST_READINGS
+        weeks[:, day] = np.where(enough, np.nanmean(readings, axis=1), np.nan)
+    return weeks
+
+
+def _day_error(occupied: FloatArray, week: FloatArray, weekday: NDArray[np.int64]) -> float:
+    """Return the standard deviation of the shifts, logits, that give the week the mean of each weekday by day."""
+    shifts = []
+    for day in np.flatnonzero(weekday < WORKDAYS):
+        readings, usual = occupied[day, BY_DAY], week[weekday[day], BY_DAY]
+        known = np.isfinite(readings) & (usual > 2 * _CLIP) & (usual < 1.0 - 2 * _CLIP)
+        if known.sum() >= 8:
+            centre = logit(usual[known])
+            wanted = float(np.clip(readings[known].mean(), _CLIP, 1.0 - _CLIP))
+            shifts.append(brentq(lambda s, c=centre, w=wanted: expit(c + s).mean() - w, -15.0, 15.0))
+    return float(np.std(shifts)) if len(shifts) >= LEAST_READINGS else np.nan
