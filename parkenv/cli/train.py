@@ -74,7 +74,7 @@ def train(
             ppo (default).
         env (search|drive): Learn to search (parkenv/Search-v2), or to drive into slots (parkenv/Drive-v1).
         scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
-            campus; to drive, campus,street; for network, made lots]
+            campus; to drive, campus,street; for network, made lots alone]
         steps (N >= 1): Decisions of a training; for network, those that belief labels.  [default: 2000000; for network,
             10000; to drive, the training config's]
         trainings (N >= 1): How many, with one seed each from --seed on.

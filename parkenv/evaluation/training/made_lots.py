@@ -6,6 +6,7 @@ import numpy as np
 
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import make_scenario
+from parkenv.world.real_week import DAY_ERROR, real_week_occupancy
 from parkenv.world.scenario import KMH, Scenario
 
 GRIDS = ((2, 8), (2, 20), (4, 10), (4, 25), (6, 15), (8, 12), (8, 30), (12, 20))
@@ -14,16 +15,20 @@ CITIES = (40, 80, 120, 160, 240, 320, 400, 500)
 """Slots along the streets of a made town."""
 
 
-def made_places(day_error: float = 0.8) -> list[Scenario]:
-    """Return scenarios on made lots: car parks with rows of bays, and towns with cars parked along one-way streets.
+FULLER_THAN = (0.5, 0.7, 0.9, 0.95)
+"""Shares of real car parks that are less full than the made ones, by turns."""
 
-    Args:
-        day_error: how far days differ from their forecast, logits.
-    """
+
+def made_places() -> list[Scenario]:
+    """Return scenarios on made lots with real weeks: car parks with rows of bays, and towns with cars along streets."""
     lots = [grid_lot(rows, columns) for rows, columns in GRIDS]
     lots += [city_lot(slots, seed=number) for number, slots in enumerate(CITIES)]
     names = [f"grid {rows} x {columns}" for rows, columns in GRIDS] + [f"town {slots}" for slots in CITIES]
-    return [make_scenario(lot, name=name, day_error=day_error) for lot, name in zip(lots, names, strict=True)]
+    made = []
+    for number, (lot, name) in enumerate(zip(lots, names, strict=True)):
+        occupancy = real_week_occupancy(lot, fuller_than=FULLER_THAN[number % len(FULLER_THAN)])
+        made.append(make_scenario(lot, name=name, occupancy=occupancy, day_error=DAY_ERROR))
+    return made
 
 
 def varied(scenarios: list[Scenario], seed: int) -> list[Scenario]:

@@ -22,7 +22,7 @@ from planners.network.policy import NetworkPolicy
 
 FloatArray = NDArray[np.float64]
 
-LONGEST = 300
+LONGEST = 200
 """Decisions after which a search of the training data ends: longer ones drive in circles in a full lot."""
 EXPLORATION = 0.15  # probability of a random action in the searches that the teacher drives
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
 
@@ -33,10 +34,14 @@ class NetworkTask(SearchTask):
         super().__init__(spec)
         self.steps = spec.steps or STEPS
 
+    @cached_property
+    def _made(self) -> list[Scenario]:
+        return made_places()
+
     @property
     def worlds(self) -> list[Scenario]:
-        """Scenarios to train in: the given ones, or made lots."""
-        return super().worlds if self.scenarios else made_places()
+        """Scenarios to train in: the given ones and made lots."""
+        return [*super().worlds, *self._made] if self.scenarios else self._made
 
     def check(self) -> None:
         """See `TrainingTask`."""

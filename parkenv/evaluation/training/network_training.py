@@ -42,7 +42,7 @@ PAIRS_WEIGHT = 3.0
 
 @dataclass(frozen=True, eq=False)
 class NetworkTraining(AnyTraining):
-    """Training of `network`; `steps` are the labelled decisions, and there are half as many played pairs.
+    """Training of `network`; `steps` are the labelled decisions, and there are a quarter as many played pairs.
 
     Args:
         places: scenarios to train in.
@@ -124,7 +124,7 @@ class NetworkTraining(AnyTraining):
             evaluate()
         labelled, played = Labelled.joined(parts), list[Pairs]()
         for k in range(PAIR_ROUNDS):
-            played.append(play_pairs(places, max(1, self.steps // 4), worlds + 1_000_000 * (2 + k), CLOSEST))
+            played.append(play_pairs(places, max(1, self.steps // 8), worlds + 1_000_000 * (2 + k), CLOSEST))
             decisions += int(played[-1].decisions.sum())
             fit(
                 network, labelled, Pairs.joined(played), epochs=EPOCHS, learning_rate=LEARNING_RATES[2],
@@ -136,7 +136,7 @@ class NetworkTraining(AnyTraining):
                 "trained_on": tuple(scenario.name for scenario in self.places),
                 "decisions": decisions,
                 "settings": {
-                    "labelled": self.steps, "pairs": PAIR_ROUNDS * (self.steps // 4), "closest": CLOSEST,
+                    "labelled": self.steps, "pairs": PAIR_ROUNDS * (self.steps // 8), "closest": CLOSEST,
                     "epochs": EPOCHS, "learning_rates": list(LEARNING_RATES), "pairs_weight": PAIRS_WEIGHT,
                 },
                 "results": {name: curve[-1][name] for name in self.metrics},
