@@ -122,14 +122,14 @@ def fit(
             error[known], torch.zeros(()).expand(int(known.sum())), delta=0.2
         )
         loss = chosen + 10.0 * differences
-        parts = {"choice": float(chosen), "value": float(differences)}
+        parts = {"choice": chosen.item(), "value": differences.item()}
         if played is not None:
             batch = torch.from_numpy(rng.integers(len(played[3]), size=BATCH))
             scores = network(*(a[batch] for a in played[:3]))
             first, second = (scores.gather(1, a[batch, None])[:, 0] for a in played[3:5])
             found = nn.functional.mse_loss(second - first, played[5][batch])
             loss = loss + pairs_weight * found
-            parts["pairs"] = float(found)
+            parts["pairs"] = found.item()
         optimizer.zero_grad()
         torch.autograd.backward(loss)
         nn.utils.clip_grad_norm_(network.parameters(), 1.0)

@@ -133,7 +133,7 @@ class NetworkTraining(AnyTraining):
             evaluate()
         card = network.card.model_copy(
             update={
-                "trained_on": tuple(scenario.name for scenario in self.places),
+                "trained_on": tuple(dict.fromkeys(scenario.name for scenario in self.places)),
                 "decisions": decisions,
                 "settings": {
                     "labelled": self.steps, "pairs": PAIR_ROUNDS * (self.steps // 8), "closest": CLOSEST,
