@@ -1,5 +1,6 @@
 """Tasks for tests of workers, in a separate module that worker processes can import."""
 
+import logging
 import os
 import signal
 import time
@@ -23,6 +24,11 @@ def square_killed_once(marker: str, number: int) -> int:
     with Path(f"{marker}.{number}").open("a") as file:
         file.write("run\n")
     return number * number
+
+
+def warn() -> None:
+    """Say what a worker says that compiles."""
+    logging.getLogger("parkenv").warning("compiling functions for this machine")
 
 
 def die() -> None:

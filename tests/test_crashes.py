@@ -36,6 +36,19 @@ def test_a_full_disk_is_no_error_of_ours(monkeypatch):
     assert (ended.returncode, ended.stderr) == (2, "parkenv: error: No space left on device\n")
 
 
+@pytest.mark.parametrize(
+    "words",
+    [("plan", "--occupancy", "log\udcff.csv"), ("compare", "--out", "\udcff"), ("\ud800",)],
+    ids=("file", "folder", "command"),
+)
+def test_what_is_not_utf_8_on_the_command_line_is_refused(tmp_path, words):
+    """Such as the name of a file from another system; summaries could not name it, and reports not read them."""
+    ended = parkenv(*words, cwd=tmp_path)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr == f"parkenv: error: {words[-1]!a} on the command line is not UTF-8\n"
+    assert not list(tmp_path.iterdir())
+
+
 def test_closed_streams_do_not_stop_a_command(tmp_path):
     shown = tmp_path / "mini.png"
     command = shlex.join([*PARKENV, "lot", "show", "mini", "--out", str(shown)])

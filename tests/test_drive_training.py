@@ -25,6 +25,7 @@ from parkenv.errors import InputError
 from parkenv.evaluation.experiments.workers import HERE
 from parkenv.evaluation.figures.learning_curves import across_seeds, save_success_curves
 from parkenv.evaluation.training.configs import DRIVE_CONFIGS, WAY_IN
+from parkenv.evaluation.training.curve_file import read_curve
 from parkenv.evaluation.training.drive_batch import (
     CONTACT,
     LEFT_AREA,
@@ -43,7 +44,7 @@ from parkenv.evaluation.training.drive_training_env import (
     planned_path,
     slot_groups,
 )
-from parkenv.evaluation.training.rl_training import read_curve, train_one
+from parkenv.evaluation.training.rl_training import train_one
 from parkenv.lots import packaged_lot
 from planners.driving.parking_agents import make_parking_agent
 from planners.driving.policy_interface import (

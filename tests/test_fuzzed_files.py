@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import shutil
 import tempfile
 import tomllib
 from collections.abc import Callable
@@ -16,11 +17,13 @@ from file_mutations import mutated_bytes, mutated_json, mutated_text
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_import_osm import car_park
+from test_typed_csv import SESSION
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.benchmark import Suite, check_result
 from parkenv.evaluation.experiments.results import ResultFolder
 from parkenv.evaluation.experiments.spec import ExperimentSpec
+from parkenv.evaluation.experiments.surveys import detection_by_distance, read_sessions
 from parkenv.evaluation.report.page import page_data, write_page
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.trips.calibration import Calibration, TripFolder
@@ -103,6 +106,16 @@ def reported(path):
     run = RunFolder.read(path.parent)
     run.totals()
     write_page(page_data(run), path.with_name("report.html"), run.figures)
+
+
+def reported_kind(path):
+    """Report on a summary whose file is named after its command."""
+    shutil.copy(path, path.with_name("summary.json"))
+    reported(path.with_name("summary.json"))
+
+
+def sessions(path):
+    detection_by_distance(read_sessions(path))
 
 
 def true_locations(path):
@@ -206,7 +219,7 @@ EPISODE_ROWS = (
     "scenario,occupancy_level,agent,failure_cost_s,v_walk_kmh,v_drive_kmh,seed,day,arrival_s,occupancy,slot,parked,truncated,"
     "total_s,drive_s,failed_s,walk_s,parking_cost_s,gave_up_s,bound_s,driven_m,walked_m,failed_parks,slots_passed,replans,steps\n"
     "mini,,mdp,10.0,4.0,10.0,0,mon,3600.0,0.5,A1,True,False,50.0,30.0,0.0,20.0,0.0,0.0,49.0,80.0,20.0,0,3,1,9\n"
-    "mini,,mdp,10.0,4.0,10.0,1,tue,3600.0,0.5,A2,True,False,50.0,30.0,0.0,20.0,0.0,0.0,,80.0,20.0,0,3,1,9\n"
+    "mini,,mdp,10.0,4.0,10.0,1,tue,3600.0,0.5,A2,True,False,50.0,30.0,0.0,20.0,0.0,0.0,49.0,80.0,20.0,0,3,1,9\n"
 )
 TIMING_ROWS = (
     "scenario,occupancy_level,agent,failure_cost_s,v_walk_kmh,v_drive_kmh,seed,decisions_us\n"
@@ -216,6 +229,28 @@ SUMMARY = {
     "command": ["parkenv", "compare", "--episodes", "2"], "version": "0.1.0", "seed": 0,
     "rows": [SUMMARY_ROW, SUMMARY_ROW | {"agent": "random", "total_s": 70.0}],
 }  # fmt: skip
+SURVEY_SUMMARY = {
+    "command": ["parkenv", "survey"], "version": "0.1.0", "seed": 0,
+    "rows": [
+        {
+            "scenario": "mini", "sessions": 1, "slots": 10, "car_detection_rate": 0.6, "slot_accuracy": 1.0,
+            "range_abs_error_m": {"median": 0.002, "p95": 0.003},
+            "by_weather": {"dusk": {"sessions": 1, "car_detection_rate": 0.6, "slot_accuracy": 1.0}},
+            "detection_by_distance": [
+                {"weather": "dusk", "distance_m": [0.0, 4.0], "in_frame": 2, "detected": 2, "rate_ci95": [0.3, 1.0]}
+            ],
+        }
+    ],
+}  # fmt: skip
+COMMUTE_ROW = {
+    "scenario": "mini", "map": "none", "agent": "first-free", "courses": 1, "total_s": 31.3,
+    "total_s_ci95": [None, None], "forecast_error": None, "forecast_error_ci95": [None, None],
+}  # fmt: skip
+COMMUTE_SUMMARY = {
+    "command": ["parkenv", "commute"], "version": "0.1.0", "seed": 0, "complete": True,
+    "rows": [COMMUTE_ROW | {"day": 1}], "weeks": [COMMUTE_ROW | {"days": "1-2", "difference_s": 0.0}],
+}  # fmt: skip
+SESSION_ROWS = f"{','.join(SESSION)}\n{','.join(SESSION.values())}\n"
 TRIP = {
     "slots": "observed",
     "seed": 0,
@@ -298,6 +333,9 @@ FORMATS = [
     Format("trueLocations.txt", "0: (-5,30)\n1: (2,3) (4,5)\n", mutated_text, true_locations),
     Format("result.json", RESULT, mutated_json, benchmark),
     Format("summary.json", SUMMARY, mutated_json, reported),
+    Format("survey.json", SURVEY_SUMMARY, mutated_json, reported_kind),
+    Format("commute.json", COMMUTE_SUMMARY, mutated_json, reported_kind),
+    Format("sessions.csv", SESSION_ROWS, mutated_text, sessions),
     Format("episodes.csv", EPISODE_ROWS, mutated_text, resumed),
     Format("timings.csv", TIMING_ROWS, mutated_text, resumed),
     Format("settings.json", {"seed": 0, "agents": {"mdp": {"failure_s": 1.0}}}, mutated_json, resumed),
@@ -313,6 +351,7 @@ BESIDE = {
     "timings.csv": {"settings.json": '{"seed": 0, "agents": {}}', "episodes.csv": EPISODE_ROWS},
     "trips.jsonl": {"settings.json": '{"seed": 0}'},
     "summary.json": {"episodes.csv": EPISODE_ROWS},
+    "survey.json": {"sessions.csv": SESSION_ROWS},
 }
 """Other files that stand in the folder of a file."""
 
@@ -366,6 +405,10 @@ FOUND = [
     ("summary.json", b'{"command": 5, "version": "0.1.0", "rows": []}'),
     ("summary.json", json.dumps(SUMMARY | {"seed": 1e300, "rows": [SUMMARY_ROW | {"drive_s": 1e300}]}).encode()),
     ("summary.json", json.dumps(SUMMARY).replace("30.0", "1e999").encode()),
+    ("survey.json", json.dumps(SURVEY_SUMMARY).replace('"dusk", "distance_m"', '"dusk"}, 7, {"distance_m"').encode()),
+    ("survey.json", json.dumps(SURVEY_SUMMARY).replace('[{"weather"', '{"weather"').replace("}]}", "}}").encode()),
+    ("commute.json", json.dumps(COMMUTE_SUMMARY | {"weeks": [[COMMUTE_ROW]]}).encode()),
+    ("sessions.csv", SESSION_ROWS.replace("2 1 0", "seed0 1 0").encode()),
     ("settings.json", json.dumps({"seed": "x" * 5000}).encode()),
     ("timings.csv", TIMING_ROWS.replace("12 3", "12 <").encode()),
     ("timings.csv", TIMING_ROWS.replace("12 3", "12 " + "9" * 400).encode()),

@@ -9,6 +9,7 @@ import jsonschema
 import numpy as np
 import pytest
 from command_line import parkenv
+from test_typed_csv import SESSION, write
 
 from parkenv import InputError, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
@@ -155,6 +156,8 @@ def test_folders_that_hold_no_finished_run_are_refused_in_words(tmp_path):
         RunFolder.read(summary_in(tmp_path, version="0.0.9"))
     with pytest.raises(InputError, match="rows None is not of type 'array'"):
         RunFolder.read(summary_in(tmp_path, rows=None))
+    with pytest.raises(InputError, match=r"summary\.json: .* \$\.weeks\[0\] \[\] is not of type 'object'"):
+        RunFolder.read(summary_in(tmp_path, command=["parkenv", "commute"], weeks=[[]]))
     (tmp_path / "summary.json").write_text('{"command": [')
     with pytest.raises(InputError, match="not JSON"):
         RunFolder.read(tmp_path)
@@ -206,6 +209,13 @@ def test_other_commands_get_tables_and_figures(tmp_path):
     make_report(tmp_path, Machines(jobs=1))
     (table,) = data_of(tmp_path / "report.html")["tables"]
     assert [row[2] for row in table["rows"]] == [3.5, None]
+
+
+def test_episodes_of_other_commands_are_not_read_as_searches(tmp_path):
+    summary_in(tmp_path, command=["parkenv", "park"], rows=[{"lot": "mini", "success": 1.0}])
+    (tmp_path / "episodes.csv").write_text("agent,lot,seed,parked\nplanner,mini,0,True\n")
+    make_report(tmp_path, Machines(jobs=1))
+    assert data_of(tmp_path / "report.html")["tables"][0]["rows"] == [["mini", 1.0]]
 
 
 @pytest.mark.parametrize("drives", [False, True])
@@ -354,6 +364,6 @@ def test_data_without_replays_are_valid_too(tmp_path):
 
 
 def test_a_table_of_a_run_holds_what_json_can(tmp_path):
-    (tmp_path / "sessions.csv").write_text("weather,recall,precision\nrain,nan,0.5\n")
-    table = RunFolder(tmp_path, {}, (), "survey").table("sessions.csv")
-    assert table == [{"weather": "rain", "recall": None, "precision": 0.5}]
+    write(tmp_path / "sessions.csv", SESSION | {"slot_accuracy_seen": "nan"})
+    (session,) = RunFolder(tmp_path, {}, (), "survey").sessions()
+    assert (session["slot_accuracy"], session["slot_accuracy_seen"]) == (1.0, None)

@@ -107,7 +107,7 @@ def test_survey_and_map_on_the_command_line(tmp_path):
         "map", file, "--scenario", "mini", "--weekday", "tue", "--hour", 9.5, "--out", tmp_path / "m"
     )
     assert asked.returncode == 0, asked.stderr
-    assert "mini, tue 09:30, 1 sessions" in asked.stdout
+    assert "mini, tue 09:30, 1 session" in asked.stdout
     assert len((tmp_path / "m" / "slots.csv").read_text().splitlines()) == 11
     for words, message in (
         (["map", file, "--scenario", "campus"], "is a map of lot 'mini', not of 'campus'"),

@@ -36,7 +36,8 @@ from parkenv.evaluation.figures.learning_curves import across_seeds, save_learni
 from parkenv.evaluation.training.checkpoint import save_checkpoint
 from parkenv.evaluation.training.cloning import Demonstrations, clone
 from parkenv.evaluation.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
-from parkenv.evaluation.training.rl_training import TRAINING_SEEDS, read_curve, train_one
+from parkenv.evaluation.training.curve_file import read_curve
+from parkenv.evaluation.training.rl_training import TRAINING_SEEDS, train_one
 from parkenv.evaluation.training.search_task import SearchTask
 from parkenv.evaluation.training.search_training import SearchTraining, episode_times, search_times
 from parkenv.evaluation.training.training_task import curves_beside

@@ -56,6 +56,12 @@ def test_a_killed_worker_loses_its_own_task_which_is_run_again(tmp_path, backend
     assert again <= (3 if backend == "loky" else 0)
 
 
+def test_workers_print_no_lines_into_the_progress_bars_of_their_parent(capfd):
+    with Workers(2) as workers:
+        list(workers.results([killed_once.warn] * 2))
+    assert capfd.readouterr().err == ""
+
+
 def test_workers_that_die_again_and_again_end_the_run_with_a_word():
     with Workers(2) as workers, pytest.raises(RuntimeError, match="3 times in a row a loky worker died"):
         list(workers.results([killed_once.die] * 2))

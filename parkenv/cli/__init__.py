@@ -10,6 +10,7 @@ import sys
 import tempfile
 import traceback
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -109,6 +110,7 @@ def main() -> None:
     warnings.formatwarning = lambda message, *_: f"parkenv: warning: {message}\n"
     with stop_signals() as received:
         try:
+            _require_unicode(sys.argv[1:])
             code = app(standalone_mode=False, prog_name="parkenv")
         except (Exception, KeyboardInterrupt) as error:
             # Libraries turn an interruption into errors of their own, such as failed imports.
@@ -119,6 +121,13 @@ def main() -> None:
     if received:
         code = 128 + received[0]
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _require_unicode(words: Sequence[str]) -> None:
+    """Refuse names of files in other encodings: results are JSON, and could not name them."""
+    for word in words:
+        if word != word.encode(errors="replace").decode():
+            raise InputError(f"{word!a:.200} on the command line is not UTF-8")
 
 
 def _report(error: BaseException) -> int:

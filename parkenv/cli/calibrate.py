@@ -11,6 +11,7 @@ from parkenv.cli import arguments as args
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError
+from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import RigName
 
@@ -88,7 +89,7 @@ def calibrate(
         touched, stuck = (sum(row[name] for row in rows) for name in ("contacts", "rescues"))
         counts = {"trips": len(rows), "contacts": touched, "rescues": stuck}
         save_summary(out, seed, table, **settings | counts, calibrated=dataclasses.asdict(made))
-        title = f"{its.name}: {episodes} trips with and {episodes} without observations of slots, by {agents}"
+        title = f"{its.name}: {plural(episodes, 'trip')} with and as many without observations, by {agents}"
         calibration.save_distributions(rows, speed, title, out / file_name(f"calibration_{its.name}", ".png"))
         cells = (
             (

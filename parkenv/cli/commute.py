@@ -10,6 +10,7 @@ from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import command_line, make_console, make_table, progress_bar
 from parkenv.cli.trust import readable_models, require_trust
+from parkenv.evaluation.plurals import plural
 
 if TYPE_CHECKING:
     from rich.progress import TaskID
@@ -146,7 +147,7 @@ def _table(scenario: str, rows: list[dict[str, Any]]) -> Table:
         error = "" if row["forecast_error"] != row["forecast_error"] else f" ({row['forecast_error']:.3f})"
         cells.setdefault((row["map"], row["agent"]), {})[row["days"]] = f"{row['total_s']:.1f}{error}"
     return make_table(
-        f"{scenario}: total s (forecast error) by days, {rows[0]['courses']} drivers",
+        f"{scenario}: total s (forecast error) by days, {plural(rows[0]['courses'], 'driver')}",
         ("map", "agent", *(f"days {week}" for week in weeks)),
         ((*key, *(its.get(week, "") for week in weeks)) for key, its in cells.items()),
     )

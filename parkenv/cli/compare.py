@@ -19,6 +19,7 @@ from parkenv.cli.tables import (
 )
 from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
+from parkenv.evaluation.plurals import plural
 from parkenv.files.known_names import RigName
 
 if TYPE_CHECKING:
@@ -158,7 +159,7 @@ def run_comparison(
         console.print(f"{count} settings: their tables are in summary.json")
     if (measured := result.experiment.calibration) is not None:
         console.print(
-            f"Calibrated over {measured.trips} trips: failure cost {measured.failure_s:.4g} s, drive "
+            f"Calibrated over {plural(measured.trips, 'trip')}: failure cost {measured.failure_s:.4g} s, drive "
             f"{measured.v_drive / KMH:.4g} km/h. Parking takes {measured.manoeuvre_s:.1f} s more for the manoeuvre "
             "into the slot, under either cost; the tables leave that out."
         )
@@ -225,7 +226,7 @@ def result_tables(rows: list[Row], width: int) -> list[Table]:
             results = (*results, ("over exact", lambda r: f"{r['gap_to_exact']:+.2%}"))
         title = (
             f"{name}: failure cost {failure:g} s, walk {walk:g} km/h, drive {drive:g} km/h, "
-            f"{max(r['episodes'] for r in its_rows)} episodes"
+            f"{plural(max(r['episodes'] for r in its_rows), 'episode')}"
         )
         costs = any(row["parking_cost_s"] for row in its_rows)
         details = tuple(column for column in _DETAILS if costs or column[0] != "parking")

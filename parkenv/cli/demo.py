@@ -14,6 +14,7 @@ from parkenv.cli.compare import result_tables
 from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import command_line, make_console, print_recorded, progress_bar
+from parkenv.evaluation.plurals import plural
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import DemoSpec
@@ -164,9 +165,10 @@ def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | No
         results.finish([case.key(s) for case, its_seeds in cases for s in its_seeds], summary)
     page = make_report(out, spec, drives=None if run.recorded is None else [run.recorded], stage="4/4 report")
     console.print(
-        f"{spec.sessions} drives past {its.lot.n_slots} slots: {surveyed['car_detection_rate']:.1%} of the parked cars "
-        f"were found, {surveyed['slot_accuracy']:.1%} of the slots classified correctly. Mean absolute error of the "
-        f"map: {surveyed['occupancy_mae']:.2f} (raw counts for that hour: {surveyed['occupancy_mae_expected']:.2f})."
+        f"{plural(spec.sessions, 'drive')} past {its.lot.n_slots} slots: {surveyed['car_detection_rate']:.1%} of the "
+        f"parked cars were found, {surveyed['slot_accuracy']:.1%} of the slots classified correctly. Mean absolute "
+        f"error of the map: {surveyed['occupancy_mae']:.2f} (raw counts for that hour: "
+        f"{surveyed['occupancy_mae_expected']:.2f})."
     )
     for printed in result_tables(rows, console.width):
         console.print(printed)
@@ -195,7 +197,7 @@ def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) ->
     shown = replace(scenario.arrival, weekdays=scenario.arrival.weekdays[:2][-1:])
     time = DAY_S * shown.weekdays[0] + 0.5 * (shown.start_s + shown.end_s)
     hour, minute = divmod(int(time % DAY_S // 60), 60)
-    title = f"{scenario.name}, {DAY_NAMES[shown.weekdays[0]]} {hour:02d}:{minute:02d}, {sessions} sessions"
+    title = f"{scenario.name}, {DAY_NAMES[shown.weekdays[0]]} {hour:02d}:{minute:02d}, {plural(sessions, 'session')}"
     save_map(scenario.lot, predict(log, time), mean_occupancy(scenario.occupancy, shown), title, path)
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 from parkenv.cli.tables import make_console, make_table, save_summary
 from parkenv.errors import InputError
+from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import file_name
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def detect(
                 beside.write_bytes(cv2.imencode(".png", drawn[..., ::-1])[1].tobytes())
     headings = ["file", "left", "top", "right", "bottom", "probability", "view"]
     console.print(make_table(None, headings, cells))
-    console.print(f"{len(rows)} cars in {len(chosen)} images")
+    console.print(f"{plural(len(rows), 'car')} in {plural(len(chosen), 'image')}")
     if out is not None:
         save_summary(out, None, rows)
         console.print(f"Images are in {out}")

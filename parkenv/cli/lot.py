@@ -11,6 +11,7 @@ from parkenv.cli import arguments as args
 from parkenv.cli.command import add, group
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
+from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import file_name
 
 AUTO = "auto"
@@ -237,7 +238,9 @@ def _import_town(place: Path, out: Path, options: ImportOptions, least: int) -> 
     became = {name: sum(row["result"] == name for row in rows) for name in ("clean", "doubtful", "refused")}
     listed = ", ".join(f"{count} {name}" for name, count in became.items())
     pictures = f" Pictures: {', '.join(map(str, sheets))}" if sheets else ""
-    console.print(f"{len(rows)} car parks in {place}: {listed}. Wrote {len(lots)} lots to {out}.{pictures}")
+    console.print(
+        f"{plural(len(rows), 'car park')} in {place}: {listed}. Wrote {plural(len(lots), 'lot')} to {out}.{pictures}"
+    )
 
 
 def _points(option: str, texts: list[str] | None) -> tuple[tuple[float, float], ...]:

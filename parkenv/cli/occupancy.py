@@ -9,6 +9,7 @@ from parkenv.cli.arguments import iso_date, words
 from parkenv.cli.command import add, group
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
+from parkenv.evaluation.plurals import plural
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -152,7 +153,7 @@ def _fit_counts(counts: Counts, out: Path, console: Console) -> None:
         typical_week=typical_week,
     )
     headings = [str(key).replace("_", " ") for key in rows[0]]
-    console.print(make_table(f"{counts.source}: {n} days", headings, cells))
+    console.print(make_table(f"{counts.source}: {plural(n, 'day')}", headings, cells))
     _print_notes(counts, console)
     console.print(f"Levels drift by {drift:.2f} logits a week. The summary is in {out}")
 
@@ -252,7 +253,7 @@ def evaluate(
         *band_names,
         "log-loss more than ours",
     )
-    title = f"{rows[0]['car_parks']} car parks, {rows[0]['days']} days from {counts.days[first]}"
+    title = f"{plural(rows[0]['car_parks'], 'car park')}, {plural(rows[0]['days'], 'day')} from {counts.days[first]}"
     console.print(make_table(title, headings, cells))
     console.print(
         "90 %: days whose mean lies in its 90 % interval, in all and by forecast fullness.", soft_wrap=True
@@ -315,7 +316,7 @@ def _evaluate_log(log: Path, from_: str | None, seed: int, out: Path, console: C
         save_forecast(shown_slots(scores, log.name), out / f"{scores.model}.png")
     save_summary(out, seed, rows, first_day=first)
     headings = ("model", "log-loss", "Brier", "CRPS", "90 %: days", "log-loss more than ours")
-    title = f"{len(recorded.slot_ids)} slots, {rows[0]['days']} days from {first}"
+    title = f"{plural(len(recorded.slot_ids), 'slot')}, {plural(rows[0]['days'], 'day')} from {first}"
     console.print(make_table(title, headings, cells))
     console.print(f"Pictures and summary are in {out}")
 

@@ -10,6 +10,7 @@ from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.cli.trust import readable_models
 from parkenv.errors import InputError, nearest
+from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import file_name
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ def park(
             folder = out if len(labels) == 1 else out / file_name(label)
             make_folder(folder)
             _picture(its, cases, parking_agents[label], film, folder)
-        _show(console, f"{', '.join(names)}: {episodes} episodes per lot", table)
+        _show(console, f"{', '.join(names)}: {plural(episodes, 'episode')} per lot", table)
         for row in [row for row in rows if not row["parked"]][:SHOWN_ROWS]:
             who = f"{row['agent']}, " if len(labels) > 1 else ""
             console.print(

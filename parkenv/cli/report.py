@@ -120,7 +120,7 @@ def make_report(
     notes += too_large
     encounters = choose(cases, wanted) if wanted else []
     again = range(min(replays.sessions, repeated.sessions) if drives is None else 0)
-    counted = run.totals()
+    counted = run.totals() if encounters else {}
     tasks: list[Callable[[], dict[str, Any]]] = []
     for encounter in encounters:
         keys = [case.key(encounter.seed) for case in encounter.cases]

@@ -10,6 +10,7 @@ from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError, nearest
+from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import RigName, WeatherName
 
@@ -126,10 +127,10 @@ def run_survey_of(spec: SurveySpec, out: Path, folder: args.ReportedRun, rerun: 
     window = settings.windows[0]
     predicted = predict(log, 86_400.0 * window.weekdays[0] + 0.5 * (window.start_s + window.end_s))
     true = mean_occupancy(its.occupancy, window)
-    title = f"{its.name} after {row['sessions']} sessions"
+    title = f"{its.name} after {plural(row['sessions'], 'session')}"
     pictures.save_map(its.lot, predicted, true, title, out / file_name(f"map_{its.name}", ".png"))
     if row["detection_by_distance"]:
-        title = f"{its.name}, rig {settings.rig}, {row['sessions']} sessions"
+        title = f"{its.name}, rig {settings.rig}, {plural(row['sessions'], 'session')}"
         pictures.save_detection_reach(
             row["detection_by_distance"], title, out / file_name(f"reach_{its.name}", ".png")
         )
@@ -236,7 +237,7 @@ def show_map(
         (str(r["slot"]), f"{r['p_occupied']:.2f}", f"{r['low']:.2f}-{r['high']:.2f}", str(r["sessions"]))
         for r in sorted(rows, key=lambda r: float(str(r["p_occupied"])))[:MOST_ROWS]
     )
-    title = f"{its.name}, {when}, {len(log.time)} sessions"
+    title = f"{its.name}, {when}, {plural(len(log.time), 'session')}"
     console.print(make_table(title, ["slot", "P(taken)", f"{confidence:.0%}", "seen in"], cells))
     if len(rows) > MOST_ROWS:
         console.print(f"The {MOST_ROWS} most likely free of {len(rows)}; --out writes all.")

@@ -216,7 +216,8 @@ def _train_all(
 
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    from parkenv.evaluation.training.rl_training import CURVE, read_curve, train_one
+    from parkenv.evaluation.training.curve_file import CURVE, read_curve
+    from parkenv.evaluation.training.rl_training import train_one
 
     progress = Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[score]}"), TimeElapsedColumn(),

@@ -15,7 +15,17 @@ from typing import Any
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import append_text, atomic_write
 from parkenv.files.csv_writing import csv_text, write_csv
-from parkenv.files.limited_reading import csv_records, parse_json, read_json
+from parkenv.files.limited_reading import parse_json, read_json
+from parkenv.files.typed_csv import (
+    NUMBER,
+    NUMBER_OR_NOTHING,
+    TEXT,
+    WHOLE,
+    YES_OR_NO,
+    Kind,
+    typed_records,
+    wholes,
+)
 
 SETTING_AXES = ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")  # of a grid, as columns
 SETTING_COLUMNS = ("scenario", "occupancy_level", "agent", *SETTING_AXES)
@@ -43,9 +53,15 @@ OUTCOME_COLUMNS = (
     "steps",
 )
 """Columns of an episode's outcome."""
-_TEXT = {"scenario", "map", "agent", "day", "slot", "decisions_us"}
-_WHOLE = {"seed", "course", "day_number", "driver", "failed_parks", "slots_passed", "replans", "steps"}
-_BOOL = {"parked", "truncated"}
+_KINDS = {
+    **dict.fromkeys(("scenario", "map", "agent", "day", "slot"), TEXT),
+    **dict.fromkeys(("seed", "course", "day_number", "driver"), WHOLE),
+    **dict.fromkeys(("failed_parks", "slots_passed", "replans", "steps"), WHOLE),
+    **dict.fromkeys(("parked", "truncated"), YES_OR_NO),
+    **dict.fromkeys(("occupancy_level", "forecast_error"), NUMBER_OR_NOTHING),
+    "decisions_us": wholes(),
+}
+"""What a column holds; all others hold numbers."""
 
 SETTINGS = "settings.json"
 SUMMARY = "summary.json"
@@ -57,7 +73,7 @@ Key = tuple[Any, ...]
 
 def write_summary(folder: Path, summary: Mapping[str, Any], name: str = SUMMARY) -> None:
     """Write a command's summary as strict JSON; NaN becomes null."""
-    _write_text(folder / name, json.dumps(_plain(summary), indent=2, allow_nan=False) + "\n")
+    _write_text(folder / name, json.dumps(without_nan(summary), indent=2, allow_nan=False) + "\n")
 
 
 def read_settings(folder: Path) -> Row | None:
@@ -189,7 +205,7 @@ class ResultFolder:
         if resume:
             settings = require_same_settings(path, settings, kind)
             self.episodes, self._timings = (
-                self._by_key(_read(path / name, columns)) for name, columns in self._columns.items()
+                self._by_key(read_rows(path / name, columns)) for name, columns in self._columns.items()
             )
         elif (path / "episodes.csv").exists() and not overwrite:
             state = "a finished" if (path / SUMMARY).exists() else "an unfinished"
@@ -243,39 +259,25 @@ def _write_text(path: Path, text: str) -> None:
         beside.write_text(text, encoding="utf-8")
 
 
-def _read(path: Path, columns: Sequence[str]) -> list[Row]:
-    """Read the complete lines of a file written by `append_text`."""
-    if not path.exists():
-        return []
-    rows = []
-    for line, raw in csv_records(path, whole_lines=True):
-        if tuple(raw) != tuple(columns):
-            raise InputError(f"{path}: not written by this version of parkenv; use another folder")
-        try:
-            rows.append({name: _parse(name, value) for name, value in raw.items()})
-        except ValueError as error:
-            raise InputError(f"{path}: line {line}: {error}") from error
-    return rows
+def read_rows(path: Path, columns: Sequence[str] = (*KEY_COLUMNS, *OUTCOME_COLUMNS)) -> list[Row]:
+    """Read the complete lines of `episodes.csv` or `timings.csv`; none if there is no file.
+
+    Raises:
+        InputError: the file is damaged, or not of this version.
+    """
+    return [row for _, row in typed_records(path, _kind_of, columns, whole_lines=True)]
 
 
-def _parse(name: str, value: str) -> Any:
-    if name == "decisions_us" and not all(us.isdecimal() and len(us) < 16 for us in value.split()):
-        raise ValueError(f"{name} is {value!r:.80}, want microseconds")
-    if name in _TEXT:
-        return value
-    if name in _BOOL:
-        return value == "True"
-    if name in _WHOLE:
-        return int(value)
-    return float(value) if value else None
+def _kind_of(column: str) -> Kind:
+    return _KINDS.get(column, NUMBER)
 
 
-def _plain(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
     """Replace NaN, such as a missing interval, by None: JSON has no NaN."""
     if isinstance(value, Mapping):
-        return {k: _plain(v) for k, v in value.items()}
+        return {k: without_nan(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
+        return [without_nan(v) for v in value]
     if isinstance(value, float) and value != value:
         return None
     return value

@@ -16,7 +16,7 @@ from parkenv.errors import InputError
 from parkenv.evaluation.experiments.spec import BUSY, SurveySpec
 from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.files.csv_writing import write_csv
-from parkenv.files.limited_reading import csv_records
+from parkenv.files.typed_csv import NUMBER_OR_NAN, TEXT, WHOLE, Kind, typed_records, wholes
 from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
 from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.odometry import PoseNoise
@@ -48,6 +48,14 @@ SESSION_COLUMNS = (
     "slot_accuracy", "slot_accuracy_seen", "unknown_fraction", "occupied_fraction", "seconds_per_frame",
     "cars_in_frame", "cars_detected",
 )  # fmt: skip
+
+
+_KINDS = {
+    **dict.fromkeys(("key", "weather"), TEXT),
+    **dict.fromkeys(("parked", "found", "detections", "right"), WHOLE),
+    **dict.fromkeys(("cars_in_frame", "cars_detected"), wholes(len(DISTANCE_ENDS))),
+}
+"""What a column of `sessions.csv` holds; all others hold numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +146,7 @@ def run_survey(
     table = map_file.with_name("sessions.csv")
     with MapStore(map_file, scenario.lot) as store:
         # A row is written before its session: a row without a session is from an interrupted drive, which is repeated.
-        rows = {r["key"]: r for r in _read_rows(table) if store.has(r["key"])}
+        rows = {r["key"]: r for r in read_sessions(table) if store.has(r["key"])}
         wanted = [survey.key_of(k) for k in range(sessions)]
         missing = [k for k, key in enumerate(wanted) if not store.has(key) or key not in rows]
         shown = recorded = None
@@ -322,17 +330,23 @@ def _mean(rows: Sequence[Row], column: str) -> float:
     return float(np.mean(finite)) if finite else math.nan
 
 
-def _read_rows(path: Path) -> list[Row]:
-    if not path.exists():
-        return []
+def read_sessions(path: Path) -> list[Row]:
+    """Read the rows of `sessions.csv`; none if there is no file.
+
+    Raises:
+        InputError: the file is damaged, or not of this version.
+    """
     rows = []
-    whole = ("parked", "found", "detections", "right")
-    words = ("key", "weather", "cars_in_frame", "cars_detected")
-    for line, raw in csv_records(path):
-        if tuple(raw) != SESSION_COLUMNS:
-            raise InputError(f"{path}: not written by this version of parkenv; use another folder")
-        try:
-            rows.append({k: v if k in words else int(v) if k in whole else float(v) for k, v in raw.items()})
-        except ValueError as error:
-            raise InputError(f"{path}: line {line}: {error}") from error
+    for line, row in typed_records(path, _kind_of, SESSION_COLUMNS):
+        there, detected = ([int(n) for n in row[name].split()] for name in ("cars_in_frame", "cars_detected"))
+        if any(some > most for some, most in zip(detected, there, strict=True)):
+            raise InputError(
+                f"{path}: line {line}: cars_detected is {row['cars_detected']!r:.80}, want at most cars_in_frame, "
+                f"{row['cars_in_frame']!r:.80}"
+            )
+        rows.append(row)
     return rows
+
+
+def _kind_of(column: str) -> Kind:
+    return _KINDS.get(column, NUMBER_OR_NAN)

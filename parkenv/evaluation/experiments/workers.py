@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import importlib
+import logging
 import multiprocessing.resource_tracker
 import os
 import signal
@@ -232,6 +233,8 @@ def worker_start() -> dict[str, Any]:
 def _start_worker(parent: int, by_signal: bool) -> None:
     # loky takes compiled code for a memory leak, and would replace the worker.
     process_executor._MAX_MEMORY_LEAK_SIZE = sys.maxsize
+    # The parent says itself that functions are compiled; lines of its workers would break its progress bars.
+    logging.getLogger("parkenv").setLevel(logging.ERROR)
     if by_signal:
         ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     else:

@@ -16,6 +16,7 @@ from parkenv.evaluation.experiments.results import SETTING_AXES
 from parkenv.evaluation.figures.picture_files import INK, STYLE
 from parkenv.evaluation.figures.registry import ComparisonResults, Drawn, Setting
 from parkenv.evaluation.figures.time_figures import AGENT_COLORS, OTHER_AGENT
+from parkenv.evaluation.plurals import plural
 
 FloatArray = NDArray[np.float64]
 Totals = Mapping[str, FloatArray]
@@ -72,7 +73,7 @@ def draw_time_distribution(panels: Mapping[str, Totals]) -> Figure:
         for ax, (name, totals) in zip(axes.flat, panels.items(), strict=False):
             _draw_panel(ax, totals)
             episodes = {len(its) for its in totals.values()}
-            each = f" ({episodes.pop()} searches)" if len(episodes) == 1 else ""
+            each = f" ({plural(episodes.pop(), 'search', 'searches')})" if len(episodes) == 1 else ""
             ax.set_title(f"{name}{each}", weight="bold")
         for ax in axes.flat[len(panels) :]:
             ax.remove()

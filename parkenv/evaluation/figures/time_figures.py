@@ -18,6 +18,7 @@ from parkenv.evaluation.experiments.compare import BLIND, against_occupancy
 from parkenv.evaluation.experiments.results import SETTING_AXES
 from parkenv.evaluation.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
 from parkenv.evaluation.figures.registry import ComparisonResults, Drawn
+from parkenv.evaluation.plurals import plural
 
 FloatArray = NDArray[np.float64]
 Row = Mapping[str, Any]
@@ -347,7 +348,7 @@ def _require_rows(rows: Sequence[Row]) -> None:
 def _name(figure: Figure, rows: Sequence[Row]) -> None:
     """Title a figure with the scenario if all rows share it."""
     names = {row.get("scenario") for row in rows} - {None}
-    episodes = {row.get("episodes") for row in rows} - {None}
+    episodes = {int(row["episodes"]) for row in rows if "episodes" in row}
     if len(names) == 1:
-        each = f", {episodes.pop()} searches each" if len(episodes) == 1 else ""
+        each = f", {plural(episodes.pop(), 'search', 'searches')} each" if len(episodes) == 1 else ""
         figure.suptitle(f"{names.pop()}{each}", x=0.01, ha="left", weight="bold")

@@ -19,7 +19,7 @@ def learning_of(run: RunFolder) -> list[dict[str, Any]]:
     curve, lines = run.summary.get("curve"), run.summary.get("evaluated")
     if run.kind != "train" or not curve or not isinstance(lines, Mapping):
         return []
-    seeds = [run.table(f"seed_{row['seed']}/curve.csv") for row in run.summary["rows"]]
+    seeds = [run.curve(row["seed"]) for row in run.summary["rows"]]
     beside = run.summary.get("beside", {})
     if isinstance(curve, Mapping):
         return [

@@ -17,6 +17,7 @@ from PIL import Image as PillowImage
 from parkenv.evaluation.experiments.results import SETTING_AXES, Row
 from parkenv.evaluation.figures.picture_files import CAPTION
 from parkenv.evaluation.figures.registry import FIGURES
+from parkenv.evaluation.plurals import plural
 from parkenv.evaluation.report.drive_recording import data_uri
 from parkenv.evaluation.report.learning import learning_of
 from parkenv.evaluation.report.run_folder import RunFolder
@@ -81,7 +82,7 @@ def page_data(
             "notes": list(notes),
         },
         "learning": learning_of(run),
-        "tables": tables_of(kind, summary, run.table("sessions.csv")),
+        "tables": tables_of(kind, summary, run.sessions()),
         "lots": lots,
         "worlds": [{**e["world"], "lot": lot(e["lot"]), "searches": e["searches"]} for e in encounters],
         "drives": [{**d["drive"], "lot": lot(d["lot"])} for d in drives],
@@ -196,7 +197,7 @@ def _training_findings(summary: Mapping[str, Any]) -> list[str]:
 
 def _survey_finding(row: Row) -> str:
     return (
-        f"{row['sessions']} drive{'s' if row['sessions'] > 1 else ''} past {row['slots']} slots: "
+        f"{plural(row['sessions'], 'drive')} past {plural(row['slots'], 'slot')}: "
         f"{row['car_detection_rate']:.1%} of the parked cars were detected, {row['slot_accuracy']:.1%} of the slots "
         "classified correctly."
     )

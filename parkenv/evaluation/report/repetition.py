@@ -55,7 +55,7 @@ class Repetition:
             case specs.BenchmarkSpec():
                 return cls([*Suite.named(spec.suite).cases(spec.agents)])
             case specs.SurveySpec():
-                return cls([], survey_of(spec), len(run.table("sessions.csv")))
+                return cls([], survey_of(spec), len(run.sessions()))
             case specs.DemoSpec():
                 its, settings = demo_survey(spec)
                 with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:

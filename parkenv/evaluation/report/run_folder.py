@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +11,20 @@ import jsonschema
 
 from parkenv import __version__
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.results import KEY_COLUMNS, SETTINGS, SUMMARY, SUMMARY_PARTIAL, Row
+from parkenv.evaluation.experiments.results import (
+    SETTINGS,
+    SUMMARY,
+    SUMMARY_PARTIAL,
+    Row,
+    episode_key,
+    read_rows,
+    without_nan,
+)
 from parkenv.evaluation.experiments.spec import SPEC_FILE, SPECS
-from parkenv.files.limited_reading import csv_records, read_json
+from parkenv.evaluation.experiments.surveys import read_sessions
+from parkenv.evaluation.training.curve_file import CURVE, read_curve
+from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Spec, read_tables
-
-_TEXT = ("scenario", "agent")
 
 
 @dataclass(frozen=True)
@@ -89,43 +96,27 @@ class RunFolder:
         return [str(word) for word in self.summary["command"][2:]]
 
     def totals(self) -> dict[tuple[Any, ...], float]:
-        """Read the total time, s, of every search in `episodes.csv`, by `results.episode_key`.
-
-        Empty without the file, and for a commute, whose searches depend on those before.
+        """Read the total time, s, of every search in `episodes.csv`, by `results.episode_key`; empty without the file.
 
         Raises:
-            InputError: the file is not in the format of this version.
+            InputError: the file is damaged, or not of this version.
         """
-        file = self.path / "episodes.csv"
-        if not file.exists() or self.kind == "commute":
-            return {}
-        totals = {}
-        for line, row in csv_records(file):
-            try:
-                totals[tuple(_value(c, row[c]) for c in KEY_COLUMNS)] = float(row["total_s"])
-            except (KeyError, ValueError) as error:
-                raise InputError(f"{file}: line {line}: cannot be read ({error})") from error
-        return totals
+        return {episode_key(row): row["total_s"] for row in read_rows(self.path / "episodes.csv")}
 
-    def table(self, name: str) -> list[Row]:
-        """Read the rows of a CSV file in the folder, numbers converted (None: not finite); empty without it."""
-        file = self.path / name
-        if not file.exists():
-            return []
-        return [{k: _number(v) for k, v in row.items()} for _, row in csv_records(file)]
+    def sessions(self) -> list[Row]:
+        """Read the drives of a survey from `sessions.csv`, NaN as None; none without the file.
 
+        Raises:
+            InputError: the file is damaged, or not of this version.
+        """
+        rows: list[Row] = without_nan(read_sessions(self.path / "sessions.csv"))
+        return rows
 
-def _value(column: str, text: str) -> Any:
-    if column in _TEXT:
-        return text
-    if column == "seed":
-        return int(text)
-    return float(text) if text else None
+    def curve(self, seed: int) -> list[Row]:
+        """Read the evaluations of a training, NaN as None; none without their file.
 
-
-def _number(text: str) -> Any:
-    try:
-        number = float(text)
-    except ValueError:
-        return text
-    return number if math.isfinite(number) else None
+        Raises:
+            InputError: the file is damaged.
+        """
+        rows: list[Row] = without_nan(read_curve(self.path / f"seed_{seed}" / CURVE))
+        return rows

@@ -15,6 +15,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from parkenv.evaluation.experiments.workers import Workers
 from parkenv.evaluation.training.configs import DRIVE_CONFIGS, DriveTrainingConfig, config_of
+from parkenv.evaluation.training.curve_file import Row
 from parkenv.evaluation.training.drive_batch import CONTACT, PARKED, RUNNING, DriveBatch, PreparedTask
 from parkenv.evaluation.training.drive_training_env import (
     DECISION_S,
@@ -22,7 +23,7 @@ from parkenv.evaluation.training.drive_training_env import (
     SlotGroup,
     slot_groups,
 )
-from parkenv.evaluation.training.rl_training import Row, Training
+from parkenv.evaluation.training.rl_training import Training
 from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all
 from parkenv.world.keyed_random import world_key
 from parkenv.world.lot import ParkingLot

@@ -22,7 +22,8 @@ from parkenv.envs.search import SearchEnv
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.simulate import STEP_LIMIT, charge_truncation
-from parkenv.evaluation.training.rl_training import CURVE, MODEL, TRAINING_SEEDS, AnyTraining, Row, read_curve
+from parkenv.evaluation.training.curve_file import CURVE, Row, read_curve
+from parkenv.evaluation.training.rl_training import MODEL, TRAINING_SEEDS, AnyTraining
 from parkenv.evaluation.training.search_training import HELD_OUT, METRICS
 from parkenv.files.csv_writing import write_csv
 from parkenv.scenarios.places import seeds_by_place

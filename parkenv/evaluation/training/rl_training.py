@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,16 +21,14 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 from parkenv.errors import InputError
 from parkenv.evaluation.training.checkpoint import read_checkpoint, restore, save_checkpoint
 from parkenv.evaluation.training.configs import TrainingConfig
+from parkenv.evaluation.training.curve_file import CURVE, Row, read_curve, require_columns
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.csv_writing import write_csv
-from parkenv.files.limited_reading import csv_records
 from planners.model_file import algorithm_class, save_model
 
 TRAINING_SEEDS = 10_000_000
 """World seeds of training seed s start at (s + 1) times this, far from those of evaluations and benchmark suites."""
-MODEL, CHECKPOINT, CURVE = "model.safetensors", "checkpoint.pt", "curve.csv"
-
-Row = dict[str, Any]
+MODEL, CHECKPOINT = "model.safetensors", "checkpoint.pt"
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,42 +244,3 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
         # Last: a training that is killed before this line repeats what it has just done.
         save_checkpoint(self.folder / CHECKPOINT, model, self.curve)
         return scores
-
-
-def read_curve(path: Path, columns: Sequence[str]) -> list[Row]:
-    """Read evaluations from CSV; return an empty list if there is no file.
-
-    Args:
-        path: a `curve.csv`.
-        columns: those that it must have.
-
-    Raises:
-        InputError: a column is missing, or a value is not a number.
-    """
-    if not path.exists():
-        return []
-    try:
-        return require_columns(
-            [
-                {name: int(value) if name == "steps" else float(value) for name, value in row.items()}
-                for _, row in csv_records(path)
-            ],
-            columns,
-            path,
-        )
-    except InputError:
-        raise
-    except ValueError as error:
-        raise InputError(f"{path}: want numbers in every column of every line ({error})") from error
-
-
-def require_columns(curve: list[Row], columns: Sequence[str], path: Path) -> list[Row]:
-    """Return evaluations that a file held.
-
-    Raises:
-        InputError: one lacks a column.
-    """
-    for name in columns:
-        if any(name not in row for row in curve):
-            raise InputError(f"{path}: has no column {name!r}, want {', '.join(columns)}")
-    return curve

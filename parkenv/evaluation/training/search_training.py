@@ -23,7 +23,8 @@ from parkenv.evaluation.training.configs import (
     TrainingConfig,
     config_of,
 )
-from parkenv.evaluation.training.rl_training import Row, Training
+from parkenv.evaluation.training.curve_file import Row
+from parkenv.evaluation.training.rl_training import Training
 from parkenv.scenarios.places import by_size, open_places
 from parkenv.world.scenario import Scenario
 from planners.learned import LearnedAgent

@@ -15,7 +15,8 @@ from parkenv.evaluation.experiments.results import read_settings
 from parkenv.evaluation.experiments.spec import TrainingSpec
 from parkenv.evaluation.experiments.workers import Workers
 from parkenv.evaluation.figures.learning_curves import COLORS
-from parkenv.evaluation.training.rl_training import CURVE, AnyTraining, read_curve
+from parkenv.evaluation.training.curve_file import CURVE, read_curve
+from parkenv.evaluation.training.rl_training import AnyTraining
 from parkenv.scenarios.spec import scenario_spec
 
 EVALUATION_SEED, TEST_SEED = 2_000_000, 3_000_000

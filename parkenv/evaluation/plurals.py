@@ -1,0 +1,13 @@
+"""Numbers with their nouns, for titles and sentences."""
+
+from __future__ import annotations
+
+
+def plural(number: int, noun: str, several: str | None = None) -> str:
+    """Return a number with its noun, in the singular for 1.
+
+    Examples:
+        >>> plural(1, "episode"), plural(20, "episode"), plural(2, "search", "searches")
+        ('1 episode', '20 episodes', '2 searches')
+    """
+    return f"{number} {noun if number == 1 else several or f'{noun}s'}"

@@ -1,0 +1,106 @@
+"""Read CSV tables that parkenv wrote: a column holds one kind of value, and a wrong value is named with its place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from parkenv.errors import InputError
+from parkenv.files.limited_reading import csv_records
+
+MAX_NUMBER = 1e12
+"""Maximum absolute value of a number; sums and squares of larger ones could overflow."""
+_MAX_DIGITS = 15
+
+
+class Kind(NamedTuple):
+    """What a column holds.
+
+    Attributes:
+        wanted: in words, for messages.
+        parse: returns the value of a text; raises ValueError if the text is something else.
+    """
+
+    wanted: str
+    parse: Callable[[str], Any]
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not abs(value) <= MAX_NUMBER:
+        raise ValueError(text)
+    return value
+
+
+def _number_or_nan(text: str) -> float:
+    return float("nan") if text == "nan" else _number(text)
+
+
+def _whole(text: str) -> int:
+    if not (text.isdecimal() and len(text) <= _MAX_DIGITS):
+        raise ValueError(text)
+    return int(text)
+
+
+def _yes_or_no(text: str) -> bool:
+    return ("False", "True").index(text) == 1
+
+
+def _wholes(text: str, count: int | None) -> str:
+    numbers = [_whole(word) for word in text.split()]
+    if count not in (None, len(numbers)):
+        raise ValueError(text)
+    return text
+
+
+TEXT = Kind("text", str)
+NUMBER = Kind(f"a number, at most {MAX_NUMBER:g}", _number)
+NUMBER_OR_NAN = Kind(f"a number, at most {MAX_NUMBER:g}, or nan", _number_or_nan)
+NUMBER_OR_NOTHING = Kind(
+    f"a number, at most {MAX_NUMBER:g}, or nothing", lambda text: _number(text) if text else None
+)
+WHOLE = Kind(f"a whole number of at most {_MAX_DIGITS} digits", _whole)
+YES_OR_NO = Kind("True or False", _yes_or_no)
+
+
+def wholes(count: int | None = None) -> Kind:
+    """Return the kind of columns that hold several whole numbers, `count` or any number of them, as a text."""
+    number = "" if count is None else f"{count} "
+    return Kind(f"{number}whole numbers separated by spaces", lambda text: _wholes(text, count))
+
+
+def typed_records(
+    path: Path,
+    kind_of: Callable[[str], Kind],
+    columns: Sequence[str] | None = None,
+    *,
+    whole_lines: bool = False,
+) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Yield the rows of a table with their line numbers; none if there is no file.
+
+    Args:
+        path: the file.
+        kind_of: returns what a column holds, by its name.
+        columns: the columns that it must have, in order; None for any.
+        whole_lines: leave out a last line without its end, which a crash cut off.
+
+    Raises:
+        InputError: the file cannot be read, has other columns, or a value is not of its column's kind; the message
+            names file, line, column, value, and what was wanted.
+    """
+    if not path.exists():
+        return
+    for line, record in csv_records(path, whole_lines=whole_lines):
+        if columns is not None and tuple(record) != tuple(columns):
+            raise InputError(f"{path}: not written by this version of parkenv; use another folder")
+        row = {}
+        for name, text in record.items():
+            kind = kind_of(name)
+            try:
+                row[name] = kind.parse(text)
+            except ValueError as error:
+                raise InputError(
+                    f"{path}: line {line}: {name:.80} is {text!r:.80}, want {kind.wanted}"
+                ) from error
+        yield line, row
