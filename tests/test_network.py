@@ -65,7 +65,7 @@ def test_turning_the_map_changes_nothing(name):
 
 def test_the_same_weights_serve_small_and_large_lots():
     policy = random_policy()
-    for lot in (grid_lot(2, 5), grid_lot(40, 50)):
+    for lot in (grid_lot(2, 5), grid_lot(20, 50)):
         scenario = make_scenario(lot, day_error=0.8)
         agent = NetworkAgent(scenario, policy)
         (_, _, features, scores), *_ = decisions(agent, scenario, seed=0, most=1)
