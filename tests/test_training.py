@@ -217,7 +217,7 @@ def test_a_planner_that_finishes_nothing_cannot_be_cloned(monkeypatch):
 
 @pytest.mark.slow
 def test_cloning_begins_near_the_planner():
-    campus = make_scenario("campus", day_error=0)
+    campus = make_scenario("campus")
     shown = Demonstrations.collect("first-free", campus, range(5_000_000, 5_000_300))
     assert shown.local.shape == (len(shown.actions), 86)
     assert (shown.masks[np.arange(len(shown.actions)), shown.actions] == 1).all()
@@ -227,9 +227,10 @@ def test_cloning_begins_near_the_planner():
     fresh, _ = episode_times(model, campus, EVALUATED, 5)
     clone(model, shown, 0, updates=2000)
     cloned, _ = episode_times(model, campus, EVALUATED, 5)
-    planner = np.mean([row["total_s"] for row in Case(campus, "first-free").run(EVALUATED)[0]])
-    # The mean would be of those few searches in which a clone drives in circles.
-    assert np.median(cloned) < 1.2 * planner < np.median(fresh)
+    planner = [row["total_s"] for row in Case(campus, "first-free").run(EVALUATED)[0]]
+    # The mean would be of those few searches in which a clone drives in circles; on empty days any agent parks soon.
+    cloned_s, planner_s, fresh_s = (np.quantile(times, 0.75) for times in (cloned, planner, fresh))
+    assert cloned_s < 1.2 * planner_s < fresh_s
 
 
 def test_cloning_takes_the_read_only_arrays_of_a_worker():
@@ -654,7 +655,10 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
     ("arguments", "wanted"),
     [
         (["sarsa"], "ALGORITHM is 'sarsa', want one of"),
-        (["sac"], "ALGORITHM is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn for search"),
+        (
+            ["sac"],
+            "ALGORITHM is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn, network for search",
+        ),
         (["dqn", "--env", "drive"], "ALGORITHM is 'dqn', want one of ppo, sac, tqc for drive"),
         (["ppo", "--env", "fly"], "--env: 'fly' is not one of"),
         (["ppo", "--env", "drive", "--clone", "mdp"], "clone goes with env search"),
@@ -671,6 +675,10 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
         (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
         (["ppo", "--agents", "mdp,belif"], "unknown agent 'belif'"),
         (["ppo", "--clone", "oracle"], "oracle cannot be cloned"),
+        (["network", "--clone", "mdp"], "clone does not go with network"),
+        (["network", "--tensorboard"], "tensorboard does not go with network"),
+        (["network", "--without", "legs"], "without.0 is 'legs', want 'lookahead'"),
+        (["ppo", "--without", "day"], "without goes with algorithm network"),
         (["ppo", "--demonstrations", "5"], "demonstrations goes with clone"),
         (["ppo", "--env", "drive", "--demonstrations", "5"], "demonstrations goes with env search"),
     ],
