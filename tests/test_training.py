@@ -605,6 +605,9 @@ def curve_of_another_kind(folder):
     [
         ({"scenario": ["jam", "mini"]}, None, "scenario is 'jam' in .* and 'mini' here; their evaluations"),
         ({"evaluation_episodes": 8}, None, "evaluation_episodes is 8 in .* and 16 here"),
+        ({"scenario": 5}, None, r"other/settings\.json: scenario is 5, want a list"),
+        ({"scenario": [["mini"]]}, None, r"other/settings\.json: scenario\.0 is \['mini'\], want text"),
+        ({"algorithm": None}, None, r"other/settings\.json: algorithm is None, want text"),
         ({}, lambda folder: shutil.rmtree(folder / "seed_0"), "holds no training"),
         ({}, torn_settings, "settings.json: not JSON"),
         ({}, settings_of_another_kind, "want the settings of a command"),
