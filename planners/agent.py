@@ -18,7 +18,7 @@ from parkenv.errors import InputError, nearest
 from parkenv.files.user_class import file_of_class, load_class
 from parkenv.world.occupancy import World
 from parkenv.world.scenario import SearchProblem
-from planners.names import AGENTS, ALGORITHMS
+from planners.names import AGENTS, ALGORITHMS, FILE_AGENTS, NETWORK
 
 Observation = Mapping[str, Any]
 Memory = TypeVar("Memory")
@@ -147,8 +147,9 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
 
     Args:
         name: one of `planners.names.AGENTS`; `ALGORITHM:FILE` for a model of `parkenv train`, such as
-            `ppo:ppo.safetensors`; or `MODULE:CLASS` for your own agent, such as `my_agents:Patient`: a class whose
-            first argument is the problem. The module may be in the working directory.
+            `ppo:ppo.safetensors`; `network:FILE` for other weights of `network`; or `MODULE:CLASS` for your own agent,
+            such as `my_agents:Patient`: a class whose first argument is the problem. The module may be in the working
+            directory.
         scenario: the scenario; its hidden occupancy is not passed to the agent.
         options: options of the agent, such as `failure_s=5.0` for "mdp".
 
@@ -164,12 +165,14 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
         learned: Agent = import_module("planners.learned").LearnedAgent(scenario, before, after)
         return learned
     agent: Callable[..., Agent]
+    if colon and before == NETWORK:
+        options, name, colon = {"weights": after, **options}, NETWORK, ""
     if colon:
         agent = load_class(
             name,
             "agent",
             "predict(observation, state, episode_start, deterministic)",
-            alternatives=f"; nor is it an algorithm ({', '.join(ALGORITHMS)})",
+            alternatives=f"; nor is it an algorithm ({', '.join(FILE_AGENTS)})",
         )
         scenario = scenario.public()
     elif name in AGENTS:
@@ -203,7 +206,7 @@ def shown_name(name: str) -> str:
         name: a name that `make_agent` accepts.
     """
     before, colon, _ = name.partition(":")
-    if not colon or before in ALGORITHMS:
+    if not colon or before in FILE_AGENTS:
         return name
     own = getattr(load_class(name, "agent", "predict"), "name", None)
     return own if isinstance(own, str) and own else name
@@ -221,6 +224,6 @@ def agent_file(name: str) -> Path | None:
     before, colon, after = name.partition(":")
     if not colon:
         return None
-    if before in ALGORITHMS:
+    if before in FILE_AGENTS:
         return Path(after)
     return file_of_class(name)

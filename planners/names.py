@@ -11,6 +11,7 @@ AGENTS: dict[str, tuple[str, str]] = {
     "random": ("planners.greedy", "RandomAgent"),
     "oracle": ("planners.bounds.oracle", "OracleAgent"),
     "belief": ("planners.belief.agent", "BeliefAgent"),
+    "network": ("planners.network.agent", "NetworkAgent"),
     "mdp-tuned": ("planners.thesis.tuning", "TunedAgent"),
     "exact": ("planners.bounds.exact", "ExactAgent"),
 }
@@ -24,6 +25,10 @@ ALGORITHMS = {
     "tqc": ("sb3_contrib", "TQC"),
 }
 """Module and class of each learning algorithm; `ALGORITHM:FILE` names a trained model."""
+NETWORK = "network"
+"""The agent whose weights can be another file: `network:FILE`."""
+FILE_AGENTS = (*ALGORITHMS, NETWORK)
+"""Names before the colon of `NAME:FILE`."""
 WITHOUT_FORECAST = ("greedy-goal", "greedy-drive", "first-free", "random", "oracle")
 """Agents that make no use of an occupancy forecast."""
 SMALL_LOTS_ONLY = ("exact",)

@@ -10,7 +10,15 @@ from hypothesis import strategies as st
 from parkenv import InputError, make_scenario
 from parkenv.lots import grid_lot
 from parkenv.world.lot import PARK
-from planners import CirclingWarning, ParkingMDP, label_setting, policy_iteration, value_iteration
+from planners import (
+    CirclingWarning,
+    ParkingMDP,
+    label_setting,
+    make_agent,
+    policy_iteration,
+    value_iteration,
+)
+from planners.thesis.mdp import discount
 
 
 def line(p_free, walk_s, hop_s=1.0, failure_s=10.0, gamma=0.999):
@@ -170,3 +178,19 @@ def test_a_wrong_process_is_refused(changes, message):
 def test_policy_iteration_refuses_gamma_one():
     with pytest.raises(InputError, match="gamma below 1"):
         policy_iteration(line([0.5], [1.0], gamma=1.0))
+
+
+def test_the_shortest_edge_does_not_make_circling_pay():
+    """Stops of imported lots may be a millimetre apart; here the car is fast."""
+    scenario = make_scenario(grid_lot(2, 12), v_drive=2000.0)
+    assert scenario.move_s[scenario.lot.neighbors >= 0].min() < 0.002
+    assert discount(make_scenario("campus")) == discount(make_scenario("street")) == 0.9999
+    p_occupied = np.full(24, 0.95)
+    with pytest.warns(CirclingWarning, match=r"gamma 0\.9999 is too low"):
+        make_agent("mdp", scenario, gamma=0.9999).solve(p_occupied)
+    plans = [make_agent("mdp", scenario, solver=solver) for solver in ("label_setting", "policy_iteration")]
+    assert 0.9999 < plans[0].gamma < 1.0
+    costs = [plan.expected_time(p_occupied) for plan in plans]
+    np.testing.assert_allclose(costs[0], costs[1], rtol=1e-6)
+    exact = make_agent("mdp", scenario, gamma=1.0).expected_time(p_occupied)
+    np.testing.assert_allclose(costs[0], exact, rtol=1e-4)

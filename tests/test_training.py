@@ -654,7 +654,10 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
     ("arguments", "wanted"),
     [
         (["sarsa"], "ALGORITHM is 'sarsa', want one of"),
-        (["sac"], "ALGORITHM is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn for search"),
+        (
+            ["sac"],
+            "ALGORITHM is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn, network for search",
+        ),
         (["dqn", "--env", "drive"], "ALGORITHM is 'dqn', want one of ppo, sac, tqc for drive"),
         (["ppo", "--env", "fly"], "--env: 'fly' is not one of"),
         (["ppo", "--env", "drive", "--clone", "mdp"], "clone goes with env search"),
@@ -671,6 +674,10 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
         (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
         (["ppo", "--agents", "mdp,belif"], "unknown agent 'belif'"),
         (["ppo", "--clone", "oracle"], "oracle cannot be cloned"),
+        (["network", "--clone", "mdp"], "clone does not go with network"),
+        (["network", "--tensorboard"], "tensorboard does not go with network"),
+        (["network", "--without", "legs"], "without.0 is 'legs', want 'lookahead'"),
+        (["ppo", "--without", "day"], "without goes with algorithm network"),
         (["ppo", "--demonstrations", "5"], "demonstrations goes with clone"),
         (["ppo", "--env", "drive", "--demonstrations", "5"], "demonstrations goes with env search"),
     ],

@@ -47,6 +47,7 @@ def compare(
     costs: args.Costs,
     calibrated: Path | None = None,
     world: args.ObservedSearches,
+    largest: int | None = None,
     occupancy_levels: str | None = None,
     map_says: str | None = None,
     rig: RigName | None = None,
@@ -67,6 +68,7 @@ def compare(
         parkenv compare --scenario campus,jam --failure-cost 10,90 --out results
         parkenv compare --agents "mdp(failure_s=90),belief,oracle" --report
         parkenv compare --agents mdp,mdp-tuned,oracle --failure-cost sweep
+        parkenv compare --scenario lots --largest 5 --report
         parkenv compare --lot lot.geojson --occupancy log.csv.gz -n 300
         parkenv compare --resume --episodes 1000
 
@@ -82,6 +84,7 @@ def compare(
             calibrate`, in the same worlds.
 
     World:
+        largest (N >= 1): Of the scenarios, only those with the N largest lots.  [default: all]
         occupancy_levels (P[,...]|none): Also set the lot's mean occupancy to these values, with a third of the episodes
             each, for the figure of time against occupancy. Searches in a recorded log are binned instead.  [default:
             0.5,0.7,0.8,0.9,0.95,0.99; none with --failure-cost sweep]
@@ -93,6 +96,7 @@ def compare(
     """
     from parkenv.evaluation.experiments.agent_spec import split_agents
     from parkenv.evaluation.experiments.spec import FAILURE_COST_SWEEP, ExperimentSpec
+    from parkenv.scenarios.build import largest_lots
 
     sweep = costs.failure_cost == "sweep"
     if folder.resume:
@@ -115,6 +119,8 @@ def compare(
     if agents is not None:
         given["agents"] = readable_models(split_agents(agents), trust_model)
     scenarios = tuple(world.specs(scenario, base.scenarios))
+    if largest is not None:
+        scenarios = tuple(largest_lots(scenarios, largest))
     spec = base.changed(scenarios=scenarios, grid=grid, **given, **machines.given)
     with writing_into(out, f"--resume --out {out}"):
         run_comparison(spec, out, folder, rerun)

@@ -61,6 +61,7 @@ COMPLETERS: dict[str, Completer] = {
     "model": completer(("side", "front"), (".npz",)),
     "occupancy": completer((), (".csv", ".csv.gz", ".json")),
     "place": completer((), (*LOT_SUFFIXES, ".osm", ".csv")),
+    "places": completer((), LOT_SUFFIXES),
     "scenario": completer(SCENARIO_NAMES, (*_TABLES, ".geojson"), several=True),
     "sensor_model": completer(SENSOR_MODELS, (".json",)),
     "test_on": completer(SCENARIO_NAMES, (*_TABLES, ".geojson"), several=True),

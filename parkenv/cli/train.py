@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from parkenv.evaluation.experiments.spec import TrainingSpec
     from parkenv.evaluation.experiments.workers import Workers
-    from parkenv.evaluation.training.rl_training import Training
+    from parkenv.evaluation.training.rl_training import AnyTraining
     from parkenv.evaluation.training.training_task import Row, TrainingTask
 
 
@@ -43,6 +43,7 @@ def train(
     held_out: float | None = None,
     evaluate_on: str | None = None,
     curriculum: Literal["size"] | None = None,
+    without: str | None = None,
     test_on: str | None = None,
     agents: str | None = None,
     beside: str | None = None,
@@ -63,17 +64,19 @@ def train(
         parkenv train ppo --scenario my_lot.toml --steps 200000 --trainings 1
         parkenv train maskable-ppo --scenario lots --held-out 0.2 --curriculum size
         parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
+        parkenv train network --scenario my-lots --evaluate-on other-lots
         parkenv train ppo --beside results/maskable-ppo,results/dqn
         parkenv train sac --env drive --scenario campus,street --trainings 3
         parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
 
     Options:
-        algorithm (ALGORITHM): To search: dqn, ppo, maskable-ppo (default), recurrent-ppo. To drive: sac, tqc, ppo
-            (default).
+        algorithm (ALGORITHM): To search: dqn, ppo, maskable-ppo (default), recurrent-ppo, network. To drive: sac, tqc,
+            ppo (default).
         env (search|drive): Learn to search (parkenv/Search-v2), or to drive into slots (parkenv/Drive-v1).
         scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
-            campus; to drive, campus,street]
-        steps (N >= 1): Decisions of a training.  [default: 2000000; to drive, the training config's]
+            campus; to drive, campus,street; for network, made lots alone]
+        steps (N >= 1): Decisions of a training; for network, those that belief labels.  [default: 2000000; for network,
+            10000; to drive, the training config's]
         trainings (N >= 1): How many, with one seed each from --seed on.
         seed (N >= 0): First seed of the trainings.
         out, -o (DIR): Folder for models, curves and figures.  [default: results/ALGORITHM, results/drive-ALGORITHM]
@@ -84,6 +87,7 @@ def train(
         k (N >= 1): Slots in an observation (search).  [default: 5]
         curriculum (size): Begin with the smallest tenth of the places, and add larger ones evenly until half of --steps
             (search).  [default: all places from the start]
+        without (PART[,...]): Parts of network to leave out: lookahead, tokens, day, memory.  [default: none]
 
     Evaluation:
         evaluate_every (N >= 1): Decisions between evaluations.  [default: 100000; to drive, a twentieth of --steps]
@@ -109,6 +113,7 @@ def train(
         "scenarios": tuple(args.World(lot=lot).specs(scenario)) if scenario or lot else None,
         "evaluate_on": tuple(args.scenario_specs(evaluate_on)) if evaluate_on else None,
         "test_on": tuple(args.scenario_specs(test_on)) if test_on else None,
+        "without": args.words("--without", without) if without else None,
         "agents": None if agents is None else [] if agents == "none" else split_agents(agents),
     }
     spec = TrainingSpec().changed(
@@ -126,6 +131,10 @@ def _task_of(spec: TrainingSpec) -> TrainingTask:
     from parkenv.evaluation.training.drive_task import DriveTask
     from parkenv.evaluation.training.search_task import SearchTask
 
+    if spec.env == "search" and spec.algorithm == "network":
+        from parkenv.evaluation.training.network_task import NetworkTask
+
+        return NetworkTask(spec)
     return DriveTask(spec) if spec.env == "drive" else SearchTask(spec)
 
 
@@ -196,7 +205,7 @@ def _claim(out: Path, settings: Row, overwrite: bool) -> None:
 def _train_all(
     console: Console,
     task: TrainingTask,
-    training: Training,
+    training: AnyTraining,
     seeds: range,
     out: Path,
     workers: Workers,

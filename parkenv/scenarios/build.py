@@ -100,6 +100,17 @@ def make_scenarios(source: ScenarioSources, **changes: Any) -> list[Scenario]:
     return [made for one in source for made in make_scenarios(one, **changes)]
 
 
+def largest_lots(specs: Sequence[ScenarioSpec], count: int) -> list[ScenarioSpec]:
+    """Return the `count` scenarios whose lots have the most slots, the largest first; equal ones in their order.
+
+    Raises:
+        InputError: a lot cannot be read.
+    """
+    slots = [_lot(spec.lot).n_slots for spec in specs]
+    order = sorted(range(len(specs)), key=lambda i: -slots[i])
+    return [specs[i] for i in order[:count]]
+
+
 def _of_lot(lot: ParkingLot, changes: dict[str, Any]) -> Scenario:
     goal = changes.get("goal", 0)
     occupancy = changes.get("occupancy") or typical_occupancy(lot, goal=goal)

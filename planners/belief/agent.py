@@ -137,8 +137,8 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         self._nearness = nearness(self.problem.walk_s)
         self._worth_passing_s = WORTH_PASSING_S if day else 0.0
         self._budget = Budget(np.array(FAILURE_COSTS), int(budget_ms * WORK_PER_MS), DEPTH)
-        # With a perfect sensor no taken slot is attempted.
-        self._failure_s = 0.0 if self.problem.sensor_model.perfect else self.problem.failure_s
+        # s, what a taken slot costs on arrival; with a perfect sensor none is attempted
+        self.failure_s = 0.0 if self.problem.sensor_model.perfect else self.problem.failure_s
         self._neighborhoods = Neighborhoods(self.problem, most_vertices)
         self._routes = DriveRoutes(self.problem)
 
@@ -217,8 +217,8 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             memory.failure_s,
             memory.remaining_s,
             self._budget,
-            near.planning_graph(self.problem, self._failure_s),
-            _snapshot(here, known, memory, self._explore),
+            near.planning_graph(self.problem, self.failure_s),
+            snapshot(here, known, memory, self._explore),
             memory.paths,
         )
         kept = choice.failure_s == memory.failure_s and np.array_equal(choice.targets, memory.targets)
@@ -274,7 +274,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         return PlanPreview(tuple(path))
 
 
-def _snapshot(here: int, known: SlotBelief, memory: BeliefSearch, explore: float) -> BeliefSnapshot:
+def snapshot(here: int, known: SlotBelief, memory: BeliefSearch, explore: float) -> BeliefSnapshot:
     """Return the belief about the slots of a part as the path search uses it."""
     weights, p_free_if = memory.day.mixture()
     slots = np.empty(len(memory.state), SLOT)

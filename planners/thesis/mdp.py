@@ -15,8 +15,27 @@ from parkenv.world.scenario import SearchProblem
 FloatArray = NDArray[np.float64]
 
 
+USUAL_DISCOUNT = 0.9999
+"""The thesis's discount per decision."""
+SHORTEST_S = 1e-4
+"""Drive time, s, that shorter edges count as in `discount`."""
+
+
 class CirclingWarning(UserWarning):
     """The discount is so low that driving in circles for ever can look better than parking."""
+
+
+def discount(problem: SearchProblem) -> float:
+    """Return the discount per decision: the thesis's 0.9999, or as much as keeps circling from looking cheap.
+
+    Driving in circles for ever costs min(d_min, Δt)/(1 - γ) at least. That has to be more than a search may cost, the
+    give-up penalty and the most expensive arrival. Stops of mapped lots may be a millimetre apart, and then it is 4 s.
+    """
+    edges = problem.move_s[problem.lot.neighbors >= 0]
+    shortest = max(min(float(edges.min(initial=np.inf)), problem.wait_s), SHORTEST_S)
+    return max(
+        USUAL_DISCOUNT, 1.0 - shortest / (problem.give_up_s + float(problem.arrival_cost_s.max()) + 1.0)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +78,7 @@ class ParkingMDP:
     arrival_cost_s: FloatArray
     failure_s: float
     wait_s: float = 1.0
-    gamma: float = 0.9999
+    gamma: float = USUAL_DISCOUNT
     park_reward: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -98,7 +117,7 @@ class ParkingMDP:
         p_occupied: ArrayLike,
         *,
         failure_s: float | None = None,
-        gamma: float = 0.9999,
+        gamma: float | None = None,
     ) -> ParkingMDP:
         """Make the thesis's process from a belief about the slots.
 
@@ -106,7 +125,7 @@ class ParkingMDP:
             problem: lot, goal, speeds and costs.
             p_occupied: (n_slots,) probability that each slot is taken.
             failure_s: s, the planner's cost of a failed attempt; None: the actual cost (`problem.failure_s`).
-            gamma: discount per decision.
+            gamma: discount per decision; None: `discount`.
         """
         n, n_slots = problem.lot.n_vertices, problem.lot.n_slots
         p_free = np.zeros(n)
@@ -121,7 +140,7 @@ class ParkingMDP:
             arrival_cost_s=arrival_cost_s,
             failure_s=problem.failure_s if failure_s is None else failure_s,
             wait_s=problem.wait_s,
-            gamma=gamma,
+            gamma=discount(problem) if gamma is None else gamma,
         )
 
     @property

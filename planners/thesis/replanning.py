@@ -60,7 +60,7 @@ class StaticAgent(SearchAgent[Plan]):
         problem: lot, goal, speeds and costs.
         failure_s: s, the planner's cost of a failed attempt; a high cost makes it cautious. None: the actual cost
             (`problem.failure_s`).
-        gamma: discount per decision.
+        gamma: discount per decision. None: 0.9999, or more where edges are short (`discount`).
         solver: one of `SOLVERS`.
 
     Raises:
@@ -73,19 +73,19 @@ class StaticAgent(SearchAgent[Plan]):
         self,
         problem: SearchProblem,
         failure_s: float | None = None,
-        gamma: float = 0.9999,
+        gamma: float | None = None,
         solver: str = "label_setting",
     ) -> None:
         super().__init__(problem)
         if solver not in SOLVERS:
             raise InputError(f"solver is {solver!r}, want one of {', '.join(SOLVERS)}")
-        if solver == "policy_iteration" and gamma >= 1.0:
+        if solver == "policy_iteration" and gamma == 1.0:
             raise InputError(f"gamma is {gamma}, want below 1 for the solver policy_iteration")
         self.failure_s = problem.failure_s if failure_s is None else failure_s
-        self.gamma = gamma
         self.solver = solver
         nothing_free = np.ones(problem.lot.n_slots)
         self._mdp = ParkingMDP.from_belief(self.problem, nothing_free, failure_s=self.failure_s, gamma=gamma)
+        self.gamma = gamma = self._mdp.gamma
         self._graph = StoppingGraph.of(self._mdp)
         least_s = min(float(self._graph.in_s.min(initial=np.inf)), problem.wait_s, self.failure_s)
         self._suspect_s = least_s / (1.0 - gamma) if gamma < 1.0 else np.inf
@@ -164,7 +164,7 @@ class ReplanningAgent(StaticAgent):
     Args:
         problem: lot, goal, speeds and costs.
         failure_s: s, the planner's cost of a failed attempt. None: the actual cost (`problem.failure_s`).
-        gamma: discount per decision.
+        gamma: discount per decision. None: 0.9999, or more where edges are short (`discount`).
         solver: one of `SOLVERS`.
         day: whether to plan with the belief of `belief`: the observations of some slots tell how the day differs from
             its forecast, and so change P(taken) of the others (`DayBelief`).
@@ -179,7 +179,7 @@ class ReplanningAgent(StaticAgent):
         self,
         problem: SearchProblem,
         failure_s: float | None = None,
-        gamma: float = 0.9999,
+        gamma: float | None = None,
         solver: str = "label_setting",
         day: bool = False,
     ) -> None:

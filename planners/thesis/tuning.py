@@ -222,7 +222,7 @@ class TunedAgent(SearchAgent[TunedPlan]):
         problem: lot, goal, speeds and costs.
         worlds: number of worlds drawn from the forecast.
         seed: seed of those worlds.
-        gamma: discount per decision.
+        gamma: discount per decision. None: 0.9999, or more where edges are short.
         most_vertices: a larger lot is simulated in part (`Neighborhoods`).
 
     Raises:
@@ -236,7 +236,7 @@ class TunedAgent(SearchAgent[TunedPlan]):
         problem: SearchProblem,
         worlds: int = WORLDS,
         seed: int = 0,
-        gamma: float = 0.9999,
+        gamma: float | None = None,
         most_vertices: int = MOST_VERTICES,
     ) -> None:
         super().__init__(problem)

@@ -8,7 +8,7 @@ from pydantic import BeforeValidator, ConfigDict, model_validator
 
 from parkenv.errors import InputError
 from parkenv.files.spec_file import OrText, Spec
-from planners.names import ALGORITHMS
+from planners.names import FILE_AGENTS
 
 OptionValue = bool | int | float | str
 
@@ -128,7 +128,7 @@ def classes_in(spec: Spec) -> list[str]:
             )
             if isinstance(name, str):
                 before, colon, _ = name.partition(":")
-                found += [name] if colon and (field == "detector" or before not in ALGORITHMS) else []
+                found += [name] if colon and (field == "detector" or before not in FILE_AGENTS) else []
             elif isinstance(part, Spec):
                 found += classes_in(part)
     return list(dict.fromkeys(found))

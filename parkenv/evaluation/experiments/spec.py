@@ -291,6 +291,9 @@ class TrainingSpec(Workplace):
         description="Episodes of an evaluation; the test in the end has twice as many.",
     )
     agents: Several[AgentItem] | None = Field(None, max_length=1_000, description="Drawn for comparison.")
+    without: Several[Literal["lookahead", "tokens", "day", "memory"]] | None = Field(
+        None, description="Parts of the network to leave out, to see what they are worth (network)."
+    )
     tensorboard: bool = False
 
     @model_validator(mode="after")
@@ -299,6 +302,8 @@ class TrainingSpec(Workplace):
             for name in ("clone", "demonstrations", "k", "held_out", "evaluate_on", "curriculum"):
                 if getattr(self, name) is not None:
                     raise PydanticCustomError("whole", "{name} goes with env search", {"name": name})
+        if self.without is not None and self.algorithm != "network":
+            raise PydanticCustomError("whole", "without goes with algorithm network")
         if self.held_out is not None and self.evaluate_on is not None:
             raise PydanticCustomError("whole", "at most one of held_out, evaluate_on")
         if self.demonstrations is not None and self.clone is None:

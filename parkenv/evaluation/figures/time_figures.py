@@ -34,6 +34,7 @@ AGENT_COLORS = {
     "oracle": "#000000",
     "belief": "#cc79a7",
     "exact": "#882255",
+    "network": "#44aa99",
     "dqn": "#999933",
     "ppo": "#332288",
     "maskable-ppo": "#aa4499",

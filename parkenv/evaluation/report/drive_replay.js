@@ -55,6 +55,11 @@ class DriveReplay {
     this.views = [around, grid, slots];
     this.layOut();
     this.player.load(this.times[this.times.length - 1], this.times);
+    // At the start the sensors see little: before it is played, the page shows the frame with the most cars from a third of the drive on.
+    const { frames } = this.record;
+    const third = Math.floor(frames.length / 3);
+    const fullest = frames.reduce((best, frame, i) => (i > third && frame.cars.length > frames[best].cars.length ? i : best), third);
+    this.player.goTo(this.times[fullest]);
   }
 
   layOut() {

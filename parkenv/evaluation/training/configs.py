@@ -177,5 +177,6 @@ def config_of(algorithm: str, configs: Mapping[str, AnyConfig], task: str) -> An
         InputError: the algorithm has no config for this task.
     """
     if algorithm not in configs:
-        raise InputError(f"ALGORITHM is {algorithm!r}, want one of {', '.join(configs)} for {task}")
+        known = [*configs, *(("network",) if task == "search" else ())]
+        raise InputError(f"ALGORITHM is {algorithm!r}, want one of {', '.join(known)} for {task}")
     return configs[algorithm]

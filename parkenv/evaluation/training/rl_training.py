@@ -32,17 +32,17 @@ MODEL, CHECKPOINT = "model.safetensors", "checkpoint.pt"
 
 
 @dataclass(frozen=True, eq=False)
-class Training(ABC):
-    """Base class of trainings: what is trained, for how long, and how it is evaluated.
+class AnyTraining(ABC):
+    """Base class of all trainings: what is trained, and for how long.
 
     Args:
-        algorithm: name of an algorithm with a training config.
+        algorithm: name of the algorithm.
         steps: decisions in total.
         evaluate_every: decisions between evaluations.
         command: command line of the training, for the model's card.
 
     Raises:
-        InputError: an unknown algorithm, or a number out of range.
+        InputError: a number out of range.
     """
 
     algorithm: str
@@ -51,19 +51,9 @@ class Training(ABC):
     command: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        _ = self.config
         for name in ("steps", "evaluate_every"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}, want at least 1")
-
-    @property
-    @abstractmethod
-    def config(self) -> TrainingConfig:
-        """Training config of the algorithm.
-
-        Raises:
-            InputError: the algorithm has no config for this task.
-        """
 
     @property
     @abstractmethod
@@ -74,6 +64,40 @@ class Training(ABC):
     def columns(self) -> tuple[str, ...]:
         """All columns of `curve.csv`."""
         return ("steps", *self.metrics, "wall_s")
+
+    @abstractmethod
+    def train(self, seed: int, folder: Path, *, tensorboard: bool = False) -> list[Row]:
+        """Train with one seed; write the model and `curve.csv` to a folder.
+
+        Args:
+            seed: seed of the network and of the worlds.
+            folder: output folder, created if missing.
+            tensorboard: whether to write a log for TensorBoard.
+
+        Returns:
+            The rows of `curve.csv`.
+        """
+
+
+class Training(AnyTraining):
+    """Base class of trainings with stable-baselines3.
+
+    Raises:
+        InputError: an unknown algorithm, or a number out of range.
+    """
+
+    def __post_init__(self) -> None:
+        _ = self.config
+        super().__post_init__()
+
+    @property
+    @abstractmethod
+    def config(self) -> TrainingConfig:
+        """Training config of the algorithm.
+
+        Raises:
+            InputError: the algorithm has no config for this task.
+        """
 
     @abstractmethod
     def make_env(self) -> VecEnv:
@@ -173,7 +197,7 @@ class Trained:
             beside.write_bytes(self.model)
 
 
-def train_one(training: Training, seed: int, folder: Path, tensorboard: bool = False) -> Trained:
+def train_one(training: AnyTraining, seed: int, folder: Path, tensorboard: bool = False) -> Trained:
     """Train with one seed on a single thread, so that one training per core can run in parallel."""
     import torch
 

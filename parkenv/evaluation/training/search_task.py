@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from parkenv.evaluation.experiments.workers import Workers
 from parkenv.evaluation.figures.learning_curves import across_seeds, save_learning_curves
 from parkenv.evaluation.training.cloning import Demonstrations, require_cloneable
 from parkenv.evaluation.training.configs import SEARCH_CONFIGS, config_of
+from parkenv.evaluation.training.rl_training import AnyTraining
 from parkenv.evaluation.training.search_training import SearchTraining, episode_times, times_row
 from parkenv.evaluation.training.training_task import (
     Row,
@@ -48,7 +50,7 @@ class SearchTask(TrainingTask):
     """Training of search agents in some scenarios."""
 
     default_algorithm = "maskable-ppo"
-    default_scenarios = ("campus",)
+    default_scenarios: ClassVar[tuple[str, ...]] = ("campus",)
     default_episodes = 256
 
     def __init__(self, spec: TrainingSpec) -> None:
@@ -142,7 +144,7 @@ class SearchTask(TrainingTask):
             "evaluation_episodes": settings.get("evaluation_episodes"),
         }
 
-    def training(self, status: Status) -> SearchTraining:
+    def training(self, status: Status) -> AnyTraining:
         """See `TrainingTask`."""
         demonstrations = None
         if self.spec.clone is not None:
@@ -181,9 +183,8 @@ class SearchTask(TrainingTask):
         rows, transfer, by_place = [], [], []
         with status("Testing"):
             for (number, model), curve in zip(trained.models.items(), trained.curves, strict=True):
-                agent = LearnedAgent(self.worlds[0], self.algorithm, model)
                 for name, places in self.tests.items():
-                    times, parked = episode_times(agent.model, places, self.test_seeds, agent.local_k)
+                    times, parked = self.times_of(model, places)
                     test = {"agent": self.algorithm, "seed": number, "test_scenario": name}
                     transfer.append({**test, **times_row(times, parked)})
                     if len(places) > 1:
@@ -204,6 +205,11 @@ class SearchTask(TrainingTask):
             "curve": across_seeds(trained.curves),
             "beside": {name: across_seeds(its) for name, its in trained.beside.items()},
         }, table_of_tests(heading, self.algorithm, transfer, planners, _interval)  # fmt: skip
+
+    def times_of(self, model: Path, places: list[Scenario]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Test a model: return the times of the test's episodes, s, and whether the car parked."""
+        agent = LearnedAgent(self.worlds[0], self.algorithm, model)
+        return episode_times(agent.model, places, self.test_seeds, agent.local_k)
 
     def _curves(self, name: str, curves: list[list[Row]]) -> dict[str, list[list[Row]]]:
         """Return the curves to draw: in places trained on, and in those held out."""

@@ -29,8 +29,8 @@ from parkenv.scenarios.places import by_size, open_places
 from parkenv.world.scenario import Scenario
 from planners.learned import LearnedAgent
 
-_METRICS = ("total_s", "low_s", "high_s", "parked_fraction")
-_HELD_OUT = ("held_out_s", "held_out_low_s", "held_out_high_s", "held_out_parked_fraction")
+METRICS = ("total_s", "low_s", "high_s", "parked_fraction")
+HELD_OUT = ("held_out_s", "held_out_low_s", "held_out_high_s", "held_out_parked_fraction")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class SearchTraining(Training):
     @property
     def metrics(self) -> tuple[str, ...]:
         """Mean total time, s, its 95 % interval, and the fraction of episodes that ended parked; also held out."""
-        return _METRICS + (_HELD_OUT if self.held_out else ())
+        return METRICS + (HELD_OUT if self.held_out else ())
 
     def make_env(self) -> SearchVecEnv:
         """Make a batch of search environments over all scenarios."""

@@ -16,7 +16,7 @@ from parkenv.evaluation.experiments.spec import TrainingSpec
 from parkenv.evaluation.experiments.workers import Workers
 from parkenv.evaluation.figures.learning_curves import COLORS
 from parkenv.evaluation.training.curve_file import CURVE, read_curve
-from parkenv.evaluation.training.rl_training import Training
+from parkenv.evaluation.training.rl_training import AnyTraining
 from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.spec import scenario_spec
 
@@ -110,7 +110,7 @@ class TrainingTask(ABC):
         """Return the settings that evaluations depend on: curves are comparable if these are equal."""
 
     @abstractmethod
-    def training(self, status: Status) -> Training:
+    def training(self, status: Status) -> AnyTraining:
         """Make the training, with demonstrations if needed."""
 
     @abstractmethod

@@ -1,0 +1,160 @@
+"""`network`: an agent that scores the actions at hand with one small network, the same on every lot."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.belief.slot_belief import SlotBelief
+from parkenv.world.lot import MOVES
+from parkenv.world.scenario import SearchProblem
+from planners.agent import Observation
+from planners.belief.agent import BeliefAgent, BeliefSearch, snapshot
+from planners.belief.planning_graph import MOST_HYPOTHESES, PlanningGraph
+from planners.neighborhood import MOST_VERTICES, Neighborhood
+from planners.network.features import FAILURE_COSTS, PARKING, WAITING, Features, Situation, observe
+from planners.network.lookahead import Scratch
+from planners.network.policy import SHIPPED, NetworkPolicy
+
+FloatArray = NDArray[np.float64]
+
+CIRCLING = 0.1
+"""Time scales by which an action is worse for each visit of its end since something new was observed."""
+
+
+@dataclass
+class NetworkSearch(BeliefSearch):
+    """Memory of an episode."""
+
+    previous: int = -1  # the vertex before, in the lot
+    # (n_vertices,) float64, s since the search began, the last visit of each vertex of the part; -1 without one
+    visited_at: FloatArray = field(default_factory=lambda: np.zeros(0))
+    # (n_vertices,) float64, number of visits since something new was observed
+    visits: FloatArray = field(default_factory=lambda: np.zeros(0))
+    n_known: int = 0  # slots that were observed at the last decision
+    by_cost: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # slots by arrival cost
+    graph: PlanningGraph | None = None
+    scratch: Scratch | None = None
+
+
+class NetworkAgent(BeliefAgent):
+    """`network`: takes the action with the best score of a small neural network.
+
+    **Observation.** For each action that there is (a move along an edge, parking, waiting): what a quick look ahead
+    expects of it (`planners.network.lookahead`), what it shows, whether it leads back; and tokens, the slots that
+    matter seen through that action: belief, age of the observation, drive, walk (`planners.network.features`). The
+    belief is that of `belief`: it learns from observations how the day differs from its forecast.
+
+    **Network.** The tokens of an action are pooled by attention; each action then sees the mean and the maximum over
+    all actions. Its output is added to minus the time that the look-ahead expects. Times are relative, there are no
+    coordinates, and actions have no order: the same weights serve lots of ten or two thousand slots, and turning the
+    map changes nothing.
+
+    **Where it does not.** It cannot be better than its tokens: what happens beyond the eight best slots is known to it
+    only through the look-ahead. A network does not explain itself.
+
+    Args:
+        problem: lot, goal, speeds and costs.
+        weights: file of `parkenv train network`, or its content; by default the weights that come with the package.
+        most_vertices: a larger lot is searched in parts (`Neighborhoods`).
+
+    Raises:
+        InputError: the file is not a network, `most_vertices` is out of range, or no slot can be observed.
+    """
+
+    name: ClassVar[str] = "network"
+
+    def __init__(
+        self,
+        problem: SearchProblem,
+        weights: str | os.PathLike[str] | NetworkPolicy = SHIPPED,
+        most_vertices: int = MOST_VERTICES,
+    ) -> None:
+        super().__init__(problem, most_vertices=most_vertices)
+        self.policy = weights if isinstance(weights, NetworkPolicy) else NetworkPolicy.load(weights)
+        self._failure_costs = np.array(FAILURE_COSTS)
+        self._features = Features.empty()
+        self.last_features: Features | None = None  # of the last decision; None if it needed none
+        self.last_scores: NDArray[np.float64] | None = None  # (6,) of that decision
+        # Copies: the lot's arrays are read-only, for which numba would compile every function again.
+        self._neighbors, self._move_s = self.problem.lot.neighbors.copy(), self.problem.move_s.copy()
+
+    def _search_of(self, near: Neighborhood, belief: SlotBelief) -> NetworkSearch:
+        base = super()._search_of(near, belief)
+        n = len(near.vertices)
+        return NetworkSearch(
+            **vars(base),
+            visited_at=np.full(n, -1.0),
+            visits=np.zeros(n),
+            by_cost=np.argsort(near.cost_s, kind="stable"),
+            graph=near.planning_graph(self.problem, self.failure_s),
+            scratch=Scratch.of(near.n_slots, MOST_HYPOTHESES),
+        )
+
+    def begin(self, observation: Observation, belief: SlotBelief) -> NetworkSearch:
+        """Choose the part of the lot to search."""
+        memory = super().begin(observation, belief)
+        assert isinstance(memory, NetworkSearch)
+        return memory
+
+    def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
+        """Update the memory, score the actions and take the best."""
+        self.last_features = self.last_scores = None
+        return super().decide(observation, belief, memory)
+
+    def _follow_best_path(
+        self, vertex: int, here: int, known: SlotBelief, memory: BeliefSearch
+    ) -> int | None:
+        """Return the action with the best score."""
+        assert isinstance(memory, NetworkSearch)
+        self.last_features = self.features(vertex, here, known, memory)
+        self.last_scores = self.policy.scores(self.last_features) - self._circling(vertex, here, memory)
+        memory.visited_at[here] = memory.time
+        memory.visits[here] += 1.0
+        memory.previous = vertex
+        choice = int(np.argmax(self.last_scores))
+        return self.wait(vertex) if choice == WAITING else choice
+
+    def features(self, vertex: int, here: int, known: SlotBelief, memory: NetworkSearch) -> Features:
+        """Return the network's observation; the next call overwrites it."""
+        near, out = memory.near, self._features
+        assert memory.graph is not None
+        assert memory.scratch is not None
+        following = np.full(len(MOVES), -1)
+        for a in range(len(MOVES)):
+            if (end := int(self._neighbors[vertex, a])) >= 0:
+                following[a] = near.index(end)
+        waits = (self._neighbors[vertex] < 0).any()
+        now = Situation(
+            here,
+            near.index(memory.previous) if memory.previous >= 0 else -1,
+            following,
+            self._move_s[vertex],
+            self.problem.wait_s if waits else np.inf,
+            self.problem.failure_s,
+            known.time,
+            memory.visited_at,
+            known.forecast.astype(np.float64),
+            known.observed_at.astype(np.float64),
+        )
+        belief = snapshot(here, known, memory, 0.0)
+        observe(now, memory.by_cost, self._failure_costs, memory.graph, belief, memory.scratch, out)
+        return out
+
+    def _circling(self, vertex: int, here: int, memory: NetworkSearch) -> FloatArray:
+        """Return by how much each action is worse, (6,), because the car has been at its end without seeing news."""
+        n_known = int((memory.state != 0).sum())
+        if n_known != memory.n_known:
+            memory.visits[:] = 0.0
+            memory.n_known = n_known
+        cost = np.zeros(6)
+        for a in range(len(MOVES)):
+            end = int(self._neighbors[vertex, a])
+            if end >= 0 and (i := memory.near.index(end)) >= 0:
+                cost[a] = CIRCLING * memory.visits[i]
+        cost[[PARKING, WAITING]] = CIRCLING * memory.visits[here]
+        return cost

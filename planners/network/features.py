@@ -1,0 +1,329 @@
+"""What the network observes: numbers about each action, and tokens for the slots that matter, seen through each action.
+
+Nothing here depends on coordinates, on the number of slots or on the order of the moves, so turning the map changes
+nothing, and the same weights serve every lot. Times are divided by the decision's own time scale, the least expected
+time of the look-ahead, so the speed of the car and the size of the lot do not matter either.
+
+An action is one of the four moves, parking, or waiting. A token is a slot seen through an action: its belief, the
+drive to it if the car takes the action, and its arrival cost.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
+from planners.belief.path_evaluation import expected_cost_to_slot
+from planners.belief.planning_graph import (
+    BeliefSnapshot,
+    FloatArray,
+    IntArray,
+    PlanningGraph,
+    is_hidden,
+    needs_attempt,
+)
+from planners.network.lookahead import Scratch, best_option, next_target, options_at_hand, path_value
+from sim_sensors.compilation import compiled
+
+ACTION_COUNT = 6
+"""Four moves, parking, waiting."""
+PARKING, WAITING = 4, 5
+FAILURE_COSTS = (1.0, 4.0, 16.0)
+"""s, failure costs of the thesis's planner on the paths of the look-ahead."""
+CANDIDATES = 8
+"""Number of slots that are tokens."""
+PER_PATH = 6
+ACTION_FEATURES = 15 + PER_PATH * len(FAILURE_COSTS) + 12
+TOKEN_FEATURES = 14
+MOST_REGRET = 4.0  # largest difference between times, in time scales
+
+
+class Situation(NamedTuple):
+    """Where the car is and what it may do; vertices are numbered as in the planning graph."""
+
+    here: int
+    previous: int  # vertex before, or -1
+    following: IntArray  # (4,) vertex after each move, or -1
+    move_s: FloatArray  # (4,) s
+    wait_s: float  # s, duration of waiting; inf if every move exists, so none can be used to wait
+    failure_s: float  # s, cost of a failed attempt
+    time: float  # s since the search began
+    visited_at: FloatArray  # (n_vertices,) s since the search began, of the last visit; -1 without one
+    forecast: FloatArray  # (n_slots,) P(taken)
+    observed_at: FloatArray  # (n_slots,) s since the search began; -1 if the slot is unobserved
+
+
+class Features(NamedTuple):
+    """Observation of the network at one decision.
+
+    Attributes:
+        actions: (6, ACTION_FEATURES) float32, the four moves, parking, waiting.
+        tokens: (6, CANDIDATES, TOKEN_FEATURES) float32.
+        allowed: (6,) bool, the actions that there are.
+        lookahead_s: (6,) float64, s, expected time by the look-ahead; inf for actions that there are not.
+    """
+
+    actions: NDArray[np.float32]
+    tokens: NDArray[np.float32]
+    allowed: NDArray[np.bool_]
+    lookahead_s: FloatArray
+
+    @classmethod
+    def empty(cls) -> Features:
+        """Allocate the observation of one decision."""
+        return cls(
+            np.zeros((ACTION_COUNT, ACTION_FEATURES), np.float32),
+            np.zeros((ACTION_COUNT, CANDIDATES, TOKEN_FEATURES), np.float32),
+            np.zeros(ACTION_COUNT, np.bool_),
+            np.full(ACTION_COUNT, np.inf),
+        )
+
+
+@compiled(error_model="numpy")
+def _squashed(ratio: float) -> float:
+    """Map times from 0 to infinity, in time scales, to 0 to 1."""
+    return ratio / (1.0 + ratio) if ratio < np.inf else 1.0
+
+
+@compiled(error_model="numpy")
+def _regret(value: float, best: float, scale: float) -> float:
+    return min((value - best) / scale, MOST_REGRET) if value < np.inf else MOST_REGRET
+
+
+@compiled(error_model="numpy")
+def _logit(p: float) -> float:
+    p = min(max(p, 1e-4), 1.0 - 1e-4)
+    return math.log(p / (1.0 - p))
+
+
+@compiled(error_model="numpy")
+def observe(
+    now: Situation,
+    by_cost: IntArray,
+    failure_costs: FloatArray,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    scratch: Scratch,
+    out: Features,
+) -> None:
+    """Write the network's observation of a decision.
+
+    Args:
+        now: the situation.
+        by_cost: (n_slots,) the slots, least arrival cost first.
+        failure_costs: (k,) s, `FAILURE_COSTS`.
+        graph: the lot, or a part of it.
+        belief: the belief about its slots.
+        scratch: buffers.
+        out: output.
+    """
+    here, n = now.here, len(belief.slots)
+    n_costs = len(failure_costs)
+    ends, step_s = np.full(6, -1), np.full(6, np.inf)
+    for a in range(4):
+        ends[a] = now.following[a]
+        if now.following[a] >= 0:
+            step_s[a] = now.move_s[a]
+    # A slot that is seen taken from its own vertex is not worth an attempt.
+    if here < n and (belief.slots[here].state == OBSERVED_FREE or needs_attempt(here, graph, belief)):
+        ends[PARKING], step_s[PARKING] = here, 0.0
+    if now.wait_s < np.inf:
+        ends[WAITING], step_s[WAITING] = here, now.wait_s
+
+    _, fallback_s = next_target(
+        here, 0.0, failure_costs[n_costs // 2], by_cost, scratch.seen_at, graph, belief
+    )
+    fallback_s = min(fallback_s, graph.give_up_s)
+    options = options_at_hand(here, fallback_s, graph, belief)
+    path_s, p_none = np.full((6, n_costs), np.inf), np.ones((6, n_costs))
+    first, end_s, option_s = np.full((6, n_costs), -1), np.zeros((6, n_costs)), np.full(6, np.inf)
+    for a in range(6):
+        out.allowed[a] = ends[a] >= 0
+        if ends[a] < 0 or a == PARKING:
+            continue
+        option_s[a] = step_s[a] + best_option(ends[a], step_s[a], options, fallback_s, graph, belief)
+        for c in range(n_costs):
+            path_s[a, c], p_none[a, c], first[a, c], end_s[a, c] = path_value(
+                ends[a], step_s[a], failure_costs[c], by_cost, options, fallback_s, graph, belief, scratch
+            )
+    best_path_s = np.full(n_costs, np.inf)
+    for c in range(n_costs):
+        for a in range(6):
+            best_path_s[c] = min(best_path_s[c], path_s[a, c])
+    least_s = min(best_path_s.min(), option_s.min(), graph.give_up_s)
+    if ends[PARKING] >= 0:
+        p_here = belief.slots[here].p_free
+        path_s[PARKING, :] = p_here * graph.cost_s[here] + (1.0 - p_here) * (now.failure_s + least_s)
+        least_s = min(least_s, path_s[PARKING, 0])
+    scale = max(least_s, 1e-3)
+    least_option_s = option_s.min()
+
+    n_observed, n_actions, shift, p_free_mean = 0, 0, 0.0, 0.0
+    for s in range(n):
+        n_observed += int(now.observed_at[s] >= 0.0)
+        p_free_mean += belief.slots[s].p_free
+    for a in range(6):
+        n_actions += int(out.allowed[a])
+    candidates = _candidates(here, by_cost, failure_costs, graph, belief)
+    p_if, n_unobserved = np.zeros(len(belief.weights)), 0
+    for s in candidates:
+        if s >= 0 and belief.slots[s].state == UNOBSERVED:
+            n_unobserved += 1
+            shift += _logit(1.0 - belief.slots[s].p_free) - _logit(now.forecast[s])
+            p_if += belief.p_free_if[s]
+    spread = 0.0
+    if n_unobserved > 0:
+        shift, p_if = shift / n_unobserved, p_if / n_unobserved
+        mean = (belief.weights * p_if).sum()
+        spread = math.sqrt(max((belief.weights * (p_if - mean) ** 2).sum(), 0.0))
+    nearest_rate = belief.slots[candidates[0]].decay_rate if candidates[0] >= 0 else 0.0
+
+    for a in range(6):
+        row = out.actions[a]
+        row[:] = 0.0
+        out.lookahead_s[a] = np.inf
+        if not out.allowed[a]:
+            continue
+        end = ends[a]
+        value = min(path_s[a].min(), option_s[a])
+        out.lookahead_s[a] = min(value, step_s[a] + graph.give_up_s)
+        row[0] = 1.0 if a < PARKING else 0.0
+        row[1] = 1.0 if a == PARKING else 0.0
+        row[2] = 1.0 if a == WAITING else 0.0
+        row[3] = _squashed(step_s[a] / scale)
+        row[4] = 1.0 if a < PARKING and end == now.previous else 0.0
+        if a < PARKING and now.visited_at[end] >= 0.0:
+            row[5] = 1.0 - _squashed((now.time - now.visited_at[end]) / scale)
+        row[6] = _regret(out.lookahead_s[a], least_s, scale)
+        row[7] = _squashed(option_s[a] / scale)
+        row[8] = _regret(option_s[a], least_option_s, scale) if least_option_s < np.inf else 0.0
+        if end < n:
+            row[9] = belief.slots[end].p_free
+            row[10] = 1.0 if belief.slots[end].state == UNOBSERVED else 0.0
+            row[11] = _squashed(graph.cost_s[end] / scale)
+        if a != PARKING:
+            new, n_new = 0.0, 0
+            for i in range(graph.view_starts[end], graph.view_starts[end + 1]):
+                view = graph.views[i]
+                if belief.slots[view.slot].state == UNOBSERVED and not is_hidden(
+                    view.slot, view.rate, belief
+                ):
+                    new += belief.slots[view.slot].p_free
+                    n_new += 1
+            row[12], row[13] = _squashed(new), _squashed(0.25 * n_new)
+            row[14] = _squashed(graph.drive_s[end, here] / scale)
+        for c in range(n_costs):
+            at = 15 + PER_PATH * c
+            row[at] = _squashed(path_s[a, c] / scale)
+            row[at + 1] = _regret(path_s[a, c], best_path_s[c], scale)
+            row[at + 2] = p_none[a, c]
+            target = first[a, c]
+            if target >= 0:
+                row[at + 3] = belief.slots[target].p_free
+                row[at + 4] = _squashed(graph.drive_s[end, target] / scale)
+                row[at + 5] = _squashed(graph.cost_s[target] / scale)
+        at = 15 + PER_PATH * n_costs
+        row[at] = _squashed(now.time / scale)
+        row[at + 1] = n_observed / n
+        row[at + 2] = _squashed(0.01 * n)
+        row[at + 3] = shift / 4.0
+        row[at + 4] = spread
+        row[at + 5] = p_free_mean / n
+        row[at + 6] = _squashed(least_option_s / scale)
+        row[at + 7] = _squashed(now.failure_s / scale)
+        row[at + 8] = _squashed(graph.give_up_s / scale / 10.0)
+        row[at + 9] = _squashed(nearest_rate * scale)
+        row[at + 10] = n_actions / 6.0
+        row[at + 11] = float(options.size) / 4.0
+
+    for i in range(CANDIDATES):
+        s = candidates[i]
+        nearest_s = np.inf
+        if s >= 0:
+            for a in range(6):
+                if out.allowed[a] and a != PARKING:
+                    nearest_s = min(nearest_s, step_s[a] + graph.drive_s[ends[a], s])
+        for a in range(6):
+            token = out.tokens[a, i]
+            token[:] = 0.0
+            if s < 0 or not out.allowed[a]:
+                continue
+            slot = belief.slots[s]
+            drive_s = step_s[a] + graph.drive_s[ends[a], s]
+            if a == PARKING:
+                drive_s = now.failure_s + graph.drive_s[here, s]
+            p_free = slot.p_free + (slot.p_free_usual - slot.p_free) * (
+                1.0 - math.exp(-slot.decay_rate * min(drive_s, 1e6))
+            )
+            deviation = 0.0
+            if slot.state == UNOBSERVED:
+                mean, square = 0.0, 0.0
+                for h in range(len(belief.weights)):
+                    p = belief.p_free_if[s, h]
+                    mean += belief.weights[h] * p
+                    square += belief.weights[h] * p * p
+                deviation = math.sqrt(max(square - mean * mean, 0.0))
+            token[0] = 1.0
+            token[1] = p_free
+            token[2] = deviation
+            token[3] = min(max((_logit(1.0 - slot.p_free) - _logit(now.forecast[s])) / 4.0, -1.0), 1.0)
+            token[4] = 1.0 if slot.state == OBSERVED_FREE else 0.0
+            token[5] = 1.0 if slot.state == OBSERVED_TAKEN else 0.0
+            if now.observed_at[s] >= 0.0:
+                token[6] = 1.0 - _squashed((now.time - now.observed_at[s]) / scale)
+            token[7] = _squashed(graph.cost_s[s] / scale)
+            token[8] = _squashed(drive_s / scale)
+            token[9] = _regret(drive_s, nearest_s, scale)
+            token[10] = _regret(drive_s + graph.cost_s[s], least_s, scale)
+            token[11] = 1.0 if s == ends[a] else 0.0
+            token[12] = _squashed(slot.decay_rate * min(drive_s, 1e6))
+            expected_s = expected_cost_to_slot(ends[a], s, slot.p_free, step_s[a], fallback_s, graph, belief)
+            token[13] = _regret(step_s[a] + expected_s, least_s, scale)
+
+
+@compiled(error_model="numpy")
+def _candidates(
+    here: int,
+    by_cost: IntArray,
+    failure_costs: FloatArray,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+) -> IntArray:
+    """Return `CANDIDATES` different slots, -1 for none: the best to drive to at failure costs taken in turn."""
+    found, n_found = np.full(CANDIDATES, -1), 0
+    n_costs = len(failure_costs)
+    values = np.empty((n_costs, CANDIDATES))
+    slots = np.full((n_costs, CANDIDATES), -1)
+    for c in range(n_costs):
+        values[c, :] = np.inf
+        for s in by_cost:
+            if graph.cost_s[s] >= values[c, CANDIDATES - 1]:
+                break
+            value = graph.drive_s[here, s] + graph.cost_s[s]
+            if value >= values[c, CANDIDATES - 1]:
+                continue
+            p_free = belief.slots[s].p_free
+            if belief.slots[s].state == UNOBSERVED:
+                value += failure_costs[c] * belief.slots[s].odds
+            else:
+                value += failure_costs[c] * (1.0 - p_free) / max(p_free, 1e-6)
+            place = CANDIDATES - 1
+            if value >= values[c, place]:
+                continue
+            while place > 0 and values[c, place - 1] > value:
+                values[c, place], slots[c, place] = values[c, place - 1], slots[c, place - 1]
+                place -= 1
+            values[c, place], slots[c, place] = value, s
+    for i in range(CANDIDATES):
+        for c in range(n_costs):
+            s, known = slots[c, i], n_found == CANDIDATES
+            for j in range(n_found):
+                known = known or found[j] == s
+            if s >= 0 and not known:
+                found[n_found] = s
+                n_found += 1
+    return found

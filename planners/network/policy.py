@@ -1,0 +1,163 @@
+"""The network's weights: their file, and the network itself in NumPy.
+
+A file is in the safetensors format, read here without its library, and runs no code when it is opened.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, JsonValue
+
+from parkenv import __version__
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
+from parkenv.files.limited_reading import parse_json, read_bytes
+from parkenv.files.spec_file import Several, Spec
+from planners.network.features import ACTION_FEATURES, FAILURE_COSTS, PER_PATH, TOKEN_FEATURES, Features
+
+OBSERVATION = "network-1"
+"""Version of the layout of `planners.network.features`."""
+SHIPPED = Path(__file__).with_name("models") / "network.safetensors"
+PARTS = ("lookahead", "tokens", "day", "memory")
+_KEY, _MAX_BYTES, _MAX_WEIGHT = "parkenv", 8_000_000, 1e4
+_HEADER = 15 + PER_PATH * len(FAILURE_COSTS)
+
+Part = Literal["lookahead", "tokens", "day", "memory"]
+
+
+class NetworkCard(Spec):
+    """Metadata of a file of weights: the model card."""
+
+    format: Literal["parkenv-network-1"] = "parkenv-network-1"
+    observation: Literal["network-1"] = "network-1"
+    width: Annotated[int, Field(ge=1, le=256)] = Field(64, description="Units of a layer.")
+    token_width: Annotated[int, Field(ge=1, le=256)] = Field(48, description="Units of a layer over tokens.")
+    without: Several[Part] = Field((), description="Parts left out, for comparisons.")
+    trained_on: Several[str] = Field((), description="Places that it was trained on.")
+    seed: int | None = Field(None, description="Of the training.")
+    decisions: int = Field(0, ge=0, description="Decisions that it was trained on.")
+    settings: dict[str, JsonValue] = Field({}, description="Of the training.")
+    results: dict[str, float | None] = Field({}, description="Of the evaluation during training.")
+    command: Several[str] = Field((), description="Command line of the training.")
+    parkenv: str = __version__
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Return the shape of every weight."""
+        t, w = self.token_width, self.width
+        layers = {
+            "token_1": (TOKEN_FEATURES, t), "token_2": (t, t), "attention": (t, 1),
+            "action_1": (ACTION_FEATURES + 2 * t, w), "action_2": (w, w),
+            "score_1": (3 * w, w), "score_2": (w, 1),
+        }  # fmt: skip
+        return {f"{name}.weight": shape for name, shape in layers.items()} | {
+            f"{name}.bias": shape[1:] for name, shape in layers.items()
+        }
+
+
+def feature_masks(without: tuple[Part, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return factors of the features of actions, (ACTION_FEATURES,), and of tokens: 0 for parts left out."""
+    actions, tokens = np.ones(ACTION_FEATURES, np.float32), np.ones(TOKEN_FEATURES, np.float32)
+    if "lookahead" in without:
+        actions[[6, 7, 8, *range(15, _HEADER), _HEADER + 6]] = tokens[13] = 0.0
+    if "tokens" in without:
+        tokens[:] = 0.0
+    if "day" in without:
+        actions[_HEADER + 3 : _HEADER + 5] = tokens[2:4] = 0.0
+    if "memory" in without:
+        actions[4:6] = tokens[6] = 0.0
+    return actions, tokens
+
+
+class NetworkPolicy(NamedTuple):
+    """A card and weights by name, float32."""
+
+    card: NetworkCard
+    weights: dict[str, NDArray[np.float32]]
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str] = SHIPPED) -> Self:
+        """Read a file of weights.
+
+        Raises:
+            InputError: the file is missing or damaged, or holds another network.
+        """
+        data = read_bytes(Path(path), _MAX_BYTES)
+        size = int.from_bytes(data[:8], "little")
+        if data[8:9] != b"{" or size > len(data) - 8:
+            raise InputError(f"{path}: no network of `parkenv train network`, or a damaged file")
+        header = parse_json(data[8 : 8 + size], f"{path}: header")
+        metadata = header.pop("__metadata__", None) if isinstance(header, dict) else None
+        text = metadata.get(_KEY) if isinstance(metadata, dict) else None
+        content = parse_json(text, f"{path}: card") if isinstance(text, str) else None
+        if not isinstance(content, dict) or content.get("format") != "parkenv-network-1":
+            raise InputError(f"{path}: has no card of a network; want a file of `parkenv train network`")
+        card = NetworkCard.parse(content, f"{path}: card")
+        body, weights = data[8 + size :], {}
+        for name, shape in card.shapes().items():
+            entry = header.get(name)
+            begin, end = _offsets(entry, name, shape, len(body), path)
+            values = np.frombuffer(body[begin:end], "<f4").reshape(shape)
+            if not (np.abs(values) <= _MAX_WEIGHT).all():
+                raise InputError(f"{path}: {name} has weights that are no numbers, or above {_MAX_WEIGHT:g}")
+            weights[name] = values.astype(np.float32)
+        return cls(card, weights)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the file, atomically."""
+        header: dict[str, object] = {"__metadata__": {_KEY: self.card.model_dump_json()}}
+        at = 0
+        for name, values in self.weights.items():
+            header[name] = {"dtype": "F32", "shape": values.shape, "data_offsets": [at, at + values.nbytes]}
+            at += values.nbytes
+        text = json.dumps(header).encode()
+        text += b" " * (-len(text) % 8)
+        with atomic_write(path) as beside:
+            body = b"".join(np.ascontiguousarray(v, "<f4").tobytes() for v in self.weights.values())
+            beside.write_bytes(len(text).to_bytes(8, "little") + text + body)
+
+    def scores(self, features: Features) -> NDArray[np.float32]:
+        """Score the actions, (..., 6): minus the expected time in time scales, up to a constant; -inf for none."""
+        w, without = self.weights, self.card.without
+        own, tokens = features.actions, features.tokens
+        if without:
+            of_actions, of_tokens = feature_masks(without)
+            own, tokens = own * of_actions, tokens * of_tokens
+        h = np.maximum(tokens @ w["token_1.weight"] + w["token_1.bias"], 0.0)
+        h = np.maximum(h @ w["token_2.weight"] + w["token_2.bias"], 0.0)
+        absent = tokens[..., :1] == 0.0
+        attention = h @ w["attention.weight"] + w["attention.bias"] - 1e4 * absent
+        attention = np.exp(attention - attention.max(axis=-2, keepdims=True))
+        attention /= attention.sum(axis=-2, keepdims=True)
+        pooled = (attention * h).sum(axis=-2), (h * ~absent).max(axis=-2)
+        x = np.concatenate([own, *pooled], axis=-1)
+        x = np.maximum(x @ w["action_1.weight"] + w["action_1.bias"], 0.0)
+        x = np.maximum(x @ w["action_2.weight"] + w["action_2.bias"], 0.0)
+        there = features.allowed[..., None]
+        x = x * there
+        mean = x.sum(axis=-2, keepdims=True) / np.maximum(there.sum(axis=-2, keepdims=True), 1)
+        most = x.max(axis=-2, keepdims=True)
+        x = np.concatenate([x, *np.broadcast_arrays(mean, most, x)[:2]], axis=-1)
+        x = np.maximum(x @ w["score_1.weight"] + w["score_1.bias"], 0.0)
+        score = (x @ w["score_2.weight"] + w["score_2.bias"])[..., 0]
+        if "lookahead" not in without:
+            score = score - features.actions[..., 6]
+        return np.where(features.allowed, score, -np.inf).astype(np.float32)
+
+
+def _offsets(
+    entry: object, name: str, shape: tuple[int, ...], size: int, path: str | os.PathLike[str]
+) -> tuple[int, int]:
+    """Return where the bytes of a weight begin and end."""
+    if isinstance(entry, dict) and entry.get("dtype") == "F32" and entry.get("shape") == list(shape):
+        offsets = entry.get("data_offsets")
+        if isinstance(offsets, list) and len(offsets) == 2 and all(type(o) is int for o in offsets):
+            begin, end = offsets
+            if begin >= 0 and end == begin + 4 * int(np.prod(shape)) and end <= size:
+                return begin, end
+    raise InputError(f"{path}: has no weights {name!r} of shape {shape}, float32")

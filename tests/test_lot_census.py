@@ -1,0 +1,115 @@
+"""The census of lots, and the way from a town's export to a comparison on its largest car parks."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import parkenv
+from made_outlines import document, double_row, kerb, row, write
+
+from parkenv.errors import InputError
+from parkenv.evaluation.lot_census import COLUMNS, count_lot, longest_drive_m, lot_columns, lot_files
+from parkenv.lots import grid_lot, import_lot, packaged_lot, write_lot
+from parkenv.lots.importers.import_options import ImportOptions
+from parkenv.scenarios.build import largest_lots
+from parkenv.scenarios.spec import scenario_specs
+
+TOWN = Path(__file__).parents[1] / "examples" / "outlined_town.geojson"
+AUTO = ImportOptions(guess_entry=True, guess_goal=True)
+
+
+@pytest.fixture
+def lots(tmp_path):
+    """A folder of three lots."""
+    folder = tmp_path / "lots"
+    folder.mkdir()
+    for name, lot in (("b", grid_lot(2, 5)), ("a", grid_lot(4, 30)), ("mini", packaged_lot("mini"))):
+        write_lot(lot, folder / f"{name}.geojson")
+    (folder / "notes.txt").write_text("no lot")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("rows", "kind"),
+    [
+        (double_row(), "perpendicular"),
+        ([row((0.0, 0.0), 0.0, 12, angle_deg=60.0)], "oblique"),
+        ([kerb((0.0, 0.0), 0.0, 6), kerb((36.0, -5.5), 180.0, 6)], "kerbside"),
+        ([kerb((0.0, 0.0), 0.0, 6), row((30.0, -5.5), 180.0, 10)], "mixed"),
+    ],
+)
+def test_lots_are_of_the_kind_of_their_slots(tmp_path, rows, kind):
+    lot = import_lot(write(tmp_path / "made.geojson", document(rows)), AUTO).lot()
+    found = lot_columns(lot, drive=False)
+    assert (found["kind"], found["slots"]) == (kind, lot.n_slots)
+    assert sum(found[name] for name in ("perpendicular", "oblique", "kerbside")) == lot.n_slots
+
+
+def test_the_drive_is_that_to_the_farthest_slot():
+    lot = grid_lot(2, 30)
+    assert longest_drive_m(lot) == pytest.approx(79.75), (
+        "30 slots of 2.5 m, 3 m from the entry, and across the lane"
+    )
+    found = lot_columns(lot, drive=False)
+    assert found["drive_s"] == pytest.approx(longest_drive_m(lot) * 0.36, abs=0.06)
+    assert [lot_columns(grid_lot(2, n), drive=False)["size"] for n in (39, 40, 99, 100)] == [
+        "small", "medium", "medium", "large",
+    ]  # fmt: skip
+
+
+def test_a_census_is_a_table_and_pictures(lots, tmp_path):
+    out = tmp_path / "census"
+    done = parkenv("lot", "census", lots, "--no-drive", "--out", out)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "3 lots, 140 slots: 3 clean" in done.stdout
+    assert sorted(path.name for path in out.iterdir()) == [
+        "census.csv", "census.png", "contact-sheet-1.png", "summary.json",
+    ]  # fmt: skip
+    rows = json.loads((out / "summary.json").read_text())["rows"]
+    assert [row["slots"] for row in rows] == [120, 10, 10], "the largest first"
+    with (out / "census.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert tuple(table[0]) == COLUMNS
+    assert [row["file"] for row in table] == [row["file"] for row in rows]
+    assert float(table[0]["drive_s"]) == rows[0]["drive_s"]
+
+
+def test_what_is_no_lot_is_named_and_the_others_are_counted(lots, tmp_path):
+    (lots / "broken.geojson").write_text('{"type": "FeatureCollection", "features": [')
+    done = parkenv("lot", "census", lots, "--no-drive", "--out", tmp_path / "census")
+    assert (done.returncode, "3 clean, 1 invalid" in done.stdout) == (2, True)
+    rows = json.loads((tmp_path / "census" / "summary.json").read_text())["rows"]
+    assert [row["result"] for row in rows] == ["clean"] * 3 + ["invalid"]
+    assert "not JSON" in rows[-1]["reason"]
+    assert count_lot(lots / "broken.geojson")[1] is None
+    for place, message in ((tmp_path / "none", "no such file or folder"), (tmp_path, "holds no lot")):
+        with pytest.raises(InputError, match=message):
+            lot_files([place])
+        refused = parkenv("lot", "census", place)
+        assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
+
+
+def test_the_largest_lots_are_chosen(lots):
+    specs = scenario_specs(lots)
+    assert [spec.title for spec in largest_lots(specs, 2)] == ["a", "b"]
+    assert len(largest_lots(specs, 9)) == 3
+
+
+@pytest.mark.slow  # about half a minute: the story of docs/own.md on fewer episodes
+def test_three_commands_lead_from_a_town_to_a_comparison(tmp_path):
+    for command in (
+        ("lot", "import", TOWN, "--split", "--out", "lots"),
+        ("lot", "census", "lots", "--no-drive", "--out", "census"),
+        ("compare", "--scenario", "lots", "--largest", 3, "--agents", "mdp,first-free", "-n", 2, "--jobs", 1,
+         "--occupancy-levels", "none", "--no-figures", "--report", "--out", "compared"),
+    ):  # fmt: skip
+        done = parkenv(*command, cwd=tmp_path)
+        assert (done.returncode, done.stderr) == (0, ""), command
+    census = json.loads((tmp_path / "census" / "summary.json").read_text())["rows"]
+    rows = json.loads((tmp_path / "compared" / "summary.json").read_text())["rows"]
+    compared = list(dict.fromkeys(row["scenario"] for row in rows))
+    assert compared == [row["lot"] for row in census[:3]]
+    assert np.isfinite([row["total_s"] for row in rows]).all()
+    assert (tmp_path / "compared" / "report.html").stat().st_size > 100_000

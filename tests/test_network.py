@@ -1,0 +1,278 @@
+"""The agent `network`: symmetry, one size for all lots, masks, parity with PyTorch, files, training."""
+
+import dataclasses
+import itertools
+import json
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from parkenv.belief.slot_belief import SlotBelief
+from parkenv.errors import InputError
+from parkenv.evaluation.simulate import simulate
+from parkenv.lots import grid_lot
+from parkenv.scenarios.build import make_scenario
+from planners.agent import agent_file, make_agent
+from planners.network.agent import NetworkAgent
+from planners.network.features import ACTION_FEATURES, CANDIDATES, PARKING, TOKEN_FEATURES, WAITING, Features
+from planners.network.policy import SHIPPED, NetworkCard, NetworkPolicy
+
+
+def random_policy(seed=0, **card):
+    """A network with random weights."""
+    rng, card = np.random.default_rng(seed), NetworkCard(**card)
+    return NetworkPolicy(
+        card, {name: rng.normal(0.0, 0.2, shape).astype(np.float32) for name, shape in card.shapes().items()}
+    )
+
+
+def decisions(agent, scenario, seed, most=60):
+    """The actions of one search, with observations, features and scores."""
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    observation, _ = env.reset(seed=seed)
+    memory, found = None, []
+    for _ in range(most):
+        action, memory = agent.predict(observation, memory)
+        features = None if agent.last_features is None else [a.copy() for a in agent.last_features]
+        found.append((observation, int(action), features, agent.last_scores))
+        observation, _, terminated, _, _ = env.step(action)
+        if terminated:
+            break
+    return found
+
+
+@pytest.mark.parametrize("name", ["campus", "street"])
+def test_turning_the_map_changes_nothing(name):
+    """A quarter turn permutes the columns of the moves, and nothing else that the agent knows."""
+    scenario = make_scenario(name)
+    agent, turned = (NetworkAgent(scenario, random_policy()) for _ in range(2))
+    order = [2, 3, 1, 0]  # up becomes left, and so on
+    turned._neighbors = turned._neighbors[:, order].copy()
+    turned._move_s = turned._move_s[:, order].copy()
+    found = decisions(agent, scenario, seed=3)
+    memory = None
+    rows = [*order, PARKING, WAITING]
+    for observation, _, features, scores in found:
+        _, memory = turned.predict(observation, memory)
+        if features is None:
+            continue
+        for one, other in zip(features, turned.last_features, strict=True):
+            np.testing.assert_array_equal(one[rows], other)
+        np.testing.assert_allclose(scores[rows], turned.last_scores, atol=1e-5)
+    assert len(found) > 3
+
+
+def test_the_same_weights_serve_small_and_large_lots():
+    policy = random_policy()
+    for lot in (grid_lot(2, 5), grid_lot(20, 50)):
+        scenario = make_scenario(lot, day_error=0.8)
+        agent = NetworkAgent(scenario, policy)
+        (_, _, features, scores), *_ = decisions(agent, scenario, seed=0, most=1)
+        assert features[0].shape == (6, ACTION_FEATURES)
+        assert features[1].shape == (6, CANDIDATES, TOKEN_FEATURES)
+        assert np.isfinite(scores[features[2]]).all()
+        assert all(np.isfinite(a[features[2]]).all() for a in features[:2])
+
+
+def test_times_are_relative():
+    """If everything takes twice the time, the network observes the same."""
+    scenario = make_scenario("campus", day_error=0.0)
+    slow = scenario.replace(
+        v_drive=scenario.v_drive / 2.0, v_walk=scenario.v_walk / 2.0, failure_s=2.0 * scenario.failure_s,
+        wait_s=2.0 * scenario.wait_s, give_up_s=2.0 * scenario.give_up_s,
+    )  # fmt: skip
+    observation, _ = gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=0)
+    SlotBelief.of_observation(observation).decay_rate[:] = 0.0  # cars are as quick as before
+    agents = [NetworkAgent(one, random_policy()) for one in (scenario, slow)]
+    for agent, factor in zip(agents, (1.0, 2.0), strict=True):
+        # The costs of the look-ahead are in seconds, so they are scaled as well.
+        agent._failure_costs = agent._failure_costs * factor
+        agent.predict(observation)
+    for one, other in zip(agents[0].last_features[:2], agents[1].last_features[:2], strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_only_actions_that_there_are_are_taken(seed):
+    scenario = make_scenario("mini")
+    agent = NetworkAgent(scenario, random_policy(seed))
+    for observation, action, features, scores in decisions(agent, scenario, seed):
+        allowed = features[2]
+        np.testing.assert_array_equal(np.isfinite(scores), allowed)
+        np.testing.assert_array_equal(allowed[:PARKING], observation["action_mask"][:PARKING].astype(bool))
+        if observation["action_mask"][action] == 0:  # waiting
+            assert scores.argmax() == WAITING
+        if action == PARKING:
+            belief = SlotBelief.of_observation(observation)
+            assert not belief.observed_taken[observation["vertex"]]
+
+
+def test_the_look_ahead_knows_the_shortest_drive_and_walk_where_all_slots_are_free():
+    scenario = make_scenario(grid_lot(4, 12), day_error=0.0)
+    problem = scenario.public()
+    agent = NetworkAgent(problem, random_policy())
+    belief = SlotBelief.of_forecast(np.full(problem.lot.n_slots, 1e-9), np.zeros(problem.lot.n_slots))
+    vertex = int(problem.lot.entry_vertices[0])
+    observation = {
+        "vertex": vertex, "time": np.zeros(2, np.float32), "action_mask": problem.action_masks[vertex],
+        **belief.to_observation(),
+    }  # fmt: skip
+    _, memory = agent.predict(observation)
+    near = memory.near
+    best = (near.table.seconds[near.index(vertex)][: near.n_slots] + near.cost_s).min()
+    assert agent.last_features.lookahead_s.min() == pytest.approx(best, rel=0.02)
+
+
+def test_numpy_and_torch_agree():
+    torch = pytest.importorskip("torch")
+    from parkenv.evaluation.training.network_fit import Network
+
+    rng = np.random.default_rng(0)
+    n = 32
+    tokens = rng.uniform(-1.0, 1.0, (n, 6, CANDIDATES, TOKEN_FEATURES)).astype(np.float32)
+    tokens[..., 0] = rng.random((n, 6, CANDIDATES)) < 0.7
+    actions = rng.uniform(0.0, 1.0, (n, 6, ACTION_FEATURES)).astype(np.float32)
+    allowed = rng.random((n, 6)) < 0.6
+    allowed[:, 0] = True
+    for without in ((), ("lookahead",), ("tokens",), ("day", "memory")):
+        policy = random_policy(without=without)
+        network = Network(policy.card)
+        with torch.no_grad():
+            for name, values in policy.weights.items():
+                network.layers[name.replace(".", "_")].copy_(torch.from_numpy(values))
+            found = network(*map(torch.from_numpy, (actions, tokens, allowed))).numpy()
+        batch = policy.scores(Features(actions, tokens, allowed, np.zeros((n, 6))))
+        np.testing.assert_allclose(batch[allowed], found[allowed], atol=2e-5)
+        for i in range(3):
+            single = policy.scores(Features(actions[i], tokens[i], allowed[i], np.zeros(6)))
+            np.testing.assert_allclose(single, batch[i], atol=2e-5)
+        for name, values in network.policy().weights.items():
+            np.testing.assert_array_equal(values, policy.weights[name])
+
+
+def test_files_keep_weights_and_card(tmp_path):
+    policy = random_policy(seed=3, trained_on=("a", "b"), command=("parkenv", "train"))
+    policy.save(tmp_path / "it.safetensors")
+    read = NetworkPolicy.load(tmp_path / "it.safetensors")
+    assert read.card == policy.card
+    for name, values in policy.weights.items():
+        np.testing.assert_array_equal(values, read.weights[name])
+
+
+def test_other_libraries_read_the_file(tmp_path):
+    safetensors = pytest.importorskip("safetensors.numpy")
+    policy = random_policy()
+    policy.save(tmp_path / "it.safetensors")
+    for name, values in safetensors.load_file(tmp_path / "it.safetensors").items():
+        np.testing.assert_array_equal(values, policy.weights[name])
+
+
+def spoilt():
+    """Bytes of files that are no network, by what is wrong."""
+    size = int.from_bytes(SHIPPED.read_bytes()[:8], "little")
+    data = SHIPPED.read_bytes()
+    header = json.loads(data[8 : 8 + size])
+
+    def with_header(**changes):
+        text = json.dumps({**header, **changes}).encode()
+        return len(text).to_bytes(8, "little") + text + data[8 + size :]
+
+    card = json.loads(header["__metadata__"]["parkenv"])
+    nan = np.full((len(data) - 8 - size) // 4, np.nan, "<f4").tobytes()
+    name = "token_1.weight"
+    yield "empty", b"", "no network"
+    yield "archive", b"PK\x03\x04" + bytes(50), "no network"
+    yield "cut", data[: len(data) // 2], "has no weights"
+    yield "no card", with_header(__metadata__={}), "has no card"
+    yield (
+        "other card",
+        with_header(__metadata__={"parkenv": json.dumps({"format": "parkenv-model-2"})}),
+        "no card",
+    )
+    wide = json.dumps({**card, "width": 10**9})
+    yield "too wide", with_header(__metadata__={"parkenv": wide}), "width"
+    yield "other shape", with_header(**{name: {**header[name], "shape": [1, 1]}}), name
+    yield "outside", with_header(**{name: {**header[name], "data_offsets": [-4, 4]}}), name
+    yield "no numbers", data[: 8 + size] + nan, "no numbers"
+
+
+@pytest.mark.parametrize(
+    ("what", "content", "wanted"), list(spoilt()), ids=lambda v: v if type(v) is str else ""
+)
+def test_bad_files_are_one_clear_line(tmp_path, what, content, wanted):
+    path = tmp_path / f"{what.replace(' ', '_')}.safetensors"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=wanted) as caught:
+        make_agent(f"network:{path}", make_scenario("mini"))
+    assert "\n" not in str(caught.value)
+    assert str(path) in str(caught.value)
+
+
+def test_a_missing_file_is_named():
+    with pytest.raises(InputError, match=r"nowhere\.safetensors"):
+        make_agent("network:nowhere.safetensors", make_scenario("mini"))
+
+
+def test_own_weights_are_named_after_a_colon(tmp_path):
+    path = tmp_path / "own.safetensors"
+    path.write_bytes(SHIPPED.read_bytes())
+    scenario = make_scenario("mini")
+    own, shipped = make_agent(f"network:{path}", scenario), make_agent("network", scenario)
+    assert [d[1] for d in decisions(own, scenario, 1)] == [d[1] for d in decisions(shipped, scenario, 1)]
+    assert agent_file(f"network:{path}") == path
+
+
+def test_the_shipped_network_is_small_and_says_what_it_is():
+    policy = NetworkPolicy.load()
+    assert sum(w.size for w in policy.weights.values()) < 300_000
+    assert policy.card.trained_on
+    assert policy.card.command[:3] == ("parkenv", "train", "network")
+    assert not policy.card.without
+
+
+@pytest.mark.parametrize("name", ["campus", "street", "jam", "mini"])
+def test_it_parks_and_repeats_itself(name):
+    scenario = make_scenario(name)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    agents = make_agent("network", scenario), make_agent("network", scenario)
+    for seed in range(5):
+        first, second = (simulate(env, agent, seed) for agent in agents)
+        assert not first.truncated
+        assert first.info["total_s"] == second.info["total_s"]
+        assert first.steps == second.steps
+
+
+def test_without_news_it_does_not_circle_forever():
+    """A network that always wants to turn back is made to drive on."""
+    scenario = make_scenario("campus")
+    policy = random_policy()
+    for weights in policy.weights.values():
+        weights[...] = 0.0
+    agent = NetworkAgent(scenario, policy)
+    visited = [int(observation["vertex"]) for observation, *_ in decisions(agent, scenario, 0, most=200)]
+    pairs = list(itertools.pairwise(visited))
+    assert max(pairs.count(pair) for pair in set(pairs)) < 20
+
+
+@pytest.mark.slow
+def test_trainings_are_repeatable_and_learn(tmp_path):
+    from parkenv.evaluation.training.network_training import NetworkTraining
+    from parkenv.evaluation.training.rl_training import MODEL
+
+    places = tuple(make_scenario(name) for name in ("mini", "campus"))
+    held_out = (make_scenario(grid_lot(4, 10), name="grid", day_error=0.8),)
+    training = NetworkTraining("network", 400, 400, places, range(2_000_000, 2_000_010), held_out)
+    curves = [training.train(0, tmp_path / str(i)) for i in range(2)]
+    assert (tmp_path / "0" / MODEL).read_bytes() == (tmp_path / "1" / MODEL).read_bytes()
+    for one, other in zip(*curves, strict=True):
+        assert {**one, "wall_s": 0.0} == {**other, "wall_s": 0.0}
+    card = NetworkPolicy.load(tmp_path / "0" / MODEL).card
+    assert card.trained_on == ("mini", "campus")
+    assert card.decisions == curves[0][-1]["steps"] > 400
+    # A training that has ended is not repeated.
+    before = (tmp_path / "0" / MODEL).stat().st_mtime_ns
+    training.train(0, tmp_path / "0")
+    assert (tmp_path / "0" / MODEL).stat().st_mtime_ns == before
+    with pytest.raises(InputError, match="steps is 0"):
+        dataclasses.replace(training, steps=0)
