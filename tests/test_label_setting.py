@@ -250,12 +250,15 @@ def test_changes_everywhere_are_planned_afresh(city):
 # --- the agents ------------------------------------------------------------------------------------
 
 
+# On a full day of mini, failing for ever costs nothing.
+@pytest.mark.filterwarnings("ignore:gamma.*failure cost of 0 s:planners.CirclingWarning")
 @pytest.mark.parametrize("failure_s", [0.0, 10.0, 90.0])
 @pytest.mark.parametrize("name", SCENARIO_NAMES)
 def test_both_solvers_lead_to_the_same_actions(name, failure_s):
-    scenario = make_scenario(name, failure_s=failure_s, day_error=0.0)
+    scenario = make_scenario(name, failure_s=failure_s)
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     agents = [make_agent("mdp", scenario, solver=s) for s in ("label_setting", "policy_iteration")]
+    replans = 0
     for seed in range(6):
         observation, _ = env.reset(seed=seed)
         memories, over, steps = [None, None], False, 0
@@ -268,8 +271,9 @@ def test_both_solvers_lead_to_the_same_actions(name, failure_s):
             observation, _, terminated, truncated, _ = env.step(actions[0])
             over, steps = terminated or truncated, steps + 1
         assert memories[0].replans == memories[1].replans
-        assert memories[0].replans > 0
+        replans += memories[0].replans
         np.testing.assert_array_equal(memories[0].policy, memories[1].policy)
+    assert replans > 0, "on an empty day a search ends without any"
 
 
 def test_the_plan_is_expected_to_take_the_same_time_by_either_solver():

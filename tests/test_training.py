@@ -217,7 +217,7 @@ def test_a_planner_that_finishes_nothing_cannot_be_cloned(monkeypatch):
 
 @pytest.mark.slow
 def test_cloning_begins_near_the_planner():
-    campus = make_scenario("campus", day_error=0)
+    campus = make_scenario("campus")
     shown = Demonstrations.collect("first-free", campus, range(5_000_000, 5_000_300))
     assert shown.local.shape == (len(shown.actions), 86)
     assert (shown.masks[np.arange(len(shown.actions)), shown.actions] == 1).all()
@@ -227,9 +227,10 @@ def test_cloning_begins_near_the_planner():
     fresh, _ = episode_times(model, campus, EVALUATED, 5)
     clone(model, shown, 0, updates=2000)
     cloned, _ = episode_times(model, campus, EVALUATED, 5)
-    planner = np.mean([row["total_s"] for row in Case(campus, "first-free").run(EVALUATED)[0]])
-    # The mean would be of those few searches in which a clone drives in circles.
-    assert np.median(cloned) < 1.2 * planner < np.median(fresh)
+    planner = [row["total_s"] for row in Case(campus, "first-free").run(EVALUATED)[0]]
+    # The mean would be of those few searches in which a clone drives in circles; on empty days any agent parks soon.
+    cloned_s, planner_s, fresh_s = (np.quantile(times, 0.75) for times in (cloned, planner, fresh))
+    assert cloned_s < 1.2 * planner_s < fresh_s
 
 
 def test_cloning_takes_the_read_only_arrays_of_a_worker():
