@@ -308,3 +308,14 @@ def test_a_detector_that_does_not_exist_is_named(tmp_path):
         refused = parkenv(command, "--detector", "nowhere:Mine", "--out", tmp_path / command, "--jobs", 1)
         assert (refused.returncode, len(refused.stderr.splitlines())) == (2, 1), refused.stderr
         assert "detector 'nowhere:Mine': no module 'nowhere'" in refused.stderr
+
+
+def test_a_damaged_image_is_refused_before_any_is_searched(tmp_path):
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    photos.mkdir()
+    whole = cv2.imencode(".png", np.zeros((8, 8), np.uint8))[1].tobytes()
+    (photos / "a.png").write_bytes(whole)
+    (photos / "b.png").write_bytes(whole[:40])
+    refused = parkenv("detect", photos, "--out", out)
+    assert (refused.returncode, refused.stdout, out.exists()) == (2, "", False)
+    assert f"{photos / 'b.png'}: is no image that can be read whole" in refused.stderr

@@ -306,6 +306,7 @@ CREATE VIEW session AS WITH RECURSIVE c(n) AS (SELECT 1 UNION ALL SELECT n + 1 F
         ("UPDATE session SET time = 9e999", "time of session 'a' is inf"),
         ("UPDATE session SET key = ''", "key of a session is empty"),
         ("UPDATE car SET x = 'west'", "could not convert"),
+        ("UPDATE car SET x = 1e300", "want .n, 3. of finite numbers, at most 1e"),
         ("UPDATE car SET x = x'ff'", "could not convert"),
         ("UPDATE session SET key = CAST(x'ff' AS TEXT)", "Could not decode"),
         ("DELETE FROM lot", "a table is missing or empty"),

@@ -109,6 +109,11 @@ def test_survey_and_map_on_the_command_line(tmp_path):
     assert asked.returncode == 0, asked.stderr
     assert "mini, tue 09:30, 1 session" in asked.stdout
     assert len((tmp_path / "m" / "slots.csv").read_text().splitlines()) == 11
+    spec = (out / "experiment.json").read_text()
+    other = parkenv("survey", "--scenario", "campus", "--sessions", 1, "--jobs", 1, "--out", out)
+    assert (other.returncode, len(other.stderr.splitlines())) == (2, 1)
+    assert "is a map of lot 'mini', not of 'campus'" in other.stderr
+    assert (out / "experiment.json").read_text() == spec
     for words, message in (
         (["map", file, "--scenario", "campus"], "is a map of lot 'mini', not of 'campus'"),
         (["map", file, "--scenario", "mini", "--slot", "Z9"], "--slot Z9: lot 'mini' has no such slot"),

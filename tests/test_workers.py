@@ -2,6 +2,7 @@
 
 import json
 import os
+import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 from command_line import parkenv
 
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.workers import HERE, Workers
+from parkenv.evaluation.experiments.workers import HERE, Workers, kill_workers
 
 CLUSTERS = ("ray", "dask")
 
@@ -54,6 +55,17 @@ def test_a_killed_worker_loses_its_own_task_which_is_run_again(tmp_path, backend
     again = sum(Path(f"{marker}.{k}").read_text().count("run") for k in range(12)) - 12
     # loky breaks up the pool when a worker dies, so that the one beside it starts its task over, too.
     assert again <= (3 if backend == "loky" else 0)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_workers_without_tasks_are_killed_on_request():
+    with Workers(2) as workers:
+        started = set(workers.in_order([os.getpid] * 8))
+    assert all(Path(f"/proc/{pid}").exists() for pid in started)
+    kill_workers()
+    assert not any(Path(f"/proc/{pid}").exists() for pid in started)
+    kill_workers()
+    assert squares(Workers(2), 3) == {0: 0, 1: 1, 2: 4}, "others are started"
 
 
 def test_workers_print_no_lines_into_the_progress_bars_of_their_parent(capfd):

@@ -119,6 +119,8 @@ def main() -> None:
                 # What was interrupted could not close its files.
                 warnings.simplefilter("ignore", ResourceWarning)
     if received:
+        if workers := sys.modules.get("parkenv.evaluation.experiments.workers"):
+            workers.kill_workers()
         code = 128 + received[0]
     sys.exit(code if isinstance(code, int) else 0)
 

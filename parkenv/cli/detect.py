@@ -49,6 +49,8 @@ def detect(
 
     detector = HogDetector.load(*(model or ()), threshold=threshold, least_height=least_height)
     chosen = [f for path in images for f in (images_in(path) if path.is_dir() else [path])]
+    for file in chosen:
+        read_image(file)  # a damaged one is refused before any work
     if out is not None:
         make_folder(out)
     console = make_console()

@@ -104,7 +104,9 @@ def run_survey_of(spec: SurveySpec, out: Path, folder: args.ReportedRun, rerun: 
     map_file = out / MAP_FILE
     if folder.overwrite:
         map_file.unlink(missing_ok=True)
-    spec.write(out / SPEC_FILE)
+    # A map of another lot is refused before its specification is replaced.
+    with MapStore(map_file, its.lot):
+        spec.write(out / SPEC_FILE)
     console = make_console()
     with (
         args.workers_of(spec) as workers,

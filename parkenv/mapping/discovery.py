@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from parkenv.errors import InputError
-from parkenv.world.lot import ParkingLot
+from parkenv.world.lot import FARTHEST, ParkingLot
 
 FloatArray = NDArray[np.float64]
 
@@ -57,8 +57,10 @@ def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSl
         >>> found.xy.round(1).tolist(), found.cars.tolist()
         ([[0.0, 0.0]], [3])
     """
-    if cars.ndim != 2 or cars.shape[1] != 3 or not np.isfinite(cars).all():
-        raise InputError(f"cars have shape {cars.shape}, want finite (n, 3)")
+    if cars.ndim != 2 or cars.shape[1] != 3 or not (np.abs(cars) <= FARTHEST).all():
+        raise InputError(
+            f"cars have shape {cars.shape}, want (n, 3) of finite numbers, at most {FARTHEST:.0e}"
+        )
     if not (math.isfinite(reach) and reach > 0.0):
         raise InputError(f"reach is {reach} m, want a finite number above 0")
     if least < 1:

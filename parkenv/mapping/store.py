@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from parkenv.errors import InputError
 from parkenv.mapping.inference import SessionLog
 from parkenv.mapping.trips import Trip
-from parkenv.world.lot import ParkingLot
+from parkenv.world.lot import FARTHEST, ParkingLot
 
 FloatArray = NDArray[np.float64]
 
@@ -75,7 +75,7 @@ class Session:
         cars: (n, 3) float64, x, y in m and yaw in rad of the located cars.
 
     Raises:
-        InputError: an empty key, a time or a car that is not finite, or a probability outside 0 to 1.
+        InputError: an empty key, a time or a car that is not finite or too far, or a probability outside 0 to 1.
     """
 
     key: str
@@ -95,8 +95,11 @@ class Session:
             raise InputError(
                 f"p_occupied of session {self.key!r}: want (n_slots,) from 0 to 1, NaN where not seen"
             )
-        if self.cars.ndim != 2 or self.cars.shape[1] != 3 or not np.isfinite(self.cars).all():
-            raise InputError(f"cars of session {self.key!r} have shape {self.cars.shape}, want finite (n, 3)")
+        if self.cars.ndim != 2 or self.cars.shape[1] != 3 or not (np.abs(self.cars) <= FARTHEST).all():
+            raise InputError(
+                f"cars of session {self.key!r} have shape {self.cars.shape}, want (n, 3) of finite numbers, at most "
+                f"{FARTHEST:.0e}"
+            )
 
 
 class MapStore:

@@ -22,7 +22,7 @@ from typing import Any, Self, TypeVar, get_args
 from urllib.parse import urlsplit
 
 from joblib import Parallel, cpu_count, delayed
-from joblib.externals.loky import process_executor
+from joblib.externals.loky import process_executor, reusable_executor
 from joblib.externals.loky.backend import resource_tracker
 
 from parkenv.errors import InputError
@@ -228,6 +228,15 @@ def worker_start() -> dict[str, Any]:
     # Linux sends the signal when the thread ends that started the worker.
     by_signal = sys.platform == "linux" and threading.current_thread() is threading.main_thread()
     return {"initializer": _start_worker, "initargs": (os.getpid(), by_signal)}
+
+
+def kill_workers() -> None:
+    """Kill the workers of this machine that wait for further tasks; at its end this process waits until each has ended.
+
+    Workers that tidy up after themselves take seconds on a busy machine.
+    """
+    if reusable_executor._executor is not None:
+        reusable_executor._executor.shutdown(kill_workers=True)
 
 
 def _start_worker(parent: int, by_signal: bool) -> None:

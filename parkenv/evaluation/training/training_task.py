@@ -11,12 +11,13 @@ from typing import Any, ClassVar, NamedTuple
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.experiment import fingerprints, flat_tables
-from parkenv.evaluation.experiments.results import read_settings
+from parkenv.evaluation.experiments.results import SETTINGS, read_settings
 from parkenv.evaluation.experiments.spec import TrainingSpec
 from parkenv.evaluation.experiments.workers import Workers
 from parkenv.evaluation.figures.learning_curves import COLORS
 from parkenv.evaluation.training.curve_file import CURVE, read_curve
 from parkenv.evaluation.training.rl_training import AnyTraining
+from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.spec import scenario_spec
 
 EVALUATION_SEED, TEST_SEED = 2_000_000, 3_000_000
@@ -121,11 +122,24 @@ class TrainingTask(ABC):
         """Test the models and draw the figure; return the entries of the summary, and a table to print."""
 
 
-def name_of(settings: Row) -> str:
-    """Return the name of a training in a figure with others."""
-    scenarios, cloned = settings.get("scenario", ()), settings.get("clone")
-    name = f"{settings['algorithm']}{' on ' + ', '.join(scenarios) if len(scenarios) > 1 else ''}"
-    return f"{name} after cloning {cloned}" if cloned else name
+class _Naming(Spec, extra="ignore"):
+    """The settings that a training is named after."""
+
+    algorithm: str
+    scenario: Several[str] | None = None
+    clone: str | None = None
+
+
+def name_of(settings: Row, source: str = "settings") -> str:
+    """Return the name of a training in a figure with others.
+
+    Raises:
+        InputError: a setting is of another kind; the message starts with `source`.
+    """
+    its = _Naming.parse(settings, source)
+    scenarios = its.scenario or ()
+    name = f"{its.algorithm}{' on ' + ', '.join(scenarios) if len(scenarios) > 1 else ''}"
+    return f"{name} after cloning {its.clone}" if its.clone else name
 
 
 def curves_beside(folders: Sequence[str], out: Path, task: TrainingTask) -> dict[str, list[list[Row]]]:
@@ -154,6 +168,7 @@ def curves_beside(folders: Sequence[str], out: Path, task: TrainingTask) -> dict
         curves = [curve for curve in curves if curve]
         if settings is None or not curves or "algorithm" not in settings:
             raise InputError(f"--beside: {folder} holds no training")
+        label = name_of(settings, str(folder / SETTINGS))
         theirs = task.evaluation_settings(settings)
         for name, value in task.evaluation_settings(own).items():
             if theirs[name] != value:
@@ -161,10 +176,9 @@ def curves_beside(folders: Sequence[str], out: Path, task: TrainingTask) -> dict
                     f"--beside: {name} is {theirs[name]!r} in {folder} and {value!r} here; their evaluations cannot "
                     "be compared"
                 )
-        name = name_of(settings)
-        if name == name_of(own) or name in beside:
-            name = f"{name} ({folder})"
-        beside[name] = curves
+        if label == name_of(own) or label in beside:
+            label = f"{label} ({folder})"
+        beside[label] = curves
     return beside
 
 
