@@ -108,10 +108,11 @@ def test_a_signal_during_compiled_code_stops_it():
         "work(1)\n"
         "try:\n"
         "    with stop_signals():\n"
-        "        subprocess.Popen(['sh', '-c', f'sleep 0.1; kill -TERM {os.getpid()}'])\n"
+        "        killer = subprocess.Popen(['sh', '-c', f'sleep 0.1; kill -TERM {os.getpid()}'])\n"
         "        while True:\n"
         "            work(1_000_000)\n"
         "except KeyboardInterrupt:\n"
+        "    killer.wait()\n"
         "    print('stopped')\n"
     )
     assert printed(script) == "stopped\n"
