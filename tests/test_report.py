@@ -346,7 +346,7 @@ def test_a_survey_is_driven_again(tmp_path):
     assert done.returncode == 0, done.stderr
     data = data_of(out / "report.html")
     jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
-    (drive,), sessions = data["drives"], RunFolder.read(out).table("sessions.csv")
+    (drive,), sessions = data["drives"], RunFolder.read(out).sessions()
     assert drive["key"] == sessions[0]["key"]
     assert drive["slot_accuracy"] == sessions[0]["slot_accuracy"]
     assert (drive["found"], drive["parked"]) == (sessions[0]["found"], sessions[0]["parked"])
