@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
-from planners.belief.path_evaluation import evaluate_path, expected_cost_to_slot
+from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED
+from planners.belief.path_evaluation import evaluate_path, expected_cost_to_slot, options_at_hand
 from planners.belief.path_rollout import is_worth_an_attempt, rollout_path
 from planners.belief.planning_graph import (
     BeliefSnapshot,
@@ -108,7 +108,7 @@ def _best_path(
     """Return the fields of `PathChoice`."""
     costs = budget.failure_costs
     plans = _plans(vertex, failure_s, costs, graph, belief, paths)
-    options, fallback_s = _options_at_hand(vertex, plans.search_s.min(), graph, belief)
+    options, fallback_s = _options_and_fallbacks(vertex, plans.search_s.min(), graph, belief)
     at_hand_s, slot = np.inf, -1
     for s in options:
         value = expected_cost_to_slot(vertex, s, belief.slots[s].p_free, 0.0, fallback_s[s], graph, belief)
@@ -209,7 +209,7 @@ def _action_values(
         n_stops, left_s = rollout_path(vertex, no_options, cost, graph, belief, path)
         found = _evaluate(vertex, n_stops, left_s, np.inf, no_options, no_fallback_s, graph, belief, path)
         search_s = min(search_s, found.onward_s)
-    options, fallback_s = _options_at_hand(vertex, search_s, graph, belief)
+    options, fallback_s = _options_and_fallbacks(vertex, search_s, graph, belief)
     for i in range(len(following)):
         move_s, target = graph.drive_s[vertex, following[i]], following[i : i + 1]
         for s in options:
@@ -375,7 +375,7 @@ def _evaluate(
 
 
 @compiled(error_model="numpy")
-def _options_at_hand(
+def _options_and_fallbacks(
     vertex: int, search_s: float, graph: PlanningGraph, belief: BeliefSnapshot
 ) -> tuple[IntArray, FloatArray]:
     """Return the best slots known to be free, and the remaining time if each slot is gone, s.
@@ -384,25 +384,8 @@ def _options_at_hand(
     another slot.
     """
     n = len(belief.slots)
-    options, n_options = np.empty(MOST_OPTIONS, np.int64), 0
     fallback_s, search_s = np.zeros(n), min(search_s, graph.give_up_s)
-    expected_s = np.full(MOST_OPTIONS, np.inf)
-    for s in range(n):
-        if belief.slots[s].state != OBSERVED_FREE:
-            continue
-        value = expected_cost_to_slot(vertex, s, belief.slots[s].p_free, 0.0, search_s, graph, belief)
-        if n_options < MOST_OPTIONS:
-            place = n_options
-            n_options += 1
-        elif value < expected_s[MOST_OPTIONS - 1]:
-            place = MOST_OPTIONS - 1
-        else:
-            continue
-        while place > 0 and expected_s[place - 1] > value:
-            expected_s[place], options[place] = expected_s[place - 1], options[place - 1]
-            place -= 1
-        expected_s[place], options[place] = value, s
-    options = options[:n_options]
+    options = options_at_hand(vertex, search_s, MOST_OPTIONS, graph, belief)
     for s in range(n):
         fallback_s[s] = search_s
         for o in options:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from parkenv.belief.slot_belief import OBSERVED_FREE
 from planners.belief.path_rollout import p_free_when_first_observed
 from planners.belief.planning_graph import (
     BeliefSnapshot,
@@ -55,6 +56,40 @@ def expected_cost_to_slot(
     p = p_free + (at.p_free_usual - p_free) * decayed_part(at.decay_rate, age + drive)
     expected: float = drive + p * graph.cost_s[slot] + (1.0 - p) * (fallback_s + graph.failure_s)
     return expected
+
+
+@compiled(error_model="numpy")
+def options_at_hand(
+    vertex: int, fallback_s: float, most: int, graph: PlanningGraph, belief: BeliefSnapshot
+) -> IntArray:
+    """Return the best slots known to be free, at most `most`, best first.
+
+    Args:
+        vertex: where the car is.
+        fallback_s: s, remaining time of the search if a slot is taken on arrival.
+        most: maximum number of slots.
+        graph: the lot.
+        belief: the belief.
+    """
+    options, n_options = np.empty(most, np.int64), 0
+    expected_s = np.full(most, np.inf)
+    for s in range(len(belief.slots)):
+        if belief.slots[s].state != OBSERVED_FREE:
+            continue
+        value = expected_cost_to_slot(vertex, s, belief.slots[s].p_free, 0.0, fallback_s, graph, belief)
+        if n_options < most:
+            place = n_options
+            n_options += 1
+        elif value < expected_s[most - 1]:
+            place = most - 1
+        else:
+            continue
+        while place > 0 and expected_s[place - 1] > value:
+            expected_s[place], options[place] = expected_s[place - 1], options[place - 1]
+            place -= 1
+        expected_s[place], options[place] = value, s
+    best: IntArray = options[:n_options]
+    return best
 
 
 @compiled(error_model="numpy")

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
-from planners.belief.path_evaluation import expected_cost_to_slot
+from planners.belief.path_evaluation import expected_cost_to_slot, options_at_hand
 from planners.belief.planning_graph import (
     BeliefSnapshot,
     FloatArray,
@@ -26,7 +26,7 @@ from planners.belief.planning_graph import (
     is_hidden,
     needs_attempt,
 )
-from planners.network.lookahead import Scratch, best_option, next_target, options_at_hand, path_value
+from planners.network.lookahead import Scratch, best_option, next_target, path_value
 from sim_sensors.compilation import compiled
 
 ACTION_COUNT = 6
@@ -36,6 +36,8 @@ FAILURE_COSTS = (1.0, 4.0, 16.0)
 """s, failure costs of the thesis's planner on the paths of the look-ahead."""
 CANDIDATES = 8
 """Number of slots that are tokens."""
+MOST_OPTIONS = 4
+"""Number of slots known to be free that the look-ahead considers."""
 PER_PATH = 6
 ACTION_FEATURES = 15 + PER_PATH * len(FAILURE_COSTS) + 12
 TOKEN_FEATURES = 14
@@ -138,7 +140,7 @@ def observe(
         here, 0.0, failure_costs[n_costs // 2], by_cost, scratch.seen_at, graph, belief
     )
     fallback_s = min(fallback_s, graph.give_up_s)
-    options = options_at_hand(here, fallback_s, graph, belief)
+    options = options_at_hand(here, fallback_s, MOST_OPTIONS, graph, belief)
     path_s, p_none = np.full((6, n_costs), np.inf), np.ones((6, n_costs))
     first, end_s, option_s = np.full((6, n_costs), -1), np.zeros((6, n_costs)), np.full(6, np.inf)
     for a in range(6):

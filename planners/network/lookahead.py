@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, UNOBSERVED
 from planners.belief.path_evaluation import expected_cost_to_slot
@@ -29,7 +28,6 @@ MOST_OBSERVATIONS = 192
 ENOUGH = 0.02  # P(nothing found) at which a path ends
 OBSERVE_AGAIN_S = 10.0
 """s until a slot that was observed taken is worth another observation along a path."""
-MOST_OPTIONS = 4  # maximum number of slots known to be free that are considered
 
 
 class Scratch(NamedTuple):
@@ -243,28 +241,3 @@ def path_value(
     for j in range(n_observed):
         scratch.seen_at[scratch.slots[j]] = -1.0
     return start_s + ahead, p_none, first_target, seconds
-
-
-@compiled(error_model="numpy")
-def options_at_hand(
-    vertex: int, fallback_s: float, graph: PlanningGraph, belief: BeliefSnapshot
-) -> NDArray[np.int64]:
-    """Return the best slots known to be free, up to `MOST_OPTIONS`, best first."""
-    options, n_options = np.empty(MOST_OPTIONS, np.int64), 0
-    expected_s = np.full(MOST_OPTIONS, np.inf)
-    for s in range(len(belief.slots)):
-        if belief.slots[s].state != OBSERVED_FREE:
-            continue
-        value = expected_cost_to_slot(vertex, s, belief.slots[s].p_free, 0.0, fallback_s, graph, belief)
-        if n_options < MOST_OPTIONS:
-            place = n_options
-            n_options += 1
-        elif value < expected_s[MOST_OPTIONS - 1]:
-            place = MOST_OPTIONS - 1
-        else:
-            continue
-        while place > 0 and expected_s[place - 1] > value:
-            expected_s[place], options[place] = expected_s[place - 1], options[place - 1]
-            place -= 1
-        expected_s[place], options[place] = value, s
-    return options[:n_options]
