@@ -89,7 +89,8 @@ def test_ctrl_c_while_modules_are_imported_is_quiet(tmp_path):
 
 def printed(script):
     """Run a script in a Python of its own, which has to end well and without a complaint; return what it printed."""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=60)
+    command = [sys.executable, "-W", "default::ResourceWarning", "-c", script]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout
 
@@ -142,6 +143,28 @@ def test_a_signal_while_a_compiled_module_is_imported_stops_after_it():
         "    print('stopped')\n"
     )
     assert printed(script) == "sent\nstopped\n"
+
+
+def test_a_signal_while_the_file_of_a_module_is_opened_leaves_no_file_open():
+    script = (
+        "import _io, os, signal\n"
+        "from parkenv.cli.stop_signals import stop_signals\n"
+        "open_code = _io.open_code\n"
+        "def interrupted(path):\n"
+        "    _io.open_code = open_code\n"
+        "    file = open_code(path)\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+        "    return file\n"
+        "try:\n"
+        "    with stop_signals():\n"
+        "        _io.open_code = interrupted\n"
+        "        import colorsys\n"
+        "        while True:\n"
+        "            pass\n"
+        "except KeyboardInterrupt:\n"
+        "    print('stopped')\n"
+    )
+    assert printed(script) == "stopped\n"
 
 
 def test_a_signal_while_numba_compiles_is_not_lost():

@@ -8,10 +8,15 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.machinery import ExtensionFileLoader
+from importlib.machinery import ExtensionFileLoader, SourceFileLoader
 from types import FrameType
 
-_IMPORTS_COMPILED = (ExtensionFileLoader.create_module.__code__, ExtensionFileLoader.exec_module.__code__)
+_IMPORTS = (
+    ExtensionFileLoader.create_module.__code__,
+    ExtensionFileLoader.exec_module.__code__,
+    SourceFileLoader.get_data.__code__,
+)
+"""Functions of importlib that import a compiled module, and that read a file of a module in Python."""
 _CALLED_BY_NUMBA = {"_numba_unpickle", "_raw_object_cache_notify", "_raw_object_cache_getbuffer"}
 """Functions of numba and llvmlite that compiled code calls: for the result of a function, and while LLVM compiles."""
 
@@ -21,12 +26,12 @@ def stop_signals() -> Iterator[list[int]]:
     """Raise KeyboardInterrupt on each of the signals during the block; yield the list of signals received so far.
 
     Signals that the caller of the process ignores, such as SIGHUP under `nohup`, stay ignored. A signal that comes
-    where an exception would crash the process is sent again until it comes elsewhere.
+    where an exception would do harm is sent again until it comes elsewhere.
     """
     received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
-        if _would_crash(frame):
+        if _does_harm(frame):
             _thread.start_new_thread(os.kill, (os.getpid(), number))
             return
         received.append(number)
@@ -45,13 +50,15 @@ def stop_signals() -> Iterator[list[int]]:
             signal.signal(number, handler)
 
 
-def _would_crash(frame: FrameType | None) -> bool:
-    """Whether compiled code has called this code, and would end the process, or lose the exception, if it raised one.
+def _does_harm(frame: FrameType | None) -> bool:
+    """Whether an exception raised here would end the process, be lost or leave a file open.
 
-    So do modules in C++ while they are imported, and numba while it compiles and while it makes Python objects.
+    Compiled code that called this code may end the process or lose the exception: modules in C++ while they are
+    imported, and numba while it compiles and while it makes Python objects. A file stays open where importlib has
+    opened a module's file and not yet entered its `with`: Python warns of that where warnings are on.
     """
     while frame is not None:
-        if frame.f_code in _IMPORTS_COMPILED or frame.f_code.co_name in _CALLED_BY_NUMBA:
+        if frame.f_code in _IMPORTS or frame.f_code.co_name in _CALLED_BY_NUMBA:
             return True
         frame = frame.f_back
     return False
