@@ -1,6 +1,6 @@
 """The network's weights: their file, and the network itself in NumPy.
 
-A file is in the safetensors format, read here without its library, and runs no code when it is opened.
+The file is a model file as of `planners.model_file`; it is read without PyTorch and the library of safetensors.
 """
 
 from __future__ import annotations
@@ -17,15 +17,14 @@ from pydantic import Field, JsonValue
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
-from parkenv.files.limited_reading import parse_json, read_bytes
+from parkenv.files.limited_reading import read_bytes
 from parkenv.files.spec_file import Several, Spec
+from planners.model_header import CARD_KEY, read_header
 from planners.network.features import ACTION_FEATURES, FAILURE_COSTS, PER_PATH, TOKEN_FEATURES, Features
 
-OBSERVATION = "network-1"
-"""Version of the layout of `planners.network.features`."""
+FORMAT = "parkenv-network-1"
 SHIPPED = Path(__file__).with_name("models") / "network.safetensors"
-PARTS = ("lookahead", "tokens", "day", "memory")
-_KEY, _MAX_BYTES, _MAX_WEIGHT = "parkenv", 8_000_000, 1e4
+_MAX_BYTES, _MAX_WEIGHT = 8_000_000, 1e4
 _HEADER = 15 + PER_PATH * len(FAILURE_COSTS)
 
 Part = Literal["lookahead", "tokens", "day", "memory"]
@@ -88,21 +87,14 @@ class NetworkPolicy(NamedTuple):
             InputError: the file is missing or damaged, or holds another network.
         """
         data = read_bytes(Path(path), _MAX_BYTES)
-        size = int.from_bytes(data[:8], "little")
-        if data[8:9] != b"{" or size > len(data) - 8:
-            raise InputError(f"{path}: no network of `parkenv train network`, or a damaged file")
-        header = parse_json(data[8 : 8 + size], f"{path}: header")
-        metadata = header.pop("__metadata__", None) if isinstance(header, dict) else None
-        text = metadata.get(_KEY) if isinstance(metadata, dict) else None
-        content = parse_json(text, f"{path}: card") if isinstance(text, str) else None
-        if not isinstance(content, dict) or content.get("format") != "parkenv-network-1":
+        header = read_header(data, path)
+        if header.card.get("format") != FORMAT:
             raise InputError(f"{path}: has no card of a network; want a file of `parkenv train network`")
-        card = NetworkCard.parse(content, f"{path}: card")
-        body, weights = data[8 + size :], {}
+        card = NetworkCard.parse(header.card, f"{path}: card")
+        weights = {}
         for name, shape in card.shapes().items():
-            entry = header.get(name)
-            begin, end = _offsets(entry, name, shape, len(body), path)
-            values = np.frombuffer(body[begin:end], "<f4").reshape(shape)
+            begin, end = _offsets(header.tensors.get(name), name, shape, len(header.body), path)
+            values = np.frombuffer(header.body[begin:end], "<f4").reshape(shape)
             if not (np.abs(values) <= _MAX_WEIGHT).all():
                 raise InputError(f"{path}: {name} has weights that are no numbers, or above {_MAX_WEIGHT:g}")
             weights[name] = values.astype(np.float32)
@@ -110,7 +102,7 @@ class NetworkPolicy(NamedTuple):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file, atomically."""
-        header: dict[str, object] = {"__metadata__": {_KEY: self.card.model_dump_json()}}
+        header: dict[str, object] = {"__metadata__": {CARD_KEY: self.card.model_dump_json()}}
         at = 0
         for name, values in self.weights.items():
             header[name] = {"dtype": "F32", "shape": values.shape, "data_offsets": [at, at + values.nbytes]}
