@@ -21,9 +21,10 @@ from pydantic_core import to_jsonable_python
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
-from parkenv.files.limited_reading import parse_json, read_bytes
+from parkenv.files.limited_reading import read_bytes
 from parkenv.files.spec_file import Several, Spec
 from parkenv.world.lot import ACTIONS
+from planners.model_header import CARD_KEY, read_header
 from planners.names import ALGORITHMS
 
 SUFFIX = ".safetensors"
@@ -33,8 +34,7 @@ FIXED_NUMBERS, NUMBERS_PER_SLOT = 46, 8
 """Size of that observation: for k slots, 46 + 8k numbers."""
 COMMANDS = {"search": "parkenv compare", "drive": "parkenv park"}
 """Commands that run the models of each task."""
-_KEY = "parkenv"
-_MAX_HEADER, _MAX_BYTES = 1_000_000, 500_000_000
+_MAX_BYTES = 500_000_000
 _MAX_WEIGHT = 1e6  # products of larger ones over several layers could overflow
 _ZIP = b"PK"
 
@@ -142,19 +142,7 @@ class ModelCard(Spec):
                 f"{path}: is an archive of pickled objects, which run code when they are loaded; if you trust its "
                 f"author, convert it to a {SUFFIX} file: name it once with --trust-model (compare, park, benchmark run)"
             )
-        # The layout of safetensors: the header's length, 8 bytes; the header, JSON; the tensors.
-        size = int.from_bytes(data[:8], "little")
-        if not data[8:9] == b"{" or size > min(_MAX_HEADER, len(data) - 8):
-            raise InputError(f"{path}: no model file, or a damaged one")
-        header = parse_json(data[8 : 8 + size], f"{path}: header")
-        text = header.get("__metadata__", {})
-        text = text.get(_KEY) if isinstance(text, dict) else None
-        if not isinstance(text, str):
-            raise InputError(f"{path}: no model of `parkenv train`: it has no card")
-        content = parse_json(text, f"{path}: card")
-        if not isinstance(content, dict):
-            raise InputError(f"{path}: card is a {type(content).__name__}, want a JSON object")
-        return cls.parse(content, f"{path}: card")
+        return cls.parse(read_header(data, path).card, f"{path}: card")
 
     def build(self) -> Any:
         """Build the policy, with random weights."""
@@ -236,7 +224,7 @@ def save_model(
     # Networks may share tensors; safetensors wants each on its own.
     weights = {key: value.detach().cpu().clone() for key, value in model.policy.state_dict().items()}
     with atomic_write(path) as beside:
-        beside.write_bytes(save(weights, {_KEY: card.model_dump_json()}))
+        beside.write_bytes(save(weights, {CARD_KEY: card.model_dump_json()}))
 
 
 def _observation_of(space: spaces.Space[Any]) -> tuple[str, str, int]:

@@ -319,3 +319,30 @@ def test_a_damaged_image_is_refused_before_any_is_searched(tmp_path):
     refused = parkenv("detect", photos, "--out", out)
     assert (refused.returncode, refused.stdout, out.exists()) == (2, "", False)
     assert f"{photos / 'b.png'}: is no image that can be read whole" in refused.stderr
+
+
+def grey_image(path):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(cv2.imencode(path.suffix, np.zeros((70, 140), np.uint8))[1].tobytes())
+    return path
+
+
+def test_every_image_has_a_picture_of_its_own(tmp_path):
+    photos, out = tmp_path / "photos", tmp_path / "out"
+    for name in ("a.png", "b.png", "b.jpg", "more/b.jpg"):
+        grey_image(photos / name)
+    done = parkenv("detect", photos, "--model", "side", "--out", out)
+    assert done.returncode == 0, done.stderr
+    names = sorted(path.name for path in out.glob("*.png"))
+    assert names[:3] == ["a_cars.png", "b.jpg_cars.png", "b.png_cars.png"]
+    assert names[3].startswith("more_b.jpg_cars-")
+    assert len(names) == 4
+
+
+def test_a_picture_never_replaces_an_image_that_is_searched(tmp_path):
+    a, before = grey_image(tmp_path / "a.png"), grey_image(tmp_path / "a_cars.png").read_bytes()
+    refused = parkenv("detect", tmp_path, "--out", tmp_path)
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert "a_cars.png would replace an image that is searched" in refused.stderr
+    assert (tmp_path / "a_cars.png").read_bytes() == before
+    assert parkenv("detect", a, "--model", "side", "--out", tmp_path).returncode == 0

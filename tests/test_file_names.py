@@ -2,13 +2,14 @@
 
 import gc
 import json
+from pathlib import Path
 
 import pytest
 from command_line import parkenv
 from hypothesis import given
 from hypothesis import strategies as st
 
-from parkenv.files.file_names import MAX_BYTES, file_name
+from parkenv.files.file_names import MAX_BYTES, distinct_names, file_name
 from parkenv.lots import load_lot, write_lot
 
 HOSTILE = "..[bold]$a_{$:b*?<|> CON.txt " + "ℵ" * 50
@@ -46,6 +47,19 @@ def test_different_names_have_different_files():
         "\ud800",
     ]
     assert len({file_name(name) for name in names}) == len(names)
+
+
+NAMES = st.sampled_from(["a", "A", "a.png", "b"])
+FILES = st.builds("{}/{}.{}".format, st.sampled_from(["x", "y"]), NAMES, st.sampled_from(["png", "jpg"]))
+
+
+@given(st.lists(FILES.map(Path), max_size=12))
+def test_different_files_have_distinct_names_and_one_alone_its_stem(files):
+    names = distinct_names(files)
+    assert len(set(names)) == len(set(files))
+    stems = [file.stem.casefold() for file in set(files)]
+    if len(set(stems)) == len(stems):
+        assert names == [file.stem for file in files]
 
 
 def lot_named(name, path):

@@ -1036,6 +1036,24 @@ def test_the_command_line_draws_what_it_refuses_and_writes_no_lot(tmp_path):
     assert not (tmp_path / "bare.geojson").exists()
 
 
+@pytest.mark.parametrize(
+    ("out", "picture", "message"),
+    [
+        ("lot.txt", "lot.png", "lot.txt: a lot is written as .geojson or .json"),
+        ("none/lot.geojson", "lot.png", "none/lot.geojson: cannot be written: No such file or directory"),
+        ("taken.geojson", "lot.png", "taken.geojson: cannot be written: Is a directory"),
+        ("lot.geojson", "lot.jpg", "--picture lot.jpg: want a name that ends in .png"),
+        ("lot.geojson", "none/lot.png", "none/lot.png: cannot be written: No such file or directory"),
+    ],
+)
+def test_no_output_is_written_if_one_cannot_be(tmp_path, out, picture, message):
+    (tmp_path / "place.osm").write_text(car_park().xml(), encoding="utf-8")
+    (tmp_path / "taken.geojson").mkdir()
+    done = parkenv("lot", "import", "place.osm", "--out", out, "--picture", picture, cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", f"parkenv: error: {message}\n")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["place.osm", "taken.geojson"]
+
+
 def test_pictures_are_drawn_of_whatever_was_found(tmp_path):
     for name, draft in (
         ("all", car_park().draft(tmp_path)),

@@ -181,8 +181,8 @@ def spoilt():
     card = json.loads(header["__metadata__"]["parkenv"])
     nan = np.full((len(data) - 8 - size) // 4, np.nan, "<f4").tobytes()
     name = "token_1.weight"
-    yield "empty", b"", "no network"
-    yield "archive", b"PK\x03\x04" + bytes(50), "no network"
+    yield "empty", b"", "no model file"
+    yield "archive", b"PK\x03\x04" + bytes(50), "no model file"
     yield "cut", data[: len(data) // 2], "has no weights"
     yield "no card", with_header(__metadata__={}), "has no card"
     yield (

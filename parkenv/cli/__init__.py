@@ -37,6 +37,7 @@ from parkenv.cli import (
     sensors,
     survey,
     train,
+    verify,
 )
 from parkenv.cli.command import add, group
 from parkenv.cli.stop_signals import stop_signals
@@ -78,6 +79,7 @@ add(app, "park", park.park, DRIVE)
 app.add_typer(lot.app, rich_help_panel=DATA)
 app.add_typer(occupancy.app, rich_help_panel=DATA)
 add(app, "schema", schema.schema, DATA)
+add(app, "verify", verify.verify, DATA)
 add(app, "bench", bench.bench, DATA)
 
 

@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
+from parkenv.cli.folder_run import run_into
 from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
-from parkenv.cli.tables import command_line, make_console, make_table, progress_bar
+from parkenv.cli.tables import make_console, make_table
 from parkenv.cli.trust import readable_models, require_trust
 from parkenv.evaluation.plurals import plural
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
     from rich.table import Table
 
     from parkenv.evaluation.experiments.spec import CommuteSpec
@@ -113,18 +113,7 @@ def run_commute_of(spec: CommuteSpec, out: Path, folder: args.ReportedRun) -> No
     from parkenv.evaluation.experiments.commute import run_commute
 
     console = make_console()
-    with progress_bar(console, "searches") as progress:
-        bars: list[TaskID] = []
-        result = run_commute(
-            spec,
-            out,
-            command=command_line(),
-            resume=folder.resume,
-            overwrite=folder.overwrite,
-            workers=args.workers_of(spec),
-            on_start=lambda n: bars.append(progress.add_task("Driving", total=n)),
-            on_progress=lambda n: progress.advance(bars[0], n),
-        )
+    result = run_into(out, run_commute, spec, folder, console, doing="Driving", unit="searches")
     for name in dict.fromkeys(row["scenario"] for row in result.weeks):
         console.print(_table(name, [row for row in result.weeks if row["scenario"] == name]))
     if not result.complete:

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
+from parkenv.cli.folder_run import run_into
 from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import (
     WIDE,
-    command_line,
     make_console,
     make_table,
     print_recorded,
-    progress_bar,
 )
 from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
@@ -23,7 +22,6 @@ from parkenv.evaluation.plurals import plural
 from parkenv.files.known_names import RigName
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
     from rich.table import Table
 
     from parkenv.evaluation.experiments.compare import Case
@@ -146,18 +144,7 @@ def run_comparison(
             raise InputError("--rerun records what sensors measure: add --rig laser")
         require_viewer()
     console = make_console()
-    with progress_bar(console, "episodes") as progress:
-        bars: list[TaskID] = []
-        result = run_experiment(
-            spec,
-            out,
-            command=command_line(),
-            resume=folder.resume,
-            overwrite=folder.overwrite,
-            workers=args.workers_of(spec),
-            on_start=lambda n: bars.append(progress.add_task("Searching", total=n)),
-            on_progress=lambda n: progress.advance(bars[0], n),
-        )
+    result = run_into(out, run_experiment, spec, folder, console, doing="Searching", unit="episodes")
     count = setting_count(result.rows)
     for printed in result_tables(result.rows, console.width) if count <= MOST_TABLES else []:
         console.print(printed)

@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from parkenv.files.known_names import LOT_SUFFIXES, PACKAGED_LOTS, SCENARIO_NAMES, SENSOR_MODELS, WEATHERS
+from parkenv.files.known_names import (
+    LOT_SUFFIXES,
+    PACKAGED_LOTS,
+    SCENARIO_NAMES,
+    SENSOR_MODELS,
+    VERIFY_CASES,
+    WEATHERS,
+)
 from planners.names import AGENTS
 
 Completer = Callable[[str], list[str]]
@@ -50,6 +57,7 @@ _TABLES = (".toml", ".json")
 COMPLETERS: dict[str, Completer] = {
     "agents": completer(tuple(AGENTS), several=True),
     "calibrated": completer((), (".json",)),
+    "cases": completer(VERIFY_CASES, several=True),
     "clone": completer(tuple(AGENTS)),
     "detector": completer(("hog", "side", "front"), (".npz",)),
     "evaluate_on": completer(SCENARIO_NAMES, (*_TABLES, ".geojson"), several=True),
@@ -68,5 +76,10 @@ COMPLETERS: dict[str, Completer] = {
     "weather": completer(WEATHERS, several=True),
 }
 """How the values of an argument or option are completed."""
-NAMES = {"agents": ", ".join(AGENTS), "scenarios": ", ".join(SCENARIO_NAMES), "weathers": ", ".join(WEATHERS)}
+NAMES = {
+    "agents": ", ".join(AGENTS),
+    "cases": ", ".join(VERIFY_CASES),
+    "scenarios": ", ".join(SCENARIO_NAMES),
+    "weathers": ", ".join(WEATHERS),
+}
 """Names that help texts list."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from parkenv.cli.tables import make_console, make_table, save_summary
 from parkenv.errors import InputError
 from parkenv.evaluation.plurals import plural
-from parkenv.files.file_names import file_name
+from parkenv.files.file_names import distinct_names, file_name
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -36,7 +36,7 @@ def detect(
         model (NAME|FILE): side, front, or an .npz of `parkenv train-detector`; repeatable.  [default: side and front]
         threshold (P): Least probability of a reported car.
         least_height (PX >= 8): Height of the smallest regions searched, px.  [default: the model's]
-        out, -o (DIR): Folder for pictures and summary.json.  [default: none]
+        out, -o (DIR): Folder for pictures, NAME_cars.png, and summary.json.  [default: none]
     """
     import cv2
     from rich.progress import track
@@ -51,11 +51,23 @@ def detect(
     chosen = [f for path in images for f in (images_in(path) if path.is_dir() else [path])]
     for file in chosen:
         read_image(file)  # a damaged one is refused before any work
+    drawings = [file_name(f"{name}_cars", ".png") for name in distinct_names(chosen)]
     if out is not None:
+        originals = {file.resolve() for file in chosen}
+        for drawing in drawings:
+            if (out / drawing).resolve() in originals:
+                raise InputError(f"--out {out}: {drawing} would replace an image that is searched")
         make_folder(out)
     console = make_console()
     rows, cells = [], []
-    for file in track(chosen, "Detecting", console=console, disable=not console.is_terminal):
+    progress = track(
+        zip(chosen, drawings, strict=True),
+        "Detecting",
+        total=len(chosen),
+        console=console,
+        disable=not console.is_terminal,
+    )
+    for file, drawing in progress:
         image = read_image(file)
         found = detector.detect(image)
         for box, p, end in zip(
@@ -67,7 +79,7 @@ def detect(
         if out is not None:
             colored = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
             drawn = draw_detections(colored, found)
-            with atomic_write(out / file_name(f"{file.stem}_cars", ".png")) as beside:
+            with atomic_write(out / drawing) as beside:
                 beside.write_bytes(cv2.imencode(".png", drawn[..., ::-1])[1].tobytes())
     headings = ["file", "left", "top", "right", "bottom", "probability", "view"]
     console.print(make_table(None, headings, cells))
@@ -115,6 +127,7 @@ def train_detector(
         jitter (N >= 0): Shifted copies of each car; 0 if the crops are not aligned.
         misaligned (N >= 0): Misaligned crops of each car as negatives; 0 if the crops are not aligned.
     """
+    from parkenv.files.atomic_write import check_writable
     from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
     from parkenv.perception.cross_validation import cross_validated
     from parkenv.perception.hog import Descriptor
@@ -124,6 +137,7 @@ def train_detector(
         raise InputError("give either --uiuc FOLDER or --crops FOLDER")
     if out.suffix != ".npz":
         raise InputError(f"--out {out}: want a name that ends in .npz")
+    check_writable(out)
     data = read_uiuc_training(uiuc) if uiuc is not None else read_crop_folder(Path(str(crops)))
     descriptor = Descriptor(128, 128 if front else 64, normalization)
     settings = TrainingSettings(

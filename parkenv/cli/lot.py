@@ -143,7 +143,9 @@ def import_place(
         split: Find the car parks of a town and write a lot of each; entries and goals are guessed.
         least (N >= 2): Number of spaces of the smallest car park, with --split.
     """
+    from parkenv.files.atomic_write import check_writable
     from parkenv.lots import import_lot, write_lot
+    from parkenv.lots.geojson import check_lot_output
     from parkenv.lots.importers.import_options import ImportOptions
     from parkenv.lots.provenance import Provenance
 
@@ -164,6 +166,11 @@ def import_place(
             )
         _import_town(place, out, options, least)
         return
+    check_lot_output(out)
+    if picture is not None:
+        if picture.suffix.lower() != ".png":
+            raise InputError(f"--picture {picture}: want a name that ends in .png")
+        check_writable(picture)
     draft = import_lot(place, options)
     for line in draft.found:
         console.print(line)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -20,9 +21,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         InputError: the file cannot be written; the message names it.
     """
     path = Path(path)
-    if not path.name:
-        raise InputError(f"{path}: cannot be written: is no name of a file")
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    beside = _temporary(path)
     try:
         yield beside
         beside.replace(path)
@@ -31,6 +30,30 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # also where there is no such file, on a file system that is read-only
             beside.unlink()
+
+
+def check_writable(path: str | os.PathLike[str]) -> None:
+    """Check that `atomic_write` can write a file, before any work; nothing is left behind, a previous file stays.
+
+    Raises:
+        InputError: the file cannot be written; the message names it.
+    """
+    path = Path(path)
+    beside = _temporary(path)
+    try:
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        beside.touch()
+        beside.unlink()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _temporary(path: Path) -> Path:
+    """Return the temporary file that is written beside a file."""
+    if not path.name:
+        raise InputError(f"{path}: cannot be written: is no name of a file")
+    return path.with_name(f".{path.name}.{os.getpid()}.part")
 
 
 def append_text(path: Path, text: str) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import atomic_write, check_writable
 from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import read_json
 from parkenv.lots.geojson_slots import SLOT_SHAPE, RawFeature, is_coordinate, read_slots
@@ -53,8 +53,7 @@ def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None =
         InputError: the name does not end in `.geojson` or `.json`, or the file cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() not in (".geojson", ".json"):
-        raise InputError(f"{path}: a lot is written as .geojson or .json")
+    _check_suffix(path)
     head: dict[str, Any] = {
         "type": "FeatureCollection",
         "name": lot.name,
@@ -67,6 +66,21 @@ def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None =
     text = f'{json.dumps(head)[:-1]},\n"features": [\n{features}\n]}}\n'
     with atomic_write(path) as beside:
         beside.write_text(text, encoding="utf-8")
+
+
+def check_lot_output(path: Path) -> None:
+    """Check that `write_lot` can write a file, before any work.
+
+    Raises:
+        InputError: the name does not end in `.geojson` or `.json`, or the file cannot be written.
+    """
+    _check_suffix(path)
+    check_writable(path)
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix.lower() not in (".geojson", ".json"):
+        raise InputError(f"{path}: a lot is written as .geojson or .json")
 
 
 def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:

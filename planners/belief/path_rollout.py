@@ -261,7 +261,14 @@ def _extrapolate(last: int, n_observations: int, graph: PlanningGraph, path: Pat
 
 @compiled(error_model="numpy")
 def p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnapshot) -> float:
-    """Return P(free) at a given time of a slot observed taken, in fact or along the path; 0 if too low."""
+    """Return P(free) at a given time of a slot observed taken, in fact or along a path; 0 if too low or too soon.
+
+    Args:
+        slot: the slot.
+        time: s from now.
+        observed_at: s from now, when the path observed the slot last; negative if it did not.
+        belief: the belief.
+    """
     at = belief.slots[slot]
     if observed_at >= 0.0:
         if time - observed_at < OBSERVE_AGAIN_S:

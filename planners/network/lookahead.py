@@ -1,8 +1,8 @@
 """A quick look ahead: the expected time of one short path behind an action.
 
-The path follows the thesis's planner at one failure cost while every slot that it observes is taken. Its value is that
-of stopping at the first slot that is better than going on. Compared with `planners.belief`, no slot is remembered along
-the path, the path is short, and no target is inserted: a path takes microseconds.
+The path follows the thesis's planner at one failure cost while every slot that it observes is taken. Its value is the
+expected time of a car that stops at the first slot that is better than going on. Unlike in `planners.belief`, no slot
+is remembered along the path, the path is short, and no target is inserted: a path takes microseconds.
 """
 
 from __future__ import annotations
@@ -13,21 +13,13 @@ import numpy as np
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, UNOBSERVED
 from planners.belief.path_evaluation import expected_cost_to_slot
-from planners.belief.planning_graph import (
-    BeliefSnapshot,
-    FloatArray,
-    IntArray,
-    PlanningGraph,
-    decayed_part,
-    is_hidden,
-)
+from planners.belief.path_rollout import p_free_again
+from planners.belief.planning_graph import BeliefSnapshot, FloatArray, IntArray, PlanningGraph, is_hidden
 from sim_sensors.compilation import compiled
 
 MOST_STOPS = 48  # maximum number of vertices of a path
 MOST_OBSERVATIONS = 192
 ENOUGH = 0.02  # P(nothing found) at which a path ends
-OBSERVE_AGAIN_S = 10.0
-"""s until a slot that was observed taken is worth another observation along a path."""
 
 
 class Scratch(NamedTuple):
@@ -58,19 +50,6 @@ class Scratch(NamedTuple):
 
 
 @compiled(error_model="numpy")
-def p_free_at(slot: int, seconds: float, seen_at: float, belief: BeliefSnapshot) -> float:
-    """Return P(free) some seconds from now of a slot that was observed, in fact or along a path; 0 if too soon."""
-    at = belief.slots[slot]
-    if seen_at >= 0.0:
-        if seconds - seen_at < OBSERVE_AGAIN_S:
-            return 0.0
-        p: float = at.p_free_usual * decayed_part(at.decay_rate, seconds - seen_at)
-    else:
-        p = at.p_free + (at.p_free_usual - at.p_free) * decayed_part(at.decay_rate, seconds)
-    return p
-
-
-@compiled(error_model="numpy")
 def next_target(
     vertex: int,
     seconds: float,
@@ -95,8 +74,8 @@ def next_target(
         if at.state == UNOBSERVED and seen_at[s] < 0.0:
             value += failure_s * at.odds
         else:
-            p_free = p_free_at(s, seconds + graph.drive_s[vertex, s], seen_at[s], belief)
-            if p_free <= 0.1 * at.p_free_usual:
+            p_free = p_free_again(s, seconds + graph.drive_s[vertex, s], seen_at[s], belief)
+            if p_free == 0.0:
                 continue
             value += failure_s * (1.0 - p_free) / p_free
         if value < best:
@@ -135,7 +114,7 @@ def path_value(
     graph: PlanningGraph,
     belief: BeliefSnapshot,
     scratch: Scratch,
-) -> tuple[float, float, int, float]:
+) -> tuple[float, float, int]:
     """Evaluate the path of the thesis's planner from a vertex.
 
     Args:
@@ -150,7 +129,7 @@ def path_value(
         scratch: buffers.
 
     Returns:
-        The expected time from now, s; P(nothing found on the path); its first target, or -1; s until the path ends.
+        The expected time from now, s; P(nothing found on the path); its first target, or -1.
     """
     weights = scratch.weights[: len(belief.weights)]
     for h in range(len(weights)):
@@ -187,8 +166,8 @@ def path_value(
                     for h in range(len(weights)):
                         weights[h] *= (1.0 - p_free_if[h]) * rest
             else:
-                p_free = p_free_at(s, seconds, scratch.seen_at[s], belief)
-                if p_free <= 0.1 * at.p_free_usual:
+                p_free = p_free_again(s, seconds, scratch.seen_at[s], belief)
+                if p_free == 0.0:
                     continue
             scratch.slots[n_observed] = s
             scratch.seen_at[s] = seconds
@@ -240,4 +219,4 @@ def path_value(
         ahead = expected + p_rest * ahead
     for j in range(n_observed):
         scratch.seen_at[scratch.slots[j]] = -1.0
-    return start_s + ahead, p_none, first_target, seconds
+    return start_s + ahead, p_none, first_target

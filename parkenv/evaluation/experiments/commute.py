@@ -21,7 +21,7 @@ from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.agent_spec import AgentSpec, label_of
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
-from parkenv.evaluation.experiments.experiment import agent_fingerprints, fingerprints, flat_tables
+from parkenv.evaluation.experiments.experiment import spec_fingerprint
 from parkenv.evaluation.experiments.results import OUTCOME_COLUMNS, ResultFolder, Row
 from parkenv.evaluation.experiments.spec import SPEC_FILE, CommuteSpec
 from parkenv.evaluation.experiments.statistics import mean_interval, trimmed_mean_interval
@@ -244,15 +244,7 @@ class Commute:
 
     def fingerprint(self) -> Row:
         """Return everything that affects the outcome of a day; a resumed run must have the same settings."""
-        spec = self.spec
-        return {
-            "version": __version__,
-            "seed": spec.seed,
-            "fleet": spec.fleet,
-            "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in spec.scenarios},
-            "files": fingerprints(spec.files()),
-            "agent files": agent_fingerprints(agent.name for agent in spec.agents),
-        }
+        return {**spec_fingerprint(self.spec), "seed": self.spec.seed, "fleet": self.spec.fleet}
 
 
 def _with_fixed_slots(scenario: Scenario) -> Scenario:

@@ -24,7 +24,7 @@ from parkenv.evaluation.experiments.compare import (
     table,
 )
 from parkenv.evaluation.experiments.results import ResultFolder, Row
-from parkenv.evaluation.experiments.spec import SPEC_FILE, ExperimentSpec
+from parkenv.evaluation.experiments.spec import SPEC_FILE, CommuteSpec, ExperimentSpec
 from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.evaluation.figures.registry import ComparisonResults, remove_figures
 from parkenv.evaluation.trips.calibration import Calibration
@@ -152,13 +152,7 @@ class Experiment:
 
     def fingerprint(self) -> Row:
         """Return everything that affects the outcome of an episode; a resumed run must have the same settings."""
-        return {
-            "version": __version__,
-            "rig": self.spec.rig,
-            "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in self.spec.scenarios},
-            "files": fingerprints(self.spec.files()),
-            "agent files": agent_fingerprints(agent.name for agent in self.spec.agents),
-        }
+        return {**spec_fingerprint(self.spec), "rig": self.spec.rig}
 
 
 def _works_blind(agent: AgentSpec) -> bool:
@@ -194,6 +188,16 @@ def flat_tables(tables: Mapping[str, Any], before: str = "") -> Row:
             flat_tables(value, f"{before}{key}.") if isinstance(value, Mapping) else {f"{before}{key}": value}
         )
     return flat
+
+
+def spec_fingerprint(spec: ExperimentSpec | CommuteSpec) -> Row:
+    """Return the version, the scenarios, and hashes of the files of scenarios and agents."""
+    return {
+        "version": __version__,
+        "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in spec.scenarios},
+        "files": fingerprints(spec.files()),
+        "agent files": agent_fingerprints(agent.name for agent in spec.agents),
+    }
 
 
 def fingerprints(files: Iterable[Path]) -> dict[str, str]:

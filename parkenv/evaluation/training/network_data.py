@@ -23,7 +23,7 @@ from planners.network.policy import NetworkPolicy
 FloatArray = NDArray[np.float64]
 
 LONGEST = 200
-"""Decisions after which a search of the training data ends: longer ones drive in circles in a full lot."""
+"""Number of decisions after which a search of the training data ends: longer ones drive in circles in a full lot."""
 EXPLORATION = 0.15  # probability of a random action in the searches that the teacher drives
 
 
@@ -41,65 +41,64 @@ class Place(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Labelled:
-    """Decisions with the network's observations and the teacher's choices and values.
+class Decisions:
+    """Decisions as the network observes them.
 
     Attributes:
         actions, tokens, allowed: see `planners.network.features.Features`, with a leading axis of n decisions.
-        choice: (n,) int64, the teacher's action, of the network's six.
-        values: (n, 6) float32, the teacher's expected times in time scales of the decision; nan where it has none.
     """
 
     actions: NDArray[np.float32]
     tokens: NDArray[np.float32]
     allowed: NDArray[np.bool_]
-    choice: NDArray[np.int64]
-    values: NDArray[np.float32]
 
     @classmethod
-    def joined(cls, parts: Sequence[Labelled]) -> Self:
+    def joined(cls, parts: Sequence[Self]) -> Self:
         """Concatenate sets of decisions."""
         names = (one.name for one in fields(cls))
         return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
     def __len__(self) -> int:
-        return len(self.choice)
+        return len(self.allowed)
 
 
 @dataclass(frozen=True, eq=False)
-class Pairs:
-    """Two actions at one decision, each played to the end in the same world.
+class Labelled(Decisions):
+    """Decisions with the teacher's choices and values.
 
     Attributes:
-        actions, tokens, allowed: see `planners.network.features.Features`, with a leading axis of n decisions.
+        choice: (n,) int64, the teacher's action, of the network's six.
+        values: (n, 6) float32, the teacher's expected times in time scales of the decision; nan where it has none.
+    """
+
+    choice: NDArray[np.int64]
+    values: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs(Decisions):
+    """Decisions with two actions, each played to the end in the same world.
+
+    Attributes:
         first, second: (n,) int64, the two actions.
         longer: (n,) float32, by how much longer the first search took, in time scales of the decision.
         decisions: (n,) int64, decisions of the searches that it took to play each pair.
     """
 
-    actions: NDArray[np.float32]
-    tokens: NDArray[np.float32]
-    allowed: NDArray[np.bool_]
     first: NDArray[np.int64]
     second: NDArray[np.int64]
     longer: NDArray[np.float32]
     decisions: NDArray[np.int64]
-
-    @classmethod
-    def joined(cls, parts: Sequence[Pairs]) -> Self:
-        """Concatenate sets of pairs."""
-        names = (one.name for one in fields(cls))
-        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def label_searches(places: Sequence[Place], decisions: int, seed: int, student_drives: bool) -> Labelled:
     """Run searches, and label each decision by the teacher.
 
     Args:
-        places: lots; each search is in one of them, by turns.
-        decisions: how many to collect at least.
-        seed: of the worlds and of the exploration.
-        student_drives: whether the student's actions are taken; else the teacher's, and random ones now and then.
+        places: lots; each search is in the next one, and after the last in the first again.
+        decisions: minimum number of decisions to collect.
+        seed: seed of the worlds and of the exploration.
+        student_drives: take the student's actions; else the teacher's, and random ones now and then.
     """
     rng = np.random.default_rng(seed)
     rows: list[tuple[Any, ...]] = []
@@ -160,9 +159,9 @@ def play_pairs(places: Sequence[Place], count: int, seed: int, closest: float) -
     """Play the student's two best actions to the end in the same world, at decisions where their scores are close.
 
     Args:
-        places: lots; each search is in one of them, by turns.
+        places: lots; each search is in the next one, and after the last in the first again.
         count: number of pairs.
-        seed: of the worlds and of the decisions.
+        seed: seed of the worlds and of the choice of decisions.
         closest: largest difference of the two scores.
     """
     rng = np.random.default_rng(seed)

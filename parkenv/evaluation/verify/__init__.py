@@ -1,0 +1,1 @@
+"""What theory says of parking searches, against what the package's planners and worlds do."""
