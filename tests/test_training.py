@@ -152,7 +152,7 @@ def test_seeds_decide_networks_and_worlds(tmp_path, monkeypatch):
     (tmp_path / "temporary").mkdir()
     for seed in (0, 1):
         train_one(training, seed, tmp_path / str(seed))
-    assert not list((tmp_path / "temporary").iterdir()), "stable-baselines3 keeps a folder of logs"
+    assert not list((tmp_path / "temporary").glob("SB3-*")), "stable-baselines3 keeps a folder of logs"
     assert seeds[1::2] == [TRAINING_SEEDS, 2 * TRAINING_SEEDS], "worlds apart from those of evaluations"
     models = [(tmp_path / seed / "model.safetensors").read_bytes() for seed in "01"]
     assert models[0] != models[1]
@@ -678,7 +678,8 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
         (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
         (["ppo", "--agents", "mdp,belif"], "unknown agent 'belif'"),
         (["ppo", "--clone", "oracle"], "oracle cannot be cloned"),
-        (["network", "--clone", "mdp"], "clone does not go with network"),
+        (["network", "--clone", "mdp"], "clone does not go with network, which clones belief"),
+        (["network", "--evaluate-every", "9"], "evaluate_every does not go with network, which is evaluated"),
         (["network", "--tensorboard"], "tensorboard does not go with network"),
         (["network", "--without", "legs"], "without.0 is 'legs', want 'lookahead'"),
         (["ppo", "--without", "day"], "without goes with algorithm network"),

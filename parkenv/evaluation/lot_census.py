@@ -25,7 +25,7 @@ KERBSIDE_BELOW, OBLIQUE_BELOW = 15, 75
 """Degrees between lane and parked car below which a slot is kerbside, and below which it is oblique."""
 SIZES = (("small", 80), ("medium", 200), ("large", np.inf))
 """Names of sizes, each with the number of slots that it stays below."""
-V_DRIVE = 10.0 * KMH
+V_DRIVE = 10.0 * KMH  # m/s, of the drive time
 COLUMNS = (
     "lot", "file", "slots", "size", "kind", *KINDS, "extent_x_m", "extent_y_m", "lanes", "one_way_lanes", "entries",
     "goals", "drive_s", "doubt", "result", "reason",
@@ -56,7 +56,7 @@ def lot_files(places: list[Path]) -> list[Path]:
 
 
 def count_lot(path: Path, *, drive: bool = True) -> tuple[Row, ParkingLot | None]:
-    """Return the row of a lot file in a census, and the lot; of a file that is no lot, the reason, and None."""
+    """Return the row of a lot file in a census, and the lot; for a file that is no lot, its row says why, and None."""
     try:
         lot = read_lot(path)
         origin = read_provenance(path) if path.suffix == ".geojson" else None
@@ -73,7 +73,7 @@ def lot_columns(lot: ParkingLot, doubts: tuple[Doubt, ...] = (), *, drive: bool 
     Args:
         lot: the lot.
         doubts: reasons to doubt it that are known from its import.
-        drive: whether manoeuvres are planned, as by `parkenv lot check`.
+        drive: plan manoeuvres, as `parkenv lot check` does.
     """
     counts = slots_by_kind(lot)
     survey = survey_lot(lot, doubts, drive=drive)

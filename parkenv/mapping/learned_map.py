@@ -27,7 +27,7 @@ SURVEY_ERROR = 0.03
 """Share of the slots that a survey session judges wrong."""
 USUAL_DAY = DayError(0.8)
 """Day error of a map that states none: the median of 99 car parks over two years is 0.77 logits."""
-_MEMORY = (30.0, 365.0)
+_MEMORY = (30.0, 365.0)  # days, time constants of the drift
 _SHAPE = {"level": 1.0, "slope": 0.8, "smooth": 0.8, "own": 0.6, "hour": 0.5}
 """Standard deviations, relative to that of the level."""
 
@@ -103,9 +103,9 @@ class ReversedMap:
 def map_prior(log: SessionLog, trips: Sequence[Trip], walk: ArrayLike) -> PriorModel:
     """Return the forecast of a map file, from its survey sessions and the trips after them.
 
-    Both go into one posterior: few sessions give a forecast that is not sure of itself, with a day error to say so,
-    and a row that is full near the goal says something of the slots beside it that were not observed. In lots of more
-    than 1,000 slots, sessions without trips are counted (`MapPrior`).
+    Both go into one posterior: after few sessions the forecast is uncertain, and its day error says so; a full row near
+    the goal is evidence about the unobserved slots beside it. In lots of more than 1,000 slots, sessions are counted
+    instead (`MapPrior`).
 
     Args:
         log: the sessions.
@@ -130,7 +130,7 @@ def map_prior(log: SessionLog, trips: Sequence[Trip], walk: ArrayLike) -> PriorM
 
 
 class LearnedMap:
-    """A map and what trips have taught since.
+    """A map, corrected by trips.
 
     The forecast is the mean over days of the corrected map; its day error holds the day's own and what is still unknown
     of the error that all slots share.
@@ -138,7 +138,7 @@ class LearnedMap:
     Args:
         base: the map before any trip.
         walk: (n,) walk from each slot to the goal.
-        priors: how wrong that map may be.
+        priors: how far that map may be off.
 
     Raises:
         InputError: a lot with more than 3,000 slots.
@@ -162,7 +162,7 @@ class LearnedMap:
         return self._base.n_slots
 
     def pass_time(self, day: int) -> None:
-        """Let the map age until a day, counted from the first Monday; it never gets younger."""
+        """Let the map age until a day, counted from the first Monday; earlier days change nothing."""
         if self._day is not None and day > self._day:
             self._error.pass_days(day - self._day)
         self._day = day if self._day is None else max(day, self._day)

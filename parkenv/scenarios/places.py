@@ -54,8 +54,8 @@ def split_places(
 ) -> tuple[list[Scenario], list[Scenario]]:
     """Split scenarios by their lots: those to train on, and those held out.
 
-    A lot is held out if its `lot_share` is below `held_out`. So scenarios on one lot are on one side, and further lots
-    change nothing for those that were there before.
+    A lot is held out if its `lot_share` is below `held_out`. So scenarios on one lot are on one side, and lots that are
+    added later do not move the others.
 
     Args:
         scenarios: the places.

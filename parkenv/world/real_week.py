@@ -1,4 +1,4 @@
-"""A week as counted in real car parks, laid on any lot: the occupancy of a lot file alone.
+"""A week as counted in real car parks, for any lot: the occupancy of a lot file alone.
 
 `OCCUPIED` and `LEVELS` are derived from hourly counts of free places of 54 German car parks (38 to 1,059 places), 2023
 and 2024, collected from the public pages of the cities. The terms of these sources are not settled, so the counts
@@ -62,7 +62,7 @@ def real_week_occupancy(
         fuller_than: share of real car parks that are less full: 0.5 for the typical one, 0.9 for a busy one.
         pull: logits by which the demand for the nearest slot is above, and for the farthest below, that of the middle.
         unevenness: standard deviation, in logits, of the demand for equally near slots.
-        mean_stay_s: mean parking duration, s. Where counts fall faster than cars of that stay leave, nobody arrives.
+        mean_stay_s: mean parking duration, s. Where counts fall faster than parked cars leave, no car arrives.
 
     Examples:
         >>> from parkenv.lots import packaged_lot
@@ -87,7 +87,7 @@ def _demand(popularity: FloatArray, wanted: FloatArray, mean_stay_s: float) -> F
         return np.asarray(equilibrium + (p - equilibrium) * np.exp(-(1.0 + odds) * HOUR_S / mean_stay_s))
 
     p = np.full(popularity.size, wanted[-25])
-    # The last day comes before the first one, too: what was at its beginning is forgotten by its end.
+    # Start with the last day, then the whole week: the state at the start is forgotten within a day.
     for hour in (*range(WEEK_HOURS - 24, WEEK_HOURS), *range(WEEK_HOURS)):
 
         def excess(logits: float, p: FloatArray = p, target: float = wanted[hour]) -> float:

@@ -23,7 +23,7 @@ from planners.network.policy import SHIPPED, NetworkPolicy
 FloatArray = NDArray[np.float64]
 
 CIRCLING = 0.1
-"""Time scales by which an action is worse for each visit of its end since something new was observed."""
+"""Penalty of an action, in time scales, for each visit of its end since something new was observed."""
 
 
 @dataclass
@@ -44,18 +44,19 @@ class NetworkSearch(BeliefSearch):
 class NetworkAgent(BeliefAgent):
     """`network`: takes the action with the best score of a small neural network.
 
-    **Observation.** For each action that there is (a move along an edge, parking, waiting): what a quick look ahead
-    expects of it (`planners.network.lookahead`), what it shows, whether it leads back; and tokens, the slots that
-    matter seen through that action: belief, age of the observation, drive, walk (`planners.network.features`). The
-    belief is that of `belief`: it learns from observations how the day differs from its forecast.
+    **Observation.** For each action that there is (a move along an edge, parking, waiting): the time that a quick
+    look-ahead expects (`planners.network.lookahead`), what comes into view, whether the car turns back; and tokens, the
+    slots that matter seen through that action: belief, age of the observation, drive, arrival cost
+    (`planners.network.features`). The belief is that of `belief`: it learns from observations how the day differs from
+    its forecast.
 
     **Network.** The tokens of an action are pooled by attention; each action then sees the mean and the maximum over
-    all actions. Its output is added to minus the time that the look-ahead expects. Times are relative, there are no
-    coordinates, and actions have no order: the same weights serve lots of ten or two thousand slots, and turning the
-    map changes nothing.
+    all actions. The score of an action is the network's output minus the time that the look-ahead expects. Times are
+    relative, there are no coordinates, and actions have no order: the same weights serve lots of ten or two thousand
+    slots, and turning the map changes nothing.
 
-    **Where it does not.** It cannot be better than its tokens: what happens beyond the eight best slots is known to it
-    only through the look-ahead. A network does not explain itself.
+    **Limits.** It cannot be better than its tokens: what happens beyond the eight best slots is known to it only
+    through the look-ahead. A network does not explain itself.
 
     Args:
         problem: lot, goal, speeds and costs.
@@ -146,7 +147,7 @@ class NetworkAgent(BeliefAgent):
         return out
 
     def _circling(self, vertex: int, here: int, memory: NetworkSearch) -> FloatArray:
-        """Return by how much each action is worse, (6,), because the car has been at its end without seeing news."""
+        """Return a penalty of each action, (6,), for visits of its end since something new was observed."""
         n_known = int((memory.state != 0).sum())
         if n_known != memory.n_known:
             memory.visits[:] = 0.0

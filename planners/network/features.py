@@ -38,10 +38,32 @@ CANDIDATES = 8
 """Number of slots that are tokens."""
 MOST_OPTIONS = 4
 """Number of slots known to be free that the look-ahead considers."""
-PER_PATH = 6
-ACTION_FEATURES = 15 + PER_PATH * len(FAILURE_COSTS) + 12
-TOKEN_FEATURES = 14
+LEAST_SCALE = 1e-3  # s, lower bound of the time scale
 MOST_REGRET = 4.0  # largest difference between times, in time scales
+
+# Times are in time scales, mapped to 0 to 1; regrets are differences from the best, at most MOST_REGRET.
+# Columns of actions: the action itself,
+IS_MOVE, IS_PARKING, IS_WAITING, DURATION, IS_RETURN, LAST_VISIT = range(6)
+# what the look-ahead expects, and the way to the best slot that is known to be free,
+LOOKAHEAD, KNOWN_FREE, KNOWN_FREE_REGRET = range(6, 9)
+# the slot at its end, if there is one, and the slots in view from there,
+END_P_FREE, END_UNOBSERVED, END_COST, VIEW_P_FREE, VIEW_SLOTS, DRIVE_BACK = range(9, 15)
+# the look-ahead's path at each failure cost; from the first column of the path,
+PATHS = 15
+PATH_TIME, PATH_REGRET, PATH_P_NONE, TARGET_P_FREE, TARGET_DRIVE, TARGET_COST = range(6)
+PATH_FEATURES = 6
+# and the situation, which all actions share.
+SITUATION = PATHS + PATH_FEATURES * len(FAILURE_COSTS)
+ELAPSED, SHARE_OBSERVED, LOT_SIZE, DAY_SHIFT, DAY_SPREAD, MEAN_P_FREE = range(SITUATION, SITUATION + 6)
+BEST_KNOWN_FREE, FAILURE_COST, GIVE_UP, DECAY_RATE, N_ACTIONS, N_OPTIONS = range(
+    SITUATION + 6, SITUATION + 12
+)
+ACTION_FEATURES = SITUATION + 12
+
+# Columns of tokens.
+IS_SLOT, P_FREE, P_FREE_SPREAD, SLOT_SHIFT, IS_FREE, IS_TAKEN, LAST_OBSERVED = range(7)
+COST, DRIVE, DRIVE_REGRET, TOTAL_REGRET, IS_END, DECAY, EXPECTED_REGRET = range(7, 14)
+TOKEN_FEATURES = 14
 
 
 class Situation(NamedTuple):
@@ -125,8 +147,8 @@ def observe(
     """
     here, n = now.here, len(belief.slots)
     n_costs = len(failure_costs)
-    ends, step_s = np.full(6, -1), np.full(6, np.inf)
-    for a in range(4):
+    ends, step_s = np.full(ACTION_COUNT, -1), np.full(ACTION_COUNT, np.inf)
+    for a in range(PARKING):
         ends[a] = now.following[a]
         if now.following[a] >= 0:
             step_s[a] = now.move_s[a]
@@ -141,50 +163,40 @@ def observe(
     )
     fallback_s = min(fallback_s, graph.give_up_s)
     options = options_at_hand(here, fallback_s, MOST_OPTIONS, graph, belief)
-    path_s, p_none = np.full((6, n_costs), np.inf), np.ones((6, n_costs))
-    first, end_s, option_s = np.full((6, n_costs), -1), np.zeros((6, n_costs)), np.full(6, np.inf)
-    for a in range(6):
+    path_s, p_none = np.full((ACTION_COUNT, n_costs), np.inf), np.ones((ACTION_COUNT, n_costs))
+    first, option_s = np.full((ACTION_COUNT, n_costs), -1), np.full(ACTION_COUNT, np.inf)
+    for a in range(ACTION_COUNT):
         out.allowed[a] = ends[a] >= 0
         if ends[a] < 0 or a == PARKING:
             continue
         option_s[a] = step_s[a] + best_option(ends[a], step_s[a], options, fallback_s, graph, belief)
         for c in range(n_costs):
-            path_s[a, c], p_none[a, c], first[a, c], end_s[a, c] = path_value(
+            path_s[a, c], p_none[a, c], first[a, c] = path_value(
                 ends[a], step_s[a], failure_costs[c], by_cost, options, fallback_s, graph, belief, scratch
             )
     best_path_s = np.full(n_costs, np.inf)
     for c in range(n_costs):
-        for a in range(6):
+        for a in range(ACTION_COUNT):
             best_path_s[c] = min(best_path_s[c], path_s[a, c])
     least_s = min(best_path_s.min(), option_s.min(), graph.give_up_s)
     if ends[PARKING] >= 0:
         p_here = belief.slots[here].p_free
         path_s[PARKING, :] = p_here * graph.cost_s[here] + (1.0 - p_here) * (now.failure_s + least_s)
         least_s = min(least_s, path_s[PARKING, 0])
-    scale = max(least_s, 1e-3)
+    scale = max(least_s, LEAST_SCALE)
     least_option_s = option_s.min()
 
-    n_observed, n_actions, shift, p_free_mean = 0, 0, 0.0, 0.0
+    n_observed, n_actions, p_free_mean = 0, 0, 0.0
     for s in range(n):
         n_observed += int(now.observed_at[s] >= 0.0)
         p_free_mean += belief.slots[s].p_free
-    for a in range(6):
+    for a in range(ACTION_COUNT):
         n_actions += int(out.allowed[a])
     candidates = _candidates(here, by_cost, failure_costs, graph, belief)
-    p_if, n_unobserved = np.zeros(len(belief.weights)), 0
-    for s in candidates:
-        if s >= 0 and belief.slots[s].state == UNOBSERVED:
-            n_unobserved += 1
-            shift += _logit(1.0 - belief.slots[s].p_free) - _logit(now.forecast[s])
-            p_if += belief.p_free_if[s]
-    spread = 0.0
-    if n_unobserved > 0:
-        shift, p_if = shift / n_unobserved, p_if / n_unobserved
-        mean = (belief.weights * p_if).sum()
-        spread = math.sqrt(max((belief.weights * (p_if - mean) ** 2).sum(), 0.0))
+    shift, spread = _day_of_slots(candidates, now, belief)
     nearest_rate = belief.slots[candidates[0]].decay_rate if candidates[0] >= 0 else 0.0
 
-    for a in range(6):
+    for a in range(ACTION_COUNT):
         row = out.actions[a]
         row[:] = 0.0
         out.lookahead_s[a] = np.inf
@@ -193,20 +205,22 @@ def observe(
         end = ends[a]
         value = min(path_s[a].min(), option_s[a])
         out.lookahead_s[a] = min(value, step_s[a] + graph.give_up_s)
-        row[0] = 1.0 if a < PARKING else 0.0
-        row[1] = 1.0 if a == PARKING else 0.0
-        row[2] = 1.0 if a == WAITING else 0.0
-        row[3] = _squashed(step_s[a] / scale)
-        row[4] = 1.0 if a < PARKING and end == now.previous else 0.0
+        row[IS_MOVE] = 1.0 if a < PARKING else 0.0
+        row[IS_PARKING] = 1.0 if a == PARKING else 0.0
+        row[IS_WAITING] = 1.0 if a == WAITING else 0.0
+        row[DURATION] = _squashed(step_s[a] / scale)
+        row[IS_RETURN] = 1.0 if a < PARKING and end == now.previous else 0.0
         if a < PARKING and now.visited_at[end] >= 0.0:
-            row[5] = 1.0 - _squashed((now.time - now.visited_at[end]) / scale)
-        row[6] = _regret(out.lookahead_s[a], least_s, scale)
-        row[7] = _squashed(option_s[a] / scale)
-        row[8] = _regret(option_s[a], least_option_s, scale) if least_option_s < np.inf else 0.0
+            row[LAST_VISIT] = 1.0 - _squashed((now.time - now.visited_at[end]) / scale)
+        row[LOOKAHEAD] = _regret(out.lookahead_s[a], least_s, scale)
+        row[KNOWN_FREE] = _squashed(option_s[a] / scale)
+        row[KNOWN_FREE_REGRET] = (
+            _regret(option_s[a], least_option_s, scale) if least_option_s < np.inf else 0.0
+        )
         if end < n:
-            row[9] = belief.slots[end].p_free
-            row[10] = 1.0 if belief.slots[end].state == UNOBSERVED else 0.0
-            row[11] = _squashed(graph.cost_s[end] / scale)
+            row[END_P_FREE] = belief.slots[end].p_free
+            row[END_UNOBSERVED] = 1.0 if belief.slots[end].state == UNOBSERVED else 0.0
+            row[END_COST] = _squashed(graph.cost_s[end] / scale)
         if a != PARKING:
             new, n_new = 0.0, 0
             for i in range(graph.view_starts[end], graph.view_starts[end + 1]):
@@ -216,40 +230,87 @@ def observe(
                 ):
                     new += belief.slots[view.slot].p_free
                     n_new += 1
-            row[12], row[13] = _squashed(new), _squashed(0.25 * n_new)
-            row[14] = _squashed(graph.drive_s[end, here] / scale)
+            row[VIEW_P_FREE], row[VIEW_SLOTS] = _squashed(new), _squashed(0.25 * n_new)
+            row[DRIVE_BACK] = _squashed(graph.drive_s[end, here] / scale)
         for c in range(n_costs):
-            at = 15 + PER_PATH * c
-            row[at] = _squashed(path_s[a, c] / scale)
-            row[at + 1] = _regret(path_s[a, c], best_path_s[c], scale)
-            row[at + 2] = p_none[a, c]
+            at = PATHS + PATH_FEATURES * c
+            row[at + PATH_TIME] = _squashed(path_s[a, c] / scale)
+            row[at + PATH_REGRET] = _regret(path_s[a, c], best_path_s[c], scale)
+            row[at + PATH_P_NONE] = p_none[a, c]
             target = first[a, c]
             if target >= 0:
-                row[at + 3] = belief.slots[target].p_free
-                row[at + 4] = _squashed(graph.drive_s[end, target] / scale)
-                row[at + 5] = _squashed(graph.cost_s[target] / scale)
-        at = 15 + PER_PATH * n_costs
-        row[at] = _squashed(now.time / scale)
-        row[at + 1] = n_observed / n
-        row[at + 2] = _squashed(0.01 * n)
-        row[at + 3] = shift / 4.0
-        row[at + 4] = spread
-        row[at + 5] = p_free_mean / n
-        row[at + 6] = _squashed(least_option_s / scale)
-        row[at + 7] = _squashed(now.failure_s / scale)
-        row[at + 8] = _squashed(graph.give_up_s / scale / 10.0)
-        row[at + 9] = _squashed(nearest_rate * scale)
-        row[at + 10] = n_actions / 6.0
-        row[at + 11] = float(options.size) / 4.0
+                row[at + TARGET_P_FREE] = belief.slots[target].p_free
+                row[at + TARGET_DRIVE] = _squashed(graph.drive_s[end, target] / scale)
+                row[at + TARGET_COST] = _squashed(graph.cost_s[target] / scale)
+        row[ELAPSED] = _squashed(now.time / scale)
+        row[SHARE_OBSERVED] = n_observed / n
+        row[LOT_SIZE] = _squashed(0.01 * n)
+        row[DAY_SHIFT] = shift / 4.0
+        row[DAY_SPREAD] = spread
+        row[MEAN_P_FREE] = p_free_mean / n
+        row[BEST_KNOWN_FREE] = _squashed(least_option_s / scale)
+        row[FAILURE_COST] = _squashed(now.failure_s / scale)
+        row[GIVE_UP] = _squashed(graph.give_up_s / scale / 10.0)
+        row[DECAY_RATE] = _squashed(nearest_rate * scale)
+        row[N_ACTIONS] = n_actions / ACTION_COUNT
+        row[N_OPTIONS] = options.size / MOST_OPTIONS
+    _write_tokens(now, candidates, ends, step_s, fallback_s, least_s, graph, belief, out)
 
+
+@compiled(error_model="numpy")
+def _day_of_slots(candidates: IntArray, now: Situation, belief: BeliefSnapshot) -> tuple[float, float]:
+    """Return what the belief about the day says of the candidates that are unobserved.
+
+    Returns:
+        By how much they are fuller than forecast, mean in logits; the standard deviation over days of their P(free).
+    """
+    p_if, n_unobserved, shift = np.zeros(len(belief.weights)), 0, 0.0
+    for s in candidates:
+        if s >= 0 and belief.slots[s].state == UNOBSERVED:
+            n_unobserved += 1
+            shift += _logit(1.0 - belief.slots[s].p_free) - _logit(now.forecast[s])
+            p_if += belief.p_free_if[s]
+    if n_unobserved == 0:
+        return 0.0, 0.0
+    p_if /= n_unobserved
+    mean = (belief.weights * p_if).sum()
+    return shift / n_unobserved, math.sqrt(max((belief.weights * (p_if - mean) ** 2).sum(), 0.0))
+
+
+@compiled(error_model="numpy")
+def _write_tokens(
+    now: Situation,
+    candidates: IntArray,
+    ends: IntArray,
+    step_s: FloatArray,
+    fallback_s: float,
+    least_s: float,
+    graph: PlanningGraph,
+    belief: BeliefSnapshot,
+    out: Features,
+) -> None:
+    """Write the tokens: each candidate, seen through each action.
+
+    Args:
+        now: the situation.
+        candidates: (CANDIDATES,) slots, -1 for none.
+        ends: (6,) vertex after each action.
+        step_s: (6,) s, duration of each action.
+        fallback_s: s, remaining time of the search if a slot is taken on arrival.
+        least_s: s, least expected time of the look-ahead.
+        graph: the lot, or a part of it.
+        belief: the belief about its slots.
+        out: output.
+    """
+    scale = max(least_s, LEAST_SCALE)
     for i in range(CANDIDATES):
         s = candidates[i]
         nearest_s = np.inf
         if s >= 0:
-            for a in range(6):
+            for a in range(ACTION_COUNT):
                 if out.allowed[a] and a != PARKING:
                     nearest_s = min(nearest_s, step_s[a] + graph.drive_s[ends[a], s])
-        for a in range(6):
+        for a in range(ACTION_COUNT):
             token = out.tokens[a, i]
             token[:] = 0.0
             if s < 0 or not out.allowed[a]:
@@ -257,7 +318,7 @@ def observe(
             slot = belief.slots[s]
             drive_s = step_s[a] + graph.drive_s[ends[a], s]
             if a == PARKING:
-                drive_s = now.failure_s + graph.drive_s[here, s]
+                drive_s = now.failure_s + graph.drive_s[now.here, s]
             p_free = slot.p_free + (slot.p_free_usual - slot.p_free) * (
                 1.0 - math.exp(-slot.decay_rate * min(drive_s, 1e6))
             )
@@ -269,22 +330,24 @@ def observe(
                     mean += belief.weights[h] * p
                     square += belief.weights[h] * p * p
                 deviation = math.sqrt(max(square - mean * mean, 0.0))
-            token[0] = 1.0
-            token[1] = p_free
-            token[2] = deviation
-            token[3] = min(max((_logit(1.0 - slot.p_free) - _logit(now.forecast[s])) / 4.0, -1.0), 1.0)
-            token[4] = 1.0 if slot.state == OBSERVED_FREE else 0.0
-            token[5] = 1.0 if slot.state == OBSERVED_TAKEN else 0.0
+            token[IS_SLOT] = 1.0
+            token[P_FREE] = p_free
+            token[P_FREE_SPREAD] = deviation
+            token[SLOT_SHIFT] = min(
+                max((_logit(1.0 - slot.p_free) - _logit(now.forecast[s])) / 4.0, -1.0), 1.0
+            )
+            token[IS_FREE] = 1.0 if slot.state == OBSERVED_FREE else 0.0
+            token[IS_TAKEN] = 1.0 if slot.state == OBSERVED_TAKEN else 0.0
             if now.observed_at[s] >= 0.0:
-                token[6] = 1.0 - _squashed((now.time - now.observed_at[s]) / scale)
-            token[7] = _squashed(graph.cost_s[s] / scale)
-            token[8] = _squashed(drive_s / scale)
-            token[9] = _regret(drive_s, nearest_s, scale)
-            token[10] = _regret(drive_s + graph.cost_s[s], least_s, scale)
-            token[11] = 1.0 if s == ends[a] else 0.0
-            token[12] = _squashed(slot.decay_rate * min(drive_s, 1e6))
+                token[LAST_OBSERVED] = 1.0 - _squashed((now.time - now.observed_at[s]) / scale)
+            token[COST] = _squashed(graph.cost_s[s] / scale)
+            token[DRIVE] = _squashed(drive_s / scale)
+            token[DRIVE_REGRET] = _regret(drive_s, nearest_s, scale)
+            token[TOTAL_REGRET] = _regret(drive_s + graph.cost_s[s], least_s, scale)
+            token[IS_END] = 1.0 if s == ends[a] else 0.0
+            token[DECAY] = _squashed(slot.decay_rate * min(drive_s, 1e6))
             expected_s = expected_cost_to_slot(ends[a], s, slot.p_free, step_s[a], fallback_s, graph, belief)
-            token[13] = _regret(step_s[a] + expected_s, least_s, scale)
+            token[EXPECTED_REGRET] = _regret(step_s[a] + expected_s, least_s, scale)
 
 
 @compiled(error_model="numpy")

@@ -1,8 +1,8 @@
 """A quick look ahead: the expected time of one short path behind an action.
 
-The path follows the thesis's planner at one failure cost while every slot that it observes is taken. Its value is that
-of stopping at the first slot that is better than going on. Compared with `planners.belief`, no slot is remembered along
-the path, the path is short, and no target is inserted: a path takes microseconds.
+The path follows the thesis's planner at one failure cost while every slot that it observes is taken. Its value is the
+expected time of a car that stops at the first slot that is better than going on. Unlike in `planners.belief`, no slot
+is remembered along the path, the path is short, and no target is inserted: a path takes microseconds.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def path_value(
     graph: PlanningGraph,
     belief: BeliefSnapshot,
     scratch: Scratch,
-) -> tuple[float, float, int, float]:
+) -> tuple[float, float, int]:
     """Evaluate the path of the thesis's planner from a vertex.
 
     Args:
@@ -129,7 +129,7 @@ def path_value(
         scratch: buffers.
 
     Returns:
-        The expected time from now, s; P(nothing found on the path); its first target, or -1; s until the path ends.
+        The expected time from now, s; P(nothing found on the path); its first target, or -1.
     """
     weights = scratch.weights[: len(belief.weights)]
     for h in range(len(weights)):
@@ -219,4 +219,4 @@ def path_value(
         ahead = expected + p_rest * ahead
     for j in range(n_observed):
         scratch.seen_at[scratch.slots[j]] = -1.0
-    return start_s + ahead, p_none, first_target, seconds
+    return start_s + ahead, p_none, first_target

@@ -20,12 +20,30 @@ from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import read_bytes
 from parkenv.files.spec_file import Several, Spec
 from planners.model_header import CARD_KEY, read_header
-from planners.network.features import ACTION_FEATURES, FAILURE_COSTS, PER_PATH, TOKEN_FEATURES, Features
+from planners.network.features import (
+    ACTION_FEATURES,
+    BEST_KNOWN_FREE,
+    DAY_SHIFT,
+    DAY_SPREAD,
+    EXPECTED_REGRET,
+    IS_RETURN,
+    IS_SLOT,
+    KNOWN_FREE,
+    KNOWN_FREE_REGRET,
+    LAST_OBSERVED,
+    LAST_VISIT,
+    LOOKAHEAD,
+    P_FREE_SPREAD,
+    PATHS,
+    SITUATION,
+    SLOT_SHIFT,
+    TOKEN_FEATURES,
+    Features,
+)
 
 FORMAT = "parkenv-network-1"
 SHIPPED = Path(__file__).with_name("models") / "network.safetensors"
 _MAX_BYTES, _MAX_WEIGHT = 8_000_000, 1e4
-_HEADER = 15 + PER_PATH * len(FAILURE_COSTS)
 
 Part = Literal["lookahead", "tokens", "day", "memory"]
 
@@ -63,18 +81,19 @@ def feature_masks(without: tuple[Part, ...]) -> tuple[NDArray[np.float32], NDArr
     """Return factors of the features of actions, (ACTION_FEATURES,), and of tokens: 0 for parts left out."""
     actions, tokens = np.ones(ACTION_FEATURES, np.float32), np.ones(TOKEN_FEATURES, np.float32)
     if "lookahead" in without:
-        actions[[6, 7, 8, *range(15, _HEADER), _HEADER + 6]] = tokens[13] = 0.0
+        actions[[LOOKAHEAD, KNOWN_FREE, KNOWN_FREE_REGRET, BEST_KNOWN_FREE]] = 0.0
+        actions[PATHS:SITUATION] = tokens[EXPECTED_REGRET] = 0.0
     if "tokens" in without:
         tokens[:] = 0.0
     if "day" in without:
-        actions[_HEADER + 3 : _HEADER + 5] = tokens[2:4] = 0.0
+        actions[[DAY_SHIFT, DAY_SPREAD]] = tokens[[P_FREE_SPREAD, SLOT_SHIFT]] = 0.0
     if "memory" in without:
-        actions[4:6] = tokens[6] = 0.0
+        actions[[IS_RETURN, LAST_VISIT]] = tokens[LAST_OBSERVED] = 0.0
     return actions, tokens
 
 
 class NetworkPolicy(NamedTuple):
-    """A card and weights by name, float32."""
+    """The network: its card, and its weights by name, float32."""
 
     card: NetworkCard
     weights: dict[str, NDArray[np.float32]]
@@ -114,7 +133,11 @@ class NetworkPolicy(NamedTuple):
             beside.write_bytes(len(text).to_bytes(8, "little") + text + body)
 
     def scores(self, features: Features) -> NDArray[np.float32]:
-        """Score the actions, (..., 6): minus the expected time in time scales, up to a constant; -inf for none."""
+        """Score the actions, (..., 6): minus expected times, in time scales, up to a constant; -inf if not allowed.
+
+        Args:
+            features: the observation of a decision, or of many: arrays with further axes before theirs.
+        """
         w, without = self.weights, self.card.without
         own, tokens = features.actions, features.tokens
         if without:
@@ -122,7 +145,7 @@ class NetworkPolicy(NamedTuple):
             own, tokens = own * of_actions, tokens * of_tokens
         h = np.maximum(tokens @ w["token_1.weight"] + w["token_1.bias"], 0.0)
         h = np.maximum(h @ w["token_2.weight"] + w["token_2.bias"], 0.0)
-        absent = tokens[..., :1] == 0.0
+        absent = tokens[..., IS_SLOT, None] == 0.0
         attention = h @ w["attention.weight"] + w["attention.bias"] - 1e4 * absent
         attention = np.exp(attention - attention.max(axis=-2, keepdims=True))
         attention /= attention.sum(axis=-2, keepdims=True)
@@ -138,7 +161,7 @@ class NetworkPolicy(NamedTuple):
         x = np.maximum(x @ w["score_1.weight"] + w["score_1.bias"], 0.0)
         score = (x @ w["score_2.weight"] + w["score_2.bias"])[..., 0]
         if "lookahead" not in without:
-            score = score - features.actions[..., 6]
+            score = score - features.actions[..., LOOKAHEAD]
         return np.where(features.allowed, score, -np.inf).astype(np.float32)
 
 

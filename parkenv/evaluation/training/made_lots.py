@@ -13,10 +13,8 @@ GRIDS = ((2, 8), (2, 20), (4, 10), (4, 25), (6, 15), (8, 12), (8, 30), (12, 20))
 """Rows of slots, and slots in a row."""
 CITIES = (40, 80, 120, 160, 240, 320, 400, 500)
 """Slots along the streets of a made town."""
-
-
 FULLER_THAN = (0.5, 0.7, 0.9, 0.95)
-"""Shares of real car parks that are less full than the made ones, by turns."""
+"""Shares of real car parks that are less full than the made ones, in turn."""
 
 
 def made_places() -> list[Scenario]:
@@ -35,8 +33,8 @@ def varied(scenarios: list[Scenario], seed: int) -> list[Scenario]:
     """Return the scenarios with other speeds and costs, drawn within a factor of two of the usual ones.
 
     Args:
-        scenarios: scenarios.
-        seed: of the draw.
+        scenarios: the scenarios.
+        seed: seed of the draws.
     """
     rng = np.random.default_rng(seed)
     made = []

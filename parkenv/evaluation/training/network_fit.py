@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from parkenv.evaluation.training.network_data import Labelled, Pairs
+from planners.network.features import IS_SLOT, LOOKAHEAD
 from planners.network.policy import NetworkCard, NetworkPolicy, feature_masks
 
 BATCH = 256
@@ -46,7 +47,7 @@ class Network(nn.Module):
         own, tokens = actions * self.of_actions, tokens * self.of_tokens
         h = torch.relu(self._layer("token_1", tokens))
         h = torch.relu(self._layer("token_2", h))
-        absent = tokens[..., :1] == 0.0
+        absent = tokens[..., IS_SLOT, None] == 0.0
         attention = torch.softmax(self._layer("attention", h) - 1e4 * absent, dim=-2)
         x = torch.cat([own, (attention * h).sum(-2), (h * ~absent).amax(-2)], -1)
         x = torch.relu(self._layer("action_1", x))
@@ -58,7 +59,7 @@ class Network(nn.Module):
         x = torch.cat([x, mean.expand_as(x), most.expand_as(x)], -1)
         score = self._layer("score_2", torch.relu(self._layer("score_1", x)))[..., 0]
         if "lookahead" not in self.card.without:
-            score = score - actions[..., 6]
+            score = score - actions[..., LOOKAHEAD]
         return torch.where(allowed, score, torch.full_like(score, -1e4))
 
     def policy(self) -> NetworkPolicy:
@@ -81,16 +82,16 @@ def fit(
 ) -> dict[str, float]:
     """Fit a network in place.
 
-    The loss has three parts: the cross-entropy of the teacher's choice; the Huber loss of differences between scores
-    and differences between the teacher's values; and, with pairs, that of differences between the two scores and
-    differences between the times that the actions took.
+    The loss has three parts: the cross-entropy of the teacher's choice; the Huber loss between differences of scores
+    and differences of the teacher's values; and, with pairs, the squared error between differences of scores and
+    differences of the times that the two actions took.
 
     Args:
         network: the network.
         labelled: decisions with the teacher's labels.
         pairs: played pairs.
         epochs: passes over `labelled`.
-        learning_rate: at the beginning; it falls to a twentieth along a cosine.
+        learning_rate: learning rate at the beginning; it falls to a twentieth along a cosine.
         seed: seed of the batches.
         pairs_weight: weight of the pairs in the loss.
         status: called with the share that is done.

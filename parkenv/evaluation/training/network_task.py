@@ -22,6 +22,14 @@ from planners.network.policy import NetworkPolicy
 
 VARIED_SEED = 1
 """Seed of the speeds and costs of the varied places."""
+FIXED = {
+    "clone": "clones belief in any case",
+    "demonstrations": "labels as many decisions of belief as --steps says",
+    "k": "observes the same number of slots in every lot",
+    "curriculum": "trains in all places from the beginning",
+    "evaluate_every": "is evaluated after each of its stages",
+}
+"""Settings of other algorithms that `network` does not take, each with the reason."""
 
 
 class NetworkTask(SearchTask):
@@ -45,11 +53,9 @@ class NetworkTask(SearchTask):
 
     def check(self) -> None:
         """See `TrainingTask`."""
-        for name in ("clone", "demonstrations", "k", "curriculum", "evaluate_every"):
+        for name, reason in FIXED.items():
             if getattr(self.spec, name) is not None:
-                raise InputError(
-                    f"{name} does not go with network: it clones belief, and is evaluated at each stage"
-                )
+                raise InputError(f"{name} does not go with network, which {reason}")
         if self.spec.tensorboard:
             raise InputError("tensorboard does not go with network, which keeps no log")
         algorithm_class("ppo")  # raises the error of the missing extra

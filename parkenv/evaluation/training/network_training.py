@@ -2,9 +2,9 @@
 
 1. The teacher, `belief`, drives, with a random action now and then, and labels every decision.
 2. The network drives, and the teacher labels every decision (DAgger): so it learns what to do where it goes itself.
-3. Twice, the network's two best actions are played to the end in the same world, at decisions where it finds them about
-   equal, and the network learns which of them took longer. No teacher has a say here. Worlds are the same for both
-   actions, so the difference has little noise (common random numbers).
+3. Twice, the network's two best actions are played to the end in the same world, at decisions where their scores are
+   about equal, and the network learns which of them took longer. The teacher takes no part in this. Both actions meet
+   the same world, so the difference has little noise (common random numbers).
 """
 
 from __future__ import annotations
@@ -35,10 +35,12 @@ NETWORK = "network"
 """Name of the algorithm, and of the agent."""
 STEPS = 10_000
 """Default number of labelled decisions of a training."""
+STUDENT_DRIVES = (False, True)  # in the rounds with labels
 PAIR_ROUNDS = 2
 CLOSEST = 0.05  # time scales, difference of two scores that are about equal
 EPOCHS, LEARNING_RATES = 8.0, (2e-3, 1e-3, 5e-4)
 PAIRS_WEIGHT = 3.0
+WORLDS_APART = 1_000_000  # between the first seeds of the rounds
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +74,7 @@ class NetworkTraining(AnyTraining):
             raise InputError("--tensorboard: a training of network keeps no log, want another algorithm")
         folder.mkdir(parents=True, exist_ok=True)
         done = read_curve(folder / CURVE, self.columns)
-        if done and (folder / MODEL).exists() and len(done) == 3 + PAIR_ROUNDS:
+        if done and (folder / MODEL).exists() and len(done) == 1 + len(STUDENT_DRIVES) + PAIR_ROUNDS:
             return done
         return self._train(seed, folder)
 
@@ -109,10 +111,10 @@ class NetworkTraining(AnyTraining):
             curve.append({**row, "wall_s": time.monotonic() - begin})
 
         evaluate()
-        parts: list[Labelled] = []
-        for k, student_drives in enumerate((False, True)):
-            half = max(1, self.steps // 2)
-            parts.append(label_searches(places, half, worlds + 1_000_000 * k, student_drives))
+        parts = list[Labelled]()
+        for k, student_drives in enumerate(STUDENT_DRIVES):
+            half = max(1, self.steps // len(STUDENT_DRIVES))
+            parts.append(label_searches(places, half, worlds + WORLDS_APART * k, student_drives))
             decisions += len(parts[-1])
             fit(
                 network,
@@ -125,7 +127,8 @@ class NetworkTraining(AnyTraining):
             evaluate()
         labelled, played = Labelled.joined(parts), list[Pairs]()
         for k in range(PAIR_ROUNDS):
-            played.append(play_pairs(places, max(1, self.steps // 8), worlds + 1_000_000 * (2 + k), CLOSEST))
+            seed_of_pairs = worlds + WORLDS_APART * (len(STUDENT_DRIVES) + k)
+            played.append(play_pairs(places, max(1, self.steps // 8), seed_of_pairs, CLOSEST))
             decisions += int(played[-1].decisions.sum())
             fit(
                 network, labelled, Pairs.joined(played), epochs=EPOCHS, learning_rate=LEARNING_RATES[2],
@@ -137,7 +140,7 @@ class NetworkTraining(AnyTraining):
                 "trained_on": tuple(dict.fromkeys(scenario.name for scenario in self.places)),
                 "decisions": decisions,
                 "settings": {
-                    "labelled": self.steps, "pairs": PAIR_ROUNDS * (self.steps // 8), "closest": CLOSEST,
+                    "labelled": self.steps, "pairs": sum(map(len, played)), "closest": CLOSEST,
                     "epochs": EPOCHS, "learning_rates": list(LEARNING_RATES), "pairs_weight": PAIRS_WEIGHT,
                 },
                 "results": {name: curve[-1][name] for name in self.metrics},
