@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from parkenv.envs.fleet_records import PARKED, LEFT
+from parkenv.envs.fleet_records import LEFT, PARKED
 from parkenv.envs.fleet_rules import RULES
 from parkenv.evaluation.verify.fleets import STAY_S, erlang_b, independent_runs, lane, loaded_fleet
 from parkenv.evaluation.verify.rows import Row, Task, mean_row

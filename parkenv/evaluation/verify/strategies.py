@@ -26,6 +26,7 @@ from parkenv.envs.shared_slots import is_shared_slot_taken
 from parkenv.evaluation.verify.fleets import erlang_b, independent_runs, lane, loaded_fleet, mean_parked
 from parkenv.evaluation.verify.rows import Row, Task, mean_row
 from parkenv.world.occupancy_kernel import inlined, kernel
+from parkenv.world.pointers import int64s
 from parkenv.world.week import HOUR_S
 
 MEEK_SOURCE = "Krapivsky & Redner 2019, own derivation"
@@ -38,52 +39,59 @@ WARM_UP_H = 15.0
 _BEST, _OTHER = 1, 0  # what a driver of a threshold strategy notes in the field `n_moves` of its CAR record
 
 
+@inlined
+def _by_distance(fleet: Any, car: Any) -> Any:
+    """Return the slots in order of their distance from the goal, (n_slots,) int64."""
+    return int64s(fleet.by_cost + 8 * fleet.n_slots * car.place)
+
+
 @kernel
 def decide_meek(address: int, number: int) -> int:
-    """Park right behind the most distant parked car. The last slot of the lane is at the goal."""
+    """Park right behind the most distant parked car."""
     fleet = fleet_at(address, 0)
-    slot = 0
-    while slot < fleet.n_slots and not is_shared_slot_taken(address, slot, fleet.time):
-        slot += 1
-    return TAKE_SLOT + slot - 1 if slot > 0 else LEAVE
+    slots, behind = _by_distance(fleet, car_at(fleet.cars, number)), fleet.n_slots
+    while behind > 0 and not is_shared_slot_taken(address, slots[behind - 1], fleet.time):
+        behind -= 1
+    return int(TAKE_SLOT + slots[behind]) if behind < fleet.n_slots else LEAVE
 
 
 @inlined
 def _take_first_of_zone(address: int, number: int, zone: int) -> int:
     """Take the first free slot of the zone; else the first one on the way back. Note whether it is the zone's best."""
     fleet = fleet_at(address, 0)
-    n = fleet.n_slots
+    car = car_at(fleet.cars, number)
+    slots = _by_distance(fleet, car)
     first, count = -1, 0
-    for slot in range(n - zone, n):
-        if not is_shared_slot_taken(address, slot, fleet.time):
+    for k in range(zone - 1, -1, -1):
+        if not is_shared_slot_taken(address, slots[k], fleet.time):
             if count == 0:
-                first = slot
+                first = slots[k]
             count += 1
-    car_at(fleet.cars, number).n_moves = _BEST if count == 1 else _OTHER
+    car.n_moves = _BEST if count == 1 else _OTHER
     if count > 0:
         return int(TAKE_SLOT + first)
-    for slot in range(n - zone - 1, -1, -1):
-        if not is_shared_slot_taken(address, slot, fleet.time):
-            return int(TAKE_SLOT + slot)
+    for k in range(zone, fleet.n_slots):
+        if not is_shared_slot_taken(address, slots[k], fleet.time):
+            return int(TAKE_SLOT + slots[k])
     return LEAVE
 
 
 @kernel
 def decide_quarter(address: int, number: int) -> int:
     """Threshold 1/4."""
-    return _take_first_of_zone(address, number, ZONE_LOAD // 4)
+    return int(_take_first_of_zone(address, number, ZONE_LOAD // 4))
 
 
 @kernel
 def decide_half(address: int, number: int) -> int:
     """Threshold 1/2."""
-    return _take_first_of_zone(address, number, ZONE_LOAD // 2)
+    return int(_take_first_of_zone(address, number, ZONE_LOAD // 2))
 
 
 @kernel
 def decide_three_quarters(address: int, number: int) -> int:
     """Threshold 3/4."""
-    return _take_first_of_zone(address, number, 3 * ZONE_LOAD // 4)
+    return int(_take_first_of_zone(address, number, 3 * ZONE_LOAD // 4))
 
 
 THRESHOLDS: dict[float, Any] = {0.25: decide_quarter, 0.5: decide_half, 0.75: decide_three_quarters}
